@@ -1,0 +1,139 @@
+"""The configuration: one model per stage, unknown keys refused with their path.
+
+Every default says where it comes from: ``paper``, a peer (field_notes.md), or a measurement.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from aquaflow.errors import ConfigError, InputError
+
+
+class Stage(BaseModel):
+    """A stage's settings: immutable, and a misspelt key is an error."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class SourceConfig(Stage):
+    """Which frames, and how they are prepared."""
+
+    every: int = Field(1, ge=1, description="use every n-th frame")
+    start: int = Field(0, ge=0, description="first frame index")
+    stop: int | None = Field(None, ge=1, description="first frame index not used")
+    width: int | None = Field(
+        None, ge=64, description="px; frames are made this wide (None: 480, or less if smaller)"
+    )
+    crop: str | None = Field(None, description="left | right | x,y,width,height, before resizing")
+    fps: float | None = Field(None, gt=0, description="frames/s of a folder without timestamps")
+
+
+class InitialisationConfig(Stage):
+    """Two-view initialisation (prior_notes.md section 2)."""
+
+    points: int = Field(800, ge=100, description="sample points; 800 solve in 0.1 s")
+    min_share: float = Field(
+        0.25, gt=0, lt=1, description="matched part of the samples below which the place is lost"
+    )
+    min_views: int = Field(2, ge=1, description="frames beside the reference to judge by")
+    max_waiting: int = Field(24, ge=3, description="frames kept while waiting; bounds memory")
+    parallax_widths: float = Field(
+        0.04, gt=0, description="rotation-compensated median parallax over width; measured: "
+        "0.02 leaves the depth of gentle relief undecided"
+    )
+    pairs: int = Field(2, ge=1, description="second views tried, most parallax first")
+    candidates: int = Field(3, ge=1, description="E and H poses tried per pair")
+    focal_factors: tuple[float, ...] = Field(
+        (0.7, 1.0, 1.4), description="starts for an unknown focal length, over the guess"
+    )
+    max_focal_sigma: float = Field(
+        0.05, gt=0, description="relative; a focal length known worse than this waits for parallax"
+    )
+    sigma_px: float = Field(0.5, gt=0, description="noise of a checked DIS match")
+    inlier_px: float = Field(1.0, gt=0, description="reprojection error of an explained match")
+    min_explained: float = Field(
+        0.7, gt=0, le=1, description="explained part of all matches to accept a geometry"
+    )
+    max_depth_sigma: float = Field(
+        0.1, gt=0, description="median relative sigma of the points' depth to accept a geometry"
+    )
+
+
+class TrackingConfig(Stage):
+    """Tracking and frame classes (paper, Sec. 3.2)."""
+
+    keyframe_share: float = Field(
+        0.7, gt=0, lt=1, description="tau_keyframe: matched share below which a keyframe is made; "
+        "paper: 0.7"
+    )
+    mapping_parallax_widths: float = Field(
+        30.0 / 512.0, gt=0, description="tau_mapframe over width; paper: 30 px at 512 px"
+    )
+    matches: int = Field(
+        5000, ge=200, description="matches in the pose solver; more gain nothing (prior_notes 4)"
+    )
+    min_matches: int = Field(40, ge=10, description="fewer decide no pose (prior_notes 4)")
+    min_inlier_share: float = Field(
+        0.35, gt=0, lt=1, description="inliers below which the frame is lost"
+    )
+    known_sigma: float = Field(
+        0.15, gt=0, description="relative depth sigma of points that poses are solved from"
+    )
+    sigma_px: float = Field(0.5, gt=0, description="noise of a checked DIS match")
+    lost_after: int = Field(
+        3, ge=1, description="consecutive lost frames after which a new sub-map starts"
+    )
+    initialisation: InitialisationConfig = InitialisationConfig()
+
+
+class Config(Stage):
+    """Everything a run depends on."""
+
+    seed: int = 0
+    threads: int | None = Field(None, ge=1, description="None: every core")
+    prior: Literal["classical"] = "classical"
+    source: SourceConfig = SourceConfig()
+    tracking: TrackingConfig = TrackingConfig()
+
+
+def parse_config(data: dict[str, Any], origin: str) -> Config:
+    """Validate a mapping read from ``origin``.
+
+    Raises:
+        ConfigError: with the path of the first key that is unknown or out of range.
+    """
+    try:
+        return Config.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        path = ".".join(str(part) for part in first["loc"])
+        problem = "is not a known key" if first["type"] == "extra_forbidden" else first["msg"]
+        raise ConfigError(f"{origin}: '{path}' {problem.lower()}; see `aquaflow config`") from error
+
+
+def load_config(path: Path) -> Config:
+    """Read a YAML config; keys that are absent keep their defaults.
+
+    Raises:
+        InputError: the file cannot be read, or is not YAML.
+        ConfigError: a key is unknown or a value out of range.
+    """
+    try:
+        data = yaml.safe_load(path.read_text()) or {}
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read the config {path}: {error}") from error
+    except yaml.YAMLError as error:
+        raise InputError(f"{path} is not YAML; write `key: value` lines") from error
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path} holds no key: value pairs; see `aquaflow config`")
+    return parse_config(data, str(path))
+
+
+def dump_config(config: Config, path: Path) -> None:
+    """Write the effective configuration."""
+    path.write_text(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))

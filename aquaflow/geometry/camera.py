@@ -1,0 +1,187 @@
+"""Camera models: pinhole with OpenCV distortion, read from ``camera.yaml``.
+
+Pixel convention: the centre of the top-left pixel is (0.5, 0.5), so the centre of a W-wide image
+is W / 2. OpenCV's convention is half a pixel less; the difference is applied where OpenCV is called.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from aquaflow.errors import ConfigError, InputError
+
+DistortionModel = Literal["none", "radtan", "fisheye"]
+
+GUESSED_FOCAL_WIDTHS = 0.85
+"""Focal length over width when nothing is known. The shared clips in water span 0.63 (GoPro wide)
+to 1.10 (SLR behind a dome); this is the geometric mean of the two."""
+
+ASPECT_TOLERANCE = 0.01
+"""A calibration for another resolution may be scaled if the aspect ratio differs by less."""
+
+
+@dataclass(frozen=True)
+class Port:
+    """The window between camera and water; ``flat`` and ``dome`` are carried for later use."""
+
+    kind: Literal["none", "flat", "dome"] = "none"
+    thickness_m: float = 0.0
+    distance_m: float = 0.0
+    refractive_index_glass: float = 1.49
+    refractive_index_water: float = 1.34
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """Intrinsics in pixels for images of ``width`` x ``height``."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion_model: DistortionModel = "none"
+    distortion: tuple[float, ...] = ()
+    """OpenCV order: k1 k2 p1 p2 [k3 ...] for ``radtan``, k1..k4 for ``fisheye``."""
+    port: Port = Port()
+    calibrated: bool = True
+    """False while the focal length is only a guess."""
+
+    @property
+    def K(self) -> npt.NDArray[np.float64]:
+        """[3, 3] intrinsic matrix."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def is_distorted(self) -> bool:
+        return self.distortion_model != "none" and any(k != 0.0 for k in self.distortion)
+
+    def scaled(self, width: int, height: int) -> CameraModel:
+        """The same camera for the same picture resized to ``width`` x ``height``."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=self.cx * sx,
+            cy=self.cy * sy,
+        )
+
+    def cropped(self, x: int, y: int, width: int, height: int) -> CameraModel:
+        """The same camera for the part of its picture that starts at (x, y)."""
+        return replace(self, width=width, height=height, cx=self.cx - x, cy=self.cy - y)
+
+    def with_focal_scaled(self, factor: float) -> CameraModel:
+        """The same camera with its focal length multiplied by ``factor``."""
+        return replace(self, fx=self.fx * factor, fy=self.fy * factor)
+
+    def pixel_centres(self) -> npt.NDArray[np.float64]:
+        """[H, W, 2] pixel coordinates of every pixel's centre."""
+        u, v = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
+        return np.stack([u, v], axis=-1)
+
+    def unproject(
+        self,
+        pixels: npt.NDArray[np.floating],  # [..., 2] px, undistorted
+    ) -> npt.NDArray[np.float64]:
+        """Points [..., 3] at z = 1 on the rays of ``pixels``, camera frame."""
+        x = (pixels[..., 0] - self.cx) / self.fx
+        y = (pixels[..., 1] - self.cy) / self.fy
+        return np.stack([x, y, np.ones_like(x)], axis=-1).astype(np.float64)
+
+    def project(
+        self,
+        points: npt.NDArray[np.floating],  # [..., 3], camera frame, z > 0
+    ) -> npt.NDArray[np.float64]:
+        """Undistorted pixel coordinates [..., 2]; z is kept away from zero."""
+        z = np.maximum(points[..., 2], 1e-9)
+        u = self.fx * points[..., 0] / z + self.cx
+        v = self.fy * points[..., 1] / z + self.cy
+        return np.stack([u, v], axis=-1)
+
+
+def guess_camera(width: int, height: int) -> CameraModel:
+    """A pinhole camera with a typical underwater focal length, marked as not calibrated."""
+    focal = GUESSED_FOCAL_WIDTHS * width
+    return CameraModel(
+        width, height, focal, focal, width / 2.0, height / 2.0, calibrated=False
+    )
+
+
+class CameraFile(BaseModel):
+    """The ``camera.yaml`` format."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    model: Literal["pinhole"] = "pinhole"
+    fx: float = Field(gt=0)
+    fy: float = Field(gt=0)
+    cx: float
+    cy: float
+    distortion_model: Literal["none", "radial", "radtan", "opencv", "fisheye"] = "none"
+    distortion: list[float] = Field(default_factory=list, max_length=14)
+    port: Literal["none", "flat", "dome"] = "none"
+
+
+def load_camera(path: Path) -> CameraModel:
+    """Read a calibration.
+
+    Raises:
+        InputError: the file is not there or is not YAML.
+        ConfigError: a key is unknown, missing, or its value is out of range.
+    """
+    try:
+        data = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read the calibration {path}: {error}") from error
+    except yaml.YAMLError as error:
+        raise InputError(f"{path} is not YAML; compare it with the README's camera.yaml") from error
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path} holds no key: value pairs; compare it with the README")
+    try:
+        file = CameraFile.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise ConfigError(
+            f"{path}: key '{key}': {first['msg'].lower()}; known keys are "
+            f"{', '.join(CameraFile.model_fields)}"
+        ) from error
+    kind: DistortionModel = {"none": "none", "fisheye": "fisheye"}.get(  # type: ignore[assignment]
+        file.distortion_model, "radtan"
+    )
+    return CameraModel(
+        file.width, file.height, file.fx, file.fy, file.cx, file.cy,
+        distortion_model=kind,
+        distortion=tuple(file.distortion),
+        port=Port(kind=file.port),
+    )
+
+
+def save_camera(camera: CameraModel, path: Path) -> None:
+    """Write ``camera`` in the format that :func:`load_camera` reads."""
+    data = {
+        "width": camera.width,
+        "height": camera.height,
+        "model": "pinhole",
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "distortion_model": camera.distortion_model,
+        "distortion": list(camera.distortion),
+        "port": camera.port.kind,
+    }
+    path.write_text(yaml.safe_dump(data, sort_keys=False))

@@ -1,0 +1,134 @@
+"""Sim(3): the group of rotations, translations and scale in which all poses live.
+
+``T_ab`` maps points of frame b into frame a; poses are ``T_wc``. Tangent vectors are
+``[translation (3), rotation (3), log-scale (1)]`` and act from the left: ``exp(xi) @ T``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+Array = npt.NDArray[np.float64]
+
+# Nodes on [0, 1]: 24 integrate e^(sigma t) exp(t w) to float64 accuracy for |w| <= pi, |sigma| <= 10,
+# with none of the closed form's branches near zero.
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
+_NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
+
+
+def hat(
+    w: Array,  # [..., 3]
+) -> Array:
+    """Skew-symmetric matrices [..., 3, 3] with ``hat(w) @ x == cross(w, x)``."""
+    x, y, z = w[..., 0], w[..., 1], w[..., 2]
+    zero = np.zeros_like(x)
+    rows = [zero, -z, y, z, zero, -x, -y, x, zero]
+    return np.stack(rows, axis=-1).reshape(*w.shape[:-1], 3, 3)
+
+
+def so3_exp(
+    w: Array,  # [3] rad
+) -> Array:
+    """Rotation matrix [3, 3] of the rotation vector ``w``."""
+    return np.asarray(Rotation.from_rotvec(w).as_matrix())
+
+
+def so3_log(
+    R: Array,  # [3, 3]
+) -> Array:
+    """Rotation vector [3], rad, angle in [0, pi]."""
+    return np.asarray(Rotation.from_matrix(R).as_rotvec())
+
+
+def quaternion_from_rotation(
+    R: Array,  # [..., 3, 3]
+) -> Array:
+    """Unit quaternions [..., 4], wxyz, w >= 0."""
+    return np.asarray(
+        Rotation.from_matrix(R).as_quat(canonical=True, scalar_first=True)
+    )
+
+
+def rotation_from_quaternion(
+    wxyz: Array,  # [..., 4], normalised here
+) -> Array:
+    """Rotation matrices [..., 3, 3]."""
+    return np.asarray(Rotation.from_quat(wxyz, scalar_first=True).as_matrix())
+
+
+@dataclass(frozen=True)
+class Sim3:
+    """x -> scale * R @ x + t."""
+
+    R: Array
+    """[3, 3]"""
+    t: Array
+    """[3]"""
+    scale: float = 1.0
+
+    @staticmethod
+    def identity() -> Sim3:
+        return Sim3(np.eye(3), np.zeros(3))
+
+    @staticmethod
+    def exp(
+        xi: Array,  # [7]
+    ) -> Sim3:
+        """The group element of a tangent vector, exact in rotation, scale and translation."""
+        sigma = float(xi[6])
+        return Sim3(so3_exp(xi[3:6]), _left_jacobian(xi[3:6], sigma) @ xi[:3], float(np.exp(sigma)))
+
+    def log(self) -> Array:
+        """The tangent vector [7] whose ``exp`` is this element."""
+        w, sigma = so3_log(self.R), float(np.log(self.scale))
+        u = np.linalg.solve(_left_jacobian(w, sigma), self.t)
+        return np.concatenate([u, w, [sigma]])
+
+    def inverse(self) -> Sim3:
+        s = 1.0 / self.scale
+        return Sim3(self.R.T, -s * (self.R.T @ self.t), s)
+
+    def __matmul__(self, other: Sim3) -> Sim3:
+        """Composition; the rotation is put back on SO(3), so that long products do not drift."""
+        R = Rotation.from_matrix(self.R @ other.R).as_matrix()
+        t = self.scale * (self.R @ other.t) + self.t
+        return Sim3(np.asarray(R), t, self.scale * other.scale)
+
+    def apply(
+        self,
+        points: Array,  # [..., 3]
+    ) -> Array:
+        return self.scale * (points @ self.R.T) + self.t
+
+    @property
+    def matrix(self) -> Array:
+        """[4, 4] homogeneous matrix, scale included."""
+        M = np.eye(4)
+        M[:3, :3], M[:3, 3] = self.scale * self.R, self.t
+        return M
+
+    @property
+    def quaternion(self) -> Array:
+        """[4] wxyz."""
+        return quaternion_from_rotation(self.R)
+
+    def is_finite(self) -> bool:
+        """True while every entry is a number and the scale is positive."""
+        finite = np.isfinite(self.R).all() and np.isfinite(self.t).all()
+        return bool(finite and np.isfinite(self.scale) and self.scale > 0.0)
+
+
+def _left_jacobian(w: Array, sigma: float) -> Array:
+    """V with ``exp([u, w, sigma]).t == V @ u``: the integral of e^(sigma t) exp(t hat(w)) dt."""
+    theta = float(np.linalg.norm(w))
+    growth = _WEIGHTS * np.exp(sigma * _NODES)
+    # sin(theta t) / theta and (1 - cos(theta t)) / theta^2 written with sinc: finite at theta = 0.
+    first = float(np.sum(growth * _NODES * np.sinc(theta * _NODES / np.pi)))
+    half = np.sinc(0.5 * theta * _NODES / np.pi)
+    second = float(np.sum(growth * 0.5 * (_NODES * half) ** 2))
+    W = hat(w)
+    return float(np.sum(growth)) * np.eye(3) + first * W + second * (W @ W)

@@ -1,0 +1,68 @@
+"""Depth of matched pixels from two known views, with the uncertainty that the parallax allows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
+
+Array = npt.NDArray[np.float64]
+
+MIN_PARALLAX_RAD = np.radians(0.15)
+"""Below this angle a depth from two views is noise (prior_notes.md section 4: 0.15-0.3 degrees)."""
+
+MAX_REPROJECTION_PX = 1.5
+"""A match further than this from its epipolar line is an outlier, not a measurement."""
+
+
+@dataclass(frozen=True)
+class Triangulation:
+    """Inverse depths in view a, one per match."""
+
+    rho: Array
+    """[M] 1 / z in a."""
+    variance: Array
+    """[M] variance of ``rho``."""
+    good: npt.NDArray[np.bool_]
+    """[M] in front of both cameras, enough parallax, close to the epipolar line."""
+    parallax_rad: Array
+    """[M] angle between the two rays."""
+
+
+def triangulate(
+    rays_a: Array,  # [M, 3], z = 1, camera a
+    pixels_b: Array,  # [M, 2] px
+    T_ba: Sim3,
+    camera_b: CameraModel,
+    sigma_px: float,
+) -> Triangulation:
+    """Point on each ray of a that is nearest to the matched ray of b.
+
+    The variance is first order: ``sigma_px`` along the epipolar line moves the inverse depth by
+    (sigma / f) * rho / sin(parallax).
+    """
+    rays_b = camera_b.unproject(pixels_b)
+    a_in_b = rays_a @ T_ba.R.T
+    # x_b ~ z_a a_in_b + t  =>  x_b x (z_a a_in_b + t) = 0, solved for z_a by least squares.
+    c = np.cross(rays_b, a_in_b)
+    d = np.cross(rays_b, np.broadcast_to(T_ba.t, rays_b.shape))
+    z = -(c * d).sum(1) / np.maximum((c * c).sum(1), 1e-18)
+    z_safe = np.maximum(z, 1e-6)
+
+    in_b = z_safe[:, None] * a_in_b + T_ba.t
+    centre_b_in_a = -(T_ba.R.T @ T_ba.t)
+    from_b = rays_a * z_safe[:, None] - centre_b_in_a
+    sine = np.linalg.norm(np.cross(rays_a, from_b), axis=1)
+    cosine = (rays_a * from_b).sum(1)
+    parallax = np.arctan2(sine, cosine)
+
+    error = np.linalg.norm(camera_b.project(in_b) - pixels_b, axis=1)
+    good = (z > 1e-3) & (in_b[:, 2] > 1e-3) & (error < MAX_REPROJECTION_PX)
+    good &= parallax > MIN_PARALLAX_RAD
+    rho = 1.0 / z_safe
+    sigma = (sigma_px / camera_b.fx) * rho / np.maximum(np.sin(parallax), 1e-6)
+    return Triangulation(rho, sigma**2, good, parallax)

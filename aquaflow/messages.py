@@ -1,0 +1,131 @@
+"""What every source yields: frames and telemetry samples.
+
+Times are CLOCK_MONOTONIC nanoseconds. ``t_ns`` is the moment of exposure or measurement where the
+device tells it; ``arrival_ns`` is when the sample reached this process.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.geometry.camera import CameraModel
+
+__all__ = [
+    "Acceleration",
+    "Altitude",
+    "AngularRate",
+    "Attitude",
+    "CameraModel",
+    "Depth",
+    "Dropped",
+    "Frame",
+    "Lights",
+    "TelemetrySample",
+    "Velocity",
+]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picture, as a source hands it over."""
+
+    index: int
+    """Position in the source, counted before any sub-sampling."""
+    t_ns: int
+    arrival_ns: int
+    image: npt.NDArray[np.uint8]
+    """[H, W, 3] RGB."""
+    camera: CameraModel
+    exposure_s: float | None = None
+    gain: float | None = None
+    mask: npt.NDArray[np.bool_] | None = None
+    """[H, W], True where the pixel shows the scene (False: vehicle frame, gripper)."""
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """A picture that could not be used; the dive goes on without it."""
+
+    index: int
+    t_ns: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Depth:
+    """Metres below the surface, positive down."""
+
+    t_ns: int
+    arrival_ns: int
+    source: str
+    depth_m: float
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """Rotation of the body (forward, right, down) in NED, wxyz."""
+
+    t_ns: int
+    arrival_ns: int
+    source: str
+    wxyz: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class AngularRate:
+    """Body frame, rad/s."""
+
+    t_ns: int
+    arrival_ns: int
+    source: str
+    rate_rad_s: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Acceleration:
+    """Specific force in the body frame, m/s^2."""
+
+    t_ns: int
+    arrival_ns: int
+    source: str
+    acceleration_m_s2: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Velocity:
+    """Velocity over ground in the body frame, m/s, with the device's figure of merit (1 sigma)."""
+
+    t_ns: int
+    arrival_ns: int
+    source: str
+    velocity_m_s: tuple[float, float, float]
+    figure_of_merit_m_s: float
+
+
+@dataclass(frozen=True)
+class Altitude:
+    """Metres above the bottom."""
+
+    t_ns: int
+    arrival_ns: int
+    source: str
+    altitude_m: float
+
+
+@dataclass(frozen=True)
+class Lights:
+    """Lamp level, 0 (off) to 1 (full)."""
+
+    t_ns: int
+    arrival_ns: int
+    source: str
+    level: float
+
+
+TelemetrySample: TypeAlias = (
+    Depth | Attitude | AngularRate | Acceleration | Velocity | Altitude | Lights
+)

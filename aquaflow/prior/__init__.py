@@ -1,0 +1,1 @@
+"""The two-view prior: what two pictures say about matches and geometry."""

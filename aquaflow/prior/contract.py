@@ -1,0 +1,107 @@
+"""The contract between a two-view prior and the rest of AquaFlow (paper, Sec. 3.1).
+
+A prior encodes each picture once and decodes pairs of encodings. Later priors replace the classical
+one behind these two protocols; nothing above them knows which is running.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.geometry.camera import CameraModel
+
+Float = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
+
+
+class Encoding(Protocol):
+    """One picture, digested once and kept with its frame."""
+
+    camera: CameraModel
+
+    @property
+    def interesting(self) -> Mask:
+        """[H, W]: pixels with enough texture that a match may be expected of them."""
+        ...
+
+
+class PairGeometry(Protocol):
+    """What a prior knows about the pair (a, b); a is the reference (paper: camera i).
+
+    Everything but the matches is computed when first asked for.
+    """
+
+    @property
+    def matches(self) -> Float:
+        """[H, W, 2] px: where each pixel of a is seen in b."""
+        ...
+
+    @property
+    def valid(self) -> Mask:
+        """[H, W]: the match survived the prior's own check."""
+        ...
+
+    @property
+    def matches_back(self) -> Float:
+        """[H, W, 2] px: where each pixel of b is seen in a."""
+        ...
+
+    @property
+    def valid_back(self) -> Mask:
+        """[H, W]: the match of b's pixel survived the prior's own check."""
+        ...
+
+    @property
+    def C(self) -> Float:
+        """[H, W] confidence of the matches in [0, 1]."""
+        ...
+
+    @property
+    def X_a(self) -> Float:
+        """[H, W, 3] pointmap of a in a's frame; NaN where unknown. Scale is the prior's."""
+        ...
+
+    @property
+    def X_b(self) -> Float:
+        """[H, W, 3] pointmap of b in a's frame; NaN where unknown."""
+        ...
+
+    @property
+    def Q_a(self) -> Float:
+        """[H, W] point confidence: 1 / relative variance of the range; 0 where unknown."""
+        ...
+
+    @property
+    def Q_b(self) -> Float: ...
+
+    @property
+    def D_a(self) -> Float | None:
+        """[H, W, d] descriptors; None for a prior that matches without any."""
+        ...
+
+    @property
+    def D_b(self) -> Float | None: ...
+
+
+class Prior(Protocol):
+    """A two-view prior."""
+
+    name: str
+    metric: bool
+    """True if its pointmaps are in metres."""
+
+    def encode(
+        self,
+        image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
+        camera: CameraModel,
+    ) -> Encoding: ...
+
+    def decode(
+        self,
+        a: Encoding,
+        b: Encoding,
+        predicted: Float | None = None,  # [H, W, 2] px, expected matches of a in b
+    ) -> PairGeometry: ...

@@ -1,0 +1,110 @@
+"""Dense matches by DIS optical flow, checked forward against backward."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+Float = npt.NDArray[np.float32]
+Grey = npt.NDArray[np.uint8]
+
+CLAHE_CLIP = 2.0
+CLAHE_TILES = (8, 8)
+"""Local contrast normalisation: water takes contrast away unevenly (prior_notes.md section 2)."""
+
+FORWARD_BACKWARD_PX = 1.0
+"""A match that does not come back to within a pixel is occluded, out of view or wrong."""
+
+CONFIDENCE_SIGMA_PX = 0.5
+"""Forward-backward error at which a match's confidence has fallen to exp(-1/2)."""
+
+MIN_TEXTURE = 30.0
+"""Smoothed squared Sobel gradient of the normalised grey image below which flow only guesses."""
+
+BORDER_PX = 2.0
+
+
+@dataclass(frozen=True)
+class Flow:
+    """Displacements in pixels, both ways, and which pixels of a to believe."""
+
+    forward: Float
+    """[H, W, 2] from a to b."""
+    backward: Float
+    """[H, W, 2] from b to a."""
+    error: Float
+    """[H, W] px, forward-backward."""
+    valid: npt.NDArray[np.bool_]
+    """[H, W]"""
+
+    @property
+    def share(self) -> float:
+        """Part of the picture that is matched."""
+        return float(self.valid.mean())
+
+
+def normalised_grey(
+    image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
+) -> Grey:
+    """[H, W] grey with local contrast equalised."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    clahe = cv2.createCLAHE(CLAHE_CLIP, CLAHE_TILES)
+    return np.asarray(clahe.apply(grey), dtype=np.uint8)
+
+
+def texture(
+    grey: Grey,  # [H, W]
+) -> Float:
+    """[H, W] smoothed squared gradient: what flow can hold on to."""
+    dx = cv2.Sobel(grey, cv2.CV_32F, 1, 0)
+    dy = cv2.Sobel(grey, cv2.CV_32F, 0, 1)
+    return np.asarray(cv2.GaussianBlur(dx * dx + dy * dy, (0, 0), 2.0), dtype=np.float32)
+
+
+def pixel_grid(height: int, width: int) -> Float:
+    """[H, W, 2] pixel centres in this package's convention (+0.5)."""
+    u, v = np.meshgrid(np.arange(width), np.arange(height))
+    return (np.stack([u, v], -1) + 0.5).astype(np.float32)
+
+
+def sample(
+    field: Float,  # [H, W] or [H, W, C]
+    pixels: Float,  # [..., 2] px
+) -> Float:
+    """Bilinear values of ``field`` at ``pixels``; the border is repeated outside."""
+    xy = (pixels - 0.5).astype(np.float32)
+    return np.asarray(
+        cv2.remap(field, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    )
+
+
+class FlowMatcher:
+    """DIS flow both ways from a starting flow, with the forward-backward check."""
+
+    def __init__(self) -> None:
+        self._dis = cv2.DISOpticalFlow_create(cv2.DISOpticalFlow_PRESET_MEDIUM)
+
+    def __call__(
+        self,
+        a: Grey,  # [H, W]
+        b: Grey,  # [H, W]
+        texture_a: Float,  # [H, W]
+        start: Float | None = None,  # [H, W, 2] px, a to b
+        start_backward: Float | None = None,  # [H, W, 2] px, b to a
+    ) -> Flow:
+        forward = self._flow(a, b, start)
+        backward = self._flow(b, a, start_backward)
+        height, width = a.shape
+        target = pixel_grid(height, width) + forward
+        error = np.linalg.norm(forward + sample(backward, target), axis=-1)
+        inside = (target[..., 0] > BORDER_PX) & (target[..., 0] < width - BORDER_PX)
+        inside &= (target[..., 1] > BORDER_PX) & (target[..., 1] < height - BORDER_PX)
+        valid = inside & (error < FORWARD_BACKWARD_PX) & (texture_a > MIN_TEXTURE)
+        return Flow(forward, backward, error.astype(np.float32), valid)
+
+    def _flow(self, a: Grey, b: Grey, start: Float | None) -> Float:
+        initial = None if start is None else np.ascontiguousarray(start, dtype=np.float32).copy()
+        return np.asarray(self._dis.calc(a, b, initial), dtype=np.float32)

@@ -1,0 +1,73 @@
+"""Where a picture went, coarsely: a homography from SIFT matches, to start dense flow from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.prior.flow import Float, Grey, pixel_grid
+
+SIFT_FEATURES = 2000
+SIFT_CONTRAST = 0.015
+"""Below OpenCV's 0.04: water lowers contrast (prior_notes.md section 2)."""
+LOWE_RATIO = 0.8
+RANSAC_PX = 4.0
+"""Loose on purpose: relief does not follow a homography, the flow takes care of the rest."""
+MIN_INLIERS = 12
+
+
+@dataclass(frozen=True)
+class Keypoints:
+    """SIFT keypoints of one picture."""
+
+    pixels: Float
+    """[M, 2] px, this package's convention."""
+    descriptors: Float
+    """[M, 128]"""
+
+
+def detect(
+    grey: Grey,  # [H, W]
+) -> Keypoints:
+    """SIFT keypoints; empty where the picture shows nothing."""
+    sift = cv2.SIFT_create(SIFT_FEATURES, contrastThreshold=SIFT_CONTRAST)
+    points, descriptors = sift.detectAndCompute(grey, None)
+    if descriptors is None:
+        return Keypoints(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32))
+    pixels = np.array([point.pt for point in points], dtype=np.float32) + 0.5
+    return Keypoints(pixels, np.asarray(descriptors, dtype=np.float32))
+
+
+def homography(a: Keypoints, b: Keypoints) -> npt.NDArray[np.float64] | None:
+    """[3, 3] map from pixels of a to pixels of b, or None where the pictures do not match."""
+    if len(a.pixels) < MIN_INLIERS or len(b.pixels) < MIN_INLIERS:
+        return None
+    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(a.descriptors, b.descriptors, 2)
+    good = [p[0] for p in pairs if len(p) == 2 and p[0].distance < LOWE_RATIO * p[1].distance]
+    if len(good) < MIN_INLIERS:
+        return None
+    source = a.pixels[[match.queryIdx for match in good]]
+    target = b.pixels[[match.trainIdx for match in good]]
+    H, inliers = cv2.findHomography(source, target, cv2.USAC_MAGSAC, RANSAC_PX)
+    if H is None or inliers is None or int(inliers.sum()) < MIN_INLIERS:
+        return None
+    return np.asarray(H, dtype=np.float64)
+
+
+def flow_of_homography(
+    H: npt.NDArray[np.float64],  # [3, 3]
+    height: int,
+    width: int,
+) -> Float:
+    """[H, W, 2] displacement in pixels that ``H`` gives every pixel."""
+    grid = pixel_grid(height, width).astype(np.float64)
+    mapped = grid @ H[:, :2].T + H[:, 2]
+    # The denominator changes sign behind the plane's horizon: such pixels keep a finite nonsense
+    # flow, which the forward-backward check throws away.
+    w = mapped[..., 2:]
+    w = np.where(np.abs(w) < 1e-6, 1e-6, w)
+    limit = 2.0 * (height + width)
+    return np.clip(mapped[..., :2] / w - grid, -limit, limit).astype(np.float32)

@@ -1,0 +1,1 @@
+"""Tracking: pose of every frame against its keyframe, and the keyframes' fused pointmaps."""

@@ -1,0 +1,171 @@
+"""Small bundle adjustment around one reference view: poses, inverse depths and, if asked, focal.
+
+Every point is a pixel of the reference view with an unknown inverse depth, so the points' block of
+the normal equations is diagonal and the Schur complement costs nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3, hat, so3_exp
+
+Array = npt.NDArray[np.float64]
+
+HUBER_PX = 1.0
+MAX_ITERATIONS = 25
+STOP_RELATIVE_DECREASE = 1e-5
+MIN_RHO = 1e-3
+"""Points further than 1000 scene units are held there: infinity has no parallax to solve for."""
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """Views, points and camera; the reference view is the identity and is not listed."""
+
+    T: list[Sim3]
+    """[V] reference to view."""
+    rho: Array
+    """[P] inverse depth in the reference view."""
+    camera: CameraModel
+
+
+@dataclass(frozen=True)
+class BundleResult:
+    bundle: Bundle
+    residual_px: float
+    """Median reprojection error over all observations."""
+    rho_sigma: Array
+    """[P] standard deviation of the inverse depths, poses held."""
+    focal_sigma: float
+    """Relative standard deviation of the focal length; 0 when it was not solved for."""
+
+
+def adjust(
+    pixels_reference: Array,  # [P, 2] px
+    pixels: Array,  # [V, P, 2] px
+    observed: npt.NDArray[np.bool_],  # [V, P]
+    start: Bundle,
+    solve_focal: bool = False,
+    iterations: int = MAX_ITERATIONS,
+) -> BundleResult:
+    """Levenberg-Marquardt with Huber weights; the scale gauge is fixed at median depth 1."""
+    bundle, damping = _normalised(start), 1e-4
+    system = _System(pixels_reference, pixels, observed, solve_focal)
+    cost = system.cost(bundle)
+    for _ in range(iterations):
+        candidate = system.step(bundle, damping)
+        new_cost = system.cost(candidate)
+        if not np.isfinite(new_cost) or new_cost >= cost:
+            damping *= 10.0
+            if damping > 1e6:
+                break
+            continue
+        decrease = (cost - new_cost) / max(cost, 1e-12)
+        bundle, cost, damping = candidate, new_cost, max(0.2 * damping, 1e-9)
+        if decrease < STOP_RELATIVE_DECREASE:
+            break
+    return system.summary(_normalised(bundle))
+
+
+def _normalised(bundle: Bundle) -> Bundle:
+    scale = float(np.median(bundle.rho))
+    views = [Sim3(T.R, T.t * scale) for T in bundle.T]
+    return Bundle(views, bundle.rho / scale, bundle.camera)
+
+
+class _System:
+    """The normal equations of one problem."""
+
+    def __init__(
+        self,
+        pixels_reference: Array,
+        pixels: Array,
+        observed: npt.NDArray[np.bool_],
+        solve_focal: bool,
+    ) -> None:
+        self.pixels_reference, self.pixels = pixels_reference, pixels
+        self.observed, self.solve_focal = observed, solve_focal
+
+    def residuals(self, bundle: Bundle) -> tuple[Array, Array, Array]:
+        """Errors [V, P, 2], camera points Y [V, P, 3] and reference rays [P, 3]."""
+        rays = bundle.camera.unproject(self.pixels_reference)
+        Y = np.stack([rays @ T.R.T + bundle.rho[:, None] * T.t for T in bundle.T])
+        error = bundle.camera.project(Y) - self.pixels
+        behind = Y[..., 2] < 1e-3
+        return np.where((self.observed & ~behind)[..., None], error, 0.0), Y, rays
+
+    def cost(self, bundle: Bundle) -> float:
+        error, Y, _ = self.residuals(bundle)
+        size = np.linalg.norm(error, axis=-1)
+        loss = np.where(size < HUBER_PX, 0.5 * size**2, HUBER_PX * (size - 0.5 * HUBER_PX))
+        # A point behind a camera that sees it costs as much as a very bad match.
+        wrong = self.observed & (Y[..., 2] < 1e-3)
+        return float(loss.sum() + 10.0 * HUBER_PX * wrong.sum())
+
+    def _blocks(self, bundle: Bundle) -> tuple[Array, Array, Array, Array, Array]:
+        """H_cc, H_cp, H_pp (diagonal), g_c, g_p for cameras (6 each, then log-focal) and points."""
+        camera = bundle.camera
+        error, Y, rays = self.residuals(bundle)
+        views, count = self.observed.shape
+        size = np.linalg.norm(error, axis=-1)
+        weight = np.where(size < HUBER_PX, 1.0, HUBER_PX / np.maximum(size, 1e-12))
+        weight = np.where(self.observed & (Y[..., 2] > 1e-3), weight, 0.0)
+        iz = 1.0 / np.maximum(Y[..., 2], 1e-3)
+        P = np.zeros((views, count, 2, 3))
+        P[..., 0, 0], P[..., 1, 1] = camera.fx * iz, camera.fy * iz
+        P[..., 0, 2] = -camera.fx * Y[..., 0] * iz**2
+        P[..., 1, 2] = -camera.fy * Y[..., 1] * iz**2
+        size_c = 6 * views + int(self.solve_focal)
+        Jc = np.zeros((views, count, 2, size_c))
+        Jp = np.zeros((views, count, 2))
+        for v, T in enumerate(bundle.T):
+            Jc[v, :, :, 6 * v : 6 * v + 3] = P[v] * bundle.rho[:, None, None]
+            Jc[v, :, :, 6 * v + 3 : 6 * v + 6] = -P[v] @ hat(Y[v])
+            Jp[v] = P[v] @ T.t
+            if self.solve_focal:
+                # f scales the projection, and the reference rays shrink as 1 / f.
+                image = np.stack([camera.fx * Y[v, :, 0], camera.fy * Y[v, :, 1]], -1)
+                lateral = rays * np.array([1.0, 1.0, 0.0])
+                moved = np.einsum("nij,nj->ni", P[v], -(lateral @ T.R.T))
+                Jc[v, :, :, -1] = image * iz[v][:, None] + moved
+        wJc = Jc * weight[..., None, None]
+        H_cc = np.einsum("vpik,vpil->kl", wJc, Jc, optimize=True)
+        H_cp = np.einsum("vpik,vpi->kp", wJc, Jp, optimize=True)
+        H_pp = np.einsum("vp,vpi,vpi->p", weight, Jp, Jp, optimize=True)
+        g_c = np.einsum("vpik,vpi->k", wJc, error, optimize=True)
+        g_p = np.einsum("vp,vpi,vpi->p", weight, Jp, error, optimize=True)
+        return H_cc, H_cp, H_pp, g_c, g_p
+
+    def step(self, bundle: Bundle, damping: float) -> Bundle:
+        H_cc, H_cp, H_pp, g_c, g_p = self._blocks(bundle)
+        pp = H_pp * (1.0 + damping) + 1e-6
+        cc = H_cc + damping * np.diag(np.diag(H_cc)) + 1e-9 * np.eye(len(H_cc))
+        S = cc - (H_cp / pp) @ H_cp.T
+        dc = -np.linalg.lstsq(S, g_c - (H_cp / pp) @ g_p, rcond=None)[0]
+        dp = -(g_p + H_cp.T @ dc) / pp
+        views = []
+        for v, T in enumerate(bundle.T):
+            R = so3_exp(dc[6 * v + 3 : 6 * v + 6])
+            views.append(Sim3(R @ T.R, R @ T.t + dc[6 * v : 6 * v + 3]))
+        camera = bundle.camera
+        if self.solve_focal:
+            camera = camera.with_focal_scaled(float(np.exp(np.clip(dc[-1], -0.2, 0.2))))
+        return Bundle(views, np.maximum(bundle.rho + dp, MIN_RHO), camera)
+
+    def summary(self, bundle: Bundle) -> BundleResult:
+        error, _, _ = self.residuals(bundle)
+        H_cc, H_cp, H_pp, _, _ = self._blocks(bundle)
+        size = np.linalg.norm(error, axis=-1)[self.observed]
+        sigma_px = max(float(np.median(size)), 0.05) if size.size else float("inf")
+        focal_sigma = 0.0
+        if self.solve_focal:
+            S = H_cc - (H_cp / (H_pp + 1e-6)) @ H_cp.T
+            variance = float(np.linalg.pinv(S, hermitian=True)[-1, -1])
+            focal_sigma = sigma_px * float(np.sqrt(max(variance, 0.0)))
+        rho_sigma = sigma_px / np.sqrt(np.maximum(H_pp, 1e-12))
+        return BundleResult(bundle, sigma_px, rho_sigma, focal_sigma)

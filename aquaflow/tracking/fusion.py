@@ -1,0 +1,102 @@
+"""Fusing two-view depths into a keyframe's pointmap, and handing the map to the next keyframe."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.geometry.triangulation import triangulate
+from aquaflow.keyframes import UNKNOWN_VARIANCE, Pointmap
+from aquaflow.prior.contract import PairGeometry
+
+Array = npt.NDArray[np.float64]
+
+MEASUREMENT_FLOOR = 0.01
+"""Relative sigma that no single two-view depth is trusted beyond: flow errors are not independent
+from frame to frame."""
+FUSED_FLOOR = 0.003
+"""Relative sigma that no fused depth is trusted beyond (same reason)."""
+GATE_SIGMAS = 3.0
+"""A measurement further off than this disagrees: it does not move the depth, it lowers trust."""
+DISAGREEMENT_INFLATION = 1.3
+TRANSFER_INFLATION = 1.5
+"""Variance growth when a pointmap moves to another keyframe through matches."""
+FORGETTING_VARIANCE_SIGMAS = 0.5
+"""A depth whose relative sigma grew past this by disagreement is replaced by the newcomer."""
+TRANSFER_ERROR_PX = 1.0
+"""Backward-forward error up to which a pixel may take its depth through the flow."""
+
+
+def fuse(
+    pointmap: Pointmap,
+    pair: PairGeometry,
+    T_ba: Sim3,
+    camera_b: CameraModel,
+    sigma_px: float,
+) -> float:
+    """Inverse-variance fusion of the pair's triangulated depths into ``pointmap`` (in place).
+
+    Returns the share of the picture that got a usable measurement.
+    """
+    rows, columns = np.nonzero(pair.valid)
+    if len(rows) == 0:
+        return 0.0
+    camera = pointmap.camera
+    rays = camera.unproject(np.stack([columns + 0.5, rows + 0.5], -1))
+    matched = pair.matches[rows, columns].astype(np.float64)
+    new = triangulate(rays, matched, T_ba, camera_b, sigma_px)
+    confidence = np.maximum(pair.C[rows, columns].astype(np.float64), 0.05)
+    variance = np.maximum(new.variance / confidence, (MEASUREMENT_FLOOR * new.rho) ** 2)
+
+    old_rho, old_variance = pointmap.rho[rows, columns], pointmap.variance[rows, columns]
+    fresh = (old_variance >= UNKNOWN_VARIANCE) | (
+        old_variance > (FORGETTING_VARIANCE_SIGMAS * old_rho) ** 2
+    )
+    distance = np.abs(new.rho - old_rho)
+    agrees = fresh | (distance < GATE_SIGMAS * np.sqrt(variance + old_variance))
+    merged_variance = variance * old_variance / (variance + old_variance)
+    merged = (new.rho * old_variance + old_rho * variance) / (variance + old_variance)
+    merged = np.where(fresh, new.rho, merged)
+    merged_variance = np.where(fresh, variance, merged_variance)
+    merged_variance = np.maximum(merged_variance, (FUSED_FLOOR * merged) ** 2)
+
+    use = new.good & agrees
+    distrust = new.good & ~agrees
+    pointmap.rho[rows, columns] = np.where(use, merged, old_rho)
+    kept = np.where(distrust, old_variance * DISAGREEMENT_INFLATION, old_variance)
+    pointmap.variance[rows, columns] = np.where(use, merged_variance, kept)
+    return float(new.good.sum()) / camera.width / camera.height
+
+
+def transfer(
+    pointmap: Pointmap,
+    source_pixels: npt.NDArray[np.float32],  # [H, W, 2] px, where each pixel of b lies in a
+    reliable: npt.NDArray[np.bool_],  # [H, W] pixels of b whose source may be believed
+    T_ba: Sim3,
+    camera_b: CameraModel,
+) -> Pointmap:
+    """The pointmap seen from b: every reliable pixel of b takes the depth of its match in a.
+
+    The nearest pixel's depth is taken, never a mean across a depth edge.
+    """
+    camera_a = pointmap.camera
+    column = np.clip(np.floor(source_pixels[..., 0]).astype(int), 0, camera_a.width - 1)
+    row = np.clip(np.floor(source_pixels[..., 1]).astype(int), 0, camera_a.height - 1)
+    rho_a, variance_a = pointmap.rho[row, column], pointmap.variance[row, column]
+    known = reliable & (rho_a > 1e-6) & (variance_a < UNKNOWN_VARIANCE)
+
+    moved = Pointmap.unknown(camera_b)
+    # The depth of the neighbouring pixel is taken along the ray of the exact source position.
+    rays = camera_a.unproject(source_pixels[known].astype(np.float64))
+    depth_a = 1.0 / rho_a[known]
+    depth_b = T_ba.apply(rays * depth_a[:, None])[:, 2]
+    in_front = depth_b > 1e-3
+    rho_b = np.where(in_front, 1.0 / np.maximum(depth_b, 1e-3), 0.0)
+    # d rho_b / d rho_a = (rho_b / rho_a)^2 to first order, along rays that are nearly parallel.
+    gain = (rho_b / rho_a[known]) ** 4
+    spread = variance_a[known] * gain * TRANSFER_INFLATION
+    moved.rho[known] = rho_b
+    moved.variance[known] = np.where(in_front, spread, UNKNOWN_VARIANCE)
+    return moved

@@ -1,0 +1,333 @@
+"""The frontend: every frame's pose against the latest keyframe, and its class (paper, Sec. 3.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.config import TrackingConfig
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
+from aquaflow.messages import Frame
+from aquaflow.prior.contract import Encoding, PairGeometry, Prior
+from aquaflow.tracking.fusion import fuse, transfer
+from aquaflow.tracking.initialisation import Initialised, Initialiser, calibrated
+from aquaflow.tracking.relocate import pose_from_scratch
+from aquaflow.tracking.solver import PoseEstimate, PoseProblem, solve_pose
+
+MAX_ORPHANS = 60
+"""Frames without a pose that are kept for back-filling; bounds memory while nothing moves."""
+
+
+class FrameClass(str, Enum):
+    """What a frame is used for (paper, Sec. 3.2), or why it is not used."""
+
+    KEYFRAME = "keyframe"
+    MAPPING = "mapping"
+    COMMON = "common"
+    SKIPPED = "skipped"
+    LOST = "lost"
+    DROPPED = "dropped"
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How well a pose is known."""
+
+    inlier_share: float = 1.0
+    residual_px: float = 0.0
+    matched_share: float = 1.0
+    conditioning: float = 1.0
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A frame with its pose, or the reason why it has none."""
+
+    frame: Frame
+    frame_class: FrameClass
+    sub_map: int
+    keyframe: int | None = None
+    """Number of the keyframe that the pose hangs on."""
+    T_wc: Sim3 | None = None
+    quality: Quality = Quality()
+    pointmap: Pointmap | None = None
+    """Depth of this frame's own pixels; present for keyframes and mapping frames."""
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class _Solved:
+    estimate: PoseEstimate
+    pair: PairGeometry
+    share: float
+    parallax_px: float
+
+
+class Tracker:
+    """One camera, one stream; a loss starts a new sub-map instead of failing."""
+
+    def __init__(self, prior: Prior, keyframes: KeyframeStore, config: TrackingConfig) -> None:
+        self.sub_map = 0
+        self.camera: CameraModel | None = None
+        """The camera as refined by initialisation, once known."""
+        self.focal_sigma = 0.0
+        self._prior, self._keyframes, self._config = prior, keyframes, config
+        self._initialiser: Initialiser | None = None
+        self._orphans: list[Frame] = []
+        self._keyframe: Keyframe | None = None
+        self._T_fk = Sim3.identity()
+        self._velocity = Sim3.identity()
+        self._predicted: npt.NDArray[np.float32] | None = None
+        self._mapped_parallax_px = 0.0
+        self._lost: list[Frame] = []
+        self._origin = Sim3.identity()
+
+    def track(self, frame: Frame) -> list[Tracked]:
+        """Poses that this frame makes known: none while waiting, several when waiting ends."""
+        encoding = self._prior.encode(frame.image, self.camera or frame.camera)
+        if self._keyframe is None:
+            return self._initialise(frame, encoding)
+        tracked = self._follow(frame, encoding)
+        if tracked is not None:
+            lost, self._lost = self._lost, []
+            return [self._as_lost(past) for past in lost] + [tracked]
+        self._lost.append(frame)
+        if len(self._lost) >= self._config.lost_after:
+            return self._start_sub_map()
+        return []
+
+    def finish(self) -> list[Tracked]:
+        """Account for the frames that never got a pose; tries one last time with what there is."""
+        tracked: list[Tracked] = []
+        if self._keyframe is None and self._initialiser is not None and self._initialiser.waiting:
+            tracked = self._begin(self._initialiser)
+        left = self._orphans + self._lost
+        self._orphans, self._lost = [], []
+        if self._keyframe is None and self._initialiser is not None:
+            left += self._waiting_frames(self._initialiser)
+        return tracked + [self._as_lost(frame) for frame in left]
+
+    # --- initialisation -----------------------------------------------------------------------
+
+    def _initialise(self, frame: Frame, encoding: Encoding) -> list[Tracked]:
+        if self._initialiser is None:
+            self._restart(frame, encoding)
+            return []
+        matched = self._initialiser.add(frame, encoding)
+        if matched and not self._initialiser.ready:
+            return self._forget_oldest_orphans()
+        tracked = self._begin(self._initialiser) if self._initialiser.waiting else []
+        if self._keyframe is None:
+            if not matched:
+                self._orphans += self._waiting_frames(self._initialiser)
+                self._restart(frame, encoding)
+            return self._forget_oldest_orphans()
+        return tracked if matched else tracked + self.track(frame)
+
+    def _restart(self, frame: Frame, encoding: Encoding) -> None:
+        self._initialiser = Initialiser(
+            frame, encoding, self._prior, self._config.initialisation
+        )
+
+    def _begin(self, initialiser: Initialiser) -> list[Tracked]:
+        """Turn a decided geometry into the first keyframe, and pose every frame that waited."""
+        solution = initialiser.solve()
+        if solution is None:
+            return []
+        camera = calibrated(solution.camera)
+        if self.camera is None:
+            self.camera, self.focal_sigma = camera, solution.focal_sigma
+        reference = initialiser.frame
+        encoding = self._prior.encode(reference.image, camera)
+        pointmap = self._fused(solution, camera)
+        self._orphans += initialiser.thinned
+        self._initialiser = None
+        self._make_keyframe(reference, encoding, self._origin, pointmap)
+        first = Tracked(
+            reference, FrameClass.KEYFRAME, self.sub_map, self._number, self._origin,
+            pointmap=pointmap.copy(),
+        )
+        tracked = [first, *self._back_fill()]
+        for waiting, T in zip(solution.waiting, solution.T, strict=True):
+            on_reference = self._number == first.keyframe
+            if on_reference:
+                self._T_fk = T
+            encoded = self._prior.encode(waiting.frame.image, camera)
+            result = self._follow(waiting.frame, encoded, waiting.pair if on_reference else None)
+            tracked.append(result or self._as_lost(waiting.frame))
+        return tracked
+
+    def _fused(self, solution: Initialised, camera: CameraModel) -> Pointmap:
+        """The reference's pointmap from all waiting frames, best parallax first."""
+        pointmap = Pointmap.unknown(camera)
+        pairs = sorted(
+            zip(solution.waiting, solution.T, strict=True), key=lambda item: -item[0].parallax_px
+        )
+        for waiting, T in pairs:
+            fuse(pointmap, waiting.pair, T, camera, self._config.sigma_px)
+        return pointmap
+
+    def _back_fill(self) -> list[Tracked]:
+        """Poses of earlier frames that could not start a map, against the first keyframe."""
+        assert self._keyframe is not None and self.camera is not None
+        orphans, self._orphans = self._orphans, []
+        tracked = []
+        for frame in reversed(orphans):
+            encoding = self._prior.encode(frame.image, self.camera)
+            solved = self._solve(encoding, None)
+            if solved is None:
+                tracked.append(self._as_lost(frame))
+                continue
+            self._T_fk = solved.estimate.T
+            tracked.append(self._tracked(frame, FrameClass.COMMON, solved, None))
+        self._T_fk = Sim3.identity()
+        return tracked[::-1]
+
+    def _waiting_frames(self, initialiser: Initialiser) -> list[Frame]:
+        return [
+            *initialiser.thinned, initialiser.frame, *(w.frame for w in initialiser.waiting)
+        ]
+
+    def _forget_oldest_orphans(self) -> list[Tracked]:
+        surplus = max(0, len(self._orphans) - MAX_ORPHANS)
+        forgotten, self._orphans = self._orphans[:surplus], self._orphans[surplus:]
+        return [self._as_lost(frame, "no parallax yet") for frame in forgotten]
+
+    # --- following a keyframe -----------------------------------------------------------------
+
+    def _follow(
+        self, frame: Frame, encoding: Encoding, pair: PairGeometry | None = None
+    ) -> Tracked | None:
+        """Pose, fusion and class of one frame; None when it cannot be placed."""
+        solved = self._solve(encoding, pair)
+        if solved is None:
+            return None
+        assert self._keyframe is not None and self.camera is not None
+        T_fk = solved.estimate.T
+        self._velocity = T_fk @ self._T_fk.inverse()
+        self._T_fk, self._predicted = T_fk, solved.pair.matches
+        fuse(self._keyframe.pointmap, solved.pair, T_fk, self.camera, self._config.sigma_px)
+        frame_class = self._classify(solved)
+        if frame_class is FrameClass.COMMON:
+            return self._tracked(frame, frame_class, solved, None)
+        pointmap = transfer(
+            self._keyframe.pointmap,
+            solved.pair.matches_back,
+            solved.pair.valid_back,
+            T_fk,
+            self.camera,
+        )
+        if frame_class is FrameClass.KEYFRAME:
+            T_wc = self._keyframe.T_wc @ T_fk.inverse()
+            self._make_keyframe(frame, encoding, T_wc, pointmap)
+        else:
+            self._mapped_parallax_px = solved.parallax_px
+        return self._tracked(frame, frame_class, solved, pointmap.copy())
+
+    def _solve(self, encoding: Encoding, pair: PairGeometry | None) -> _Solved | None:
+        """Match against the keyframe and solve the pose; from scratch where prediction fails."""
+        keyframe, camera = self._keyframe, self.camera
+        assert keyframe is not None and camera is not None
+        if pair is None:
+            pair = self._prior.decode(keyframe.encoding, encoding, self._predicted)
+        problem, pixels_k = self._problem(keyframe, pair, camera)
+        if len(problem.points) < self._config.min_matches:
+            return None
+        predictions = [self._velocity @ self._T_fk, self._T_fk]
+        estimate = solve_pose(problem, predictions[0])
+        if estimate is None or estimate.inlier_share < self._config.min_inlier_share:
+            guess = pose_from_scratch(problem) or predictions[1]
+            estimate = solve_pose(problem, guess)
+        if estimate is None or estimate.inlier_share < self._config.min_inlier_share:
+            return None
+        displacement = np.linalg.norm(problem.pixels - pixels_k, axis=1)
+        share = _matched_share(keyframe.encoding, pair)
+        return _Solved(estimate, pair, share, float(displacement.mean()))
+
+    def _problem(
+        self, keyframe: Keyframe, pair: PairGeometry, camera: CameraModel
+    ) -> tuple[PoseProblem, npt.NDArray[np.float64]]:
+        """At most ``matches`` matches whose depth is known, and their keyframe pixels."""
+        usable = pair.valid & keyframe.pointmap.known(self._config.known_sigma)
+        rows, columns = np.nonzero(usable)
+        step = max(1, -(-len(rows) // self._config.matches))
+        rows, columns = rows[::step], columns[::step]
+        pixels_k = np.stack([columns + 0.5, rows + 0.5], -1)
+        rho = keyframe.pointmap.rho[rows, columns]
+        problem = PoseProblem(
+            camera.unproject(pixels_k) / rho[:, None],
+            keyframe.pointmap.variance[rows, columns],
+            pair.matches[rows, columns].astype(np.float64),
+            pair.C[rows, columns].astype(np.float64),
+            camera,
+            self._config.sigma_px,
+        )
+        return problem, pixels_k
+
+    def _classify(self, solved: _Solved) -> FrameClass:
+        """The paper's rules: keyframe by matched share, mapping frame by parallax."""
+        if solved.share < self._config.keyframe_share:
+            return FrameClass.KEYFRAME
+        assert self.camera is not None
+        threshold = self._config.mapping_parallax_widths * self.camera.width
+        if solved.parallax_px - self._mapped_parallax_px > threshold:
+            return FrameClass.MAPPING
+        return FrameClass.COMMON
+
+    # --- bookkeeping --------------------------------------------------------------------------
+
+    @property
+    def _number(self) -> int:
+        assert self._keyframe is not None
+        return self._keyframe.number
+
+    def _make_keyframe(
+        self, frame: Frame, encoding: Encoding, T_wc: Sim3, pointmap: Pointmap
+    ) -> None:
+        self._keyframe = self._keyframes.add(
+            frame.index, frame.t_ns, encoding, T_wc, pointmap, self.sub_map
+        )
+        self._T_fk, self._predicted, self._mapped_parallax_px = Sim3.identity(), None, 0.0
+
+    def _tracked(
+        self, frame: Frame, frame_class: FrameClass, solved: _Solved, pointmap: Pointmap | None
+    ) -> Tracked:
+        assert self._keyframe is not None
+        # A new keyframe already is self._keyframe, with the identity as its relative pose.
+        T_wc = self._keyframe.T_wc @ self._T_fk.inverse()
+        estimate = solved.estimate
+        quality = Quality(
+            estimate.inlier_share, estimate.residual_px, solved.share, estimate.conditioning
+        )
+        return Tracked(
+            frame, frame_class, self.sub_map, self._number, T_wc, quality, pointmap
+        )
+
+    def _start_sub_map(self) -> list[Tracked]:
+        """Give the lost frames to a new sub-map that starts where the old one ended."""
+        assert self._keyframe is not None
+        self._origin = self._keyframe.T_wc @ self._T_fk.inverse()
+        self.sub_map += 1
+        self._keyframe, self._predicted, self._velocity = None, None, Sim3.identity()
+        lost, self._lost = self._lost, []
+        tracked = []
+        for frame in lost:
+            tracked += self.track(frame)
+        return tracked
+
+    def _as_lost(self, frame: Frame, reason: str = "no pose found") -> Tracked:
+        return Tracked(frame, FrameClass.LOST, self.sub_map, reason=reason)
+
+
+def _matched_share(encoding: Encoding, pair: PairGeometry) -> float:
+    """min(valid matches, distinct matched pixels) over the pixels looked at (DESIGN section 4)."""
+    looked_at = encoding.interesting
+    matched = looked_at & pair.valid
+    targets = np.floor(pair.matches[matched]).astype(np.int64)
+    distinct = len(np.unique(targets[:, 1] * encoding.camera.width + targets[:, 0]))
+    return min(int(matched.sum()), distinct) / max(int(looked_at.sum()), 1)

@@ -1,0 +1,1 @@
+"""Real hardware behind the source protocols of :mod:`aquaflow.sources`."""

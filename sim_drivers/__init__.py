@@ -1,0 +1,1 @@
+"""The drivers' doubles: the same interfaces fed from recordings and synthetic dives."""
