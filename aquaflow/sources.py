@@ -41,6 +41,14 @@ class CameraSource(Protocol):
 class RecordedCamera(CameraSource, Protocol):
     """A camera source that opens something recorded on disk."""
 
+    specificity: int
+    """Where several sources recognise a path, the highest opens it: a synthetic dive is also a
+    folder of images."""
+
+    def name_of(self, index: int) -> str:
+        """The file name of a frame, or ``clip.mp4#123``."""
+        ...
+
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """True if this class is the right reader for ``path``."""
@@ -72,11 +80,10 @@ def open_recording(path: Path, fps: float | None = None) -> RecordedCamera:
     """
     if not path.exists():
         raise InputError(f"there is nothing at {path}; give a folder of images or a video file")
-    # The most specific reader first: a synthetic dive is also a folder of images.
-    readers = sorted(entry_points(group=CAMERAS), key=lambda entry: entry.name, reverse=True)
-    for entry in readers:
-        reader: type[RecordedCamera] = entry.load()
-        if hasattr(reader, "recognises") and reader.recognises(path):
-            return reader.open(path, fps=fps)
-    names = ", ".join(sorted(entry.name for entry in readers)) or "none; reinstall aquaflow"
+    entries = sorted(entry_points(group=CAMERAS), key=lambda entry: entry.name)
+    readers: list[type[RecordedCamera]] = [entry.load() for entry in entries]
+    fitting = [cls for cls in readers if hasattr(cls, "recognises") and cls.recognises(path)]
+    if fitting:
+        return max(fitting, key=lambda cls: cls.specificity).open(path, fps=fps)
+    names = ", ".join(entry.name for entry in entries) or "none; reinstall aquaflow"
     raise InputError(f"no installed source reads {path}; installed sources are: {names}")

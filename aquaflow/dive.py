@@ -1,0 +1,221 @@
+"""The dive folder: what a run writes, while it runs and at its end (DESIGN section 5)."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from aquaflow.config import Config, dump_config
+from aquaflow.errors import InputError
+from aquaflow.export.atomic import atomic_write
+from aquaflow.export.ply import Splats, write_ply
+from aquaflow.export.report import ReportData, write_report
+from aquaflow.export.tum import write_tum
+from aquaflow.geometry.camera import CameraModel, save_camera
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.outcome import HeldOut, WaterSummary, water_of
+
+FRAME_COLUMNS = ("index", "source", "t_s", "class", "sub_map", "keyframe", "quality", "reason")
+MARKER = "frames.csv"
+"""The file by which a folder is known to be a dive."""
+
+
+@dataclass(frozen=True)
+class FrameRow:
+    """One line of frames.csv."""
+
+    index: int
+    source: str
+    t_s: float
+    frame_class: str
+    sub_map: int | None = None
+    keyframe: int | None = None
+    quality: float | None = None
+    """Inlier share of the pose's matches."""
+    reason: str = ""
+
+    def cells(self) -> list[str]:
+        quality = "" if self.quality is None else f"{self.quality:.3f}"
+        sub_map = "" if self.sub_map is None else str(self.sub_map)
+        keyframe = "" if self.keyframe is None else str(self.keyframe)
+        return [
+            str(self.index), self.source, f"{self.t_s:.9f}", self.frame_class,
+            sub_map, keyframe, quality, self.reason,
+        ]  # fmt: skip
+
+
+class DiveFolder:
+    """Writes one dive; everything decided is on disk at once, final files are atomic."""
+
+    def __init__(self, path: Path, config: Config, overwrite: bool = False) -> None:
+        """Make the folder.
+
+        Raises:
+            InputError: it cannot be made, holds something else, or holds a dive and ``overwrite``
+                is not set.
+        """
+        self.path = path
+        self._claim(overwrite)
+        dump_config(config, path / "config.yaml")
+        self._frames = (path / MARKER).open("w", newline="", encoding="utf-8")
+        self._rows: list[FrameRow] = []
+        self._write_rows(self._frames, [FRAME_COLUMNS])
+        self._log = _JsonLog(path / "log.jsonl")
+        logging.getLogger("aquaflow").addHandler(self._log)
+
+    def _claim(self, overwrite: bool) -> None:
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            occupied = any(self.path.iterdir())
+        except OSError as error:
+            raise InputError(
+                f"cannot make the dive folder {self.path}: {error.strerror}; choose another --out"
+            ) from error
+        if occupied and not (self.path / MARKER).exists():
+            raise InputError(
+                f"{self.path} holds files that are not a dive; choose an empty folder as --out"
+            )
+        if occupied and not overwrite:
+            raise InputError(
+                f"{self.path} already holds a dive; choose another --out or add --overwrite"
+            )
+
+    def close(self) -> None:
+        """Release the open files; what was written stays."""
+        logging.getLogger("aquaflow").removeHandler(self._log)
+        self._log.close()
+        self._frames.close()
+
+    # --- while the dive runs ------------------------------------------------------------------
+
+    def record(self, rows: Iterable[FrameRow]) -> None:
+        """Append frames in the order in which their fate was decided."""
+        new = list(rows)
+        self._rows += new
+        self._write_rows(self._frames, [row.cells() for row in new])
+        self._frames.flush()
+
+    @staticmethod
+    def _write_rows(stream: Any, rows: Iterable[Sequence[str]]) -> None:
+        csv.writer(stream, lineterminator="\n").writerows(rows)
+
+    # --- at its end ---------------------------------------------------------------------------
+
+    def write_frames(self) -> None:
+        """frames.csv once more, in the order of the recording."""
+        text = io.StringIO(newline="")
+        rows = sorted(self._rows, key=lambda row: row.index)
+        self._write_rows(text, [FRAME_COLUMNS, *(row.cells() for row in rows)])
+        self._frames.close()
+        with atomic_write(self.path / MARKER) as stream:
+            stream.write(text.getvalue().encode("utf-8"))
+
+    def write_trajectory(self, t_s: list[float], poses: list[Sim3]) -> None:
+        """trajectory.tum: every frame that has a pose."""
+        order = np.argsort(t_s, kind="stable")
+        write_tum(
+            self.path / "trajectory.tum",
+            np.array([t_s[i] for i in order]),
+            np.array([poses[i].t for i in order]).reshape(-1, 3),
+            np.array([poses[i].quaternion for i in order]).reshape(-1, 4),
+            comment="camera to world; world is the first keyframe's camera (x right, y down, "
+            "z forward); scale: see scale_source in metrics.json",
+        )
+
+    def write_camera(self, camera: CameraModel) -> None:
+        """camera.yaml: the pinhole camera of the mapped pictures."""
+        save_camera(camera, self.path / "camera.yaml")
+
+    def write_map(self, mapper: Mapper, water: WaterSummary | None, suffix: str = "") -> None:
+        """map.ply as seen through water at the median range, map_clear.ply without water."""
+        with torch.no_grad():
+            clear = mapper.gaussians.colours
+            seen = clear
+            if water is not None:
+                medium = water_of(water)
+                z = torch.full((len(clear),), water.range_median)
+                seen = clear * medium.transmission(z) + medium.backscatter(z)
+            for name, colours in (("map", seen), ("map_clear", clear)):
+                write_ply(self.path / f"{name}{suffix}.ply", _splats(mapper, colours))
+
+    def write_medium(self, water: WaterSummary | None, scale_source: str) -> None:
+        """medium.json: parameters, their units, and the range at which map.ply is shown."""
+        data: dict[str, Any] = {"active": water is not None, "scale_source": scale_source}
+        if water is not None:
+            data |= {
+                "attenuation_per_unit": water.beta_a,
+                "attenuation_unit": "1/map unit",
+                "backscatter": {
+                    "B_inf": water.B_inf, "b": water.b, "B_res": water.B_res, "d": water.d,
+                },
+                "range_p5": water.range_p5,
+                "range_p95": water.range_p95,
+                "map_ply_reference_range": water.range_median,
+            }  # fmt: skip
+        self.write_json("medium.json", data)
+
+    def write_held_out(self, examples: list[HeldOut]) -> None:
+        """heldout/: what the camera saw, what the map shows, and the map without water."""
+        import cv2
+
+        folder = self.path / "heldout"
+        folder.mkdir(exist_ok=True)
+        for example in examples:
+            pictures = {"real": example.real, "rendered": example.rendered}
+            if example.restored is not None:
+                pictures["restored"] = example.restored
+            for name, picture in pictures.items():
+                file = folder / f"{example.frame_index:06d}_{name}.png"
+                cv2.imwrite(str(file), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+
+    def write_json(self, name: str, data: dict[str, Any]) -> None:
+        """A JSON file of the dive; a number that is not finite is a mistake, not a result."""
+        with atomic_write(self.path / name) as stream:
+            stream.write((json.dumps(data, indent=2, allow_nan=False) + "\n").encode("utf-8"))
+
+    def write_report(self, data: ReportData) -> None:
+        """report.html."""
+        write_report(self.path / "report.html", data)
+
+
+def _splats(mapper: Mapper, colours: torch.Tensor) -> Splats:
+    gaussians = mapper.gaussians
+    return Splats(
+        gaussians.means.numpy(),
+        torch.nn.functional.normalize(gaussians.parameters["quats"], dim=-1).numpy(),
+        gaussians.scales.numpy(),
+        gaussians.opacities.numpy(),
+        colours.numpy(),
+    )
+
+
+class _JsonLog(logging.Handler):
+    """One JSON object a line, flushed at once."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(logging.INFO)
+        self._stream = path.open("w", encoding="utf-8")
+
+    def emit(self, record: logging.LogRecord) -> None:
+        entry = {
+            "t": round(record.created, 3),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        self._stream.write(json.dumps(entry) + "\n")
+        self._stream.flush()
+
+    def close(self) -> None:
+        self._stream.close()
+        super().close()

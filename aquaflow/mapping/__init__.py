@@ -1,0 +1,1 @@
+"""Mapping: Gaussians, the water between them and the camera, and their joint optimisation."""

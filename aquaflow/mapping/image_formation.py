@@ -1,0 +1,67 @@
+"""Underwater image formation (paper, Eq. underwater_formation and backscatter_model).
+
+    I = J exp(-beta_a z) + B(z),   B(z) = B_inf (1 - exp(-b z)) + B_res exp(-d z)
+
+with z the range along the ray. Rendering composes it in :mod:`aquaflow.render.water`; here it is
+inverted, to see a picture without its water.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from aquaflow.render.water import MAX_OPTICAL_DEPTH
+
+MIN_TRANSMISSION = 0.05
+"""Where less light than this arrives, the scene's colour cannot be recovered (DESIGN section 4)."""
+MAX_RESTORED = 2.0
+"""Radiance that restoration may return: twice the brightest white that the camera can store."""
+
+
+@dataclass(frozen=True)
+class Water:
+    """The medium's parameters for one picture, each [3] RGB; rates per map unit."""
+
+    beta_a: Tensor
+    B_inf: Tensor
+    b: Tensor
+    B_res: Tensor
+    d: Tensor
+
+    def backscatter(
+        self,
+        z: Tensor,  # [...] range
+    ) -> Tensor:
+        """B(z) [..., 3]."""
+        near = torch.exp(-_optical_depth(self.d, z))
+        far = -torch.expm1(-_optical_depth(self.b, z))
+        return self.B_inf * far + self.B_res * near
+
+    def transmission(
+        self,
+        z: Tensor,  # [...] range
+    ) -> Tensor:
+        """exp(-beta_a z) [..., 3]."""
+        return torch.exp(-_optical_depth(self.beta_a, z))
+
+    def stacked(self) -> Tensor:
+        """[5, 3] in the order that the fused kernel takes."""
+        return torch.stack([self.beta_a, self.B_inf, self.b, self.B_res, self.d])
+
+    def restore(
+        self,
+        image: Tensor,  # [H, W, 3]
+        z: Tensor,  # [H, W] range
+    ) -> tuple[Tensor, Tensor]:
+        """J-hat [H, W, 3] of the paper, and where it can be believed [H, W]."""
+        transmission = self.transmission(z)
+        recoverable = (transmission > MIN_TRANSMISSION).all(dim=-1)
+        restored = (image - self.backscatter(z)) / transmission.clamp_min(MIN_TRANSMISSION)
+        return restored.clamp(0.0, MAX_RESTORED), recoverable
+
+
+def _optical_depth(rate: Tensor, z: Tensor) -> Tensor:
+    return (rate * z[..., None]).clamp(0.0, MAX_OPTICAL_DEPTH)

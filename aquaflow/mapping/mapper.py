@@ -1,0 +1,236 @@
+"""The map of one sub-map: views in, Gaussians and water out (paper, Sec. 3.3 and 3.4)."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from aquaflow.config import MappingConfig
+from aquaflow.keyframes import Pointmap
+from aquaflow.mapping.gaussians import GaussianMap
+from aquaflow.mapping.image_formation import Water
+from aquaflow.mapping.insertion import insertion_probability, new_gaussians, select
+from aquaflow.mapping.losses import depth_loss, outlier_mask, radial_weight, scale_loss
+from aquaflow.mapping.medium import Medium
+from aquaflow.mapping.rendering import Shown, show
+from aquaflow.mapping.views import View, refine_pose
+from aquaflow.render.adam import SelectiveAdam
+from aquaflow.render.contract import Renderer
+from aquaflow.render.photometric import photometric_loss
+
+log = logging.getLogger(__name__)
+
+
+class Mapper:
+    """Owns the Gaussians, the medium, their optimisers and the views of one sub-map."""
+
+    def __init__(self, config: MappingConfig, renderer: Renderer, seed: int) -> None:
+        self.config, self.renderer = config, renderer
+        self._random = torch.Generator().manual_seed(seed)
+        self.gaussians = GaussianMap()
+        self.medium = Medium(config.medium, self._random)
+        self.views: list[View] = []
+        self.steps = 0
+        self.undone = 0
+        """Steps that were undone because their loss or gradient was not finite."""
+        rates = config.optimiser
+        self._optimiser = SelectiveAdam(
+            {name: (tensor, getattr(rates, name)) for name, tensor in self._parameters.items()},
+            rates.betas,
+            threads=renderer.threads,
+        )
+        self._medium_optimiser = torch.optim.Adam(self.medium.parameters(), lr=config.medium.rate)
+        self._K_rad: dict[tuple[int, int], Tensor] = {}
+
+    # --- growing ------------------------------------------------------------------------------
+
+    def add_view(self, view: View) -> None:
+        """Let later optimisation steps use ``view``."""
+        self.views.append(view)
+
+    @torch.no_grad()
+    def insert(self, view: View, pointmap: Pointmap) -> int:
+        """Medium-guided insertion (paper, Sec. 3.3.3); returns the number of new Gaussians."""
+        prior_range, known = _range_of(pointmap, self.config.insertion.known_sigma)
+        shown = self.show(view)
+        covered = shown.alpha > self.config.insertion.covered_alpha
+        z = torch.where(known, prior_range, torch.where(covered, shown.z, 0.0))
+        water = self.water(view)
+        restored, recoverable = view.target(), torch.ones_like(known)
+        if water is not None:
+            restored, recoverable = water.restore(restored, torch.where(known | covered, z, 0.0))
+        # Where the map already explains the ray with the same depth, only structure that the map
+        # lacks asks for more; where it is bare or its surface lies elsewhere, any pixel may.
+        agree = (shown.z - prior_range).abs() < self.config.insertion.agreement * prior_range
+        solid = torch.where(agree, shown.alpha, 0.0)
+        P = insertion_probability(restored, shown.radiance, solid, self.config.insertion)
+        allowed = known & recoverable
+        if view.mask is not None:
+            allowed &= torch.from_numpy(view.mask)
+        rows, columns = select(P, allowed, self.config.insertion, self._random)
+        room = self.config.max_gaussians - len(self.gaussians)
+        rows, columns = rows[:max(room, 0)], columns[:max(room, 0)]
+        if len(rows) == 0:
+            return 0
+        confidence = _confidence(pointmap)
+        new = new_gaussians(
+            view, rows, columns, z, restored, confidence, P, self.config.insertion
+        )
+        self.gaussians.extend(new, view.keyframe)
+        self._optimiser.extend(len(rows))
+        self._optimiser.bind(self._parameters)
+        view.inverse_range = torch.where(known, 1.0 / prior_range.clamp_min(1e-6), 0.0)
+        view.range_confidence = confidence
+        return len(rows)
+
+    # --- optimising ---------------------------------------------------------------------------
+
+    def optimise(self, steps: int) -> None:
+        """Steps on the newest view now and then, else on any (paper, Sec. 3.4)."""
+        for _ in range(steps if self.views and len(self.gaussians) else 0):
+            newest = torch.rand((), generator=self._random) < self.config.optimiser.newest_share
+            index = int(torch.randint(len(self.views), (), generator=self._random))
+            self._step(self.views[-1 if newest else index], refine_poses=False)
+
+    def refine(self, progress: Callable[[int, int], None] | None = None) -> None:
+        """The final refinement: all views in random order, rates falling, poses included."""
+        steps, limit = self.config.optimiser.refine_steps, self.config.optimiser.refine_seconds
+        started = time.monotonic()
+        order: list[int] = []
+        for step in range(steps if self.views and len(self.gaussians) else 0):
+            if limit is not None and time.monotonic() - started > limit:
+                break
+            if not order:
+                order = torch.randperm(len(self.views), generator=self._random).tolist()
+            factor = self.config.optimiser.means_final ** (step / max(steps - 1, 1))
+            self._optimiser.learning_rates["means"] = self.config.optimiser.means * factor
+            self._step(self.views[order.pop()], refine_poses=self.config.optimiser.poses > 0.0)
+            if progress is not None:
+                progress(step + 1, steps)
+
+    def _step(self, view: View, refine_poses: bool) -> None:
+        """Render, compare, differentiate, move; undone when anything is not finite."""
+        leaves = {
+            name: tensor.detach().requires_grad_()
+            for name, tensor in self.gaussians.parameters.items()
+        }
+        viewmat = view.viewmat().requires_grad_(refine_poses)
+        self._medium_optimiser.zero_grad(set_to_none=True)
+        shown = show(leaves, self.water(view), self.renderer, view, viewmat)
+        loss = self._loss(view, shown, leaves)
+        if not torch.isfinite(loss):
+            self._undo("loss", view)
+            return
+        loss.backward()
+        gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+        self._optimiser.step(shown.visible, gradients)
+        self._step_medium(view)
+        if refine_poses and viewmat.grad is not None and view is not self.views[0]:
+            refine_pose(view, viewmat.grad, self.config.optimiser.poses)
+        self.steps += 1
+        if self.steps % self.config.optimiser.prune_every == 0:
+            self._prune(shown, view)
+
+    def _loss(self, view: View, shown: Shown, leaves: dict[str, Tensor]) -> Tensor:
+        """L_total (paper, Eq. total_loss)."""
+        weights, target = self.config.loss, view.target()
+        K_rad = self._radial(view)
+        mask = torch.ones_like(K_rad, dtype=torch.bool)
+        if view.robust:
+            mask = outlier_mask(shown.image, target, K_rad, weights.tau_e)
+        if view.mask is not None:
+            mask &= torch.from_numpy(view.mask)
+        loss = photometric_loss(shown.image, target, K_rad, mask, weights.ssim, self.renderer.threads)
+        if weights.depth > 0.0 and view.inverse_range is not None:
+            assert view.range_confidence is not None
+            trust = K_rad * mask * view.range_confidence
+            loss = loss + weights.depth * depth_loss(
+                shown.z, shown.alpha, view.inverse_range, trust
+            )
+        if weights.scale > 0.0:
+            loss = loss + weights.scale * scale_loss(torch.exp(leaves["log_scales"]))
+        return loss
+
+    def _step_medium(self, view: View) -> None:
+        if not self.medium.active:
+            return
+        norm = torch.nn.utils.clip_grad_norm_(
+            self.medium.parameters(), self.config.medium.max_gradient
+        )
+        if not torch.isfinite(norm):
+            self._undo("medium gradient", view)
+            return
+        self._medium_optimiser.step()
+
+    def _undo(self, what: str, view: View) -> None:
+        self.undone += 1
+        log.warning("non-finite %s on frame %d: step undone", what, view.frame_index)
+
+    def _prune(self, shown: Shown, view: View) -> None:
+        """Drop Gaussians that are all but transparent, or that fill the picture."""
+        opaque = self.gaussians.opacities > self.config.optimiser.prune_opacity
+        widest = self.config.optimiser.prune_radius_widths * view.camera.width
+        keep = opaque & (shown.radius_px < widest)
+        if not bool(keep.all()):
+            self.gaussians.keep(keep)
+            self._optimiser.keep(keep)
+            self._optimiser.bind(self._parameters)
+
+    # --- looking ------------------------------------------------------------------------------
+
+    def water(self, view: View) -> Water | None:
+        """The medium for this view, or None while it is switched off."""
+        if not self.medium.active:
+            return None
+        R_wc = torch.from_numpy(view.T_wc.R).to(torch.float32)
+        return self.medium(R_wc)  # type: ignore[no-any-return]
+
+    @torch.no_grad()
+    def show(self, view: View) -> Shown:
+        """The map from ``view``."""
+        return show(
+            self.gaussians.parameters, self.water(view), self.renderer, view, view.viewmat()
+        )
+
+    def register(self, view: View) -> None:
+        """Refine the pose of a held-out view photometrically against the frozen map."""
+        config, K_rad = self.config.optimiser, self._radial(view)
+        mask = torch.ones_like(K_rad, dtype=torch.bool)
+        for _ in range(config.heldout_steps if len(self.gaussians) else 0):
+            viewmat = view.viewmat().requires_grad_()
+            with torch.no_grad():
+                water = self.water(view)
+            shown = show(self.gaussians.parameters, water, self.renderer, view, viewmat)
+            loss = photometric_loss(shown.image, view.target(), K_rad, mask, self.config.loss.ssim, self.renderer.threads)
+            (gradient,) = torch.autograd.grad(loss, viewmat)
+            refine_pose(view, gradient, config.heldout_rate)
+
+    @property
+    def _parameters(self) -> dict[str, Tensor]:
+        return self.gaussians.parameters
+
+    def _radial(self, view: View) -> Tensor:
+        size = (view.camera.height, view.camera.width)
+        if size not in self._K_rad:
+            self._K_rad[size] = radial_weight(*size)
+        return self._K_rad[size]
+
+
+def _range_of(pointmap: Pointmap, known_sigma: float) -> tuple[Tensor, Tensor]:
+    """Range along the ray [H, W] and where it is known, of a tracked frame."""
+    camera = pointmap.camera
+    known = pointmap.known(known_sigma)
+    length = torch.from_numpy(camera.unproject(camera.pixel_centres())).norm(dim=-1)
+    depth = torch.from_numpy(1.0 / pointmap.rho.clip(1e-6))
+    mask = torch.from_numpy(known)
+    return torch.where(mask, length * depth, 0.0).to(torch.float32), mask
+
+
+def _confidence(pointmap: Pointmap) -> Tensor:
+    """[H, W] in [0, 1]: Q of the paper, saturating at a relative range sigma of 3 %."""
+    Q = torch.from_numpy(pointmap.Q)
+    return (Q / (Q + (1.0 / 0.03) ** 2)).to(torch.float32).sqrt()

@@ -1,0 +1,67 @@
+"""One picture of the map: clean radiance and range from the renderer, then the water."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from aquaflow.mapping.gaussians import radiance
+from aquaflow.mapping.image_formation import Water
+from aquaflow.mapping.views import View
+from aquaflow.render.contract import Renderer
+from aquaflow.render.water import MIN_SOLID, compose_water
+
+
+@dataclass(frozen=True)
+class Shown:
+    """The map from one view."""
+
+    image: Tensor
+    """[H, W, 3] I-hat, through the water."""
+    radiance: Tensor
+    """[H, W, 3] J-tilde, without water, premultiplied by alpha."""
+    alpha: Tensor
+    """[H, W]"""
+    z: Tensor
+    """[H, W] range along the ray, map units; meaningless where alpha is near 0."""
+    visible: Tensor
+    """[N] bool"""
+    radius_px: Tensor
+    """[N]"""
+
+
+def show(
+    parameters: Mapping[str, Tensor],  # of a GaussianMap
+    water: Water | None,
+    renderer: Renderer,
+    view: View,
+    viewmat: Tensor,  # [4, 4] world to camera
+) -> Shown:
+    """Draw the map; differentiable in the parameters, the water and the view matrix.
+
+    Range rides as a fourth colour channel divided by alpha, the same on every renderer.
+    """
+    means = parameters["means"]
+    centre = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    ranges = torch.linalg.vector_norm(means - centre.detach(), dim=-1, keepdim=True)
+    colours = torch.cat([radiance(parameters["raw_colours"]), ranges], dim=-1)
+    drawn = renderer(
+        means,
+        parameters["quats"],
+        torch.exp(parameters["log_scales"]),
+        torch.sigmoid(parameters["opacity_logits"][:, 0]),
+        colours,
+        viewmat,
+        view.K(),
+        view.camera.width,
+        view.camera.height,
+    )
+    clean = drawn.image[..., :3]
+    if water is None:
+        image, z = clean, drawn.image[..., 3] / drawn.alpha.clamp_min(MIN_SOLID)
+    else:
+        image, z = compose_water(drawn.image, drawn.alpha, water.stacked(), renderer.threads)
+    return Shown(image, clean, drawn.alpha, z, drawn.visible, drawn.radius_px)

@@ -1,0 +1,231 @@
+"""Replay: every frame of a recording, in order, as fast as the machine goes, into a dive folder."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from aquaflow.config import Config
+from aquaflow.dive import DiveFolder, FrameRow
+from aquaflow.errors import NotMappedError
+from aquaflow.messages import CameraModel, Dropped
+from aquaflow.outcome import (
+    examine_held_out,
+    largest_sub_map,
+    metrics,
+    refined_poses,
+    summarise_water,
+)
+from aquaflow.preparation import Preparation
+from aquaflow.reporting import report_data
+from aquaflow.slam import Slam
+from aquaflow.sources import RecordedCamera
+from aquaflow.tracking.tracker import Tracked
+
+log = logging.getLogger(__name__)
+
+Progress = Callable[[str, int, int | None], None]
+"""Called with the stage, the steps done and, where known, the steps there are."""
+
+MIN_POSED_FRAMES = 3
+"""Fewer posed frames are not a map."""
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """A finished run."""
+
+    dive: Path
+    metrics: dict[str, Any]
+    notes: list[str]
+
+
+def map_recording(
+    recording: RecordedCamera,
+    name: str,
+    out: Path,
+    config: Config,
+    calibration: CameraModel | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Replayed:
+    """Map a recording into the dive folder ``out``.
+
+    Raises:
+        InputError: the folder cannot be written.
+        ConfigError: crop or calibration do not fit the pictures.
+        NotMappedError: the frames were read but gave no map; the folder says why.
+    """
+    _fix_threads(config.threads or os.cpu_count() or 1)
+    folder = DiveFolder(out, config, overwrite)
+    try:
+        return _Replay(recording, name, folder, config, calibration, progress).run()
+    finally:
+        folder.close()
+        recording.close()
+
+
+class _Replay:
+    """One run's state; ``run`` is its table of contents."""
+
+    def __init__(
+        self,
+        recording: RecordedCamera,
+        name: str,
+        folder: DiveFolder,
+        config: Config,
+        calibration: CameraModel | None,
+        progress: Progress | None,
+    ) -> None:
+        self.recording, self.name, self.folder, self.config = recording, name, folder, config
+        self.calibration = calibration or recording.camera
+        self.preparation = Preparation(config.source, self.calibration)
+        self.slam = Slam(config)
+        self.results: list[Tracked] = []
+        self.dropped: list[Dropped] = []
+        self.notes: list[str] = []
+        self._progress = progress or (lambda stage, done, total: None)
+
+    def run(self) -> Replayed:
+        started = time.monotonic()
+        self._frames()
+        self._decide(self.slam.finish(lambda done, total: self._progress("refine", done, total)))
+        self._note_what_was_left_out()
+        self.folder.write_frames()
+        if sum(tracked.T_wc is not None for tracked in self.results) < MIN_POSED_FRAMES:
+            raise NotMappedError(self._why_not())
+        return self._write(started)
+
+    # --- frames -------------------------------------------------------------------------------
+
+    def _frames(self) -> None:
+        source = self.config.source
+        count = self.recording.frame_count
+        stop = count if source.stop is None else min(source.stop, count or source.stop)
+        total = None if stop is None else len(range(source.start, stop, source.every))
+        done = 0
+        profile = self.slam.profiler.stage
+        frames = self.recording.frames(source.every, source.start, source.stop)
+        while True:
+            with profile("read"):
+                frame = next(frames, None)
+            if frame is None:
+                return
+            done += 1
+            if isinstance(frame, Dropped):
+                self._drop(frame)
+            else:
+                with profile("prepare"):
+                    prepared = self.preparation(frame)
+                self._decide(self.slam.process(prepared))
+            self._progress("map", done, total)
+
+    def _drop(self, frame: Dropped) -> None:
+        self.dropped.append(frame)
+        log.warning("frame %d left out: %s", frame.index, frame.reason)
+        row = FrameRow(
+            frame.index,
+            self.recording.name_of(frame.index),
+            frame.t_ns * 1e-9,
+            "dropped",
+            reason=frame.reason,
+        )
+        self.folder.record([row])
+
+    def _decide(self, decided: list[Tracked]) -> None:
+        self.results += decided
+        self.folder.record(self._row(tracked) for tracked in decided)
+
+    def _row(self, tracked: Tracked) -> FrameRow:
+        posed = tracked.T_wc is not None
+        return FrameRow(
+            tracked.frame.index,
+            self.recording.name_of(tracked.frame.index),
+            tracked.frame.t_ns * 1e-9,
+            tracked.frame_class.value,
+            tracked.sub_map if posed else None,
+            tracked.keyframe,
+            tracked.quality.inlier_share if posed else None,
+            tracked.reason,
+        )
+
+    # --- the end ------------------------------------------------------------------------------
+
+    def _note_what_was_left_out(self) -> None:
+        self.notes += self.recording.notes
+        lost = sum(tracked.T_wc is None for tracked in self.results)
+        if lost:
+            self.notes.append(f"{lost} of {len(self.results)} frames got no pose")
+        sub_maps = {tracked.sub_map for tracked in self.results if tracked.T_wc is not None}
+        if len(sub_maps) > 1:
+            self.notes.append(
+                f"tracking was lost {len(sub_maps) - 1} times: the dive has {len(sub_maps)} "
+                "sub-maps without a common scale"
+            )
+        if self.calibration is None and self.slam.tracker.camera is not None:
+            focal, sigma = self.slam.tracker.camera.fx, self.slam.tracker.focal_sigma
+            self.notes.append(
+                "no calibration was given: the focal length was guessed and refined to "
+                f"{focal:.0f} px ({100.0 * sigma:.0f} % formal uncertainty), distortion ignored"
+            )
+        for note in self.notes:
+            log.info(note)
+
+    def _why_not(self) -> str:
+        read = len(self.results)
+        if read == 0:
+            return f"{self.name}: no frame could be read, see {self.folder.path}/frames.csv"
+        if read < MIN_POSED_FRAMES:
+            return f"{self.name} has {read} usable frames; a map needs at least {MIN_POSED_FRAMES}"
+        return (
+            f"{self.name}: none of {read} frames could be placed; the pictures need texture and "
+            "the camera must move sideways, see frames.csv for each frame"
+        )
+
+    def _write(self, started: float) -> Replayed:
+        main = largest_sub_map(self.results)
+        mapper = self.slam.mappers.get(main)
+        with self.slam.profiler.stage("evaluate"):
+            held_out = examine_held_out(self.slam, main)
+            water = None if mapper is None else summarise_water(mapper)
+        poses = refined_poses(self.slam, self.results)
+        times = {tracked.frame.index: tracked.frame.t_ns * 1e-9 for tracked in self.results}
+        with self.slam.profiler.stage("write"):
+            self.folder.write_trajectory([times[i] for i in poses], list(poses.values()))
+            assert self.slam.tracker.camera is not None
+            self.folder.write_camera(self.slam.tracker.camera)
+            for sub_map, mapped in self.slam.mappers.items():
+                suffix = "" if sub_map == main else f"_{sub_map}"
+                self.folder.write_map(mapped, summarise_water(mapped), suffix)
+            self.folder.write_held_out(held_out)
+        wall_s = time.monotonic() - started
+        numbers = metrics(self.slam, self.results, self.dropped, held_out, wall_s)
+        self.folder.write_medium(water, numbers["scale_source"])
+        self.folder.write_json("metrics.json", numbers)
+        self.folder.write_report(
+            report_data(
+                self.name, self.slam, self.results, self.dropped, poses, held_out, water,
+                numbers, self.notes, calibrated=self.calibration is not None,
+            )
+        )  # fmt: skip
+        return Replayed(self.folder.path, numbers, self.notes)
+
+
+def _fix_threads(threads: int) -> None:
+    """Results repeat bit for bit at a given number of threads, so it is set once and everywhere.
+
+    torch itself gets one: its OpenMP barriers cost whole scheduler quanta on a busy machine
+    (kernel_notes.md, pitfall 4), and the heavy work runs in our own pool and in OpenCV's.
+    """
+    import cv2
+
+    torch.set_num_threads(1)
+    cv2.setNumThreads(threads)
+    cv2.setRNGSeed(0)

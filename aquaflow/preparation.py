@@ -1,0 +1,109 @@
+"""From a source's picture to the one that is mapped: crop, calibration, width, undistortion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from aquaflow.config import SourceConfig
+from aquaflow.errors import ConfigError, InputError
+from aquaflow.geometry.camera import ASPECT_TOLERANCE, CameraModel, guess_camera
+from aquaflow.geometry.rectification import Rectifier
+from aquaflow.messages import Frame
+
+DEFAULT_WIDTH_PX = 480
+"""Width mapped when none is asked for: what two CPU cores track and map at a few frames a second."""
+
+Box = tuple[int, int, int, int]
+
+
+class Preparation:
+    """Prepares every frame of one recording in the same way."""
+
+    def __init__(self, config: SourceConfig, calibration: CameraModel | None) -> None:
+        self._config, self._calibration = config, calibration
+        self._rectifier: Rectifier | None = None
+        self._box: Box = (0, 0, 0, 0)
+        self._size = (0, 0)
+
+    @property
+    def camera(self) -> CameraModel | None:
+        """The camera of the prepared frames, once the first has been seen."""
+        return None if self._rectifier is None else self._rectifier.camera
+
+    def __call__(self, frame: Frame) -> Frame:
+        """The prepared frame.
+
+        Raises:
+            ConfigError: the crop or the calibration does not fit the picture.
+        """
+        height, width = frame.image.shape[:2]
+        if self._rectifier is None:
+            self._rectifier = self._plan(width, height)
+            self._size = (width, height)
+        if (width, height) != self._size:
+            raise InputError(
+                f"frame {frame.index} is {width} x {height}, the recording is "
+                f"{self._size[0]} x {self._size[1]}; frames of one recording must be of one size"
+            )
+        x, y, w, h = self._box
+        image = self._rectifier(np.ascontiguousarray(frame.image[y : y + h, x : x + w]))
+        mask = frame.mask
+        if mask is not None:
+            mask = self._rectifier.mask(mask[y : y + h, x : x + w])
+        return replace(frame, image=image, camera=self._rectifier.camera, mask=mask)
+
+    def _plan(self, width: int, height: int) -> Rectifier:
+        self._box = crop_box(self._config.crop, width, height)
+        camera = fit_calibration(self._calibration, (width, height), self._box)
+        asked = self._config.width or min(DEFAULT_WIDTH_PX, camera.width)
+        return Rectifier(camera, asked)
+
+
+def crop_box(crop: str | None, width: int, height: int) -> Box:
+    """(x, y, width, height) of ``left``, ``right`` or ``x,y,width,height``; None keeps it all.
+
+    Raises:
+        ConfigError: it is none of these, or reaches outside the picture.
+    """
+    if crop is None:
+        return (0, 0, width, height)
+    if crop in {"left", "right"}:
+        half = width // 2
+        return (0 if crop == "left" else width - half, 0, half, height)
+    try:
+        x, y, w, h = (int(part) for part in crop.split(","))
+    except ValueError as error:
+        raise ConfigError(
+            f"crop '{crop}' is neither left, right nor x,y,width,height in pixels"
+        ) from error
+    if min(x, y) < 0 or min(w, h) < 1 or x + w > width or y + h > height:
+        raise ConfigError(f"crop '{crop}' reaches outside the {width} x {height} picture")
+    return (x, y, w, h)
+
+
+def fit_calibration(
+    calibration: CameraModel | None, size: tuple[int, int], box: Box
+) -> CameraModel:
+    """The calibration for the cropped picture, whether it was made for the crop or the whole.
+
+    Raises:
+        ConfigError: its aspect ratio fits neither.
+    """
+    x, y, width, height = box
+    if calibration is None:
+        return guess_camera(width, height)
+    if _same_shape(calibration, width, height):
+        return calibration.scaled(width, height)
+    if _same_shape(calibration, *size):
+        return calibration.scaled(*size).cropped(x, y, width, height)
+    raise ConfigError(
+        f"the calibration is for {calibration.width} x {calibration.height} pictures, these are "
+        f"{width} x {height}; calibrate at this shape or choose the --crop that it was made for"
+    )
+
+
+def _same_shape(calibration: CameraModel, width: int, height: int) -> bool:
+    ratio = (calibration.width * height) / (calibration.height * width)
+    return abs(ratio - 1.0) < ASPECT_TOLERANCE

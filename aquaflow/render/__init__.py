@@ -1,0 +1,52 @@
+"""One differentiable Gaussian renderer behind three implementations.
+
+``select_renderer`` picks: ``cpu`` (compiled SIMD kernels), ``tiles`` (torch), ``gsplat`` (CUDA).
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from aquaflow.render.contract import Renderer
+
+RendererName = Literal["auto", "cpu", "tiles", "gsplat"]
+
+
+def select_renderer(name: RendererName = "auto", threads: int | None = None) -> Renderer:
+    """The renderer called ``name``; ``auto`` takes gsplat on CUDA machines, else the CPU kernels.
+
+    ``threads`` defaults to torch's number. Where ``auto`` finds no compiled library and no compiler
+    it warns once, in one sentence, and returns the torch tile renderer. Raises AquaFlowError when a
+    renderer asked for by name is not to be had.
+    """
+    from aquaflow.render import gsplat
+    from aquaflow.render.tiles import TileRenderer
+
+    if name == "gsplat" or (name == "auto" and gsplat.available()):
+        return gsplat.GsplatRenderer()
+    if name == "tiles":
+        return TileRenderer(threads)
+    return _cpu_or_tiles(name == "auto", threads)
+
+
+def _cpu_or_tiles(may_fall_back: bool, threads: int | None) -> Renderer:
+    from aquaflow.render.cpu import CpuRenderer
+    from aquaflow.render.library import NativeUnavailableError
+    from aquaflow.render.tiles import TileRenderer
+
+    try:
+        return CpuRenderer(threads)
+    except NativeUnavailableError as error:
+        if not may_fall_back:
+            raise
+        warnings.warn(
+            f"{error} Drawing with the torch tile renderer instead, hundreds of times slower.",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+        return TileRenderer(threads)
+
+
+__all__ = ["RendererName", "select_renderer"]

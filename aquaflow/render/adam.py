@@ -1,0 +1,189 @@
+"""Adam that steps only the Gaussians that were seen, each at its own count of steps.
+
+Kingma & Ba 2015, row by row: a row that is not visible keeps its parameters and moments, and the
+bias correction uses the row's own step count, so a Gaussian's first visible step is a proper first
+step.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from aquaflow.errors import AquaFlowError
+from aquaflow.render.library import Library, library_or_none, pointer
+
+LARGEST_GRADIENT = 1e18
+"""Larger gradients count as not finite: their square overflows float32."""
+
+SETTLED = 1e-8
+"""Bias corrections this close to one are taken as one."""
+
+
+class _NativeGroup(ctypes.Structure):
+    """``AdamGroup`` of native/adam.h."""
+
+    _fields_ = (
+        ("param", ctypes.c_void_p),
+        ("gradient", ctypes.c_void_p),
+        ("first_moment", ctypes.c_void_p),
+        ("second_moment", ctypes.c_void_p),
+        ("dim", ctypes.c_int32),
+        ("learning_rate", ctypes.c_float),
+    )
+
+
+class SelectiveAdam:
+    """Optimiser over named tensors that share their rows: [N, ...] each, float32."""
+
+    def __init__(
+        self,
+        groups: Mapping[str, tuple[Tensor, float]],
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-15,
+        threads: int | None = None,
+    ) -> None:
+        """``groups``: name -> (tensor, learning rate). Tensors are updated in place.
+
+        Raises AquaFlowError when the tensors differ in rows or are not contiguous float32.
+        """
+        if not groups:
+            raise AquaFlowError("SelectiveAdam has no tensors; pass at least one group.")
+        self.params = {name: tensor for name, (tensor, _) in groups.items()}
+        self.learning_rates = {name: rate for name, (_, rate) in groups.items()}
+        self.betas, self.eps = betas, eps
+        self.threads = threads if threads is not None else torch.get_num_threads()
+        self.skipped = 0
+        """Visible rows not stepped so far because a gradient was not finite."""
+        first = next(iter(self.params.values()))
+        self.steps = torch.zeros(len(first), dtype=torch.int32, device=first.device)
+        self.first_moments = {k: torch.zeros_like(v.detach()) for k, v in self.params.items()}
+        self.second_moments = {k: torch.zeros_like(v.detach()) for k, v in self.params.items()}
+        self._bias = _bias_table(betas).to(first.device)
+        self._check_params(self.params)
+
+    def step(
+        self,
+        visible: Tensor,  # [N] bool
+        grads: Mapping[str, Tensor],
+    ) -> int:
+        """Step the visible rows of the tensors named in ``grads``; returns rows skipped.
+
+        A row with a gradient that is not finite in any tensor is left as it is, in all tensors.
+        """
+        self._check_step(visible, grads)
+        library = library_or_none() if self.steps.device.type == "cpu" else None
+        with torch.no_grad():
+            if library is None:
+                skipped = self._step_torch(visible, grads)
+            else:
+                skipped = self._step_native(library, visible, grads)
+        self.skipped += skipped
+        return skipped
+
+    def extend(self, n_new: int) -> None:
+        """Add state for ``n_new`` rows at the end, at step 0; then ``bind`` the grown tensors."""
+        self.steps = torch.cat([self.steps, self.steps.new_zeros(n_new)])
+        for moments in (self.first_moments, self.second_moments):
+            for name, moment in moments.items():
+                moments[name] = torch.cat([moment, moment.new_zeros(n_new, *moment.shape[1:])])
+
+    def keep(
+        self,
+        mask: Tensor,  # [N] bool
+    ) -> None:
+        """Drop the state of rows where ``mask`` is False; then ``bind`` the pruned tensors."""
+        self.steps = self.steps[mask]
+        for moments in (self.first_moments, self.second_moments):
+            for name, moment in moments.items():
+                moments[name] = moment[mask]
+
+    def bind(self, params: Mapping[str, Tensor]) -> None:
+        """Replace the tensors named in ``params``; raises AquaFlowError if they do not fit."""
+        bound = {**self.params, **params}
+        self._check_params(bound)
+        self.params = bound
+
+    def _check_params(self, params: Mapping[str, Tensor]) -> None:
+        for name, tensor in params.items():
+            moment = self.first_moments.get(name)
+            if moment is None or tensor.shape != moment.shape or len(tensor) != len(self.steps):
+                raise AquaFlowError(
+                    f"SelectiveAdam tensor {name} has shape {tuple(tensor.shape)}, not the "
+                    f"{len(self.steps)} rows of the state; call extend or keep before bind."
+                )
+            if tensor.dtype != torch.float32 or not tensor.is_contiguous():
+                raise AquaFlowError(
+                    f"SelectiveAdam tensor {name} is not contiguous float32; pass a plain tensor."
+                )
+
+    def _check_step(self, visible: Tensor, grads: Mapping[str, Tensor]) -> None:
+        self._check_params(self.params)  # a caller may have forgotten to bind after keep
+        if visible.dtype != torch.bool or tuple(visible.shape) != (len(self.steps),):
+            raise AquaFlowError(
+                f"SelectiveAdam input visible is {visible.dtype} {tuple(visible.shape)}; "
+                f"pass bool ({len(self.steps)},)."
+            )
+        for name, gradient in grads.items():
+            if name not in self.params or gradient.shape != self.params[name].shape:
+                raise AquaFlowError(
+                    f"SelectiveAdam gradient {name} with shape {tuple(gradient.shape)} fits no "
+                    "tensor; name and shape it as in the groups."
+                )
+
+    def _step_native(self, library: Library, visible: Tensor, grads: Mapping[str, Tensor]) -> int:
+        seen = visible.contiguous()
+        plain = {name: g.detach().to(torch.float32).contiguous() for name, g in grads.items()}
+        groups = (_NativeGroup * len(plain))()
+        for group, (name, gradient) in zip(groups, plain.items(), strict=True):
+            group.param = pointer(self.params[name].detach())
+            group.gradient = pointer(gradient)
+            group.first_moment = pointer(self.first_moments[name])
+            group.second_moment = pointer(self.second_moments[name])
+            group.dim = gradient[0].numel() if len(gradient) else 0
+            group.learning_rate = self.learning_rates[name]
+        return library.call(
+            "aq_adam_step",
+            len(plain),
+            ctypes.addressof(groups),
+            len(self.steps),
+            pointer(seen),
+            pointer(self.steps),
+            *self.betas,
+            self.eps,
+            pointer(self._bias),
+            len(self._bias),
+            self.threads,
+        )
+
+    def _step_torch(self, visible: Tensor, grads: Mapping[str, Tensor]) -> int:
+        sound = torch.ones_like(visible)
+        for gradient in grads.values():
+            sound &= (gradient.abs() < LARGEST_GRADIENT).reshape(len(visible), -1).all(1)
+        rows = torch.nonzero(visible & sound)[:, 0]
+        bias = self._bias[self.steps[rows].long().clamp(max=len(self._bias) - 1)]
+        self.steps[rows] += 1
+        beta1, beta2 = self.betas
+        for name, gradient in grads.items():
+            g = gradient[rows]
+            m = beta1 * self.first_moments[name][rows] + (1 - beta1) * g
+            v = beta2 * self.second_moments[name][rows] + (1 - beta2) * g * g
+            self.first_moments[name][rows] = m
+            self.second_moments[name][rows] = v
+            b1, b2 = (b.view(-1, *[1] * (g.dim() - 1)) for b in bias.unbind(1))
+            change = self.learning_rates[name] * b1 * m / (v.sqrt() * b2 + self.eps)
+            self.params[name].detach()[rows] -= change
+        return int((visible & ~sound).sum())
+
+
+def _bias_table(betas: tuple[float, float]) -> Tensor:
+    """[T, 2]: 1 / (1 - beta1^t) and 1 / sqrt(1 - beta2^t) for t = 1 ... T; one afterwards."""
+    beta1, beta2 = betas
+    slowest = min(max(beta1, beta2, 0.5), 1 - 1e-5)
+    length = math.ceil(math.log(SETTLED) / math.log(slowest))
+    t = torch.arange(1, length + 1, dtype=torch.float64)
+    return torch.stack([1 / (1 - beta1**t), (1 - beta2**t).rsqrt()], 1).float().contiguous()

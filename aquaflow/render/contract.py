@@ -1,0 +1,124 @@
+"""What every renderer takes, returns and means by it.
+
+World points map to the camera by the 4x4 ``viewmat`` (axes x right, y down, z forward, metres); the
+centre of the top-left pixel is (0.5, 0.5). Images are premultiplied: the accumulated sum of weight
+times colour over a black background, so callers composite with ``alpha``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from torch import Tensor
+
+from aquaflow.errors import AquaFlowError
+
+DILATION_PX2 = 0.3
+"""Low-pass filter of EWA splatting: added to both variances of the projected covariance."""
+
+MAX_ALPHA = 0.99
+"""Clamp of one Gaussian's alpha; a clamped alpha has no gradient."""
+
+MIN_ALPHA = 1.0 / 255.0
+"""Contributions below one grey level are dropped."""
+
+MIN_TRANSMITTANCE = 1e-4
+"""A pixel takes contributions while its transmittance is above this."""
+
+NEAR_PLANE_M = 0.05
+"""Means closer than this along the optical axis are culled."""
+
+TANGENT_MARGIN = 0.3
+"""The projection's Jacobian is taken at most this many half fields of view outside the image."""
+
+MIN_QUAT_NORM_SQ = 1e-24
+"""Shorter quaternions have no direction: culled."""
+
+MAX_SIGMA_PX = 1e5
+"""Footprints wider than this along their long axis are culled: their determinant would leave
+float32."""
+
+RADIUS_SIGMAS = 3.0
+"""``Rendering.radius_px`` is this many standard deviations along the ellipse's long axis."""
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """One picture and what it says about the Gaussians."""
+
+    image: Tensor
+    """[H, W, C] premultiplied, differentiable."""
+
+    alpha: Tensor
+    """[H, W] in [0, 1], differentiable."""
+
+    visible: Tensor
+    """[N] bool: sound, in front of the camera, and reaching 1/255 of alpha on the image."""
+
+    radius_px: Tensor
+    """[N] three standard deviations of the footprint, pixels; 0 where not visible."""
+
+
+class Renderer(Protocol):
+    """A differentiable Gaussian rasteriser."""
+
+    name: str
+    isa: str
+    """For reports: ``avx512``, ``avx2``, ``sse4``, ``neon``, ``torch`` or ``cuda``."""
+
+    threads: int
+
+    def __call__(
+        self,
+        means: Tensor,  # [N, 3] m, world
+        quats: Tensor,  # [N, 4] wxyz, any length
+        scales: Tensor,  # [N, 3] m, standard deviations
+        opacities: Tensor,  # [N]
+        colours: Tensor,  # [N, C], C is 3 or 4
+        viewmat: Tensor,  # [4, 4] world -> camera
+        K: Tensor,  # [3, 3] px; skew is ignored
+        width: int,
+        height: int,
+    ) -> Rendering:
+        """Draw. Differentiable in all tensors but ``K``.
+
+        A Gaussian that is not finite, has a zero quaternion, a scale or opacity that is not
+        positive, or lies behind the near plane is culled: it draws nothing and its gradient is
+        zero. A camera that is not finite culls all. Raises AquaFlowError for wrong shapes.
+        """
+        ...
+
+
+def check_inputs(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colours: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+) -> None:
+    """Raise AquaFlowError naming the first input whose shape breaks the contract."""
+    n = len(means) if means.dim() else 0
+    expected = {
+        "means": (means, (n, 3)),
+        "quats": (quats, (n, 4)),
+        "scales": (scales, (n, 3)),
+        "opacities": (opacities, (n,)),
+        "viewmat": (viewmat, (4, 4)),
+        "K": (K, (3, 3)),
+    }
+    for name, (tensor, shape) in expected.items():
+        if tuple(tensor.shape) != shape:
+            raise AquaFlowError(
+                f"Renderer input {name} has shape {tuple(tensor.shape)}; pass {shape}."
+            )
+    if colours.dim() != 2 or colours.shape[0] != n or colours.shape[1] not in {3, 4}:
+        raise AquaFlowError(
+            f"Renderer input colours has shape {tuple(colours.shape)}; pass ({n}, 3) or ({n}, 4)."
+        )
+    if width < 1 or height < 1:
+        raise AquaFlowError(f"Image size {width} x {height} is empty; pass at least 1 x 1 pixels.")

@@ -1,0 +1,130 @@
+"""The compiled CPU renderer: a ctypes call inside an autograd function."""
+
+from __future__ import annotations
+
+import weakref
+from collections import deque
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from aquaflow.render.contract import Rendering, check_inputs
+from aquaflow.render.library import Library, load_library, pointer
+
+
+class _ContextPool:
+    """Native contexts at rest; their buffers are reused by later forward passes."""
+
+    def __init__(self, library: Library) -> None:
+        self.library = library
+        self.idle: deque[int] = deque()  # append and pop are atomic: renderers may share threads
+        weakref.finalize(self, _free_all, library, self.idle)
+
+
+def _free_all(library: Library, idle: deque[int]) -> None:
+    while idle:
+        library.free_context(idle.pop())
+
+
+class _Lease:
+    """One context, held from a forward pass until its graph is gone."""
+
+    def __init__(self, pool: _ContextPool) -> None:
+        self.pool = pool
+        try:
+            self.context = pool.idle.pop()
+        except IndexError:
+            self.context = pool.library.new_context()
+
+    def __del__(self) -> None:
+        if hasattr(self, "context"):
+            self.pool.idle.append(self.context)
+
+
+class CpuRenderer:
+    """SIMD kernels from ``native/``, on ``threads`` threads; same result for the same inputs and
+    thread count, bit for bit."""
+
+    name = "cpu"
+
+    def __init__(self, threads: int | None = None, isa: str | None = None) -> None:
+        """``threads`` defaults to torch's; ``isa`` to the fastest that this processor runs.
+
+        Raises NativeUnavailableError when no library can be had.
+        """
+        library = load_library(isa)
+        self.isa = library.isa
+        self.threads = threads if threads is not None else torch.get_num_threads()
+        self._pool = _ContextPool(library)
+
+    def __call__(
+        self,
+        means: Tensor,  # [N, 3] m, world
+        quats: Tensor,  # [N, 4] wxyz, any length
+        scales: Tensor,  # [N, 3] m
+        opacities: Tensor,  # [N]
+        colours: Tensor,  # [N, C]
+        viewmat: Tensor,  # [4, 4] world -> camera
+        K: Tensor,  # [3, 3] px
+        width: int,
+        height: int,
+    ) -> Rendering:
+        """Draw as the contract says; inputs of other types are converted to float32 on the CPU."""
+        check_inputs(means, quats, scales, opacities, colours, viewmat, K, width, height)
+        inputs = [
+            tensor.to(device="cpu", dtype=torch.float32).contiguous()
+            for tensor in (means, quats, scales, opacities, colours, viewmat)
+        ]
+        focal_and_centre = K.detach()[[0, 1, 0, 1], [0, 1, 2, 2]]
+        intrinsics = focal_and_centre.to(device="cpu", dtype=torch.float32)
+        image, alpha, visible, radius_px = _Rasterise.apply(  # type: ignore[no-untyped-call]
+            *inputs, intrinsics, self._pool, self.threads, width, height
+        )
+        return Rendering(image, alpha, visible, radius_px)
+
+
+class _Rasterise(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        colours: Tensor,
+        viewmat: Tensor,
+        intrinsics: Tensor,  # [4] fx fy cx cy, px
+        pool: _ContextPool,
+        threads: int,
+        width: int,
+        height: int,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        n, channels = colours.shape
+        image = torch.empty(height, width, channels)
+        alpha = torch.empty(height, width)
+        visible = torch.empty(n, dtype=torch.bool)
+        radius_px = torch.empty(n)
+        gaussians = (means, quats, scales, opacities, colours)
+        lease = _Lease(pool)
+        sizes = (n, channels, width, height, threads)
+        tensors = (*gaussians, viewmat, intrinsics, image, alpha, visible, radius_px)
+        pool.library.call("aq_forward", lease.context, *sizes, *map(pointer, tensors))
+        ctx.save_for_backward(*gaussians, image)
+        ctx.lease = lease
+        ctx.mark_non_differentiable(visible, radius_px)
+        return image, alpha, visible, radius_px
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, g_image: Tensor, g_alpha: Tensor, *_: Tensor) -> tuple[Any, ...]:
+        *gaussians, image = ctx.saved_tensors
+        gradients = [*(torch.empty_like(tensor) for tensor in gaussians), torch.empty(4, 4)]
+        incoming = [g_image.contiguous(), g_alpha.contiguous()]
+        ctx.lease.pool.library.call(
+            "aq_backward",
+            ctx.lease.context,
+            *map(pointer, (*gaussians, image, *incoming, *gradients)),
+        )
+        return (*gradients, None, None, None, None, None)

@@ -1,0 +1,91 @@
+"""The CUDA renderer: gsplat >= 1.5 behind the same contract."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import torch
+from torch import Tensor
+
+from aquaflow.errors import AquaFlowError
+from aquaflow.render.contract import DILATION_PX2, NEAR_PLANE_M, Rendering, check_inputs
+
+
+def available() -> bool:
+    """Whether this machine has a CUDA device and gsplat is installed."""
+    return torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
+
+
+class GsplatRenderer:
+    """Draws on the CUDA device; inputs are moved there, the result stays there.
+
+    Two differences to the contract, both within one grey level: gsplat stops before the Gaussian
+    that would take the transmittance below 1e-4, and clamps alpha at 0.999. ``radius_px`` is
+    gsplat's rounded extent.
+    """
+
+    name = "gsplat"
+    isa = "cuda"
+    threads = 1
+
+    def __init__(self) -> None:
+        """Raises AquaFlowError when CUDA or gsplat is missing."""
+        if not torch.cuda.is_available():
+            raise AquaFlowError(
+                "Renderer gsplat needs a CUDA device and torch sees none; use renderer cpu."
+            )
+        if importlib.util.find_spec("gsplat") is None:
+            raise AquaFlowError(
+                "Renderer gsplat is not installed; run `pip install --no-deps 'gsplat>=1.5'`."
+            )
+
+    def __call__(
+        self,
+        means: Tensor,  # [N, 3] m, world
+        quats: Tensor,  # [N, 4] wxyz
+        scales: Tensor,  # [N, 3] m
+        opacities: Tensor,  # [N]
+        colours: Tensor,  # [N, C]
+        viewmat: Tensor,  # [4, 4] world -> camera
+        K: Tensor,  # [3, 3] px
+        width: int,
+        height: int,
+    ) -> Rendering:
+        """Draw as the contract says."""
+        from gsplat import rasterization
+
+        check_inputs(means, quats, scales, opacities, colours, viewmat, K, width, height)
+        inputs = (means, quats, scales, opacities, colours, viewmat, K.detach())
+        on_device = [tensor.to(device="cuda", dtype=torch.float32) for tensor in inputs]
+        *gaussians, view, intrinsics = on_device
+        sound = _sound(*gaussians) & torch.isfinite(view).all()
+        kept = torch.nonzero(sound)[:, 0]
+        visible = torch.zeros(len(means), dtype=torch.bool, device="cuda")
+        radius_px = torch.zeros(len(means), device="cuda")
+        if len(kept) == 0:  # gsplat does not take empty scenes
+            image = torch.zeros(height, width, colours.shape[1], device="cuda")
+            return Rendering(image, image[..., 0].clone(), visible, radius_px)
+        image, alpha, meta = rasterization(
+            *(tensor[kept] for tensor in gaussians),
+            view[None],
+            intrinsics[None],
+            width,
+            height,
+            near_plane=NEAR_PLANE_M,
+            eps2d=DILATION_PX2,
+            sh_degree=None,
+            packed=False,
+        )
+        radii = meta["radii"][0].detach().float()  # [M] or, since 1.5, [M, 2]
+        radius_px[kept] = radii if radii.dim() == 1 else radii.amax(1)
+        return Rendering(image[0], alpha[0, ..., 0], radius_px > 0, radius_px)
+
+
+def _sound(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colours: Tensor
+) -> Tensor:
+    """[N] bool: finite and not degenerate; gsplat itself does not look."""
+    with torch.no_grad():
+        finite = torch.isfinite(torch.cat([means, quats, scales, colours], 1)).all(1)
+        positive = (scales > 0).all(1) & (opacities > 0) & torch.isfinite(opacities)
+        return finite & positive & (quats.square().sum(1) > 0)

@@ -1,0 +1,119 @@
+"""Find, build if need be, and load the shared library with the C++ kernels."""
+
+from __future__ import annotations
+
+import ctypes
+import threading
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from aquaflow.errors import AquaFlowError
+from aquaflow.render.native import build as native
+
+_POINTER = ctypes.c_void_p
+_INT = ctypes.c_int
+_FLOAT = ctypes.c_float
+_DOUBLE = ctypes.c_double
+_SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
+    "aq_constants": (None, [_POINTER]),
+    "aq_context_new": (_POINTER, []),
+    "aq_context_free": (None, [_POINTER]),
+    "aq_forward": (_INT, [_POINTER] + [_INT] * 5 + [_POINTER] * 11),
+    "aq_backward": (_INT, [_POINTER] * 15),
+    "aq_photometric": (_INT, [_POINTER] * 4 + [_INT] * 2 + [_FLOAT, _INT] + [_POINTER] * 2),
+    "aq_compose_water": (_INT, [_POINTER] * 3 + [_INT] * 2 + [_POINTER] * 2),
+    "aq_compose_water_backward": (_INT, [_POINTER] * 3 + [_INT] * 2 + [_POINTER] * 5),
+    "aq_adam_step": (
+        _INT,
+        [_INT, _POINTER, _INT] + [_POINTER] * 2 + [_DOUBLE] * 2 + [_FLOAT, _POINTER] + [_INT] * 2,
+    ),
+}
+_BUILD_LOCK = threading.Lock()
+
+
+class NativeUnavailableError(AquaFlowError):
+    """No kernel library can be had here; the message says why and what to do."""
+
+
+class Library:
+    """The loaded kernels of one instruction set."""
+
+    def __init__(self, path: Path, isa: str) -> None:
+        self.isa = isa
+        self.path = path
+        self._dll = ctypes.CDLL(str(path))
+        for name, (result, arguments) in _SIGNATURES.items():
+            function = getattr(self._dll, name)
+            function.restype = result
+            function.argtypes = arguments
+
+    def call(self, name: str, *arguments: object) -> int:
+        """Run a kernel that reports its status; MemoryError when it ran out of memory."""
+        status = int(getattr(self._dll, name)(*arguments))
+        if name != "aq_adam_step" and status != 0:
+            raise MemoryError(f"{name} ran out of memory")
+        return status
+
+    def new_context(self) -> int:
+        """State of one forward pass; give it back with ``free_context``."""
+        context = self._dll.aq_context_new()
+        if not context:
+            raise MemoryError("aq_context_new ran out of memory")
+        return int(context)
+
+    def free_context(self, context: int) -> None:
+        self._dll.aq_context_free(context)
+
+    def constants(self) -> list[float]:
+        """The constants compiled in, in the order of ``aq_constants``."""
+        out = (ctypes.c_double * 9)()
+        self._dll.aq_constants(out)
+        return list(out)
+
+
+def pointer(tensor: Tensor) -> int:
+    """Address of a contiguous CPU tensor; the caller keeps it alive during the call."""
+    return tensor.data_ptr()
+
+
+@lru_cache(maxsize=8)
+def load_library(isa: str | None = None, directory: Path = native.NATIVE_DIR) -> Library:
+    """The fastest library this processor runs, or the variant ``isa``; built first if out of date.
+
+    Raises NativeUnavailableError when it is missing and cannot be built.
+    """
+    supported = native.supported_isas()
+    if not supported or (isa is not None and isa not in supported):
+        raise NativeUnavailableError(
+            f"This processor does not run the {isa or 'compiled'} kernels; "
+            f"choose one of {', '.join(supported) or 'the torch renderers'}."
+        )
+    chosen = isa or supported[0]
+    path = native.library_path(chosen, directory)
+    with _BUILD_LOCK:
+        if not native.is_current(path):
+            try:
+                native.build(chosen, directory)
+            except native.BuildError as error:
+                raise NativeUnavailableError(
+                    f"The compiled CPU renderer ({path.name}) is missing or out of date and was "
+                    f"not built: {error}."
+                ) from error
+    try:
+        return Library(path, chosen)
+    except OSError as error:
+        raise NativeUnavailableError(
+            f"The compiled CPU renderer {path} does not load: {error}; "
+            "delete it to have it built again."
+        ) from error
+
+
+def library_or_none() -> Library | None:
+    """The fastest library, or None where ``select_renderer`` announces the torch fallback."""
+    try:
+        return load_library()
+    except NativeUnavailableError:
+        return None

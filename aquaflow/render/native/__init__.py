@@ -1,0 +1,1 @@
+"""C++ kernels and what builds them. Importable without torch."""

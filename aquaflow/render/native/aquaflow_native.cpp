@@ -1,0 +1,153 @@
+// AquaFlow's CPU kernels behind a plain C ABI: Gaussian rasteriser, L1 + SSIM, selective Adam.
+//
+// No torch or Python headers: the library serves every version of both. All arrays are contiguous
+// float32 in row-major order. Functions return 0, or 1 when memory ran out.
+#include <cstdint>
+#include <new>
+#include <stdexcept>
+
+#include "constants.h"
+#include "simd.h"
+
+#include "pool.h"
+
+#include "context.h"
+#include "footprint.h"
+
+#include "project.h"
+#include "tiles.h"
+
+#include "moments.h"
+
+#include "blend.h"
+#include "project_backward.h"
+
+#include "photometric.h"
+
+#include "adam.h"
+#include "image_formation.h"
+
+#ifndef AQ_SOURCE_HASH
+#error "build with aquaflow/render/native/build.py, which passes AQ_SOURCE_HASH"
+#endif
+
+#define AQ_EXPORT __attribute__((visibility("default")))
+
+using namespace aq;
+
+template <class Work>
+static int guarded(const Work& work) {
+  try {
+    work();
+    return 0;
+  } catch (const std::bad_alloc&) {
+    return 1;
+  } catch (const std::length_error&) {
+    return 1;
+  }
+}
+
+static Camera make_camera(const float* viewmat, const float* intrinsics, int width, int height) {
+  Camera cam;
+  for (int i = 0; i < 3; i++) {
+    for (int j = 0; j < 3; j++) cam.w[i][j] = viewmat[4 * i + j];
+    cam.d[i] = viewmat[4 * i + 3];
+  }
+  cam.fx = intrinsics[0], cam.fy = intrinsics[1], cam.cx = intrinsics[2], cam.cy = intrinsics[3];
+  cam.width = width, cam.height = height;
+  const float margin_x = kTangentMargin * 0.5f * (float)width / cam.fx;
+  const float margin_y = kTangentMargin * 0.5f * (float)height / cam.fy;
+  cam.tan_x_min = -cam.cx / cam.fx - margin_x;
+  cam.tan_x_max = ((float)width - cam.cx) / cam.fx + margin_x;
+  cam.tan_y_min = -cam.cy / cam.fy - margin_y;
+  cam.tan_y_max = ((float)height - cam.cy) / cam.fy + margin_y;
+  return cam;
+}
+
+extern "C" {
+
+// Searched for in the file before it is loaded, to see whether it was built from these sources.
+AQ_EXPORT __attribute__((used)) extern const char aq_source_hash[];
+const char aq_source_hash[] = "aquaflow-source:" AQ_SOURCE_HASH;
+
+// Mirrored by contract.py; order as in library.py.
+AQ_EXPORT void aq_constants(double* out) {
+  const double all[] = {kDilationPx2, kMaxAlpha,      kMinAlpha,       kMinTransmittance, kNearPlane,
+                        kTangentMargin, kMinQuatNormSq, kMaxSigmaPx, kRadiusSigmas};
+  for (double value : all) *out++ = value;
+}
+
+AQ_EXPORT void* aq_context_new() { return new (std::nothrow) Context(); }
+AQ_EXPORT void aq_context_free(void* context) { delete static_cast<Context*>(context); }
+
+// viewmat [4, 4] world -> camera; intrinsics [4] fx fy cx cy, pixel centres at half-integers.
+AQ_EXPORT int aq_forward(void* context, int count, int channels, int width, int height, int threads,
+               const float* means, const float* quats, const float* scales, const float* opacities,
+               const float* colours, const float* viewmat, const float* intrinsics, float* image,
+               float* alpha, uint8_t* visible, float* radius_px) {
+  return guarded([&] {
+    Context& ctx = *static_cast<Context*>(context);
+    ctx.count = count, ctx.channels = channels;
+    ctx.threads = std::min(std::max(threads, 1), kMaxThreads);
+    ctx.camera = make_camera(viewmat, intrinsics, width, height);
+    ctx.tiles_x = (width + kTile - 1) / kTile, ctx.tiles_y = (height + kTile - 1) / kTile;
+    project(ctx, {means, quats, scales, opacities, colours}, visible, radius_px);
+    build_tile_lists(ctx);
+    channels == 3 ? blend<3>(ctx, image, alpha) : blend<4>(ctx, image, alpha);
+  });
+}
+
+// Needs the inputs and the image of the forward pass that the context belongs to. g_viewmat [4, 4].
+AQ_EXPORT int aq_backward(void* context, const float* means, const float* quats, const float* scales,
+                const float* opacities, const float* colours, const float* image,
+                const float* g_image, const float* g_alpha, float* g_means, float* g_quats,
+                float* g_scales, float* g_opacities, float* g_colours, float* g_viewmat) {
+  return guarded([&] {
+    Context& ctx = *static_cast<Context*>(context);
+    const GaussianGradients out{g_means, g_quats, g_scales, g_opacities, g_colours};
+    if (ctx.visible == 0) {  // also the way out for a camera that is not finite
+      std::fill(g_viewmat, g_viewmat + 16, 0.0f);
+      clear_gradients(ctx, out);
+      return;
+    }
+    const ImageGradients in{image, g_image, g_alpha};
+    const float* gradient = ctx.channels == 3 ? blend_backward<3>(ctx, in) : blend_backward<4>(ctx, in);
+    project_backward(ctx, {means, quats, scales, opacities, colours}, gradient, out, g_viewmat);
+  });
+}
+
+// See photometric.h. g_rendered may be null when no gradient is wanted.
+AQ_EXPORT int aq_photometric(const float* rendered, const float* target, const float* weight,
+                   const float* mask, int width, int height, float ssim_weight, int threads, float* loss,
+                   float* g_rendered) {
+  return guarded([&] {
+    *loss = photometric({rendered, target, weight, mask, width, height, ssim_weight},
+                        std::min(std::max(threads, 1), kMaxThreads), g_rendered);
+  });
+}
+
+// See image_formation.h: drawn [P, 4], alpha [P] and water [15] give image [P, 3] and range [P].
+AQ_EXPORT int aq_compose_water(const float* drawn, const float* alpha, const float* water, int pixels,
+                     int threads, float* image, float* range) {
+  return guarded([&] {
+    compose_water({drawn, alpha, water, pixels}, std::min(std::max(threads, 1), kMaxThreads), image, range);
+  });
+}
+
+AQ_EXPORT int aq_compose_water_backward(const float* drawn, const float* alpha, const float* water,
+                              int pixels, int threads, const float* g_image, const float* g_range,
+                              float* g_drawn, float* g_alpha, float* g_water) {
+  return guarded([&] {
+    compose_water_backward({drawn, alpha, water, pixels}, std::min(std::max(threads, 1), kMaxThreads),
+                           g_image, g_range, g_drawn, g_alpha, g_water);
+  });
+}
+
+// See adam.h. Returns the number of visible rows skipped for a non-finite gradient.
+AQ_EXPORT int aq_adam_step(int groups, const AdamGroup* group, int rows, const uint8_t* visible,
+                 int32_t* steps, double beta1, double beta2, float eps, const float* bias, int bias_rows, int threads) {
+  return adam_step({groups, group, rows, visible, steps, beta1, beta2, eps, bias, bias_rows},
+                   std::min(std::max(threads, 1), kMaxThreads));
+}
+
+}  // extern "C"

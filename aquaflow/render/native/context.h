@@ -1,0 +1,94 @@
+// What a forward pass leaves for its backward pass: projected Gaussians and tile lists.
+#pragma once
+#include <vector>
+
+namespace aq {
+
+constexpr int kTile = 16;  // pixels; 8 is a third slower, 32 needs more mask bits than it saves
+constexpr int kBlocksX = kTile / kBlockW, kBlocksY = kTile / kBlockH;
+constexpr int kBlocks = kBlocksX * kBlocksY;
+constexpr int kGradientFloats = 16;  // one cache line per Gaussian and thread
+constexpr int kCacheLine = 64;
+
+// One bit per block of a tile.
+#if defined(__AVX2__)
+typedef uint32_t BlockMask;
+#else
+typedef uint64_t BlockMask;
+#endif
+static_assert(kBlocks <= 8 * (int)sizeof(BlockMask), "a tile has more blocks than a mask has bits");
+constexpr BlockMask kAllBlocks = BlockMask(~BlockMask(0)) >> (8 * sizeof(BlockMask) - kBlocks);
+
+// A projected Gaussian, one cache line. log2 alpha(x, y) = qa dx^2 + qb dx dy + qc dy^2 + log2_opacity
+// with dx = x - u, dy = y - v and pixel centres at whole numbers.
+struct alignas(kCacheLine) Splat {
+  float u, v, qa, qb, qc, log2_opacity;
+  float colour[4];
+  float extent_x, extent_y;  // half size of the box where alpha reaches kMinAlpha, pixels
+  float slope_x, slope_y;    // -b/a and -b/c: lines where the conic is least along a row or column
+  float conic_a, conic_b;
+};
+static_assert(sizeof(Splat) == kCacheLine, "a splat must fill one cache line");
+
+struct Camera {
+  float w[3][3], d[3];                    // world -> camera: t = w x + d
+  float fx, fy, cx, cy;                   // pixels
+  float tan_x_min, tan_x_max, tan_y_min, tan_y_max;  // where the Jacobian's ray is clamped
+  int width, height;
+};
+
+struct TileEntry {
+  uint32_t splat;
+  BlockMask blocks;
+};
+
+struct TileHit {
+  uint32_t tile, splat;
+  BlockMask blocks;
+};
+
+template <class T>
+struct AlignedBuffer {
+  std::vector<T> storage;
+  T* reserve(size_t count) {
+    const size_t slack = kCacheLine / sizeof(T);
+    if (storage.size() < count + slack) storage.resize(count + slack);
+    const uintptr_t raw = (uintptr_t)storage.data();
+    return (T*)((raw + kCacheLine - 1) & ~(uintptr_t)(kCacheLine - 1));
+  }
+};
+
+struct Context {
+  int count = 0, visible = 0, threads = 1, channels = 3;
+  int tiles_x = 0, tiles_y = 0;
+  Camera camera{};
+  std::vector<Splat> splats;              // [count], storage order
+  std::vector<float> depth;               // [count], metres; negative = culled
+  std::vector<uint32_t> key, key_swap;    // radix sort
+  std::vector<uint32_t> order, order_swap;
+  std::vector<int32_t> tile_offset;       // [tiles + 1]
+  std::vector<int32_t> tile_cursor;       // [threads, tiles]
+  std::vector<std::vector<TileHit>> hits; // per thread
+  std::vector<TileEntry> entries;         // front to back inside each tile
+  std::vector<float> transmittance;       // [H, W] what is left behind the last Gaussian
+  AlignedBuffer<float> gradient;          // [threads, count, kGradientFloats]
+
+  int tiles() const { return tiles_x * tiles_y; }
+
+  // Contiguous runs of tiles with about equal work; contiguity keeps splats in the core's cache.
+  int first_tile(int part) const {
+    constexpr int64_t kTileOverhead = 32;  // entries' worth of work in an empty tile
+    const int n = tiles();
+    if (part >= threads) return n;
+    const int64_t total = tile_offset[n] + kTileOverhead * n, target = total * part / threads;
+    int low = 0, high = n;
+    while (low < high) {
+      const int middle = (low + high) / 2;
+      if (tile_offset[middle] + kTileOverhead * middle < target) low = middle + 1;
+      else high = middle;
+    }
+    return low;
+  }
+};
+
+}  // namespace aq

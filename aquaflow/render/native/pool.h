@@ -1,0 +1,126 @@
+// A small persistent pool of threads with a static schedule.
+//
+// run(n, job) calls job(0) ... job(n - 1) once each. What a part computes depends on its number only,
+// never on the thread that ran it, so results repeat bit for bit at a given n. When the pool is busy
+// (another Python thread renders) the caller runs all parts itself, with the same result.
+#pragma once
+#include <atomic>
+#include <condition_variable>
+#include <mutex>
+#include <thread>
+#include <vector>
+#include <unistd.h>
+
+namespace aq {
+
+constexpr int kMaxThreads = 64;
+constexpr int kSpinsBeforeSleep = 4000;  // about 50 us: longer than the gap between two stages
+
+AQ_INLINE void spin_pause() {
+#if defined(__x86_64__)
+  __builtin_ia32_pause();
+#elif defined(__aarch64__)
+  asm volatile("yield");
+#endif
+}
+
+class Pool {
+ public:
+  template <class Job>
+  static void run(int parts, const Job& job) {
+    if (parts > 1) {
+      Pool& pool = instance();
+      std::unique_lock<std::mutex> turn(pool.turn_, std::try_to_lock);
+      if (turn.owns_lock() && pool.start(parts - 1, &call<Job>, &job)) {
+        job(0);
+        pool.finish();
+        return;
+      }
+    }
+    for (int part = 0; part < parts; part++) job(part);
+  }
+
+ private:
+  using Call = void (*)(const void* job, int part);
+
+  template <class Job>
+  static void call(const void* job, int part) {
+    (*static_cast<const Job*>(job))(part);
+  }
+
+  // Threads do not survive fork(): a child process gets a pool of its own, the parent's is left alone.
+  static Pool& instance() {
+    static std::mutex guard;
+    static Pool* pool = nullptr;
+    static pid_t owner = 0;
+    std::lock_guard<std::mutex> lock(guard);
+    if (owner != getpid()) {
+      pool = new Pool();  // never freed: its threads may outlive static destruction
+      owner = getpid();
+    }
+    return *pool;
+  }
+
+  bool start(int helpers, Call call, const void* job) {
+    try {
+      while ((int)threads_.size() < helpers) {
+        const int number = (int)threads_.size() + 1;
+        threads_.emplace_back([this, number, seen = round_.load()] { work(number, seen); });
+        threads_.back().detach();
+      }
+    } catch (const std::system_error&) {
+      return false;  // no more threads to be had: the caller runs all parts
+    }
+    call_ = call;
+    job_ = job;
+    helpers_ = helpers;
+    running_.store((int)threads_.size(), std::memory_order_relaxed);
+    {
+      std::lock_guard<std::mutex> lock(sleep_);
+      round_.fetch_add(1, std::memory_order_release);
+    }
+    wake_.notify_all();
+    return true;
+  }
+
+  void finish() {
+    for (int spins = 0; running_.load(std::memory_order_acquire) != 0; spins++) {
+      if (spins < kSpinsBeforeSleep) spin_pause();
+      else std::this_thread::yield();
+    }
+  }
+
+  void work(int number, uint64_t seen) {
+    for (;;) {
+      for (int spins = 0; round_.load(std::memory_order_acquire) == seen; spins++) {
+        if (spins < kSpinsBeforeSleep) {
+          spin_pause();
+          continue;
+        }
+        std::unique_lock<std::mutex> lock(sleep_);
+        wake_.wait(lock, [&] { return round_.load(std::memory_order_acquire) != seen; });
+      }
+      seen++;
+      if (number <= helpers_) call_(job_, number);
+      running_.fetch_sub(1, std::memory_order_release);
+    }
+  }
+
+  std::mutex turn_, sleep_;
+  std::condition_variable wake_;
+  std::atomic<uint64_t> round_{0};
+  std::atomic<int> running_{0};
+  std::vector<std::thread> threads_;
+  Call call_ = nullptr;
+  const void* job_ = nullptr;
+  int helpers_ = 0;
+};
+
+// [begin, end) of part number `part` when `count` items are cut into `parts` runs of whole `grain`s.
+AQ_INLINE int part_begin(int count, int grain, int parts, int part) {
+  const int64_t grains = (count + grain - 1) / grain;
+  const int64_t begin = grains * part / parts * grain;
+  return begin < count ? (int)begin : count;
+}
+
+}  // namespace aq

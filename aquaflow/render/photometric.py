@@ -1,0 +1,140 @@
+"""The photometric loss of the map: weighted L1 and SSIM under a mask, fused with its gradient."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from aquaflow.errors import AquaFlowError
+from aquaflow.render.library import Library, library_or_none, pointer
+
+SSIM_WINDOW = 11
+SSIM_SIGMA_PX = 1.5
+SSIM_C1 = 0.01**2
+SSIM_C2 = 0.03**2
+
+
+def ssim(
+    x: Tensor,  # [H, W, 3] in [0, 1]
+    y: Tensor,  # [H, W, 3] in [0, 1]
+) -> Tensor:
+    """Mean structural similarity (Wang et al. 2004): 11 x 11 Gaussian window, zero padding."""
+    t = torch.arange(SSIM_WINDOW, dtype=x.dtype, device=x.device) - SSIM_WINDOW // 2
+    g = torch.exp(-t * t / (2 * SSIM_SIGMA_PX**2))
+    g = g / g.sum()
+
+    def window_mean(image: Tensor) -> Tensor:
+        rows = F.conv2d(image, g.view(1, 1, 1, -1), padding=(0, SSIM_WINDOW // 2))
+        return F.conv2d(rows, g.view(1, 1, -1, 1), padding=(SSIM_WINDOW // 2, 0))
+
+    a, b = x.permute(2, 0, 1)[:, None], y.permute(2, 0, 1)[:, None]
+    mu_x, mu_y = window_mean(a), window_mean(b)
+    var_x, var_y = window_mean(a * a) - mu_x * mu_x, window_mean(b * b) - mu_y * mu_y
+    cov = window_mean(a * b) - mu_x * mu_y
+    luminance = (2 * mu_x * mu_y + SSIM_C1) / (mu_x * mu_x + mu_y * mu_y + SSIM_C1)
+    return (luminance * (2 * cov + SSIM_C2) / (var_x + var_y + SSIM_C2)).mean()
+
+
+def photometric_loss_torch(
+    rendered: Tensor,  # [H, W, 3]
+    target: Tensor,  # [H, W, 3]
+    weight: Tensor,  # [H, W]
+    mask: Tensor | None,  # [H, W]
+    ssim_weight: float,
+) -> Tensor:
+    """The definition of the loss, in the inputs' dtype: oracle and fallback."""
+    if mask is not None:
+        shade = mask.to(rendered.dtype)[..., None]
+        rendered, target = shade * rendered, shade * target
+    l1 = (weight[..., None] * (rendered - target).abs()).mean()
+    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim(rendered, target))
+
+
+def photometric_loss(
+    rendered: Tensor,  # [H, W, 3]
+    target: Tensor,  # [H, W, 3]
+    weight: Tensor,  # [H, W] of the L1 term
+    mask: Tensor | None,  # [H, W] bool or float; None: all ones
+    ssim_weight: float,
+    threads: int | None = None,
+) -> Tensor:
+    """(1 - l) mean(weight |M (rendered - target)|) + l (1 - SSIM(M rendered, M target)).
+
+    l is ``ssim_weight``, M the mask, the means run over all pixels and channels.
+    Scalar, differentiable in ``rendered`` only. Off the CPU, and where no compiled library is to be
+    had, torch computes it. Raises AquaFlowError for shapes that do not fit.
+    """
+    _check(rendered, target, weight, mask)
+    library = library_or_none() if rendered.device.type == "cpu" else None
+    if library is None:
+        target, weight = target.detach(), weight.detach()
+        return photometric_loss_torch(rendered, target, weight, mask, ssim_weight)
+    constants = [_plain(tensor) for tensor in (target, weight)]
+    shade = None if mask is None else _plain(mask)
+    threads = threads if threads is not None else torch.get_num_threads()
+    plain = rendered.to(torch.float32).contiguous()
+    loss: Tensor = _Photometric.apply(  # type: ignore[no-untyped-call]
+        plain, *constants, shade, ssim_weight, threads, library
+    )
+    return loss
+
+
+def _plain(tensor: Tensor) -> Tensor:
+    return tensor.detach().to(torch.float32).contiguous()
+
+
+def _check(rendered: Tensor, target: Tensor, weight: Tensor, mask: Tensor | None) -> None:
+    if rendered.dim() != 3 or rendered.shape[2] != 3:
+        raise AquaFlowError(
+            f"Loss input rendered has shape {tuple(rendered.shape)}; pass an [H, W, 3] image."
+        )
+    shape = tuple(rendered.shape)
+    expected = {"target": (target, shape), "weight": (weight, shape[:2])}
+    if mask is not None:
+        expected["mask"] = (mask, shape[:2])
+    for name, (tensor, wanted) in expected.items():
+        if tuple(tensor.shape) != wanted:
+            raise AquaFlowError(
+                f"Loss input {name} has shape {tuple(tensor.shape)}; pass {wanted} to fit rendered."
+            )
+
+
+class _Photometric(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        rendered: Tensor,
+        target: Tensor,
+        weight: Tensor,
+        mask: Tensor | None,
+        ssim_weight: float,
+        threads: int,
+        library: Library,
+    ) -> Tensor:
+        height, width, _ = rendered.shape
+        loss = torch.empty(1)
+        gradient = torch.empty_like(rendered) if ctx.needs_input_grad[0] else None
+        images = (rendered, target, weight, mask)
+        library.call(
+            "aq_photometric",
+            *(None if image is None else pointer(image) for image in images),
+            width,
+            height,
+            ssim_weight,
+            threads,
+            pointer(loss),
+            None if gradient is None else pointer(gradient),
+        )
+        if gradient is not None:
+            ctx.save_for_backward(gradient)
+        return loss[0]
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, g_loss: Tensor) -> tuple[Any, ...]:
+        (gradient,) = ctx.saved_tensors
+        return (g_loss * gradient, *[None] * 6)

@@ -1,0 +1,121 @@
+"""AquaFlow, the algorithm: frames in, poses and maps out. No files, no threads, no clocks."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+
+from aquaflow.config import Config
+from aquaflow.keyframes import KeyframeStore
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.views import View
+from aquaflow.messages import Frame
+from aquaflow.prior.classical import ClassicalPrior
+from aquaflow.profiler import Profiler
+from aquaflow.render import select_renderer
+from aquaflow.tracking.tracker import FrameClass, Tracked, Tracker
+
+
+class Slam:
+    """One dive: a tracker, its keyframes, and a map for every sub-map."""
+
+    def __init__(self, config: Config, profiler: Profiler | None = None) -> None:
+        self.config = config
+        self.profiler = profiler or Profiler()
+        self.prior = ClassicalPrior()
+        self.keyframes = KeyframeStore()
+        self.tracker = Tracker(self.prior, self.keyframes, config.tracking)
+        self.renderer = select_renderer(config.mapping.renderer, config.threads or os.cpu_count())
+        self.mappers: dict[int, Mapper] = {}
+        self.held_out: dict[int, list[View]] = {}
+        """Per sub-map, the views that were tracked but never mapped."""
+        self._sequence: dict[int, int] = {}
+        self._keyframe_views: dict[int, View] = {}
+
+    def process(self, frame: Frame) -> list[Tracked]:
+        """Everything the paper does with one frame; returns the frames whose fate it decided."""
+        self._sequence[frame.index] = len(self._sequence)
+
+        # Sec. 3.1 and 3.2: two-view prior, Sim(3) pose against the keyframe, frame class.
+        with self.profiler.stage("track"):
+            decided = self.tracker.track(frame)
+
+        # Sec. 3.3 and 3.4: grow and optimise the map.
+        for tracked in decided:
+            self._map(tracked)
+        return decided
+
+    def finish(self, progress: Callable[[int, int], None] | None = None) -> list[Tracked]:
+        """After the last frame: what is still undecided, the last keyframes, the refinement."""
+        with self.profiler.stage("track"):
+            decided = self.tracker.finish()
+        for tracked in decided:
+            self._map(tracked)
+        for number, view in self._keyframe_views.items():
+            self._insert(self.keyframes[number].sub_map, view, number)
+        self._keyframe_views.clear()
+        with self.profiler.stage("refine"):
+            for mapper in self.mappers.values():
+                mapper.refine(progress)
+        return decided
+
+    def _map(self, tracked: Tracked) -> None:
+        if tracked.T_wc is None or not self.config.mapping.enabled:
+            return
+        view = self._view(tracked)
+        if self.is_held_out(tracked.frame):
+            self.held_out.setdefault(tracked.sub_map, []).append(view)
+            return
+        mapper = self._mapper(tracked.sub_map)
+        mapper.add_view(view)
+
+        # Sec. 3.3.3: medium-guided insertion, from this frame and from the keyframe it retires,
+        # whose pointmap has been fused over its whole life.
+        if tracked.frame_class is FrameClass.KEYFRAME:
+            for number, retired in self._keyframe_views.items():
+                self._insert(self.keyframes[number].sub_map, retired, number)
+            assert tracked.keyframe is not None
+            self._keyframe_views = {tracked.keyframe: view}
+        if tracked.pointmap is not None:
+            with self.profiler.stage("insert"):
+                mapper.insert(view, tracked.pointmap)
+
+        # Sec. 3.4: joint optimisation of Gaussians and water.
+        with self.profiler.stage("optimise"):
+            mapper.optimise(self._steps(tracked.frame_class))
+
+    def is_held_out(self, frame: Frame) -> bool:
+        """i % n == 0 and i != 0, i counting the frames that were used (DESIGN section 4)."""
+        every, i = self.config.mapping.hold_out_every, self._sequence[frame.index]
+        return every > 0 and i != 0 and i % every == 0
+
+    def _insert(self, sub_map: int, view: View, keyframe: int) -> None:
+        with self.profiler.stage("insert"):
+            self._mapper(sub_map).insert(view, self.keyframes[keyframe].pointmap)
+
+    def _mapper(self, sub_map: int) -> Mapper:
+        if sub_map not in self.mappers:
+            seed = self.config.seed + sub_map
+            self.mappers[sub_map] = Mapper(self.config.mapping, self.renderer, seed)
+        return self.mappers[sub_map]
+
+    def _steps(self, frame_class: FrameClass) -> int:
+        optimiser = self.config.mapping.optimiser
+        return {
+            FrameClass.KEYFRAME: optimiser.steps_keyframe,
+            FrameClass.MAPPING: optimiser.steps_mapping,
+        }.get(frame_class, optimiser.steps_common)
+
+    def _view(self, tracked: Tracked) -> View:
+        assert tracked.T_wc is not None and tracked.keyframe is not None
+        camera = self.tracker.camera or tracked.frame.camera
+        return View(
+            tracked.frame.index,
+            tracked.frame.image,
+            camera,
+            replace(tracked.T_wc),
+            tracked.keyframe,
+            robust=tracked.frame_class is FrameClass.COMMON,
+            mask=tracked.frame.mask,
+        )
