@@ -78,17 +78,16 @@ def examine_held_out(slam: Slam, sub_map: int) -> list[HeldOut]:
     mapper = slam.mappers.get(sub_map)
     if mapper is None or len(mapper.gaussians) == 0:
         return []
-    network, _ = lpips_network()
-    return [_examine(mapper, view, network) for view in slam.held_out.get(sub_map, [])]
+    return [_examine(mapper, view) for view in slam.held_out.get(sub_map, [])]
 
 
-def _examine(mapper: Mapper, view: View, network: Any) -> HeldOut:
+def _examine(mapper: Mapper, view: View) -> HeldOut:
     mapper.register(view)
     shown = mapper.show(view)
     real = view.target().numpy()
     rendered = shown.image.clamp(0.0, 1.0).numpy()
     restored = to_bytes(shown.radiance.numpy()) if mapper.medium.active else None
-    perceptual = None if network is None else lpips(rendered, real, network)
+    perceptual, _ = lpips(rendered, real)
     return HeldOut(
         view.frame_index,
         view.image,

@@ -221,11 +221,13 @@ class _Replay:
 def _fix_threads(threads: int) -> None:
     """Results repeat bit for bit at a given number of threads, so it is set once and everywhere.
 
-    torch itself gets one: its OpenMP barriers cost whole scheduler quanta on a busy machine
+    torch and BLAS get one: their barriers cost whole scheduler quanta on a busy machine
     (kernel_notes.md, pitfall 4), and the heavy work runs in our own pool and in OpenCV's.
     """
     import cv2
+    from threadpoolctl import threadpool_limits
 
     torch.set_num_threads(1)
+    threadpool_limits(1, user_api="blas")  # the matrices are small: threads only wait for each other
     cv2.setNumThreads(threads)
     cv2.setRNGSeed(0)

@@ -48,17 +48,16 @@ def triangulate(
     rays_b = camera_b.unproject(pixels_b)
     a_in_b = rays_a @ T_ba.R.T
     # x_b ~ z_a a_in_b + t  =>  x_b x (z_a a_in_b + t) = 0, solved for z_a by least squares.
-    c = np.cross(rays_b, a_in_b)
-    d = np.cross(rays_b, np.broadcast_to(T_ba.t, rays_b.shape))
-    z = -(c * d).sum(1) / np.maximum((c * c).sum(1), 1e-18)
+    c = _cross_unit_depth(rays_b, a_in_b)
+    d = _cross_unit_depth(rays_b, T_ba.t)
+    z = -_dot(c, d) / np.maximum(_dot(c, c), 1e-18)
     z_safe = np.maximum(z, 1e-6)
 
     in_b = z_safe[:, None] * a_in_b + T_ba.t
     centre_b_in_a = -(T_ba.R.T @ T_ba.t)
     from_b = rays_a * z_safe[:, None] - centre_b_in_a
-    sine = np.linalg.norm(np.cross(rays_a, from_b), axis=1)
-    cosine = (rays_a * from_b).sum(1)
-    parallax = np.arctan2(sine, cosine)
+    across = _cross_unit_depth(rays_a, from_b)
+    parallax = np.arctan2(np.sqrt(_dot(across, across)), _dot(rays_a, from_b))
 
     error = np.linalg.norm(camera_b.project(in_b) - pixels_b, axis=1)
     good = (z > 1e-3) & (in_b[:, 2] > 1e-3) & (error < MAX_REPROJECTION_PX)
@@ -66,3 +65,17 @@ def triangulate(
     rho = 1.0 / z_safe
     sigma = (sigma_px / camera_b.fx) * rho / np.maximum(np.sin(parallax), 1e-6)
     return Triangulation(rho, sigma**2, good, parallax)
+
+
+def _cross_unit_depth(
+    x: Array,  # [M, 3] with z = 1
+    y: Array,  # [M, 3] or [3]
+) -> Array:
+    """x cross y [M, 3]; several times faster than numpy's general one."""
+    y0, y1, y2 = y[..., 0], y[..., 1], y[..., 2]
+    return np.stack([x[:, 1] * y2 - y1, y0 - x[:, 0] * y2, x[:, 0] * y1 - x[:, 1] * y0], -1)
+
+
+def _dot(x: Array, y: Array) -> Array:
+    """[M] inner products of rows."""
+    return np.einsum("ij,ij->i", x, y)

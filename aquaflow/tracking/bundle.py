@@ -109,44 +109,52 @@ class _System:
 
     def _blocks(self, bundle: Bundle) -> tuple[Array, Array, Array, Array, Array]:
         """H_cc, H_cp, H_pp (diagonal), g_c, g_p for cameras (6 each, then log-focal) and points."""
-        camera = bundle.camera
         error, Y, rays = self.residuals(bundle)
         views, count = self.observed.shape
-        size = np.linalg.norm(error, axis=-1)
-        weight = np.where(size < HUBER_PX, 1.0, HUBER_PX / np.maximum(size, 1e-12))
-        weight = np.where(self.observed & (Y[..., 2] > 1e-3), weight, 0.0)
-        iz = 1.0 / np.maximum(Y[..., 2], 1e-3)
-        P = np.zeros((views, count, 2, 3))
-        P[..., 0, 0], P[..., 1, 1] = camera.fx * iz, camera.fy * iz
-        P[..., 0, 2] = -camera.fx * Y[..., 0] * iz**2
-        P[..., 1, 2] = -camera.fy * Y[..., 1] * iz**2
-        size_c = 6 * views + int(self.solve_focal)
-        Jc = np.zeros((views, count, 2, size_c))
-        Jp = np.zeros((views, count, 2))
-        for v, T in enumerate(bundle.T):
-            Jc[v, :, :, 6 * v : 6 * v + 3] = P[v] * bundle.rho[:, None, None]
-            Jc[v, :, :, 6 * v + 3 : 6 * v + 6] = -P[v] @ hat(Y[v])
-            Jp[v] = P[v] @ T.t
+        size = 6 * views + int(self.solve_focal)
+        H_cc, H_cp, H_pp = np.zeros((size, size)), np.zeros((size, count)), np.zeros(count)
+        g_c, g_p = np.zeros(size), np.zeros(count)
+        for v in range(views):
+            weight = _huber_weight(error[v]) * (self.observed[v] & (Y[v, :, 2] > 1e-3))
+            Jc, Jp = self._jacobians(bundle, v, Y[v], rays)
+            # A view touches its own six columns and, at the end, the focal length.
+            columns = np.arange(6 * v, 6 * v + 6)
             if self.solve_focal:
-                # f scales the projection, and the reference rays shrink as 1 / f.
-                image = np.stack([camera.fx * Y[v, :, 0], camera.fy * Y[v, :, 1]], -1)
-                lateral = rays * np.array([1.0, 1.0, 0.0])
-                moved = np.einsum("nij,nj->ni", P[v], -(lateral @ T.R.T))
-                Jc[v, :, :, -1] = image * iz[v][:, None] + moved
-        wJc = Jc * weight[..., None, None]
-        H_cc = np.einsum("vpik,vpil->kl", wJc, Jc, optimize=True)
-        H_cp = np.einsum("vpik,vpi->kp", wJc, Jp, optimize=True)
-        H_pp = np.einsum("vp,vpi,vpi->p", weight, Jp, Jp, optimize=True)
-        g_c = np.einsum("vpik,vpi->k", wJc, error, optimize=True)
-        g_p = np.einsum("vp,vpi,vpi->p", weight, Jp, error, optimize=True)
+                columns = np.append(columns, size - 1)
+            wJc, wJp = Jc * weight[:, None, None], Jp * weight[:, None]
+            flat, k = Jc.reshape(2 * count, -1), len(columns)
+            H_cc[np.ix_(columns, columns)] += wJc.reshape(2 * count, k).T @ flat
+            H_cp[columns] += np.einsum("pik,pi->kp", wJc, Jp)
+            H_pp += (wJp * Jp).sum(1)
+            g_c[columns] += wJc.reshape(2 * count, k).T @ error[v].reshape(-1)
+            g_p += (wJp * error[v]).sum(1)
         return H_cc, H_cp, H_pp, g_c, g_p
+
+    def _jacobians(
+        self, bundle: Bundle, v: int, Y: Array, rays: Array
+    ) -> tuple[Array, Array]:
+        """d error / d camera [P, 2, 6 or 7] and d error / d rho [P, 2] of view ``v``."""
+        camera, T = bundle.camera, bundle.T[v]
+        iz = 1.0 / np.maximum(Y[:, 2], 1e-3)
+        P = np.zeros((len(Y), 2, 3))
+        P[:, 0, 0], P[:, 1, 1] = camera.fx * iz, camera.fy * iz
+        P[:, 0, 2] = -camera.fx * Y[:, 0] * iz**2
+        P[:, 1, 2] = -camera.fy * Y[:, 1] * iz**2
+        parts = [P * bundle.rho[:, None, None], -P @ hat(Y)]
+        if self.solve_focal:
+            # f scales the projection, and the reference rays shrink as 1 / f.
+            image = np.stack([camera.fx * Y[:, 0], camera.fy * Y[:, 1]], -1) * iz[:, None]
+            lateral = rays * np.array([1.0, 1.0, 0.0])
+            moved = np.einsum("nij,nj->ni", P, -(lateral @ T.R.T))
+            parts.append((image + moved)[..., None])
+        return np.concatenate(parts, axis=2), P @ T.t
 
     def step(self, bundle: Bundle, damping: float) -> Bundle:
         H_cc, H_cp, H_pp, g_c, g_p = self._blocks(bundle)
         pp = H_pp * (1.0 + damping) + 1e-6
-        cc = H_cc + damping * np.diag(np.diag(H_cc)) + 1e-9 * np.eye(len(H_cc))
+        cc = H_cc + damping * np.diag(np.diag(H_cc)) + 1e-6 * np.eye(len(H_cc))
         S = cc - (H_cp / pp) @ H_cp.T
-        dc = -np.linalg.lstsq(S, g_c - (H_cp / pp) @ g_p, rcond=None)[0]
+        dc = -np.linalg.solve(S, g_c - (H_cp / pp) @ g_p)
         dp = -(g_p + H_cp.T @ dc) / pp
         views = []
         for v, T in enumerate(bundle.T):
@@ -169,3 +177,10 @@ class _System:
             focal_sigma = sigma_px * float(np.sqrt(max(variance, 0.0)))
         rho_sigma = sigma_px / np.sqrt(np.maximum(H_pp, 1e-12))
         return BundleResult(bundle, sigma_px, rho_sigma, focal_sigma)
+
+
+def _huber_weight(
+    error: Array,  # [P, 2] px
+) -> Array:
+    size = np.linalg.norm(error, axis=-1)
+    return np.where(size < HUBER_PX, 1.0, HUBER_PX / np.maximum(size, 1e-12))

@@ -329,5 +329,6 @@ def _matched_share(encoding: Encoding, pair: PairGeometry) -> float:
     looked_at = encoding.interesting
     matched = looked_at & pair.valid
     targets = np.floor(pair.matches[matched]).astype(np.int64)
-    distinct = len(np.unique(targets[:, 1] * encoding.camera.width + targets[:, 0]))
-    return min(int(matched.sum()), distinct) / max(int(looked_at.sum()), 1)
+    hit = np.zeros_like(looked_at)
+    hit[targets[:, 1], targets[:, 0]] = True
+    return min(int(matched.sum()), int(hit.sum())) / max(int(looked_at.sum()), 1)

@@ -1,0 +1,1 @@
+"""How well a dive was mapped: trajectory, picture and water errors against ground truth."""

@@ -1,0 +1,1 @@
+"""What others read: PLY maps, TUM trajectories, the report."""

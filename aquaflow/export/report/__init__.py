@@ -1,0 +1,20 @@
+"""``report.html``: one file that explains a dive and opens without a network."""
+
+from aquaflow.export.report.data import (
+    CameraSummary,
+    HeldOutExample,
+    MediumCurves,
+    PathPlot,
+    ReportData,
+)
+from aquaflow.export.report.page import render_report, write_report
+
+__all__ = [
+    "CameraSummary",
+    "HeldOutExample",
+    "MediumCurves",
+    "PathPlot",
+    "ReportData",
+    "render_report",
+    "write_report",
+]

@@ -1,0 +1,97 @@
+"""What a report is made of: values only, so that it can be built again from a dive folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+FocalSource = Literal["calibrated", "guessed", "refined"]
+
+Rgb = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class CameraSummary:
+    """The camera in the units of a data sheet."""
+
+    width: int
+    height: int
+    """Pixels of the recording."""
+    focal_px: float
+    focal_source: FocalSource
+    """``refined``: guessed at first, then estimated from the dive."""
+    distortion_model: str = "none"
+
+
+@dataclass(frozen=True)
+class PathPlot:
+    """The camera's path."""
+
+    positions: npt.NDArray[np.floating]
+    """[M, 3] camera centres, world."""
+    classes: list[str]
+    """[M] ``keyframe``, ``mapping``, ``common`` or ``skipped``."""
+    sub_maps: list[int]
+    """[M] sub-map of each pose; poses of different sub-maps share no frame of reference."""
+    unit: str = "map units"
+    """``m`` where the scale is known."""
+    truth: npt.NDArray[np.floating] | None = None
+    """[K, 3] true positions, already aligned to the map's world."""
+
+
+@dataclass(frozen=True)
+class HeldOutExample:
+    """A frame that the mapper never saw, and what the map shows from there."""
+
+    caption: str
+    """The frame's name."""
+    real: npt.NDArray[np.uint8]
+    """[H, W, 3] RGB, as all three pictures."""
+    rendered: npt.NDArray[np.uint8]
+    restored: npt.NDArray[np.uint8] | None = None
+    """Without water; None if the medium is off."""
+    psnr: float | None = None
+    """dB."""
+    ssim: float | None = None
+
+
+@dataclass(frozen=True)
+class MediumCurves:
+    """Water, mean over the dive: I = J exp(-beta z) + B_inf (1 - exp(-b z)) + B_res exp(-d z)."""
+
+    beta: Rgb
+    b: Rgb
+    B_inf: Rgb
+    B_res: Rgb
+    d: Rgb
+    range_p5: float
+    range_p95: float
+    """Span of ranges z that the dive saw; outside it the curves are extrapolated."""
+    unit: str = "map units"
+    """Unit of z; beta, b and d are per unit."""
+
+
+@dataclass(frozen=True)
+class ReportData:
+    """Everything that the report shows; empty parts are left out of it."""
+
+    name: str
+    camera: CameraSummary
+    metrics: Mapping[str, Any]
+    """``metrics.json``."""
+    path: PathPlot | None = None
+    timeline: list[str] = field(default_factory=list)
+    """Class of every frame in order, also ``skipped``, ``lost`` and ``dropped``."""
+    examples: list[HeldOutExample] = field(default_factory=list)
+    medium: MediumCurves | None = None
+    """None if the medium is off."""
+    stages: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Stage -> ``count``, ``total``, ``p50``, ``p95``; times in ms."""
+    notes: list[str] = field(default_factory=list)
+    """Sentences about what went wrong or was left out."""
+    written: str = ""
+    """Date for the footer; empty, by default, so that the same dive gives the same bytes."""

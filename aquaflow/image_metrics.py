@@ -1,0 +1,99 @@
+"""Picture quality: PSNR, SSIM, LPIPS and, for restored colours, PSNR after a gain per channel."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Image = npt.NDArray[np.floating]
+Mask = npt.NDArray[np.bool_]
+
+PSNR_LIMIT_DB = 100.0
+"""Reported for equal pictures, whose PSNR is infinite and has no JSON number."""
+
+LPIPS_BACKBONE = "vgg16-397923af.pth"
+"""The file that torchvision keeps in torch's hub folder."""
+
+
+def psnr(
+    image: Image,  # [H, W, 3] in [0, 1]
+    reference: Image,  # [H, W, 3] in [0, 1]
+    mask: Mask | None = None,  # [H, W], True where the pixel counts
+) -> float:
+    """Peak signal-to-noise ratio in dB, at most ``PSNR_LIMIT_DB``; zero counted pixels give 0."""
+    difference = (image.astype(np.float64) - reference.astype(np.float64)) ** 2
+    counted = difference if mask is None else difference[mask]
+    if counted.size == 0:
+        return 0.0
+    error = max(float(counted.mean()), 10.0 ** (-PSNR_LIMIT_DB / 10.0))
+    return -10.0 * float(np.log10(error))
+
+
+def psnr_after_gain(
+    image: Image,  # [H, W, 3] in [0, 1]
+    reference: Image,  # [H, W, 3] in [0, 1]
+    mask: Mask | None = None,  # [H, W]
+) -> float:
+    """PSNR once each channel has its own least-squares gain.
+
+    The brightness and white balance of a picture without water are a convention; what remains
+    after one gain per channel is the error of the restoration.
+    """
+    x = image.astype(np.float64)
+    counted = slice(None) if mask is None else mask
+    xs, ys = x[counted].reshape(-1, 3), reference.astype(np.float64)[counted].reshape(-1, 3)
+    energy = (xs * xs).sum(axis=0)
+    gain = (xs * ys).sum(axis=0) / np.maximum(energy, np.finfo(np.float64).tiny)
+    return psnr(np.clip(x * gain, 0.0, 1.0), reference, mask)
+
+
+def ssim(
+    image: Image,  # [H, W, 3] in [0, 1]
+    reference: Image,  # [H, W, 3] in [0, 1]
+) -> float:
+    """Structural similarity as the mapper's loss defines it: 11 x 11 Gaussian, zeros outside."""
+    import torch
+
+    from aquaflow.render.photometric import ssim as similarity
+
+    x, y = (torch.from_numpy(picture.astype(np.float64)) for picture in (image, reference))
+    return float(similarity(x, y))
+
+
+def lpips(
+    image: Image,  # [H, W, 3] in [0, 1]
+    reference: Image,  # [H, W, 3] in [0, 1]
+) -> tuple[float | None, str | None]:
+    """LPIPS (VGG) and None, or None and the reason why it cannot be measured here.
+
+    Nothing is downloaded: a vehicle's computer has no network, and a metric must not need one.
+    """
+    network, reason = lpips_network()
+    if network is None:
+        return None, reason
+    import torch
+
+    def tensor(picture: Image) -> torch.Tensor:  # [1, 3, H, W] in [-1, 1]
+        return torch.from_numpy(picture.astype(np.float32)).permute(2, 0, 1)[None] * 2.0 - 1.0
+
+    with torch.no_grad():
+        return float(network(tensor(image), tensor(reference))), None
+
+
+@functools.lru_cache(maxsize=1)
+def lpips_network() -> tuple[Any | None, str | None]:
+    """The LPIPS network and None, or None and the reason why there is none."""
+    try:
+        import lpips as package  # type: ignore[import-not-found]
+    except ImportError:
+        return None, "the Python package 'lpips' is not installed"
+    import torch
+
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / LPIPS_BACKBONE
+    if not weights.is_file():
+        return None, f"the VGG weights of LPIPS are not at {weights}"
+    return package.LPIPS(net="vgg", verbose=False).eval(), None

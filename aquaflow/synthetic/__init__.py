@@ -1,0 +1,42 @@
+"""Synthetic dives: a procedural sea floor seen through known water, with the truth about it all.
+
+Names are loaded when first used, so that importing the config costs neither torch nor OpenCV.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from aquaflow.synthetic.config import SyntheticConfig
+    from aquaflow.synthetic.dive import write_dive
+    from aquaflow.synthetic.telemetry import read_telemetry
+    from aquaflow.synthetic.truth import Truth, read_truth
+    from aquaflow.synthetic.water import WATER_TYPES, Medium
+
+__all__ = [
+    "WATER_TYPES",
+    "Medium",
+    "SyntheticConfig",
+    "Truth",
+    "read_telemetry",
+    "read_truth",
+    "write_dive",
+]
+
+_HOMES = {
+    "Medium": "water",
+    "SyntheticConfig": "config",
+    "Truth": "truth",
+    "WATER_TYPES": "water",
+    "read_telemetry": "telemetry",
+    "read_truth": "truth",
+    "write_dive": "dive",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -1,0 +1,108 @@
+"""What a synthetic dive is made from: every setting with its unit and where its default is from."""
+
+from __future__ import annotations
+
+from typing import Literal, TypeAlias
+
+from pydantic import BaseModel, ConfigDict, Field
+
+__all__ = ["SceneKind", "SyntheticConfig", "TelemetryNoise", "WaterType"]
+
+SceneKind: TypeAlias = Literal["reef", "flat_sand", "wall", "pipe"]
+WaterType: TypeAlias = Literal[
+    "clear", "oceanic_IB", "oceanic_II", "coastal_1C", "coastal_3C", "coastal_5C"
+]
+
+
+class TelemetryNoise(BaseModel):
+    """Rates and one-sigma white noise of the simulated instruments."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    depth_hz: float = Field(10.0, gt=0, description="Hz; Bar30-class depth cell over MAVLink")
+    depth_sigma_m: float = Field(0.01, ge=0, description="m; Bar30 short-term noise is about 1 cm")
+    attitude_hz: float = Field(20.0, gt=0, description="Hz; ATTITUDE stream of an autopilot")
+    attitude_sigma_deg: float = Field(
+        0.5, ge=0, description="degrees per body axis; typical MEMS AHRS in motion"
+    )
+    rate_hz: float = Field(50.0, gt=0, description="Hz; raw gyro stream of an autopilot")
+    rate_sigma_rad_s: float = Field(
+        0.002, ge=0, description="rad/s; 0.01 deg/s/sqrt(Hz) MEMS gyro over 50 Hz, rounded up"
+    )
+    dvl_hz: float = Field(5.0, gt=0, description="Hz; DVL-A50-class, 4 to 15 Hz with altitude")
+    dvl_sigma_m_s: float = Field(
+        0.01, ge=0, description="m/s per axis, also reported as the figure of merit"
+    )
+    latency_s: float = Field(0.03, ge=0, description="s; mean delay from measurement to arrival")
+
+
+class SyntheticConfig(BaseModel):
+    """One synthetic dive; the same config gives the same files, byte for byte."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    seed: int = Field(0, ge=0, description="of every random draw in the dive")
+    frames: int = Field(90, ge=2, le=5000, description="pictures; 9 s at 10 fps closes one loop")
+    width: int = Field(480, ge=32, le=4096, description="px")
+    height: int = Field(360, ge=24, le=4096, description="px")
+    fps: float = Field(10.0, gt=0, description="pictures per second")
+    focal_widths: float = Field(
+        0.85,
+        gt=0.3,
+        le=3.0,
+        description="focal length / width; geometric mean of the shared clips (geometry.camera)",
+    )
+    scene: SceneKind = Field("reef", description="what the sea floor is made of")
+    water: WaterType = Field(
+        "coastal_1C", description="row of water.WATER_TYPES; blue-green, visibility about 8 m"
+    )
+    supersampling: int = Field(2, ge=1, le=4, description="rays per pixel and axis; 2 is 4 rays")
+    speed_m_s: float = Field(
+        0.6,
+        gt=0,
+        le=3.0,
+        description="m/s over ground; with 10 fps, 6 to 20 px a picture at 480 px width",
+    )
+    altitude_m: float = Field(
+        1.45, gt=0.5, le=20.0, description="m above the smoothed relief; ROV survey height"
+    )
+    altitude_swing_m: float = Field(
+        0.35, ge=0, description="m, amplitude: lowest at the far end of each lane"
+    )
+    camera_pitch_deg: float = Field(
+        42.0,
+        ge=25,
+        le=90,
+        description="degrees below the horizon; oblique, so that ranges span 1:3 in a picture",
+    )
+    lane_spacing_m: float = Field(0.6, gt=0, description="m; half a footprint at 1.5 m altitude")
+    lane_length_m: float = Field(4.0, gt=0, description="m, longest lane before one is added")
+    roll_deg: float = Field(3.0, ge=0, le=20, description="degrees, sway amplitude of an ROV")
+    pitch_deg: float = Field(3.0, ge=0, le=20, description="degrees, sway amplitude of an ROV")
+    yaw_deg: float = Field(8.0, ge=0, le=60, description="degrees, heading-hold wander")
+    floor_depth_m: float = Field(12.0, gt=3, description="m below the surface, mean sea floor")
+    max_range_m: float = Field(
+        14.0,
+        gt=2,
+        le=40,
+        description="m; in the default water under 3 % of any channel gets further",
+    )
+    snow_per_m3: float = Field(
+        40.0, ge=0, le=2000, description="particles per m3 large enough to see; 0 is none"
+    )
+    vignette: float = Field(
+        0.2, ge=0, lt=1, description="fraction of light that is missing in the corners"
+    )
+    noise_sigma: float = Field(
+        0.005, ge=0, le=0.2, description="sensor noise, of full scale; 1.3 grey levels"
+    )
+    telemetry: TelemetryNoise = TelemetryNoise.model_validate({})
+
+    @property
+    def duration_s(self) -> float:
+        """Time to travel the whole loop; the frame after the last would be the first again."""
+        return self.frames / self.fps
+
+    @property
+    def focal_px(self) -> float:
+        return self.focal_widths * self.width

@@ -1,0 +1,162 @@
+"""Relief of the sea floor: a height map of real shapes, with the colours that go with them.
+
+Heights are metres upward from the mean floor, on a grid of cells whose centres lie at
+``origin + (index + 0.5) * cell`` in the survey frame (x along columns, y along rows).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
+
+from aquaflow.synthetic import stamps
+from aquaflow.synthetic.config import SceneKind
+from aquaflow.synthetic.noise import FloatMap, fractal, smoothstep
+
+__all__ = ["Area", "Relief", "build_relief"]
+
+Array: TypeAlias = npt.NDArray[np.float64]
+
+SIZE_MULTIPLE = 16
+"""Rows and columns are multiples of this, so that five mip levels of the texture divide evenly."""
+
+
+@dataclass(frozen=True)
+class Area:
+    """The rectangle of sea floor that a dive sees."""
+
+    x0: float
+    y0: float
+    cell: float
+    """m"""
+    shape: tuple[int, int]
+    """Rows (y), columns (x)."""
+
+    @classmethod
+    def around(cls, low: Array, high: Array, cell: float) -> Area:
+        """The area from ``low`` to ``high`` ([2] m), rounded up."""
+        count = [
+            SIZE_MULTIPLE * math.ceil((high[k] - low[k]) / (cell * SIZE_MULTIPLE)) for k in (1, 0)
+        ]
+        return cls(float(low[0]), float(low[1]), cell, (count[0], count[1]))
+
+    def sample(self, values: FloatMap, xy: Array) -> Array:
+        """Bilinear ``values`` at points [N, 2] (m), clamped to the area."""
+        at = [(xy[:, 1] - self.y0) / self.cell - 0.5, (xy[:, 0] - self.x0) / self.cell - 0.5]
+        return np.asarray(map_coordinates(values, at, order=1, mode="nearest"), np.float64)
+
+
+@dataclass
+class Relief:
+    """Height and what covers it."""
+
+    area: Area
+    height: FloatMap
+    """[H, W] m, up."""
+    tint: FloatMap
+    """[H, W, 3] albedo of stamped things."""
+    cover: FloatMap
+    """[H, W] 0 (sediment) to 1 (rock, coral)."""
+
+
+def build_relief(
+    kind: SceneKind,
+    area: Area,
+    loop: Array,  # [N, 2] m, the vehicle's way, kept clear of tall things
+    rng: np.random.Generator,
+) -> Relief:
+    """The relief of one scene."""
+    base = _BASES[kind](rng, area)
+    relief = Relief(
+        area, base, np.full((*area.shape, 3), 0.4, np.float32), np.zeros(area.shape, np.float32)
+    )
+    plan = _PLANS[kind]
+    rough = fractal(rng, area.shape, area.cell, 0.5, 0.03, 0.15)
+    if plan.rock_cover > 0.0:
+        patch = fractal(rng, area.shape, area.cell, 3.0, 0.1, 0.3)
+        relief.cover[:] = smoothstep(patch, plan.rock_level - 0.25, plan.rock_level + 0.25)
+        relief.cover *= np.float32(plan.rock_cover)
+        relief.height += relief.cover * (0.10 + 0.03 * rough)
+        stone = np.array([0.50, 0.45, 0.38], np.float32)
+        relief.tint[:] = stone * (1.0 + 0.12 * rough[..., None])
+    clear = cKDTree(loop)
+    for maker, per_m2 in plan.stamps:
+        count = rng.poisson(per_m2 * area.cell**2 * area.shape[0] * area.shape[1])
+        stamps.scatter(relief, maker, int(count), rng, rough, clear)
+    return relief
+
+
+def _reef(rng: np.random.Generator, area: Area) -> FloatMap:
+    hills = fractal(rng, area.shape, area.cell, 4.5, 0.3, 0.15)
+    ridges = 1.0 - np.abs(fractal(rng, area.shape, area.cell, 2.4, 0.1, 0.2))
+    fine = fractal(rng, area.shape, area.cell, 0.6, 0.03, 0.2)
+    return np.asarray(0.14 * hills + 0.10 * ridges + 0.015 * fine, np.float32)
+
+
+def _sand(rng: np.random.Generator, area: Area) -> FloatMap:
+    """Ripples whose crests wander and fork, on low dunes."""
+    rows, columns = area.shape
+    y, x = np.mgrid[0:rows, 0:columns].astype(np.float32) * np.float32(area.cell)
+    bend = fractal(rng, area.shape, area.cell, 2.5, 0.3, 0.2)
+    strength = smoothstep(fractal(rng, area.shape, area.cell, 3.0, 0.5, 0.2), -1.2, 0.6)
+    phase = 2.0 * math.pi * ((0.93 * x + 0.36 * y) / 0.17 + 0.9 * bend)
+    # A ripple's crest is sharper than its trough.
+    ripple = 1.0 - 2.0 * np.abs(np.sin(0.5 * phase)) ** 0.8
+    dunes = fractal(rng, area.shape, area.cell, 5.0, 0.6, 0.1)
+    fine = fractal(rng, area.shape, area.cell, 0.3, 0.02, 0.3)
+    return np.asarray(0.05 * dunes + 0.011 * strength * ripple + 0.003 * fine, np.float32)
+
+
+def _wall(rng: np.random.Generator, area: Area) -> FloatMap:
+    """Ledges across the climb, on rough rock."""
+    hills = fractal(rng, area.shape, area.cell, 3.5, 0.3, 0.2)
+    x = np.arange(area.shape[1], dtype=np.float32) * np.float32(area.cell)
+    bedding = x[None, :] / 0.8 + 0.5 * fractal(rng, area.shape, area.cell, 3.0, 0.2, 0.3)
+    step = bedding - np.floor(bedding)
+    ledge = np.where(step < 0.85, step / 0.85, (1.0 - step) / 0.15)
+    fine = fractal(rng, area.shape, area.cell, 0.7, 0.03, 0.25)
+    return np.asarray(0.15 * hills + 0.16 * ledge + 0.025 * fine, np.float32)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    rock_cover: float
+    rock_level: float
+    """Threshold, in sigmas of the patch noise, above which there is rock."""
+    stamps: tuple[tuple[stamps.Maker, float], ...]
+    """What is scattered, and how many per square metre."""
+
+
+_BASES = {"reef": _reef, "flat_sand": _sand, "wall": _wall, "pipe": _sand}
+_PLANS = {
+    "reef": _Plan(
+        1.0,
+        -0.1,
+        (
+            (stamps.boulder, 0.9),
+            (stamps.brain_coral, 0.45),
+            (stamps.table_coral, 0.2),
+            (stamps.branching_coral, 0.6),
+            (stamps.sponge, 0.4),
+            (stamps.pebble, 10.0),
+        ),
+    ),
+    "flat_sand": _Plan(0.0, 0.0, ((stamps.boulder, 0.03), (stamps.pebble, 6.0))),
+    "wall": _Plan(
+        1.0,
+        -3.0,
+        (
+            (stamps.boulder, 0.6),
+            (stamps.brain_coral, 0.3),
+            (stamps.branching_coral, 0.8),
+            (stamps.sponge, 1.2),
+        ),
+    ),
+    "pipe": _Plan(0.0, 0.0, ((stamps.boulder, 0.12), (stamps.sponge, 0.1), (stamps.pebble, 7.0))),
+}

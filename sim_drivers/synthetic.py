@@ -1,0 +1,34 @@
+"""A synthetic dive as a camera, with the truth that it was rendered from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sim_drivers.images import SUBFOLDER, ImageFolder
+
+MARK = "synth.yaml"
+"""Only ``aquaflow synth`` writes this file."""
+
+
+class SyntheticDive(ImageFolder):
+    """A folder that ``aquaflow synth`` wrote: pictures, calibration and ground truth."""
+
+    specificity = 2
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        return (path / MARK).is_file() and (path / SUBFOLDER).is_dir()
+
+    @classmethod
+    def open(cls, path: Path, fps: float | None = None) -> SyntheticDive:
+        return cls(path, fps)
+
+    @property
+    def poses_path(self) -> Path:
+        """True camera poses, TUM, metres."""
+        return self.folder / "poses.tum"
+
+    @property
+    def medium_path(self) -> Path:
+        """True water, rates per metre."""
+        return self.folder / "medium.yaml"

@@ -1,0 +1,168 @@
+"""Rectification: points land where the distortion model says, and no border is black."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from aquaflow.errors import ConfigError
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.rectification import Rectifier, undistort_points
+
+Array = npt.NDArray[np.float64]
+
+RADTAN = CameraModel(
+    320, 240, 260.0, 262.0, 157.0, 123.0,
+    distortion_model="radtan",
+    distortion=(-0.25, 0.06, 0.001, -0.002),
+)
+FISHEYE = CameraModel(
+    320, 240, 200.0, 201.0, 163.0, 118.0,
+    distortion_model="fisheye",
+    distortion=(0.05, -0.01, 0.002, 0.0),
+)
+PINCUSHION = CameraModel(
+    320, 240, 260.0, 260.0, 160.0, 120.0, distortion_model="radtan", distortion=(0.2, 0.0, 0.0, 0.0)
+)
+DISTORTED = pytest.mark.parametrize(
+    "camera", [RADTAN, FISHEYE, PINCUSHION], ids=["radtan", "fisheye", "pincushion"]
+)
+
+
+def distorted(rays: Array, camera: CameraModel) -> Array:
+    """[M, 2] px of rays [M, 3] at z = 1: the model's formulas, written out."""
+    x, y = rays[:, 0], rays[:, 1]
+    r2 = x**2 + y**2
+    k = camera.distortion
+    if camera.distortion_model == "fisheye":
+        r = np.sqrt(r2)
+        theta = np.arctan(r)
+        bent = theta * (1 + sum(c * theta ** (2 * i + 2) for i, c in enumerate(k)))
+        factor = np.where(r > 1e-12, bent / np.maximum(r, 1e-12), 1.0)
+        xd, yd = x * factor, y * factor
+    else:
+        radial = 1 + k[0] * r2 + k[1] * r2**2
+        xd = x * radial + 2 * k[2] * x * y + k[3] * (r2 + 2 * x**2)
+        yd = y * radial + k[2] * (r2 + 2 * y**2) + 2 * k[3] * x * y
+    return np.stack([camera.fx * xd + camera.cx, camera.fy * yd + camera.cy], -1)
+
+
+def spots(pixels: Array, camera: CameraModel) -> npt.NDArray[np.uint8]:
+    """[H, W, 3] picture with one soft spot at each pixel position."""
+    grid = camera.pixel_centres()
+    image = np.zeros((camera.height, camera.width))
+    for pixel in pixels:
+        image += np.exp(-0.5 * ((grid - pixel) ** 2).sum(-1) / 2.0**2)
+    return np.repeat((255 * np.clip(image, 0, 1)).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def spot_at(image: npt.NDArray[np.uint8], near: Array, camera: CameraModel) -> Array:
+    """[2] px centre of gravity of the spot next to ``near``."""
+    grid = camera.pixel_centres()
+    weight = image[..., 0] * (np.linalg.norm(grid - near, axis=-1) < 9.0)
+    return np.asarray((grid * weight[..., None]).sum((0, 1)) / weight.sum())
+
+
+@DISTORTED
+def test_undistorting_undoes_the_distortion_model(camera: CameraModel) -> None:
+    rng = np.random.default_rng(0)
+    rays = np.concatenate([rng.uniform(-0.4, 0.4, (50, 2)), np.ones((50, 1))], 1)
+    found = undistort_points(distorted(rays, camera), camera)
+    np.testing.assert_allclose(found, rays[:, :2], atol=2e-5)
+
+
+@DISTORTED
+def test_known_points_land_where_the_pinhole_camera_sees_them(camera: CameraModel) -> None:
+    rectifier = Rectifier(camera, camera.width)
+    pinhole = rectifier.camera
+    assert not pinhole.is_distorted
+    wanted = np.array([[60.0, 50.0], [250.0, 60.0], [160.0, 120.0], [70.0, 190.0], [260.0, 180.0]])
+    image = spots(distorted(pinhole.unproject(wanted), camera), camera)
+
+    rectified = rectifier(image)
+
+    for pixel in wanted:
+        np.testing.assert_allclose(spot_at(rectified, pixel, pinhole), pixel, atol=0.15)
+
+
+@DISTORTED
+def test_a_straight_line_of_the_world_is_straight_in_the_picture(camera: CameraModel) -> None:
+    rectifier = Rectifier(camera, camera.width)
+    pinhole = rectifier.camera
+    along = np.linspace(0.1, 0.9, 7)
+    line = np.stack([40 + 240 * along, 20 + 40 * along], -1)
+    raw = distorted(pinhole.unproject(line), camera)
+
+    rectified = rectifier(spots(raw, camera))
+    found = np.array([spot_at(rectified, pixel, pinhole) for pixel in line])
+
+    def bend(points: Array) -> float:
+        return float(np.abs(np.polyval(np.polyfit(*points.T, 1), points[:, 0]) - points[:, 1]).max())
+
+    assert bend(found) < 0.15
+    assert bend(raw) > 0.4
+
+
+@DISTORTED
+@pytest.mark.parametrize("width", [320, 200, 480])
+def test_the_rectified_picture_has_no_black_border(camera: CameraModel, width: int) -> None:
+    rectifier = Rectifier(camera, width)
+    white = np.full((camera.height, camera.width, 3), 255, np.uint8)
+    result = rectifier(white)
+    assert result.shape == (rectifier.camera.height, width, 3)
+    assert result.min() >= 253
+    assert rectifier.mask(np.ones((camera.height, camera.width), bool)).all()
+
+
+@DISTORTED
+def test_the_rectified_picture_wastes_no_edge(camera: CameraModel) -> None:
+    """Zoomed out by 3 %, the pinhole picture would reach past the distorted one."""
+    pinhole = Rectifier(camera, camera.width).camera.with_focal_scaled(0.97)
+    W, H = float(camera.width), float(camera.height)
+    along = np.linspace(0.0, 1.0, 50)[:, None]
+    edges = np.concatenate(
+        [
+            np.concatenate([along * W, 0 * along], 1),
+            np.concatenate([along * W, 0 * along + H], 1),
+            np.concatenate([0 * along, along * H], 1),
+            np.concatenate([0 * along + W, along * H], 1),
+        ]
+    )
+    source = distorted(pinhole.unproject(edges), camera)
+    assert ((source < 0.0) | (source > [W, H])).any()
+
+
+def test_a_picture_without_distortion_is_only_resized() -> None:
+    camera = CameraModel(320, 240, 260.0, 260.0, 160.0, 120.0)
+    image = np.random.default_rng(0).integers(0, 256, (240, 320, 3), dtype=np.uint8)
+    rectifier = Rectifier(camera, 160)
+    assert rectifier.camera == camera.scaled(160, 120)
+    np.testing.assert_array_equal(
+        rectifier(image), cv2.resize(image, (160, 120), interpolation=cv2.INTER_AREA)
+    )
+    np.testing.assert_array_equal(Rectifier(camera, 320)(image), image)
+
+
+def test_a_mask_is_warped_like_its_picture_and_stays_binary() -> None:
+    rectifier = Rectifier(RADTAN, RADTAN.width)
+    mask = np.zeros((RADTAN.height, RADTAN.width), bool)
+    mask[60:180, 80:200] = True
+    image = np.repeat((255 * mask.astype(np.uint8))[..., None], 3, axis=2)
+    warped = rectifier.mask(mask)
+    assert warped.dtype == np.bool_
+    differ = warped != (rectifier(image)[..., 0] > 127)
+    outline = cv2.morphologyEx(warped.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3)))
+    assert not (differ & (outline == 0)).any()
+
+
+@pytest.mark.parametrize(
+    "coefficients", [(-3.0, 0.0, 0.0, 0.0), (-8.0, 20.0, 0.0, 0.0), (0.0, 0.0, 3.0, 3.0)]
+)
+def test_a_distortion_that_folds_the_picture_is_refused(coefficients: tuple[float, ...]) -> None:
+    camera = CameraModel(
+        320, 240, 160.0, 160.0, 160.0, 120.0, distortion_model="radtan", distortion=coefficients
+    )
+    with pytest.raises(ConfigError, match="folds a 320 x 240 picture over itself"):
+        Rectifier(camera, 320)
