@@ -83,11 +83,13 @@ def map_command(
         config, {"seed": seed, "threads": threads, "source": source_settings, "mapping": mapping}
     )
     from aquaflow.geometry.camera import load_camera
-    from aquaflow.pipeline import map_recording
     from aquaflow.sources import open_recording
 
     calibration = None if calib is None else load_camera(calib)
     recording = open_recording(source, fps=settings.source.fps)
+
+    from aquaflow.pipeline import map_recording  # loads torch: after what can be refused without it
+
     with _progress(quiet=as_json) as progress:
         replayed = map_recording(
             recording, source.name, out, settings, calibration, overwrite, progress
@@ -96,7 +98,8 @@ def map_command(
         typer.echo(json.dumps({"dive": str(replayed.dive), **replayed.metrics}))
         return
     _print_summary(replayed.metrics, replayed.notes)
-    typer.echo(f"Look at {replayed.dive / 'report.html'} and {replayed.dive / 'map.ply'}.")
+    shown = [name for name in ("report.html", "map.ply") if (replayed.dive / name).exists()]
+    typer.echo(f"Look at {' and '.join(str(replayed.dive / name) for name in shown)}.")
 
 
 @app.command()
@@ -149,6 +152,7 @@ def evaluate(
     from aquaflow.errors import InputError
     from aquaflow.evaluation.protocol import evaluate_dive
     from aquaflow.evaluation.restoration import evaluate_restoration
+    from aquaflow.evaluation.summary import in_words
 
     if truth is None and clean is None:
         raise InputError("nothing to compare with: give --truth, --clean, or both")
@@ -160,7 +164,7 @@ def evaluate(
     if as_json:
         typer.echo(json.dumps(result))
     else:
-        _print_table(result)
+        typer.echo("\n".join(in_words(result)))
 
 
 @app.command()
@@ -210,7 +214,7 @@ def _merged(base: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]:
 
 @contextmanager
 def _progress(quiet: bool) -> Iterator[Any]:
-    """A function (stage, done, total) that draws one bar per stage."""
+    """A function (stage, done, total) that draws one bar per stage where somebody looks on."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -220,9 +224,10 @@ def _progress(quiet: bool) -> Iterator[Any]:
         TimeRemainingColumn,
     )
 
-    console = Console(stderr=True, quiet=quiet)
+    console = Console(stderr=True)
     columns = (TextColumn("{task.description:>8}"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, TimeRemainingColumn(), console=console) as bars:
+    hidden = quiet or not console.is_terminal
+    with Progress(*columns, TimeRemainingColumn(), console=console, disable=hidden) as bars:
         tasks: dict[str, Any] = {}
 
         def advance(stage: str, done: int, total: int | None) -> None:
@@ -245,12 +250,3 @@ def _print_summary(metrics: dict[str, Any], notes: list[str]) -> None:
     )
     for note in notes:
         typer.echo(f"Note: {note}.")
-
-
-def _print_table(values: dict[str, Any], prefix: str = "") -> None:
-    for key, value in values.items():
-        if isinstance(value, dict):
-            _print_table(value, f"{prefix}{key}.")
-        else:
-            shown = f"{value:.5g}" if isinstance(value, float) else value
-            typer.echo(f"{prefix}{key:<28} {shown}")

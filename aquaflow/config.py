@@ -100,6 +100,11 @@ class MediumConfig(Stage):
     max_gradient: float = Field(
         0.01, gt=0, description="gradient norm kept (WaterSplatting clips at 0.001)"
     )
+    first_fit_views: int = Field(
+        12, ge=2, description="views after which water is first fitted to sightings; then at every "
+        "doubling, and before refining"
+    )
+    fit_views: int = Field(20, ge=4, description="views that a fit looks at, spread over the dive")
     initial_attenuation: float = Field(
         0.1, gt=0, description="1 / map unit; the median range of the first keyframe is 1 unit"
     )

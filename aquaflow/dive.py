@@ -132,9 +132,12 @@ class DiveFolder:
             "z forward); scale: see scale_source in metrics.json",
         )
 
-    def write_camera(self, camera: CameraModel) -> None:
-        """camera.yaml: the pinhole camera of the mapped pictures."""
-        save_camera(camera, self.path / "camera.yaml")
+    def write_cameras(self, mapped: CameraModel, calibration: CameraModel | None) -> None:
+        """camera.yaml: the pinhole camera of the mapped pictures; calibration.yaml: the one that
+        they were undistorted with, where there is one."""
+        save_camera(mapped, self.path / "camera.yaml")
+        if calibration is not None:
+            save_camera(calibration, self.path / "calibration.yaml")
 
     def write_map(self, mapper: Mapper, water: WaterSummary | None, suffix: str = "") -> None:
         """map.ply as seen through water at the median range, map_clear.ply without water."""

@@ -43,12 +43,22 @@ def psnr_after_gain(
     The brightness and white balance of a picture without water are a convention; what remains
     after one gain per channel is the error of the restoration.
     """
-    x = image.astype(np.float64)
-    counted = slice(None) if mask is None else mask
-    xs, ys = x[counted].reshape(-1, 3), reference.astype(np.float64)[counted].reshape(-1, 3)
+    gain = channel_gain(image, reference, mask)
+    return psnr(np.clip(image.astype(np.float64) * gain, 0.0, 1.0), reference, mask)
+
+
+def channel_gain(
+    image: Image,  # [..., 3]
+    reference: Image,  # [..., 3]
+    mask: Mask | None = None,  # [...], True where the pixel counts
+) -> npt.NDArray[np.float64]:
+    """[3] factors on ``image`` that bring it closest to ``reference``; 0 for a black channel."""
+    counted = Ellipsis if mask is None else mask
+    xs, ys = (
+        picture.astype(np.float64)[counted].reshape(-1, 3) for picture in (image, reference)
+    )
     energy = (xs * xs).sum(axis=0)
-    gain = (xs * ys).sum(axis=0) / np.maximum(energy, np.finfo(np.float64).tiny)
-    return psnr(np.clip(x * gain, 0.0, 1.0), reference, mask)
+    return np.asarray((xs * ys).sum(axis=0) / np.maximum(energy, np.finfo(np.float64).tiny))
 
 
 def ssim(

@@ -109,7 +109,7 @@ def summarise_water(mapper: Mapper) -> WaterSummary | None:
     """Mean medium over the views and the ranges they span; None while the medium is off."""
     if not mapper.medium.active or not mapper.views or len(mapper.gaussians) == 0:
         return None
-    waters = [water for view in mapper.views if (water := mapper.water(view)) is not None]
+    waters = [water for view in mapper.views if (water := mapper.scene.water(view)) is not None]
     # Every tenth view is enough for the span of ranges.
     z = torch.cat([_solid_ranges(mapper, view) for view in mapper.views[::10]])
     if len(z) == 0:

@@ -200,7 +200,7 @@ class _Replay:
         with self.slam.profiler.stage("write"):
             self.folder.write_trajectory([times[i] for i in poses], list(poses.values()))
             assert self.slam.tracker.camera is not None
-            self.folder.write_camera(self.slam.tracker.camera)
+            self.folder.write_cameras(self.slam.tracker.camera, self.calibration)
             for sub_map, mapped in self.slam.mappers.items():
                 suffix = "" if sub_map == main else f"_{sub_map}"
                 self.folder.write_map(mapped, summarise_water(mapped), suffix)

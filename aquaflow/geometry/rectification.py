@@ -13,6 +13,9 @@ from aquaflow.geometry.camera import CameraModel
 BORDER_SAMPLES = 200
 """Points per picture edge that decide how far to zoom in."""
 
+NEWTON_ITERATIONS = 50
+MAX_UNDISTORTION_ERROR_PX = 0.01
+
 
 class Rectifier:
     """Resizes and undistorts; the result has square corners of real pixels, no black border."""
@@ -46,7 +49,10 @@ class Rectifier:
                 image, size, interpolation=cv2.INTER_AREA if shrinking else cv2.INTER_CUBIC
             )
         if self._maps is not None:
-            image = cv2.remap(image, *self._maps, cv2.INTER_CUBIC)  # type: ignore[assignment]
+            # The outermost half pixel lies between the last centres and the picture's edge.
+            image = cv2.remap(  # type: ignore[assignment]
+                image, *self._maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+            )
         return np.ascontiguousarray(image)
 
     def mask(
@@ -67,16 +73,54 @@ def undistort_points(
     pixels: npt.NDArray[np.float64],  # [M, 2] px, distorted
     camera: CameraModel,
 ) -> npt.NDArray[np.float64]:
-    """Points [M, 2] at z = 1 on the rays of distorted pixels."""
+    """Points [M, 2] at z = 1 on the rays of distorted pixels; NaN where there is no such ray.
+
+    OpenCV's own inverse of ``radtan`` stops after five rounds, pixels away at wide corners.
+    """
     import cv2
 
-    undistort = (
-        cv2.fisheye.undistortPoints
-        if camera.distortion_model == "fisheye"
-        else cv2.undistortPoints
-    )
     coefficients = np.asarray(camera.distortion, dtype=np.float64)
-    return np.asarray(undistort(pixels[:, None], camera.K, coefficients)[:, 0], dtype=np.float64)
+    if camera.distortion_model == "fisheye":
+        points = cv2.fisheye.undistortPoints(pixels[:, None], camera.K, coefficients)[:, 0]
+        # OpenCV marks what did not converge with -1e6.
+        lost = np.abs(points).max(1, keepdims=True) > 1e5
+        return np.where(lost, np.nan, points).astype(np.float64)
+    points = camera.unproject(pixels)[:, :2]
+    for _ in range(NEWTON_ITERATIONS):
+        found, J = _distort(points, camera)
+        error = np.nan_to_num(found - pixels, posinf=1e9, neginf=-1e9)
+        step = np.einsum("nij,nj->ni", np.linalg.pinv(J), error)
+        # Half a radian at most: far out the polynomial sends Newton anywhere.
+        points = points - step / np.maximum(1.0, 2.0 * np.linalg.norm(step, axis=1))[:, None]
+    found, _ = _distort(points, camera)
+    close = np.linalg.norm(found - pixels, axis=1) < MAX_UNDISTORTION_ERROR_PX
+    return np.where((close & _unfolded(points, camera))[:, None], points, np.nan)
+
+
+def _distort(
+    points: npt.NDArray[np.float64],  # [M, 2] at z = 1
+    camera: CameraModel,
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Pixels [M, 2] where ``radtan`` sees the points, and their derivative [M, 2, 2]."""
+    import cv2
+
+    rays = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+    zero, coefficients = np.zeros(3), np.asarray(camera.distortion, dtype=np.float64)
+    pixels, J = cv2.projectPoints(rays, zero, zero, camera.K, coefficients)
+    # With the identity as pose, moving the camera by (tx, ty) moves the point by as much.
+    derivative = np.nan_to_num(np.asarray(J[:, 3:5], dtype=np.float64)).reshape(-1, 2, 2)
+    return np.asarray(pixels, dtype=np.float64).reshape(-1, 2), derivative
+
+
+def _unfolded(
+    points: npt.NDArray[np.float64],  # [M, 2] at z = 1
+    camera: CameraModel,
+) -> npt.NDArray[np.bool_]:
+    """[M] True where the way from the centre to the point never turns back in the picture."""
+    unfolded = np.ones(len(points), dtype=bool)
+    for share in np.linspace(0.05, 1.0, 20):
+        unfolded &= np.linalg.det(_distort(share * points, camera)[1]) > 0.0
+    return unfolded
 
 
 def _pinhole_inside(camera: CameraModel) -> CameraModel:

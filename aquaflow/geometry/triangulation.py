@@ -50,7 +50,8 @@ def triangulate(
     # x_b ~ z_a a_in_b + t  =>  x_b x (z_a a_in_b + t) = 0, solved for z_a by least squares.
     c = _cross_unit_depth(rays_b, a_in_b)
     d = _cross_unit_depth(rays_b, T_ba.t)
-    z = -_dot(c, d) / np.maximum(_dot(c, c), 1e-18)
+    cc = _dot(c, c)
+    z = -_dot(c, d) / np.maximum(cc, 1e-18)
     z_safe = np.maximum(z, 1e-6)
 
     in_b = z_safe[:, None] * a_in_b + T_ba.t
@@ -61,7 +62,8 @@ def triangulate(
 
     error = np.linalg.norm(camera_b.project(in_b) - pixels_b, axis=1)
     good = (z > 1e-3) & (in_b[:, 2] > 1e-3) & (error < MAX_REPROJECTION_PX)
-    good &= parallax > MIN_PARALLAX_RAD
+    # Parallel rays meet nowhere; their z is rounding noise over the guard.
+    good &= (parallax > MIN_PARALLAX_RAD) & (cc > 1e-12)
     rho = 1.0 / z_safe
     sigma = (sigma_px / camera_b.fx) * rho / np.maximum(np.sin(parallax), 1e-6)
     return Triangulation(rho, sigma**2, good, parallax)

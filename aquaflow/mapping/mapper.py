@@ -6,17 +6,18 @@ import logging
 import time
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from aquaflow.config import MappingConfig
 from aquaflow.keyframes import Pointmap
 from aquaflow.mapping.gaussians import GaussianMap
-from aquaflow.mapping.image_formation import Water
 from aquaflow.mapping.insertion import insertion_probability, new_gaussians, select
 from aquaflow.mapping.losses import depth_loss, outlier_mask, radial_weight, scale_loss
 from aquaflow.mapping.medium import Medium
-from aquaflow.mapping.rendering import Shown, show
+from aquaflow.mapping.rendering import Shown
+from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.views import View, refine_pose
 from aquaflow.render.adam import SelectiveAdam
 from aquaflow.render.contract import Renderer
@@ -31,8 +32,7 @@ class Mapper:
     def __init__(self, config: MappingConfig, renderer: Renderer, seed: int) -> None:
         self.config, self.renderer = config, renderer
         self._random = torch.Generator().manual_seed(seed)
-        self.gaussians = GaussianMap()
-        self.medium = Medium(config.medium, self._random)
+        self.scene = Scene(config.medium, renderer, self._random)
         self.views: list[View] = []
         self.steps = 0
         self.undone = 0
@@ -44,6 +44,7 @@ class Mapper:
             threads=renderer.threads,
         )
         self._medium_optimiser = torch.optim.Adam(self.medium.parameters(), lr=config.medium.rate)
+        self._next_water_fit = config.medium.first_fit_views
         self._K_rad: dict[tuple[int, int], Tensor] = {}
 
     # --- growing ------------------------------------------------------------------------------
@@ -51,18 +52,18 @@ class Mapper:
     def add_view(self, view: View) -> None:
         """Let later optimisation steps use ``view``."""
         self.views.append(view)
+        if len(self.views) >= self._next_water_fit:
+            self.fit_water()
+            self._next_water_fit *= 2
 
     @torch.no_grad()
     def insert(self, view: View, pointmap: Pointmap) -> int:
         """Medium-guided insertion (paper, Sec. 3.3.3); returns the number of new Gaussians."""
         prior_range, known = _range_of(pointmap, self.config.insertion.known_sigma)
-        shown = self.show(view)
+        shown = self.scene.show(view)
         covered = shown.alpha > self.config.insertion.covered_alpha
         z = torch.where(known, prior_range, torch.where(covered, shown.z, 0.0))
-        water = self.water(view)
-        restored, recoverable = view.target(), torch.ones_like(known)
-        if water is not None:
-            restored, recoverable = water.restore(restored, torch.where(known | covered, z, 0.0))
+        restored, recoverable = self.scene.restore(view, z)
         # Where the map already explains the ray with the same depth, only structure that the map
         # lacks asks for more; where it is bare or its surface lies elsewhere, any pixel may.
         agree = (shown.z - prior_range).abs() < self.config.insertion.agreement * prior_range
@@ -87,6 +88,18 @@ class Mapper:
         view.range_confidence = confidence
         return len(rows)
 
+    def fit_water(self) -> None:
+        """Estimate the water from views spread over the dive so far."""
+        count = self.config.medium.fit_views
+        chosen = np.linspace(0, len(self.views) - 1, min(count, len(self.views))).astype(int)
+        estimate = self.scene.fit_water([self.views[i] for i in chosen], self._random)
+        if estimate is not None:
+            log.info(
+                "water fitted: beta_a %s per map unit (relative sigma %s)",
+                estimate.beta_a.round(3).tolist(),
+                estimate.beta_a_sigma.round(2).tolist(),
+            )
+
     # --- optimising ---------------------------------------------------------------------------
 
     def optimise(self, steps: int) -> None:
@@ -101,6 +114,7 @@ class Mapper:
         steps, limit = self.config.optimiser.refine_steps, self.config.optimiser.refine_seconds
         started = time.monotonic()
         order: list[int] = []
+        self.fit_water()
         for step in range(steps if self.views and len(self.gaussians) else 0):
             if limit is not None and time.monotonic() - started > limit:
                 break
@@ -120,7 +134,7 @@ class Mapper:
         }
         viewmat = view.viewmat().requires_grad_(refine_poses)
         self._medium_optimiser.zero_grad(set_to_none=True)
-        shown = show(leaves, self.water(view), self.renderer, view, viewmat)
+        shown = self.scene.draw(view, leaves, viewmat)
         loss = self._loss(view, shown, leaves)
         if not torch.isfinite(loss):
             self._undo("loss", view)
@@ -182,19 +196,9 @@ class Mapper:
 
     # --- looking ------------------------------------------------------------------------------
 
-    def water(self, view: View) -> Water | None:
-        """The medium for this view, or None while it is switched off."""
-        if not self.medium.active:
-            return None
-        R_wc = torch.from_numpy(view.T_wc.R).to(torch.float32)
-        return self.medium(R_wc)  # type: ignore[no-any-return]
-
-    @torch.no_grad()
     def show(self, view: View) -> Shown:
         """The map from ``view``."""
-        return show(
-            self.gaussians.parameters, self.water(view), self.renderer, view, view.viewmat()
-        )
+        return self.scene.show(view)
 
     def register(self, view: View) -> None:
         """Refine the pose of a held-out view photometrically against the frozen map."""
@@ -202,12 +206,18 @@ class Mapper:
         mask = torch.ones_like(K_rad, dtype=torch.bool)
         for _ in range(config.heldout_steps if len(self.gaussians) else 0):
             viewmat = view.viewmat().requires_grad_()
-            with torch.no_grad():
-                water = self.water(view)
-            shown = show(self.gaussians.parameters, water, self.renderer, view, viewmat)
+            shown = self.scene.draw(view, viewmat=viewmat)
             loss = photometric_loss(shown.image, view.target(), K_rad, mask, self.config.loss.ssim, self.renderer.threads)
             (gradient,) = torch.autograd.grad(loss, viewmat)
             refine_pose(view, gradient, config.heldout_rate)
+
+    @property
+    def gaussians(self) -> GaussianMap:
+        return self.scene.gaussians
+
+    @property
+    def medium(self) -> Medium:
+        return self.scene.medium
 
     @property
     def _parameters(self) -> dict[str, Tensor]:

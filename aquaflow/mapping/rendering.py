@@ -20,7 +20,7 @@ class Shown:
     """The map from one view."""
 
     image: Tensor
-    """[H, W, 3] I-hat, through the water."""
+    """[H, W, 3] I-hat, through the water and with the camera's shading."""
     radiance: Tensor
     """[H, W, 3] J-tilde, without water, premultiplied by alpha."""
     alpha: Tensor
@@ -36,6 +36,7 @@ class Shown:
 def show(
     parameters: Mapping[str, Tensor],  # of a GaussianMap
     water: Water | None,
+    gain: Tensor | None,  # [H, W] shading
     renderer: Renderer,
     view: View,
     viewmat: Tensor,  # [4, 4] world to camera
@@ -64,4 +65,6 @@ def show(
         image, z = clean, drawn.image[..., 3] / drawn.alpha.clamp_min(MIN_SOLID)
     else:
         image, z = compose_water(drawn.image, drawn.alpha, water.stacked(), renderer.threads)
+    if gain is not None:
+        image = image * gain[..., None]
     return Shown(image, clean, drawn.alpha, z, drawn.visible, drawn.radius_px)

@@ -92,9 +92,7 @@ class ClassicalPair:
         pixels_a = np.stack([columns + 0.5, rows + 0.5], -1)
         pixels_b = self.matches[rows, columns].astype(np.float64)
         step = max(1, len(rows) // POSE_SAMPLES)
-        T_ba = relative_pose(
-            pixels_a[::step], pixels_b[::step], self._a.camera, self._b.camera
-        )
+        T_ba = relative_pose(pixels_a[::step], pixels_b[::step], self._a.camera, self._b.camera)
         if T_ba is None:
             return X, Q
         rays = self._a.camera.unproject(pixels_a)
@@ -154,7 +152,7 @@ class ClassicalPrior:
         b: ClassicalEncoding,
         predicted: Float | None = None,  # [H, W, 2] px, expected matches of a in b
     ) -> ClassicalPair:
-        """Flow from the prediction; where that fails, from a SIFT homography; the better is kept."""
+        """Flow from the prediction; where it fails, from a SIFT homography; the better is kept."""
         height, width = a.grey.shape
         start = None if predicted is None else predicted - dense.pixel_grid(height, width)
         best = self._flow(a, b, start)
@@ -169,7 +167,7 @@ class ClassicalPrior:
 
     def _flow(self, a: ClassicalEncoding, b: ClassicalEncoding, start: Float | None) -> dense.Flow:
         back = None if start is None else _reverse(start)
-        return self._matcher(a.grey, b.grey, a.texture, start, back)
+        return self._matcher(a.grey, b.grey, a.texture, b.texture, start, back)
 
 
 def _reverse(

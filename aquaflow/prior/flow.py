@@ -92,6 +92,7 @@ class FlowMatcher:
         a: Grey,  # [H, W]
         b: Grey,  # [H, W]
         texture_a: Float,  # [H, W]
+        texture_b: Float,  # [H, W]
         start: Float | None = None,  # [H, W, 2] px, a to b
         start_backward: Float | None = None,  # [H, W, 2] px, b to a
     ) -> Flow:
@@ -102,7 +103,9 @@ class FlowMatcher:
         error = np.linalg.norm(forward + sample(backward, target), axis=-1)
         inside = (target[..., 0] > BORDER_PX) & (target[..., 0] < width - BORDER_PX)
         inside &= (target[..., 1] > BORDER_PX) & (target[..., 1] < height - BORDER_PX)
-        valid = inside & (error < FORWARD_BACKWARD_PX) & (texture_a > MIN_TEXTURE)
+        # Both ends: onto a black picture DIS flows nowhere, and comes back from there exactly.
+        textured = (texture_a > MIN_TEXTURE) & (sample(texture_b, target) > MIN_TEXTURE)
+        valid = inside & (error < FORWARD_BACKWARD_PX) & textured
         return Flow(forward, backward, error.astype(np.float32), valid)
 
     def _flow(self, a: Grey, b: Grey, start: Float | None) -> Float:

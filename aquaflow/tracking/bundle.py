@@ -89,7 +89,9 @@ class _System:
         solve_focal: bool,
     ) -> None:
         self.pixels_reference, self.pixels = pixels_reference, pixels
-        self.observed, self.solve_focal = observed, solve_focal
+        # One match that is no number would cost the whole system.
+        self.observed = observed & np.isfinite(pixels).all(-1)
+        self.solve_focal = solve_focal
 
     def residuals(self, bundle: Bundle) -> tuple[Array, Array, Array]:
         """Errors [V, P, 2], camera points Y [V, P, 3] and reference rays [P, 3]."""
@@ -130,9 +132,7 @@ class _System:
             g_p += (wJp * error[v]).sum(1)
         return H_cc, H_cp, H_pp, g_c, g_p
 
-    def _jacobians(
-        self, bundle: Bundle, v: int, Y: Array, rays: Array
-    ) -> tuple[Array, Array]:
+    def _jacobians(self, bundle: Bundle, v: int, Y: Array, rays: Array) -> tuple[Array, Array]:
         """d error / d camera [P, 2, 6 or 7] and d error / d rho [P, 2] of view ``v``."""
         camera, T = bundle.camera, bundle.T[v]
         iz = 1.0 / np.maximum(Y[:, 2], 1e-3)

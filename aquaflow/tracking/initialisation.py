@@ -77,7 +77,7 @@ class Initialiser:
         pair = self._prior.decode(self.reference, encoding, self._predicted)
         rows, columns = self._samples
         observed = pair.valid[rows, columns]
-        if observed.mean() < self._config.min_share or observed.sum() < MIN_MATCHES:
+        if observed.sum() < MIN_MATCHES or observed.mean() < self._config.min_share:
             return False
         pixels = pair.matches[rows, columns].astype(np.float64)
         parallax = rotation_compensated_parallax_px(
@@ -103,11 +103,14 @@ class Initialiser:
     def solve(self) -> Initialised | None:
         """The best explanation of all waiting frames; None when none is good enough."""
         best: tuple[float, BundleResult] | None = None
+        best_rank = (-1.0, 0.0)
         for start in self._starts():
             result = self._adjust(start)
             explained = self._explained(result.bundle)
-            if best is None or explained > best[0]:
-                best = (explained, result)
+            # Over a plane two geometries explain every match; then the residual tells them apart.
+            rank = (round(explained, 2), -result.residual_px)
+            if best is None or rank > best_rank:
+                best, best_rank = (explained, result), rank
         if best is None or not self._trustworthy(*best):
             return None
         result = best[1]

@@ -60,7 +60,10 @@ class PoseProblem:
 
 
 def solve_pose(problem: PoseProblem, initial: Sim3) -> PoseEstimate | None:
-    """Levenberg-Marquardt from ``initial``; None when the normal equations stay unsolvable."""
+    """Levenberg-Marquardt from ``initial``; None without matches, or when the normal equations stay
+    unsolvable."""
+    if len(problem.points) == 0:
+        return None
     T, damping = initial, FIRST_DAMPING
     residual, J = _linearise(problem, T)
     cost = _cost(residual, problem.weights)

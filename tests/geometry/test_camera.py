@@ -110,7 +110,12 @@ def test_only_coefficients_that_are_not_zero_distort(
     model: str, coefficients: tuple[float, ...], distorted: bool
 ) -> None:
     camera = CameraModel(
-        64, 48, 50.0, 50.0, 32.0, 24.0,
+        64,
+        48,
+        50.0,
+        50.0,
+        32.0,
+        24.0,
         distortion_model=model,  # type: ignore[arg-type]
         distortion=coefficients,
     )
@@ -152,7 +157,12 @@ def test_the_names_of_distortion_models_are_understood(
 
 def test_a_saved_camera_loads_as_it_was(tmp_path: Path) -> None:
     camera = CameraModel(
-        640, 480, 500.0, 510.0, 315.0, 242.0,
+        640,
+        480,
+        500.0,
+        510.0,
+        315.0,
+        242.0,
         distortion_model="fisheye",
         distortion=(0.1, -0.02, 0.0, 0.001),
         port=Port(kind="flat"),

@@ -8,26 +8,49 @@ import numpy.typing as npt
 import pytest
 
 from aquaflow.errors import ConfigError
-from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.camera import CameraModel, DistortionModel
 from aquaflow.geometry.rectification import Rectifier, undistort_points
 
 Array = npt.NDArray[np.float64]
 
 RADTAN = CameraModel(
-    320, 240, 260.0, 262.0, 157.0, 123.0,
+    320,
+    240,
+    260.0,
+    262.0,
+    157.0,
+    123.0,
     distortion_model="radtan",
     distortion=(-0.25, 0.06, 0.001, -0.002),
 )
 FISHEYE = CameraModel(
-    320, 240, 200.0, 201.0, 163.0, 118.0,
+    320,
+    240,
+    200.0,
+    201.0,
+    163.0,
+    118.0,
     distortion_model="fisheye",
     distortion=(0.05, -0.01, 0.002, 0.0),
 )
+WIDE = CameraModel(
+    320,
+    240,
+    160.0,
+    160.0,
+    160.0,
+    120.0,
+    distortion_model="radtan",
+    distortion=(-0.35, 0.12, 0.0, 0.0),
+)
+"""Corners 51 degrees off the axis: OpenCV's own inverse is 40 px off there."""
 PINCUSHION = CameraModel(
     320, 240, 260.0, 260.0, 160.0, 120.0, distortion_model="radtan", distortion=(0.2, 0.0, 0.0, 0.0)
 )
 DISTORTED = pytest.mark.parametrize(
-    "camera", [RADTAN, FISHEYE, PINCUSHION], ids=["radtan", "fisheye", "pincushion"]
+    "camera",
+    [RADTAN, WIDE, FISHEYE, PINCUSHION],
+    ids=["radtan", "wide radtan", "fisheye", "pincushion"],
 )
 
 
@@ -99,7 +122,9 @@ def test_a_straight_line_of_the_world_is_straight_in_the_picture(camera: CameraM
     found = np.array([spot_at(rectified, pixel, pinhole) for pixel in line])
 
     def bend(points: Array) -> float:
-        return float(np.abs(np.polyval(np.polyfit(*points.T, 1), points[:, 0]) - points[:, 1]).max())
+        return float(
+            np.abs(np.polyval(np.polyfit(*points.T, 1), points[:, 0]) - points[:, 1]).max()
+        )
 
     assert bend(found) < 0.15
     assert bend(raw) > 0.4
@@ -113,25 +138,40 @@ def test_the_rectified_picture_has_no_black_border(camera: CameraModel, width: i
     result = rectifier(white)
     assert result.shape == (rectifier.camera.height, width, 3)
     assert result.min() >= 253
+    # The mask's border is False outside the picture, whatever the picture's own border repeats.
     assert rectifier.mask(np.ones((camera.height, camera.width), bool)).all()
 
 
-@DISTORTED
-def test_the_rectified_picture_wastes_no_edge(camera: CameraModel) -> None:
-    """Zoomed out by 3 %, the pinhole picture would reach past the distorted one."""
-    pinhole = Rectifier(camera, camera.width).camera.with_focal_scaled(0.97)
+def outline(camera: CameraModel) -> Array:
+    """[200, 2] px along the picture's four edges."""
     W, H = float(camera.width), float(camera.height)
     along = np.linspace(0.0, 1.0, 50)[:, None]
-    edges = np.concatenate(
-        [
-            np.concatenate([along * W, 0 * along], 1),
-            np.concatenate([along * W, 0 * along + H], 1),
-            np.concatenate([0 * along, along * H], 1),
-            np.concatenate([0 * along + W, along * H], 1),
-        ]
-    )
-    source = distorted(pinhole.unproject(edges), camera)
-    assert ((source < 0.0) | (source > [W, H])).any()
+    edges = [
+        (along * W, 0 * along),
+        (along * W, 0 * along + H),
+        (0 * along, along * H),
+        (0 * along + W, along * H),
+    ]
+    return np.concatenate([np.concatenate(edge, 1) for edge in edges])
+
+
+@DISTORTED
+@pytest.mark.parametrize(("zoom", "inside"), [(1.001, True), (0.97, False)])
+def test_the_rectified_picture_reaches_just_to_the_edge_of_the_raw_one(
+    camera: CameraModel, zoom: float, inside: bool
+) -> None:
+    pinhole = Rectifier(camera, camera.width).camera.with_focal_scaled(zoom)
+    source = distorted(pinhole.unproject(outline(pinhole)), camera)
+    size = [camera.width, camera.height]
+    assert bool(((source >= 0.0) & (source <= size)).all()) is inside
+
+
+@DISTORTED
+def test_undistorting_is_exact_up_to_the_corners(camera: CameraModel) -> None:
+    edges = outline(camera)
+    points = undistort_points(edges, camera)
+    rays = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+    np.testing.assert_allclose(distorted(rays, camera), edges, atol=0.02)
 
 
 def test_a_picture_without_distortion_is_only_resized() -> None:
@@ -158,11 +198,20 @@ def test_a_mask_is_warped_like_its_picture_and_stays_binary() -> None:
 
 
 @pytest.mark.parametrize(
-    "coefficients", [(-3.0, 0.0, 0.0, 0.0), (-8.0, 20.0, 0.0, 0.0), (0.0, 0.0, 3.0, 3.0)]
+    ("model", "coefficients"),
+    [
+        ("radtan", (-3.0, 0.0, 0.0, 0.0)),
+        ("radtan", (-8.0, 20.0, 0.0, 0.0)),
+        ("radtan", (0.0, 0.0, 3.0, 3.0)),
+        ("radtan", (0.0, -1e6, 0.0, 0.0)),
+        ("fisheye", (-1.0, 0.0, 0.0, 0.0)),
+    ],
 )
-def test_a_distortion_that_folds_the_picture_is_refused(coefficients: tuple[float, ...]) -> None:
+def test_a_distortion_that_folds_the_picture_is_refused(
+    model: DistortionModel, coefficients: tuple[float, ...]
+) -> None:
     camera = CameraModel(
-        320, 240, 160.0, 160.0, 160.0, 120.0, distortion_model="radtan", distortion=coefficients
+        320, 240, 160.0, 160.0, 160.0, 120.0, distortion_model=model, distortion=coefficients
     )
     with pytest.raises(ConfigError, match="folds a 320 x 240 picture over itself"):
         Rectifier(camera, 320)

@@ -81,7 +81,7 @@ def test_without_a_baseline_nothing_is_good_and_all_is_finite() -> None:
 
 
 def test_points_at_infinity_are_not_good_and_finite() -> None:
-    rays, depth = scene(4)
+    rays, _ = scene(4)
     at_infinity = CAMERA.project(rays @ SIDEWAYS.R.T)
     points = triangulate(rays, at_infinity, SIDEWAYS, CAMERA, NOISE_PX)
     assert not points.good.any()
@@ -100,7 +100,7 @@ def test_points_behind_the_first_camera_are_not_good() -> None:
     rays, depth = scene(6)
     behind = SIDEWAYS.apply(rays * -depth[:, None])
     pixels = CAMERA.K[:2, :2] @ (behind[:, :2] / behind[:, 2:]).T
-    points = triangulate(rays, pixels.T + [CAMERA.cx, CAMERA.cy], SIDEWAYS, CAMERA, NOISE_PX)
+    points = triangulate(rays, pixels.T + CAMERA.K[:2, 2], SIDEWAYS, CAMERA, NOISE_PX)
     assert not points.good.any()
     assert_finite(points)
 
@@ -121,7 +121,7 @@ def test_points_behind_the_second_camera_are_not_good() -> None:
 def test_a_match_off_its_epipolar_line_is_no_measurement(off_px: float, good: bool) -> None:
     sideways = Sim3(np.eye(3), np.array([-0.2, 0.0, 0.0]))
     rays, depth = scene(7)
-    pixels = seen(rays, depth, sideways) + [0.0, off_px]
+    pixels = seen(rays, depth, sideways) + np.array([0.0, off_px])
     points = triangulate(rays, pixels, sideways, CAMERA, NOISE_PX)
     assert (points.good == good).all()
 

@@ -1,0 +1,57 @@
+# Everything that these targets make stays inside the checkout; `make clean` removes it.
+.DEFAULT_GOAL := help
+SHELL := /bin/bash
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+KERNELS := $(wildcard aquaflow/render/native/*.cpp aquaflow/render/native/*.h)
+
+OUT ?= out/dive
+SYNTHETIC := out/synthetic
+
+export PIP_NO_CACHE_DIR := 1
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+export XDG_CACHE_HOME := $(CURDIR)/$(VENV)/cache
+export MPLCONFIGDIR := $(CURDIR)/$(VENV)/cache/matplotlib
+
+.PHONY: help setup run test test-all check clean
+
+help: ## Show this list.
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+setup: $(INSTALLED) ## Make .venv and install AquaFlow with the tested versions.
+
+$(INSTALLED): pyproject.toml constraints.txt setup.py $(KERNELS)
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet -c constraints.txt -e '.[dev]'
+	@touch $@
+
+ifdef CLIP
+run: setup ## Map a synthetic dive, or yours: CLIP=dive.mp4 [CALIB=camera.yaml] [ARGS="--every 2"]
+	$(BIN)/aquaflow map '$(CLIP)' $(if $(CALIB),--calib '$(CALIB)') --out '$(OUT)' --overwrite $(ARGS)
+else
+run: setup
+	$(BIN)/aquaflow synth $(SYNTHETIC) --frames 60 --width 320 --height 240
+	$(BIN)/aquaflow map $(SYNTHETIC) --out '$(OUT)' --overwrite $(ARGS)
+	$(BIN)/aquaflow evaluate '$(OUT)' --truth $(SYNTHETIC) --clean $(SYNTHETIC)
+	@echo
+	@echo 'Open $(CURDIR)/$(OUT)/report.html in a browser; $(OUT)/map_clear.ply opens in any splat viewer.'
+endif
+
+test: setup ## Run the tests that take seconds.
+	$(BIN)/pytest -m 'not slow'
+
+test-all: setup ## Run all tests, also those on whole recordings.
+	$(BIN)/pytest
+
+check: setup ## Lint, formatting, types.
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+clean: ## Remove the environment, outputs, caches and compiled kernels.
+	rm -rf $(VENV) out build *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -f aquaflow/render/native/*.so
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,146 @@
+"""How well the water was removed: restored held-out views against the scene without water.
+
+The brightness and white balance of a scene without water are a convention, so one gain per channel,
+the same for all frames, is granted to the restored pictures, and to the raw ones that they must
+beat.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.config import load_config
+from aquaflow.errors import InputError
+from aquaflow.geometry.camera import CameraModel, load_camera
+from aquaflow.image_metrics import channel_gain, psnr
+from aquaflow.messages import Frame
+from aquaflow.preparation import Preparation
+from aquaflow.sources import open_recording
+
+Pictures = npt.NDArray[np.float32]
+"""[N, H, W, 3] in [0, 1]."""
+
+SYNTHETIC_MARK = "synth.yaml"
+SYNTHETIC_CLEAN = "clean"
+"""A synthetic dive keeps its pictures without water in this folder."""
+
+
+@dataclass(frozen=True)
+class Restoration:
+    """Restored and raw held-out frames against the same frames without water."""
+
+    frames: int
+    psnr_restored: float
+    """dB, mean over the frames, after one gain per channel for all of them."""
+    psnr_raw: float
+    """dB, the same for what the camera saw."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Stable keys."""
+        return {**asdict(self), "gain_db": self.psnr_restored - self.psnr_raw}
+
+
+def evaluate_restoration(dive: Path, clean: Path, crop: str | None) -> Restoration:
+    """Compare the dive's restored held-out frames with a recording of them without water.
+
+    Args:
+        dive: the folder that a run wrote.
+        clean: a recording with the frames of the one that was mapped, or a synthetic dive.
+        crop: the part of ``clean`` that shows the scene; None is all of it.
+
+    Raises:
+        InputError: there is nothing to compare, or the pictures do not fit each other.
+        ConfigError: the crop does not fit the pictures.
+    """
+    indices = _held_out(dive)
+    reference = _clean_pictures(dive, clean, crop, indices)
+    raw, restored = _stored(dive, indices, "real"), _stored(dive, indices, "restored")
+    if reference.shape != raw.shape:
+        raise InputError(
+            f"{clean} is {reference.shape[2]} x {reference.shape[1]} once prepared like the dive, "
+            f"whose pictures are {raw.shape[2]} x {raw.shape[1]}; choose the --clean-crop that "
+            "shows the same view"
+        )
+    return Restoration(len(indices), _mean_psnr(restored, reference), _mean_psnr(raw, reference))
+
+
+def _mean_psnr(pictures: Pictures, reference: Pictures) -> float:
+    gain = channel_gain(pictures, reference)
+    matched = np.clip(pictures * gain, 0.0, 1.0)
+    return float(np.mean([psnr(ours, true) for ours, true in zip(matched, reference, strict=True)]))
+
+
+def _held_out(dive: Path) -> list[int]:
+    """Recording indices of the held-out frames that have a restored picture."""
+    folder = dive / "heldout"
+    if not any(folder.glob("*_real.png")):
+        raise InputError(
+            f"{dive} holds no held-out frames to compare; give a dive folder that was mapped with "
+            "hold_out_every above 0 and more frames than that"
+        )
+    names = sorted(path.name.split("_")[0] for path in folder.glob("*_restored.png"))
+    if not names:
+        raise InputError(
+            f"{dive} holds no restored pictures, because its map has no water to remove; map it "
+            "with mapping.medium.enabled"
+        )
+    return [int(name) for name in names]
+
+
+def _stored(dive: Path, indices: list[int], kind: str) -> Pictures:
+    import cv2
+
+    pictures = []
+    for index in indices:
+        path = dive / "heldout" / f"{index:06d}_{kind}.png"
+        bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        if bgr is None:
+            raise InputError(f"cannot read the picture {path}; map the dive again")
+        pictures.append(bgr[..., ::-1])
+    return _in_unit(pictures)
+
+
+def _in_unit(pictures: list[npt.NDArray[Any]]) -> Pictures:
+    return np.stack(pictures).astype(np.float32) / np.float32(255.0)
+
+
+def _clean_pictures(dive: Path, clean: Path, crop: str | None, indices: list[int]) -> Pictures:
+    """The frames of ``clean``, cropped, resized and undistorted as the dive's were."""
+    source = load_config(dive / "config.yaml").source.model_copy(update={"crop": crop})
+    if (clean / SYNTHETIC_MARK).is_file():
+        clean = clean / SYNTHETIC_CLEAN
+    prepare = Preparation(source, _calibration(dive))
+    found = {frame.index: prepare(frame).image for frame in _frames(clean, indices)}
+    missing = [index for index in indices if index not in found]
+    if missing:
+        raise InputError(
+            f"{clean} has no readable frame {missing[0]}, which the dive holds out; give the "
+            "recording of the same frames"
+        )
+    return _in_unit([found[index] for index in indices])
+
+
+def _frames(clean: Path, indices: list[int]) -> Iterator[Frame]:
+    """The wanted frames, decoding as few others as the recording's order allows."""
+    first = indices[0]
+    every = math.gcd(*(index - first for index in indices)) or 1
+    recording = open_recording(clean)
+    try:
+        for frame in recording.frames(every, first, indices[-1] + 1):
+            if isinstance(frame, Frame) and frame.index in indices:
+                yield frame
+    finally:
+        recording.close()
+
+
+def _calibration(dive: Path) -> CameraModel | None:
+    """The calibration that the dive's pictures were undistorted with; None if it had none."""
+    path = dive / "calibration.yaml"
+    return load_camera(path) if path.is_file() else None

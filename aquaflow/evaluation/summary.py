@@ -1,0 +1,87 @@
+"""An evaluation's JSON in words: what was measured, in the order in which a reader asks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+Values = Mapping[str, Any]
+
+LABEL_WIDTH = 26
+
+
+def in_words(result: Values) -> list[str]:
+    """Lines for the terminal; parts that were not evaluated are left out."""
+    lines: list[str] = []
+    if "posed" in result:
+        lines += _trajectory(result)
+        lines += _views(result)
+    if result.get("medium_error"):
+        lines += _water(result["medium_error"])
+    if "restoration" in result:
+        lines += _restoration(result["restoration"])
+    return lines + [f"Note: {note}." for note in result.get("notes", [])]
+
+
+def _row(label: str, text: str) -> str:
+    return f"  {label:<{LABEL_WIDTH}}{text}"
+
+
+def _trajectory(result: Values) -> list[str]:
+    lines = [
+        "Trajectory (distances in the truth's unit)",
+        _row(
+            "posed",
+            f"{result['posed']} of {result['frames']} frames, {result['matched']} of them compared",
+        ),
+        _row("path", f"{result['path_length']:.4g}"),
+    ]
+    for kind, title in (("sim3", "error, Sim(3) aligned"), ("se3", "error, SE(3) aligned")):
+        error, share = result[f"ate_rmse_m_{kind}"], result[f"ate_pct_{kind}"]
+        lines.append(_row(title, f"{error:.4g} rms, {share:.3g} % of the path"))
+    if result["rotation_rmse_deg"] is not None:
+        lines.append(_row("rotation error", f"{result['rotation_rmse_deg']:.3g} degrees rms"))
+    if result["drift_pct"] is not None:
+        lines.append(_row("drift at the end", f"{result['drift_pct']:.3g} % of the path"))
+    relative = result["rpe"]
+    if relative is not None:
+        moved, turned = relative["translation_pct"], relative["rotation_rmse_deg"]
+        lines.append(
+            _row("pose to pose (RPE)", f"{moved:.3g} % of the step, {turned:.3g} degrees")
+        )
+    return lines
+
+
+def _views(result: Values) -> list[str]:
+    if result.get("psnr") is None:
+        return []
+    said = f"PSNR {result['psnr']:.2f} dB, SSIM {result['ssim']:.3f}"
+    if result.get("lpips") is not None:
+        said += f", LPIPS {result['lpips']:.3f}"
+    return ["Held-out views (measured while mapping)", _row("as the camera saw them", said)]
+
+
+def _water(error: Values) -> list[str]:
+    if not error["active"]:
+        return ["Water", _row("medium", "switched off: the dive found the water clear")]
+    low, high = error["backscatter_span_m"]
+    return [
+        "Water (red, green, blue)",
+        _row("attenuation, 1/m", _rgb(error["attenuation_per_m"])),
+        _row("true attenuation, 1/m", _rgb(error["true_attenuation_per_m"])),
+        _row("recovered / true", _rgb(error["attenuation_ratio"])),
+        _row("backscatter error", f"{error['backscatter_rmse']:.3g} from {low:g} to {high:g} m"),
+    ]
+
+
+def _restoration(restored: Values) -> list[str]:
+    return [
+        "Without water (one gain per channel)",
+        _row("restored", f"{restored['psnr_restored']:.2f} dB on {restored['frames']} frames"),
+        _row("raw", f"{restored['psnr_raw']:.2f} dB"),
+        _row("gain", f"{restored['gain_db']:+.2f} dB"),
+    ]
+
+
+def _rgb(values: Sequence[float | None]) -> str:
+    return ", ".join("-" if value is None else f"{value:.3g}" for value in values)

@@ -1,0 +1,81 @@
+"""What several tests share: the command line in a process of its own, and one small mapped dive."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+# A machine that does other work meanwhile is slow, not wrong.
+settings.register_profile("aquaflow", deadline=None)
+settings.load_profile("aquaflow")
+
+SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+FRAMES = 24
+WIDTH, HEIGHT = 160, 120
+QUICK = ("--refine-steps", "60")
+"""A map good enough to look at the files; its quality is the bars' business."""
+
+
+@dataclass(frozen=True)
+class Ran:
+    """A finished command."""
+
+    code: int
+    out: str
+    err: str
+
+
+Cli = Callable[..., Ran]
+
+
+def run_aquaflow(*arguments: object, timeout_s: float = 400.0) -> Ran:
+    """Run ``aquaflow`` as a user does."""
+    script = Path(sys.executable).with_name("aquaflow")
+    done = subprocess.run(
+        [str(script), *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=timeout_s,
+        check=False,
+    )
+    return Ran(done.returncode, done.stdout, done.stderr)
+
+
+@pytest.fixture(scope="session")
+def aquaflow() -> Cli:
+    """``aquaflow("map", source, "--out", dive)`` runs the command in a process of its own."""
+    return run_aquaflow
+
+
+@pytest.fixture(scope="session")
+def small_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A synthetic dive of 24 small pictures, made once."""
+    from aquaflow.synthetic import SyntheticConfig, write_dive
+
+    folder = tmp_path_factory.mktemp("recording") / "small"
+    write_dive(folder, SyntheticConfig(frames=FRAMES, width=WIDTH, height=HEIGHT))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def small_dive(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dive folder of the small recording, mapped once."""
+    dive = tmp_path_factory.mktemp("dive") / "small"
+    ran = run_aquaflow("map", small_recording, "--out", dive, *QUICK)
+    assert ran.code == 0, ran.err
+    return dive
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The real recordings; tests that need them are skipped where they are not."""
+    if not SHARED_DATA.is_dir():
+        pytest.skip(f"the real recordings are not at {SHARED_DATA}")
+    return SHARED_DATA

@@ -1,0 +1,241 @@
+"""The prior without a network: candidate flows, confidence, pointmaps, and lazy work."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from textured_pictures import (
+    HEIGHT,
+    WIDTH,
+    Picture,
+    lookup,
+    mapped,
+    moved_pair,
+    pixel_centres,
+    rgb,
+    shift,
+    texture,
+)
+
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3, so3_exp
+from aquaflow.prior import classical, homography
+from aquaflow.prior.classical import ClassicalPair, ClassicalPrior
+from aquaflow.prior.flow import sample
+
+CAMERA = CameraModel(WIDTH, HEIGHT, 200.0, 200.0, 120.0, 90.0)
+T_BA = Sim3(so3_exp(np.array([0.01, -0.04, 0.02])), np.array([-0.12, 0.02, 0.03]))
+
+
+def pair_of(
+    a: Picture, b: Picture, predicted: npt.NDArray[np.float32] | None = None
+) -> ClassicalPair:
+    prior = ClassicalPrior()
+    return prior.decode(prior.encode(a, CAMERA), prior.encode(b, CAMERA), predicted)
+
+
+def relief_depth() -> npt.NDArray[np.float64]:
+    """[H, W] smooth hills in a's frame, depth 0.8 to 1.6."""
+    grid = pixel_centres()
+    x, y = grid[..., 0] / WIDTH, grid[..., 1] / HEIGHT
+    return 1.2 + 0.25 * np.sin(5.0 * x + 1.0) + 0.15 * np.cos(6.0 * y + 2.0 * x)
+
+
+def relief_pair() -> tuple[Picture, Picture, npt.NDArray[np.float64]]:
+    """Two views of the hills, and where each pixel of a is seen in b."""
+    grid = pixel_centres()
+    X = CAMERA.unproject(grid) * relief_depth()[..., None]
+    matches = CAMERA.project(T_BA.apply(X))
+    # b's texture coordinates by fixed point of p = q - (match(p) - p).
+    source = grid.copy()
+    for _ in range(30):
+        source = grid - sample((matches - grid).astype(np.float32), source.astype(np.float32))
+    field = texture(3)
+    return rgb(lookup(field, grid)), rgb(lookup(field, source)), matches
+
+
+@pytest.fixture(scope="module")
+def relief() -> tuple[ClassicalPair, npt.NDArray[np.float64]]:
+    a, b, matches = relief_pair()
+    return pair_of(a, b), matches
+
+
+Relief = tuple[ClassicalPair, npt.NDArray[np.float64]]
+
+
+def test_matches_follow_the_scene(relief: Relief) -> None:
+    pair, matches = relief
+    error = np.linalg.norm(pair.matches - matches, axis=-1)[pair.valid]
+    assert pair.valid.mean() > 0.6
+    assert np.median(error) < 0.15
+
+
+def test_matches_back_undo_the_matches(relief: Relief) -> None:
+    pair, _ = relief
+    there = pair.matches
+    again = sample(pair.matches_back, there)
+    error = np.linalg.norm(again - pixel_centres(), axis=-1)[pair.valid]
+    assert error.max() < 1.01
+    back_error = np.linalg.norm(sample(there, pair.matches_back) - pixel_centres(), axis=-1)
+    assert pair.valid_back.mean() > 0.6
+    assert back_error[pair.valid_back].max() < 1.01
+
+
+def test_the_confidence_is_one_for_a_perfect_match_and_zero_for_none(relief: Relief) -> None:
+    pair, _ = relief
+    assert pair.C.min() == 0.0
+    assert pair.C.max() <= 1.0
+    assert not pair.C[~pair.valid].any()
+    order = np.argsort(pair.flow.error[pair.valid])
+    assert (np.diff(pair.C[pair.valid][order]) <= 1e-7).all()
+
+
+def test_the_pointmap_is_the_scene_up_to_scale(relief: Relief) -> None:
+    pair, _ = relief
+    truth = CAMERA.unproject(pixel_centres()) * relief_depth()[..., None]
+    known = np.isfinite(pair.X_a).all(-1)
+    assert known.mean() > 0.5
+    assert not (known & ~pair.valid).any()
+    ratio = pair.X_a[known][:, 2] / truth[known][:, 2]
+    scale = float(np.median(ratio))
+    assert np.median(np.abs(ratio / scale - 1.0)) < 0.03
+    assert scale == pytest.approx(1.0 / np.linalg.norm(T_BA.t), rel=0.1)
+
+
+def test_the_point_confidence_says_how_far_off_the_points_are(relief: Relief) -> None:
+    """Q is 1 / relative variance for a noise of half a pixel; these matches have less."""
+    pair, _ = relief
+    known = pair.Q_a > 0.0
+    np.testing.assert_array_equal(known, np.isfinite(pair.X_a).all(-1))
+    depth = relief_depth()[known]
+    ratio = pair.X_a[known][:, 2] / depth
+    error = np.abs(ratio / np.median(ratio) - 1.0)
+    stated = 1.0 / np.sqrt(pair.Q_a[known])
+    assert np.mean(error < 2.0 * stated) > 0.9
+    assert len(np.unique(pair.Q_a[known])) > 1000
+
+
+def test_the_second_pointmap_gives_matching_pixels_the_same_point(relief: Relief) -> None:
+    pair, _ = relief
+    known = np.isfinite(pair.X_b).all(-1)
+    np.testing.assert_array_equal(pair.Q_b > 0.0, known)
+    assert not (known & ~pair.valid_back).any()
+    assert known.mean() > 0.5
+    unit = Sim3(T_BA.R, T_BA.t / np.linalg.norm(T_BA.t))
+    seen = CAMERA.project(unit.apply(pair.X_b[known].astype(np.float64)))
+    error = np.linalg.norm(seen - pixel_centres()[known], axis=-1)
+    assert np.median(error) < 1.0
+
+
+def test_without_motion_there_is_no_pointmap() -> None:
+    a, _ = moved_pair(shift(0.0, 0.0))
+    pair = pair_of(a, a)
+    assert pair.valid.mean() > 0.8
+    assert not pair.Q_a.any()
+    assert np.isnan(pair.X_a).all()
+    assert not pair.Q_b.any()
+
+
+def test_with_too_few_matches_for_a_pose_there_is_no_pointmap(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(classical, "relative_pose", lambda *_: None)
+    pair = pair_of(*moved_pair(shift(5.0, 0.0)))
+    assert pair.valid.any()
+    assert not pair.Q_a.any()
+
+
+@pytest.mark.parametrize("value", [0, 128, 255])
+def test_pictures_of_one_colour_give_no_matches_and_no_points(value: int) -> None:
+    flat = np.full((HEIGHT, WIDTH, 3), value, np.uint8)
+    pair = pair_of(flat, flat)
+    assert not pair.valid.any()
+    assert not pair.C.any()
+    assert np.isnan(pair.X_a).all()
+    assert np.isnan(pair.X_b).all()
+    assert not pair.Q_a.any()
+    assert np.isfinite(pair.matches).all()
+
+
+def test_a_picture_of_one_colour_is_not_interesting() -> None:
+    encoding = ClassicalPrior().encode(np.full((HEIGHT, WIDTH, 3), 80, np.uint8), CAMERA)
+    assert not encoding.interesting.any()
+    textured = ClassicalPrior().encode(moved_pair(shift(0, 0))[0], CAMERA)
+    assert textured.interesting.mean() > 0.9
+
+
+def test_the_homography_start_rescues_a_shift_of_thirty_percent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    move = (0.3 * WIDTH, 10.0)
+    pictures = moved_pair(shift(*move))
+    rescued = pair_of(*pictures)
+    assert rescued.valid.mean() > 0.5
+    error = rescued.matches - pixel_centres() - np.array(move)
+    assert np.median(np.linalg.norm(error, axis=-1)[rescued.valid]) < 0.1
+
+    monkeypatch.setattr(homography, "homography", lambda *_: None)
+    assert pair_of(*pictures).valid.mean() < 0.3
+
+
+def test_a_good_prediction_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise AssertionError("SIFT ran though the prediction was good")
+
+    monkeypatch.setattr(homography, "detect", refuse)
+    H = np.array([[1.0, -0.05, 60.0], [0.05, 1.0, 4.0], [0.0, 0.0, 1.0]])
+    predicted = mapped(H, pixel_centres()).astype(np.float32)
+    pair = pair_of(*moved_pair(H), predicted)
+    assert pair.valid.mean() > 0.5
+
+
+def test_a_wrong_prediction_does_no_harm() -> None:
+    pictures = moved_pair(shift(3.0, 1.0))
+    wrong = (pixel_centres() + np.array([120.0, -70.0])).astype(np.float32)
+    pair = pair_of(*pictures, wrong)
+    assert pair.valid.mean() > 0.8
+
+
+def test_a_wrong_prediction_without_a_homography_falls_back_to_plain_flow(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(homography, "homography", lambda *_: None)
+    wrong = (pixel_centres() + np.array([120.0, -70.0])).astype(np.float32)
+    assert pair_of(*moved_pair(shift(3.0, 1.0)), wrong).valid.mean() > 0.8
+
+
+def test_keypoints_are_found_once_per_picture_and_only_when_needed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    calls = []
+    detect = homography.detect
+
+    def counted(grey: npt.NDArray[np.uint8]) -> homography.Keypoints:
+        calls.append(grey)
+        return detect(grey)
+
+    monkeypatch.setattr(homography, "detect", counted)
+    prior = ClassicalPrior()
+    a, b = (prior.encode(image, CAMERA) for image in moved_pair(shift(0.3 * WIDTH, 0.0)))
+    near = prior.encode(moved_pair(shift(2.0, 0.0))[1], CAMERA)
+    prior.decode(a, near)
+    assert len(calls) == 0
+    prior.decode(a, b)
+    prior.decode(b, a)
+    prior.decode(a, b)
+    assert len(calls) == 2
+
+
+def test_decoding_twice_gives_the_same_bit_for_bit() -> None:
+    pictures = moved_pair(shift(0.3 * WIDTH, 10.0))
+    first, second = pair_of(*pictures), pair_of(*pictures)
+    np.testing.assert_array_equal(first.matches, second.matches)
+    np.testing.assert_array_equal(first.valid, second.valid)
+
+
+def test_the_classical_prior_claims_no_metres_and_no_descriptors() -> None:
+    assert ClassicalPrior.metric is False
+    pair = pair_of(*moved_pair(shift(2.0, 0.0)))
+    assert pair.D_a is None
+    assert pair.D_b is None

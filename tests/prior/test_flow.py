@@ -1,0 +1,139 @@
+"""Dense flow: known motions come back, and what cannot be matched is not claimed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from textured_pictures import (
+    HEIGHT,
+    WIDTH,
+    Picture,
+    inside,
+    lookup,
+    mapped,
+    moved_pair,
+    pixel_centres,
+    rgb,
+    shift,
+    texture,
+)
+
+from aquaflow.prior.flow import (
+    BORDER_PX,
+    Flow,
+    FlowMatcher,
+    normalised_grey,
+    pixel_grid,
+    sample,
+)
+from aquaflow.prior.flow import texture as texture_of
+
+
+def flow_between(a: Picture, b: Picture, start: np.ndarray | None = None) -> Flow:
+    grey_a, grey_b = normalised_grey(a), normalised_grey(b)
+    back = None if start is None else -start
+    return FlowMatcher()(grey_a, grey_b, texture_of(grey_a), texture_of(grey_b), start, back)
+
+
+@pytest.mark.parametrize("move", [(0.0, 0.0), (0.3, -0.45), (6.4, 3.7), (-14.25, 9.5)])
+def test_a_known_subpixel_shift_comes_back(move: tuple[float, float]) -> None:
+    flow = flow_between(*moved_pair(shift(*move)))
+    assert flow.share > 0.8
+    error = np.linalg.norm(flow.forward[flow.valid] - move, axis=-1)
+    assert np.median(error) < 0.15
+    assert np.percentile(error, 95) < 0.4
+
+
+def test_a_known_homography_comes_back() -> None:
+    H = np.array([[1.04, -0.06, 5.0], [0.05, 0.97, -4.0], [1e-4, -1e-4, 1.0]])
+    flow = flow_between(*moved_pair(H))
+    grid = pixel_centres()
+    error = np.linalg.norm(grid + flow.forward - mapped(H, grid), axis=-1)[flow.valid]
+    assert flow.share > 0.75
+    assert np.median(error) < 0.15
+    assert np.percentile(error, 95) < 0.6
+
+
+def test_the_stated_error_is_the_way_forward_and_back() -> None:
+    flow = flow_between(*moved_pair(shift(5.0, 2.0)))
+    target = pixel_grid(HEIGHT, WIDTH) + flow.forward
+    back = sample(flow.backward, target)
+    np.testing.assert_allclose(flow.error, np.linalg.norm(flow.forward + back, axis=-1), atol=1e-5)
+
+
+def test_what_left_the_picture_is_mostly_not_matched() -> None:
+    start = np.broadcast_to(np.float32([40.0, 0.0]), (HEIGHT, WIDTH, 2))
+    flow = flow_between(*moved_pair(shift(40.0, 0.0)), start)
+    left = pixel_centres()[..., 0] > WIDTH - 40.0 + BORDER_PX
+    assert flow.valid[left].mean() < 0.1
+    assert flow.valid[~left].mean() > 0.8
+
+
+def test_what_something_else_covers_is_mostly_not_matched() -> None:
+    a, b = moved_pair(shift(3.0, 1.0))
+    cover = rgb(lookup(texture(9), pixel_centres()))
+    covered = b.copy()
+    covered[60:120, 80:160] = cover[60:120, 80:160]
+    flow = flow_between(a, covered)
+    assert flow.valid[66:112, 84:150].mean() < 0.35
+    assert flow.valid[:40].mean() > 0.8
+
+
+def test_pixels_without_texture_are_not_matched() -> None:
+    field = texture(0)
+    grid = pixel_centres()
+    a, b = rgb(lookup(field, grid)), rgb(lookup(field, grid))
+    a[15:165, 20:220] = b[15:165, 20:220] = 90
+    flow = flow_between(a, b)
+    assert not flow.valid[75:105, 100:140].any()
+    assert flow.valid[:10, 10:-10].mean() > 0.7
+
+
+@pytest.mark.parametrize("value", [0, 128, 255])
+def test_pictures_of_one_colour_match_nowhere(value: int) -> None:
+    flat = np.full((HEIGHT, WIDTH, 3), value, np.uint8)
+    flow = flow_between(flat, flat)
+    assert not flow.valid.any()
+    assert np.isfinite(flow.forward).all()
+
+
+def test_a_textured_picture_does_not_match_a_black_one() -> None:
+    a, _ = moved_pair(shift(0.0, 0.0))
+    assert not flow_between(a, np.zeros_like(a)).valid.any()
+    assert not flow_between(np.zeros_like(a), a).valid.any()
+
+
+def test_a_start_rescues_a_shift_that_plain_flow_loses() -> None:
+    move = (0.3 * WIDTH, 0.0)
+    pair = moved_pair(shift(*move))
+    start = np.broadcast_to(np.float32(move), (HEIGHT, WIDTH, 2))
+    plain, started = flow_between(*pair), flow_between(*pair, start)
+    assert plain.share < 0.3
+    assert started.share > 0.55
+    assert np.median(np.linalg.norm(started.forward[started.valid] - move, axis=-1)) < 0.1
+
+
+def test_the_start_is_not_written_to() -> None:
+    start = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+    flow_between(*moved_pair(shift(6.0, 0.0)), start)
+    assert not start.any()
+
+
+def test_low_contrast_is_matched_like_high_contrast() -> None:
+    a, b = moved_pair(shift(4.0, -2.0))
+    dim_a, dim_b = (np.uint8(20) + image // 8 for image in (a, b))
+    flow = flow_between(dim_a, dim_b)
+    assert flow.share > 0.6
+    assert np.median(np.linalg.norm(flow.forward[flow.valid] - (4.0, -2.0), axis=-1)) < 0.3
+
+
+def test_sampling_interpolates_and_repeats_the_border() -> None:
+    field = np.float32([[0.0, 1.0], [2.0, 3.0]])
+    pixels = np.float32([[[0.5, 0.5], [1.0, 0.5], [1.0, 1.0], [-9.0, -9.0], [9.0, 9.0]]])
+    np.testing.assert_allclose(sample(field, pixels)[0], [0.0, 0.5, 1.5, 0.0, 3.0], atol=1e-3)
+
+
+def test_inside_of_these_tests_agrees_with_the_matcher_border() -> None:
+    flow = flow_between(*moved_pair(shift(0.0, 0.0)))
+    target = pixel_centres() + flow.forward
+    assert not (flow.valid & ~inside(target, BORDER_PX)).any()

@@ -1,0 +1,147 @@
+"""Every command as a user types it: what it prints, and what it leaves alone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+from conftest import FRAMES, QUICK, Cli
+
+from aquaflow import __version__
+from aquaflow.config import Config, load_config
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_version_is_the_packages(aquaflow: Cli) -> None:
+    assert aquaflow("--version").out.strip() == __version__
+
+
+def test_without_a_command_the_help_is_shown(aquaflow: Cli) -> None:
+    ran = aquaflow()
+    assert "map" in ran.out + ran.err
+    assert "evaluate" in ran.out + ran.err
+
+
+def test_config_prints_yaml_that_loads_back(aquaflow: Cli, tmp_path: Path) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text(aquaflow("config").out)
+    assert load_config(file) == Config.model_validate({})
+
+
+def test_config_completes_a_file(aquaflow: Cli, tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text("mapping:\n  max_gaussians: 2000\n")
+    shown = yaml.safe_load(aquaflow("config", file).out)
+    assert shown["mapping"]["max_gaussians"] == 2000
+    assert shown["source"]["every"] == 1
+
+
+def test_options_come_before_the_config_file(
+    aquaflow: Cli, small_recording: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text("seed: 3\nsource:\n  every: 2\n  stop: 9\n")
+    dive = tmp_path / "dive"
+    aquaflow("map", small_recording, "--config", file, "--stop", 12, "--tracking-only", "--out", dive)
+    used = load_config(dive / "config.yaml")
+    assert (used.seed, used.source.every, used.source.stop) == (3, 2, 12)
+    assert not used.mapping.enabled
+
+
+def test_map_as_json_prints_one_object_and_nothing_else(
+    aquaflow: Cli, small_recording: Path, tmp_path: Path
+) -> None:
+    dive = tmp_path / "dive"
+    ran = aquaflow("map", small_recording, "--out", dive, "--stop", 10, *QUICK, "--json")
+    printed = json.loads(ran.out)
+    assert ran.err == ""
+    assert printed.pop("dive") == str(dive)
+    assert printed == json.loads((dive / "metrics.json").read_text())
+
+
+def test_synth_and_doctor_as_json_print_one_object(aquaflow: Cli, tmp_path: Path) -> None:
+    small = ("--frames", 2, "--width", 64, "--height", 48)
+    ran = aquaflow("synth", tmp_path / "s", *small, "--json")
+    assert json.loads(ran.out)["frames"] == 2
+    assert ran.err == ""
+    assert json.loads(aquaflow("doctor", "--json").out)
+
+
+def test_map_says_what_came_out_and_where_to_look(
+    aquaflow: Cli, small_recording: Path, tmp_path: Path
+) -> None:
+    dive = tmp_path / "dive"
+    ran = aquaflow("map", small_recording, "--out", dive, "--stop", 10, *QUICK)
+    assert "10 of 10 frames posed" in ran.out
+    assert str(dive / "report.html") in ran.out
+
+
+def test_tracking_only_names_no_map_that_was_not_made(
+    aquaflow: Cli, small_recording: Path, tmp_path: Path
+) -> None:
+    dive = tmp_path / "dive"
+    ran = aquaflow("map", small_recording, "--out", dive, "--tracking-only")
+    assert ran.code == 0
+    assert (dive / "trajectory.tum").is_file()
+    assert not (dive / "map.ply").exists()
+    assert "map.ply" not in ran.out
+
+
+def test_overwrite_leaves_nothing_of_the_dive_before(
+    aquaflow: Cli, small_recording: Path, tmp_path: Path
+) -> None:
+    dive = tmp_path / "dive"
+    aquaflow("map", small_recording, "--out", dive, *QUICK)
+    assert (dive / "heldout" / "000016_real.png").is_file()
+    ran = aquaflow("map", small_recording, "--out", dive, "--stop", 12, "--tracking-only", "--overwrite")
+    assert ran.code == 0
+    assert not list(dive.glob("*.ply"))
+    assert not (dive / "heldout" / "000016_real.png").exists()
+
+
+@pytest.mark.parametrize("truth", ["poses.tum", "."])
+def test_evaluate_prints_one_object_and_changes_nothing(
+    aquaflow: Cli, small_recording: Path, small_dive: Path, truth: str
+) -> None:
+    before = contents(small_dive)
+    ran = aquaflow("evaluate", small_dive, "--truth", small_recording / truth, "--json")
+    assert ran.err == ""
+    result = json.loads(ran.out)
+    assert result["posed"] == FRAMES
+    assert result["ate_pct_sim3"] < 2.0
+    assert (result["medium_error"] is None) == (truth == "poses.tum")
+    assert contents(small_dive) == before
+
+
+def test_evaluate_against_a_table_of_positions(
+    aquaflow: Cli, small_recording: Path, small_dive: Path, tmp_path: Path
+) -> None:
+    poses = [
+        line.split() for line in (small_recording / "poses.tum").read_text().splitlines() if line
+    ]
+    table = tmp_path / "positions.csv"
+    rows = [f"{i:06d}.png,{pose[1]},{pose[2]}" for i, pose in enumerate(poses)]
+    table.write_text("\n".join(["file,easting_m,northing_m", *rows]) + "\n")
+    result = json.loads(aquaflow("evaluate", small_dive, "--truth", table, "--json").out)
+    assert result["matched"] == FRAMES
+    # The heights that the table lacks are part of what is missed.
+    assert result["ate_pct_sim3"] < 10.0
+
+
+def test_evaluate_for_people_names_what_was_measured(
+    aquaflow: Cli, small_recording: Path, small_dive: Path
+) -> None:
+    ran = aquaflow("evaluate", small_dive, "--truth", small_recording, "--clean", small_recording)
+    assert f"{FRAMES} of {FRAMES} frames" in ran.out
+    for part in ("Trajectory", "Held-out views", "Water", "Without water"):
+        assert part in ran.out
+    assert "{" not in ran.out

@@ -1,0 +1,216 @@
+"""Initialisation: waits for parallax, decides rightly on plane and relief, keeps memory bounded."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tracking_scenes import KnownPrior, KnownView, depth_map, pose
+
+from aquaflow.config import InitialisationConfig
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3, so3_log
+from aquaflow.tracking.initialisation import Initialiser, calibrated
+
+CAMERA = CameraModel(96, 72, 80.0, 80.0, 48.0, 36.0)
+CONFIG = InitialisationConfig(points=300, pairs=1)
+GUESS = replace(CAMERA.with_focal_scaled(1.2), calibrated=False)
+
+MOVING = [pose((0.01 * i, 0.03 * i, -0.04 * i), (0.06 * i, 0.02 * i, 0.03 * i)) for i in range(7)]
+CURVED = [
+    pose(
+        (0.03 * np.sin(i), 0.02 * i, -0.03 * i),
+        (0.07 * i, 0.12 * np.sin(i), 0.05 * np.sin(2 * i)),
+    )
+    for i in range(7)
+]
+"""Over a plane, a straight way has two explanations that are equally good; a curved one has one."""
+TURNING = [pose((0.02 * i, -0.03 * i, 0.05 * i), (0.0, 0.0, 0.0)) for i in range(6)]
+
+
+def prior_of(
+    poses: list[Sim3], flat: bool = False, noise_px: float = 0.1, blind: tuple[int, ...] = ()
+) -> KnownPrior:
+    """Views whose first is the reference; only its depth is ever used to match forward."""
+    depth = depth_map(CAMERA, flat)
+    views = [KnownView(CAMERA, T, depth, i in blind) for i, T in enumerate(poses)]
+    return KnownPrior(views, CAMERA, noise_px)
+
+
+def started(
+    prior: KnownPrior,
+    config: InitialisationConfig = CONFIG,
+    camera: CameraModel = CAMERA,
+) -> Initialiser:
+    """An initialiser that was given every frame."""
+    frames = prior.frames(camera)
+    initialiser = Initialiser(frames[0], prior.encode(frames[0].image, camera), prior, config)
+    for frame in frames[1:]:
+        assert initialiser.add(frame, prior.encode(frame.image, camera))
+    return initialiser
+
+
+def assert_poses(initialiser: Initialiser, poses: list[Sim3], tolerance: float) -> None:
+    """The relative poses are the true ones up to one common scale."""
+    solution = initialiser.solve()
+    assert solution is not None
+    truth = [poses[w.frame.index].inverse() @ poses[0] for w in solution.waiting]
+    found_t = np.array([T.t for T in solution.T])
+    true_t = np.array([T.t for T in truth])
+    scale = float((found_t * true_t).sum() / (true_t**2).sum())
+    assert scale > 0.0
+    assert np.linalg.norm(found_t / scale - true_t, axis=1).max() < tolerance
+    turns = [so3_log(f.R @ t.R.T) for f, t in zip(solution.T, truth, strict=True)]
+    assert np.linalg.norm(turns, axis=1).max() < tolerance
+
+
+def test_turning_on_the_spot_never_decides_a_geometry() -> None:
+    initialiser = started(prior_of(TURNING))
+    assert len(initialiser.waiting) == 5
+    assert not initialiser.ready
+    assert initialiser.parallax_px < 0.5
+    assert initialiser.solve() is None
+
+
+def test_standing_still_never_decides_a_geometry() -> None:
+    initialiser = started(prior_of([Sim3.identity()] * 4))
+    assert not initialiser.ready
+    assert initialiser.solve() is None
+
+
+def test_parallax_makes_it_ready_and_not_before() -> None:
+    prior = prior_of(MOVING)
+    frames = prior.frames(CAMERA)
+    initialiser = Initialiser(frames[0], prior.encode(frames[0].image, CAMERA), prior, CONFIG)
+    assert initialiser.parallax_px == 0.0
+    states = []
+    for frame in frames[1:]:
+        initialiser.add(frame, prior.encode(frame.image, CAMERA))
+        enough = initialiser.parallax_px >= CONFIG.parallax_widths * CAMERA.width
+        assert initialiser.ready is enough
+        states.append(initialiser.ready)
+    assert states[0] is False
+    assert states[-1] is True
+
+
+def test_one_view_alone_is_not_enough_however_large_its_parallax() -> None:
+    initialiser = started(prior_of([MOVING[0], MOVING[6]]))
+    assert initialiser.parallax_px > CONFIG.parallax_widths * CAMERA.width
+    assert not initialiser.ready
+
+
+def test_of_two_geometries_that_explain_every_match_the_smaller_residual_wins() -> None:
+    """Straight over a plane: the rival is 15 degrees off and explains as much."""
+    two_pairs = CONFIG.model_copy(update={"points": 400, "pairs": 2})
+    assert_poses(started(prior_of(MOVING, flat=True), two_pairs), MOVING, tolerance=0.02)
+
+
+@pytest.mark.parametrize("flat", [False, True], ids=["relief", "plane"])
+def test_the_right_geometry_wins(flat: bool) -> None:
+    assert_poses(started(prior_of(CURVED, flat)), CURVED, tolerance=0.015)
+
+
+def test_the_geometry_has_median_depth_one_and_a_small_residual() -> None:
+    solution = started(prior_of(MOVING)).solve()
+    assert solution is not None
+    assert solution.residual_px < 0.3
+    assert solution.focal_sigma == 0.0
+    assert solution.camera == CAMERA
+    baseline = np.linalg.norm(solution.T[-1].t) / np.linalg.norm(MOVING[-1].t)
+    assert baseline == pytest.approx(1.0 / np.median(depth_map(CAMERA, flat=False)), rel=0.1)
+
+
+def test_an_unknown_focal_length_is_refined() -> None:
+    far = [pose((0.03 * i, 0.05 * i, -0.06 * i), (0.1 * i, 0.03 * i, 0.05 * i)) for i in range(6)]
+    initialiser = started(prior_of(far, noise_px=0.03), camera=GUESS)
+    solution = initialiser.solve()
+    assert solution is not None
+    assert solution.camera.fx == pytest.approx(CAMERA.fx, rel=0.05)
+    assert 0.0 < solution.focal_sigma < 0.05
+
+
+def test_a_focal_length_that_is_too_uncertain_waits_for_parallax() -> None:
+    strict = CONFIG.model_copy(update={"max_focal_sigma": 1e-9})
+    prior = prior_of(MOVING[:4])
+    assert started(prior, strict, GUESS).solve() is None
+    assert started(prior, strict, CAMERA).solve() is not None
+
+
+def test_far_more_parallax_ends_the_wait_for_the_focal_length() -> None:
+    impatient = CONFIG.model_copy(update={"max_focal_sigma": 1e-9, "parallax_widths": 0.005})
+    assert started(prior_of(MOVING[:4]), impatient, GUESS).solve() is not None
+
+
+@pytest.mark.parametrize(
+    "limit", [{"min_explained": 1.0}, {"max_depth_sigma": 1e-6}], ids=["explained", "depth"]
+)
+def test_a_geometry_that_explains_or_knows_too_little_is_refused(limit: dict[str, float]) -> None:
+    initialiser = started(prior_of(MOVING, noise_px=0.5), CONFIG.model_copy(update=limit))
+    assert initialiser.solve() is None
+
+
+def test_nothing_waiting_is_no_solution() -> None:
+    prior = prior_of(MOVING)
+    frame = prior.frames(CAMERA)[0]
+    initialiser = Initialiser(frame, prior.encode(frame.image, CAMERA), prior, CONFIG)
+    assert not initialiser.ready
+    assert initialiser.solve() is None
+
+
+def test_a_frame_that_does_not_see_the_place_is_turned_away() -> None:
+    prior = prior_of(MOVING, blind=(2,))
+    frames = prior.frames(CAMERA)
+    initialiser = Initialiser(frames[0], prior.encode(frames[0].image, CAMERA), prior, CONFIG)
+    assert initialiser.add(frames[1], prior.encode(frames[1].image, CAMERA))
+    assert not initialiser.add(frames[2], prior.encode(frames[2].image, CAMERA))
+    assert len(initialiser.waiting) == 1
+
+
+def test_a_frame_that_sees_only_a_corner_of_the_place_is_turned_away() -> None:
+    away = pose((0.0, 0.0, 0.0), (1.55, 0.0, 0.0))
+    prior = prior_of([Sim3.identity(), away])
+    frames = prior.frames(CAMERA)
+    initialiser = Initialiser(
+        frames[0],
+        prior.encode(frames[0].image, CAMERA),
+        prior,
+        InitialisationConfig(points=6000),
+    )
+    pair = prior.decode(prior.views[0], prior.views[1])
+    assert pair.valid.sum() > 40
+    assert not initialiser.add(frames[1], prior.encode(frames[1].image, CAMERA))
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_reference_without_texture_turns_every_frame_away(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(KnownView, "interesting", np.zeros((72, 96), bool))
+    prior = prior_of(MOVING)
+    frames = prior.frames(CAMERA)
+    initialiser = Initialiser(frames[0], prior.encode(frames[0].image, CAMERA), prior, CONFIG)
+    assert not initialiser.add(frames[1], prior.encode(frames[1].image, CAMERA))
+
+
+def test_each_match_starts_from_the_one_before() -> None:
+    prior = prior_of(MOVING)
+    initialiser = started(prior)
+    assert prior.predictions[0] is None
+    for prediction, waiting in zip(prior.predictions[1:], initialiser.waiting, strict=False):
+        assert prediction is waiting.pair.matches
+
+
+def test_waiting_frames_are_thinned_and_none_is_forgotten() -> None:
+    config = CONFIG.model_copy(update={"max_waiting": 3})
+    initialiser = started(prior_of(MOVING), config)
+    waiting = [w.frame.index for w in initialiser.waiting]
+    thinned = [frame.index for frame in initialiser.thinned]
+    assert len(waiting) == 3
+    assert sorted(waiting + thinned) == [1, 2, 3, 4, 5, 6]
+    assert 6 in waiting
+    assert_poses(initialiser, MOVING, tolerance=0.01)
+
+
+def test_a_calibrated_camera_differs_from_its_guess_only_in_saying_so() -> None:
+    assert calibrated(GUESS) == replace(GUESS, calibrated=True)
