@@ -6,6 +6,7 @@ Heavy modules load inside the commands, so that ``aquaflow --help`` costs no tor
 from __future__ import annotations
 
 import json
+import logging
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -32,6 +33,8 @@ Json = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON.
 
 def main() -> None:
     """Entry point: an AquaFlowError becomes one sentence and exit code 1."""
+    # What Python warns of is for the log of the dive, not for who flies it.
+    logging.captureWarnings(True)
     try:
         app()
     except AquaFlowError as error:

@@ -29,6 +29,15 @@ FRAME_COLUMNS = ("index", "source", "t_s", "class", "sub_map", "keyframe", "qual
 MARKER = "frames.csv"
 """The file by which a folder is known to be a dive."""
 
+RESULTS = (
+    *("trajectory.tum", "camera.yaml", "calibration.yaml", "map*.ply", "medium.json"),
+    *("metrics.json", "report.html", "heldout/*.png"),
+)
+"""What a run writes at its end; of an earlier run in the same folder nothing must remain."""
+
+LOGGERS = ("aquaflow", "py.warnings")
+"""Loggers whose records go to log.jsonl."""
+
 
 @dataclass(frozen=True)
 class FrameRow:
@@ -71,7 +80,8 @@ class DiveFolder:
         self._rows: list[FrameRow] = []
         self._write_rows(self._frames, [FRAME_COLUMNS])
         self._log = _JsonLog(path / "log.jsonl")
-        logging.getLogger("aquaflow").addHandler(self._log)
+        for name in LOGGERS:
+            logging.getLogger(name).addHandler(self._log)
 
     def _claim(self, overwrite: bool) -> None:
         try:
@@ -89,10 +99,14 @@ class DiveFolder:
             raise InputError(
                 f"{self.path} already holds a dive; choose another --out or add --overwrite"
             )
+        for pattern in RESULTS:
+            for old in self.path.glob(pattern):
+                old.unlink()
 
     def close(self) -> None:
         """Release the open files; what was written stays."""
-        logging.getLogger("aquaflow").removeHandler(self._log)
+        for name in LOGGERS:
+            logging.getLogger(name).removeHandler(self._log)
         self._log.close()
         self._frames.close()
 

@@ -54,9 +54,7 @@ def channel_gain(
 ) -> npt.NDArray[np.float64]:
     """[3] factors on ``image`` that bring it closest to ``reference``; 0 for a black channel."""
     counted = Ellipsis if mask is None else mask
-    xs, ys = (
-        picture.astype(np.float64)[counted].reshape(-1, 3) for picture in (image, reference)
-    )
+    xs, ys = (picture.astype(np.float64)[counted].reshape(-1, 3) for picture in (image, reference))
     energy = (xs * xs).sum(axis=0)
     return np.asarray((xs * ys).sum(axis=0) / np.maximum(energy, np.finfo(np.float64).tiny))
 

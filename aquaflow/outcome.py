@@ -1,4 +1,4 @@
-"""What a finished run amounts to: held-out quality, poses, water and the numbers of metrics.json."""
+"""What a finished run amounts to: held-out quality, poses, water and metrics.json's numbers."""
 
 from __future__ import annotations
 

@@ -180,6 +180,11 @@ class _Replay:
 
     def _why_not(self) -> str:
         read = len(self.results)
+        if read == 0 and not self.dropped:
+            source, count = self.config.source, self.recording.frame_count
+            stop = "the end" if source.stop is None else f"--stop {source.stop}"
+            known = "" if count is None else f" of its {count} frames"
+            return f"{self.name}: none{known} lies between --start {source.start} and {stop}"
         if read == 0:
             return f"{self.name}: no frame could be read, see {self.folder.path}/frames.csv"
         if read < MIN_POSED_FRAMES:
@@ -228,6 +233,6 @@ def _fix_threads(threads: int) -> None:
     from threadpoolctl import threadpool_limits
 
     torch.set_num_threads(1)
-    threadpool_limits(1, user_api="blas")  # the matrices are small: threads only wait for each other
+    threadpool_limits(1, user_api="blas")  # small matrices: threads only wait for each other
     cv2.setNumThreads(threads)
     cv2.setRNGSeed(0)

@@ -13,7 +13,7 @@ from aquaflow.geometry.rectification import Rectifier
 from aquaflow.messages import Frame
 
 DEFAULT_WIDTH_PX = 480
-"""Width mapped when none is asked for: what two CPU cores track and map at a few frames a second."""
+"""Width mapped when none is asked for: two CPU cores track and map a few such frames a second."""
 
 Box = tuple[int, int, int, int]
 

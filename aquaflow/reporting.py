@@ -95,9 +95,17 @@ def _examples(held_out: list[HeldOut]) -> list[HeldOutExample]:
 def _curves(water: WaterSummary | None) -> MediumCurves | None:
     if water is None:
         return None
-    r, g, b = 0, 1, 2
-    rgb = [
-        (values[r], values[g], values[b])
-        for values in (water.beta_a, water.b, water.B_inf, water.B_res, water.d)
-    ]
-    return MediumCurves(*rgb, range_p5=water.range_p5, range_p95=water.range_p95)
+    return MediumCurves(
+        beta=_rgb(water.beta_a),
+        b=_rgb(water.b),
+        B_inf=_rgb(water.B_inf),
+        B_res=_rgb(water.B_res),
+        d=_rgb(water.d),
+        range_p5=water.range_p5,
+        range_p95=water.range_p95,
+    )
+
+
+def _rgb(values: list[float]) -> tuple[float, float, float]:
+    red, green, blue = values
+    return red, green, blue

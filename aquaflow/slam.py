@@ -108,7 +108,8 @@ class Slam:
         }.get(frame_class, optimiser.steps_common)
 
     def _view(self, tracked: Tracked) -> View:
-        assert tracked.T_wc is not None and tracked.keyframe is not None
+        assert tracked.T_wc is not None
+        assert tracked.keyframe is not None
         camera = self.tracker.camera or tracked.frame.camera
         return View(
             tracked.frame.index,

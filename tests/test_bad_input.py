@@ -156,14 +156,15 @@ def test_a_clip_of_three_frames_is_mapped_or_refused_with_its_name(
 def test_a_clip_of_two_frames_is_too_short(
     aquaflow: Cli, small_recording: Path, tmp_path: Path
 ) -> None:
-    ran = aquaflow("map", small_recording, "--stop", 2, "--out", tmp_path / "out")
+    ran = aquaflow("map", small_recording, "--stop", 2, *QUICK, "--out", tmp_path / "out")
     refused(ran, small_recording.name, "at least 3")
 
 
 def test_a_range_without_frames_says_so(
     aquaflow: Cli, small_recording: Path, tmp_path: Path
 ) -> None:
-    refused(aquaflow("map", small_recording, "--start", 500, "--out", tmp_path / "out"), "500")
+    ran = aquaflow("map", small_recording, "--start", 500, "--out", tmp_path / "out")
+    refused(ran, small_recording.name, "500", "24 frames")
 
 
 # --- options and files beside the recording -------------------------------------------------------
@@ -277,9 +278,7 @@ def test_a_dive_is_not_replaced_unasked(
     assert (small_dive / "trajectory.tum").read_bytes() == before
 
 
-def test_a_dive_is_not_written_over_the_recording(
-    aquaflow: Cli, small_recording: Path
-) -> None:
+def test_a_dive_is_not_written_over_the_recording(aquaflow: Cli, small_recording: Path) -> None:
     refused(aquaflow("map", small_recording, "--out", small_recording), small_recording)
 
 

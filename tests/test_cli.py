@@ -51,7 +51,9 @@ def test_options_come_before_the_config_file(
     file = tmp_path / "mine.yaml"
     file.write_text("seed: 3\nsource:\n  every: 2\n  stop: 9\n")
     dive = tmp_path / "dive"
-    aquaflow("map", small_recording, "--config", file, "--stop", 12, "--tracking-only", "--out", dive)
+    aquaflow(
+        "map", small_recording, "--config", file, "--stop", 12, "--tracking-only", "--out", dive
+    )
     used = load_config(dive / "config.yaml")
     assert (used.seed, used.source.every, used.source.stop) == (3, 2, 12)
     assert not used.mapping.enabled
@@ -102,7 +104,9 @@ def test_overwrite_leaves_nothing_of_the_dive_before(
     dive = tmp_path / "dive"
     aquaflow("map", small_recording, "--out", dive, *QUICK)
     assert (dive / "heldout" / "000016_real.png").is_file()
-    ran = aquaflow("map", small_recording, "--out", dive, "--stop", 12, "--tracking-only", "--overwrite")
+    ran = aquaflow(
+        "map", small_recording, "--out", dive, "--stop", 12, "--tracking-only", "--overwrite"
+    )
     assert ran.code == 0
     assert not list(dive.glob("*.ply"))
     assert not (dive / "heldout" / "000016_real.png").exists()

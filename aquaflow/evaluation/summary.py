@@ -46,9 +46,7 @@ def _trajectory(result: Values) -> list[str]:
     relative = result["rpe"]
     if relative is not None:
         moved, turned = relative["translation_pct"], relative["rotation_rmse_deg"]
-        lines.append(
-            _row("pose to pose (RPE)", f"{moved:.3g} % of the step, {turned:.3g} degrees")
-        )
+        lines.append(_row("pose to pose (RPE)", f"{moved:.3g} % of the step, {turned:.3g} degrees"))
     return lines
 
 

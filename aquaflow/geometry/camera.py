@@ -153,7 +153,9 @@ def load_camera(path: Path) -> CameraModel:
     try:
         file = CameraFile.model_validate(data)
     except ValidationError as error:
-        first = error.errors()[0]
+        # A misspelt key is also a missing one; the one that was written says more.
+        found = sorted(error.errors(), key=lambda each: each["type"] != "extra_forbidden")
+        first = found[0]
         key = ".".join(str(part) for part in first["loc"])
         raise ConfigError(
             f"{path}: key '{key}': {first['msg'].lower()}; known keys are "

@@ -7,7 +7,7 @@ towards B_inf. For trial parameters the best J of every point is linear, so it i
 them, because every Gaussian's colour can follow the water's error.
 
 Lamps and lenses darken the picture towards its edge, and near ground is seen near the edge: left
-out, that looks like water. The shading enters only where it explains the sightings clearly better.
+out, that looks like water. The shading enters only where the sightings warrant its parameters.
 """
 
 from __future__ import annotations
@@ -37,8 +37,6 @@ DARK_SHARE, DARK_LEVEL, DARK_SIGMA = 0.02, 0.02, 0.1
 """Prior: the darkest 2 % of the points are shadows, nearly black (dark channel, He et al. 2011)."""
 SHADING_SIGMA = 0.3
 """Prior: log-gain at the edge of the picture; a third is a strong lamp fall-off."""
-SHADING_PAYS = 0.85
-"""Shading is kept if it lowers the sightings' cost below this share."""
 MAX_EVALUATIONS = 40
 
 
@@ -105,9 +103,18 @@ def estimate_water(
     x, cost, noise = _solve(plain, start)
     shaded = _Problem(seen, B_res, d, start_beta, shaded=True)
     x_shaded, cost_shaded, noise_shaded = _solve(shaded, np.append(x, np.zeros(TERMS)))
-    if cost_shaded < SHADING_PAYS * cost:
+    if _pays(cost, cost_shaded, 3 * seen.points):
         return _estimate(shaded, x_shaded, noise_shaded)
     return _estimate(plain, x, noise)
+
+
+def _pays(plain: float, shaded: float, values: int) -> bool:
+    """Bayesian information criterion: does the lower cost warrant the additional parameters?
+
+    ``values`` independent values, one per point and channel; costs are mean absolute errors.
+    """
+    gain = 2.0 * values * np.log(max(plain, 1e-12) / max(shaded, 1e-12))
+    return bool(gain > TERMS * np.log(values))
 
 
 def _solve(problem: _Problem, start: Array) -> tuple[Array, float, float]:

@@ -1,0 +1,132 @@
+"""Restored views against pictures without water, on small dives written here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from aquaflow.config import Config, dump_config, parse_config
+from aquaflow.errors import InputError
+from aquaflow.evaluation.restoration import evaluate_restoration
+
+WIDTH, HEIGHT = 96, 72
+INDICES = (8, 16)
+COUNT = 18
+
+Picture = npt.NDArray[np.uint8]
+
+
+def scene(index: int) -> Picture:
+    """What the camera would see without water; another picture for every index."""
+    noise = np.random.default_rng(index).uniform(40, 200, (9, 12, 3)).astype(np.float32)
+    return cv2.resize(noise, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC).astype(np.uint8)
+
+
+def in_water(picture: Picture) -> Picture:
+    """Dimmed by channel, and veiled."""
+    return (picture * np.array([0.3, 0.6, 0.7]) + np.array([10.0, 60.0, 70.0])).astype(np.uint8)
+
+
+def save(path: Path, rgb: Picture) -> None:
+    assert cv2.imwrite(str(path), np.ascontiguousarray(rgb[..., ::-1]))
+
+
+def write_dive(folder: Path, restored_gain: tuple[float, float, float] | None) -> Path:
+    (folder / "heldout").mkdir(parents=True)
+    dump_config(Config.model_validate({}), folder / "config.yaml")
+    for index in INDICES:
+        picture = scene(index)
+        save(folder / "heldout" / f"{index:06d}_real.png", in_water(picture))
+        if restored_gain is not None:
+            restored = (picture * np.array(restored_gain)).astype(np.uint8)
+            save(folder / "heldout" / f"{index:06d}_restored.png", restored)
+    return folder
+
+
+def write_clean(folder: Path, side_by_side: bool = False, count: int = COUNT) -> Path:
+    folder.mkdir(parents=True)
+    for index in range(count):
+        picture = scene(index)
+        if side_by_side:
+            picture = np.concatenate([in_water(picture), picture], axis=1)
+        save(folder / f"{index}.png", picture)
+    return folder
+
+
+def test_a_scene_restored_up_to_white_balance_beats_the_raw_pictures(tmp_path: Path) -> None:
+    dive = write_dive(tmp_path / "dive", (0.9, 0.5, 0.7))
+    result = evaluate_restoration(dive, write_clean(tmp_path / "clean"), None).to_json()
+    assert result["frames"] == len(INDICES)
+    assert result["psnr_restored"] > 45.0
+    assert result["psnr_raw"] < 25.0
+    assert result["gain_db"] == pytest.approx(result["psnr_restored"] - result["psnr_raw"])
+
+
+def test_one_gain_serves_all_frames(tmp_path: Path) -> None:
+    """A restoration whose brightness flickers is not forgiven."""
+    dive = write_dive(tmp_path / "dive", (0.9, 0.9, 0.9))
+    path = dive / "heldout" / f"{INDICES[0]:06d}_restored.png"
+    save(path, (scene(INDICES[0]) * 0.5).astype(np.uint8))
+    assert evaluate_restoration(dive, write_clean(tmp_path / "c"), None).psnr_restored < 25.0
+
+
+def test_a_half_of_a_side_by_side_recording_is_compared(tmp_path: Path) -> None:
+    dive = write_dive(tmp_path / "dive", (0.8, 0.8, 0.8))
+    both = write_clean(tmp_path / "both", side_by_side=True)
+    right, left = (evaluate_restoration(dive, both, crop) for crop in ("right", "left"))
+    assert right.psnr_restored > 45.0
+    assert left.psnr_raw > right.psnr_raw
+
+
+def test_a_synthetic_dive_is_compared_with_its_clean_pictures(tmp_path: Path) -> None:
+    dive = write_dive(tmp_path / "dive", (0.8, 0.8, 0.8))
+    write_clean(tmp_path / "synthetic" / "clean")
+    (tmp_path / "synthetic" / "synth.yaml").touch()
+    assert evaluate_restoration(dive, tmp_path / "synthetic", None).psnr_restored > 45.0
+
+
+def test_the_clean_pictures_are_resized_as_the_dive_was(tmp_path: Path) -> None:
+    dive = write_dive(tmp_path / "dive", (0.8, 0.8, 0.8))
+    dump_config(parse_config({"source": {"width": WIDTH}}, "test"), dive / "config.yaml")
+    large = tmp_path / "large"
+    large.mkdir()
+    for index in range(COUNT):
+        size = (2 * WIDTH, 2 * HEIGHT)
+        save(large / f"{index}.png", cv2.resize(scene(index), size, interpolation=cv2.INTER_CUBIC))
+    assert evaluate_restoration(dive, large, None).psnr_restored > 40.0
+
+
+def test_a_dive_without_held_out_frames_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no held-out frames"):
+        evaluate_restoration(tmp_path, write_clean(tmp_path / "clean"), None)
+
+
+def test_a_dive_without_water_is_refused(tmp_path: Path) -> None:
+    dive = write_dive(tmp_path / "dive", None)
+    with pytest.raises(InputError, match="no water to remove"):
+        evaluate_restoration(dive, write_clean(tmp_path / "clean"), None)
+
+
+def test_pictures_of_another_shape_are_refused(tmp_path: Path) -> None:
+    dive = write_dive(tmp_path / "dive", (0.8, 0.8, 0.8))
+    both = write_clean(tmp_path / "both", side_by_side=True)
+    with pytest.raises(InputError, match=r"192 x 72 .* 96 x 72"):
+        evaluate_restoration(dive, both, None)
+
+
+def test_a_recording_that_is_too_short_is_refused(tmp_path: Path) -> None:
+    dive = write_dive(tmp_path / "dive", (0.8, 0.8, 0.8))
+    with pytest.raises(InputError, match="no readable frame 16"):
+        evaluate_restoration(dive, write_clean(tmp_path / "clean", count=12), None)
+
+
+def test_a_damaged_picture_of_the_dive_is_named(tmp_path: Path) -> None:
+    dive = write_dive(tmp_path / "dive", (0.8, 0.8, 0.8))
+    damaged = dive / "heldout" / f"{INDICES[1]:06d}_restored.png"
+    damaged.write_bytes(b"no picture")
+    with pytest.raises(InputError, match=damaged.name):
+        evaluate_restoration(dive, write_clean(tmp_path / "clean"), None)

@@ -1,0 +1,145 @@
+"""The dive folder: every file of DESIGN section 5, readable by what reads it."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from conftest import FRAMES, HEIGHT, WIDTH
+
+from aquaflow.config import Config, load_config
+from aquaflow.dive import DiveFolder, FrameRow
+from aquaflow.errors import InputError
+from aquaflow.evaluation.trajectory import read_tum
+from aquaflow.export.ply import read_ply
+from aquaflow.geometry.camera import load_camera
+
+METRICS = {
+    *("frames", "tracked", "lost", "skipped", "keyframes", "mapping_frames", "common_frames"),
+    *("gaussians", "wall_s", "fps", "stage_ms", "peak_rss_mb", "psnr", "ssim", "lpips"),
+    *("lpips_reason", "heldout_frames", "ate_rmse_m_se3", "ate_rmse_m_sim3", "rpe"),
+    *("scale_source", "renderer", "prior", "device", "seed", "version", "protocol"),
+}
+"""The keys that DESIGN section 5 promises."""
+
+HELD_OUT = (8, 16)
+DEFAULT = Config.model_validate({})
+
+
+def table(dive: Path) -> list[dict[str, str]]:
+    with (dive / "frames.csv").open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+@contextmanager
+def opened(path: Path, overwrite: bool = False) -> Iterator[DiveFolder]:
+    folder = DiveFolder(path, DEFAULT, overwrite)
+    try:
+        yield folder
+    finally:
+        folder.close()
+
+
+def test_every_frame_is_in_the_table_once_and_in_order(small_dive: Path) -> None:
+    rows = table(small_dive)
+    assert [int(row["index"]) for row in rows] == list(range(FRAMES))
+    assert [row["source"] for row in rows] == [f"{i:06d}.png" for i in range(FRAMES)]
+    assert {row["class"] for row in rows} <= {"keyframe", "mapping", "common"}
+    assert rows[0]["class"] == "keyframe"
+
+
+def test_trajectory_has_the_posed_frames_at_their_times(small_dive: Path) -> None:
+    posed = [float(row["t_s"]) for row in table(small_dive) if row["sub_map"]]
+    trajectory = read_tum(small_dive / "trajectory.tum")
+    np.testing.assert_allclose(trajectory.t_s, posed, atol=1e-9)
+    np.testing.assert_allclose(posed, np.arange(FRAMES) / 10.0, atol=1e-9)
+
+
+def test_metrics_have_the_stable_keys_and_agree_with_the_table(small_dive: Path) -> None:
+    metrics = json.loads((small_dive / "metrics.json").read_text())
+    assert metrics.keys() >= METRICS
+    classes = [row["class"] for row in table(small_dive)]
+    assert metrics["frames"] == metrics["tracked"] == FRAMES
+    assert metrics["keyframes"] == classes.count("keyframe")
+    assert metrics["mapping_frames"] == classes.count("mapping")
+    assert metrics["common_frames"] == classes.count("common")
+    assert metrics["heldout_frames"] == len(HELD_OUT)
+    for stage in metrics["stage_ms"].values():
+        assert stage.keys() == {"count", "total", "p50", "p95"}
+
+
+def test_maps_load_and_differ_only_in_colour(small_dive: Path) -> None:
+    seen, clear = (read_ply(small_dive / name) for name in ("map.ply", "map_clear.ply"))
+    count = json.loads((small_dive / "metrics.json").read_text())["gaussians"]
+    assert len(seen.means) == len(clear.means) == count > 0
+    np.testing.assert_array_equal(seen.means, clear.means)
+    assert np.abs(seen.colours - clear.colours).max() > 0.01
+
+
+def test_water_has_its_rates_and_their_unit(small_dive: Path) -> None:
+    medium = json.loads((small_dive / "medium.json").read_text())
+    assert medium["active"]
+    assert medium["attenuation_unit"] == "1/map unit"
+    values = [medium["attenuation_per_unit"], *medium["backscatter"].values()]
+    assert np.shape(values) == (5, 3)
+    assert np.min(values) >= 0.0
+    assert medium["range_p5"] <= medium["map_ply_reference_range"] <= medium["range_p95"]
+
+
+def test_config_cameras_log_and_report_can_be_read_again(small_dive: Path) -> None:
+    assert load_config(small_dive / "config.yaml").mapping.optimiser.refine_steps == 60
+    camera = load_camera(small_dive / "camera.yaml")
+    assert (camera.width, camera.height) == (WIDTH, HEIGHT)
+    assert load_camera(small_dive / "calibration.yaml").fx == pytest.approx(camera.fx)
+    for line in (small_dive / "log.jsonl").read_text().splitlines():
+        assert {"t", "level", "message"} <= json.loads(line).keys()
+    report = (small_dive / "report.html").read_text()
+    assert report.startswith("<!doctype html>")
+    assert "http://" not in report.replace("http://www.w3.org", "")
+
+
+def test_held_out_pictures_lie_beside_what_the_map_shows(small_dive: Path) -> None:
+    for index in HELD_OUT:
+        for kind in ("real", "rendered", "restored"):
+            picture = cv2.imread(str(small_dive / "heldout" / f"{index:06d}_{kind}.png"))
+            assert picture.shape == (HEIGHT, WIDTH, 3)
+    assert len(list((small_dive / "heldout").iterdir())) == 3 * len(HELD_OUT)
+
+
+def test_what_was_decided_is_on_disk_before_the_end(tmp_path: Path) -> None:
+    with opened(tmp_path / "dive") as folder:
+        folder.record([FrameRow(3, "3.png", 0.3, "lost", reason="blurred, and dark")])
+        (row,) = table(folder.path)
+        assert (row["index"], row["class"], row["reason"]) == ("3", "lost", "blurred, and dark")
+
+
+def test_table_is_sorted_at_the_end(tmp_path: Path) -> None:
+    with opened(tmp_path / "dive") as folder:
+        folder.record([FrameRow(i, f"{i}.png", i / 10.0, "common", 0, 0, 0.5) for i in (2, 0, 1)])
+        folder.write_frames()
+        assert [row["index"] for row in table(folder.path)] == ["0", "1", "2"]
+
+
+def test_a_number_that_is_not_finite_is_never_written(tmp_path: Path) -> None:
+    with opened(tmp_path / "dive") as folder:
+        with pytest.raises(ValueError, match="JSON compliant"):
+            folder.write_json("metrics.json", {"psnr": float("nan")})
+        assert not (folder.path / "metrics.json").exists()
+
+
+def test_overwriting_removes_results_and_keeps_what_is_not_a_runs(tmp_path: Path) -> None:
+    dive = tmp_path / "dive"
+    with opened(dive):
+        (dive / "map_1.ply").touch()
+        (dive / "my notes.txt").touch()
+    with pytest.raises(InputError, match="--overwrite"):
+        DiveFolder(dive, DEFAULT)
+    with opened(dive, overwrite=True):
+        assert not (dive / "map_1.ply").exists()
+        assert (dive / "my notes.txt").exists()

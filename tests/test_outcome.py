@@ -1,0 +1,113 @@
+"""What a run amounts to, from results made by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from aquaflow.config import Config
+from aquaflow.geometry.camera import guess_camera
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.messages import Dropped, Frame
+from aquaflow.outcome import (
+    HeldOut,
+    WaterSummary,
+    examine_held_out,
+    largest_sub_map,
+    metrics,
+    refined_poses,
+    to_bytes,
+    water_of,
+)
+from aquaflow.slam import Slam
+from aquaflow.tracking.tracker import FrameClass, Tracked
+
+PICTURE = np.zeros((48, 64, 3), np.uint8)
+
+
+def tracked(index: int, frame_class: FrameClass, sub_map: int = 0, posed: bool = True) -> Tracked:
+    frame = Frame(index, index, index, PICTURE, guess_camera(64, 48))
+    pose = Sim3(np.eye(3), np.array([float(index), 0.0, 0.0])) if posed else None
+    return Tracked(frame, frame_class, sub_map, 0, pose)
+
+
+def held_out(psnr: float, ssim: float) -> HeldOut:
+    return HeldOut(8, PICTURE, PICTURE, None, psnr, ssim, None)
+
+
+@pytest.fixture(scope="module")
+def slam() -> Slam:
+    return Slam(Config.model_validate({}))
+
+
+RESULTS = [
+    tracked(0, FrameClass.KEYFRAME),
+    tracked(1, FrameClass.COMMON),
+    tracked(2, FrameClass.LOST, 0, posed=False),
+    tracked(4, FrameClass.KEYFRAME, 1),
+    tracked(5, FrameClass.MAPPING, 1),
+    tracked(6, FrameClass.COMMON, 1),
+]
+
+
+def test_the_sub_map_with_most_poses_is_the_dives() -> None:
+    assert largest_sub_map(RESULTS) == 1
+
+
+def test_of_equal_sub_maps_the_earlier_is_the_dives() -> None:
+    assert largest_sub_map(RESULTS[:-1]) == 0
+
+
+def test_without_a_pose_the_first_sub_map_is_meant() -> None:
+    assert largest_sub_map([RESULTS[2]]) == 0
+
+
+def test_every_frame_is_counted_once(slam: Slam) -> None:
+    numbers = metrics(slam, RESULTS, [Dropped(3, 3, "damaged")], [], 2.0)
+    assert (numbers["frames"], numbers["tracked"], numbers["sub_maps"]) == (7, 5, 2)
+    classes = ("keyframes", "mapping_frames", "common_frames", "lost", "skipped")
+    assert [numbers[key] for key in classes] == [2, 1, 2, 1, 1]
+    assert sum(numbers[key] for key in classes) == numbers["frames"]
+    assert numbers["fps"] == 3.5
+
+
+def test_quality_is_the_mean_over_held_out_frames(slam: Slam) -> None:
+    numbers = metrics(slam, RESULTS, [], [held_out(20.0, 0.5), held_out(30.0, 0.7)], 1.0)
+    assert (numbers["psnr"], numbers["ssim"], numbers["heldout_frames"]) == (25.0, 0.6, 2)
+
+
+def test_without_held_out_frames_quality_is_null_and_not_zero(slam: Slam) -> None:
+    numbers = metrics(slam, RESULTS, [], [], 1.0)
+    assert numbers["psnr"] is None
+    assert numbers["ssim"] is None
+
+
+def test_an_lpips_that_was_not_measured_has_a_reason(slam: Slam) -> None:
+    numbers = metrics(slam, RESULTS, [], [held_out(20.0, 0.5)], 1.0)
+    assert (numbers["lpips"] is None) == bool(numbers["lpips_reason"])
+
+
+def test_only_posed_frames_have_a_pose(slam: Slam) -> None:
+    poses = refined_poses(slam, RESULTS)
+    assert list(poses) == [0, 1, 4, 5, 6]
+    assert poses[5].t[0] == 5.0
+
+
+def test_a_dive_without_a_map_has_nothing_to_examine(slam: Slam) -> None:
+    assert examine_held_out(slam, 0) == []
+
+
+def test_bytes_are_rounded_and_kept_in_range() -> None:
+    image = np.array([[[-1.0, 0.5, 2.0]]])
+    assert to_bytes(image).tolist() == [[[0, 128, 255]]]
+
+
+def test_a_summary_becomes_the_water_it_describes() -> None:
+    summary = WaterSummary(
+        [0.4, 0.2, 0.1], [0.3] * 3, [0.1, 0.2, 0.3], [0.0] * 3, [1.0] * 3, 0.5, 1.0, 2.0
+    )
+    water = water_of(summary)
+    z = torch.tensor([1.0])
+    torch.testing.assert_close(water.transmission(z)[0], torch.exp(-torch.tensor([0.4, 0.2, 0.1])))
+    assert water.backscatter(z)[0, 2] == pytest.approx(0.3 * (1.0 - np.exp(-0.3)), abs=1e-6)
