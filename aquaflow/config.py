@@ -43,8 +43,10 @@ class InitialisationConfig(Stage):
     min_views: int = Field(2, ge=1, description="frames beside the reference to judge by")
     max_waiting: int = Field(24, ge=3, description="frames kept while waiting; bounds memory")
     parallax_widths: float = Field(
-        0.04, gt=0, description="rotation-compensated median parallax over width; measured: "
-        "0.02 leaves the depth of gentle relief undecided"
+        0.04,
+        gt=0,
+        description="rotation-compensated median parallax over width; measured: "
+        "0.02 leaves the depth of gentle relief undecided",
     )
     pairs: int = Field(2, ge=1, description="second views tried, most parallax first")
     candidates: int = Field(3, ge=1, description="E and H poses tried per pair")
@@ -68,8 +70,10 @@ class TrackingConfig(Stage):
     """Tracking and frame classes (paper, Sec. 3.2)."""
 
     keyframe_share: float = Field(
-        0.7, gt=0, lt=1, description="tau_keyframe: matched share below which a keyframe is made; "
-        "paper: 0.7"
+        0.7,
+        gt=0,
+        lt=1,
+        description="tau_keyframe: matched share below which a keyframe is made; paper: 0.7",
     )
     mapping_parallax_widths: float = Field(
         30.0 / 512.0, gt=0, description="tau_mapframe over width; paper: 30 px at 512 px"
@@ -96,13 +100,17 @@ class MediumConfig(Stage):
 
     enabled: bool = Field(True, description="False: the map is what the camera saw, water included")
     width: int = Field(32, ge=4, description="hidden units of MLP_a; paper silent, 32 cost nothing")
-    rate: float = Field(2e-3, gt=0, description="Adam rate of all medium parameters")
+    rate: float = Field(
+        5e-4, gt=0, description="Adam rate of all medium parameters; 2e-3 drifts off the fit"
+    )
     max_gradient: float = Field(
         0.01, gt=0, description="gradient norm kept (WaterSplatting clips at 0.001)"
     )
     first_fit_views: int = Field(
-        12, ge=2, description="views after which water is first fitted to sightings; then at every "
-        "doubling, and before refining"
+        12,
+        ge=2,
+        description="views after which water is first fitted to sightings; then at every "
+        "doubling, and before refining",
     )
     fit_views: int = Field(20, ge=4, description="views that a fit looks at, spread over the dive")
     initial_attenuation: float = Field(
@@ -118,8 +126,11 @@ class InsertionConfig(Stage):
 
     sigma_px: float = Field(1.0, gt=0, description="sigma of the Laplacian of Gaussian")
     tau_a: float = Field(
-        0.02, ge=0, le=1, description="P_a above which a pixel may get a Gaussian; the paper's 1.0 "
-        "never fires (DESIGN section 4)"
+        0.02,
+        ge=0,
+        le=1,
+        description="P_a above which a pixel may get a Gaussian; the paper's 1.0 "
+        "never fires (DESIGN section 4)",
     )
     density: float = Field(0.5, gt=0, le=1, description="Gaussians per pixel of certain structure")
     bare_probability: float = Field(
@@ -225,7 +236,8 @@ def load_config(path: Path) -> Config:
     try:
         data = yaml.safe_load(path.read_text()) or {}
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read the config {path}: {error}") from error
+        reason = error.strerror if isinstance(error, OSError) else "it is not text"
+        raise InputError(f"cannot read the config {path}: {reason}; give a YAML file") from error
     except yaml.YAMLError as error:
         raise InputError(f"{path} is not YAML; write `key: value` lines") from error
     if not isinstance(data, dict):

@@ -80,8 +80,7 @@ class DiveFolder:
         self._rows: list[FrameRow] = []
         self._write_rows(self._frames, [FRAME_COLUMNS])
         self._log = _JsonLog(path / "log.jsonl")
-        for name in LOGGERS:
-            logging.getLogger(name).addHandler(self._log)
+        self._log.attach()
 
     def _claim(self, overwrite: bool) -> None:
         try:
@@ -105,8 +104,6 @@ class DiveFolder:
 
     def close(self) -> None:
         """Release the open files; what was written stays."""
-        for name in LOGGERS:
-            logging.getLogger(name).removeHandler(self._log)
         self._log.close()
         self._frames.close()
 
@@ -175,6 +172,9 @@ class DiveFolder:
                 "backscatter": {
                     "B_inf": water.B_inf, "b": water.b, "B_res": water.B_res, "d": water.d,
                 },
+                "attenuation_relative_sigma": water.beta_a_sigma,
+                "identifiable": water.beta_a_sigma is not None,
+                "shading_log_gain": water.shading,
                 "range_p5": water.range_p5,
                 "range_p95": water.range_p95,
                 "map_ply_reference_range": water.range_median,
@@ -222,6 +222,15 @@ class _JsonLog(logging.Handler):
     def __init__(self, path: Path) -> None:
         super().__init__(logging.INFO)
         self._stream = path.open("w", encoding="utf-8")
+        self._levels_before: dict[str, int] = {}
+
+    def attach(self) -> None:
+        """Receive what AquaFlow logs from here on, until closed."""
+        for name in LOGGERS:
+            logger = logging.getLogger(name)
+            self._levels_before[name] = logger.level
+            logger.setLevel(logging.INFO)
+            logger.addHandler(self)
 
     def emit(self, record: logging.LogRecord) -> None:
         entry = {
@@ -234,5 +243,9 @@ class _JsonLog(logging.Handler):
         self._stream.flush()
 
     def close(self) -> None:
+        for name, level in self._levels_before.items():
+            logger = logging.getLogger(name)
+            logger.removeHandler(self)
+            logger.setLevel(level)
         self._stream.close()
         super().close()

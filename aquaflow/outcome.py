@@ -30,6 +30,8 @@ PROTOCOL = {
 }
 
 RANGE_PERCENTILES = (5.0, 95.0)
+BRIGHT_QUANTILE, BRIGHT_LEVEL = 0.995, 0.95
+"""This share of the restored values is shown no brighter than this level."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,10 @@ class WaterSummary:
     range_p5: float
     range_median: float
     range_p95: float
+    beta_a_sigma: list[float] | None
+    """Relative standard deviation of beta_a; None if the ranges seen never allowed a fit."""
+    shading: list[float]
+    """Log-gain of the camera over the picture: x, y, x^2, x y, y^2 with x, y from -1 to 1."""
 
 
 def largest_sub_map(results: list[Tracked]) -> int:
@@ -78,15 +84,30 @@ def examine_held_out(slam: Slam, sub_map: int) -> list[HeldOut]:
     mapper = slam.mappers.get(sub_map)
     if mapper is None or len(mapper.gaussians) == 0:
         return []
-    return [_examine(mapper, view) for view in slam.held_out.get(sub_map, [])]
+    views = slam.held_out.get(sub_map, [])
+    for view in views:
+        mapper.register(view)
+    exposure = restored_exposure(mapper, views)
+    return [_examine(mapper, view, exposure) for view in views]
 
 
-def _examine(mapper: Mapper, view: View) -> HeldOut:
-    mapper.register(view)
+def restored_exposure(mapper: Mapper, views: list[View]) -> float:
+    """One gain for all restored pictures, so that the bright end of the dive is not cut off.
+
+    Without water a scene may be brighter than the camera's white; 1 where it is not.
+    """
+    if not views:
+        return 1.0
+    pictures = [mapper.show(view).radiance.numpy() for view in views]
+    brightest = max(float(np.quantile(picture, BRIGHT_QUANTILE)) for picture in pictures)
+    return min(1.0, BRIGHT_LEVEL / max(brightest, 1e-6))
+
+
+def _examine(mapper: Mapper, view: View, exposure: float) -> HeldOut:
     shown = mapper.show(view)
     real = view.target().numpy()
     rendered = shown.image.clamp(0.0, 1.0).numpy()
-    restored = to_bytes(shown.radiance.numpy()) if mapper.medium.active else None
+    restored = to_bytes(exposure * shown.radiance.numpy()) if mapper.medium.active else None
     perceptual, _ = lpips(rendered, real)
     return HeldOut(
         view.frame_index,
@@ -125,6 +146,8 @@ def summarise_water(mapper: Mapper) -> WaterSummary | None:
         float(low),
         float(z.median()),
         float(high),
+        mapper.scene.beta_a_sigma,
+        mapper.scene.shading.tolist(),
     )
 
 

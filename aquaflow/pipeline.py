@@ -25,7 +25,7 @@ from aquaflow.outcome import (
 )
 from aquaflow.preparation import Preparation
 from aquaflow.reporting import report_data
-from aquaflow.slam import Slam
+from aquaflow.slam import MIN_VIEWS, Slam
 from aquaflow.sources import RecordedCamera
 from aquaflow.tracking.tracker import Tracked
 
@@ -33,10 +33,6 @@ log = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int | None], None]
 """Called with the stage, the steps done and, where known, the steps there are."""
-
-MIN_POSED_FRAMES = 3
-"""Fewer posed frames are not a map."""
-
 
 @dataclass(frozen=True)
 class Replayed:
@@ -99,7 +95,7 @@ class _Replay:
         self._decide(self.slam.finish(lambda done, total: self._progress("refine", done, total)))
         self._note_what_was_left_out()
         self.folder.write_frames()
-        if sum(tracked.T_wc is not None for tracked in self.results) < MIN_POSED_FRAMES:
+        if sum(tracked.T_wc is not None for tracked in self.results) < MIN_VIEWS:
             raise NotMappedError(self._why_not())
         return self._write(started)
 
@@ -187,8 +183,8 @@ class _Replay:
             return f"{self.name}: none{known} lies between --start {source.start} and {stop}"
         if read == 0:
             return f"{self.name}: no frame could be read, see {self.folder.path}/frames.csv"
-        if read < MIN_POSED_FRAMES:
-            return f"{self.name} has {read} usable frames; a map needs at least {MIN_POSED_FRAMES}"
+        if read < MIN_VIEWS:
+            return f"{self.name} has {read} usable frames; a map needs at least {MIN_VIEWS}"
         return (
             f"{self.name}: none of {read} frames could be placed; the pictures need texture and "
             "the camera must move sideways, see frames.csv for each frame"

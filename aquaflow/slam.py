@@ -16,6 +16,9 @@ from aquaflow.profiler import Profiler
 from aquaflow.render import select_renderer
 from aquaflow.tracking.tracker import FrameClass, Tracked, Tracker
 
+MIN_VIEWS = 3
+"""Fewer posed frames are not a map, and not worth refining."""
+
 
 class Slam:
     """One dive: a tracker, its keyframes, and a map for every sub-map."""
@@ -57,7 +60,8 @@ class Slam:
         self._keyframe_views.clear()
         with self.profiler.stage("refine"):
             for mapper in self.mappers.values():
-                mapper.refine(progress)
+                if len(mapper.views) >= MIN_VIEWS:
+                    mapper.refine(progress)
         return decided
 
     def _map(self, tracked: Tracked) -> None:

@@ -29,9 +29,9 @@ class CameraSource(Protocol):
     notes: list[str]
     """Sentences for the user about what was left out, complete once iteration ends."""
 
-    def frames(self, every: int = 1, start: int = 0, stop: int | None = None) -> (
-        Iterator[Frame | Dropped]
-    ):
+    def frames(
+        self, every: int = 1, start: int = 0, stop: int | None = None
+    ) -> Iterator[Frame | Dropped]:
         """Frames whose index is ``start, start + every, ...`` below ``stop``."""
         ...
 

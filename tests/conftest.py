@@ -48,6 +48,17 @@ def run_aquaflow(*arguments: object, timeout_s: float = 400.0) -> Ran:
     return Ran(done.returncode, done.stdout, done.stderr)
 
 
+def refused(ran: Ran, *named: object) -> None:
+    """The command failed with one sentence that names the input."""
+    assert ran.code == 1
+    assert ran.out == ""
+    assert "Traceback" not in ran.err
+    (line,) = ran.err.splitlines()
+    assert line.startswith("aquaflow: ")
+    for name in named:
+        assert str(name) in line
+
+
 @pytest.fixture(scope="session")
 def aquaflow() -> Cli:
     """``aquaflow("map", source, "--out", dive)`` runs the command in a process of its own."""

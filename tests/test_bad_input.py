@@ -1,4 +1,4 @@
-"""Bad input through the real command line: one sentence that names it, and no traceback."""
+"""Bad recordings through the real command line: one sentence, or a dive that says what it lacks."""
 
 from __future__ import annotations
 
@@ -11,21 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import QUICK, Cli, Ran
-
-USAGE = 2
-"""Exit code of an option that does not exist or is out of range."""
-
-
-def refused(ran: Ran, *named: object) -> None:
-    """The command failed with one sentence that names the input."""
-    assert ran.code == 1
-    assert ran.out == ""
-    assert "Traceback" not in ran.err
-    (line,) = ran.err.splitlines()
-    assert line.startswith("aquaflow: ")
-    for name in named:
-        assert str(name) in line
+from conftest import QUICK, Cli, refused
 
 
 def rows(dive: Path) -> list[dict[str, str]]:
@@ -165,139 +151,3 @@ def test_a_range_without_frames_says_so(
 ) -> None:
     ran = aquaflow("map", small_recording, "--start", 500, "--out", tmp_path / "out")
     refused(ran, small_recording.name, "500", "24 frames")
-
-
-# --- options and files beside the recording -------------------------------------------------------
-
-
-@pytest.mark.parametrize("crop", ["100,0,100,120", "0,0,0,0", "middle", "1,2,3", "-1,0,20,20"])
-def test_a_crop_that_does_not_fit_is_refused(
-    aquaflow: Cli, small_recording: Path, tmp_path: Path, crop: str
-) -> None:
-    ran = aquaflow("map", small_recording, f"--crop={crop}", "--out", tmp_path / "out")
-    refused(ran, crop)
-
-
-def test_a_misspelt_key_of_a_calibration_is_named(
-    aquaflow: Cli, small_recording: Path, tmp_path: Path
-) -> None:
-    file = tmp_path / "camera.yaml"
-    file.write_text((small_recording / "camera.yaml").read_text().replace("fx:", "focal_x:"))
-    ran = aquaflow("map", small_recording, "--calib", file, "--out", tmp_path / "out")
-    refused(ran, file, "focal_x")
-
-
-def test_a_calibration_of_another_shape_is_refused(
-    aquaflow: Cli, small_recording: Path, tmp_path: Path
-) -> None:
-    file = tmp_path / "camera.yaml"
-    text = (small_recording / "camera.yaml").read_text()
-    file.write_text(text.replace("width: 160", "width: 320"))
-    ran = aquaflow("map", small_recording, "--calib", file, "--out", tmp_path / "out")
-    refused(ran, "320 x 120", "160 x 120")
-
-
-def test_a_missing_calibration_is_refused(
-    aquaflow: Cli, small_recording: Path, tmp_path: Path
-) -> None:
-    file = tmp_path / "none.yaml"
-    refused(aquaflow("map", small_recording, "--calib", file, "--out", tmp_path / "out"), file)
-
-
-@pytest.mark.parametrize(
-    ("text", "named"),
-    [
-        ("mapping:\n  optimiser:\n    refine_stepz: 5\n", "mapping.optimiser.refine_stepz"),
-        ("source:\n  every: 0\n", "source.every"),
-        ("- a\n- b\n", "key: value"),
-        ("a: [1,\n", "not YAML"),
-    ],
-)
-def test_a_bad_config_is_refused_with_the_keys_path(
-    aquaflow: Cli, small_recording: Path, tmp_path: Path, text: str, named: str
-) -> None:
-    file = tmp_path / "config.yaml"
-    file.write_text(text)
-    ran = aquaflow("map", small_recording, "--config", file, "--out", tmp_path / "out")
-    refused(ran, file, named)
-
-
-@pytest.mark.parametrize(
-    ("option", "value"), [("every", 0), ("width", 3), ("fps", 0), ("stop", 0), ("threads", 0)]
-)
-def test_an_option_out_of_range_is_refused_by_its_name(
-    aquaflow: Cli, small_recording: Path, tmp_path: Path, option: str, value: int
-) -> None:
-    ran = aquaflow("map", small_recording, f"--{option}", value, "--out", tmp_path / "out")
-    refused(ran, option)
-    assert not (tmp_path / "out").exists()
-
-
-def test_an_unknown_option_is_a_usage_error(aquaflow: Cli, tmp_path: Path) -> None:
-    ran = aquaflow("map", tmp_path, "--evry", 2)
-    assert ran.code == USAGE
-    assert "--evry" in ran.err
-    assert "Traceback" not in ran.err
-
-
-@pytest.mark.parametrize(
-    ("option", "value"), [("scene", "moon"), ("water", "milk"), ("frames", 1), ("seed", -1)]
-)
-def test_a_synthetic_dive_that_does_not_exist_is_refused(
-    aquaflow: Cli, tmp_path: Path, option: str, value: object
-) -> None:
-    refused(aquaflow("synth", tmp_path / "s", f"--{option}", value), f"--{option}")
-
-
-# --- folders to write to and to read from ---------------------------------------------------------
-
-
-def test_a_folder_with_other_files_is_not_written_to(
-    aquaflow: Cli, small_recording: Path, tmp_path: Path
-) -> None:
-    (tmp_path / "thesis.txt").write_text("years of work")
-    for extra in ((), ("--overwrite",)):
-        refused(aquaflow("map", small_recording, "--out", tmp_path, *extra), tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
-
-
-def test_an_out_that_is_a_file_is_refused(
-    aquaflow: Cli, small_recording: Path, tmp_path: Path
-) -> None:
-    file = tmp_path / "file"
-    file.write_text("x")
-    refused(aquaflow("map", small_recording, "--out", file), file)
-    assert file.read_text() == "x"
-
-
-def test_a_dive_is_not_replaced_unasked(
-    aquaflow: Cli, small_recording: Path, small_dive: Path
-) -> None:
-    before = (small_dive / "trajectory.tum").read_bytes()
-    refused(aquaflow("map", small_recording, "--out", small_dive), small_dive, "--overwrite")
-    assert (small_dive / "trajectory.tum").read_bytes() == before
-
-
-def test_a_dive_is_not_written_over_the_recording(aquaflow: Cli, small_recording: Path) -> None:
-    refused(aquaflow("map", small_recording, "--out", small_recording), small_recording)
-
-
-def test_evaluate_needs_something_to_compare_with(aquaflow: Cli, small_dive: Path) -> None:
-    refused(aquaflow("evaluate", small_dive), "--truth")
-
-
-def test_evaluate_refuses_a_folder_that_is_no_dive(
-    aquaflow: Cli, small_recording: Path, tmp_path: Path
-) -> None:
-    for folder in (tmp_path / "none", tmp_path):
-        refused(aquaflow("evaluate", folder, "--truth", small_recording), folder)
-        refused(aquaflow("evaluate", folder, "--clean", small_recording), folder)
-
-
-def test_evaluate_refuses_a_truth_that_is_none(
-    aquaflow: Cli, small_dive: Path, tmp_path: Path
-) -> None:
-    truth = tmp_path / "truth.tum"
-    refused(aquaflow("evaluate", small_dive, "--truth", truth), truth)
-    truth.write_text("0.0 1 2 three 0 0 0 1\n")
-    refused(aquaflow("evaluate", small_dive, "--truth", truth), truth)

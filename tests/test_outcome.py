@@ -105,7 +105,16 @@ def test_bytes_are_rounded_and_kept_in_range() -> None:
 
 def test_a_summary_becomes_the_water_it_describes() -> None:
     summary = WaterSummary(
-        [0.4, 0.2, 0.1], [0.3] * 3, [0.1, 0.2, 0.3], [0.0] * 3, [1.0] * 3, 0.5, 1.0, 2.0
+        beta_a=[0.4, 0.2, 0.1],
+        b=[0.3] * 3,
+        B_inf=[0.1, 0.2, 0.3],
+        B_res=[0.0] * 3,
+        d=[1.0] * 3,
+        range_p5=0.5,
+        range_median=1.0,
+        range_p95=2.0,
+        beta_a_sigma=None,
+        shading=[0.0] * 5,
     )
     water = water_of(summary)
     z = torch.tensor([1.0])

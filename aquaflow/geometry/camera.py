@@ -1,7 +1,7 @@
 """Camera models: pinhole with OpenCV distortion, read from ``camera.yaml``.
 
 Pixel convention: the centre of the top-left pixel is (0.5, 0.5), so the centre of a W-wide image
-is W / 2. OpenCV's convention is half a pixel less; the difference is applied where OpenCV is called.
+is W / 2. OpenCV's convention is half a pixel less; that is applied where OpenCV is called.
 """
 
 from __future__ import annotations
@@ -113,9 +113,7 @@ class CameraModel:
 def guess_camera(width: int, height: int) -> CameraModel:
     """A pinhole camera with a typical underwater focal length, marked as not calibrated."""
     focal = GUESSED_FOCAL_WIDTHS * width
-    return CameraModel(
-        width, height, focal, focal, width / 2.0, height / 2.0, calibrated=False
-    )
+    return CameraModel(width, height, focal, focal, width / 2.0, height / 2.0, calibrated=False)
 
 
 class CameraFile(BaseModel):
@@ -145,7 +143,9 @@ def load_camera(path: Path) -> CameraModel:
     try:
         data = yaml.safe_load(path.read_text())
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read the calibration {path}: {error}") from error
+        raise InputError(
+            f"cannot read the calibration {path}: {_reason(error)}; give a camera.yaml file"
+        ) from error
     except yaml.YAMLError as error:
         raise InputError(f"{path} is not YAML; compare it with the README's camera.yaml") from error
     if not isinstance(data, dict):
@@ -165,11 +165,20 @@ def load_camera(path: Path) -> CameraModel:
         file.distortion_model, "radtan"
     )
     return CameraModel(
-        file.width, file.height, file.fx, file.fy, file.cx, file.cy,
+        file.width,
+        file.height,
+        file.fx,
+        file.fy,
+        file.cx,
+        file.cy,
         distortion_model=kind,
         distortion=tuple(file.distortion),
         port=Port(kind=file.port),
     )
+
+
+def _reason(error: OSError | UnicodeDecodeError) -> str:
+    return (error.strerror or "unreadable") if isinstance(error, OSError) else "it is not text"
 
 
 def save_camera(camera: CameraModel, path: Path) -> None:

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 Array = npt.NDArray[np.float64]
 
-# Nodes on [0, 1]: 24 integrate e^(sigma t) exp(t w) to float64 accuracy for |w| <= pi, |sigma| <= 10,
-# with none of the closed form's branches near zero.
+# Nodes on [0, 1]: 24 integrate e^(sigma t) exp(t w) to float64 accuracy for |w| <= pi and
+# |sigma| <= 10, with none of the closed form's branches near zero.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
 
@@ -48,9 +48,7 @@ def quaternion_from_rotation(
     R: Array,  # [..., 3, 3]
 ) -> Array:
     """Unit quaternions [..., 4], wxyz, w >= 0."""
-    return np.asarray(
-        Rotation.from_matrix(R).as_quat(canonical=True, scalar_first=True)
-    )
+    return np.asarray(Rotation.from_matrix(R).as_quat(canonical=True, scalar_first=True))
 
 
 def rotation_from_quaternion(

@@ -80,4 +80,4 @@ def _cross_unit_depth(
 
 def _dot(x: Array, y: Array) -> Array:
     """[M] inner products of rows."""
-    return np.einsum("ij,ij->i", x, y)
+    return np.asarray(np.einsum("ij,ij->i", x, y))

@@ -94,7 +94,7 @@ def _essential_poses(a: Array, b: Array, K: Array) -> list[tuple[Sim3, str]]:
     )
     if E is None or E.shape != (3, 3):
         return []
-    R1, R2, t = cv2.decomposeEssentialMat(E)
+    R1, R2, t = (np.asarray(part, dtype=np.float64) for part in cv2.decomposeEssentialMat(E))
     return [(Sim3(R, sign * t[:, 0]), "essential") for R in (R1, R2) for sign in (1.0, -1.0)]
 
 
@@ -107,7 +107,7 @@ def _homography_poses(a: Array, b: Array, K: Array) -> list[tuple[Sim3, str]]:
     _, rotations, translations, _ = cv2.decomposeHomographyMat(H, K)
     poses = []
     for R, t in zip(rotations, translations, strict=True):
-        length = float(np.linalg.norm(t))
+        direction, length = np.asarray(t[:, 0], dtype=np.float64), float(np.linalg.norm(t))
         if length > 1e-6:
-            poses.append((Sim3(np.asarray(R), t[:, 0] / length), "homography"))
+            poses.append((Sim3(np.asarray(R), direction / length), "homography"))
     return poses

@@ -1,4 +1,4 @@
-"""The Gaussians of one sub-map: explicit parameters, each tied to the keyframe that saw it first."""
+"""The Gaussians of one sub-map: explicit parameters, each tied to the keyframe that saw it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,11 @@ class GaussianMap:
 
     NAMES = ("means", "quats", "log_scales", "opacity_logits", "raw_colours")
     WIDTHS: Mapping[str, int] = {
-        "means": 3, "quats": 4, "log_scales": 3, "opacity_logits": 1, "raw_colours": 3,
+        "means": 3,
+        "quats": 4,
+        "log_scales": 3,
+        "opacity_logits": 1,
+        "raw_colours": 3,
     }
 
     def __init__(self) -> None:

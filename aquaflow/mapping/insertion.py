@@ -59,6 +59,19 @@ def select(
     return rows, columns
 
 
+def thin(
+    rows: Tensor,  # [M]
+    columns: Tensor,  # [M]
+    room: int,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor]:
+    """At most ``room`` of the pixels, drawn from the whole picture."""
+    if len(rows) <= room:
+        return rows, columns
+    chosen = torch.randperm(len(rows), generator=generator)[: max(room, 0)].sort().values
+    return rows[chosen], columns[chosen]
+
+
 def new_gaussians(
     view: View,
     rows: Tensor,  # [M]

@@ -13,7 +13,7 @@ from torch import Tensor
 from aquaflow.config import MappingConfig
 from aquaflow.keyframes import Pointmap
 from aquaflow.mapping.gaussians import GaussianMap
-from aquaflow.mapping.insertion import insertion_probability, new_gaussians, select
+from aquaflow.mapping.insertion import insertion_probability, new_gaussians, select, thin
 from aquaflow.mapping.losses import depth_loss, outlier_mask, radial_weight, scale_loss
 from aquaflow.mapping.medium import Medium
 from aquaflow.mapping.rendering import Shown
@@ -74,18 +74,16 @@ class Mapper:
             allowed &= torch.from_numpy(view.mask)
         rows, columns = select(P, allowed, self.config.insertion, self._random)
         room = self.config.max_gaussians - len(self.gaussians)
-        rows, columns = rows[:max(room, 0)], columns[:max(room, 0)]
+        rows, columns = thin(rows, columns, room, self._random)
+        confidence = _confidence(pointmap)
+        view.inverse_range = torch.where(known, 1.0 / prior_range.clamp_min(1e-6), 0.0)
+        view.range_confidence = confidence
         if len(rows) == 0:
             return 0
-        confidence = _confidence(pointmap)
-        new = new_gaussians(
-            view, rows, columns, z, restored, confidence, P, self.config.insertion
-        )
+        new = new_gaussians(view, rows, columns, z, restored, confidence, P, self.config.insertion)
         self.gaussians.extend(new, view.keyframe)
         self._optimiser.extend(len(rows))
         self._optimiser.bind(self._parameters)
-        view.inverse_range = torch.where(known, 1.0 / prior_range.clamp_min(1e-6), 0.0)
-        view.range_confidence = confidence
         return len(rows)
 
     def fit_water(self) -> None:
@@ -139,7 +137,7 @@ class Mapper:
         if not torch.isfinite(loss):
             self._undo("loss", view)
             return
-        loss.backward()
+        torch.autograd.backward(loss)
         gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
         self._optimiser.step(shown.visible, gradients)
         self._step_medium(view)
@@ -158,7 +156,9 @@ class Mapper:
             mask = outlier_mask(shown.image, target, K_rad, weights.tau_e)
         if view.mask is not None:
             mask &= torch.from_numpy(view.mask)
-        loss = photometric_loss(shown.image, target, K_rad, mask, weights.ssim, self.renderer.threads)
+        loss = photometric_loss(
+            shown.image, target, K_rad, mask, weights.ssim, self.renderer.threads
+        )
         if weights.depth > 0.0 and view.inverse_range is not None:
             assert view.range_confidence is not None
             trust = K_rad * mask * view.range_confidence
@@ -207,7 +207,14 @@ class Mapper:
         for _ in range(config.heldout_steps if len(self.gaussians) else 0):
             viewmat = view.viewmat().requires_grad_()
             shown = self.scene.draw(view, viewmat=viewmat)
-            loss = photometric_loss(shown.image, view.target(), K_rad, mask, self.config.loss.ssim, self.renderer.threads)
+            loss = photometric_loss(
+                shown.image,
+                view.target(),
+                K_rad,
+                mask,
+                self.config.loss.ssim,
+                self.renderer.threads,
+            )
             (gradient,) = torch.autograd.grad(loss, viewmat)
             refine_pose(view, gradient, config.heldout_rate)
 

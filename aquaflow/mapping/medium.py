@@ -18,7 +18,7 @@ from aquaflow.mapping.image_formation import Water
 
 
 class Medium(nn.Module):
-    """beta_a = MLP_a(gamma(vec R)); B_inf, b, B_res, d learnable RGB vectors (paper, Sec. 3.3.2)."""
+    """beta_a = MLP_a(gamma(vec R)); B_inf, b, B_res, d learnable RGB (paper, Sec. 3.3.2)."""
 
     def __init__(self, config: MediumConfig, generator: torch.Generator) -> None:
         super().__init__()
@@ -35,7 +35,9 @@ class Medium(nn.Module):
         self.B_inf_logit = nn.Parameter(torch.full((3,), _logit(config.initial_B_inf)))
         self.b_raw = nn.Parameter(torch.full((3,), _inverse_softplus(config.initial_attenuation)))
         self.B_res_logit = nn.Parameter(torch.full((3,), _logit(config.initial_B_res)))
-        self.d_raw = nn.Parameter(torch.full((3,), _inverse_softplus(config.initial_residual_decay)))
+        self.d_raw = nn.Parameter(
+            torch.full((3,), _inverse_softplus(config.initial_residual_decay))
+        )
         self.active = config.enabled
 
     def forward(

@@ -23,7 +23,9 @@ from aquaflow.render.contract import Renderer
 class Scene:
     """One sub-map's contents; draws them, and fits the water to what the views saw."""
 
-    def __init__(self, config: MediumConfig, renderer: Renderer, generator: torch.Generator) -> None:
+    def __init__(
+        self, config: MediumConfig, renderer: Renderer, generator: torch.Generator
+    ) -> None:
         self.config, self.renderer = config, renderer
         self.gaussians = GaussianMap()
         self.medium = Medium(config, generator)

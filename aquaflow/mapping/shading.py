@@ -1,8 +1,8 @@
 """How the camera darkens its own picture: lamp and lens fall-off, fixed to the camera.
 
 A smooth gain g(x, y) = exp(q(x, y)) multiplies the whole picture, water included; q is a quadratic
-without a constant, so g = 1 in the middle. The paper has none; without it a lamp's fall-off is taken
-for water.
+without a constant, so g = 1 in the middle. The paper has none; without it a lamp's fall-off is
+taken for water.
 """
 
 from __future__ import annotations

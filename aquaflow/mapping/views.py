@@ -66,18 +66,18 @@ def refine_pose(
     """
     V = view.viewmat().numpy().astype(np.float64)
     G = gradient.numpy().astype(np.float64)
+    if not np.isfinite(G[:3]).all():
+        return
     M = G[:3] @ V.T
     g = np.array(
         [M[0, 3], M[1, 3], M[2, 3], M[2, 1] - M[1, 2], M[0, 2] - M[2, 0], M[1, 0] - M[0, 1]]
     )
-    if not np.isfinite(g).all():
-        return
     m, v, count = view.moments
     count += 1
     m = BETAS[0] * m + (1.0 - BETAS[0]) * g
     v = BETAS[1] * v + (1.0 - BETAS[1]) * g * g
-    step = -rate * (m / (1.0 - BETAS[0] ** count)) / (
-        np.sqrt(v / (1.0 - BETAS[1] ** count)) + 1e-15
+    step = (
+        -rate * (m / (1.0 - BETAS[0] ** count)) / (np.sqrt(v / (1.0 - BETAS[1] ** count)) + 1e-15)
     )
     view.moments = (m, v, count)
     R_cw = so3_exp(step[3:]) @ V[:3, :3]

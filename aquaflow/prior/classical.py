@@ -16,7 +16,7 @@ from aquaflow.geometry.triangulation import triangulate
 from aquaflow.geometry.two_view import relative_pose
 from aquaflow.prior import flow as dense
 from aquaflow.prior import homography as sparse
-from aquaflow.prior.contract import Float, Mask
+from aquaflow.prior.contract import Encoding, Float, Mask
 
 GOOD_SHARE = 0.5
 """A candidate flow that matches this part of the picture needs no rival."""
@@ -73,7 +73,8 @@ class ClassicalPair:
         back = self.flow.backward + dense.sample(self.flow.forward, self.matches_back)
         height, width = self._a.grey.shape
         inside = ((self.matches_back > 0.0) & (self.matches_back < (width, height))).all(-1)
-        return inside & (np.linalg.norm(back, axis=-1) < dense.FORWARD_BACKWARD_PX)
+        close = np.linalg.norm(back, axis=-1) < dense.FORWARD_BACKWARD_PX
+        return np.asarray(inside & close)
 
     @cached_property
     def C(self) -> Float:
@@ -148,11 +149,13 @@ class ClassicalPrior:
 
     def decode(
         self,
-        a: ClassicalEncoding,
-        b: ClassicalEncoding,
+        a: Encoding,
+        b: Encoding,
         predicted: Float | None = None,  # [H, W, 2] px, expected matches of a in b
     ) -> ClassicalPair:
         """Flow from the prediction; where it fails, from a SIFT homography; the better is kept."""
+        assert isinstance(a, ClassicalEncoding)
+        assert isinstance(b, ClassicalEncoding)
         height, width = a.grey.shape
         start = None if predicted is None else predicted - dense.pixel_grid(height, width)
         best = self._flow(a, b, start)

@@ -33,7 +33,7 @@ def detect(
     grey: Grey,  # [H, W]
 ) -> Keypoints:
     """SIFT keypoints; empty where the picture shows nothing."""
-    sift = cv2.SIFT_create(SIFT_FEATURES, contrastThreshold=SIFT_CONTRAST)
+    sift = cv2.SIFT.create(SIFT_FEATURES, contrastThreshold=SIFT_CONTRAST)
     points, descriptors = sift.detectAndCompute(grey, None)
     if descriptors is None:
         return Keypoints(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32))

@@ -2,8 +2,8 @@
 
     I = J exp(-beta z) + a (B_inf (1 - exp(-b z)) + B_res exp(-d z)) + (1 - a) B_inf
 
-J is premultiplied by alpha a. Where the map has no geometry the ray goes on to infinity, and what it
-sees there is B_inf; where a = 1 this is the paper's equation.
+J is premultiplied by alpha a. Where the map has no geometry the ray goes on to infinity, and what
+it sees there is B_inf; where a = 1 this is the paper's equation.
 """
 
 from __future__ import annotations

@@ -32,6 +32,9 @@ __all__ = ["FORMAT_VERSION", "build", "camera_of", "write_dive"]
 
 Array: TypeAlias = npt.NDArray[np.float64]
 
+MARKER = "synth.yaml"
+"""The file by which a folder is known to be a synthetic dive."""
+
 FORMAT_VERSION = 1
 """Of the files and of the generator: the same config gives the same dive within a version."""
 
@@ -110,8 +113,10 @@ def write_dive(
         progress: called with (pictures written, pictures in all).
 
     Raises:
-        InputError: ``out`` cannot be written to.
+        InputError: ``out`` cannot be written to, or holds files that are not a synthetic dive.
     """
+    if out.is_dir() and not (out / MARKER).is_file() and any(p.is_file() for p in out.rglob("*")):
+        raise InputError(f"{out} holds files that are not a synthetic dive; choose another folder")
     try:
         for name in ("images", "range", "clean"):
             folder = out / name
@@ -149,7 +154,7 @@ def _write_tables(out: Path, config: SyntheticConfig, path: paths.Path) -> None:
         "vignette": "image = water * (1 - vignette * r^2 / r_corner^2), before noise",
         "loop_length_m": config.speed_m_s * config.duration_s,
     }
-    (out / "synth.yaml").write_text(yaml.safe_dump(stated, sort_keys=False))
+    (out / MARKER).write_text(yaml.safe_dump(stated, sort_keys=False))
 
 
 def _write_pictures(

@@ -154,7 +154,7 @@ class _System:
         pp = H_pp * (1.0 + damping) + 1e-6
         cc = H_cc + damping * np.diag(np.diag(H_cc)) + 1e-6 * np.eye(len(H_cc))
         S = cc - (H_cp / pp) @ H_cp.T
-        dc = -np.linalg.solve(S, g_c - (H_cp / pp) @ g_p)
+        dc = np.asarray(-np.linalg.solve(S, g_c - (H_cp / pp) @ g_p), dtype=np.float64)
         dp = -(g_p + H_cp.T @ dc) / pp
         views = []
         for v, T in enumerate(bundle.T):

@@ -30,5 +30,7 @@ def pose_from_scratch(problem: PoseProblem) -> Sim3 | None:
     )
     if not found or inliers is None or len(inliers) < MIN_INLIERS:
         return None
-    pose = Sim3(so3_exp(w[:, 0]), np.asarray(t[:, 0], dtype=np.float64))
+    pose = Sim3(
+        so3_exp(np.asarray(w[:, 0], dtype=np.float64)), np.asarray(t[:, 0], dtype=np.float64)
+    )
     return pose if pose.is_finite() else None

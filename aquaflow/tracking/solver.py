@@ -163,7 +163,7 @@ def _summary(problem: PoseProblem, T: Sim3, residual: Array, J: Array) -> PoseEs
     scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-12))
     eigenvalues = np.linalg.eigvalsh(H * scale[:, None] * scale[None, :])
     conditioning = float(max(eigenvalues[0], 0.0) / max(eigenvalues[-1], 1e-12))
-    covariance = np.linalg.pinv(H, hermitian=True)
+    covariance = np.linalg.pinv(H, hermitian=True).astype(np.float64, copy=False)
     Y = T.apply(problem.points)
     in_front = Y[:, 2] > 1e-3
     error = np.linalg.norm(problem.camera.project(Y) - problem.pixels, axis=1)

@@ -130,9 +130,7 @@ class Tracker:
         return tracked if matched else tracked + self.track(frame)
 
     def _restart(self, frame: Frame, encoding: Encoding) -> None:
-        self._initialiser = Initialiser(
-            frame, encoding, self._prior, self._config.initialisation
-        )
+        self._initialiser = Initialiser(frame, encoding, self._prior, self._config.initialisation)
 
     def _begin(self, initialiser: Initialiser) -> list[Tracked]:
         """Turn a decided geometry into the first keyframe, and pose every frame that waited."""
@@ -149,7 +147,11 @@ class Tracker:
         self._initialiser = None
         self._make_keyframe(reference, encoding, self._origin, pointmap)
         first = Tracked(
-            reference, FrameClass.KEYFRAME, self.sub_map, self._number, self._origin,
+            reference,
+            FrameClass.KEYFRAME,
+            self.sub_map,
+            self._number,
+            self._origin,
             pointmap=pointmap.copy(),
         )
         tracked = [first, *self._back_fill()]
@@ -174,7 +176,8 @@ class Tracker:
 
     def _back_fill(self) -> list[Tracked]:
         """Poses of earlier frames that could not start a map, against the first keyframe."""
-        assert self._keyframe is not None and self.camera is not None
+        assert self._keyframe is not None
+        assert self.camera is not None
         orphans, self._orphans = self._orphans, []
         tracked = []
         for frame in reversed(orphans):
@@ -189,9 +192,7 @@ class Tracker:
         return tracked[::-1]
 
     def _waiting_frames(self, initialiser: Initialiser) -> list[Frame]:
-        return [
-            *initialiser.thinned, initialiser.frame, *(w.frame for w in initialiser.waiting)
-        ]
+        return [*initialiser.thinned, initialiser.frame, *(w.frame for w in initialiser.waiting)]
 
     def _forget_oldest_orphans(self) -> list[Tracked]:
         surplus = max(0, len(self._orphans) - MAX_ORPHANS)
@@ -207,7 +208,8 @@ class Tracker:
         solved = self._solve(encoding, pair)
         if solved is None:
             return None
-        assert self._keyframe is not None and self.camera is not None
+        assert self._keyframe is not None
+        assert self.camera is not None
         T_fk = solved.estimate.T
         self._velocity = T_fk @ self._T_fk.inverse()
         self._T_fk, self._predicted = T_fk, solved.pair.matches
@@ -232,7 +234,8 @@ class Tracker:
     def _solve(self, encoding: Encoding, pair: PairGeometry | None) -> _Solved | None:
         """Match against the keyframe and solve the pose; from scratch where prediction fails."""
         keyframe, camera = self._keyframe, self.camera
-        assert keyframe is not None and camera is not None
+        assert keyframe is not None
+        assert camera is not None
         if pair is None:
             pair = self._prior.decode(keyframe.encoding, encoding, self._predicted)
         problem, pixels_k = self._problem(keyframe, pair, camera)
@@ -304,9 +307,7 @@ class Tracker:
         quality = Quality(
             estimate.inlier_share, estimate.residual_px, solved.share, estimate.conditioning
         )
-        return Tracked(
-            frame, frame_class, self.sub_map, self._number, T_wc, quality, pointmap
-        )
+        return Tracked(frame, frame_class, self.sub_map, self._number, T_wc, quality, pointmap)
 
     def _start_sub_map(self) -> list[Tracked]:
         """Give the lost frames to a new sub-map that starts where the old one ended."""

@@ -20,7 +20,7 @@ class CameraSummary:
 
     width: int
     height: int
-    """Pixels of the recording."""
+    """Pixels of the mapped pictures."""
     focal_px: float
     focal_source: FocalSource
     """``refined``: guessed at first, then estimated from the dive."""

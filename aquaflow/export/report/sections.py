@@ -198,7 +198,7 @@ def camera(summary: CameraSummary) -> str:
         ("focal length", f"{summary.focal_px:.1f} px, {FOCAL_WORDS[summary.focal_source]}"),
         ("lens distortion", summary.distortion_model),
     )
-    said = "What the dive was filmed with; a wrong focal length bends the map."
+    said = "The camera of the mapped pictures; a wrong focal length bends the map."
     return _section("The camera", said, _table(rows))
 
 
