@@ -66,6 +66,7 @@ def map_command(
     width: Annotated[int | None, typer.Option(help="Width in pixels to map at.")] = None,
     crop: Annotated[str | None, typer.Option(help="left | right | x,y,width,height")] = None,
     fps: Annotated[float | None, typer.Option(help="Frames/s of a folder.")] = None,
+    preset: Annotated[str | None, typer.Option(help="fast | balanced | accurate")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of every random draw.")] = None,
     threads: Annotated[int | None, typer.Option(help="Default: every core.")] = None,
     refine_steps: Annotated[int | None, typer.Option(help="Steps after the last frame.")] = None,
@@ -74,6 +75,7 @@ def map_command(
     ] = None,
     tracking_only: Annotated[bool, typer.Option(help="Trajectory without a map.")] = False,
     overwrite: Annotated[bool, typer.Option(help="Replace the dive in --out.")] = False,
+    profile: Annotated[bool, typer.Option(help="Write trace.json for Chrome's tracing.")] = False,
     as_json: Json = False,
 ) -> None:
     """Turn a recording into a dive folder: trajectory, map, water, report."""
@@ -83,7 +85,9 @@ def map_command(
     optimiser = {"refine_steps": refine_steps, "refine_seconds": refine_seconds}
     mapping = {"optimiser": optimiser, "enabled": False if tracking_only else None}
     settings = _configured(
-        config, {"seed": seed, "threads": threads, "source": source_settings, "mapping": mapping}
+        config,
+        preset,
+        {"seed": seed, "threads": threads, "source": source_settings, "mapping": mapping},
     )
     from aquaflow.geometry.camera import load_camera
     from aquaflow.sources import open_recording
@@ -95,7 +99,7 @@ def map_command(
 
     with _progress(quiet=as_json) as progress:
         replayed = map_recording(
-            recording, source.name, out, settings, calibration, overwrite, progress
+            recording, source.name, out, settings, calibration, overwrite, progress, trace=profile
         )
     if as_json:
         typer.echo(json.dumps({"dive": str(replayed.dive), **replayed.metrics}))
@@ -197,22 +201,15 @@ def config_command(
     typer.echo(yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
 
 
-def _configured(path: Path | None, overrides: dict[str, Any]) -> Config:
-    """The config file with the command line's options on top."""
+def _configured(path: Path | None, preset: str | None, overrides: dict[str, Any]) -> Config:
+    """The config file with the preset, and then the command line's options, on top."""
+    from aquaflow import presets
     from aquaflow.config import Config, load_config, parse_config
 
-    base = Config() if path is None else load_config(path)
-    return parse_config(_merged(base.model_dump(), overrides), "command line")
-
-
-def _merged(base: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]:
-    merged = dict(base)
-    for key, value in overrides.items():
-        if isinstance(value, dict):
-            merged[key] = _merged(merged[key], value)
-        elif value is not None:
-            merged[key] = value
-    return merged
+    base = (Config() if path is None else load_config(path)).model_dump()
+    if preset is not None:
+        base = presets.merged(base, presets.preset(preset))
+    return parse_config(presets.merged(base, overrides), "command line")
 
 
 @contextmanager

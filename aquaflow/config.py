@@ -112,6 +112,8 @@ class MediumConfig(Stage):
         description="views after which water is first fitted to sightings; then at every "
         "doubling, and before refining",
     )
+    fit: bool = Field(True, description="False: the water starts from the values below, no fit")
+    shading: bool = Field(True, description="False: the fit knows no lamp or lens fall-off")
     fit_views: int = Field(20, ge=4, description="views that a fit looks at, spread over the dive")
     initial_attenuation: float = Field(
         0.1, gt=0, description="1 / map unit; the median range of the first keyframe is 1 unit"
@@ -124,6 +126,9 @@ class MediumConfig(Stage):
 class InsertionConfig(Stage):
     """Where new Gaussians go (paper, Sec. 3.3.3)."""
 
+    medium_reduced: bool = Field(
+        True, description="False: structure and colours of new Gaussians from the raw picture"
+    )
     sigma_px: float = Field(1.0, gt=0, description="sigma of the Laplacian of Gaussian")
     tau_a: float = Field(
         0.02,

@@ -29,9 +29,12 @@ FRAME_COLUMNS = ("index", "source", "t_s", "class", "sub_map", "keyframe", "qual
 MARKER = "frames.csv"
 """The file by which a folder is known to be a dive."""
 
+TRACE = "trace.json"
+"""Every run of every stage, in Chrome's trace event format; written when asked for."""
+
 RESULTS = (
     *("trajectory.tum", "camera.yaml", "calibration.yaml", "map*.ply", "medium.json"),
-    *("metrics.json", "report.html", "heldout/*.png"),
+    *("metrics.json", "report.html", "heldout/*.png", "heldout/*.npz", TRACE),
 )
 """What a run writes at its end; of an earlier run in the same folder nothing must remain."""
 
@@ -182,12 +185,14 @@ class DiveFolder:
         self.write_json("medium.json", data)
 
     def write_held_out(self, examples: list[HeldOut]) -> None:
-        """heldout/: what the camera saw, what the map shows, and the map without water."""
+        """heldout/: what the camera saw, what the map shows, its range, the map without water."""
         import cv2
 
         folder = self.path / "heldout"
         folder.mkdir(exist_ok=True)
         for example in examples:
+            if example.z is not None:
+                np.savez_compressed(folder / f"{example.frame_index:06d}_range.npz", z=example.z)
             pictures = {"real": example.real, "rendered": example.rendered}
             if example.restored is not None:
                 pictures["restored"] = example.restored

@@ -45,6 +45,8 @@ class HeldOut:
     psnr: float
     ssim: float
     lpips: float | None
+    z: npt.NDArray[np.float32] | None = None
+    """[H, W] rendered range, map units; 0 where the map is not solid."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ def examine_held_out(slam: Slam, sub_map: int) -> list[HeldOut]:
     mapper = slam.mappers.get(sub_map)
     if mapper is None or len(mapper.gaussians) == 0:
         return []
-    views = slam.held_out.get(sub_map, [])
+    views = sorted(slam.held_out.get(sub_map, []), key=lambda view: view.frame_index)
     for view in views:
         mapper.register(view)
     exposure = restored_exposure(mapper, views)
@@ -117,6 +119,7 @@ def _examine(mapper: Mapper, view: View, exposure: float) -> HeldOut:
         psnr(rendered, real),
         ssim(rendered, real),
         perceptual,
+        torch.where(shown.alpha > 0.5, shown.z, 0.0).to(torch.float32).numpy(),
     )
 
 
@@ -206,6 +209,22 @@ def metrics(
         "seed": slam.config.seed,
         "version": __version__,
         "protocol": PROTOCOL,
+    }
+
+
+def pace(frame_ms: list[float], first_pose_s: float | None, wall_s: float) -> dict[str, Any]:
+    """Milliseconds per frame and seconds to the first pose.
+
+    ``p50`` and ``p95`` are of one frame while frames come in; ``total`` is the whole run, refining
+    included, over its frames.
+    """
+    return {
+        "ms_per_frame": {
+            "p50": round(float(np.percentile(frame_ms, 50)), 3),
+            "p95": round(float(np.percentile(frame_ms, 95)), 3),
+            "total": round(1e3 * wall_s / len(frame_ms), 3),
+        },
+        "time_to_first_pose_s": None if first_pose_s is None else round(first_pose_s, 3),
     }
 
 

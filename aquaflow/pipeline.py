@@ -13,17 +13,20 @@ from typing import Any
 import torch
 
 from aquaflow.config import Config
-from aquaflow.dive import DiveFolder, FrameRow
+from aquaflow.dive import TRACE, DiveFolder, FrameRow
 from aquaflow.errors import NotMappedError
 from aquaflow.messages import CameraModel, Dropped
 from aquaflow.outcome import (
+    HeldOut,
     examine_held_out,
     largest_sub_map,
     metrics,
+    pace,
     refined_poses,
     summarise_water,
 )
 from aquaflow.preparation import Preparation
+from aquaflow.profiler import Profiler
 from aquaflow.reporting import report_data
 from aquaflow.slam import MIN_VIEWS, Slam
 from aquaflow.sources import RecordedCamera
@@ -51,8 +54,9 @@ def map_recording(
     calibration: CameraModel | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
+    trace: bool = False,
 ) -> Replayed:
-    """Map a recording into the dive folder ``out``.
+    """Map a recording into the dive folder ``out``; with ``trace`` it gets a ``trace.json`` too.
 
     Raises:
         InputError: the folder cannot be written.
@@ -62,7 +66,7 @@ def map_recording(
     _fix_threads(config.threads or os.cpu_count() or 1)
     folder = DiveFolder(out, config, overwrite)
     try:
-        return _Replay(recording, name, folder, config, calibration, progress).run()
+        return _Replay(recording, name, folder, config, calibration, progress, trace).run()
     finally:
         folder.close()
         recording.close()
@@ -79,35 +83,43 @@ class _Replay:
         config: Config,
         calibration: CameraModel | None,
         progress: Progress | None,
+        trace: bool,
     ) -> None:
         self.recording, self.name, self.folder, self.config = recording, name, folder, config
         self.calibration = calibration or recording.camera
         self.preparation = Preparation(config.source, self.calibration)
-        self.slam = Slam(config)
+        self.profiler = Profiler(trace)
+        self.slam = Slam(config, self.profiler)
+        self._trace = trace
         self.results: list[Tracked] = []
         self.dropped: list[Dropped] = []
         self.notes: list[str] = []
+        self.frame_ms: list[float] = []
+        """Of every frame that was read: preparing, tracking and mapping it."""
+        self.first_pose_s: float | None = None
+        """Seconds from the start of the run."""
         self._progress = progress or (lambda stage, done, total: None)
 
     def run(self) -> Replayed:
         started = time.monotonic()
-        self._frames()
+        self._frames(started)
         self._decide(self.slam.finish(lambda done, total: self._progress("refine", done, total)))
-        self._note_what_was_left_out()
-        self.folder.write_frames()
+        with self.profiler.stage("write"):
+            self._note_what_was_left_out()
+            self.folder.write_frames()
         if sum(tracked.T_wc is not None for tracked in self.results) < MIN_VIEWS:
             raise NotMappedError(self._why_not())
         return self._write(started)
 
     # --- frames -------------------------------------------------------------------------------
 
-    def _frames(self) -> None:
+    def _frames(self, started: float) -> None:
         source = self.config.source
         count = self.recording.frame_count
         stop = count if source.stop is None else min(source.stop, count or source.stop)
         total = None if stop is None else len(range(source.start, stop, source.every))
         done = 0
-        profile = self.slam.profiler.stage
+        profile = self.profiler.stage
         frames = self.recording.frames(source.every, source.start, source.stop)
         while True:
             with profile("read"):
@@ -118,10 +130,19 @@ class _Replay:
             if isinstance(frame, Dropped):
                 self._drop(frame)
             else:
+                begun = time.monotonic()
                 with profile("prepare"):
                     prepared = self.preparation(frame)
                 self._decide(self.slam.process(prepared))
-            self._progress("map", done, total)
+                self._time_frame(started, begun)
+            with profile("progress"):
+                self._progress("map", done, total)
+
+    def _time_frame(self, started: float, begun: float) -> None:
+        now = time.monotonic()
+        self.frame_ms.append(1e3 * (now - begun))
+        if self.first_pose_s is None and any(t.T_wc is not None for t in self.results):
+            self.first_pose_s = now - started
 
     def _drop(self, frame: Dropped) -> None:
         self.dropped.append(frame)
@@ -137,7 +158,8 @@ class _Replay:
 
     def _decide(self, decided: list[Tracked]) -> None:
         self.results += decided
-        self.folder.record(self._row(tracked) for tracked in decided)
+        with self.profiler.stage("record"):
+            self.folder.record(self._row(tracked) for tracked in decided)
 
     def _row(self, tracked: Tracked) -> FrameRow:
         posed = tracked.T_wc is not None
@@ -193,12 +215,12 @@ class _Replay:
     def _write(self, started: float) -> Replayed:
         main = largest_sub_map(self.results)
         mapper = self.slam.mappers.get(main)
-        with self.slam.profiler.stage("evaluate"):
+        with self.profiler.stage("evaluate"):
             held_out = examine_held_out(self.slam, main)
             water = None if mapper is None else summarise_water(mapper)
-        poses = refined_poses(self.slam, self.results)
+            poses = refined_poses(self.slam, self.results)
         times = {tracked.frame.index: tracked.frame.t_ns * 1e-9 for tracked in self.results}
-        with self.slam.profiler.stage("write"):
+        with self.profiler.stage("write"):
             self.folder.write_trajectory([times[i] for i in poses], list(poses.values()))
             assert self.slam.tracker.camera is not None
             self.folder.write_cameras(self.slam.tracker.camera, self.calibration)
@@ -206,17 +228,25 @@ class _Replay:
                 suffix = "" if sub_map == main else f"_{sub_map}"
                 self.folder.write_map(mapped, summarise_water(mapped), suffix)
             self.folder.write_held_out(held_out)
+        with self.profiler.stage("report"):
+            numbers = self._numbers(held_out, started)
+            self.folder.write_medium(water, numbers["scale_source"])
+            self.folder.write_report(
+                report_data(
+                    self.name, self.slam, self.results, self.dropped, poses, held_out, water,
+                    numbers, self.notes, calibrated=self.calibration is not None,
+                )
+            )  # fmt: skip
+        numbers = self._numbers(held_out, started)  # the report's own time included
+        self.folder.write_json("metrics.json", numbers)
+        if self._trace:
+            self.folder.write_json(TRACE, self.profiler.chrome_trace())
+        return Replayed(self.folder.path, numbers, self.notes)
+
+    def _numbers(self, held_out: list[HeldOut], started: float) -> dict[str, Any]:
         wall_s = time.monotonic() - started
         numbers = metrics(self.slam, self.results, self.dropped, held_out, wall_s)
-        self.folder.write_medium(water, numbers["scale_source"])
-        self.folder.write_json("metrics.json", numbers)
-        self.folder.write_report(
-            report_data(
-                self.name, self.slam, self.results, self.dropped, poses, held_out, water,
-                numbers, self.notes, calibrated=self.calibration is not None,
-            )
-        )  # fmt: skip
-        return Replayed(self.folder.path, numbers, self.notes)
+        return numbers | pace(self.frame_ms, self.first_pose_s, wall_s)
 
 
 def _fix_threads(threads: int) -> None:

@@ -15,6 +15,9 @@ from aquaflow.messages import Frame
 DEFAULT_WIDTH_PX = 480
 """Width mapped when none is asked for: two CPU cores track and map a few such frames a second."""
 
+MIN_SIDE_PX = 16
+"""Optical flow needs patches of 8 pixels at two scales; smaller pictures hold no motion."""
+
 Box = tuple[int, int, int, int]
 
 
@@ -37,7 +40,9 @@ class Preparation:
 
         Raises:
             ConfigError: the crop or the calibration does not fit the picture.
+            InputError: the picture cannot be tracked, or is of another size than the first.
         """
+        check_picture(frame)
         height, width = frame.image.shape[:2]
         if self._rectifier is None:
             self._rectifier = self._plan(width, height)
@@ -59,6 +64,26 @@ class Preparation:
         camera = fit_calibration(self._calibration, (width, height), self._box)
         asked = self._config.width or min(DEFAULT_WIDTH_PX, camera.width)
         return Rectifier(camera, asked)
+
+
+def check_picture(frame: Frame) -> None:
+    """Refuse what no later stage can use.
+
+    Raises:
+        InputError: the picture is not 8-bit RGB, or is too small to be tracked.
+    """
+    image = frame.image
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+        raise InputError(
+            f"frame {frame.index} is {image.dtype} of shape {image.shape}; pictures must be 8-bit "
+            "RGB, [height, width, 3]"
+        )
+    height, width = image.shape[:2]
+    if min(height, width) < MIN_SIDE_PX:
+        raise InputError(
+            f"frame {frame.index} is {width} x {height} pixels; tracking needs pictures of at "
+            f"least {MIN_SIDE_PX} x {MIN_SIDE_PX}"
+        )
 
 
 def crop_box(crop: str | None, width: int, height: int) -> Box:

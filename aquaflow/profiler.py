@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import defaultdict
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import TypedDict
+from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
 
@@ -20,20 +19,40 @@ class StageTime(TypedDict):
     p95: float
 
 
+class _Event(NamedTuple):
+    """One run of a stage, for the trace; seconds on the profiler's clock."""
+
+    name: str
+    started_s: float
+    ended_s: float
+    thread: int
+    depth: int
+
+
+class _Nesting(threading.local):
+    """How many stages this thread is inside of."""
+
+    depth = 0
+
+
 class Profiler:
-    """Collects durations per stage; stages may nest, each counts its own wall time."""
+    """Collects durations per stage; stages may nest, each counts its own wall time.
 
-    def __init__(self) -> None:
+    With ``trace`` every single run of a stage is kept, for :meth:`chrome_trace`.
+    """
+
+    def __init__(self, trace: bool = False) -> None:
+        self.top_level_s = 0.0
+        """Time inside stages, what nests counted once; of the thread that made the profiler."""
         self._durations: dict[str, list[float]] = defaultdict(list)
+        self._events: list[_Event] | None = [] if trace else None
+        self._nesting = _Nesting()
+        self._owner = threading.get_ident()
+        self._origin_s = time.perf_counter()
 
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Measure the block as one run of ``name``."""
-        started = time.perf_counter()
-        try:
-            yield
-        finally:
-            self._durations[name].append((time.perf_counter() - started) * 1e3)
+    def stage(self, name: str) -> _Stage:
+        """Measure the ``with`` block as one run of ``name``."""
+        return _Stage(self, name)
 
     def summary(self) -> dict[str, StageTime]:
         """Per stage: how often, total, median and 95th percentile in milliseconds."""
@@ -46,3 +65,56 @@ class Profiler:
             )
             for name, values in self._durations.items()
         }
+
+    def chrome_trace(self) -> dict[str, Any]:
+        """The runs in Chrome's trace event format; times in microseconds since the start.
+
+        ``depth`` among an event's arguments is 0 for a stage that is inside no other.
+        """
+        return {
+            "displayTimeUnit": "ms",
+            "traceEvents": [
+                {
+                    "name": event.name,
+                    "cat": "stage",
+                    "ph": "X",
+                    "ts": round((event.started_s - self._origin_s) * 1e6, 3),
+                    "dur": round((event.ended_s - event.started_s) * 1e6, 3),
+                    "pid": 1,
+                    "tid": event.thread,
+                    "args": {"depth": event.depth},
+                }
+                for event in self._events or ()
+            ],
+        }
+
+    def _enter(self) -> int:
+        depth = self._nesting.depth
+        self._nesting.depth = depth + 1
+        return depth
+
+    def _leave(self, name: str, started_s: float, depth: int) -> None:
+        ended_s = time.perf_counter()
+        self._nesting.depth = depth
+        self._durations[name].append((ended_s - started_s) * 1e3)
+        thread = threading.get_ident()
+        if depth == 0 and thread == self._owner:
+            self.top_level_s += ended_s - started_s
+        if self._events is not None:
+            self._events.append(_Event(name, started_s, ended_s, thread, depth))
+
+
+class _Stage:
+    """One run of a stage; a class, because a generator's context costs several times as much."""
+
+    __slots__ = ("_depth", "_name", "_profiler", "_started_s")
+
+    def __init__(self, profiler: Profiler, name: str) -> None:
+        self._profiler, self._name = profiler, name
+
+    def __enter__(self) -> None:
+        self._depth = self._profiler._enter()
+        self._started_s = time.perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        self._profiler._leave(self._name, self._started_s, self._depth)

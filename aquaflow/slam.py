@@ -71,8 +71,9 @@ class Slam:
         if self.is_held_out(tracked.frame):
             self.held_out.setdefault(tracked.sub_map, []).append(view)
             return
-        mapper = self._mapper(tracked.sub_map)
-        mapper.add_view(view)
+        with self.profiler.stage("view"):  # now and then a view makes the water be fitted again
+            mapper = self._mapper(tracked.sub_map)
+            mapper.add_view(view)
 
         # Sec. 3.3.3: medium-guided insertion, from this frame and from the keyframe it retires,
         # whose pointmap has been fused over its whole life.

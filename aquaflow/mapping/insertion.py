@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from aquaflow.config import InsertionConfig
+from aquaflow.keyframes import Pointmap
 from aquaflow.mapping.gaussians import raw_colour
 from aquaflow.mapping.views import View
 
@@ -102,3 +103,19 @@ def new_gaussians(
         "opacity_logits": torch.logit(opacity)[:, None],
         "raw_colours": raw_colour(colour[rows, columns]),
     }
+
+
+def range_of(pointmap: Pointmap, known_sigma: float) -> tuple[Tensor, Tensor]:
+    """Range along the ray [H, W] and where it is known, of a tracked frame."""
+    camera = pointmap.camera
+    known = pointmap.known(known_sigma)
+    length = torch.from_numpy(camera.unproject(camera.pixel_centres())).norm(dim=-1)
+    depth = torch.from_numpy(1.0 / pointmap.rho.clip(1e-6))
+    mask = torch.from_numpy(known)
+    return torch.where(mask, length * depth, 0.0).to(torch.float32), mask
+
+
+def confidence_of(pointmap: Pointmap) -> Tensor:
+    """[H, W] in [0, 1]: Q of the paper, saturating at a relative range sigma of 3 %."""
+    Q = torch.from_numpy(pointmap.Q)
+    return (Q / (Q + (1.0 / 0.03) ** 2)).to(torch.float32).sqrt()

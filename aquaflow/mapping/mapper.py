@@ -13,7 +13,14 @@ from torch import Tensor
 from aquaflow.config import MappingConfig
 from aquaflow.keyframes import Pointmap
 from aquaflow.mapping.gaussians import GaussianMap
-from aquaflow.mapping.insertion import insertion_probability, new_gaussians, select, thin
+from aquaflow.mapping.insertion import (
+    confidence_of,
+    insertion_probability,
+    new_gaussians,
+    range_of,
+    select,
+    thin,
+)
 from aquaflow.mapping.losses import depth_loss, outlier_mask, radial_weight, scale_loss
 from aquaflow.mapping.medium import Medium
 from aquaflow.mapping.rendering import Shown
@@ -59,11 +66,13 @@ class Mapper:
     @torch.no_grad()
     def insert(self, view: View, pointmap: Pointmap) -> int:
         """Medium-guided insertion (paper, Sec. 3.3.3); returns the number of new Gaussians."""
-        prior_range, known = _range_of(pointmap, self.config.insertion.known_sigma)
+        prior_range, known = range_of(pointmap, self.config.insertion.known_sigma)
         shown = self.scene.show(view)
         covered = shown.alpha > self.config.insertion.covered_alpha
         z = torch.where(known, prior_range, torch.where(covered, shown.z, 0.0))
         restored, recoverable = self.scene.restore(view, z)
+        if not self.config.insertion.medium_reduced:
+            restored = view.target()
         # Where the map already explains the ray with the same depth, only structure that the map
         # lacks asks for more; where it is bare or its surface lies elsewhere, any pixel may.
         agree = (shown.z - prior_range).abs() < self.config.insertion.agreement * prior_range
@@ -75,7 +84,7 @@ class Mapper:
         rows, columns = select(P, allowed, self.config.insertion, self._random)
         room = self.config.max_gaussians - len(self.gaussians)
         rows, columns = thin(rows, columns, room, self._random)
-        confidence = _confidence(pointmap)
+        confidence = confidence_of(pointmap)
         view.inverse_range = torch.where(known, 1.0 / prior_range.clamp_min(1e-6), 0.0)
         view.range_confidence = confidence
         if len(rows) == 0:
@@ -126,6 +135,8 @@ class Mapper:
 
     def _step(self, view: View, refine_poses: bool) -> None:
         """Render, compare, differentiate, move; undone when anything is not finite."""
+        if len(self.gaussians) == 0:  # all pruned since the steps began
+            return
         leaves = {
             name: tensor.detach().requires_grad_()
             for name, tensor in self.gaussians.parameters.items()
@@ -136,6 +147,7 @@ class Mapper:
         loss = self._loss(view, shown, leaves)
         if not torch.isfinite(loss):
             self._undo("loss", view)
+            self._drop_unsound()
             return
         torch.autograd.backward(loss)
         gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
@@ -189,6 +201,17 @@ class Mapper:
         opaque = self.gaussians.opacities > self.config.optimiser.prune_opacity
         widest = self.config.optimiser.prune_radius_widths * view.camera.width
         keep = opaque & (shown.radius_px < widest)
+        self._keep(keep)
+
+    def _drop_unsound(self) -> None:
+        """Drop Gaussians that are not finite: the scale loss of one would spoil every step."""
+        sound = torch.isfinite(self.gaussians.scales.prod(dim=-1))
+        for tensor in self._parameters.values():
+            sound &= torch.isfinite(tensor).all(dim=-1)
+        self._keep(sound)
+
+    def _keep(self, keep: Tensor) -> None:
+        """Drop the Gaussians where ``keep`` [N] is False, their optimiser state with them."""
         if not bool(keep.all()):
             self.gaussians.keep(keep)
             self._optimiser.keep(keep)
@@ -202,18 +225,15 @@ class Mapper:
 
     def register(self, view: View) -> None:
         """Refine the pose of a held-out view photometrically against the frozen map."""
-        config, K_rad = self.config.optimiser, self._radial(view)
+        config, K_rad, target = self.config.optimiser, self._radial(view), view.target()
         mask = torch.ones_like(K_rad, dtype=torch.bool)
+        if view.mask is not None:
+            mask &= torch.from_numpy(view.mask)
         for _ in range(config.heldout_steps if len(self.gaussians) else 0):
             viewmat = view.viewmat().requires_grad_()
             shown = self.scene.draw(view, viewmat=viewmat)
             loss = photometric_loss(
-                shown.image,
-                view.target(),
-                K_rad,
-                mask,
-                self.config.loss.ssim,
-                self.renderer.threads,
+                shown.image, target, K_rad, mask, self.config.loss.ssim, self.renderer.threads
             )
             (gradient,) = torch.autograd.grad(loss, viewmat)
             refine_pose(view, gradient, config.heldout_rate)
@@ -235,19 +255,3 @@ class Mapper:
         if size not in self._K_rad:
             self._K_rad[size] = radial_weight(*size)
         return self._K_rad[size]
-
-
-def _range_of(pointmap: Pointmap, known_sigma: float) -> tuple[Tensor, Tensor]:
-    """Range along the ray [H, W] and where it is known, of a tracked frame."""
-    camera = pointmap.camera
-    known = pointmap.known(known_sigma)
-    length = torch.from_numpy(camera.unproject(camera.pixel_centres())).norm(dim=-1)
-    depth = torch.from_numpy(1.0 / pointmap.rho.clip(1e-6))
-    mask = torch.from_numpy(known)
-    return torch.where(mask, length * depth, 0.0).to(torch.float32), mask
-
-
-def _confidence(pointmap: Pointmap) -> Tensor:
-    """[H, W] in [0, 1]: Q of the paper, saturating at a relative range sigma of 3 %."""
-    Q = torch.from_numpy(pointmap.Q)
-    return (Q / (Q + (1.0 / 0.03) ** 2)).to(torch.float32).sqrt()

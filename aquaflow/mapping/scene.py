@@ -91,7 +91,8 @@ class Scene:
 
         None, and nothing changes, while too few Gaussians are seen over a span of ranges.
         """
-        if not self.medium.active or not views or len(self.gaussians) == 0:
+        wanted = self.config.fit and self.medium.active
+        if not wanted or not views or len(self.gaussians) == 0:
             return None
         seen = sight(self.gaussians, views, self.renderer, generator)
         old = self.water(views[0])
@@ -101,6 +102,7 @@ class Scene:
             old.B_res.detach().double().numpy(),
             old.d.detach().double().numpy(),
             float(old.beta_a.detach().mean()),
+            self.config.shading,
         )
         if estimate is None:
             return None

@@ -93,14 +93,18 @@ def estimate_water(
     B_res: Array,  # [3]
     d: Array,  # [3] 1 / map unit
     start_beta: float,
+    shading: bool = True,
 ) -> WaterEstimate | None:
-    """Fit beta_a, b, B_inf and shading; None where too few points span a range."""
+    """Fit beta_a, b, B_inf and, unless told not to, shading; None where too few points span a
+    range."""
     seen = informative(observations)
     if seen.points < MIN_POINTS:
         return None
     plain = _Problem(seen, B_res, d, start_beta, shaded=False)
     start = np.concatenate([np.full(6, np.log(start_beta)), np.full(3, B_INF_LOGIT)])
     x, cost, noise = _solve(plain, start)
+    if not shading:
+        return _estimate(plain, x, noise)
     shaded = _Problem(seen, B_res, d, start_beta, shaded=True)
     x_shaded, cost_shaded, noise_shaded = _solve(shaded, np.append(x, np.zeros(TERMS)))
     if _pays(cost, cost_shaded, 3 * seen.points):

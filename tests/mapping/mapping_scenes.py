@@ -161,3 +161,8 @@ def copied(mapper: Mapper) -> dict[str, Tensor]:
         **{name: tensor.clone() for name, tensor in mapper.gaussians.parameters.items()},
         **{name: tensor.clone() for name, tensor in mapper.medium.state_dict().items()},
     }
+
+
+def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
+    """Bit for bit."""
+    return all(torch.equal(a[name], b[name]) for name in a)

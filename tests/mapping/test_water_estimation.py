@@ -43,7 +43,9 @@ def sighted(
     # Near ground is seen near the lower edge: the case in which a lamp looks like water.
     xy[:, 1] = np.clip(0.95 - 0.5 * z + 0.4 * xy[:, 1], -0.95, 0.95)
     path = z[:, None]
-    seen = J[point] * np.exp(-BETA * path) + B_INF * -np.expm1(-B * path) + B_RES * np.exp(-D * path)
+    seen = (
+        J[point] * np.exp(-BETA * path) + B_INF * -np.expm1(-B * path) + B_RES * np.exp(-D * path)
+    )
     if shading is not None:
         seen = seen * np.exp(shading_basis(xy) @ shading)[:, None]
     return Observations(point, seen + noise * rng.normal(size=seen.shape), z, xy)
@@ -68,7 +70,7 @@ def shaded() -> WaterEstimate:
 @cache
 def repeats() -> list[WaterEstimate]:
     """Small noisy fits that differ in nothing but their random numbers."""
-    return [fitted(sighted(seed, points=110, sightings=3, noise=0.02)) for seed in range(6)]
+    return [fitted(sighted(seed, points=140, sightings=3, noise=0.02)) for seed in range(6)]
 
 
 @pytest.mark.parametrize("shading", [None, LAMP])
@@ -93,7 +95,6 @@ def test_shading_is_found_where_there_is_some() -> None:
 def test_the_reported_sigma_is_the_scatter_of_repeats_within_a_factor_of_three() -> None:
     scatter = np.std([np.log(repeat.beta_a) for repeat in repeats()], axis=0, ddof=1)
     reported = np.mean([repeat.beta_a_sigma for repeat in repeats()], axis=0)
-    print(scatter, reported)
     assert (reported < 3.0 * scatter).all()
     assert (reported > scatter / 3.0).all()
 
@@ -110,9 +111,7 @@ def test_points_that_are_all_at_one_range_give_no_estimate() -> None:
 
 
 def test_no_sightings_at_all_give_no_estimate() -> None:
-    nothing = Observations(
-        np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2))
-    )
+    nothing = Observations(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2)))
     assert nothing.points == 0
     assert estimate_water(nothing, B_RES, D, 0.1) is None
 
@@ -128,16 +127,23 @@ def test_only_points_seen_over_a_span_of_ranges_are_kept_and_renumbered() -> Non
 
 
 def test_sightings_without_noise_fit_perfectly_and_stay_finite() -> None:
-    estimate = fitted(sighted(points=110, sightings=3, noise=0.0))
+    estimate = fitted(sighted(points=140, sightings=3, noise=0.0))
     np.testing.assert_allclose(estimate.beta_a, BETA, rtol=0.1)
     assert estimate.shading.shape == (TERMS,)
     assert np.isfinite(estimate.beta_a_sigma).all()
 
 
 def test_black_pictures_give_finite_water() -> None:
-    seen = sighted(points=110, sightings=3)
+    seen = sighted(points=140, sightings=3)
     black = Observations(seen.point, np.zeros_like(seen.colour), seen.z, seen.xy)
     estimate = fitted(black)
     for values in (estimate.beta_a, estimate.B_inf, estimate.b, estimate.beta_a_sigma):
         assert np.isfinite(values).all()
     assert (estimate.B_inf < 0.1).all()
+
+
+def test_shading_stays_out_when_it_is_switched_off() -> None:
+    seen = sighted(points=140, sightings=3, shading=LAMP)
+    estimate = estimate_water(seen, B_RES, D, 0.1, shading=False)
+    assert estimate is not None
+    assert not estimate.shading.any()

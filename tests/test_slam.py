@@ -1,0 +1,266 @@
+"""Slam end to end on a small recording, and its order of work behind a tracker that is told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aquaflow.config import Config, parse_config
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes import Pointmap
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.views import View
+from aquaflow.messages import Frame
+from aquaflow.preparation import Preparation
+from aquaflow.slam import Slam
+from aquaflow.sources import open_recording
+from aquaflow.tracking.tracker import FrameClass, Tracked
+
+CAMERA = CameraModel(64, 48, 55.0, 55.0, 32.0, 24.0)
+STEPS = {"steps_keyframe": 3, "steps_mapping": 2, "steps_common": 1, "refine_steps": 4}
+
+DRY = {"medium": {"enabled": False}}
+"""Fitting water takes longer than all the rest; tests/mapping does it."""
+
+
+def config(**mapping: object) -> Config:
+    return parse_config({"threads": 1, "mapping": {"optimiser": STEPS, **mapping}}, "test")
+
+
+@dataclass
+class Ran:
+    slam: Slam
+    frames: list[Frame]
+    decided: list[Tracked]
+
+
+def ran(frames: list[Frame], settings: Config) -> Ran:
+    slam = Slam(settings)
+    decided = [tracked for frame in frames for tracked in slam.process(frame)]
+    return Ran(slam, frames, decided + slam.finish())
+
+
+# --- a real clip ----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def clip(small_recording: Path) -> list[Frame]:
+    recording, frames = open_recording(small_recording), []
+    prepare = Preparation(config().source, recording.camera)
+    for frame in recording.frames(1, 0, None):
+        assert isinstance(frame, Frame)
+        frames.append(prepare(frame))
+    recording.close()
+    return frames[:18]
+
+
+@pytest.fixture(scope="module")
+def mapped(clip: list[Frame]) -> Ran:
+    return ran(clip, config(**DRY))
+
+
+def test_every_frame_is_decided_exactly_once(mapped: Ran) -> None:
+    decided = sorted(tracked.frame.index for tracked in mapped.decided)
+    assert decided == [frame.index for frame in mapped.frames]
+
+
+def test_a_clip_becomes_poses_and_gaussians(mapped: Ran) -> None:
+    assert sum(tracked.T_wc is not None for tracked in mapped.decided) > 14
+    assert len(mapped.slam.mappers[0].gaussians) > 100
+    assert mapped.slam.mappers[0].undone == 0
+
+
+def test_every_eighth_frame_is_held_out_and_never_mapped(mapped: Ran) -> None:
+    mapper, held = mapped.slam.mappers[0], mapped.slam.held_out[0]
+    assert [view.frame_index for view in held] == [8, 16]
+    used = {view.frame_index for view in mapper.views}
+    posed = {tracked.frame.index for tracked in mapped.decided if tracked.T_wc is not None}
+    assert used == posed - {8, 16}
+    assert 0 in used
+
+
+def test_the_same_clip_gives_the_same_map_bit_for_bit(mapped: Ran, clip: list[Frame]) -> None:
+    again = ran(clip, config(**DRY)).slam.mappers[0]
+    for name, tensor in mapped.slam.mappers[0].gaussians.parameters.items():
+        assert np.array_equal(tensor.numpy(), again.gaussians.parameters[name].numpy()), name
+
+
+def test_without_mapping_there_is_the_same_trajectory_and_no_map(
+    mapped: Ran, clip: list[Frame]
+) -> None:
+    plain = ran(clip, config(enabled=False))
+    assert plain.slam.mappers == {}
+    assert plain.slam.held_out == {}
+    assert len(plain.decided) == len(mapped.decided)
+    for a, b in zip(plain.decided, mapped.decided, strict=True):
+        assert a.frame.index == b.frame.index
+        assert a.frame_class == b.frame_class
+        if a.T_wc is not None and b.T_wc is not None:
+            np.testing.assert_array_equal(a.T_wc.matrix, b.T_wc.matrix)
+
+
+# --- the order of work ----------------------------------------------------------------------------
+
+
+def frame_of(index: int) -> Frame:
+    rng = np.random.default_rng(index)
+    image = rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)
+    return Frame(index, index, index, image, CAMERA)
+
+
+def pointmap() -> Pointmap:
+    rho = np.full((48, 64), 0.5)
+    return Pointmap(CAMERA, rho, (0.01 * rho) ** 2)
+
+
+class ToldTracker:
+    """Decides every frame at once as it is told; keyframes go to the store as they do in truth."""
+
+    camera: CameraModel | None = None
+
+    def __init__(self, slam: Slam, classes: str, sub_maps: str = "") -> None:
+        self._slam, self._classes, self._sub_maps = slam, classes, sub_maps or "0" * len(classes)
+
+    def track(self, frame: Frame) -> list[Tracked]:
+        kind, sub_map = self._classes[frame.index], int(self._sub_maps[frame.index])
+        if kind == "L":
+            return [Tracked(frame, FrameClass.LOST, sub_map, reason="told so")]
+        T_wc = Sim3(np.eye(3), np.array([0.01 * frame.index, 0.0, 0.0]))
+        frame_class, seen = FrameClass.COMMON, None
+        if kind in "KM":
+            frame_class = FrameClass.KEYFRAME if kind == "K" else FrameClass.MAPPING
+            seen = pointmap()
+        if kind == "K":
+            encoding = self._slam.prior.encode(frame.image, CAMERA)
+            self._slam.keyframes.add(frame.index, 0, encoding, T_wc, pointmap(), sub_map)
+        number = len(self._slam.keyframes) - 1
+        return [Tracked(frame, frame_class, sub_map, number, T_wc, pointmap=seen)]
+
+    def finish(self) -> list[Tracked]:
+        return []
+
+
+Calls = list[tuple[str, int]]
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> Calls:
+    """What the mappers were asked to do: ("insert", frame) and ("optimise", steps)."""
+    made: Calls = []
+
+    def insert(self: Mapper, view: View, pointmap: Pointmap) -> int:
+        made.append(("insert", view.frame_index))
+        return 0
+
+    def optimise(self: Mapper, steps: int) -> None:
+        made.append(("optimise", steps))
+
+    monkeypatch.setattr(Mapper, "insert", insert)
+    monkeypatch.setattr(Mapper, "optimise", optimise)
+    return made
+
+
+Told = Callable[..., Slam]
+
+
+@pytest.fixture
+def told(monkeypatch: pytest.MonkeyPatch) -> Told:
+    def run(
+        classes: str, sub_maps: str = "", indices: list[int] | None = None, **keys: object
+    ) -> Slam:
+        slam = Slam(config(**keys))
+        monkeypatch.setattr(slam, "tracker", ToldTracker(slam, classes, sub_maps))
+        for index in indices or range(len(classes)):
+            slam.process(frame_of(index))
+        slam.finish()
+        return slam
+
+    return run
+
+
+def test_classes_decide_insertion_and_the_number_of_steps(told: Told, calls: Calls) -> None:
+    told("KCMC")
+    assert calls == [
+        ("insert", 0), ("optimise", 3),
+        ("optimise", 1),
+        ("insert", 2), ("optimise", 2),
+        ("optimise", 1),
+        ("insert", 0),  # the last keyframe, from its fused pointmap
+    ]  # fmt: skip
+
+
+def test_a_keyframe_is_inserted_again_when_the_next_one_retires_it(
+    told: Told, calls: Calls
+) -> None:
+    told("KCKC")
+    inserted = [number for what, number in calls if what == "insert"]
+    assert inserted == [0, 0, 2, 2]
+
+
+def test_frames_without_a_pose_reach_no_map(told: Told, calls: Calls) -> None:
+    slam = told("KLLC")
+    assert [view.frame_index for view in slam.mappers[0].views] == [0, 3]
+
+
+def test_a_lost_frame_counts_in_the_holding_out(told: Told, calls: Calls) -> None:
+    slam = told("KLLCCCCCC" + "C" * 8)
+    assert [view.frame_index for view in slam.held_out[0]] == [8, 16]
+
+
+def test_holding_out_counts_the_frames_that_were_used_and_not_their_indices(
+    told: Told, calls: Calls
+) -> None:
+    slam = told("K" + "C" * 20, indices=list(range(0, 20, 2)), hold_out_every=3)
+    assert [view.frame_index for view in slam.held_out[0]] == [6, 12, 18]
+
+
+def test_no_frame_is_held_out_when_none_is_asked_for(told: Told, calls: Calls) -> None:
+    slam = told("K" + "C" * 9, hold_out_every=0)
+    assert slam.held_out == {}
+    assert len(slam.mappers[0].views) == 10
+
+
+def test_a_keyframe_that_is_held_out_gives_the_map_nothing(told: Told, calls: Calls) -> None:
+    slam = told("KCCCCCCCKC")
+    assert [view.frame_index for view in slam.held_out[0]] == [8]
+    assert [number for what, number in calls if what == "insert"] == [0, 0]
+
+
+def test_every_sub_map_has_a_map_of_its_own(told: Told, calls: Calls) -> None:
+    slam = told("KCKC", sub_maps="0011")
+    assert [view.frame_index for view in slam.mappers[0].views] == [0, 1]
+    assert [view.frame_index for view in slam.mappers[1].views] == [2, 3]
+    assert [number for what, number in calls if what == "insert"] == [0, 0, 2, 2]
+
+
+def test_only_common_frames_are_robust_and_poses_are_the_views_own(
+    told: Told, calls: Calls
+) -> None:
+    views = told("KCM").mappers[0].views
+    assert [view.robust for view in views] == [False, True, False]
+    assert [float(view.T_wc.t[0]) for view in views] == [0.0, 0.01, 0.02]
+
+
+def test_the_stages_are_timed(told: Told, calls: Calls) -> None:
+    stages = told("KCM").profiler.summary()
+    assert {"track", "insert", "optimise", "refine"} <= set(stages)
+
+
+def test_progress_of_the_refinement_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    slam, steps = Slam(config()), []
+    monkeypatch.setattr(slam, "tracker", ToldTracker(slam, "KMM"))
+    for index in range(3):
+        slam.process(frame_of(index))
+    slam.finish(lambda done, total: steps.append((done, total)))
+    assert steps == [(1, 4), (2, 4), (3, 4), (4, 4)]
+
+
+def test_too_few_views_are_not_worth_a_refinement(told: Told) -> None:
+    slam = told("KM")
+    assert len(slam.mappers[0].gaussians) > 0
+    assert slam.mappers[0].steps == STEPS["steps_keyframe"] + STEPS["steps_mapping"]
