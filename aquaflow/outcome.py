@@ -18,7 +18,7 @@ from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.views import View
 from aquaflow.messages import Dropped
 from aquaflow.slam import Slam
-from aquaflow.tracking.tracker import FrameClass, Tracked
+from aquaflow.tracking.frames import FrameClass, Tracked
 
 PROTOCOL = {
     "held_out": "i % n == 0 and i != 0 of the used frames: tracked, never mapped; pose refined "

@@ -30,12 +30,13 @@ from aquaflow.profiler import Profiler
 from aquaflow.reporting import report_data
 from aquaflow.slam import MIN_VIEWS, Slam
 from aquaflow.sources import RecordedCamera
-from aquaflow.tracking.tracker import Tracked
+from aquaflow.tracking.frames import Tracked
 
 log = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int | None], None]
 """Called with the stage, the steps done and, where known, the steps there are."""
+
 
 @dataclass(frozen=True)
 class Replayed:

@@ -17,7 +17,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.messages import Dropped
 from aquaflow.outcome import HeldOut, WaterSummary
 from aquaflow.slam import Slam
-from aquaflow.tracking.tracker import FrameClass, Tracked
+from aquaflow.tracking.frames import FrameClass, Tracked
 
 MAX_EXAMPLES = 6
 """Held-out frames shown, spread evenly over the dive."""

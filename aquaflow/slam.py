@@ -14,7 +14,8 @@ from aquaflow.messages import Frame
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.profiler import Profiler
 from aquaflow.render import select_renderer
-from aquaflow.tracking.tracker import FrameClass, Tracked, Tracker
+from aquaflow.tracking.frames import FrameClass, Tracked
+from aquaflow.tracking.tracker import Tracker
 
 MIN_VIEWS = 3
 """Fewer posed frames are not a map, and not worth refining."""

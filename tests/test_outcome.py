@@ -21,7 +21,7 @@ from aquaflow.outcome import (
     water_of,
 )
 from aquaflow.slam import Slam
-from aquaflow.tracking.tracker import FrameClass, Tracked
+from aquaflow.tracking.frames import FrameClass, Tracked
 
 PICTURE = np.zeros((48, 64, 3), np.uint8)
 

@@ -19,7 +19,7 @@ from aquaflow.messages import Frame
 from aquaflow.preparation import Preparation
 from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
-from aquaflow.tracking.tracker import FrameClass, Tracked
+from aquaflow.tracking.frames import FrameClass, Tracked
 
 CAMERA = CameraModel(64, 48, 55.0, 55.0, 32.0, 24.0)
 STEPS = {"steps_keyframe": 3, "steps_mapping": 2, "steps_common": 1, "refine_steps": 4}

@@ -78,6 +78,13 @@ def _normalised(bundle: Bundle) -> Bundle:
     return Bundle(views, bundle.rho / scale, bundle.camera)
 
 
+def measured(
+    pixels: Array,  # [V, P, 2] px
+) -> npt.NDArray[np.bool_]:
+    """[V, P] matches that are numbers."""
+    return np.asarray(np.isfinite(pixels).all(-1))
+
+
 class _System:
     """The normal equations of one problem."""
 
@@ -90,7 +97,7 @@ class _System:
     ) -> None:
         self.pixels_reference, self.pixels = pixels_reference, pixels
         # One match that is no number would cost the whole system.
-        self.observed = observed & np.isfinite(pixels).all(-1)
+        self.observed = observed & measured(pixels)
         self.solve_focal = solve_focal
 
     def residuals(self, bundle: Bundle) -> tuple[Array, Array, Array]:

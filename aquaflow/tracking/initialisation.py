@@ -198,7 +198,8 @@ class Initialiser:
             or self.parallax_px > 3.0 * self._config.parallax_widths * result.bundle.camera.width
         )
         return (
-            explained >= self._config.min_explained
+            self.parallax_px > self._config.sigma_px  # less is noise, which has depths of its own
+            and explained >= self._config.min_explained
             and float(np.median(relative)) <= self._config.max_depth_sigma
             and focal_known
         )

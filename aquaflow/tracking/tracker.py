@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +13,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
 from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, PairGeometry, Prior
+from aquaflow.tracking.frames import FrameClass, Quality, Tracked
 from aquaflow.tracking.fusion import fuse, transfer
 from aquaflow.tracking.initialisation import Initialised, Initialiser, calibrated
 from aquaflow.tracking.relocate import pose_from_scratch
@@ -21,43 +21,6 @@ from aquaflow.tracking.solver import PoseEstimate, PoseProblem, solve_pose
 
 MAX_ORPHANS = 60
 """Frames without a pose that are kept for back-filling; bounds memory while nothing moves."""
-
-
-class FrameClass(str, Enum):
-    """What a frame is used for (paper, Sec. 3.2), or why it is not used."""
-
-    KEYFRAME = "keyframe"
-    MAPPING = "mapping"
-    COMMON = "common"
-    SKIPPED = "skipped"
-    LOST = "lost"
-    DROPPED = "dropped"
-
-
-@dataclass(frozen=True)
-class Quality:
-    """How well a pose is known."""
-
-    inlier_share: float = 1.0
-    residual_px: float = 0.0
-    matched_share: float = 1.0
-    conditioning: float = 1.0
-
-
-@dataclass(frozen=True)
-class Tracked:
-    """A frame with its pose, or the reason why it has none."""
-
-    frame: Frame
-    frame_class: FrameClass
-    sub_map: int
-    keyframe: int | None = None
-    """Number of the keyframe that the pose hangs on."""
-    T_wc: Sim3 | None = None
-    quality: Quality = Quality()
-    pointmap: Pointmap | None = None
-    """Depth of this frame's own pixels; present for keyframes and mapping frames."""
-    reason: str = ""
 
 
 @dataclass(frozen=True)
@@ -248,8 +211,10 @@ class Tracker:
             estimate = solve_pose(problem, guess)
         if estimate is None or estimate.inlier_share < self._config.min_inlier_share:
             return None
-        displacement = np.linalg.norm(problem.pixels - pixels_k, axis=1)
         share = _matched_share(keyframe.encoding, pair)
+        if share * estimate.inlier_share < self._config.min_support:
+            return None
+        displacement = np.linalg.norm(problem.pixels - pixels_k, axis=1)
         return _Solved(estimate, pair, share, float(displacement.mean()))
 
     def _problem(

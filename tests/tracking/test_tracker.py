@@ -28,7 +28,8 @@ from aquaflow.messages import Frame
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.contract import Prior
 from aquaflow.tracking import tracker as module
-from aquaflow.tracking.tracker import FrameClass, Tracked, Tracker
+from aquaflow.tracking.frames import FrameClass, Tracked
+from aquaflow.tracking.tracker import Tracker
 
 FRAMES = 18
 POSES = lawn_path(FRAMES, step_m=0.12)

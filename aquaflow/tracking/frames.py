@@ -1,0 +1,47 @@
+"""What tracking says about a frame: its class, its pose, and how well that is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes import Pointmap
+from aquaflow.messages import Frame
+
+
+class FrameClass(str, Enum):
+    """What a frame is used for (paper, Sec. 3.2), or why it is not used."""
+
+    KEYFRAME = "keyframe"
+    MAPPING = "mapping"
+    COMMON = "common"
+    SKIPPED = "skipped"
+    LOST = "lost"
+    DROPPED = "dropped"
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How well a pose is known."""
+
+    inlier_share: float = 1.0
+    residual_px: float = 0.0
+    matched_share: float = 1.0
+    conditioning: float = 1.0
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A frame with its pose, or the reason why it has none."""
+
+    frame: Frame
+    frame_class: FrameClass
+    sub_map: int
+    keyframe: int | None = None
+    """Number of the keyframe that the pose hangs on."""
+    T_wc: Sim3 | None = None
+    quality: Quality = Quality()
+    pointmap: Pointmap | None = None
+    """Depth of this frame's own pixels; present for keyframes and mapping frames."""
+    reason: str = ""
