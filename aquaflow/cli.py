@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from aquaflow import __version__
+from aquaflow.cli_bench import register as register_bench
+from aquaflow.cli_stress import register as register_stress
 from aquaflow.errors import AquaFlowError
 
 if TYPE_CHECKING:
@@ -250,3 +252,7 @@ def _print_summary(metrics: dict[str, Any], notes: list[str]) -> None:
     )
     for note in notes:
         typer.echo(f"Note: {note}.")
+
+
+register_bench(app, _progress)
+register_stress(app)

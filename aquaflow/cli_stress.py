@@ -13,6 +13,11 @@ if TYPE_CHECKING:
     from aquaflow.evaluation.stress.suite import Result
 
 
+def register(app: typer.Typer) -> None:
+    """Add the command to ``app``."""
+    app.command()(stress)
+
+
 def stress(
     family: Annotated[
         str | None, typer.Option(help="Only this family, such as images or solvers.")
@@ -44,7 +49,10 @@ def stress(
 def _print(results: list[Result], console: Console) -> None:
     from rich.table import Table
 
-    table = Table("case", "family", "outcome", "worst value", "guard")
+    table = Table()
+    for title in ("case", "family", "outcome", "worst value"):
+        table.add_column(title, no_wrap=True)
+    table.add_column("guard", overflow="fold")
     for result in results:
         outcome = result.outcome
         verdict = "[green]pass[/]" if outcome.passed else "[red]FAIL[/]"

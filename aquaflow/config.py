@@ -85,6 +85,13 @@ class TrackingConfig(Stage):
     min_inlier_share: float = Field(
         0.35, gt=0, lt=1, description="inliers below which the frame is lost"
     )
+    min_support: float = Field(
+        0.1,
+        ge=0,
+        lt=1,
+        description="matched share x inlier share below which the frame is lost; flow between "
+        "unrelated pictures reaches 0.08 by chance (`aquaflow stress`, teleport)",
+    )
     known_sigma: float = Field(
         0.15, gt=0, description="relative depth sigma of points that poses are solved from"
     )

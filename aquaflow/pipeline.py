@@ -14,8 +14,8 @@ import torch
 
 from aquaflow.config import Config
 from aquaflow.dive import TRACE, DiveFolder, FrameRow
-from aquaflow.errors import NotMappedError
-from aquaflow.messages import CameraModel, Dropped
+from aquaflow.errors import InputError, NotMappedError
+from aquaflow.messages import CameraModel, Dropped, Frame
 from aquaflow.outcome import (
     HeldOut,
     examine_held_out,
@@ -131,13 +131,21 @@ class _Replay:
             if isinstance(frame, Dropped):
                 self._drop(frame)
             else:
-                begun = time.monotonic()
-                with profile("prepare"):
-                    prepared = self.preparation(frame)
-                self._decide(self.slam.process(prepared))
-                self._time_frame(started, begun)
+                self._frame(frame, started)
             with profile("progress"):
                 self._progress("map", done, total)
+
+    def _frame(self, frame: Frame, started: float) -> None:
+        """One frame's way; a picture that cannot be prepared costs itself, not the dive."""
+        begun = time.monotonic()
+        try:
+            with self.profiler.stage("prepare"):
+                prepared = self.preparation(frame)
+        except InputError as error:
+            self._drop(Dropped(frame.index, frame.t_ns, str(error)))
+            return
+        self._decide(self.slam.process(prepared))
+        self._time_frame(started, begun)
 
     def _time_frame(self, started: float, begun: float) -> None:
         now = time.monotonic()

@@ -109,7 +109,8 @@ def test_held_out_pictures_lie_beside_what_the_map_shows(small_dive: Path) -> No
         for kind in ("real", "rendered", "restored"):
             picture = cv2.imread(str(small_dive / "heldout" / f"{index:06d}_{kind}.png"))
             assert picture.shape == (HEIGHT, WIDTH, 3)
-    assert len(list((small_dive / "heldout").iterdir())) == 3 * len(HELD_OUT)
+        assert (small_dive / "heldout" / f"{index:06d}_range.npz").exists()
+    assert len(list((small_dive / "heldout").iterdir())) == 4 * len(HELD_OUT)
 
 
 def test_what_was_decided_is_on_disk_before_the_end(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 FLOORS = (
     {"cli"},
+    {"cli_bench", "cli_stress"},
     {"evaluation", "service", "doctor"},
     {"pipeline", "viewer"},
     {"reporting"},
@@ -21,6 +22,7 @@ FLOORS = (
     {"keyframes", "synthetic", "fusion", "sources", "preparation"},
     {"image_metrics"},
     {"prior", "messages"},
+    {"presets"},
     {"render", "geometry", "config", "profiler"},
     {"errors"},
     {"aquaflow"},

@@ -26,6 +26,9 @@ to 1.10 (SLR behind a dome); this is the geometric mean of the two."""
 ASPECT_TOLERANCE = 0.01
 """A calibration for another resolution may be scaled if the aspect ratio differs by less."""
 
+MIN_DEPTH = 1e-9
+"""Projection divides by no smaller depth; what lies behind the camera lands far outside."""
+
 
 @dataclass(frozen=True)
 class Port:
@@ -104,7 +107,7 @@ class CameraModel:
         points: npt.NDArray[np.floating],  # [..., 3], camera frame, z > 0
     ) -> npt.NDArray[np.float64]:
         """Undistorted pixel coordinates [..., 2]; z is kept away from zero."""
-        z = np.maximum(points[..., 2], 1e-9)
+        z = np.maximum(points[..., 2], MIN_DEPTH)
         u = self.fx * points[..., 0] / z + self.cx
         v = self.fy * points[..., 1] / z + self.cy
         return np.stack([u, v], axis=-1)

@@ -44,6 +44,13 @@ def so3_log(
     return np.asarray(Rotation.from_matrix(R).as_rotvec())
 
 
+def on_so3(
+    R: Array,  # [3, 3] nearly a rotation
+) -> Array:
+    """The rotation [3, 3] next to ``R``: by way of a unit quaternion."""
+    return np.asarray(Rotation.from_matrix(R).as_matrix())
+
+
 def quaternion_from_rotation(
     R: Array,  # [..., 3, 3]
 ) -> Array:
@@ -92,9 +99,9 @@ class Sim3:
 
     def __matmul__(self, other: Sim3) -> Sim3:
         """Composition; the rotation is put back on SO(3), so that long products do not drift."""
-        R = Rotation.from_matrix(self.R @ other.R).as_matrix()
+        R = on_so3(self.R @ other.R)
         t = self.scale * (self.R @ other.t) + self.t
-        return Sim3(np.asarray(R), t, self.scale * other.scale)
+        return Sim3(R, t, self.scale * other.scale)
 
     def apply(
         self,

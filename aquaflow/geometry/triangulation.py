@@ -18,6 +18,12 @@ MIN_PARALLAX_RAD = np.radians(0.15)
 MAX_REPROJECTION_PX = 1.5
 """A match further than this from its epipolar line is an outlier, not a measurement."""
 
+MIN_DEPTH = 1e-3
+"""Nearer points, and those behind a camera, are no measurement."""
+
+MIN_CROSS_SQ = 1e-12
+"""Squared sine of the angle below which rays are parallel: their depth is rounding noise."""
+
 
 @dataclass(frozen=True)
 class Triangulation:
@@ -61,9 +67,9 @@ def triangulate(
     parallax = np.arctan2(np.sqrt(_dot(across, across)), _dot(rays_a, from_b))
 
     error = np.linalg.norm(camera_b.project(in_b) - pixels_b, axis=1)
-    good = (z > 1e-3) & (in_b[:, 2] > 1e-3) & (error < MAX_REPROJECTION_PX)
+    good = (z > MIN_DEPTH) & (in_b[:, 2] > MIN_DEPTH) & (error < MAX_REPROJECTION_PX)
     # Parallel rays meet nowhere; their z is rounding noise over the guard.
-    good &= (parallax > MIN_PARALLAX_RAD) & (cc > 1e-12)
+    good &= (parallax > MIN_PARALLAX_RAD) & (cc > MIN_CROSS_SQ)
     rho = 1.0 / z_safe
     sigma = (sigma_px / camera_b.fx) * rho / np.maximum(np.sin(parallax), 1e-6)
     return Triangulation(rho, sigma**2, good, parallax)

@@ -10,6 +10,9 @@ from torch import Tensor
 COLOUR_SHARPNESS = 10.0
 """Softplus sharpness that keeps radiance positive and is the identity above about 0.3."""
 
+MIN_RADIANCE = 1e-3
+"""Darker colours start here: black itself has no finite raw colour."""
+
 
 class GaussianMap:
     """Parameters as the optimiser sees them, and as the renderer wants them.
@@ -84,5 +87,5 @@ def raw_colour(
 ) -> Tensor:
     """Raw colours whose :func:`radiance` is ``colour``."""
     # softplus_beta^-1(y) = y + log(1 - exp(-beta y)) / beta, with y kept off zero.
-    y = colour.clamp_min(1e-3)
+    y = colour.clamp_min(MIN_RADIANCE)
     return y + torch.log(-torch.expm1(-COLOUR_SHARPNESS * y)) / COLOUR_SHARPNESS

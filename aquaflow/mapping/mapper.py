@@ -33,6 +33,11 @@ from aquaflow.render.photometric import photometric_loss
 log = logging.getLogger(__name__)
 
 
+def is_number(value: Tensor) -> bool:
+    """True if a loss or a norm may be acted on."""
+    return bool(torch.isfinite(value))
+
+
 class Mapper:
     """Owns the Gaussians, the medium, their optimisers and the views of one sub-map."""
 
@@ -145,7 +150,7 @@ class Mapper:
         self._medium_optimiser.zero_grad(set_to_none=True)
         shown = self.scene.draw(view, leaves, viewmat)
         loss = self._loss(view, shown, leaves)
-        if not torch.isfinite(loss):
+        if not is_number(loss):
             self._undo("loss", view)
             self._drop_unsound()
             return
@@ -187,7 +192,7 @@ class Mapper:
         norm = torch.nn.utils.clip_grad_norm_(
             self.medium.parameters(), self.config.medium.max_gradient
         )
-        if not torch.isfinite(norm):
+        if not is_number(norm):
             self._undo("medium gradient", view)
             return
         self._medium_optimiser.step()

@@ -16,6 +16,11 @@ from aquaflow.config import MediumConfig
 from aquaflow.mapping.encoding import BANDS, sinusoidal_encoding
 from aquaflow.mapping.image_formation import Water
 
+MIN_RATE = 1e-4
+"""1 / map unit; a rate of zero has no finite parameter."""
+B_INF_RANGE = (0.01, 0.99)
+"""What the water may start from: 0 and 1 have no finite logit."""
+
 
 class Medium(nn.Module):
     """beta_a = MLP_a(gamma(vec R)); B_inf, b, B_res, d learnable RGB (paper, Sec. 3.3.2)."""
@@ -60,13 +65,13 @@ class Medium(nn.Module):
         """Start from an estimate (each [3]); the residual term is left as it is."""
         self.output.weight.zero_()
         self.output.bias.copy_(inverse_softplus(beta_a))
-        self.B_inf_logit.copy_(torch.logit(B_inf.clamp(0.01, 0.99)))
+        self.B_inf_logit.copy_(torch.logit(B_inf.clamp(*B_INF_RANGE)))
         self.b_raw.copy_(inverse_softplus(b))
 
 
 def inverse_softplus(y: Tensor) -> Tensor:
     """x with softplus(x) = y, for y > 0; guarded at both ends."""
-    y = y.clamp_min(1e-4)
+    y = y.clamp_min(MIN_RATE)
     return y + torch.log(-torch.expm1(-y))
 
 

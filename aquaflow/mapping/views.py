@@ -55,6 +55,13 @@ BETAS = (0.8, 0.99)
 """Adam's decay rates for poses (ARTDECO, field_notes.md section 2.5)."""
 
 
+def is_usable(
+    gradient: npt.NDArray[np.float64],  # [4, 4]
+) -> bool:
+    """True if a pose may be moved by this gradient: one NaN would stay in it for good."""
+    return bool(np.isfinite(gradient[:3]).all())
+
+
 def refine_pose(
     view: View,
     gradient: Tensor,  # [4, 4] of the loss with respect to the view matrix
@@ -66,7 +73,7 @@ def refine_pose(
     """
     V = view.viewmat().numpy().astype(np.float64)
     G = gradient.numpy().astype(np.float64)
-    if not np.isfinite(G[:3]).all():
+    if not is_usable(G):
         return
     M = G[:3] @ V.T
     g = np.array(

@@ -17,6 +17,8 @@ LOWE_RATIO = 0.8
 RANSAC_PX = 4.0
 """Loose on purpose: relief does not follow a homography, the flow takes care of the rest."""
 MIN_INLIERS = 12
+MIN_DENOMINATOR = 1e-6
+"""On the plane's horizon the denominator is zero."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,6 @@ def flow_of_homography(
     # The denominator changes sign behind the plane's horizon: such pixels keep a finite nonsense
     # flow, which the forward-backward check throws away.
     w = mapped[..., 2:]
-    w = np.where(np.abs(w) < 1e-6, 1e-6, w)
+    w = np.where(np.abs(w) < MIN_DENOMINATOR, MIN_DENOMINATOR, w)
     limit = 2.0 * (height + width)
     return np.clip(mapped[..., :2] / w - grid, -limit, limit).astype(np.float32)

@@ -161,9 +161,7 @@ class SelectiveAdam:
         )
 
     def _step_torch(self, visible: Tensor, grads: Mapping[str, Tensor]) -> int:
-        sound = torch.ones_like(visible)
-        for gradient in grads.values():
-            sound &= (gradient.abs() < LARGEST_GRADIENT).reshape(len(visible), -1).all(1)
+        sound = sound_rows(grads, len(visible))
         rows = torch.nonzero(visible & sound)[:, 0]
         bias = self._bias[self.steps[rows].long().clamp(max=len(self._bias) - 1)]
         self.steps[rows] += 1
@@ -178,6 +176,12 @@ class SelectiveAdam:
             change = self.learning_rates[name] * b1 * m / (v.sqrt() * b2 + self.eps)
             self.params[name].detach()[rows] -= change
         return int((visible & ~sound).sum())
+
+
+def sound_rows(grads: Mapping[str, Tensor], rows: int) -> Tensor:
+    """[rows] bool: every gradient of the row is a number, and its square is one too."""
+    sound = [(g.abs() < LARGEST_GRADIENT).reshape(rows, -1).all(1) for g in grads.values()]
+    return torch.stack(sound).all(0) if sound else torch.ones(rows, dtype=torch.bool)
 
 
 def _bias_table(betas: tuple[float, float]) -> Tensor:

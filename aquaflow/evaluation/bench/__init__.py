@@ -1,1 +1,1 @@
-"""``aquaflow bench`` and ``aquaflow ablate``: run time against error, and what each part is worth."""
+"""``aquaflow bench`` and ``aquaflow ablate``: run time against error, and what parts are worth."""

@@ -96,7 +96,7 @@ class Check:
     def pose(self, what: str, T: Sim3) -> None:
         """A pose is expected to be finite, a rotation, of unit quaternion and positive scale."""
         self.finite(what, T.R, T.t, T.scale)
-        if not T.is_finite():
+        if not (T.is_finite() and np.linalg.det(T.R) > 0.0):
             self._failures.append(f"{what} is no similarity")
             return
         skew = float(np.abs(T.R.T @ T.R - np.eye(3)).max())

@@ -5,7 +5,6 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -13,22 +12,16 @@ import numpy as np
 from aquaflow.config import Config
 from aquaflow.dive import DiveFolder
 from aquaflow.evaluation.stress.case import Check, case
-from aquaflow.evaluation.stress.swim import Tracking, clear_swim, sound, track
+from aquaflow.evaluation.stress.swim import Tracking, clear_swim, clear_tracking, sound, track
 
 HOUR_NS = 3_600_000_000_000
-
-
-@lru_cache(maxsize=2)
-def _on_time(seed: int) -> Tracking:
-    """The clip with an honest clock."""
-    return track(clear_swim(seed))
 
 
 def _clocked(check: Check, seed: int, time_ns: Callable[[int], int]) -> None:
     frames = [replace(f, t_ns=time_ns(f.index)) for f in clear_swim(seed)]
     result = track(frames)
     sound(check, frames, result)
-    same = _on_time(seed).posed
+    same = clear_tracking(seed).posed
     check.true("the same frames are posed", set(same) == set(result.posed))
     for i in set(same) & set(result.posed):
         T, wanted = result.posed[i].T_wc, same[i].T_wc

@@ -12,6 +12,7 @@ from importlib import import_module
 from typing import Any
 
 import cv2
+import torch
 
 from aquaflow.errors import InputError
 from aquaflow.evaluation.stress.case import REGISTRY, Case, Outcome
@@ -19,7 +20,10 @@ from aquaflow.evaluation.stress.case import REGISTRY, Case, Outcome
 FAMILIES = (
     "images", "motion", "time", "water", "gaussians", "solvers", "precision", "soak",
 )  # fmt: skip
-_MODULES = ("images", "motion", "clock", "water", "gaussians", "solvers", "precision", "soak")
+_MODULES = (
+    "images", "motion", "clock", "water", "gaussians", "optimisation", "solvers", "precision",
+    "soak",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -57,7 +61,6 @@ def cases(family: str | None = None, name: str | None = None, long: bool = False
         InputError: there is no such family or case.
     """
     for module in _MODULES:
-        if not __import__("importlib.util").util.find_spec(f"aquaflow.evaluation.stress.{module}"): continue
         import_module(f"aquaflow.evaluation.stress.{module}")
     if family is not None and family not in FAMILIES:
         raise InputError(f"there is no family '{family}'; families are {', '.join(FAMILIES)}")
@@ -71,11 +74,16 @@ def cases(family: str | None = None, name: str | None = None, long: bool = False
 
 @contextmanager
 def on_few_threads() -> Iterator[None]:
-    """One thread for BLAS: its threads wait for each other over matrices this small."""
+    """One thread for BLAS and torch: their threads wait for each other over matrices this small."""
     from threadpoolctl import threadpool_limits
 
-    with threadpool_limits(1, user_api="blas"):
-        yield
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1, user_api="blas"):
+            yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def run_case(case: Case, seed: int) -> Result:

@@ -22,7 +22,8 @@ from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.messages import Frame
 from aquaflow.prior.classical import ClassicalPrior
-from aquaflow.tracking.tracker import Tracked, Tracker
+from aquaflow.tracking.frames import Tracked
+from aquaflow.tracking.tracker import Tracker
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
@@ -104,9 +105,7 @@ def spoiled(
     """The clip with the pictures of the frames ``which`` replaced by ``change(picture, index)``."""
     from dataclasses import replace
 
-    return [
-        replace(f, image=change(f.image, f.index)) if f.index in which else f for f in frames
-    ]
+    return [replace(f, image=change(f.image, f.index)) if f.index in which else f for f in frames]
 
 
 @dataclass(frozen=True)
@@ -129,6 +128,12 @@ def track(frames: Sequence[Frame]) -> Tracking:
     for frame in frames:
         tracked += tracker.track(frame)
     return Tracking(tracked + tracker.finish(), store)
+
+
+@lru_cache(maxsize=2)
+def clear_tracking(seed: int) -> Tracking:
+    """What the tracker says about the clear swim."""
+    return track(clear_swim(seed))
 
 
 def sound(check: Check, frames: Sequence[Frame], result: Tracking) -> None:

@@ -1,0 +1,95 @@
+"""The commands that measure AquaFlow itself: ``bench`` and ``ablate``. Thin, like cli.py."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+Json = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON.")]
+Suite = Annotated[str | None, typer.Option(help="ci (synthetic) | real DATA_DIR")]
+Data = Annotated[Path | None, typer.Argument(help="Of --suite real: a folder for each clip.")]
+Scenes = Annotated[list[Path] | None, typer.Option("--scene", help="Recording; may be repeated.")]
+Bars = Callable[[bool], AbstractContextManager[Any]]
+
+
+def register(app: typer.Typer, bars: Bars) -> None:
+    """Add the commands to ``app``; ``bars(quiet)`` is how it shows progress."""
+
+    @app.command()
+    def bench(
+        data: Data = None,
+        suite: Suite = None,
+        scene: Scenes = None,
+        preset: Annotated[list[str] | None, typer.Option(help="May be repeated.")] = None,
+        repeats: Annotated[int, typer.Option(min=1, help="Runs of each, interleaved.")] = 1,
+        peers: Annotated[bool, typer.Option(help="Run COLMAP and two-view odometry too.")] = True,
+        out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("out/bench"),
+        readme: Annotated[
+            Path | None, typer.Option(help="Write table and picture into this file's section.")
+        ] = None,
+        as_json: Json = False,
+    ) -> None:
+        """Run time against error: scenes x presets as a table, a picture and bench.json."""
+        from aquaflow.evaluation.bench import benchmark as bm
+        from aquaflow.presets import PRESETS
+
+        contenders = bm.contenders_of(preset or list(PRESETS), peers)
+        with bars(as_json) as progress:
+            scenes = bm.scenes_of(suite, data, scene or [], out, progress)
+            result = bm.benchmark(scenes, contenders, repeats, out, progress)
+        if readme is not None:
+            _into_readme(readme, out / bm.PICTURE_FILE, result)
+        if as_json:
+            typer.echo(json.dumps(result))
+            return
+        from aquaflow.evaluation.bench.table import print_table
+
+        print_table(result["runs"], _console())
+        typer.echo(f"Look at {out / bm.PICTURE_FILE}; all numbers are in {out / bm.JSON_FILE}.")
+
+    @app.command()
+    def ablate(
+        data: Data = None,
+        suite: Suite = None,
+        scene: Scenes = None,
+        out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("out/ablation"),
+        as_json: Json = False,
+    ) -> None:
+        """What each part is worth: everything once without it, error and time against full."""
+        from aquaflow.evaluation.bench import ablation
+        from aquaflow.evaluation.bench.benchmark import scenes_of
+
+        with bars(as_json) as progress:
+            scenes = scenes_of(suite, data, scene or [], out, progress)
+            if suite == "ci":
+                scenes = [s for s in scenes if s.name in ablation.CI_SCENES] or scenes
+            result = ablation.ablate(scenes, out, progress)
+        (out / "ablate.json").write_text(json.dumps(result, indent=2) + "\n")
+        if as_json:
+            typer.echo(json.dumps(result))
+        else:
+            ablation.print_ablation(result["rows"], _console())
+
+
+def _into_readme(readme: Path, picture: Path, result: dict[str, Any]) -> None:
+    """The picture goes to docs/ beside the file, where a page can show it."""
+    from aquaflow.evaluation.bench.readme import write_readme
+
+    kept = readme.parent / "docs" / picture.name
+    kept.parent.mkdir(exist_ok=True)
+    shutil.copyfile(picture, kept)
+    write_readme(readme, kept, result["machine"], result["runs"])
+
+
+def _console() -> Any:
+    """As wide as the table where nobody looks on a terminal: a log must not cut numbers."""
+    from rich.console import Console
+
+    console = Console()
+    return console if console.is_terminal else Console(width=200)

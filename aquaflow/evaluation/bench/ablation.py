@@ -1,0 +1,144 @@
+"""``aquaflow ablate``: what each part, and each skip of DESIGN section 6, costs and brings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from aquaflow.evaluation.bench import machine
+from aquaflow.evaluation.bench.job import Job
+from aquaflow.evaluation.bench.runner import Perform, Progress, Row, in_process, row_of
+from aquaflow.evaluation.bench.scene import Scene
+
+PRESET = "balanced"
+CI_SCENES = ("reef, loop", "wall, murky, slow")
+"""Of the ci suite: relief and much water; the others would double the time."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Something that can be switched off, and how."""
+
+    name: str
+    overrides: dict[str, Any] = field(default_factory=dict)
+    built: bool = True
+
+
+def _medium(**settings: object) -> dict[str, Any]:
+    return {"mapping": {"medium": settings}}
+
+
+def _insertion(**settings: object) -> dict[str, Any]:
+    return {"mapping": {"insertion": settings}}
+
+
+NEVER_AGREES = 1e-9
+"""Relative range difference: no map is this close, so no ray counts as explained."""
+
+PARTS = (
+    Part("full"),
+    Part("without medium", _medium(enabled=False)),
+    Part("without medium in insertion", _insertion(medium_reduced=False)),
+    Part("without camera shading", _medium(shading=False)),
+    Part("without water fit", _medium(fit=False)),
+    Part("without pose refinement", {"mapping": {"optimiser": {"poses": 0.0}}}),
+    Part("without depth loss", {"mapping": {"loss": {"depth": 0.0}}}),
+    Part("without distance embedding", built=False),
+    Part("without LGPD (an MLP instead)", built=False),
+    Part("without learned prior", built=False),
+    Part("skip off: insertion only where the map is wrong", _insertion(agreement=NEVER_AGREES)),
+    Part("skip off: duplicate and stationary frames", built=False),
+    Part("skip off: dark, blurred or blinded frames", built=False),
+    Part("skip off: encoder features reused", built=False),
+    Part("skip off: matching seeded by motion", built=False),
+    Part("skip off: solver stops when converged", built=False),
+    Part("skip off: retrieval only at keyframes", built=False),
+    Part("skip off: medium off in clear water", built=False),
+    Part("skip off: no Gaussians in open water", built=False),
+    Part("skip off: only voxel groups in view", built=False),
+    Part("skip off: views already explained", built=False),
+    Part("skip off: tiles at the noise floor", built=False),
+    Part("skip off: decoded attributes cached", built=False),
+)
+"""In the order of the table; a part lights up once it has a switch in the config."""
+
+
+def ablate(
+    scenes: Sequence[Scene],
+    out: Path,
+    progress: Progress,
+    parts: Sequence[Part] = PARTS,
+    perform: Perform = in_process,
+) -> dict[str, Any]:
+    """Run every part's scenes, interleaved; means over the scenes (DESIGN section 5)."""
+    built = [part for part in parts if part.built]
+    found: dict[str, list[Row]] = {part.name: [] for part in parts}
+    total, done = len(built) * len(scenes), 0
+    for scene in scenes:
+        for part in built:
+            folder = str(out / "ablation" / f"dive_{done:03d}")
+            job = Job(scene, PRESET, folder, overrides=part.overrides)
+            found[part.name].append(row_of(job, machine.load(), perform(job)))
+            done += 1
+            progress("runs", done, total)
+    return {"rows": [_row(part, found[part.name]) for part in parts]}
+
+
+def _row(part: Part, runs: list[Row]) -> dict[str, Any]:
+    """A failed run leaves no number: a mean over fewer scenes would compare other things."""
+    failed = [f"{run['scene']}: {run['failed']}" for run in runs if run["failed"]]
+    whole = runs if not failed else []
+
+    def mean(values: list[float | None]) -> float | None:
+        known = [value for value in values if value is not None]
+        return round(fmean(known), 4) if known and len(known) == len(values) else None
+
+    return {
+        "part": part.name,
+        "psnr": mean([run["psnr"] for run in whole]),
+        "ate_pct": mean([run["ate_pct_sim3"] for run in whole]),
+        "ms_per_frame": mean([run["ms_per_frame"]["total"] for run in whole]),
+        "restored_psnr": mean([run["restored_psnr"] for run in whole]),
+        "built": part.built,
+        "failed": failed,
+    }
+
+
+SHOWN = (
+    ("psnr", "PSNR dB", ".2f"),
+    ("restored_psnr", "restored dB", ".2f"),
+    ("ate_pct", "ATE %", ".3f"),
+    ("ms_per_frame", "ms/frame", ".0f"),
+)
+
+
+def print_ablation(rows: Sequence[Row], console: Console) -> None:
+    """Each number with its difference from the full system."""
+    full = rows[0]
+    table = Table(show_edge=False, pad_edge=False)
+    table.add_column("part")
+    for _, title, _ in SHOWN:
+        table.add_column(title, justify="right", no_wrap=True)
+    for row in rows:
+        if not row["built"]:
+            table.add_row(row["part"], "not built", *[""] * (len(SHOWN) - 1), style="dim")
+            continue
+        table.add_row(row["part"], *(_cell(row[key], full[key], form) for key, _, form in SHOWN))
+    console.print(table)
+    for row in rows:
+        for sentence in row["failed"]:
+            console.print(f"{row['part']}: {sentence}", highlight=False, markup=False)
+
+
+def _cell(value: float | None, full: float | None, form: str) -> str:
+    if value is None:
+        return "-"
+    if full is None or value == full:
+        return format(value, form)
+    return f"{format(value, form)} ({format(value - full, '+' + form)})"

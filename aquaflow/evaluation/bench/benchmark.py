@@ -1,0 +1,94 @@
+"""``aquaflow bench``: scenes times contenders, and everything that is written about them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from aquaflow.errors import InputError
+from aquaflow.evaluation.bench import machine
+from aquaflow.evaluation.bench.ci_suite import ci_scenes
+from aquaflow.evaluation.bench.picture import draw
+from aquaflow.evaluation.bench.real_suite import real_scenes
+from aquaflow.evaluation.bench.runner import (
+    Contender,
+    Perform,
+    Progress,
+    in_process,
+    jobs_for,
+    run_all,
+)
+from aquaflow.evaluation.bench.scene import Scene, scene_at
+from aquaflow.presets import preset
+
+JSON_FILE, PICTURE_FILE = "bench.json", "bench.png"
+PEERS = ("two-view", "colmap")
+PEERS_AT = "balanced"
+"""Peers get the frames that this preset prepares."""
+
+SUITES = ("ci", "real")
+
+
+def scenes_of(
+    suite: str | None, data: Path | None, paths: Sequence[Path], out: Path, progress: Progress
+) -> list[Scene]:
+    """The scenes of a suite, and those the user names.
+
+    Raises:
+        InputError: there is nothing to run, or something named is not there.
+    """
+    if suite not in (None, *SUITES):
+        raise InputError(f"there is no suite '{suite}'; choose {' or '.join(SUITES)}")
+    if suite == "real" and data is None:
+        raise InputError("--suite real needs a data folder: aquaflow bench --suite real DATA_DIR")
+    found = [scene_at(path) for path in paths]
+    if suite == "ci":
+        found += ci_scenes(out / "scenes", progress)
+    elif suite == "real" and data is not None:
+        found += real_scenes(data)
+    if not found:
+        raise InputError("nothing to run: give --suite ci, --suite real DATA_DIR, or --scene PATH")
+    return found
+
+
+def contenders_of(presets: Sequence[str], peers: bool) -> list[Contender]:
+    """The presets in their order, then the peers.
+
+    Raises:
+        ConfigError: there is no such preset.
+    """
+    for name in presets:
+        preset(name)
+    return [
+        *(Contender(name) for name in presets),
+        *(Contender(PEERS_AT, peer) for peer in (PEERS if peers else ())),
+    ]
+
+
+def benchmark(
+    scenes: Sequence[Scene],
+    contenders: Sequence[Contender],
+    repeats: int,
+    out: Path,
+    progress: Progress,
+    perform: Perform = in_process,
+) -> dict[str, Any]:
+    """Run everything; writes bench.json and bench.png into ``out`` and returns the former."""
+    out.mkdir(parents=True, exist_ok=True)
+    described = machine.describe()
+    rows = run_all(jobs_for(scenes, contenders, repeats, out), progress, perform)
+    result = {"machine": described, "runs": rows}
+    (out / JSON_FILE).write_text(json.dumps(result, indent=2, allow_nan=False) + "\n")
+    draw(rows, out / PICTURE_FILE, caption(described))
+    return result
+
+
+def caption(described: dict[str, Any]) -> str:
+    """What the picture says about where it comes from."""
+    return (
+        f"AquaFlow {described['aquaflow']} on {described['processor']}, {described['cores']} "
+        f"cores, {described['date']}; every run is one marker; "
+        "peers find poses only, AquaFlow's time holds the map too"
+    )

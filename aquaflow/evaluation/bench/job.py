@@ -1,0 +1,41 @@
+"""One run of the benchmark as JSON: what the runner asks of a worker process."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from aquaflow.config import Config, parse_config
+from aquaflow.evaluation.bench.scene import Scene
+from aquaflow.presets import merged, preset
+
+
+@dataclass(frozen=True)
+class Job:
+    """One contender on one scene."""
+
+    scene: Scene
+    preset: str
+    out: str
+    """Dive folder to write."""
+    peer: str | None = None
+    """Another program in AquaFlow's place, on the frames that ``preset`` prepares."""
+    overrides: dict[str, Any] | None = None
+    """Of the config, on top of the preset."""
+    repeat: int = 0
+
+    def config(self) -> Config:
+        """The scene's settings, then the preset's, then this job's own."""
+        wanted = merged(merged(Config().model_dump(), self.scene.overrides), preset(self.preset))
+        steps = wanted["mapping"]["optimiser"]["refine_steps"]
+        wanted["mapping"]["optimiser"]["refine_steps"] = round(self.scene.refine_share * steps)
+        return parse_config(merged(wanted, self.overrides or {}), f"benchmark of {self.scene.name}")
+
+    def to_text(self) -> str:
+        return json.dumps(asdict(self))
+
+    @staticmethod
+    def from_text(text: str) -> Job:
+        data = json.loads(text)
+        return Job(**{**data, "scene": Scene(**data["scene"])})

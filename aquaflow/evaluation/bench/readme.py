@@ -1,0 +1,64 @@
+"""The README's section on speed and accuracy: its numbers are written here, not typed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from aquaflow.errors import InputError
+from aquaflow.evaluation.bench.summary import NOTES
+from aquaflow.evaluation.bench.table import failures, markdown
+
+BEGIN, END = "<!-- bench: begin -->", "<!-- bench: end -->"
+
+
+def write_readme(
+    readme: Path, picture: Path, machine: dict[str, Any], rows: Sequence[dict[str, Any]]
+) -> None:
+    """Replace what stands between the markers.
+
+    Raises:
+        InputError: the file or its markers are not there.
+    """
+    try:
+        text = readme.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"cannot read {readme}: {error.strerror}; give a Markdown file") from error
+    if text.count(BEGIN) != 1 or text.count(END) != 1:
+        raise InputError(f"{readme} needs the lines '{BEGIN}' and '{END}' once each, in this order")
+    before, rest = text.split(BEGIN)
+    after = rest.split(END)[-1]
+    where = picture.resolve()
+    folder = readme.resolve().parent
+    shown = where.relative_to(folder) if where.is_relative_to(folder) else where
+    middle = section(str(shown), machine, rows)
+    readme.write_text(f"{before}{BEGIN}\n{middle}\n{END}{after}", encoding="utf-8")
+
+
+def section(picture: str, machine: dict[str, Any], rows: Sequence[dict[str, Any]]) -> str:
+    """Markdown: picture, table, how to read it, and what it ran on."""
+    failed = [f"- {sentence}" for sentence in failures(rows)]
+    parts = [
+        f"![Run time per frame against trajectory error and against picture quality]({picture})",
+        markdown(rows),
+        " ".join(NOTES),
+        "\n".join(failed),
+        describe_machine(machine, rows),
+    ]
+    return "\n\n".join(part for part in parts if part)
+
+
+def describe_machine(machine: dict[str, Any], rows: Sequence[dict[str, Any]]) -> str:
+    """One paragraph on the machine, its load, the versions and the date."""
+    loads = [row["load"] for row in rows if row["load"] is not None]
+    busy = f" Load while it ran: {min(loads):.1f} to {max(loads):.1f}." if loads else ""
+    packages = ", ".join(f"{name} {found}" for name, found in machine["packages"].items() if found)
+    repeats = 1 + max(row["repeat"] for row in rows)
+    times = "once" if repeats == 1 else f"{repeats} times, interleaved; medians ± half the range"
+    return (
+        f"Written by `aquaflow bench` on {machine['date']}; every run {times}. Machine: "
+        f"{machine['processor']}, {machine['cores']} cores, {machine['memory_gb']} GB, "
+        f"{machine['system']}.{busy} AquaFlow {machine['aquaflow']}, Python {machine['python']}, "
+        f"{packages}."
+    )

@@ -1,0 +1,68 @@
+"""One run in a process of its own: its peak memory is its own, and its crash is only its own.
+
+``python -m aquaflow.evaluation.bench.worker`` reads a job on stdin; the last line of its output is
+the row as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from pathlib import Path
+from typing import Any
+
+from aquaflow.errors import AquaFlowError
+from aquaflow.evaluation.bench.job import Job
+from aquaflow.evaluation.bench.measure import measured
+from aquaflow.evaluation.bench.peers import run_peer
+from aquaflow.geometry.camera import load_camera
+from aquaflow.pipeline import map_recording
+from aquaflow.sources import open_recording
+
+
+def perform(job: Job) -> dict[str, Any]:
+    """Run the job and measure what it wrote.
+
+    Raises:
+        AquaFlowError: the run failed; the sentence says why.
+    """
+    scene, out = job.scene, Path(job.out)
+    if job.peer is not None:
+        metrics = run_peer(job.peer, scene, job.config(), out)
+    else:
+        calibration = None if scene.calibration is None else load_camera(Path(scene.calibration))
+        recording = open_recording(Path(scene.recording), fps=job.config().source.fps)
+        metrics = map_recording(
+            recording, scene.name, out, job.config(), calibration, overwrite=True
+        ).metrics
+    peak_mb = peak_memory_mb()  # before the evaluation, whose memory is not the run's
+    return {**metrics, **measured(scene, out), "peak_rss_mb": peak_mb}
+
+
+def peak_memory_mb() -> float | None:
+    """Of this program alone; None where the system does not say.
+
+    getrusage's maximum is inherited: it holds the memory of the process that started this one.
+    """
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return None
+    found = [line.split()[1] for line in lines if line.startswith("VmHWM:")]
+    return round(int(found[0]) / 1024.0, 1) if found else None
+
+
+def main() -> None:
+    """Answer one job."""
+    logging.captureWarnings(True)
+    job = Job.from_text(sys.stdin.read())
+    try:
+        row = perform(job)
+    except AquaFlowError as error:
+        row = {"failed": str(error)}
+    print(json.dumps(row))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,43 @@
+"""What the benchmark reads of a run: its pace, and the depth of its map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from aquaflow.evaluation.bench.measure import depth_error
+from aquaflow.evaluation.bench.summary import attenuation_error_pct
+from aquaflow.outcome import pace
+
+
+def test_the_pace_counts_the_whole_run_and_single_frames() -> None:
+    found = pace([10.0, 20.0, 30.0], 0.5, 0.9)
+    assert found["ms_per_frame"]["p50"] == 20.0
+    assert found["ms_per_frame"]["total"] == 300.0
+    assert found["time_to_first_pose_s"] == 0.5
+    assert pace([10.0], None, 1.0)["time_to_first_pose_s"] is None
+
+
+def test_the_depth_error_is_relative_and_over_what_both_know(tmp_path: Path) -> None:
+    dive, truth = tmp_path / "dive", tmp_path / "truth"
+    (dive / "heldout").mkdir(parents=True)
+    (truth / "range").mkdir(parents=True)
+    true, hit = np.full((4, 6), 2.0, np.float32), np.ones((4, 6), bool)
+    hit[0] = False
+    np.savez(truth / "range" / "000008.npz", range_m=true, hit=hit)
+    z = np.full((2, 3), 1.1, np.float32)  # half the width
+    z[1, 0] = 0.0
+    np.savez(dive / "heldout" / "000008_range.npz", z=z)
+    found = depth_error(dive, truth, metres_per_unit=2.0)
+    assert found is not None
+    assert np.isclose(found, 0.1)
+    assert depth_error(tmp_path / "other", truth, 2.0) is None
+
+
+def test_the_error_of_the_water_is_a_mean_over_known_channels() -> None:
+    assert attenuation_error_pct({"medium_error": None}) is None
+    row = {"medium_error": {"attenuation_ratio": [1.1, 0.8, None]}}
+    found = attenuation_error_pct(row)
+    assert found is not None
+    assert np.isclose(found, 15.0)

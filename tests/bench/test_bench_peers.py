@@ -1,0 +1,42 @@
+"""Peers: a path they must find on a small dive, and their absence as a sentence."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+from aquaflow.config import Config
+from aquaflow.errors import AquaFlowError
+from aquaflow.evaluation.bench.peers import run_peer
+from aquaflow.evaluation.bench.scene import scene_at
+from aquaflow.evaluation.protocol import evaluate_dive
+
+
+def test_two_view_odometry_roughly_recovers_the_path(small_recording: Path, tmp_path: Path) -> None:
+    out = tmp_path / "dive"
+    metrics = run_peer("two-view", scene_at(small_recording), Config(), out)
+    assert metrics["tracked"] == metrics["frames"] == 24
+    assert metrics["ms_per_frame"]["p50"] > 0.0
+    assert evaluate_dive(out, small_recording).error.sim3.pct < 8.0
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("pycolmap") is None, reason="pycolmap is not installed"
+)
+def test_colmap_recovers_the_path(small_recording: Path, tmp_path: Path) -> None:
+    out = tmp_path / "dive"
+    metrics = run_peer("colmap", scene_at(small_recording), Config(), out)
+    assert metrics["tracked"] > 20
+    assert metrics["ms_per_frame"]["p50"] is None
+    assert evaluate_dive(out, small_recording).error.sim3.pct < 2.0
+
+
+def test_a_missing_peer_says_how_to_get_it(
+    small_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(AquaFlowError, match=r"not available: .*aquaflow\[peers\]"):
+        run_peer("colmap", scene_at(small_recording), Config(), tmp_path / "dive")
