@@ -223,10 +223,10 @@ class _Replay:
 
     def _write(self, started: float) -> Replayed:
         main = largest_sub_map(self.results)
-        mapper = self.slam.mappers.get(main)
         with self.profiler.stage("evaluate"):
             held_out = examine_held_out(self.slam, main)
-            water = None if mapper is None else summarise_water(mapper)
+            waters = {n: summarise_water(mapper) for n, mapper in self.slam.mappers.items()}
+            water = waters.get(main)
             poses = refined_poses(self.slam, self.results)
         times = {tracked.frame.index: tracked.frame.t_ns * 1e-9 for tracked in self.results}
         with self.profiler.stage("write"):
@@ -235,7 +235,7 @@ class _Replay:
             self.folder.write_cameras(self.slam.tracker.camera, self.calibration)
             for sub_map, mapped in self.slam.mappers.items():
                 suffix = "" if sub_map == main else f"_{sub_map}"
-                self.folder.write_map(mapped, summarise_water(mapped), suffix)
+                self.folder.write_map(mapped, waters[sub_map], suffix)
             self.folder.write_held_out(held_out)
         with self.profiler.stage("report"):
             numbers = self._numbers(held_out, started)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import replace
 
 from aquaflow.config import Config
-from aquaflow.keyframes import KeyframeStore
+from aquaflow.keyframes import KeyframeStore, Pointmap
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.views import View
 from aquaflow.messages import Frame
@@ -56,9 +55,7 @@ class Slam:
             decided = self.tracker.finish()
         for tracked in decided:
             self._map(tracked)
-        for number, view in self._keyframe_views.items():
-            self._insert(self.keyframes[number].sub_map, view, number)
-        self._keyframe_views.clear()
+        self._retire_keyframes()
         with self.profiler.stage("refine"):
             for mapper in self.mappers.values():
                 if len(mapper.views) >= MIN_VIEWS:
@@ -79,13 +76,10 @@ class Slam:
         # Sec. 3.3.3: medium-guided insertion, from this frame and from the keyframe it retires,
         # whose pointmap has been fused over its whole life.
         if tracked.frame_class is FrameClass.KEYFRAME:
-            for number, retired in self._keyframe_views.items():
-                self._insert(self.keyframes[number].sub_map, retired, number)
-            assert tracked.keyframe is not None
-            self._keyframe_views = {tracked.keyframe: view}
+            self._retire_keyframes()
+            self._keyframe_views = {view.keyframe: view}
         if tracked.pointmap is not None:
-            with self.profiler.stage("insert"):
-                mapper.insert(view, tracked.pointmap)
+            self._insert(mapper, view, tracked.pointmap)
 
         # Sec. 3.4: joint optimisation of Gaussians and water.
         with self.profiler.stage("optimise"):
@@ -96,9 +90,16 @@ class Slam:
         every, i = self.config.mapping.hold_out_every, self._sequence[frame.index]
         return every > 0 and i != 0 and i % every == 0
 
-    def _insert(self, sub_map: int, view: View, keyframe: int) -> None:
+    def _retire_keyframes(self) -> None:
+        """Insert once more from the keyframe in use, with its pointmap as fused until now."""
+        for number, view in self._keyframe_views.items():
+            keyframe = self.keyframes[number]
+            self._insert(self._mapper(keyframe.sub_map), view, keyframe.pointmap)
+        self._keyframe_views.clear()
+
+    def _insert(self, mapper: Mapper, view: View, pointmap: Pointmap) -> None:
         with self.profiler.stage("insert"):
-            self._mapper(sub_map).insert(view, self.keyframes[keyframe].pointmap)
+            mapper.insert(view, pointmap)
 
     def _mapper(self, sub_map: int) -> Mapper:
         if sub_map not in self.mappers:
@@ -121,7 +122,7 @@ class Slam:
             tracked.frame.index,
             tracked.frame.image,
             camera,
-            replace(tracked.T_wc),
+            tracked.T_wc,
             tracked.keyframe,
             robust=tracked.frame_class is FrameClass.COMMON,
             mask=tracked.frame.mask,

@@ -13,7 +13,7 @@ from aquaflow.mapping.gaussians import raw_colour
 from aquaflow.mapping.views import View
 
 LOG_GAIN = 3.0
-"""Laplacian-of-Gaussian response, L1 over RGB, that counts as certain structure is 1 / gain."""
+"""A Laplacian-of-Gaussian response, L1 over RGB, of 1 / LOG_GAIN counts as certain structure."""
 
 
 def structure(

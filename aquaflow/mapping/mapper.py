@@ -168,11 +168,9 @@ class Mapper:
         """L_total (paper, Eq. total_loss)."""
         weights, target = self.config.loss, view.target()
         K_rad = self._radial(view)
-        mask = torch.ones_like(K_rad, dtype=torch.bool)
+        mask = _scene_mask(view, K_rad)
         if view.robust:
-            mask = outlier_mask(shown.image, target, K_rad, weights.tau_e)
-        if view.mask is not None:
-            mask &= torch.from_numpy(view.mask)
+            mask &= outlier_mask(shown.image, target, K_rad, weights.tau_e)
         loss = photometric_loss(
             shown.image, target, K_rad, mask, weights.ssim, self.renderer.threads
         )
@@ -231,9 +229,7 @@ class Mapper:
     def register(self, view: View) -> None:
         """Refine the pose of a held-out view photometrically against the frozen map."""
         config, K_rad, target = self.config.optimiser, self._radial(view), view.target()
-        mask = torch.ones_like(K_rad, dtype=torch.bool)
-        if view.mask is not None:
-            mask &= torch.from_numpy(view.mask)
+        mask = _scene_mask(view, K_rad)
         for _ in range(config.heldout_steps if len(self.gaussians) else 0):
             viewmat = view.viewmat().requires_grad_()
             shown = self.scene.draw(view, viewmat=viewmat)
@@ -260,3 +256,10 @@ class Mapper:
         if size not in self._K_rad:
             self._K_rad[size] = radial_weight(*size)
         return self._K_rad[size]
+
+
+def _scene_mask(view: View, K_rad: Tensor) -> Tensor:
+    """[H, W] bool, a fresh one: True where the view shows the scene and not the vehicle."""
+    if view.mask is None:
+        return torch.ones_like(K_rad, dtype=torch.bool)
+    return torch.from_numpy(view.mask.copy())

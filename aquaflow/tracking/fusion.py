@@ -25,8 +25,6 @@ TRANSFER_INFLATION = 1.5
 """Variance growth when a pointmap moves to another keyframe through matches."""
 FORGETTING_VARIANCE_SIGMAS = 0.5
 """A depth whose relative sigma grew past this by disagreement is replaced by the newcomer."""
-TRANSFER_ERROR_PX = 1.0
-"""Backward-forward error up to which a pixel may take its depth through the flow."""
 
 
 def fuse(

@@ -9,7 +9,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -113,8 +113,3 @@ def in_process(job: Job) -> Row:
         return {"failed": f"the run crashed ({done.returncode}): {said[-1] if said else 'silent'}"}
     answer: Row = json.loads(done.stdout.strip().splitlines()[-1])
     return answer
-
-
-def with_overrides(job: Job, overrides: dict[str, Any], out: Path) -> Job:
-    """The same run with settings of its own, written elsewhere."""
-    return replace(job, overrides=overrides, out=str(out))
