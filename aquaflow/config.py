@@ -96,6 +96,15 @@ class TrackingConfig(Stage):
         0.15, gt=0, description="relative depth sigma of points that poses are solved from"
     )
     sigma_px: float = Field(0.5, gt=0, description="noise of a checked DIS match")
+    reuse_encodings: bool = Field(
+        True, description="skip: a keyframe's encoding is kept; False: made again for every frame"
+    )
+    seed_matching: bool = Field(
+        True, description="skip: matching starts at the last frame's matches; False: from nothing"
+    )
+    stop_converged: bool = Field(
+        True, description="skip: the pose solver stops when it converged; False: at its last step"
+    )
     lost_after: int = Field(
         3, ge=1, description="consecutive lost frames after which a new sub-map starts"
     )

@@ -59,9 +59,11 @@ class PoseProblem:
     sigma_px: float
 
 
-def solve_pose(problem: PoseProblem, initial: Sim3) -> PoseEstimate | None:
+def solve_pose(
+    problem: PoseProblem, initial: Sim3, stop_converged: bool = True
+) -> PoseEstimate | None:
     """Levenberg-Marquardt from ``initial``; None without matches, or when the normal equations stay
-    unsolvable."""
+    unsolvable. Without ``stop_converged`` it takes all MAX_ITERATIONS."""
     if len(problem.points) == 0:
         return None
     T, damping = initial, FIRST_DAMPING
@@ -83,7 +85,8 @@ def solve_pose(problem: PoseProblem, initial: Sim3) -> PoseEstimate | None:
         decrease = (cost - new_cost) / max(cost, 1e-12)
         T, residual, J, cost = candidate, new_residual, new_J, new_cost
         damping = max(damping * 0.1, 1e-9)
-        if decrease < STOP_RELATIVE_DECREASE or float(np.linalg.norm(step)) < STOP_STEP:
+        still = decrease < STOP_RELATIVE_DECREASE or float(np.linalg.norm(step)) < STOP_STEP
+        if still and stop_converged:
             break
     return _summary(problem, T, residual, J)
 

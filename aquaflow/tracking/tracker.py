@@ -43,6 +43,7 @@ class Tracker:
         self._initialiser: Initialiser | None = None
         self._orphans: list[Frame] = []
         self._keyframe: Keyframe | None = None
+        self._keyframe_image: npt.NDArray[np.uint8] | None = None
         self._T_fk = Sim3.identity()
         self._velocity = Sim3.identity()
         self._predicted: npt.NDArray[np.float32] | None = None
@@ -200,15 +201,15 @@ class Tracker:
         assert keyframe is not None
         assert camera is not None
         if pair is None:
-            pair = self._prior.decode(keyframe.encoding, encoding, self._predicted)
+            seed = self._predicted if self._config.seed_matching else None
+            pair = self._prior.decode(self._reference(keyframe), encoding, seed)
         problem, pixels_k = self._problem(keyframe, pair, camera)
         if len(problem.points) < self._config.min_matches:
             return None
-        predictions = [self._velocity @ self._T_fk, self._T_fk]
-        estimate = solve_pose(problem, predictions[0])
+        stop = self._config.stop_converged
+        estimate = solve_pose(problem, self._velocity @ self._T_fk, stop)
         if estimate is None or estimate.inlier_share < self._config.min_inlier_share:
-            guess = pose_from_scratch(problem) or predictions[1]
-            estimate = solve_pose(problem, guess)
+            estimate = solve_pose(problem, pose_from_scratch(problem) or self._T_fk, stop)
         if estimate is None or estimate.inlier_share < self._config.min_inlier_share:
             return None
         share = _matched_share(keyframe.encoding, pair)
@@ -216,6 +217,12 @@ class Tracker:
             return None
         displacement = np.linalg.norm(problem.pixels - pixels_k, axis=1)
         return _Solved(estimate, pair, share, float(displacement.mean()))
+
+    def _reference(self, keyframe: Keyframe) -> Encoding:
+        if self._config.reuse_encodings:
+            return keyframe.encoding
+        assert self._keyframe_image is not None
+        return self._prior.encode(self._keyframe_image, keyframe.pointmap.camera)
 
     def _problem(
         self, keyframe: Keyframe, pair: PairGeometry, camera: CameraModel
@@ -260,6 +267,7 @@ class Tracker:
         self._keyframe = self._keyframes.add(
             frame.index, frame.t_ns, encoding, T_wc, pointmap, self.sub_map
         )
+        self._keyframe_image = frame.image
         self._T_fk, self._predicted, self._mapped_parallax_px = Sim3.identity(), None, 0.0
 
     def _tracked(

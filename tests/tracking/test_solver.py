@@ -231,3 +231,24 @@ def test_random_matches_raise_nothing() -> None:
     assert_sane(problem, Sim3.identity())
     estimate = solve_pose(problem, Sim3.identity())
     assert estimate is None or estimate.inlier_share < 0.3
+
+
+def test_a_solver_that_may_not_stop_takes_its_last_step_to_the_same_pose(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem, taken = problem_of(cloud(3), TRUTH, noise_px=0.3), []
+    linearise = solver._linearise
+
+    def counted(problem: PoseProblem, T: Sim3) -> tuple[Array, Array]:
+        taken.append(T)
+        return linearise(problem, T)
+
+    monkeypatch.setattr(solver, "_linearise", counted)
+    early = solve_pose(problem, Sim3.identity())
+    stopped_after = len(taken)
+    late = solve_pose(problem, Sim3.identity(), stop_converged=False)
+    assert stopped_after < solver.MAX_ITERATIONS
+    assert len(taken) - stopped_after == solver.MAX_ITERATIONS + 1
+    assert early is not None
+    assert late is not None
+    assert max(errors(late.T, early.T)) < 1e-4

@@ -38,6 +38,10 @@ def _insertion(**settings: object) -> dict[str, Any]:
     return {"mapping": {"insertion": settings}}
 
 
+def _tracking(**settings: object) -> dict[str, Any]:
+    return {"tracking": settings}
+
+
 NEVER_AGREES = 1e-9
 """Relative range difference: no map is this close, so no ray counts as explained."""
 
@@ -55,9 +59,9 @@ PARTS = (
     Part("skip off: insertion only where the map is wrong", _insertion(agreement=NEVER_AGREES)),
     Part("skip off: duplicate and stationary frames", built=False),
     Part("skip off: dark, blurred or blinded frames", built=False),
-    Part("skip off: encoder features reused", built=False),
-    Part("skip off: matching seeded by motion", built=False),
-    Part("skip off: solver stops when converged", built=False),
+    Part("skip off: encoder features reused", _tracking(reuse_encodings=False)),
+    Part("skip off: matching seeded by motion", _tracking(seed_matching=False)),
+    Part("skip off: solver stops when converged", _tracking(stop_converged=False)),
     Part("skip off: retrieval only at keyframes", built=False),
     Part("skip off: medium off in clear water", built=False),
     Part("skip off: no Gaussians in open water", built=False),

@@ -17,7 +17,6 @@ from aquaflow.evaluation.bench.job import Job
 from aquaflow.evaluation.bench.measure import measured
 from aquaflow.evaluation.bench.peers import run_peer
 from aquaflow.geometry.camera import load_camera
-from aquaflow.pipeline import map_recording
 from aquaflow.sources import open_recording
 
 
@@ -31,6 +30,8 @@ def perform(job: Job) -> dict[str, Any]:
     if job.peer is not None:
         metrics = run_peer(job.peer, scene, job.config(), out)
     else:
+        from aquaflow.pipeline import map_recording  # torch: two seconds that no peer needs
+
         calibration = None if scene.calibration is None else load_camera(Path(scene.calibration))
         recording = open_recording(Path(scene.recording), fps=job.config().source.fps)
         metrics = map_recording(
