@@ -1,0 +1,89 @@
+"""The configuration: one model per stage, unknown keys refused with their path.
+
+Every default says where it comes from: ``paper``, a peer (field_notes.md), or a measurement.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import Field, ValidationError
+
+from aquaflow.config.mapping import (
+    InsertionConfig,
+    LossConfig,
+    MappingConfig,
+    MediumConfig,
+    OptimiserConfig,
+)
+from aquaflow.config.source import SourceConfig
+from aquaflow.config.stage import Stage
+from aquaflow.config.tracking import InitialisationConfig, TrackingConfig
+from aquaflow.errors import ConfigError, InputError
+
+__all__ = [
+    "Config",
+    "InitialisationConfig",
+    "InsertionConfig",
+    "LossConfig",
+    "MappingConfig",
+    "MediumConfig",
+    "OptimiserConfig",
+    "SourceConfig",
+    "TrackingConfig",
+    "dump_config",
+    "load_config",
+    "parse_config",
+]
+
+
+class Config(Stage):
+    """Everything a run depends on."""
+
+    seed: int = 0
+    threads: int | None = Field(None, ge=1, description="None: every core")
+    prior: Literal["classical"] = "classical"
+    source: SourceConfig = SourceConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    mapping: MappingConfig = MappingConfig()
+
+
+def parse_config(data: dict[str, Any], origin: str) -> Config:
+    """Validate a mapping read from ``origin``.
+
+    Raises:
+        ConfigError: with the path of the first key that is unknown or out of range.
+    """
+    try:
+        return Config.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        path = ".".join(str(part) for part in first["loc"])
+        problem = "is not a known key" if first["type"] == "extra_forbidden" else first["msg"]
+        raise ConfigError(f"{origin}: '{path}' {problem.lower()}; see `aquaflow config`") from error
+
+
+def load_config(path: Path) -> Config:
+    """Read a YAML config; keys that are absent keep their defaults.
+
+    Raises:
+        InputError: the file cannot be read, or is not YAML.
+        ConfigError: a key is unknown or a value out of range.
+    """
+    try:
+        data = yaml.safe_load(path.read_text()) or {}
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not text"
+        raise InputError(f"cannot read the config {path}: {reason}; give a YAML file") from error
+    except yaml.YAMLError as error:
+        raise InputError(f"{path} is not YAML; write `key: value` lines") from error
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path} holds no key: value pairs; see `aquaflow config`")
+    return parse_config(data, str(path))
+
+
+def dump_config(config: Config, path: Path) -> None:
+    """Write the effective configuration."""
+    path.write_text(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))

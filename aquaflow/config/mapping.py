@@ -1,0 +1,119 @@
+"""Settings of the map: water, insertion, losses, optimiser (paper, Sec. 3.3 and 3.4)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from aquaflow.config.stage import Stage
+
+
+class MediumConfig(Stage):
+    """The water (paper, Sec. 3.3.2)."""
+
+    enabled: bool = Field(True, description="False: the map is what the camera saw, water included")
+    width: int = Field(32, ge=4, description="hidden units of MLP_a; paper silent, 32 cost nothing")
+    rate: float = Field(
+        5e-4, gt=0, description="Adam rate of all medium parameters; 2e-3 drifts off the fit"
+    )
+    max_gradient: float = Field(
+        0.01, gt=0, description="gradient norm kept (WaterSplatting clips at 0.001)"
+    )
+    first_fit_views: int = Field(
+        12,
+        ge=2,
+        description="views after which water is first fitted to sightings; then at every "
+        "doubling, and before refining",
+    )
+    fit: bool = Field(True, description="False: the water starts from the values below, no fit")
+    shading: bool = Field(True, description="False: the fit knows no lamp or lens fall-off")
+    fit_views: int = Field(20, ge=4, description="views that a fit looks at, spread over the dive")
+    initial_attenuation: float = Field(
+        0.1, gt=0, description="1 / map unit; the median range of the first keyframe is 1 unit"
+    )
+    initial_B_inf: float = Field(0.3, gt=0, lt=1, description="backscatter at infinity")
+    initial_B_res: float = Field(0.01, gt=0, lt=1, description="residual backscatter close by")
+    initial_residual_decay: float = Field(1.0, gt=0, description="1 / map unit")
+
+
+class InsertionConfig(Stage):
+    """Where new Gaussians go (paper, Sec. 3.3.3)."""
+
+    medium_reduced: bool = Field(
+        True, description="False: structure and colours of new Gaussians from the raw picture"
+    )
+    sigma_px: float = Field(1.0, gt=0, description="sigma of the Laplacian of Gaussian")
+    tau_a: float = Field(
+        0.02,
+        ge=0,
+        le=1,
+        description="P_a above which a pixel may get a Gaussian; the paper's 1.0 "
+        "never fires (DESIGN section 4)",
+    )
+    density: float = Field(0.5, gt=0, le=1, description="Gaussians per pixel of certain structure")
+    bare_probability: float = Field(
+        0.06, ge=0, le=1, description="least P_a where the map does not cover the picture"
+    )
+    covered_alpha: float = Field(0.6, gt=0, lt=1, description="alpha that counts as covered")
+    agreement: float = Field(
+        0.1, gt=0, description="relative range difference up to which map and prior agree"
+    )
+    known_sigma: float = Field(
+        0.15, gt=0, description="relative range sigma of pixels that may get a Gaussian"
+    )
+    opacity: float = Field(0.5, gt=0, lt=1, description="of a new Gaussian at full confidence")
+    scale_of_spacing: float = Field(
+        0.6, gt=0, description="sigma of a new Gaussian over the expected spacing"
+    )
+    max_spacing_widths: float = Field(0.1, gt=0, description="largest spacing over image width")
+
+
+class LossConfig(Stage):
+    """Weights of the objective (paper, Sec. 3.4 and Implementation Details)."""
+
+    ssim: float = Field(0.2, ge=0, le=1, description="lambda_ssim; paper: 0.2")
+    depth: float = Field(0.01, ge=0, description="lambda_d; paper: 0.01")
+    scale: float = Field(0.01, ge=0, description="lambda_s; paper: 0.01")
+    tau_e: float = Field(0.2, gt=0, description="residual masked on common frames (ARTDECO: 0.2)")
+
+
+class OptimiserConfig(Stage):
+    """Adam rates and the number of steps."""
+
+    betas: tuple[float, float] = Field((0.9, 0.99), description="Adam's decay rates")
+    means: float = Field(4e-4, gt=0, description="map units per step")
+    means_final: float = Field(0.1, gt=0, le=1, description="factor reached at the end of refining")
+    quats: float = Field(2e-3, gt=0)
+    log_scales: float = Field(8e-3, gt=0)
+    opacity_logits: float = Field(0.04, gt=0)
+    raw_colours: float = Field(6e-3, gt=0)
+    poses: float = Field(1e-4, ge=0, description="rad and map units; ARTDECO: 1e-4; 0: held")
+    steps_keyframe: int = Field(20, ge=0, description="steps after a keyframe (ARTDECO: 20)")
+    steps_mapping: int = Field(20, ge=0, description="steps after a mapping frame (ARTDECO: 20)")
+    steps_common: int = Field(5, ge=0, description="steps after a common frame (ARTDECO: 10)")
+    newest_share: float = Field(0.2, ge=0, le=1, description="steps on the newest view (ARTDECO)")
+    refine_steps: int = Field(1500, ge=0, description="steps after the last frame")
+    refine_seconds: float | None = Field(
+        None, gt=0, description="time limit of refining; makes runs differ from each other"
+    )
+    prune_every: int = Field(200, ge=1)
+    prune_opacity: float = Field(0.02, gt=0, lt=1, description="opacity that is not worth keeping")
+    prune_radius_widths: float = Field(0.5, gt=0, description="largest radius over image width")
+    heldout_steps: int = Field(40, ge=0, description="pose steps of a held-out view, map frozen")
+    heldout_rate: float = Field(5e-4, gt=0, description="rad and map units")
+
+
+class MappingConfig(Stage):
+    """The map (paper, Sec. 3.3 and 3.4)."""
+
+    enabled: bool = Field(True, description="False: trajectory only")
+    renderer: Literal["auto", "cpu", "tiles", "gsplat"] = "auto"
+    max_gaussians: int = Field(150_000, ge=1000, description="hard cap")
+    hold_out_every: int = Field(
+        8, ge=0, description="i % n == 0 and i != 0 is tracked, never mapped; 0: map every frame"
+    )
+    insertion: InsertionConfig = InsertionConfig()
+    loss: LossConfig = LossConfig()
+    optimiser: OptimiserConfig = OptimiserConfig()
+    medium: MediumConfig = MediumConfig()
