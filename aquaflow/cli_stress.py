@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from aquaflow.evaluation.stress.suite import Result
 
 
+LOG_WIDTH = 140
+"""Columns of the table where nobody looks on a terminal: a log must not fold it."""
+
+
 def register(app: typer.Typer) -> None:
     """Add the command to ``app``."""
     app.command()(stress)
@@ -41,7 +45,8 @@ def stress(
     if as_json:
         typer.echo(json.dumps({"cases": [result.to_json() for result in results]}))
     else:
-        _print(results, Console())
+        out = Console()
+        _print(results, out if out.is_terminal else Console(width=LOG_WIDTH))
     if not all(result.outcome.passed for result in results):
         raise typer.Exit(1)
 

@@ -65,6 +65,13 @@ class GaussianMap:
         owner = torch.full((count,), keyframe, dtype=torch.int64)
         self.keyframes = torch.cat([self.keyframes, owner])
 
+    def append(self, other: GaussianMap) -> None:
+        """Append all Gaussians of ``other``, which keep their keyframes."""
+        for name in self.NAMES:
+            both = [self.parameters[name], other.parameters[name]]
+            self.parameters[name] = torch.cat(both).contiguous()
+        self.keyframes = torch.cat([self.keyframes, other.keyframes])
+
     def keep(
         self,
         mask: Tensor,  # [N] bool

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from aquaflow.config import MappingConfig
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
+from aquaflow.mapping.following import move_gaussians, move_views
 from aquaflow.mapping.gaussians import GaussianMap
 from aquaflow.mapping.insertion import (
     confidence_of,
@@ -21,14 +23,13 @@ from aquaflow.mapping.insertion import (
     select,
     thin,
 )
-from aquaflow.mapping.losses import depth_loss, outlier_mask, radial_weight, scale_loss
 from aquaflow.mapping.medium import Medium
+from aquaflow.mapping.objective import Objective
 from aquaflow.mapping.rendering import Shown
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.views import View, refine_pose
 from aquaflow.render.adam import SelectiveAdam
 from aquaflow.render.contract import Renderer
-from aquaflow.render.photometric import photometric_loss
 
 log = logging.getLogger(__name__)
 
@@ -57,7 +58,7 @@ class Mapper:
         )
         self._medium_optimiser = torch.optim.Adam(self.medium.parameters(), lr=config.medium.rate)
         self._next_water_fit = config.medium.first_fit_views
-        self._K_rad: dict[tuple[int, int], Tensor] = {}
+        self._objective = Objective(config.loss, renderer.threads)
 
     # --- growing ------------------------------------------------------------------------------
 
@@ -71,7 +72,8 @@ class Mapper:
     @torch.no_grad()
     def insert(self, view: View, pointmap: Pointmap) -> int:
         """Medium-guided insertion (paper, Sec. 3.3.3); returns the number of new Gaussians."""
-        prior_range, known = range_of(pointmap, self.config.insertion.known_sigma)
+        own_range, known = range_of(pointmap, self.config.insertion.known_sigma)
+        prior_range = own_range * view.T_wc.scale
         shown = self.scene.show(view)
         covered = shown.alpha > self.config.insertion.covered_alpha
         z = torch.where(known, prior_range, torch.where(covered, shown.z, 0.0))
@@ -90,7 +92,7 @@ class Mapper:
         room = self.config.max_gaussians - len(self.gaussians)
         rows, columns = thin(rows, columns, room, self._random)
         confidence = confidence_of(pointmap)
-        view.inverse_range = torch.where(known, 1.0 / prior_range.clamp_min(1e-6), 0.0)
+        view.inverse_range = torch.where(known, 1.0 / own_range.clamp_min(1e-6), 0.0)
         view.range_confidence = confidence
         if len(rows) == 0:
             return 0
@@ -111,6 +113,24 @@ class Mapper:
                 estimate.beta_a.round(3).tolist(),
                 estimate.beta_a_sigma.round(2).tolist(),
             )
+
+    # --- following the keyframes --------------------------------------------------------------
+
+    def move(self, moves: Mapping[int, Sim3]) -> None:
+        """Let Gaussians and views follow keyframes that were moved (see following.py)."""
+        move_gaussians(self.gaussians, moves)
+        move_views(self.views, moves)
+
+    def absorb(self, other: Mapper) -> None:
+        """Take over another sub-map's Gaussians and views, already moved into this one's world.
+
+        The water stays this map's own: it is the same water, and is fitted again to all views.
+        """
+        self.gaussians.append(other.gaussians)
+        self._optimiser.extend(len(other.gaussians))
+        self._optimiser.bind(self._parameters)
+        self.views = sorted([*self.views, *other.views], key=lambda view: view.frame_index)
+        self.steps, self.undone = self.steps + other.steps, self.undone + other.undone
 
     # --- optimising ---------------------------------------------------------------------------
 
@@ -149,7 +169,7 @@ class Mapper:
         viewmat = view.viewmat().requires_grad_(refine_poses)
         self._medium_optimiser.zero_grad(set_to_none=True)
         shown = self.scene.draw(view, leaves, viewmat)
-        loss = self._loss(view, shown, leaves)
+        loss = self._objective.total(view, shown, leaves)
         if not is_number(loss):
             self._undo("loss", view)
             self._drop_unsound()
@@ -163,26 +183,6 @@ class Mapper:
         self.steps += 1
         if self.steps % self.config.optimiser.prune_every == 0:
             self._prune(shown, view)
-
-    def _loss(self, view: View, shown: Shown, leaves: dict[str, Tensor]) -> Tensor:
-        """L_total (paper, Eq. total_loss)."""
-        weights, target = self.config.loss, view.target()
-        K_rad = self._radial(view)
-        mask = _scene_mask(view, K_rad)
-        if view.robust:
-            mask &= outlier_mask(shown.image, target, K_rad, weights.tau_e)
-        loss = photometric_loss(
-            shown.image, target, K_rad, mask, weights.ssim, self.renderer.threads
-        )
-        if weights.depth > 0.0 and view.inverse_range is not None:
-            assert view.range_confidence is not None
-            trust = K_rad * mask * view.range_confidence
-            loss = loss + weights.depth * depth_loss(
-                shown.z, shown.alpha, view.inverse_range, trust
-            )
-        if weights.scale > 0.0:
-            loss = loss + weights.scale * scale_loss(torch.exp(leaves["log_scales"]))
-        return loss
 
     def _step_medium(self, view: View) -> None:
         if not self.medium.active:
@@ -228,14 +228,10 @@ class Mapper:
 
     def register(self, view: View) -> None:
         """Refine the pose of a held-out view photometrically against the frozen map."""
-        config, K_rad, target = self.config.optimiser, self._radial(view), view.target()
-        mask = _scene_mask(view, K_rad)
+        config = self.config.optimiser
         for _ in range(config.heldout_steps if len(self.gaussians) else 0):
             viewmat = view.viewmat().requires_grad_()
-            shown = self.scene.draw(view, viewmat=viewmat)
-            loss = photometric_loss(
-                shown.image, target, K_rad, mask, self.config.loss.ssim, self.renderer.threads
-            )
+            loss = self._objective.photometric(view, self.scene.draw(view, viewmat=viewmat))
             (gradient,) = torch.autograd.grad(loss, viewmat)
             refine_pose(view, gradient, config.heldout_rate)
 
@@ -250,16 +246,3 @@ class Mapper:
     @property
     def _parameters(self) -> dict[str, Tensor]:
         return self.gaussians.parameters
-
-    def _radial(self, view: View) -> Tensor:
-        size = (view.camera.height, view.camera.width)
-        if size not in self._K_rad:
-            self._K_rad[size] = radial_weight(*size)
-        return self._K_rad[size]
-
-
-def _scene_mask(view: View, K_rad: Tensor) -> Tensor:
-    """[H, W] bool, a fresh one: True where the view shows the scene and not the vehicle."""
-    if view.mask is None:
-        return torch.ones_like(K_rad, dtype=torch.bool)
-    return torch.from_numpy(view.mask.copy())

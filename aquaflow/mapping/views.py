@@ -28,7 +28,8 @@ class View:
     """True for common frames, whose outliers are masked (paper, M)."""
     mask: npt.NDArray[np.bool_] | None = None
     inverse_range: Tensor | None = None
-    """[H, W] 1 / range from tracking; 0 where unknown."""
+    """[H, W] 1 / range from tracking, in the keyframe's unit: T_wc.scale makes it the world's.
+    0 where unknown."""
     range_confidence: Tensor | None = None
     """[H, W] in [0, 1]."""
     moments: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], int] = field(
