@@ -6,8 +6,8 @@ import csv
 import io
 import json
 import logging
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -125,10 +125,12 @@ class DiveFolder:
 
     # --- at its end ---------------------------------------------------------------------------
 
-    def write_frames(self) -> None:
-        """frames.csv once more, in the order of the recording."""
+    def write_frames(self, sub_maps: Mapping[int, int]) -> None:
+        """frames.csv once more: in the order of the recording, each posed frame in the sub-map that
+        it ended up in (``sub_maps`` by frame index)."""
         text = io.StringIO(newline="")
-        rows = sorted(self._rows, key=lambda row: row.index)
+        rows = [replace(row, sub_map=sub_maps.get(row.index, row.sub_map)) for row in self._rows]
+        rows.sort(key=lambda row: row.index)
         self._write_rows(text, [FRAME_COLUMNS, *(row.cells() for row in rows)])
         self._frames.close()
         with atomic_write(self.path / MARKER) as stream:

@@ -106,8 +106,9 @@ class _Replay:
         self._frames(started)
         self._decide(self.slam.finish(lambda done, total: self._progress("refine", done, total)))
         with self.profiler.stage("write"):
+            self.results = self.slam.settled(self.results)
             self._note_what_was_left_out()
-            self.folder.write_frames()
+            self.folder.write_frames({t.frame.index: t.sub_map for t in self.results if t.T_wc})
         if sum(tracked.T_wc is not None for tracked in self.results) < MIN_VIEWS:
             raise NotMappedError(self._why_not())
         return self._write(started)
@@ -166,7 +167,7 @@ class _Replay:
         self.folder.record([row])
 
     def _decide(self, decided: list[Tracked]) -> None:
-        self.results += decided
+        self.results += [tracked.bare() for tracked in decided]
         with self.profiler.stage("record"):
             self.folder.record(self._row(tracked) for tracked in decided)
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 from aquaflow.config import Config
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore, Pointmap
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.views import View
@@ -34,6 +36,8 @@ class Slam:
         self.held_out: dict[int, list[View]] = {}
         """Per sub-map, the views that were tracked but never mapped."""
         self._sequence: dict[int, int] = {}
+        self._T_kf: dict[int, Sim3] = {}
+        """By frame index: the pose against the frame's keyframe, which later corrections leave."""
         self._keyframe_views: dict[int, View] = {}
 
     def process(self, frame: Frame) -> list[Tracked]:
@@ -62,7 +66,24 @@ class Slam:
                     mapper.refine(progress)
         return decided
 
+    def settled(self, results: Iterable[Tracked]) -> list[Tracked]:
+        """The frames with pose and sub-map as they are now, after all corrections of keyframes."""
+        return [self._settled(tracked) for tracked in results]
+
+    def _settled(self, tracked: Tracked) -> Tracked:
+        if tracked.keyframe is None:
+            return tracked
+        keyframe = self.keyframes[tracked.keyframe]
+        T_wc = keyframe.T_wc @ self._T_kf[tracked.frame.index]
+        return replace(tracked, T_wc=T_wc, sub_map=keyframe.sub_map)
+
+    def _anchor(self, tracked: Tracked) -> None:
+        if tracked.T_wc is not None and tracked.keyframe is not None:
+            T_kw = self.keyframes[tracked.keyframe].T_wc.inverse()
+            self._T_kf[tracked.frame.index] = T_kw @ tracked.T_wc
+
     def _map(self, tracked: Tracked) -> None:
+        self._anchor(tracked)
         if tracked.T_wc is None or not self.config.mapping.enabled:
             return
         view = self._view(tracked)

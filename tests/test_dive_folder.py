@@ -123,8 +123,15 @@ def test_what_was_decided_is_on_disk_before_the_end(tmp_path: Path) -> None:
 def test_table_is_sorted_at_the_end(tmp_path: Path) -> None:
     with opened(tmp_path / "dive") as folder:
         folder.record([FrameRow(i, f"{i}.png", i / 10.0, "common", 0, 0, 0.5) for i in (2, 0, 1)])
-        folder.write_frames()
+        folder.write_frames({})
         assert [row["index"] for row in table(folder.path)] == ["0", "1", "2"]
+
+
+def test_a_frame_stands_in_the_sub_map_that_it_ended_up_in(tmp_path: Path) -> None:
+    with opened(tmp_path / "dive") as folder:
+        folder.record([FrameRow(i, f"{i}.png", i / 10.0, "common", i, 0, 0.5) for i in (0, 1)])
+        folder.write_frames({1: 0})
+        assert [row["sub_map"] for row in table(folder.path)] == ["0", "0"]
 
 
 def test_a_number_that_is_not_finite_is_never_written(tmp_path: Path) -> None:

@@ -264,3 +264,29 @@ def test_too_few_views_are_not_worth_a_refinement(told: Told) -> None:
     slam = told("KM")
     assert len(slam.mappers[0].gaussians) > 0
     assert slam.mappers[0].steps == STEPS["steps_keyframe"] + STEPS["steps_mapping"]
+
+
+def test_a_corrected_keyframe_takes_its_frames_and_their_sub_map_along(
+    told: Told, calls: Calls
+) -> None:
+    slam = told("KCMKC", "00011")
+    results = [
+        Tracked(frame_of(i), FrameClass.COMMON, i // 3, i // 3, Sim3.identity()) for i in range(5)
+    ]
+    before = slam.settled(results)
+    S = Sim3(np.eye(3), np.array([5.0, 0.0, 0.0]), 2.0)
+    first, second = slam.keyframes[0], slam.keyframes[1]
+    second.T_wc, second.sub_map = S @ second.T_wc, first.sub_map
+    after = slam.settled(results)
+    for old, new in zip(before, after, strict=True):
+        moved = old.frame.index >= 3
+        assert old.T_wc is not None
+        assert new.T_wc is not None
+        assert np.allclose(new.T_wc.t, S.apply(old.T_wc.t) if moved else old.T_wc.t)
+        assert (old.sub_map, new.sub_map) == (int(moved), 0)
+
+
+def test_a_frame_without_a_pose_settles_as_it_is(told: Told, calls: Calls) -> None:
+    slam = told("KCL")
+    lost = Tracked(frame_of(2), FrameClass.LOST, 0, reason="told so")
+    assert slam.settled([lost]) == [lost]

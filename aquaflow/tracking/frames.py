@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
+
+import numpy as np
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
@@ -45,3 +47,8 @@ class Tracked:
     pointmap: Pointmap | None = None
     """Depth of this frame's own pixels; present for keyframes and mapping frames."""
     reason: str = ""
+
+    def bare(self) -> Tracked:
+        """Itself without picture and pointmap: what a long dive can keep of every frame."""
+        nothing = np.empty((0, 0, 3), np.uint8)
+        return replace(self, frame=replace(self.frame, image=nothing, mask=None), pointmap=None)
