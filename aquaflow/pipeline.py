@@ -92,6 +92,7 @@ class _Replay:
         self.profiler = Profiler(trace)
         self.slam = Slam(config, self.profiler)
         self._trace = trace
+        self._cpu_before_s = time.process_time()
         self.results: list[Tracked] = []
         self.dropped: list[Dropped] = []
         self.notes: list[str] = []
@@ -256,6 +257,7 @@ class _Replay:
     def _numbers(self, held_out: list[HeldOut], started: float) -> dict[str, Any]:
         wall_s = time.monotonic() - started
         numbers = metrics(self.slam, self.results, self.dropped, held_out, wall_s)
+        numbers["cpu_s"] = round(time.process_time() - self._cpu_before_s, 3)  # of all threads
         return numbers | pace(self.frame_ms, self.first_pose_s, wall_s)
 
 

@@ -108,10 +108,17 @@ def _row(part: Part, runs: list[Row]) -> dict[str, Any]:
         "psnr": mean([run["psnr"] for run in whole]),
         "ate_pct": mean([run["ate_pct_sim3"] for run in whole]),
         "ms_per_frame": mean([run["ms_per_frame"]["total"] for run in whole]),
+        "cpu_ms_per_frame": mean([_cpu_ms(run) for run in whole]),
         "restored_psnr": mean([run["restored_psnr"] for run in whole]),
         "built": part.built,
         "failed": failed,
     }
+
+
+def _cpu_ms(run: Row) -> float | None:
+    """Of all threads; unlike the time that passed, it hardly knows what else the machine does."""
+    spent_s = run.get("cpu_s")
+    return None if spent_s is None else 1e3 * float(spent_s) / max(run["frames"], 1)
 
 
 SHOWN = (
@@ -119,6 +126,7 @@ SHOWN = (
     ("restored_psnr", "restored dB", ".2f"),
     ("ate_pct", "ATE %", ".3f"),
     ("ms_per_frame", "ms/frame", ".0f"),
+    ("cpu_ms_per_frame", "CPU ms/frame", ".0f"),
 )
 
 
