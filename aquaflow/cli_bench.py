@@ -10,6 +10,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
+
+from aquaflow.errors import InputError
 
 Json = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON.")]
 Suite = Annotated[str | None, typer.Option(help="ci (synthetic) | real DATA_DIR")]
@@ -17,12 +20,30 @@ Data = Annotated[Path | None, typer.Argument(help="Of --suite real: a folder for
 Scenes = Annotated[list[Path] | None, typer.Option("--scene", help="Recording; may be repeated.")]
 Bars = Callable[[bool], AbstractContextManager[Any]]
 
+DIVES = "dives"
+
+
+class _DivesUnlessNamed(TyperGroup):
+    """``aquaflow bench [OPTIONS] [DATA]`` is ``aquaflow bench dives [OPTIONS] [DATA]``.
+
+    A DATA argument of the group itself would swallow the names of its commands.
+    """
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        named = bool(args) and args[0] in self.commands
+        return super().parse_args(ctx, args if named else [DIVES, *args])
+
 
 def register(app: typer.Typer, bars: Bars) -> None:
     """Add the commands to ``app``; ``bars(quiet)`` is how it shows progress."""
 
-    @app.command()
-    def bench(
+    bench = typer.Typer(
+        cls=_DivesUnlessNamed, help="Run time against error; `bench render`: of the renderer."
+    )
+    app.add_typer(bench, name="bench")
+
+    @bench.command(DIVES)
+    def dives(
         data: Data = None,
         suite: Suite = None,
         scene: Scenes = None,
@@ -35,9 +56,18 @@ def register(app: typer.Typer, bars: Bars) -> None:
         ] = None,
         as_json: Json = False,
     ) -> None:
-        """Run time against error: scenes x presets as a table, a picture and bench.json."""
+        """Run time against error: scenes x presets as a table, a picture and bench.json.
+
+        `aquaflow bench` alone does this too; `aquaflow bench render` times the renderer.
+        """
         from aquaflow.evaluation.bench import benchmark as bm
         from aquaflow.presets import PRESETS
+
+        if data is not None and suite is None and not scene:
+            raise InputError(
+                f"bench knows neither a command nor a suite '{data}'; "
+                "give render, --suite real DATA_DIR, or --scene PATH"
+            )
 
         contenders = bm.contenders_of(preset or list(PRESETS), peers)
         with bars(as_json) as progress:
@@ -51,6 +81,31 @@ def register(app: typer.Typer, bars: Bars) -> None:
         from aquaflow.evaluation.bench.table import print_table
 
         print_table(result["runs"], _console())
+        typer.echo(f"Look at {out / bm.PICTURE_FILE}; all numbers are in {out / bm.JSON_FILE}.")
+
+    @bench.command()
+    def render(
+        quick: Annotated[bool, typer.Option("--quick", help="Only the bars' two sizes.")] = False,
+        repeats: Annotated[int, typer.Option(min=1, help="Runs of each, interleaved.")] = 7,
+        opensplat: Annotated[
+            str | None, typer.Option(help="Program that times your OpenSplat build; see README.")
+        ] = None,
+        out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("out/bench_render"),
+        as_json: Json = False,
+    ) -> None:
+        """Forward and backward ms of every renderer here: table, picture, render_bench.json."""
+        from aquaflow.evaluation.bench.render import benchmark as bm
+        from aquaflow.evaluation.bench.render.scene import QUICK_SIZES, SIZES
+
+        sizes = QUICK_SIZES if quick else SIZES
+        with bars(as_json) as progress:
+            result = bm.bench_render(sizes, repeats, out, opensplat, progress)
+        if as_json:
+            typer.echo(json.dumps(result))
+            return
+        from aquaflow.evaluation.bench.render.table import print_result
+
+        print_result(result, _console())
         typer.echo(f"Look at {out / bm.PICTURE_FILE}; all numbers are in {out / bm.JSON_FILE}.")
 
     @app.command()

@@ -67,13 +67,14 @@ def _module_present(name: str) -> bool:
 
 
 def _renderer_name() -> str | None:
-    """What renders on this machine without being asked for; None if no renderer is installed."""
+    """What renders here without being asked for, and on which instruction set; None if nothing."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a fallback is told in the findings
         try:
             from aquaflow.render import select_renderer
 
-            return select_renderer().name
+            chosen = select_renderer()
+            return f"{chosen.name}, {chosen.isa}"
         except ImportError:
             return None
 
@@ -211,7 +212,7 @@ def _renderer(machine: Machine) -> Finding:
             "nothing can be mapped",
             "reinstall aquaflow: its renderers are missing",
         )
-    return Finding("renderer", f"{chosen} ({variants})", f"maps are rendered with '{chosen}'")
+    return Finding("renderer", f"{chosen} (of {variants})", f"maps are rendered with: {chosen}")
 
 
 def _gpu(machine: Machine) -> Finding:

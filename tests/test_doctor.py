@@ -40,7 +40,7 @@ def bare(root: Path, **changes: object) -> Machine:
         "which": lambda name: None,
         "gpu": lambda: None,
         "module_present": lambda name: False,
-        "renderer": lambda: "torch",
+        "renderer": lambda: "tiles, torch",
     }
     return Machine(**{**parts, **changes})  # type: ignore[arg-type]
 
@@ -95,7 +95,7 @@ def test_missing_compiler_matters_only_without_a_compiled_variant(machine):
 
 def test_renderer_in_use_and_its_variants_are_named(machine):
     put(machine.root, "native/libaquaflow_avx2.so")
-    assert named(machine, "renderer").found == "torch (libaquaflow_avx2.so)"
+    assert named(machine, "renderer").found == "tiles, torch (of libaquaflow_avx2.so)"
     absent = bare(machine.root, renderer=lambda: None)
     assert "reinstall" in named(absent, "renderer").advice
 

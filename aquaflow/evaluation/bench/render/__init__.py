@@ -1,0 +1,1 @@
+"""``aquaflow bench render``: how fast each renderer draws and differentiates the same scenes."""

@@ -1,0 +1,149 @@
+"""``aquaflow bench render``: contenders times sizes, and what is written about them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from aquaflow.errors import AquaFlowError, InputError
+from aquaflow.evaluation.bench import machine
+from aquaflow.evaluation.bench.render.accuracy import gradient_errors
+from aquaflow.evaluation.bench.render.contenders import (
+    Contender,
+    Timed,
+    contenders_here,
+    thread_counts,
+)
+from aquaflow.evaluation.bench.render.interactions import count_interactions
+from aquaflow.evaluation.bench.render.parts import Part, parts_of, time_parts
+from aquaflow.evaluation.bench.render.peak import Peak, measure_peak
+from aquaflow.evaluation.bench.render.picture import draw
+from aquaflow.evaluation.bench.render.rows import Row, row_of
+from aquaflow.evaluation.bench.render.scene import SMALL, Size, SplatScene, height_field
+from aquaflow.evaluation.bench.render.timing import Sample, interleaved
+
+JSON_FILE, PICTURE_FILE = "render_bench.json", "render_bench.png"
+
+FAILURES = (AquaFlowError, MemoryError, RuntimeError, ImportError)
+"""What costs a contender its row at a size, and nobody else anything; torch and gsplat raise
+RuntimeError when the device is full or a kernel does not compile."""
+
+Progress = Callable[[str, int, int | None], None]
+
+
+def bench_render(
+    sizes: Sequence[Size], repeats: int, out: Path, opensplat: str | None, progress: Progress
+) -> dict[str, Any]:
+    """Time everything that runs here; writes the result and its picture into ``out``.
+
+    Raises:
+        InputError: ``out`` cannot be written.
+    """
+    _make_folder(out)
+    contenders, notes = contenders_here(opensplat)
+    peak = measure_peak(thread_counts())
+    described = {
+        **machine.describe(),
+        "peak_gflop_per_s": {str(count): rate / 1e9 for count, rate in peak.flop_per_s.items()},
+        "peak_method": peak.method,
+    }
+    kernels = [c.renderer for c in contenders if isinstance(c, Timed) and c.name == "cpu"]
+    errors = gradient_errors(kernels, height_field(SMALL))
+    rows = time_sizes(contenders, (SMALL, *sizes), repeats, peak, notes, progress)
+    result = {
+        "machine": described,
+        "rows": rows,
+        "parts": _timed_parts(parts_of(thread_counts()), repeats, progress),
+        "gradient_rel_error": errors,
+        "notes": notes,
+    }
+    (out / JSON_FILE).write_text(json.dumps(result, indent=2, allow_nan=False) + "\n")
+    draw(rows, out / PICTURE_FILE, caption(described))
+    return result
+
+
+def _make_folder(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot write to {out}: {error.strerror}; give another --out") from error
+
+
+def time_sizes(
+    contenders: Sequence[Contender],
+    sizes: Sequence[Size],
+    repeats: int,
+    peak: Peak,
+    notes: list[str],
+    progress: Progress,
+) -> list[Row]:
+    """A row for every contender that takes a size; ``notes`` gets a sentence for each failure."""
+    rows = []
+    progress("sizes", 0, len(sizes))
+    contenders = _that_run(contenders, height_field(SMALL), notes)
+    for done, size in enumerate(sizes, 1):
+        scene = height_field(size)
+        interactions = count_interactions(scene)
+        willing = [contender for contender in contenders if contender.takes(size)]
+        quick = _that_run([c for c in willing if not c.slow], scene, notes)
+        slow = [contender for contender in willing if contender.slow]
+        load = machine.load()
+        for group, times in ((quick, repeats), (slow, 1)):
+            for contender, samples in _samples(group, scene, times, notes):
+                rows.append(row_of(contender, size, samples, interactions, peak, load))
+        progress("sizes", done, len(sizes))
+    return rows
+
+
+def _that_run(
+    contenders: Sequence[Contender], scene: SplatScene, notes: list[str]
+) -> list[Contender]:
+    """Those that get through the scene once: a run that is not counted."""
+    return [c for c in contenders if _attempt(c, scene, notes) is not None]
+
+
+def _samples(
+    contenders: Sequence[Contender], scene: SplatScene, repeats: int, notes: list[str]
+) -> list[tuple[Contender, list[Sample]]]:
+    """Interleaved; a contender that fails once has none."""
+    jobs = [partial(_attempt, contender, scene, notes) for contender in contenders]
+    found = []
+    for contender, attempts in zip(contenders, interleaved(jobs, repeats), strict=True):
+        samples = [sample for sample in attempts if sample is not None]
+        if len(samples) == len(attempts):
+            found.append((contender, samples))
+    return found
+
+
+def _attempt(contender: Contender, scene: SplatScene, notes: list[str]) -> Sample | None:
+    try:
+        return contender.sample(scene)
+    except FAILURES as error:
+        said = str(error).strip().partition("\n")[0] or type(error).__name__
+        size = scene.size
+        note = f"{contender.name} ({contender.isa}) failed at {size.n}, {size.picture}: {said}"
+        if note not in notes:
+            notes.append(note)
+        return None
+
+
+def _timed_parts(parts: Sequence[Part], repeats: int, progress: Progress) -> list[dict[str, Any]]:
+    total, done = len(parts) * repeats, 0
+
+    def tick() -> None:
+        nonlocal done
+        done += 1
+        progress("parts", done, total)
+
+    return time_parts(parts, repeats, tick)
+
+
+def caption(described: dict[str, Any]) -> str:
+    """What the picture says about where it comes from."""
+    return (
+        f"AquaFlow {described['aquaflow']} on {described['processor']}, {described['cores']} "
+        f"cores, {described['date']}, load {described['load']}; medians on the wall"
+    )

@@ -1,0 +1,106 @@
+"""Who is timed here: every renderer that this machine can run, and why the others are not."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Protocol
+
+from aquaflow.errors import AquaFlowError
+from aquaflow.evaluation.bench.render.opensplat import NOTE, OpenSplat
+from aquaflow.evaluation.bench.render.scene import SMALL, Size, SplatScene
+from aquaflow.evaluation.bench.render.timing import Clock, Sample, time_renderer, torch_threads
+from aquaflow.render.contract import Renderer
+from aquaflow.render.cpu import CpuRenderer
+from aquaflow.render.gsplat import GsplatRenderer
+from aquaflow.render.library import NativeUnavailableError
+from aquaflow.render.native.build import supported_isas
+from aquaflow.render.reference import ReferenceRenderer
+from aquaflow.render.tiles import TileRenderer
+
+TILES_MOST = 30_000 * 640 * 480
+REFERENCE_MOST = SMALL.n * SMALL.pixels
+"""Gaussians times pixels: beyond, the torch fallback takes minutes and the reference memory."""
+
+
+class Contender(Protocol):
+    """Something that draws a scene and differentiates it, and says how long that took."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def isa(self) -> str: ...
+    @property
+    def threads(self) -> int: ...
+    @property
+    def slow(self) -> bool:
+        """Seconds rather than milliseconds: run once, after the others."""
+        ...
+
+    def takes(self, size: Size) -> bool:
+        """Whether a scene of this size can be waited for."""
+        ...
+
+    def sample(self, scene: SplatScene) -> Sample:
+        """One timed run."""
+        ...
+
+
+@dataclass(frozen=True)
+class Timed:
+    """A renderer of this package as a contender."""
+
+    renderer: Renderer
+    most: int | None = None
+    """Gaussians times pixels; None: any. What has a limit is slow."""
+    clock: Clock | None = None
+
+    @property
+    def name(self) -> str:
+        return self.renderer.name
+
+    @property
+    def isa(self) -> str:
+        return self.renderer.isa
+
+    @property
+    def threads(self) -> int:
+        return self.renderer.threads
+
+    @property
+    def slow(self) -> bool:
+        return self.most is not None
+
+    def takes(self, size: Size) -> bool:
+        return self.most is None or size.n * size.pixels <= self.most
+
+    def sample(self, scene: SplatScene) -> Sample:
+        with torch_threads(self.threads):
+            device = "cuda" if self.isa == "cuda" else "cpu"
+            return time_renderer(self.renderer, scene, device, self.clock)
+
+
+def thread_counts() -> tuple[int, ...]:
+    """One, and all that this process may use."""
+    return tuple(sorted({1, len(os.sched_getaffinity(0))}))
+
+
+def contenders_here(opensplat: str | None = None) -> tuple[list[Contender], list[str]]:
+    """The contenders, and one sentence for each that is missing or needs a remark."""
+    found: list[Contender] = []
+    notes: list[str] = []
+    for isa in supported_isas():
+        try:
+            found += [Timed(CpuRenderer(count, isa)) for count in thread_counts()]
+        except NativeUnavailableError as error:
+            notes.append(str(error))
+    try:
+        found.append(Timed(GsplatRenderer()))
+    except AquaFlowError as error:
+        notes.append(f"gsplat is not timed: {error}")
+    found += [Timed(TileRenderer(count), TILES_MOST) for count in thread_counts()]
+    found.append(Timed(ReferenceRenderer(), REFERENCE_MOST))
+    if opensplat is not None:
+        found.append(OpenSplat(opensplat))
+        notes.append(NOTE)
+    return found, notes

@@ -1,0 +1,71 @@
+"""A contender on a scene as a row of ``render_bench.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from aquaflow.evaluation.bench.render.contenders import Contender
+from aquaflow.evaluation.bench.render.interactions import BACKWARD_FLOP, FORWARD_FLOP
+from aquaflow.evaluation.bench.render.peak import Peak
+from aquaflow.evaluation.bench.render.scene import Size
+from aquaflow.evaluation.bench.render.timing import Sample, spread_of
+
+Row = dict[str, Any]
+
+PASSES = (("fwd", FORWARD_FLOP), ("bwd", BACKWARD_FLOP))
+
+
+def row_of(
+    contender: Contender,
+    size: Size,
+    samples: Sequence[Sample],
+    interactions: int,
+    peak: Peak,
+    load: float | None,
+) -> Row:
+    """Medians in ms; rates by the CPU time where one thread worked, else by the wall's."""
+    row: Row = {
+        "renderer": contender.name,
+        "isa": contender.isa,
+        "threads": contender.threads,
+        "n": size.n,
+        "width": size.width,
+        "height": size.height,
+        "repeats": len(samples),
+        "load": load,
+        "interactions": interactions,
+    }
+    busy_s = {}
+    for key, _ in PASSES:
+        wall = spread_of([getattr(sample, f"{key}_ms") for sample in samples])
+        cpu = [value for s in samples if (value := getattr(s, f"{key}_cpu_ms")) is not None]
+        cpu_ms = spread_of(cpu).median if cpu else None
+        row |= {
+            f"{key}_ms": wall.median,
+            f"{key}_ms_half_range": wall.half_range,
+            f"{key}_cpu_ms": cpu_ms,
+        }
+        busy_s[key] = 1e-3 * (wall.median if cpu_ms is None else cpu_ms)
+        row[f"{key}_interactions_per_s"] = interactions / busy_s[key] if busy_s[key] else None
+    row["share_of_peak"] = _shares(contender, busy_s, interactions, peak)
+    row["stage_ms"] = _stages(samples)
+    return row
+
+
+def _shares(
+    contender: Contender, busy_s: dict[str, float], interactions: int, peak: Peak
+) -> dict[str, float] | None:
+    """Useful operations/s over the peak's; None where no peak was measured for the device."""
+    most = None if contender.isa == "cuda" else peak.flop_per_s.get(contender.threads)
+    if most is None or not all(busy_s.values()):
+        return None
+    flop = {key: each * interactions for key, each in PASSES}
+    shares = {key: flop[key] / busy_s[key] / most for key, _ in PASSES}
+    return {**shares, "both": sum(flop.values()) / sum(busy_s.values()) / most}
+
+
+def _stages(samples: Sequence[Sample]) -> dict[str, float] | None:
+    """Medians of the stages; None where the renderer does not tell them."""
+    names = list(samples[0].stage_ms)
+    return {n: spread_of([s.stage_ms[n] for s in samples]).median for n in names} or None
