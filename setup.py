@@ -31,17 +31,28 @@ def load_build_module() -> ModuleType:
 native = load_build_module()
 
 
+def kernel_isas() -> tuple[str, ...]:
+    """Variants to build: those of the compiler's target; none without a compiler."""
+    compiler = native.find_compiler()
+    return () if compiler is None else native.target_isas(compiler)
+
+
 class BuildWithKernels(build_py):
-    """Copies the Python files, then compiles every variant of this architecture."""
+    """Copies the Python files, then compiles every variant of the compiler's architecture."""
 
     def run(self) -> None:
         super().run()
         out_dir = ROOT / NATIVE if self.editable_mode else Path(self.build_lib) / NATIVE
-        for isa in native.buildable_isas():
+        if not self.editable_mode:
+            for copied in out_dir.glob("*.so"):
+                copied.unlink()  # from the sources' folder: of another day or architecture
+        for isa in kernel_isas():
             try:
                 print(f"aquaflow: built {native.build(isa, out_dir)}")
             except native.BuildError as error:
-                print(f"aquaflow: no {isa} renderer: {error}; the slower torch renderer is used")
+                print(f"aquaflow: no {isa} renderer: {error}")
+        if not list(out_dir.glob("*.so")):
+            print("aquaflow: no compiled renderer; the much slower torch renderer will be used")
 
 
 class PlatformWheel(bdist_wheel):
@@ -56,7 +67,7 @@ class DistributionWithKernels(Distribution):
     """A platform wheel wherever the kernels can be compiled."""
 
     def has_ext_modules(self) -> bool:
-        return native.find_compiler() is not None and bool(native.buildable_isas())
+        return bool(kernel_isas())
 
 
 setup(

@@ -86,8 +86,10 @@ class FlowMatcher:
     """DIS flow both ways from a starting flow, with the forward-backward check."""
 
     def __init__(self) -> None:
-        # Any: OpenCV's stubs do not know that the starting flow may be None.
-        self._dis: Any = cv2.DISOpticalFlow.create(cv2.DISOpticalFlow_PRESET_MEDIUM)
+        # Two, because OpenCV keeps a starting flow for later calls that give none; it even reads
+        # beyond it when those pictures are larger. Any: its stubs do not know of None.
+        self._unseeded: Any = cv2.DISOpticalFlow.create(cv2.DISOpticalFlow_PRESET_MEDIUM)
+        self._seeded: Any = cv2.DISOpticalFlow.create(cv2.DISOpticalFlow_PRESET_MEDIUM)
 
     def __call__(
         self,
@@ -111,5 +113,7 @@ class FlowMatcher:
         return Flow(forward, backward, error.astype(np.float32), valid)
 
     def _flow(self, a: Grey, b: Grey, start: Float | None) -> Float:
-        initial = None if start is None else np.ascontiguousarray(start, dtype=np.float32).copy()
-        return np.asarray(self._dis.calc(a, b, initial), dtype=np.float32)
+        if start is None:
+            return np.asarray(self._unseeded.calc(a, b, None), dtype=np.float32)
+        initial = np.ascontiguousarray(start, dtype=np.float32).copy()
+        return np.asarray(self._seeded.calc(a, b, initial), dtype=np.float32)

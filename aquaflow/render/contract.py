@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 from aquaflow.errors import AquaFlowError
@@ -39,8 +40,16 @@ MAX_SIGMA_PX = 1e5
 """Footprints wider than this along their long axis are culled: their determinant would leave
 float32."""
 
+TILE_PX = 16
+"""Side of the square tiles that a picture is cut into, from its top left corner."""
+
 RADIUS_SIGMAS = 3.0
 """``Rendering.radius_px`` is this many standard deviations along the ellipse's long axis."""
+
+
+def tile_grid(width: int, height: int) -> tuple[int, int]:
+    """Rows and columns of tiles; the last ones may reach beyond the picture."""
+    return -(-height // TILE_PX), -(-width // TILE_PX)
 
 
 @dataclass(frozen=True)
@@ -54,7 +63,11 @@ class Rendering:
     """[H, W] in [0, 1], differentiable."""
 
     visible: Tensor
-    """[N] bool: sound, in front of the camera, and reaching 1/255 of alpha on the image."""
+    """[N] bool: sound, in front of the camera, and reaching 1/255 of alpha on the image.
+
+    With an activity mask also: the box around its 1/255 ellipse touches an active tile. What
+    touches none has no say in the picture, so an optimiser must not move it by old moments.
+    """
 
     radius_px: Tensor
     """[N] three standard deviations of the footprint, pixels; 0 where not visible."""
@@ -80,8 +93,13 @@ class Renderer(Protocol):
         K: Tensor,  # [3, 3] px; skew is ignored
         width: int,
         height: int,
+        active: Tensor | None = None,  # [ceil(H/16), ceil(W/16)] bool, tiles to draw
     ) -> Rendering:
         """Draw. Differentiable in all tensors but ``K``.
+
+        Tiles of TILE_PX pixels that are not ``active`` stay black and transparent and take no
+        gradient, at next to no cost on the CPU; the others are as they were without the mask.
+        None draws all.
 
         A Gaussian that is not finite, has a zero quaternion, a scale or opacity that is not
         positive, or lies behind the near plane is culled: it draws nothing and its gradient is
@@ -100,8 +118,9 @@ def check_inputs(
     K: Tensor,
     width: int,
     height: int,
+    active: Tensor | None = None,
 ) -> None:
-    """Raise AquaFlowError naming the first input whose shape breaks the contract."""
+    """Raise AquaFlowError naming the first input whose shape or type breaks the contract."""
     n = len(means) if means.dim() else 0
     expected = {
         "means": (means, (n, 3)),
@@ -122,3 +141,9 @@ def check_inputs(
         )
     if width < 1 or height < 1:
         raise AquaFlowError(f"Image size {width} x {height} is empty; pass at least 1 x 1 pixels.")
+    grid = tile_grid(width, height)
+    if active is not None and (tuple(active.shape) != grid or active.dtype != torch.bool):
+        raise AquaFlowError(
+            f"Renderer input active is {active.dtype} {tuple(active.shape)}; "
+            f"pass torch.bool {grid}, one element per tile of {TILE_PX} pixels."
+        )

@@ -70,17 +70,19 @@ class CpuRenderer:
         K: Tensor,  # [3, 3] px
         width: int,
         height: int,
+        active: Tensor | None = None,  # [ceil(H/16), ceil(W/16)] bool, tiles to draw
     ) -> Rendering:
         """Draw as the contract says; inputs of other types are converted to float32 on the CPU."""
-        check_inputs(means, quats, scales, opacities, colours, viewmat, K, width, height)
+        check_inputs(means, quats, scales, opacities, colours, viewmat, K, width, height, active)
         inputs = [
             tensor.to(device="cpu", dtype=torch.float32).contiguous()
             for tensor in (means, quats, scales, opacities, colours, viewmat)
         ]
         focal_and_centre = K.detach()[[0, 1, 0, 1], [0, 1, 2, 2]]
         intrinsics = focal_and_centre.to(device="cpu", dtype=torch.float32)
+        drawn_tiles = None if active is None else active.to(device="cpu").contiguous()
         image, alpha, visible, radius_px = _Rasterise.apply(  # type: ignore[no-untyped-call]
-            *inputs, intrinsics, self._pool, self.threads, width, height
+            *inputs, intrinsics, drawn_tiles, self._pool, self.threads, width, height
         )
         return Rendering(image, alpha, visible, radius_px)
 
@@ -96,6 +98,7 @@ class _Rasterise(torch.autograd.Function):
         colours: Tensor,
         viewmat: Tensor,
         intrinsics: Tensor,  # [4] fx fy cx cy, px
+        active: Tensor | None,  # [tiles]
         pool: _ContextPool,
         threads: int,
         width: int,
@@ -110,7 +113,8 @@ class _Rasterise(torch.autograd.Function):
         lease = _Lease(pool)
         sizes = (n, channels, width, height, threads)
         tensors = (*gaussians, viewmat, intrinsics, image, alpha, visible, radius_px)
-        pool.library.call("aq_forward", lease.context, *sizes, *map(pointer, tensors))
+        mask = None if active is None else pointer(active)
+        pool.library.call("aq_forward", lease.context, *sizes, *map(pointer, tensors), mask)
         ctx.save_for_backward(*gaussians, image)
         ctx.lease = lease
         ctx.mark_non_differentiable(visible, radius_px)
@@ -127,4 +131,4 @@ class _Rasterise(torch.autograd.Function):
             ctx.lease.context,
             *map(pointer, (*gaussians, image, *incoming, *gradients)),
         )
-        return (*gradients, None, None, None, None, None)
+        return (*gradients, *[None] * 6)

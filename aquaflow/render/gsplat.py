@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from aquaflow.errors import AquaFlowError
+from aquaflow.render.activity import active_pixels, touches_active
 from aquaflow.render.contract import DILATION_PX2, NEAR_PLANE_M, Rendering, check_inputs
 
 
@@ -21,7 +22,8 @@ class GsplatRenderer:
 
     Two differences to the contract, both within one grey level: gsplat stops before the Gaussian
     that would take the transmittance below 1e-4, and clamps alpha at 0.999. ``radius_px`` is
-    gsplat's rounded extent.
+    gsplat's rounded extent. An activity mask is laid over the
+    finished picture and saves nothing: gsplat's public ``rasterization`` takes none.
     """
 
     name = "gsplat"
@@ -50,11 +52,12 @@ class GsplatRenderer:
         K: Tensor,  # [3, 3] px
         width: int,
         height: int,
+        active: Tensor | None = None,  # [ceil(H/16), ceil(W/16)] bool, tiles to draw
     ) -> Rendering:
         """Draw as the contract says."""
         from gsplat import rasterization
 
-        check_inputs(means, quats, scales, opacities, colours, viewmat, K, width, height)
+        check_inputs(means, quats, scales, opacities, colours, viewmat, K, width, height, active)
         inputs = (means, quats, scales, opacities, colours, viewmat, K.detach())
         on_device = [tensor.to(device="cuda", dtype=torch.float32) for tensor in inputs]
         *gaussians, view, intrinsics = on_device
@@ -77,8 +80,17 @@ class GsplatRenderer:
             packed=False,
         )
         radii = meta["radii"][0].detach().float()  # [M] or, since 1.5, [M, 2]
-        radius_px[kept] = radii if radii.dim() == 1 else radii.amax(1)
-        return Rendering(image[0], alpha[0, ..., 0], radius_px > 0, radius_px)
+        extent = radii[:, None].expand(-1, 2) if radii.dim() == 1 else radii
+        image, alpha = image[0], alpha[0, ..., 0]
+        if active is not None:
+            active = active.to("cuda")
+            centre = meta["means2d"][0].detach()
+            box = (centre - extent, centre + extent)
+            extent = extent * touches_active(*box, active, width, height)[:, None]
+            pixels = active_pixels(active, width, height)
+            image, alpha = image * pixels[..., None], alpha * pixels
+        radius_px[kept] = extent.amax(1)
+        return Rendering(image, alpha, radius_px > 0, radius_px)
 
 
 def _sound(

@@ -21,7 +21,7 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "aq_constants": (None, [_POINTER]),
     "aq_context_new": (_POINTER, []),
     "aq_context_free": (None, [_POINTER]),
-    "aq_forward": (_INT, [_POINTER] + [_INT] * 5 + [_POINTER] * 11),
+    "aq_forward": (_INT, [_POINTER] + [_INT] * 5 + [_POINTER] * 12),
     "aq_backward": (_INT, [_POINTER] * 15),
     "aq_photometric": (_INT, [_POINTER] * 4 + [_INT] * 2 + [_FLOAT, _INT] + [_POINTER] * 2),
     "aq_compose_water": (_INT, [_POINTER] * 3 + [_INT] * 2 + [_POINTER] * 2),
@@ -69,7 +69,7 @@ class Library:
 
     def constants(self) -> list[float]:
         """The constants compiled in, in the order of ``aq_constants``."""
-        out = (ctypes.c_double * 9)()
+        out = (ctypes.c_double * 10)()
         self._dll.aq_constants(out)
         return list(out)
 
@@ -83,7 +83,8 @@ def pointer(tensor: Tensor) -> int:
 def load_library(isa: str | None = None, directory: Path = native.NATIVE_DIR) -> Library:
     """The fastest library this processor runs, or the variant ``isa``; built first if out of date.
 
-    Raises NativeUnavailableError when it is missing and cannot be built.
+    Where the fastest cannot be had, the next one is taken. Raises NativeUnavailableError when none
+    is there and none can be built.
     """
     supported = native.supported_isas()
     if not supported or (isa is not None and isa not in supported):
@@ -91,19 +92,27 @@ def load_library(isa: str | None = None, directory: Path = native.NATIVE_DIR) ->
             f"This processor does not run the {isa or 'compiled'} kernels; "
             f"choose one of {', '.join(supported) or 'the torch renderers'}."
         )
-    chosen = isa or supported[0]
-    path = native.library_path(chosen, directory)
+    failures: list[NativeUnavailableError] = []
+    for variant in supported if isa is None else (isa,):
+        try:
+            return _load_variant(variant, native.library_path(variant, directory))
+        except NativeUnavailableError as error:
+            failures.append(error)
+    raise failures[0]
+
+
+def _load_variant(isa: str, path: Path) -> Library:
     with _BUILD_LOCK:
         if not native.is_current(path):
             try:
-                native.build(chosen, directory)
+                native.build(isa, path.parent)
             except native.BuildError as error:
                 raise NativeUnavailableError(
                     f"The compiled CPU renderer ({path.name}) is missing or out of date and was "
                     f"not built: {error}."
                 ) from error
     try:
-        return Library(path, chosen)
+        return Library(path, isa)
     except OSError as error:
         raise NativeUnavailableError(
             f"The compiled CPU renderer {path} does not load: {error}; "
@@ -111,8 +120,12 @@ def load_library(isa: str | None = None, directory: Path = native.NATIVE_DIR) ->
         ) from error
 
 
+@lru_cache(maxsize=1)
 def library_or_none() -> Library | None:
-    """The fastest library, or None where ``select_renderer`` announces the torch fallback."""
+    """The fastest library, or None where ``select_renderer`` announces the torch fallback.
+
+    Looked for once in a process: a compiler that fails is not asked again at every step.
+    """
     try:
         return load_library()
     except NativeUnavailableError:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from aquaflow.render.activity import active_pixels, touches_active
 from aquaflow.render.contract import (
     DILATION_PX2,
     MAX_ALPHA,
@@ -133,6 +134,7 @@ def project(
     K: Tensor,
     width: int,
     height: int,
+    active: Tensor | None = None,
 ) -> Footprints:
     """Footprints of the visible Gaussians, nearest first, in the inputs' dtype.
 
@@ -145,7 +147,10 @@ def project(
         size = torch.tensor([width, height], dtype=means.dtype, device=means.device)
         low, high = draft.centre - draft.extent, draft.centre + draft.extent
         bounded = draft.radius_px < RADIUS_SIGMAS * MAX_SIGMA_PX
-        index = index[((high > 0) & (low < size)).all(1) & bounded]
+        seen = ((high > 0) & (low < size)).all(1) & bounded
+        if active is not None:
+            seen &= touches_active(low, high, active.to(low.device), width, height)
+        index = index[seen]
         z = means[index] @ viewmat[2, :3] + viewmat[2, 3]
         index = index[torch.argsort(z.float(), stable=True)]  # ties as in float32
     return footprints_of(index, *inputs)
@@ -191,19 +196,22 @@ class ReferenceRenderer:
         K: Tensor,  # [3, 3] px
         width: int,
         height: int,
+        active: Tensor | None = None,  # [ceil(H/16), ceil(W/16)] bool, tiles to draw
     ) -> Rendering:
         """Draw as the contract says; the result is float64."""
-        check_inputs(means, quats, scales, opacities, colours, viewmat, K, width, height)
+        check_inputs(means, quats, scales, opacities, colours, viewmat, K, width, height, active)
         colours = colours.double()
         gaussians = (means.double(), quats.double(), scales.double(), opacities.double(), colours)
         camera = (viewmat.double(), K.detach().double())
-        footprints = project(*gaussians, *camera, width, height)
+        footprints = project(*gaussians, *camera, width, height, active)
         x = torch.arange(width, dtype=torch.float64) + 0.5
         y = torch.arange(height, dtype=torch.float64) + 0.5
         pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), 2).view(-1, 2)
         offset = pixels[None] - footprints.centre[:, None]
         alpha = alpha_at(offset, footprints.conic, footprints.opacity)
         weights = blend_weights(alpha, 0)
+        if active is not None:
+            weights = weights * active_pixels(active, width, height).reshape(-1)
         image = (weights.T @ colours[footprints.index]).view(height, width, -1)
         visible, radius_px = footprints.scatter(len(means))
         return Rendering(image, weights.sum(0).view(height, width), visible, radius_px)

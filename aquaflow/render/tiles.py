@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from aquaflow.render.contract import Rendering, check_inputs
+from aquaflow.render.activity import tile_box
+from aquaflow.render.contract import TILE_PX, Rendering, check_inputs, tile_grid
 from aquaflow.render.reference import Footprints, alpha_at, blend_weights, project
-
-TILE_PX = 16
 
 BATCH_ELEMENTS = 4_000_000
 """Gaussian-pixel pairs held at once; backward recomputes each batch instead of keeping them all."""
@@ -41,38 +40,37 @@ class TileRenderer:
         K: Tensor,  # [3, 3] px
         width: int,
         height: int,
+        active: Tensor | None = None,  # [ceil(H/16), ceil(W/16)] bool, tiles to draw
     ) -> Rendering:
         """Draw as the contract says, in the dtype of ``means``."""
-        check_inputs(means, quats, scales, opacities, colours, viewmat, K, width, height)
+        check_inputs(means, quats, scales, opacities, colours, viewmat, K, width, height, active)
         dtype = means.dtype
         colours = colours.to(dtype)
         gaussians = (means, quats.to(dtype), scales.to(dtype), opacities.to(dtype), colours)
         camera = (viewmat.to(dtype), K.detach().to(dtype))
-        footprints = project(*gaussians, *camera, width, height)
-        drawn = _draw(footprints, colours, width, height)
+        if active is None:
+            active = torch.ones(tile_grid(width, height), dtype=torch.bool)
+        active = active.to(means.device)
+        footprints = project(*gaussians, *camera, width, height, active)
+        drawn = _draw(footprints, colours, width, height, active)
         visible, radius_px = footprints.scatter(len(means))
         return Rendering(drawn[..., :-1], drawn[..., -1], visible, radius_px)
 
 
 @dataclass(frozen=True)
 class _TileLists:
-    """For every tile, row by row, its footprints front to back."""
+    """For every active tile, row by row, its footprints front to back."""
 
+    tile: Tensor  # [T] long, row by row
+    start: list[int]  # [T + 1]
     footprint: Tensor  # [L] long
-    start: list[int]  # [tiles + 1]
-    tiles_x: int
-    tiles_y: int
 
 
-def _tile_lists(footprints: Footprints, width: int, height: int) -> _TileLists:
-    """Pairs of footprints and tiles that their boxes touch."""
-    tiles_x, tiles_y = -(-width // TILE_PX), -(-height // TILE_PX)
-    last = torch.tensor([tiles_x - 1, tiles_y - 1], device=footprints.centre.device)
+def _tile_lists(footprints: Footprints, active: Tensor, width: int, height: int) -> _TileLists:
+    """Pairs of footprints and active tiles that their boxes touch."""
     with torch.no_grad():
-        low = ((footprints.centre - footprints.extent) / TILE_PX).floor().clamp(min=0)
-        low = torch.minimum(low, last).long()
-        high = ((footprints.centre + footprints.extent) / TILE_PX).floor().clamp(min=0)
-        high = torch.minimum(high, last).long()
+        centre, extent = footprints.centre, footprints.extent
+        low, high = tile_box(centre - extent, centre + extent, width, height)
         size = high - low + 1
         count = size[:, 0] * size[:, 1]
         footprint = torch.arange(len(count), device=count.device).repeat_interleave(count)
@@ -80,42 +78,49 @@ def _tile_lists(footprints: Footprints, width: int, height: int) -> _TileLists:
         within = within - (count.cumsum(0) - count)[footprint]
         x = low[footprint, 0] + within % size[footprint, 0]
         y = low[footprint, 1] + within // size[footprint, 0]
-        tile = y * tiles_x + x
+        drawn = active[y, x]
+        tile = (y * active.shape[1] + x)[drawn]
         tile, by_tile = torch.sort(tile, stable=True)  # stable: the lists stay in depth order
-        per_tile = torch.bincount(tile, minlength=tiles_x * tiles_y)
+        listed = torch.nonzero(active.reshape(-1))[:, 0]
+        per_tile = torch.bincount(tile, minlength=active.numel())[listed]
         start = [0, *per_tile.cumsum(0).tolist()]
-    return _TileLists(footprint[by_tile], start, tiles_x, tiles_y)
+    return _TileLists(listed, start, footprint[drawn][by_tile])
 
 
 def _batches(lists: _TileLists) -> list[tuple[int, int, int]]:
     """Runs of tiles [first, last) with their longest list, each within BATCH_ELEMENTS."""
     runs: list[tuple[int, int, int]] = []
     first, longest = 0, 0
-    for tile in range(lists.tiles_x * lists.tiles_y):
+    for tile in range(len(lists.tile)):
         length = lists.start[tile + 1] - lists.start[tile]
         elements = (tile + 1 - first) * max(longest, length) * TILE_PX * TILE_PX
         if tile > first and elements > BATCH_ELEMENTS:
             runs.append((first, tile, longest))
             first, longest = tile, 0
         longest = max(longest, length)
-    return [*runs, (first, lists.tiles_x * lists.tiles_y, longest)]
+    return [*runs, (first, len(lists.tile), longest)]
 
 
-def _draw(footprints: Footprints, colours: Tensor, width: int, height: int) -> Tensor:
+def _draw(
+    footprints: Footprints, colours: Tensor, width: int, height: int, active: Tensor
+) -> Tensor:
     """[H, W, C + 1]: premultiplied colours, then alpha."""
-    lists = _tile_lists(footprints, width, height)
+    lists = _tile_lists(footprints, active, width, height)
+    tiles_y, tiles_x = active.shape
     opaque = torch.ones_like(colours[:, :1])
     layers = torch.cat([colours, opaque], 1)[footprints.index]
     drawn: list[Tensor] = []
     for first, last, longest in _batches(lists):
         slots, filled = _padded(lists, first, last, longest, layers.device)
-        corner = _tile_corners(first, last, lists.tiles_x, layers)
+        corner = _tile_corners(lists.tile[first:last], tiles_x, layers)
         arguments = (footprints.centre, footprints.conic, footprints.opacity, layers)
         drawn.append(
             checkpoint(_draw_batch, *arguments, slots, filled, corner, use_reentrant=False)
         )
-    grid = torch.cat(drawn).view(lists.tiles_y, lists.tiles_x, TILE_PX, TILE_PX, -1)
-    image = grid.transpose(1, 2).reshape(lists.tiles_y * TILE_PX, lists.tiles_x * TILE_PX, -1)
+    black = layers.new_zeros(active.numel(), TILE_PX * TILE_PX, layers.shape[1])
+    grid = black.index_copy(0, lists.tile, torch.cat(drawn))
+    grid = grid.view(tiles_y, tiles_x, TILE_PX, TILE_PX, -1)
+    image = grid.transpose(1, 2).reshape(tiles_y * TILE_PX, tiles_x * TILE_PX, -1)
     return image[:height, :width]
 
 
@@ -123,16 +128,15 @@ def _padded(
     lists: _TileLists, first: int, last: int, longest: int, device: torch.device
 ) -> tuple[Tensor, Tensor]:
     """[T, longest] footprint per slot, and whether the slot is filled."""
-    start = torch.tensor(lists.start[first:last], device=device)[:, None]
-    end = torch.tensor(lists.start[first + 1 : last + 1], device=device)[:, None]
+    start = torch.tensor(lists.start[first:last], dtype=torch.long, device=device)[:, None]
+    end = torch.tensor(lists.start[first + 1 : last + 1], dtype=torch.long, device=device)[:, None]
     at = start + torch.arange(longest, device=device)
     filled = at < end
     return lists.footprint[torch.where(filled, at, 0)] if longest else at, filled
 
 
-def _tile_corners(first: int, last: int, tiles_x: int, like: Tensor) -> Tensor:
+def _tile_corners(tile: Tensor, tiles_x: int, like: Tensor) -> Tensor:
     """[T, 2] px."""
-    tile = torch.arange(first, last, device=like.device)
     return TILE_PX * torch.stack([tile % tiles_x, tile // tiles_x], 1).to(like.dtype)
 
 

@@ -119,6 +119,16 @@ def test_the_start_is_not_written_to() -> None:
     assert not start.any()
 
 
+def test_a_flow_without_a_start_does_not_remember_an_earlier_one() -> None:
+    a, b = (normalised_grey(picture) for picture in moved_pair(shift(3.0, 1.0)))
+    textures = (texture_of(a), texture_of(b))
+    far = np.full((HEIGHT, WIDTH, 2), 40.0, np.float32)
+    matcher = FlowMatcher()
+    matcher(a, b, *textures, far, -far)
+    again = matcher(a, b, *textures)
+    assert np.array_equal(again.forward, FlowMatcher()(a, b, *textures).forward)
+
+
 def test_low_contrast_is_matched_like_high_contrast() -> None:
     a, b = moved_pair(shift(4.0, -2.0))
     dim_a, dim_b = (np.uint8(20) + image // 8 for image in (a, b))

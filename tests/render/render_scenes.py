@@ -75,14 +75,20 @@ def random_scene(seed: int = 0, n: int = 120, channels: int = 4, sigma_m: float 
 
 
 def draw_and_differentiate(
-    renderer: Renderer, scene: Scene, dtype: torch.dtype = torch.float32
+    renderer: Renderer,
+    scene: Scene,
+    dtype: torch.dtype = torch.float32,
+    active: Tensor | None = None,  # [tiles] the renderer's activity mask
+    seen: Tensor | None = None,  # [H, W] pixels that count in the function; None: all
 ) -> tuple[Rendering, list[Tensor]]:
     """The rendering and the gradients of a random linear function of image and alpha."""
     rng = torch.Generator().manual_seed(7)
     leaves = scene.leaves(dtype)
-    out = renderer(*leaves, WIDTH, HEIGHT)
+    out = renderer(*leaves, WIDTH, HEIGHT, active)
     g_image = torch.randn(out.image.shape, generator=rng).to(dtype)
     g_alpha = torch.randn(out.alpha.shape, generator=rng).to(dtype)
+    if seen is not None:
+        g_image, g_alpha = g_image * seen[..., None], g_alpha * seen
     ((out.image * g_image).sum() + (out.alpha * g_alpha).sum()).backward()
     gradients = [torch.zeros(0) if leaf.grad is None else leaf.grad for leaf in leaves[:6]]
     return out, gradients

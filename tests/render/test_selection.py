@@ -68,21 +68,8 @@ def test_a_compiler_that_fails_gives_one_sentence(
 ) -> None:
     monkeypatch.setattr(native, "find_compiler", lambda: ["false"])
     with pytest.raises(native.BuildError, match="`false` failed"):
-        native.build(next(iter(native.ISA_FLAGS)), tmp_path)
+        native.build("sse4", tmp_path)
     assert not list(tmp_path.iterdir())
-
-
-def test_processor_flags_decide_which_variants_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("platform.machine", lambda: "x86_64")
-    info = tmp_path / "cpuinfo"
-    laptop = "fma bmi1 bmi2 avx2 f16c movbe sse4_1 sse4_2 ssse3 popcnt"
-    info.write_text(f"processor : 0\nflags : {laptop}\n")
-    assert native.supported_isas(info) == ("avx2", "sse4")
-    info.write_text("processor : 0\nflags : sse2\n")
-    assert native.supported_isas(info) == ()
-    assert native.supported_isas(tmp_path / "missing") == ("sse4",)
 
 
 def test_the_kernels_build_without_torch() -> None:

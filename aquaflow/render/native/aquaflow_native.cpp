@@ -11,6 +11,7 @@
 
 #include "pool.h"
 
+#include "activity.h"
 #include "context.h"
 #include "footprint.h"
 
@@ -67,30 +68,32 @@ static Camera make_camera(const float* viewmat, const float* intrinsics, int wid
 extern "C" {
 
 // Searched for in the file before it is loaded, to see whether it was built from these sources.
-AQ_EXPORT __attribute__((used)) extern const char aq_source_hash[];
-const char aq_source_hash[] = "aquaflow-source:" AQ_SOURCE_HASH;
+AQ_EXPORT extern const char aq_source_hash[];
+__attribute__((used)) const char aq_source_hash[] = "aquaflow-source:" AQ_SOURCE_HASH;
 
 // Mirrored by contract.py; order as in library.py.
 AQ_EXPORT void aq_constants(double* out) {
   const double all[] = {kDilationPx2, kMaxAlpha,      kMinAlpha,       kMinTransmittance, kNearPlane,
-                        kTangentMargin, kMinQuatNormSq, kMaxSigmaPx, kRadiusSigmas};
+                        kTangentMargin, kMinQuatNormSq, kMaxSigmaPx, kRadiusSigmas, kTile};
   for (double value : all) *out++ = value;
 }
 
 AQ_EXPORT void* aq_context_new() { return new (std::nothrow) Context(); }
 AQ_EXPORT void aq_context_free(void* context) { delete static_cast<Context*>(context); }
 
-// viewmat [4, 4] world -> camera; intrinsics [4] fx fy cx cy, pixel centres at half-integers.
+// viewmat [4, 4] world -> camera; intrinsics [4] fx fy cx cy, pixel centres at half-integers; active
+// [tiles_y, tiles_x] tiles to draw, or null for all.
 AQ_EXPORT int aq_forward(void* context, int count, int channels, int width, int height, int threads,
                const float* means, const float* quats, const float* scales, const float* opacities,
                const float* colours, const float* viewmat, const float* intrinsics, float* image,
-               float* alpha, uint8_t* visible, float* radius_px) {
+               float* alpha, uint8_t* visible, float* radius_px, const uint8_t* active) {
   return guarded([&] {
     Context& ctx = *static_cast<Context*>(context);
     ctx.count = count, ctx.channels = channels;
     ctx.threads = std::min(std::max(threads, 1), kMaxThreads);
     ctx.camera = make_camera(viewmat, intrinsics, width, height);
     ctx.tiles_x = (width + kTile - 1) / kTile, ctx.tiles_y = (height + kTile - 1) / kTile;
+    ctx.active.set(active, ctx.tiles_x, ctx.tiles_y);
     project(ctx, {means, quats, scales, opacities, colours}, visible, radius_px);
     build_tile_lists(ctx);
     channels == 3 ? blend<3>(ctx, image, alpha) : blend<4>(ctx, image, alpha);

@@ -43,10 +43,6 @@ AQ_INLINE int lowest(BlockMask m) {
   return sizeof(BlockMask) == 4 ? __builtin_ctz((uint32_t)m) : __builtin_ctzll(m);
 }
 
-AQ_INLINE BlockMask saturated(Vec transmittance, int block) {
-  return (BlockMask)(!any(greater(transmittance, splat(kMinTransmittance)))) << block;
-}
-
 // Calls visit(pixel index, block, lane) for the pixels of a tile that lie on the image.
 template <class Visit>
 AQ_INLINE void each_pixel(const Camera& cam, int left, int top, const Visit& visit) {
@@ -58,11 +54,29 @@ AQ_INLINE void each_pixel(const Camera& cam, int left, int top, const Visit& vis
     }
 }
 
+// A tile that nothing reaches; its transmittance is never read.
 template <int C>
-static void blend_tile(Context& ctx, int tile, float* image, float* alpha) {
+static void clear_tile(const Camera& cam, int left, int top, float* image, float* alpha) {
+  const int columns = std::min(kTile, cam.width - left), bottom = std::min(top + kTile, cam.height);
+  for (int y = top; y < bottom; y++) {
+    const size_t p = (size_t)y * cam.width + left;
+    std::fill_n(image + p * C, columns * C, 0.0f);
+    std::fill_n(alpha + p, columns, 0.0f);
+  }
+}
+
+// Returns the work: blocks visited, and the rest in units of that.
+template <int C>
+static int64_t blend_tile(Context& ctx, int tile, float* image, float* alpha) {
+  constexpr int64_t kTileWork = 64, kEntryWork = 2;
   const BlockPixels px = block_pixels();
   const BlockCorners corners = block_corners();
   const int left = tile % ctx.tiles_x * kTile, top = tile / ctx.tiles_x * kTile;
+  const int end = ctx.tile_offset[tile + 1];
+  if (ctx.tile_offset[tile] == end) {
+    clear_tile<C>(ctx.camera, left, top, image, alpha);
+    return 0;
+  }
   Vec T[kBlocks], colour[kBlocks][C];
   for (int b = 0; b < kBlocks; b++) {
     T[b] = splat(0.0f);  // off the image: saturated from the start
@@ -71,8 +85,8 @@ static void blend_tile(Context& ctx, int tile, float* image, float* alpha) {
   each_pixel(ctx.camera, left, top, [&](size_t, int b, int lane) { T[b][lane] = 1.0f; });
   BlockExpansion e;
   BlockMask live = kAllBlocks;
+  int64_t work = kTileWork;
   const TileEntry* entries = ctx.entries.data();
-  const int end = ctx.tile_offset[tile + 1];
   for (int k = ctx.tile_offset[tile]; k < end && live; k++) {
     if (k + kPrefetchDistance < end) __builtin_prefetch(&ctx.splats[entries[k + kPrefetchDistance].splat]);
     BlockMask blocks = entries[k].blocks & live;
@@ -80,17 +94,19 @@ static void blend_tile(Context& ctx, int tile, float* image, float* alpha) {
     const Splat& s = ctx.splats[entries[k].splat];
     const Vec quadratic = s.qa * px.xx + s.qb * px.xy + s.qc * px.yy;
     expand(s, s.u - (float)left, s.v - (float)top, corners, e);
+    work += kEntryWork + __builtin_popcountll(blocks);
     do {
       const int b = lowest(blocks);
       blocks &= blocks - 1;
       const Vec exponent = quadratic + e.slope_x[b] * px.x + e.slope_y[b] * px.y + e.value[b];
       const Vec Tb = T[b];
-      const Mask drawn = greater(exponent, splat(kLog2MinAlpha)) & greater(Tb, splat(kMinTransmittance));
+      const Mask open = greater(Tb, splat(kMinTransmittance));
+      live &= ~((BlockMask)(!any(open)) << b);
+      const Mask drawn = greater(exponent, splat(kLog2MinAlpha)) & open;
       const Vec w = keep(drawn, min(splat(kMaxAlpha), exp2(exponent))) * Tb;
       T[b] = Tb - w;
 #pragma GCC unroll 4
       for (int c = 0; c < C; c++) colour[b][c] += w * s.colour[c];
-      live &= ~saturated(T[b], b);
     } while (blocks);
   }
   each_pixel(ctx.camera, left, top, [&](size_t p, int b, int lane) {
@@ -98,6 +114,7 @@ static void blend_tile(Context& ctx, int tile, float* image, float* alpha) {
     alpha[p] = 1.0f - T[b][lane];
     ctx.transmittance[p] = T[b][lane];
   });
+  return work;
 }
 
 struct ImageGradients {
@@ -107,26 +124,26 @@ struct ImageGradients {
 };
 
 template <int C>
-struct TileState {
-  Vec T[kBlocks], behind[kBlocks], g_colour[kBlocks][C];
+struct BlockState {
+  Vec T, behind, g_colour[C];
 };
 
 // behind = dL/d(what is still to come), the total at first.
 template <int C>
 AQ_INLINE void start_backward(const Context& ctx, int left, int top, const ImageGradients& g,
-                              TileState<C>& t) {
+                              BlockState<C>* state) {
   for (int b = 0; b < kBlocks; b++) {
-    t.T[b] = t.behind[b] = splat(0.0f);
-    for (int c = 0; c < C; c++) t.g_colour[b][c] = splat(0.0f);
+    state[b].T = state[b].behind = splat(0.0f);
+    for (int c = 0; c < C; c++) state[b].g_colour[c] = splat(0.0f);
   }
   each_pixel(ctx.camera, left, top, [&](size_t p, int b, int lane) {
     float behind = -ctx.transmittance[p] * g.g_alpha[p];
     for (int c = 0; c < C; c++) {
       behind += g.image[p * C + c] * g.g_image[p * C + c];
-      t.g_colour[b][c][lane] = g.g_image[p * C + c];
+      state[b].g_colour[c][lane] = g.g_image[p * C + c];
     }
-    t.behind[b][lane] = behind;
-    t.T[b][lane] = 1.0f;
+    state[b].behind[lane] = behind;
+    state[b].T[lane] = 1.0f;
   });
 }
 
@@ -146,12 +163,13 @@ static void blend_tile_backward(const Context& ctx, int tile, const ImageGradien
   const BlockPixels px = block_pixels();
   const BlockCorners corners = block_corners();
   const int left = tile % ctx.tiles_x * kTile, top = tile / ctx.tiles_x * kTile;
-  TileState<C> t;
-  start_backward<C>(ctx, left, top, g, t);
+  const int end = ctx.tile_offset[tile + 1];
+  if (ctx.tile_offset[tile] == end) return;
+  BlockState<C> state[kBlocks];
+  start_backward<C>(ctx, left, top, g, state);
   BlockExpansion e;
   BlockMask live = kAllBlocks;
   const TileEntry* entries = ctx.entries.data();
-  const int end = ctx.tile_offset[tile + 1];
   for (int k = ctx.tile_offset[tile]; k < end && live; k++) {
     if (k + kPrefetchDistance < end) {
       const uint32_t soon = entries[k + kPrefetchDistance].splat;
@@ -171,42 +189,47 @@ static void blend_tile_backward(const Context& ctx, int tile, const ImageGradien
     do {
       const int b = lowest(blocks);
       blocks &= blocks - 1;
-      const float bx = (float)(b % kBlocksX * kBlockW), by = (float)(b / kBlocksX * kBlockH);
+      BlockState<C>& at = state[b];
       const Vec exponent = quadratic + e.slope_x[b] * px.x + e.slope_y[b] * px.y + e.value[b];
-      const Vec Tb = t.T[b], raw = exp2(exponent);
-      const Mask drawn = greater(exponent, splat(kLog2MinAlpha)) & greater(Tb, splat(kMinTransmittance));
-      const Vec alpha = keep(drawn, min(splat(kMaxAlpha), raw)), w = alpha * Tb;
-      t.T[b] = Tb - w;
-      Vec dot = t.g_colour[b][0] * s.colour[0];
+      const Vec T = at.T, raw = exp2(exponent);
+      const Mask open = greater(T, splat(kMinTransmittance));
+      live &= ~((BlockMask)(!any(open)) << b);
+      const Mask drawn = greater(exponent, splat(kLog2MinAlpha)) & open;
+      const Vec alpha = keep(drawn, min(splat(kMaxAlpha), raw)), w = alpha * T;
+      at.T = T - w;
+      Vec dot = at.g_colour[0] * s.colour[0];
 #pragma GCC unroll 4
-      for (int c = 1; c < C; c++) dot += t.g_colour[b][c] * s.colour[c];
-      const Vec own = w * dot, behind = t.behind[b] - own;
-      t.behind[b] = behind;
+      for (int c = 1; c < C; c++) dot += at.g_colour[c] * s.colour[c];
+      const Vec own = w * dot, behind = at.behind - own;
+      at.behind = behind;
       // a clamped alpha has no gradient
       const Vec ga = keep(greater(splat(kMaxAlpha), raw),
-                          own - behind * (alpha * reciprocal(splat(1.0f) - alpha)));
+                          own - behind * (alpha / (splat(1.0f) - alpha)));
 #pragma GCC unroll 4
-      for (int c = 0; c < C; c++) m.lane[kColour + c] += w * t.g_colour[b][c];
+      for (int c = 0; c < C; c++) m.lane[kColour + c] += w * at.g_colour[c];
       m.lane[kG] += ga;
-      m.lane[kGx] += bx * ga;
-      m.lane[kGy] += by * ga;
-      m.lane[kGxx] += (bx * bx) * ga;
-      m.lane[kGxy] += (bx * by) * ga;
-      m.lane[kGyy] += (by * by) * ga;
-      live &= ~saturated(t.T[b], b);
+      m.lane[kGx] += kOffsets.x[b] * ga;
+      m.lane[kGy] += kOffsets.y[b] * ga;
+      m.lane[kGxx] += kOffsets.xx[b] * ga;
+      m.lane[kGxy] += kOffsets.xy[b] * ga;
+      m.lane[kGyy] += kOffsets.yy[b] * ga;
     } while (blocks);
     centre_moments(px, u, v, m);
     add_moments(gradient + (size_t)id * kGradientFloats, m);
   }
 }
 
+// Threads take tiles as they come: no tile depends on another, so the picture does not depend on that.
 template <int C>
 static void blend(Context& ctx, float* image, float* alpha) {
   ctx.transmittance.resize((size_t)ctx.camera.width * ctx.camera.height);
-  Pool::run(ctx.threads, [&](int part) {
-    const int end = ctx.first_tile(part + 1);
-    for (int tile = ctx.first_tile(part); tile < end; tile++) blend_tile<C>(ctx, tile, image, alpha);
+  ctx.work_before.assign(ctx.tiles() + 1, 0);
+  std::atomic<int> next{0};
+  Pool::run(ctx.threads, [&](int) {
+    for (int tile; (tile = next.fetch_add(1, std::memory_order_relaxed)) < ctx.tiles();)
+      ctx.work_before[tile + 1] = blend_tile<C>(ctx, tile, image, alpha);
   });
+  for (int tile = 0; tile < ctx.tiles(); tile++) ctx.work_before[tile + 1] += ctx.work_before[tile];
 }
 
 // Returns per-thread sums [threads, count, kGradientFloats]; slots as moment_slot says.

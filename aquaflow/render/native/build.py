@@ -19,13 +19,46 @@ from pathlib import Path
 NATIVE_DIR = Path(__file__).resolve().parent
 SOURCE = "aquaflow_native.cpp"
 
-ISA_FLAGS: dict[str, tuple[str, ...]] = {
-    "avx512": ("-march=x86-64-v4", "-mprefer-vector-width=512"),
-    "avx2": ("-march=x86-64-v3",),
-    "sse4": ("-march=x86-64-v2",),
-    "neon": ("-march=armv8-a",),
+X86_64_V2 = {
+    "cx16": "-mcx16",
+    "lahf_lm": "-msahf",
+    "popcnt": "-mpopcnt",
+    "sse4_1": "-msse4.1",
+    "sse4_2": "-msse4.2",
+    "ssse3": "-mssse3",
 }
-"""Instruction sets by name, fastest first within an architecture."""
+X86_64_V3 = X86_64_V2 | {
+    "abm": "-mlzcnt",
+    "avx2": "-mavx2",
+    "bmi1": "-mbmi",
+    "bmi2": "-mbmi2",
+    "f16c": "-mf16c",
+    "fma": "-mfma",
+    "movbe": "-mmovbe",
+}
+X86_64_V4 = X86_64_V3 | {
+    "avx512bw": "-mavx512bw",
+    "avx512cd": "-mavx512cd",
+    "avx512dq": "-mavx512dq",
+    "avx512f": "-mavx512f",
+    "avx512vl": "-mavx512vl",
+}
+"""Levels of the x86-64 psABI: name in /proc/cpuinfo -> compiler flag. One table for both, so that a
+library holds no instruction that is not looked for; compilers before -march=x86-64-v3 (GCC 11,
+clang 12) know these flags too."""
+
+CPU_FLAGS = {"avx512": X86_64_V4, "avx2": X86_64_V3, "sse4": X86_64_V2, "neon": {}}
+"""What a library may use, and /proc/cpuinfo must list."""
+
+EXTRA_FLAGS = {"avx512": ("-mprefer-vector-width=512",), "neon": ("-march=armv8-a",)}
+
+ISAS = {
+    "x86_64": ("avx512", "avx2", "sse4"),
+    "amd64": ("avx512", "avx2", "sse4"),
+    "aarch64": ("neon",),
+    "arm64": ("neon",),
+}
+"""Variants by architecture, as the operating system or the compiler calls it, fastest first."""
 
 COMPILE_FLAGS = (
     "-std=c++17",
@@ -45,29 +78,26 @@ COMPILE_FLAGS = (
 LINK_FLAGS = ("-shared", "-pthread")
 """Never -ffast-math here: a library linked with it switches denormals off in the whole process."""
 
-CPU_FLAGS = {
-    "avx512": {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl", "avx2", "fma", "bmi2"},
-    "avx2": {"avx2", "fma", "bmi1", "bmi2", "f16c", "movbe"},
-    "sse4": {"sse4_1", "sse4_2", "ssse3", "popcnt"},
-}
-"""What /proc/cpuinfo must list."""
-
 
 class BuildError(RuntimeError):
     """The kernels cannot be compiled; the message is one sentence."""
 
 
-def buildable_isas() -> tuple[str, ...]:
-    """Variants that make sense on this architecture, fastest first."""
-    machine = platform.machine().lower()
-    if machine in {"x86_64", "amd64"}:
-        return ("avx512", "avx2", "sse4")
-    return ("neon",) if machine in {"aarch64", "arm64"} else ()
+def target_isas(compiler: list[str]) -> tuple[str, ...]:
+    """Variants of the architecture that ``compiler`` builds for, fastest first.
+
+    That is the machine's own unless it is a cross compiler such as ``aarch64-linux-gnu-g++``.
+    """
+    asked = subprocess.run(
+        [*compiler, "-dumpmachine"], capture_output=True, text=True, errors="replace", check=False
+    )
+    triplet = asked.stdout.strip() if asked.returncode == 0 else platform.machine()
+    return ISAS.get(triplet.partition("-")[0].lower(), ())
 
 
 def supported_isas(cpuinfo: Path = Path("/proc/cpuinfo")) -> tuple[str, ...]:
     """Variants that this processor runs, fastest first."""
-    isas = buildable_isas()
+    isas = ISAS.get(platform.machine().lower(), ())
     if "neon" in isas:
         return isas  # part of every 64-bit Arm processor
     try:
@@ -75,12 +105,12 @@ def supported_isas(cpuinfo: Path = Path("/proc/cpuinfo")) -> tuple[str, ...]:
     except OSError:
         return isas[-1:]
     flags = set(next((line for line in lines if line.startswith("flags")), "").split())
-    return tuple(isa for isa in isas if flags >= CPU_FLAGS[isa])
+    return tuple(isa for isa in isas if flags >= CPU_FLAGS[isa].keys())
 
 
 def source_hash(directory: Path = NATIVE_DIR) -> str:
     """Hash of the sources and of the flags they are compiled with."""
-    digest = hashlib.sha256(repr((ISA_FLAGS, COMPILE_FLAGS, LINK_FLAGS)).encode())
+    digest = hashlib.sha256(repr((CPU_FLAGS, EXTRA_FLAGS, COMPILE_FLAGS, LINK_FLAGS)).encode())
     for path in sorted([directory / SOURCE, *directory.glob("*.h")]):
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]
@@ -107,6 +137,12 @@ def find_compiler() -> list[str] | None:
     return None
 
 
+def compile_flags(isa: str) -> list[str]:
+    """How the sources are compiled for the variant ``isa``."""
+    instructions = [*CPU_FLAGS[isa].values(), *EXTRA_FLAGS.get(isa, ())]
+    return [*COMPILE_FLAGS, *instructions, f'-DAQ_SOURCE_HASH="{source_hash()}"']
+
+
 def build(isa: str, out_dir: Path) -> Path:
     """Compile the variant ``isa`` into ``out_dir``; the finished file appears in one step.
 
@@ -120,10 +156,8 @@ def build(isa: str, out_dir: Path) -> Path:
         out_dir.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".build-", dir=out_dir) as scratch:
             obj, library = Path(scratch) / "native.o", Path(scratch) / target.name
-            macro = f'-DAQ_SOURCE_HASH="{source_hash()}"'
             source = str(NATIVE_DIR / SOURCE)
-            flags = (*COMPILE_FLAGS, *ISA_FLAGS[isa], macro)
-            _run([*compiler, *flags, "-c", source, "-o", str(obj)])
+            _run([*compiler, *compile_flags(isa), "-c", source, "-o", str(obj)])
             _run([*compiler, *LINK_FLAGS, str(obj), "-o", str(library)])
             os.replace(library, target)
     except OSError as error:
@@ -132,9 +166,10 @@ def build(isa: str, out_dir: Path) -> Path:
 
 
 def _run(command: list[str]) -> None:
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
     if done.returncode != 0:
-        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        lines = done.stderr.strip().splitlines() or ["no message"]
+        cause = next((line for line in lines if "error" in line), lines[-1])
         raise BuildError(
-            f"`{command[0]}` failed on {SOURCE}: {last}; check the compiler, or set CXX"
+            f"`{command[0]}` failed on {SOURCE}: {cause}; check the compiler, or set CXX"
         )

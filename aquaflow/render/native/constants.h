@@ -12,6 +12,7 @@ constexpr float kTangentMargin = 0.3f;        // half fields of view outside the
 constexpr float kMinQuatNormSq = 1e-24f;      // shorter quaternions have no direction
 constexpr float kMaxSigmaPx = 1e5f;           // keeps det(V') inside float32
 constexpr float kRadiusSigmas = 3.0f;         // reported radius
+constexpr int kTile = 16;                     // pixels; 8 is a third slower, 32 needs more mask bits
 
 constexpr int kSsimWindow = 11;
 constexpr double kSsimSigma = 1.5;

@@ -1,10 +1,10 @@
 // What a forward pass leaves for its backward pass: projected Gaussians and tile lists.
 #pragma once
+#include <algorithm>
 #include <vector>
 
 namespace aq {
 
-constexpr int kTile = 16;  // pixels; 8 is a third slower, 32 needs more mask bits than it saves
 constexpr int kBlocksX = kTile / kBlockW, kBlocksY = kTile / kBlockH;
 constexpr int kBlocks = kBlocksX * kBlocksY;
 constexpr int kGradientFloats = 16;  // one cache line per Gaussian and thread
@@ -18,6 +18,21 @@ typedef uint64_t BlockMask;
 #endif
 static_assert(kBlocks <= 8 * (int)sizeof(BlockMask), "a tile has more blocks than a mask has bits");
 constexpr BlockMask kAllBlocks = BlockMask(~BlockMask(0)) >> (8 * sizeof(BlockMask) - kBlocks);
+
+// Corners of the blocks of a tile, and their products: a table is cheaper than int to float.
+struct BlockOffsets {
+  float x[kBlocks], y[kBlocks], xx[kBlocks], xy[kBlocks], yy[kBlocks];
+  constexpr BlockOffsets() : x(), y(), xx(), xy(), yy() {
+    for (int b = 0; b < kBlocks; b++) {
+      x[b] = (float)(b % kBlocksX * kBlockW);
+      y[b] = (float)(b / kBlocksX * kBlockH);
+      xx[b] = x[b] * x[b];
+      xy[b] = x[b] * y[b];
+      yy[b] = y[b] * y[b];
+    }
+  }
+};
+constexpr BlockOffsets kOffsets;
 
 // A projected Gaussian, one cache line. log2 alpha(x, y) = qa dx^2 + qb dx dy + qc dy^2 + log2_opacity
 // with dx = x - u, dy = y - v and pixel centres at whole numbers.
@@ -62,6 +77,7 @@ struct Context {
   int count = 0, visible = 0, threads = 1, channels = 3;
   int tiles_x = 0, tiles_y = 0;
   Camera camera{};
+  ActiveTiles active;
   std::vector<Splat> splats;              // [count], storage order
   std::vector<float> depth;               // [count], metres; negative = culled
   std::vector<uint32_t> key, key_swap;    // radix sort
@@ -71,24 +87,26 @@ struct Context {
   std::vector<std::vector<TileHit>> hits; // per thread
   std::vector<TileEntry> entries;         // front to back inside each tile
   std::vector<float> transmittance;       // [H, W] what is left behind the last Gaussian
+  std::vector<int64_t> work_before;       // [tiles + 1] work of drawing the tiles before
   AlignedBuffer<float> gradient;          // [threads, count, kGradientFloats]
 
   int tiles() const { return tiles_x * tiles_y; }
 
-  // Contiguous runs of tiles with about equal work; contiguity keeps splats in the core's cache.
+  // Contiguous runs of tiles with about equal work, as the forward pass found it; contiguity keeps
+  // splats in the core's cache.
   int first_tile(int part) const {
-    constexpr int64_t kTileOverhead = 32;  // entries' worth of work in an empty tile
-    const int n = tiles();
-    if (part >= threads) return n;
-    const int64_t total = tile_offset[n] + kTileOverhead * n, target = total * part / threads;
-    int low = 0, high = n;
-    while (low < high) {
-      const int middle = (low + high) / 2;
-      if (tile_offset[middle] + kTileOverhead * middle < target) low = middle + 1;
-      else high = middle;
-    }
-    return low;
+    const int64_t target = work_before.back() * part / threads;
+    return (int)(std::lower_bound(work_before.begin(), work_before.end(), target) - work_before.begin());
   }
 };
+
+// The tiles that the box around a splat's ellipse touches on the picture.
+AQ_INLINE TileBox tile_box(const Context& ctx, const Splat& s) {
+  const auto clamped = [](float pixel, int tiles) {
+    return (int)std::min(std::max(pixel * (1.0f / kTile), 0.0f), (float)(tiles - 1));
+  };
+  return {clamped(s.u - s.extent_x, ctx.tiles_x), clamped(s.u + s.extent_x, ctx.tiles_x),
+          clamped(s.v - s.extent_y, ctx.tiles_y), clamped(s.v + s.extent_y, ctx.tiles_y)};
+}
 
 }  // namespace aq

@@ -2,11 +2,14 @@
 //
 // run(n, job) calls job(0) ... job(n - 1) once each. What a part computes depends on its number only,
 // never on the thread that ran it, so results repeat bit for bit at a given n. When the pool is busy
-// (another Python thread renders) the caller runs all parts itself, with the same result.
+// (another Python thread renders) the caller runs all parts itself, with the same result. A job whose
+// parts draw their work from a counter must itself see to it that the result does not depend on who drew.
 #pragma once
 #include <atomic>
 #include <condition_variable>
+#include <exception>
 #include <mutex>
+#include <new>
 #include <thread>
 #include <vector>
 #include <unistd.h>
@@ -29,12 +32,14 @@ class Pool {
   template <class Job>
   static void run(int parts, const Job& job) {
     if (parts > 1) {
-      Pool& pool = instance();
-      std::unique_lock<std::mutex> turn(pool.turn_, std::try_to_lock);
-      if (turn.owns_lock() && pool.start(parts - 1, &call<Job>, &job)) {
-        job(0);
-        pool.finish();
-        return;
+      if (Pool* pool = instance()) {
+        std::unique_lock<std::mutex> turn(pool->turn_, std::try_to_lock);
+        if (turn.owns_lock() && pool->start(parts - 1, &call<Job>, &job)) {
+          pool->attempt(0);
+          pool->finish();
+          if (pool->failed_.exchange(false)) throw std::bad_alloc();
+          return;
+        }
       }
     }
     for (int part = 0; part < parts; part++) job(part);
@@ -49,16 +54,17 @@ class Pool {
   }
 
   // Threads do not survive fork(): a child process gets a pool of its own, the parent's is left alone.
-  static Pool& instance() {
+  // Null where there is no memory for it.
+  static Pool* instance() {
     static std::mutex guard;
     static Pool* pool = nullptr;
     static pid_t owner = 0;
     std::lock_guard<std::mutex> lock(guard);
     if (owner != getpid()) {
-      pool = new Pool();  // never freed: its threads may outlive static destruction
-      owner = getpid();
+      pool = new (std::nothrow) Pool();  // never freed: its threads may outlive static destruction
+      if (pool) owner = getpid();
     }
-    return *pool;
+    return pool;
   }
 
   bool start(int helpers, Call call, const void* job) {
@@ -68,8 +74,8 @@ class Pool {
         threads_.emplace_back([this, number, seen = round_.load()] { work(number, seen); });
         threads_.back().detach();
       }
-    } catch (const std::system_error&) {
-      return false;  // no more threads to be had: the caller runs all parts
+    } catch (const std::exception&) {
+      return false;  // no more threads or no memory for them: the caller runs all parts
     }
     call_ = call;
     job_ = job;
@@ -81,6 +87,16 @@ class Pool {
     }
     wake_.notify_all();
     return true;
+  }
+
+  // An exception must leave neither a thread (it would end the process) nor run() while others work on
+  // the job. Kernels throw only when memory runs out.
+  void attempt(int part) {
+    try {
+      call_(job_, part);
+    } catch (const std::exception&) {
+      failed_.store(true, std::memory_order_relaxed);
+    }
   }
 
   void finish() {
@@ -101,7 +117,7 @@ class Pool {
         wake_.wait(lock, [&] { return round_.load(std::memory_order_acquire) != seen; });
       }
       seen++;
-      if (number <= helpers_) call_(job_, number);
+      if (number <= helpers_) attempt(number);
       running_.fetch_sub(1, std::memory_order_release);
     }
   }
@@ -110,6 +126,7 @@ class Pool {
   std::condition_variable wake_;
   std::atomic<uint64_t> round_{0};
   std::atomic<int> running_{0};
+  std::atomic<bool> failed_{false};
   std::vector<std::thread> threads_;
   Call call_ = nullptr;
   const void* job_ = nullptr;

@@ -95,6 +95,7 @@ static void project_chunk(Context& ctx, const GaussianInputs& in, int begin, int
     bool ok = p.depth[j] > 0;
     for (int k = 0; k < ctx.channels; k++) ok &= std::fabs(colour[k]) < HUGE_VALF;
     ctx.splats[i] = make_splat(p, j, colour, ctx.channels);
+    ok = ok && ctx.active.touch(tile_box(ctx, ctx.splats[i]));
     ctx.depth[i] = ok ? p.depth[j] : -1.0f;
     visible[i] = ok;
     radius_px[i] = ok ? p.radius[j] : 0.0f;

@@ -38,10 +38,6 @@ AQ_INLINE Vec keep(Mask m, Vec a) { return (Vec)_mm512_maskz_mov_ps(m, (__m512)a
 AQ_INLINE Vec min(Vec a, Vec b) { return (Vec)_mm512_min_ps((__m512)a, (__m512)b); }
 AQ_INLINE Vec max(Vec a, Vec b) { return (Vec)_mm512_max_ps((__m512)a, (__m512)b); }
 AQ_INLINE float sum(Vec a) { return _mm512_reduce_add_ps((__m512)a); }
-AQ_INLINE Vec reciprocal(Vec a) {  // 14 bits and one Newton step
-  Vec r = (Vec)_mm512_rcp14_ps((__m512)a);
-  return r * (splat(2.0f) - a * r);
-}
 
 #elif defined(__AVX2__)
 
@@ -52,14 +48,11 @@ AQ_INLINE bool any(Mask m) { return bits(m) != 0; }
 AQ_INLINE Vec keep(Mask m, Vec a) { return (Vec)((VecInt)a & m); }
 AQ_INLINE Vec min(Vec a, Vec b) { return (Vec)_mm256_min_ps((__m256)a, (__m256)b); }
 AQ_INLINE Vec max(Vec a, Vec b) { return (Vec)_mm256_max_ps((__m256)a, (__m256)b); }
+AQ_INLINE VecInt nearest(Vec a) { return (VecInt)_mm256_cvtps_epi32((__m256)a); }
 AQ_INLINE float sum(Vec a) {
   __m128 h = _mm_add_ps(_mm256_castps256_ps128((__m256)a), _mm256_extractf128_ps((__m256)a, 1));
   h = _mm_add_ps(h, _mm_movehl_ps(h, h));
   return _mm_cvtss_f32(_mm_add_ss(h, _mm_shuffle_ps(h, h, 1)));
-}
-AQ_INLINE Vec reciprocal(Vec a) {  // 12 bits and one Newton step
-  Vec r = (Vec)_mm256_rcp_ps((__m256)a);
-  return r * (splat(2.0f) - a * r);
 }
 
 #else
@@ -78,24 +71,26 @@ AQ_INLINE bool any(Mask m) {
 AQ_INLINE Vec keep(Mask m, Vec a) { return (Vec)((VecInt)a & m); }
 AQ_INLINE Vec min(Vec a, Vec b) { return a < b ? a : b; }
 AQ_INLINE Vec max(Vec a, Vec b) { return a > b ? a : b; }
+AQ_INLINE VecInt nearest(Vec a) {  // of a in [-16, 16]; the conversion itself cuts off
+  return __builtin_convertvector(a + splat(16.5f), VecInt) - 16;
+}
 AQ_INLINE float sum(Vec a) { return (a[0] + a[1]) + (a[2] + a[3]); }
-AQ_INLINE Vec reciprocal(Vec a) { return splat(1.0f) / a; }
 
 #endif
 
-// 2^x, relative error 3e-7 for x in [-16, 16]; what lies outside is masked by the callers.
+// 2^x, relative error 3e-6 for x in [-16, 16]; what lies outside is masked by the callers. The
+// polynomial is the one of fourth degree with the least relative error on [-1/2, 1/2] and value 1 at 0.
 AQ_INLINE Vec exp2(Vec x) {
 #if defined(__AVX512F__)
   const Vec whole = (Vec)_mm512_roundscale_ps((__m512)x, _MM_FROUND_TO_NEAREST_INT);
 #else
-  const VecInt n = __builtin_convertvector(x + splat(16.5f), VecInt) - 16;
+  const VecInt n = nearest(x);
   const Vec whole = __builtin_convertvector(n, Vec);
 #endif
   const Vec f = x - whole;
-  Vec p = splat(1.3333558e-3f) * f + splat(9.6181291e-3f);
-  p = p * f + splat(5.5504109e-2f);
-  p = p * f + splat(0.24022651f);
-  p = p * f + splat(0.69314718f);
+  Vec p = splat(9.58104707e-3f) * f + splat(5.5905971e-2f);
+  p = p * f + splat(0.240241451f);
+  p = p * f + splat(0.693124328f);
   p = p * f + splat(1.0f);
 #if defined(__AVX512F__)
   return (Vec)_mm512_scalef_ps((__m512)p, (__m512)whole);

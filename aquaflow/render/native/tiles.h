@@ -84,19 +84,6 @@ AQ_INLINE BlockMask reached_blocks(const Splat& s, float u, float v, const Block
   return out;
 }
 
-struct TileBox {
-  int x0, x1, y0, y1;  // inclusive
-};
-
-AQ_INLINE TileBox tile_box(const Context& ctx, const Splat& s) {
-  constexpr float kInverse = 1.0f / kTile;
-  const float last_x = (float)(ctx.tiles_x - 1), last_y = (float)(ctx.tiles_y - 1);
-  return {(int)clamp((s.u - s.extent_x) * kInverse, 0.0f, last_x),
-          (int)clamp((s.u + s.extent_x) * kInverse, 0.0f, last_x),
-          (int)clamp((s.v - s.extent_y) * kInverse, 0.0f, last_y),
-          (int)clamp((s.v + s.extent_y) * kInverse, 0.0f, last_y)};
-}
-
 // Hits of the splats [n part / parts, n (part + 1) / parts) in depth order, and their number per tile.
 static size_t find_hits(Context& ctx, int part) {
   const BlockCorners corners = block_corners();
@@ -115,6 +102,7 @@ static size_t find_hits(Context& ctx, int part) {
     for (int y = box.y0; y <= box.y1; y++)
       for (int x = box.x0; x <= box.x1; x++) {
         const int tile = y * ctx.tiles_x + x;
+        if (!ctx.active.contains(tile)) continue;
         const BlockMask blocks =
             reached_blocks(s, s.u - (float)(x * kTile), s.v - (float)(y * kTile), corners);
         hits[n] = {(uint32_t)tile, ctx.order[k], blocks};
@@ -127,17 +115,18 @@ static size_t find_hits(Context& ctx, int part) {
 
 // Turns the threads' counts into cursors: tile by tile, earlier (nearer) threads first.
 static void place_tiles(Context& ctx) {
-  int32_t next = 0;
+  int64_t next = 0;
   for (int tile = 0; tile < ctx.tiles(); tile++) {
-    ctx.tile_offset[tile] = next;
+    ctx.tile_offset[tile] = (int32_t)next;
     for (int part = 0; part < ctx.threads; part++) {
       int32_t& cursor = ctx.tile_cursor[(size_t)part * ctx.tiles() + tile];
       const int32_t n = cursor;
-      cursor = next;
+      cursor = (int32_t)next;
       next += n;
     }
   }
-  ctx.tile_offset[ctx.tiles()] = next;
+  if (next > INT32_MAX) throw std::length_error("tile lists");  // 16 GB of them
+  ctx.tile_offset[ctx.tiles()] = (int32_t)next;
   if ((int64_t)ctx.entries.size() < next) ctx.entries.resize(next);
 }
 

@@ -1,0 +1,152 @@
+// Runs every kernel on scenes from files, outside Python: under a sanitizer, under an emulator of
+// another processor, or short of memory. kernel_driver.py writes the scenes and reads the results.
+//
+//   kernel_driver SCENE RESULT [SCENE RESULT ...]
+//   kernel_driver --out-of-memory SCENE RESULT   every allocation fails once before it succeeds
+#include "aquaflow_native.cpp"
+
+#include <cstddef>
+#include <cstdio>
+#include <cstdlib>
+#include <string>
+
+static std::atomic<long> allocations_left{-1};  // negative: no limit
+
+static void* allocate(size_t size, size_t alignment) {
+  if (allocations_left.load() >= 0 && allocations_left.fetch_sub(1) <= 0) {
+    allocations_left = 0;
+    throw std::bad_alloc();
+  }
+  void* memory = nullptr;
+  if (posix_memalign(&memory, alignment, size) != 0) throw std::bad_alloc();
+  return memory;
+}
+
+void* operator new(size_t size) { return allocate(size, alignof(std::max_align_t)); }
+void* operator new(size_t size, const std::nothrow_t&) noexcept {
+  try {
+    return operator new(size);
+  } catch (const std::bad_alloc&) {
+    return nullptr;
+  }
+}
+void* operator new(size_t size, std::align_val_t alignment) { return allocate(size, (size_t)alignment); }
+void operator delete(void* memory) noexcept { std::free(memory); }
+void operator delete(void* memory, size_t) noexcept { std::free(memory); }
+void operator delete(void* memory, std::align_val_t) noexcept { std::free(memory); }
+void operator delete(void* memory, size_t, std::align_val_t) noexcept { std::free(memory); }
+
+typedef std::vector<float> Floats;
+
+// Exactly as long as its content, so that an address sanitizer sees the first element too far.
+class Scene {
+ public:
+  explicit Scene(const char* path) : file_(std::fopen(path, "rb")) {
+    if (!file_) std::perror(path), std::exit(2);
+    int32_t header[6];
+    read(header, sizeof header);
+    count = header[0], channels = header[1], width = header[2], height = header[3], threads = header[4];
+    const size_t n = count, pixels = (size_t)width * height;
+    for (size_t size : {3 * n, 4 * n, 3 * n, n, channels * n, (size_t)16, (size_t)4, pixels * channels, pixels,
+                        3 * pixels, pixels, pixels, (size_t)aq::kWater}) {
+      arrays.emplace_back(size);
+      read(arrays.back().data(), size * sizeof(float));
+    }
+    active.resize(header[5]);
+    read(active.data(), active.size());
+    std::fclose(file_);
+  }
+
+  enum { kMeans, kQuats, kScales, kOpacities, kColours, kViewmat, kIntrinsics, kGImage, kGAlpha, kTarget,
+         kWeight, kMask, kWaterRates };
+  const float* operator[](int array) const { return arrays[array].data(); }
+
+  int count, channels, width, height, threads;
+  std::vector<Floats> arrays;
+  std::vector<uint8_t> active;  // [tiles], or empty
+
+ private:
+  void read(void* to, size_t bytes) {
+    if (bytes && std::fread(to, 1, bytes, file_) != bytes) std::fputs("scene too short\n", stderr), std::exit(2);
+  }
+  std::FILE* file_;
+};
+
+// Calls a kernel until it reports success; unless memory is short that is the first time.
+template <class Kernel>
+static void run(bool out_of_memory, const Kernel& kernel) {
+  for (long allowed = 0;; allowed++) {
+    allocations_left = out_of_memory ? allowed : -1;
+    const int status = kernel();
+    allocations_left = -1;
+    if (status == 0) return;
+    if (!out_of_memory) std::fprintf(stderr, "kernel returned %d\n", status), std::exit(3);
+  }
+}
+
+static void draw(const Scene& s, bool short_of_memory, std::FILE* result) {
+  const size_t n = s.count, pixels = (size_t)s.width * s.height, c = s.channels;
+  const auto write = [&](const Floats& values) {
+    if (!values.empty()) std::fwrite(values.data(), sizeof(float), values.size(), result);
+  };
+  Floats image(pixels * c), alpha(pixels), radius(n);
+  std::vector<uint8_t> visible(n);
+  Floats g_means(3 * n), g_quats(4 * n), g_scales(3 * n), g_opacities(n), g_colours(c * n), g_viewmat(16);
+  void* context = aq_context_new();
+  run(short_of_memory, [&] {
+    return aq_forward(context, s.count, s.channels, s.width, s.height, s.threads, s[s.kMeans], s[s.kQuats],
+                      s[s.kScales], s[s.kOpacities], s[s.kColours], s[s.kViewmat], s[s.kIntrinsics],
+                      image.data(), alpha.data(), visible.data(), radius.data(),
+                      s.active.empty() ? nullptr : s.active.data());
+  });
+  run(short_of_memory, [&] {
+    return aq_backward(context, s[s.kMeans], s[s.kQuats], s[s.kScales], s[s.kOpacities], s[s.kColours],
+                       image.data(), s[s.kGImage], s[s.kGAlpha], g_means.data(), g_quats.data(),
+                       g_scales.data(), g_opacities.data(), g_colours.data(), g_viewmat.data());
+  });
+  aq_context_free(context);
+
+  Floats rendered(image), range(pixels), g_drawn(4 * pixels), g_a(pixels), g_water(aq::kWater);
+  if (s.channels == 4) {
+    rendered.resize(3 * pixels);
+    run(short_of_memory, [&] {
+      return aq_compose_water(image.data(), alpha.data(), s[s.kWaterRates], (int)pixels, s.threads,
+                              rendered.data(), range.data());
+    });
+    run(short_of_memory, [&] {
+      return aq_compose_water_backward(image.data(), alpha.data(), s[s.kWaterRates], (int)pixels, s.threads,
+                                       s[s.kTarget], s[s.kGAlpha], g_drawn.data(), g_a.data(), g_water.data());
+    });
+  }
+  Floats loss(1), g_rendered(3 * pixels);
+  run(short_of_memory, [&] {
+    return aq_photometric(rendered.data(), s[s.kTarget], s[s.kWeight], s[s.kMask], s.width, s.height, 0.2f,
+                          s.threads, loss.data(), g_rendered.data());
+  });
+
+  Floats means(s.arrays[s.kMeans]), first(3 * n), second(3 * n);
+  std::vector<int32_t> steps(n);
+  const Floats bias{10.0f, 31.622776f};
+  const AdamGroup group{means.data(), g_means.data(), first.data(), second.data(), 3, 1e-3f};
+  run(short_of_memory, [&] {
+    const int more_threads = s.threads + 1;  // the pool has to grow
+    const int skipped = aq_adam_step(1, &group, s.count, visible.data(), steps.data(), 0.9, 0.999, 1e-8f,
+                                     bias.data(), 1, more_threads);
+    return skipped < 0 ? skipped : 0;
+  });
+  for (const Floats* values : {&image, &alpha}) write(*values);
+  write(Floats(visible.begin(), visible.end()));
+  for (const Floats* values : {&radius, &g_means, &g_quats, &g_scales, &g_opacities, &g_colours, &g_viewmat,
+                               &rendered, &range, &g_drawn, &g_a, &g_water, &loss, &g_rendered, &means})
+    write(*values);
+}
+
+int main(int count, char** arguments) {
+  const bool short_of_memory = count > 1 && std::string(arguments[1]) == "--out-of-memory";
+  for (int i = short_of_memory ? 2 : 1; i + 1 < count; i += 2) {
+    std::FILE* result = std::fopen(arguments[i + 1], "wb");
+    if (!result) return std::perror(arguments[i + 1]), 2;
+    draw(Scene(arguments[i]), short_of_memory, result);
+    std::fclose(result);
+  }
+}

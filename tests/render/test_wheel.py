@@ -1,0 +1,119 @@
+"""The wheel: one for every Python version, with the kernels in it, installed without a compiler."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from aquaflow.render.native import build as native
+
+ROOT = Path(__file__).resolve().parents[2]
+PARTS = ("pyproject.toml", "setup.py", "README.md", "LICENSE", "aquaflow", "drivers", "sim_drivers")
+NO_COMPILER = {"PATH": "/nonexistent", "CXX": "/nonexistent/g++"}
+
+SHOW_RENDERER = """
+import warnings
+from aquaflow.render import select_renderer
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    renderer = select_renderer("auto")
+print(renderer.name, len(caught))
+if renderer.name == "cpu":
+    from aquaflow.render.library import load_library
+    print(load_library().path)
+"""
+
+
+def setuptools_is_recent() -> bool:
+    try:
+        return int(importlib.metadata.version("setuptools").partition(".")[0]) >= 77
+    except importlib.metadata.PackageNotFoundError:
+        return False
+
+
+pytestmark = pytest.mark.skipif(
+    not setuptools_is_recent(), reason="no setuptools >= 77 here to build a wheel with"
+)
+
+
+def pip(*arguments: object, cwd: Path, **environment: str) -> str:
+    """Run pip and return all it says; fails with that."""
+    done = subprocess.run(
+        [sys.executable, "-m", "pip", *map(str, arguments)],
+        cwd=cwd,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    said = done.stdout + done.stderr
+    assert done.returncode == 0, said
+    return said
+
+
+def build_wheel(folder: Path, **environment: str) -> tuple[Path, str]:
+    """A wheel from a copy of the sources, which holds a library from elsewhere; and the log."""
+    for part in PARTS:
+        source = ROOT / part
+        if source.is_dir():
+            shutil.copytree(
+                source, folder / part, ignore=shutil.ignore_patterns("*.so", "__pycache__")
+            )
+        else:
+            shutil.copy(source, folder / part)
+    (folder / "aquaflow/render/native/libaquaflow_elsewhere.so").write_bytes(b"elsewhere")
+    options = ("--no-deps", "--no-build-isolation", "--no-index", "-v", "-w", folder / "dist")
+    log = pip("wheel", ".", *options, cwd=folder, **environment)
+    (wheel,) = (folder / "dist").iterdir()
+    return wheel, log
+
+
+def libraries(wheel: Path) -> set[str]:
+    with zipfile.ZipFile(wheel) as archive:
+        return {Path(name).name for name in archive.namelist() if name.endswith(".so")}
+
+
+def renderer_of(wheel: Path, folder: Path) -> list[str]:
+    """What an installed wheel renders with where there is no compiler."""
+    installed = folder / "installed"
+    options = ("--no-deps", "--no-index", "--target", installed)
+    pip("install", wheel, *options, cwd=folder, **NO_COMPILER)
+    done = subprocess.run(
+        [sys.executable, "-c", SHOW_RENDERER],
+        cwd=folder / "dist",
+        env={**os.environ, **NO_COMPILER, "PYTHONPATH": str(installed)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def test_wheel_holds_every_variant_and_is_installed_without_a_compiler(tmp_path: Path) -> None:
+    compiler = native.find_compiler()
+    if compiler is None:
+        pytest.skip("no C++ compiler")
+    wheel, _ = build_wheel(tmp_path)
+    _, python, abi, platform = wheel.stem.rsplit("-", 3)
+    assert (python, abi) == ("py3", "none")
+    assert platform != "any"
+    assert libraries(wheel) == {f"libaquaflow_{isa}.so" for isa in native.target_isas(compiler)}
+    renderer, path = renderer_of(wheel, tmp_path)
+    assert renderer == "cpu 0"
+    assert Path(path).is_relative_to(tmp_path / "installed")
+
+
+def test_without_a_compiler_the_wheel_fits_every_machine_and_torch_renders(tmp_path: Path) -> None:
+    wheel, log = build_wheel(tmp_path, CXX=NO_COMPILER["CXX"])
+    assert wheel.name.endswith("-py3-none-any.whl")
+    assert libraries(wheel) == set()
+    assert "torch renderer will be used" in log
+    assert renderer_of(wheel, tmp_path) == ["tiles 1"]
