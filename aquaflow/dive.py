@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import logging
+import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,6 +38,9 @@ RESULTS = (
     *("metrics.json", "report.html", "heldout/*.png", "heldout/*.npz", "heldout/*.npz", TRACE),
 )
 """What a run writes at its end; of an earlier run in the same folder nothing must remain."""
+
+WORK = "work"
+"""Folder of what waits for a long dive's memory; gone when the run has ended."""
 
 LOGGERS = ("aquaflow", "py.warnings")
 """Loggers whose records go to log.jsonl."""
@@ -104,9 +108,16 @@ class DiveFolder:
         for pattern in RESULTS:
             for old in self.path.glob(pattern):
                 old.unlink()
+        shutil.rmtree(self.work, ignore_errors=True)  # of a run that was stopped
+
+    @property
+    def work(self) -> Path:
+        """Where a run may put what does not fit into memory."""
+        return self.path / WORK
 
     def close(self) -> None:
         """Release the open files; what was written stays."""
+        shutil.rmtree(self.work, ignore_errors=True)
         self._log.close()
         self._frames.close()
 

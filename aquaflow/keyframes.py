@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.prior.contract import Encoding
+from aquaflow.prior.contract import Encoding, Prior
+from aquaflow.spill import Arrays, Spill
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 UNKNOWN_VARIANCE = 1e6
 """Variance of an inverse depth that nothing has been measured about."""
+
+RESIDENT_KEYFRAMES = 32
+"""Keyframes in memory while the others wait in files: the current one, the last ones that a bundle
+adjustment takes, and some candidates of loop closures. About 5 MB each at 480 x 270 px."""
 
 
 @dataclass
@@ -56,25 +62,63 @@ class Pointmap:
         return Pointmap(self.camera, self.rho.copy(), self.variance.copy())
 
 
-@dataclass
+@dataclass(frozen=True)
+class _Content:
+    """What a keyframe keeps of every pixel."""
+
+    encoding: Encoding
+    pointmap: Pointmap
+
+
+@dataclass(eq=False)
 class Keyframe:
-    """A frame that others are tracked against."""
+    """A frame that others are tracked against; pose and sub-map may be set at any time."""
 
     number: int
     """Position in the store."""
     frame_index: int
     t_ns: int
-    encoding: Encoding
     T_wc: Sim3
-    pointmap: Pointmap
     sub_map: int
+    _store: KeyframeStore = field(repr=False)
+
+    @property
+    def encoding(self) -> Encoding:
+        return self._store.content(self.number).encoding
+
+    @property
+    def pointmap(self) -> Pointmap:
+        """Writable while the store holds this keyframe; of any other, set a new one instead."""
+        return self._store.content(self.number).pointmap
+
+    @pointmap.setter
+    def pointmap(self, pointmap: Pointmap) -> None:
+        self._store.replace_pointmap(self.number, pointmap)
 
 
-@dataclass
 class KeyframeStore:
-    """All keyframes of a dive, in the order of their making."""
+    """All keyframes of a dive, in the order of their making.
 
-    keyframes: list[Keyframe] = field(default_factory=list)
+    With a work folder, encodings and pointmaps of all but the last used keyframes wait in its
+    ``keyframes`` folder and come back, bit for bit, when they are looked up.
+    """
+
+    def __init__(
+        self,
+        work: Path | None = None,
+        prior: Prior | None = None,
+        resident: int = RESIDENT_KEYFRAMES,
+    ) -> None:
+        """``prior`` made the encodings, and packs them; a work folder needs it."""
+        if work is not None and prior is None:
+            raise ValueError("keyframes go to a work folder only with the prior that packs them")
+        self.keyframes: list[Keyframe] = []
+        self._prior = prior
+        self._cameras: list[tuple[CameraModel, CameraModel]] = []
+        """Of encoding and pointmap: before calibration they may differ."""
+        folder = None if work is None else work / "keyframes"
+        self._contents = Spill(folder, resident, self._pack, self._unpack)
+        self._held: int | None = None
 
     def add(
         self,
@@ -85,13 +129,75 @@ class KeyframeStore:
         pointmap: Pointmap,
         sub_map: int,
     ) -> Keyframe:
+        """Append a keyframe and hold it; the pointmap is the store's own from here on."""
         number = len(self.keyframes)
-        keyframe = Keyframe(number, frame_index, t_ns, encoding, T_wc, pointmap, sub_map)
+        keyframe = Keyframe(number, frame_index, t_ns, T_wc, sub_map, self)
         self.keyframes.append(keyframe)
-        return keyframe
+        self._cameras.append((encoding.camera, pointmap.camera))
+        self._contents[number] = _Content(encoding, pointmap)
+        return self.hold(number)
+
+    def hold(self, number: int) -> Keyframe:
+        """Make this the one keyframe whose pointmap may be changed in place, until the next call.
+
+        The one held before becomes read-only: from here on it may lie in a file.
+
+        Raises:
+            InputError: it cannot be read back; the one held before still is.
+        """
+        before = None if self._held is None else self.content(self._held).pointmap
+        self._contents.pin(number)
+        if before is not None:
+            _set_writable(before, False)
+        self._held = number
+        _set_writable(self.content(number).pointmap, True)
+        return self.keyframes[number]
+
+    def content(self, number: int) -> _Content:
+        """Encoding and pointmap.
+
+        Raises:
+            InputError: they cannot be read back.
+        """
+        return self._contents[number]
+
+    def replace_pointmap(self, number: int, pointmap: Pointmap) -> None:
+        """A better pointmap for a keyframe; it is the store's own from here on."""
+        _set_writable(pointmap, number == self._held)
+        self._cameras[number] = (self._cameras[number][0], pointmap.camera)
+        self._contents[number] = replace(self.content(number), pointmap=pointmap)
 
     def __len__(self) -> int:
         return len(self.keyframes)
 
     def __getitem__(self, number: int) -> Keyframe:
         return self.keyframes[number]
+
+    @property
+    def resident_bytes(self) -> int:
+        """Size of the encodings and pointmaps in memory; asks the prior."""
+        return self._contents.resident_bytes
+
+    def close(self, keep: bool = False) -> None:
+        """Remove the files; or, to ``keep`` them, write what is only in memory too."""
+        self._contents.close(keep)
+
+    def _pack(self, content: _Content) -> Arrays:
+        assert self._prior is not None
+        pointmap = {"rho": content.pointmap.rho, "variance": content.pointmap.variance}
+        packed = self._prior.pack(content.encoding)
+        return pointmap | {f"encoding.{name}": array for name, array in packed.items()}
+
+    def _unpack(self, number: int, arrays: Arrays) -> _Content:
+        assert self._prior is not None
+        encoding_camera, pointmap_camera = self._cameras[number]
+        pointmap = Pointmap(pointmap_camera, arrays.pop("rho"), arrays.pop("variance"))
+        _set_writable(pointmap, False)
+        packed = {name.removeprefix("encoding."): array for name, array in arrays.items()}
+        return _Content(self._prior.unpack(packed, encoding_camera), pointmap)
+
+
+def _set_writable(pointmap: Pointmap, writable: bool) -> None:
+    """A change that would be lost with the file's next reading is refused by numpy."""
+    pointmap.rho.setflags(write=writable)
+    pointmap.variance.setflags(write=writable)

@@ -187,6 +187,8 @@ def metrics(
     perceptual = [example.lpips for example in held_out if example.lpips is not None]
     return counts | {
         "sub_maps": len({t.sub_map for t in results if t.T_wc is not None}),
+        "skipped_by": dict(slam.skipped) | ({"dropped": len(dropped)} if dropped else {}),
+        "loops": slam.loops,
         "gaussians": sum(len(mapper.gaussians) for mapper in slam.mappers.values()),
         "steps": sum(mapper.steps for mapper in slam.mappers.values()),
         "steps_undone": sum(mapper.undone for mapper in slam.mappers.values()),

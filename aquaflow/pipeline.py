@@ -67,7 +67,11 @@ def map_recording(
     _fix_threads(config.threads or os.cpu_count() or 1)
     folder = DiveFolder(out, config, overwrite)
     try:
-        return _Replay(recording, name, folder, config, calibration, progress, trace).run()
+        replay = _Replay(recording, name, folder, config, calibration, progress, trace)
+        try:
+            return replay.run()
+        finally:
+            replay.slam.close()
     finally:
         folder.close()
         recording.close()
@@ -90,7 +94,7 @@ class _Replay:
         self.calibration = calibration or recording.camera
         self.preparation = Preparation(config.source, self.calibration)
         self.profiler = Profiler(trace)
-        self.slam = Slam(config, self.profiler)
+        self.slam = Slam(config, self.profiler, folder.work)
         self._trace = trace
         self._cpu_before_s = time.process_time()
         self.results: list[Tracked] = []

@@ -1,21 +1,28 @@
-"""AquaFlow, the algorithm: frames in, poses and maps out. No files, no threads, no clocks."""
+"""AquaFlow, the algorithm: frames in, poses and maps out. No threads, no clocks."""
 
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from pathlib import Path
 
 from aquaflow.config import Config
+from aquaflow.errors import ConfigError
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore, Pointmap
+from aquaflow.mapping.following import move_views
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.views import View
+from aquaflow.mapping.views import View, ViewStore
 from aquaflow.messages import Frame
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.profiler import Profiler
 from aquaflow.render import select_renderer
 from aquaflow.tracking.frames import FrameClass, Tracked
+from aquaflow.tracking.gate import FrameGate, Verdict
+from aquaflow.tracking.keyframe_graph import Correction, KeyframeGraph
+from aquaflow.tracking.places import Places
 from aquaflow.tracking.tracker import Tracker
 
 MIN_VIEWS = 3
@@ -23,48 +30,126 @@ MIN_VIEWS = 3
 
 
 class Slam:
-    """One dive: a tracker, its keyframes, and a map for every sub-map."""
+    """One dive: a tracker, its keyframes and their graph, and a map for every sub-map."""
 
-    def __init__(self, config: Config, profiler: Profiler | None = None) -> None:
+    def __init__(
+        self, config: Config, profiler: Profiler | None = None, work: Path | None = None
+    ) -> None:
+        """What does not fit into memory waits in the folder ``work``, if there is one.
+
+        Raises:
+            ConfigError: the prior cannot give what the config asks tracking for.
+        """
+        if config.tracking.residual == "point":
+            raise ConfigError(
+                "tracking.residual 'point' needs points of each frame's own, which the classical "
+                "prior does not have; choose pixel or ray"
+            )
         self.config = config
         self.profiler = profiler or Profiler()
         self.prior = ClassicalPrior()
-        self.keyframes = KeyframeStore()
-        self.tracker = Tracker(self.prior, self.keyframes, config.tracking)
+        self.keyframes = KeyframeStore(work, self.prior)
+        places = Places(self.keyframes, config.tracking)
+        self.gate = FrameGate(config.tracking.gate)
+        self.tracker = Tracker(self.prior, self.keyframes, config.tracking, places)
+        self.graph = KeyframeGraph(self.keyframes, places, config.tracking)
         self.renderer = select_renderer(config.mapping.renderer, config.threads or os.cpu_count())
         self.mappers: dict[int, Mapper] = {}
         self.held_out: dict[int, list[View]] = {}
         """Per sub-map, the views that were tracked but never mapped."""
+        self.skipped: Counter[str] = Counter()
+        """Frames that the gate kept from tracking, by its reason's kind."""
+        self.loops = 0
+        self._views = ViewStore(work)
         self._sequence: dict[int, int] = {}
         self._T_kf: dict[int, Sim3] = {}
         """By frame index: the pose against the frame's keyframe, which later corrections leave."""
+        self._latest: Tracked | None = None
         self._keyframe_views: dict[int, View] = {}
 
     def process(self, frame: Frame) -> list[Tracked]:
         """Everything the paper does with one frame; returns the frames whose fate it decided."""
+        # Not in the paper: is the frame worth looking at (DESIGN section 6)?
+        with self.profiler.stage("gate"):
+            verdict = self.gate.judge(frame.image, frame.mask)
+        if not verdict.passed:
+            return [self._skip(frame, verdict)]
         self._sequence[frame.index] = len(self._sequence)
 
         # Sec. 3.1 and 3.2: two-view prior, Sim(3) pose against the keyframe, frame class.
         with self.profiler.stage("track"):
             decided = self.tracker.track(frame)
+        if self.tracker.lost:
+            self.gate.forget()
 
+        # Sec. 3.2: loops between keyframes, graph optimisation, and a map that follows.
         # Sec. 3.3 and 3.4: grow and optimise the map.
-        for tracked in decided:
-            self._map(tracked)
-        return decided
+        return self._place_all(decided)
 
     def finish(self, progress: Callable[[int, int], None] | None = None) -> list[Tracked]:
         """After the last frame: what is still undecided, the last keyframes, the refinement."""
         with self.profiler.stage("track"):
             decided = self.tracker.finish()
-        for tracked in decided:
-            self._map(tracked)
+        placed = self._place_all(decided)
         self._retire_keyframes()
         with self.profiler.stage("refine"):
             for mapper in self.mappers.values():
                 if len(mapper.views) >= MIN_VIEWS:
                     mapper.refine(progress)
-        return decided
+        return placed
+
+    def close(self) -> None:
+        """Remove what waits in the work folder."""
+        self.keyframes.close()
+        self._views.close()
+
+    # --- poses --------------------------------------------------------------------------------
+
+    def _place_all(self, decided: list[Tracked]) -> list[Tracked]:
+        """Anchor all frames before a loop among them moves the keyframes that they hang on."""
+        for tracked in decided:
+            if tracked.keyframe is not None and tracked.T_wc is not None:
+                T_kw = self.keyframes[tracked.keyframe].T_wc.inverse()
+                self._T_kf[tracked.frame.index] = T_kw @ tracked.T_wc
+        return [self._place(tracked) for tracked in decided]
+
+    def _place(self, tracked: Tracked) -> Tracked:
+        """Let the keyframe graph and the map know of a frame; its pose after that."""
+        if tracked.keyframe is None or tracked.T_wc is None:
+            self._latest = None
+            return tracked
+        if tracked.frame_class is FrameClass.KEYFRAME:
+            with self.profiler.stage("graph"):
+                self._follow(self.graph.add(tracked.keyframe, tracked.link))
+        self._latest = self._settled(tracked)
+        if self.config.mapping.enabled:
+            self._map(self._latest)
+        return self._latest
+
+    def _skip(self, frame: Frame, verdict: Verdict) -> Tracked:
+        """A frame that was not looked at; one like the frame before it has that frame's pose."""
+        self.skipped[verdict.kind.value] += 1
+        before = self._latest
+        if not verdict.same_place or before is None or before.keyframe is None:
+            sub_map = self.tracker.sub_map
+            return Tracked(frame, FrameClass.SKIPPED, sub_map, reason=verdict.reason)
+        self._T_kf[frame.index] = self._T_kf[before.frame.index]
+        skipped = replace(before, frame=frame, frame_class=FrameClass.SKIPPED, pointmap=None)
+        return replace(skipped, link=None, reason=verdict.reason)
+
+    def _follow(self, correction: Correction) -> None:
+        """Gaussians and views go where their keyframes went; merged sub-maps become one map."""
+        self.loops += correction.loops
+        if not correction.moves:
+            return
+        for mapper in self.mappers.values():
+            mapper.move(correction.moves)
+        for views in self.held_out.values():
+            move_views(views, correction.moves)
+        for source, target in correction.merged.items():
+            if source in self.mappers:
+                self._mapper(target).absorb(self.mappers.pop(source))
+            self.held_out.setdefault(target, []).extend(self.held_out.pop(source, []))
 
     def settled(self, results: Iterable[Tracked]) -> list[Tracked]:
         """The frames with pose and sub-map as they are now, after all corrections of keyframes."""
@@ -77,15 +162,9 @@ class Slam:
         T_wc = keyframe.T_wc @ self._T_kf[tracked.frame.index]
         return replace(tracked, T_wc=T_wc, sub_map=keyframe.sub_map)
 
-    def _anchor(self, tracked: Tracked) -> None:
-        if tracked.T_wc is not None and tracked.keyframe is not None:
-            T_kw = self.keyframes[tracked.keyframe].T_wc.inverse()
-            self._T_kf[tracked.frame.index] = T_kw @ tracked.T_wc
+    # --- the map ------------------------------------------------------------------------------
 
     def _map(self, tracked: Tracked) -> None:
-        self._anchor(tracked)
-        if tracked.T_wc is None or not self.config.mapping.enabled:
-            return
         view = self._view(tracked)
         if self.is_held_out(tracked.frame):
             self.held_out.setdefault(tracked.sub_map, []).append(view)
@@ -139,7 +218,7 @@ class Slam:
         assert tracked.T_wc is not None
         assert tracked.keyframe is not None
         camera = self.tracker.camera or tracked.frame.camera
-        return View(
+        view = View(
             tracked.frame.index,
             tracked.frame.image,
             camera,
@@ -148,3 +227,4 @@ class Slam:
             robust=tracked.frame_class is FrameClass.COMMON,
             mask=tracked.frame.mask,
         )
+        return self._views.keep(view)

@@ -23,7 +23,7 @@ FLOORS = (
     {"image_metrics"},
     {"prior", "messages"},
     {"presets"},
-    {"render", "geometry", "config", "profiler"},
+    {"render", "geometry", "config", "profiler", "spill"},
     {"errors"},
     {"aquaflow"},
 )

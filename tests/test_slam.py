@@ -28,8 +28,13 @@ DRY = {"medium": {"enabled": False}}
 """Fitting water takes longer than all the rest; tests/mapping does it."""
 
 
-def config(**mapping: object) -> Config:
-    return parse_config({"threads": 1, "mapping": {"optimiser": STEPS, **mapping}}, "test")
+OPEN_GATE = dict.fromkeys(("skip_duplicates", "skip_dark", "skip_blurred", "skip_blinded"), False)
+
+
+def config(gate: dict[str, bool] | None = None, **mapping: object) -> Config:
+    tracking = {"gate": gate or {}}
+    settings = {"threads": 1, "tracking": tracking, "mapping": {"optimiser": STEPS, **mapping}}
+    return parse_config(settings, "test")
 
 
 @dataclass
@@ -122,6 +127,7 @@ class ToldTracker:
     """Decides every frame at once as it is told; keyframes go to the store as they do in truth."""
 
     camera: CameraModel | None = None
+    lost, sub_map = False, 0
 
     def __init__(self, slam: Slam, classes: str, sub_maps: str = "") -> None:
         self._slam, self._classes, self._sub_maps = slam, classes, sub_maps or "0" * len(classes)
@@ -173,7 +179,7 @@ def told(monkeypatch: pytest.MonkeyPatch) -> Told:
     def run(
         classes: str, sub_maps: str = "", indices: list[int] | None = None, **keys: object
     ) -> Slam:
-        slam = Slam(config(**keys))
+        slam = Slam(config(OPEN_GATE, **keys))  # the frames are noise
         monkeypatch.setattr(slam, "tracker", ToldTracker(slam, classes, sub_maps))
         for index in indices or range(len(classes)):
             slam.process(frame_of(index))
@@ -252,7 +258,7 @@ def test_the_stages_are_timed(told: Told, calls: Calls) -> None:
 
 
 def test_progress_of_the_refinement_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    slam, steps = Slam(config()), []
+    slam, steps = Slam(config(OPEN_GATE)), []
     monkeypatch.setattr(slam, "tracker", ToldTracker(slam, "KMM"))
     for index in range(3):
         slam.process(frame_of(index))

@@ -12,27 +12,42 @@ import yaml
 from pydantic import Field, ValidationError
 
 from aquaflow.config.mapping import (
+    DecoderConfig,
     InsertionConfig,
     LossConfig,
     MappingConfig,
     MediumConfig,
     OptimiserConfig,
+    VoxelConfig,
 )
 from aquaflow.config.source import SourceConfig
 from aquaflow.config.stage import Stage
-from aquaflow.config.tracking import InitialisationConfig, TrackingConfig
+from aquaflow.config.tracking import (
+    GateConfig,
+    GraphConfig,
+    InitialisationConfig,
+    RetrievalConfig,
+    TrackingConfig,
+    VerificationConfig,
+)
 from aquaflow.errors import ConfigError, InputError
 
 __all__ = [
     "Config",
+    "DecoderConfig",
+    "GateConfig",
+    "GraphConfig",
     "InitialisationConfig",
     "InsertionConfig",
     "LossConfig",
     "MappingConfig",
     "MediumConfig",
     "OptimiserConfig",
+    "RetrievalConfig",
     "SourceConfig",
     "TrackingConfig",
+    "VerificationConfig",
+    "VoxelConfig",
     "dump_config",
     "load_config",
     "parse_config",

@@ -104,6 +104,39 @@ class OptimiserConfig(Stage):
     heldout_rate: float = Field(5e-4, gt=0, description="rad and map units")
 
 
+class VoxelConfig(Stage):
+    """Groups of neighbouring Gaussians (paper, Sec. 3.3.1)."""
+
+    size: float = Field(
+        0.05,
+        gt=0,
+        description="map units (1 is the first keyframe's median range); paper: 0.2 m, which is "
+        "this at a range of 4 m; measured: 13 to 23 Gaussians a group on three dives",
+    )
+    capacity: int = Field(32, ge=1, description="Gaussians a group; paper: 32")
+
+
+class DecoderConfig(Stage):
+    """Rotation, scale and colour decoded from features and observation (paper, Sec. 3.3.1)."""
+
+    enabled: bool = Field(False, description="False: every Gaussian is explicit")
+    variant: Literal["lgpd", "mlp"] = Field(
+        "lgpd", description="mlp: as many weights without attention (the paper's w/o LGPD)"
+    )
+    distance: bool = Field(True, description="False: the decoder is not told the distance")
+    width: int = Field(32, ge=2, multiple_of=2, description="token width; paper silent")
+    local_width: int = Field(16, ge=1, description="feature of a Gaussian (ARTDECO: 16)")
+    global_width: int = Field(16, ge=1, description="feature of a group (ARTDECO: 16)")
+    max_turn: float = Field(
+        0.5, gt=0, description="largest component of the residual quaternion (1, u): 2 atan |u|"
+    )
+    max_log_scale: float = Field(1.0, gt=0, description="largest log-scale residual: factor e")
+    max_colour: float = Field(0.5, gt=0, description="largest residual of a raw colour")
+    rate: float = Field(4e-3, gt=0, description="Adam rate of the weights (ARTDECO: 4e-3)")
+    feature_rate: float = Field(4e-3, gt=0, description="of both features (ARTDECO: 4e-3)")
+    voxels: VoxelConfig = VoxelConfig()
+
+
 class MappingConfig(Stage):
     """The map (paper, Sec. 3.3 and 3.4)."""
 

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from aquaflow.config.stage import Stage
+
+PoseResidual = Literal["point", "ray", "pixel"]
+"""What a pose is solved from: points against points (the paper), rays, or calibrated pixels."""
 
 
 class InitialisationConfig(Stage):
@@ -40,6 +45,148 @@ class InitialisationConfig(Stage):
     )
 
 
+class GateConfig(Stage):
+    """The frame gate (DESIGN section 6): what is skipped before anything costly looks at it."""
+
+    skip_duplicates: bool = Field(True, description="skip: nothing moved since the last frame used")
+    skip_dark: bool = Field(True, description="skip: too little light for texture above the noise")
+    skip_blurred: bool = Field(True, description="skip: detail gone, against the frames before")
+    skip_blinded: bool = Field(True, description="skip: lamp glare, silt, open water: no texture")
+    duplicate_widths: float = Field(
+        0.3 / 480.0,
+        gt=0,
+        description="motion over width below which a frame is a duplicate; 0.3 px at 480 px is "
+        "what a checked DIS match is known to",
+    )
+    static_share: float = Field(
+        0.8,
+        gt=0,
+        lt=1,
+        description="part of the textured tiles that must stand still; fish move in the others",
+    )
+    min_snr: float = Field(
+        2.0,
+        gt=1,
+        description="gradient of a textured tile over that of noise alone; measured: below 1.2 to "
+        "1.8 in the median tile, flow finds no more than chance matches",
+    )
+    min_usable: float = Field(
+        0.05, ge=0, lt=1, description="textured share of the picture that a pose can come from"
+    )
+    dark_level: float = Field(
+        20.0, ge=0, le=255, description="grey level that tells dark from blinded, in the reason"
+    )
+    blur_loss: float = Field(
+        0.065,
+        ge=0,
+        lt=1,
+        description="sharpness left, of the running median; measured at 480 px: Gaussian blur of "
+        "5 px leaves 0.07 to 0.09 and still tracks, 8 px 0.04 to 0.06 and does not; good frames "
+        "keep over 0.69",
+    )
+    blur_memory: int = Field(9, ge=3, description="frames that the running sharpness is taken from")
+    longest_run: int = Field(
+        5,
+        ge=0,
+        description="dark, blurred or blinded frames skipped in a row; after them all pass until "
+        "one is good, so that tracking knows it is lost and a misjudged dive is still tracked",
+    )
+
+
+class RetrievalConfig(Stage):
+    """Candidates for loop closure and relocalisation."""
+
+    words: int = Field(
+        4096, ge=64, description="of the vocabulary; measured: 1024 separate half as well"
+    )
+    min_descriptors: int = Field(
+        100, ge=2, description="a picture with fewer is not remembered and not looked for"
+    )
+    neighbour_share: float = Field(
+        0.5,
+        ge=0,
+        le=1,
+        description="similarity of a plausible candidate over the median of consecutive keyframes",
+    )
+    min_similarity: float = Field(
+        0.02,
+        ge=0,
+        description="of a plausible candidate; measured: other places seldom reach it",
+    )
+    candidates: int = Field(3, ge=1, description="verified for each keyframe; MASt3R-SLAM: 3")
+
+
+class GraphConfig(Stage):
+    """The keyframe graph: robust Sim(3) pose-graph optimisation."""
+
+    enabled: bool = Field(True, description="False: no loops are looked for, no sub-maps merged")
+    loop_gap: int = Field(
+        12, ge=1, description="keyframes between which a link is no loop (ARTDECO: 12)"
+    )
+    link_scale_sigma: float = Field(
+        0.005,
+        gt=0,
+        description="relative scale that a link along the path may lose; on the reef clip 12 "
+        "keyframes lost 5 %",
+    )
+    huber_sigmas: float = Field(
+        3.75,
+        gt=0,
+        description="whitened residual from which an edge counts linearly; chi2(7), 95 %",
+    )
+    loop_chi2: float = Field(
+        24.3,
+        gt=0,
+        description="squared residual a loop edge may keep at full trust; chi2(7), 99.9 %",
+    )
+    drift_factor: float = Field(
+        2.0,
+        ge=1,
+        description="times worse than its covariance that the chain may have drifted for one loop "
+        "edge alone to be believed; false loops: tests/tracking/test_pose_graph.py",
+    )
+    corroborated_drift_factor: float = Field(
+        30.0,
+        ge=1,
+        description="the same for loop edges that say the same thing; drift of monocular scale has "
+        "always the same sign, so it outgrows its covariance (prior_notes 4)",
+    )
+    corroboration: int = Field(2, ge=1, description="others that must agree with a loop edge")
+    corroboration_window: int = Field(
+        30, ge=1, description="keyframes between the ends of loop edges that may corroborate"
+    )
+    tolerance_sigmas: float = Field(
+        1e-2, gt=0, description="poses that would move less, in own sigmas (rms), stay as they are"
+    )
+    max_iterations: int = Field(
+        60, ge=1, description="steps of one optimisation; 8 to 20 are usual for 10,000 keyframes"
+    )
+
+
+class VerificationConfig(Stage):
+    """When a place counts as found again. Measured on all shared clips: in 912 pairs of different
+    places at most 19 keypoints match and none agree on a pose; where a clip's frames still share a
+    third of the picture, at least 160 do, in 18 cells."""
+
+    min_inliers: int = Field(40, ge=10, description="keypoints that agree on the pose")
+    min_inlier_share: float = Field(
+        0.8, gt=0, le=1, description="of the matched keypoints; measured: below it, poses are bad"
+    )
+    min_cells: int = Field(
+        8, ge=1, le=48, description="of 8 x 6 cells with an inlier: one fish is no place"
+    )
+    inlier_px: float = Field(3.0, gt=0, description="reprojection error of an inlier")
+    sigma_px: float = Field(1.0, gt=0, description="noise of a keypoint at wide baseline")
+    known_sigma: float = Field(
+        0.15, gt=0, description="relative depth sigma of points that poses are solved from"
+    )
+    max_scale_sigma: float = Field(
+        0.05,
+        gt=0,
+        description="relative; two pointmaps whose scales are known worse are not joined",
+    )
+
+
 class TrackingConfig(Stage):
     """Tracking and frame classes (paper, Sec. 3.2)."""
 
@@ -70,6 +217,12 @@ class TrackingConfig(Stage):
         0.15, gt=0, description="relative depth sigma of points that poses are solved from"
     )
     sigma_px: float = Field(0.5, gt=0, description="noise of a checked DIS match")
+    residual: PoseResidual = Field(
+        "pixel",
+        description="what poses are solved from; point is the paper's and needs the frame's own "
+        "points; RMS error of t over the baseline at 5 % depth noise: point 3.6, ray 1.9, pixel "
+        "0.4 % (tests/tracking/test_residuals.py); on the reef clip ray and pixel are equal",
+    )
     reuse_encodings: bool = Field(
         True, description="skip: a keyframe's encoding is kept; False: made again for every frame"
     )
@@ -83,3 +236,7 @@ class TrackingConfig(Stage):
         3, ge=1, description="consecutive lost frames after which a new sub-map starts"
     )
     initialisation: InitialisationConfig = InitialisationConfig()
+    gate: GateConfig = GateConfig()
+    graph: GraphConfig = GraphConfig()
+    retrieval: RetrievalConfig = RetrievalConfig()
+    verification: VerificationConfig = VerificationConfig()

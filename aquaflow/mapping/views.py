@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,31 +13,93 @@ from torch import Tensor
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
+from aquaflow.spill import Arrays, Spill
+
+RESIDENT_VIEWS = 128
+"""Views in memory while the others wait in files; at most 1.4 MB each at 480 x 270 px. Any view may
+be the next to be optimised against, so that more of them only save a reading now and then."""
 
 
-@dataclass
-class View:
-    """One posed picture."""
+@dataclass(frozen=True)
+class Pixels:
+    """What a view keeps of every pixel."""
 
-    frame_index: int
     image: npt.NDArray[np.uint8]
     """[H, W, 3] RGB."""
-    camera: CameraModel
-    T_wc: Sim3
-    keyframe: int
-    """Number of the keyframe that the pose hangs on."""
-    robust: bool
-    """True for common frames, whose outliers are masked (paper, M)."""
     mask: npt.NDArray[np.bool_] | None = None
+    """[H, W], True where the picture shows the scene."""
     inverse_range: Tensor | None = None
-    """[H, W] 1 / range from tracking, in the keyframe's unit: T_wc.scale makes it the world's.
-    0 where unknown."""
+    """[H, W] 1 / range."""
     range_confidence: Tensor | None = None
     """[H, W] in [0, 1]."""
-    moments: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], int] = field(
-        default_factory=lambda: (np.zeros(6), np.zeros(6), 0)
-    )
-    """Adam's first and second moments of the pose, and its step count."""
+
+
+class View:
+    """One posed picture; its pixels lie in a ``ViewStore`` once one keeps them."""
+
+    def __init__(
+        self,
+        frame_index: int,
+        image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
+        camera: CameraModel,
+        T_wc: Sim3,
+        keyframe: int,
+        robust: bool,
+        mask: npt.NDArray[np.bool_] | None = None,  # [H, W]
+    ) -> None:
+        self.frame_index, self.camera, self.T_wc = frame_index, camera, T_wc
+        self.keyframe = keyframe
+        """Number of the keyframe that the pose hangs on."""
+        self.robust = robust
+        """True for common frames, whose outliers are masked (paper, M)."""
+        self.moments = (np.zeros(6), np.zeros(6), 0)
+        """Adam's first and second moments of the pose, and its step count."""
+        self._lies_in: dict[int, Pixels] | Spill[Pixels] = {frame_index: Pixels(image, mask)}
+
+    def move_pixels(self, store: Spill[Pixels]) -> None:
+        """Let the pixels lie in ``store``, under the frame's index."""
+        store[self.frame_index] = self._pixels
+        self._lies_in = store
+
+    @property
+    def _pixels(self) -> Pixels:
+        return self._lies_in[self.frame_index]
+
+    def _change(self, **arrays: Any) -> None:
+        self._lies_in[self.frame_index] = replace(self._pixels, **arrays)
+
+    @property
+    def image(self) -> npt.NDArray[np.uint8]:
+        """[H, W, 3] RGB."""
+        return self._pixels.image
+
+    @property
+    def mask(self) -> npt.NDArray[np.bool_] | None:
+        """[H, W], True where the picture shows the scene; to change it, set it."""
+        return self._pixels.mask
+
+    @mask.setter
+    def mask(self, mask: npt.NDArray[np.bool_] | None) -> None:
+        self._change(mask=mask)
+
+    @property
+    def inverse_range(self) -> Tensor | None:
+        """[H, W] 1 / range from tracking, in the keyframe's unit: T_wc.scale makes it the world's.
+        0 where unknown."""
+        return self._pixels.inverse_range
+
+    @inverse_range.setter
+    def inverse_range(self, inverse_range: Tensor | None) -> None:
+        self._change(inverse_range=inverse_range)
+
+    @property
+    def range_confidence(self) -> Tensor | None:
+        """[H, W] in [0, 1]."""
+        return self._pixels.range_confidence
+
+    @range_confidence.setter
+    def range_confidence(self, range_confidence: Tensor | None) -> None:
+        self._change(range_confidence=range_confidence)
 
     def target(self) -> Tensor:
         """[H, W, 3] float32 in [0, 1]."""
@@ -50,6 +114,44 @@ class View:
 
     def K(self) -> Tensor:
         return torch.from_numpy(self.camera.K).to(torch.float32)
+
+
+class ViewStore:
+    """Where the pixels of a dive's views lie: the last used in memory, the others, with a work
+    folder, in its ``views`` folder. They come back bit for bit."""
+
+    def __init__(self, work: Path | None = None, resident: int = RESIDENT_VIEWS) -> None:
+        folder = None if work is None else work / "views"
+        self._pixels = Spill(folder, resident, _pack, _unpack)
+
+    def keep(self, view: View) -> View:
+        """Take over the view's pixels; no other view of the dive may have its frame index."""
+        view.move_pixels(self._pixels)
+        return view
+
+    @property
+    def resident_bytes(self) -> int:
+        """Size of the pixels in memory."""
+        return self._pixels.resident_bytes
+
+    def close(self, keep: bool = False) -> None:
+        """Remove the files; or, to ``keep`` them, write what is only in memory too."""
+        self._pixels.close(keep)
+
+
+def _pack(pixels: Pixels) -> Arrays:
+    arrays = {"image": pixels.image, "mask": pixels.mask}
+    ranges = {"inverse_range": pixels.inverse_range, "range_confidence": pixels.range_confidence}
+    arrays |= {name: None if values is None else values.numpy() for name, values in ranges.items()}
+    return {name: array for name, array in arrays.items() if array is not None}
+
+
+def _unpack(number: int, arrays: Arrays) -> Pixels:
+    ranges = {
+        name: torch.from_numpy(arrays[name]) if name in arrays else None
+        for name in ("inverse_range", "range_confidence")
+    }
+    return Pixels(arrays["image"], arrays.get("mask"), **ranges)
 
 
 BETAS = (0.8, 0.99)

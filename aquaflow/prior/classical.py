@@ -5,8 +5,10 @@ It is the safety net, and the baseline that every trained prior has to beat.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +18,7 @@ from aquaflow.geometry.triangulation import triangulate
 from aquaflow.geometry.two_view import relative_pose
 from aquaflow.prior import flow as dense
 from aquaflow.prior import homography as sparse
-from aquaflow.prior.contract import Encoding, Float, Mask
+from aquaflow.prior.contract import Encoding, Float, Keypoints, Mask
 
 GOOD_SHARE = 0.5
 """A candidate flow that matches this part of the picture needs no rival."""
@@ -41,7 +43,7 @@ class ClassicalEncoding:
         return self.texture > dense.MIN_TEXTURE
 
     @cached_property
-    def keypoints(self) -> sparse.Keypoints:
+    def keypoints(self) -> Keypoints:
         return sparse.detect(self.grey)
 
 
@@ -146,6 +148,24 @@ class ClassicalPrior:
     ) -> ClassicalEncoding:
         grey = dense.normalised_grey(image)
         return ClassicalEncoding(camera, grey, dense.texture(grey))
+
+    def pack(self, encoding: Encoding) -> dict[str, npt.NDArray[Any]]:
+        """Grey and texture; keypoints only if they were detected."""
+        assert isinstance(encoding, ClassicalEncoding)
+        arrays: dict[str, npt.NDArray[Any]] = {"grey": encoding.grey, "texture": encoding.texture}
+        keypoints = vars(encoding).get("keypoints")
+        if keypoints is not None:
+            arrays |= {"pixels": keypoints.pixels, "descriptors": keypoints.descriptors}
+        return arrays
+
+    def unpack(
+        self, arrays: Mapping[str, npt.NDArray[Any]], camera: CameraModel
+    ) -> ClassicalEncoding:
+        """The encoding with all that was computed of it."""
+        encoding = ClassicalEncoding(camera, arrays["grey"], arrays["texture"])
+        if "pixels" in arrays:
+            encoding.keypoints = Keypoints(arrays["pixels"], arrays["descriptors"])
+        return encoding
 
     def decode(
         self,

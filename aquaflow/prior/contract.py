@@ -6,7 +6,9 @@ one behind these two protocols; nothing above them knows which is running.
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +19,16 @@ Float = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
 
+@dataclass(frozen=True)
+class Keypoints:
+    """Local features of one picture, by which places are found again."""
+
+    pixels: Float
+    """[M, 2] px, this package's convention."""
+    descriptors: Float
+    """[M, d]; alike where they are near each other. They do not change when the camera rolls."""
+
+
 class Encoding(Protocol):
     """One picture, digested once and kept with its frame."""
 
@@ -25,6 +37,11 @@ class Encoding(Protocol):
     @property
     def interesting(self) -> Mask:
         """[H, W]: pixels with enough texture that a match may be expected of them."""
+        ...
+
+    @property
+    def keypoints(self) -> Keypoints:
+        """Computed when first asked for; empty where the picture shows nothing."""
         ...
 
 
@@ -105,3 +122,11 @@ class Prior(Protocol):
         b: Encoding,
         predicted: Float | None = None,  # [H, W, 2] px, expected matches of a in b
     ) -> PairGeometry: ...
+
+    def pack(self, encoding: Encoding) -> dict[str, npt.NDArray[Any]]:
+        """The arrays of an encoding, not copied, for a file; what was not computed is left out."""
+        ...
+
+    def unpack(self, arrays: Mapping[str, npt.NDArray[Any]], camera: CameraModel) -> Encoding:
+        """The encoding that ``pack`` took apart, equal in every bit; ``arrays`` become its own."""
+        ...

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.prior.contract import Keypoints
 from aquaflow.prior.flow import Float, Grey, pixel_grid
 
 SIFT_FEATURES = 2000
@@ -19,16 +18,6 @@ RANSAC_PX = 4.0
 MIN_INLIERS = 12
 MIN_DENOMINATOR = 1e-6
 """On the plane's horizon the denominator is zero."""
-
-
-@dataclass(frozen=True)
-class Keypoints:
-    """SIFT keypoints of one picture."""
-
-    pixels: Float
-    """[M, 2] px, this package's convention."""
-    descriptors: Float
-    """[M, 128]"""
 
 
 def detect(

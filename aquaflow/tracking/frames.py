@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
+import numpy.typing as npt
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
@@ -34,6 +35,18 @@ class Quality:
 
 
 @dataclass(frozen=True)
+class Link:
+    """How a new keyframe hangs on the one that it was tracked against."""
+
+    keyframe: int
+    """Number of the earlier keyframe."""
+    T_fk: Sim3
+    """Earlier keyframe to new one."""
+    covariance: npt.NDArray[np.float64]
+    """[6, 6] of the left tangent [translation, rotation]."""
+
+
+@dataclass(frozen=True)
 class Tracked:
     """A frame with its pose, or the reason why it has none."""
 
@@ -47,6 +60,8 @@ class Tracked:
     pointmap: Pointmap | None = None
     """Depth of this frame's own pixels; present for keyframes and mapping frames."""
     reason: str = ""
+    link: Link | None = None
+    """Of a keyframe that continues a sub-map."""
 
     def bare(self) -> Tracked:
         """Itself without picture and pointmap: what a long dive can keep of every frame."""

@@ -1,8 +1,7 @@
-"""Pose of a frame against a keyframe's pointmap: calibrated Gauss-Newton (paper, Eq. pose_opt).
+"""Pose of a frame against a keyframe's pointmap: Levenberg-Marquardt (paper, Eq. pose_opt).
 
-The residual is the ``pixel`` one: the keyframe's point, moved into the frame, against its match.
-Scale is held at 1 inside a keyframe, because the paper's free scale shrinks at every link
-(prior_notes.md section 4).
+Scale is held at 1 inside a keyframe, because a free scale shrinks at every link
+(prior_notes.md section 4); between keyframes it may be freed.
 """
 
 from __future__ import annotations
@@ -12,8 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.geometry.camera import CameraModel
-from aquaflow.geometry.similarity import Sim3, hat, so3_exp
+from aquaflow.config.tracking import PoseResidual
+from aquaflow.geometry.similarity import Sim3, so3_exp
+from aquaflow.tracking.certainty import Degeneracy, cell_sums, certainty
+from aquaflow.tracking.residuals import ROWS, Matches, PoseProblem, Rows
+
+__all__ = ["PoseEstimate", "PoseProblem", "solve_pose"]
 
 Array = npt.NDArray[np.float64]
 
@@ -22,8 +25,13 @@ HUBER = 1.345
 INLIER = 3.0
 """Whitened residual up to which a match counts as an inlier."""
 MAX_ITERATIONS = 15
-STOP_STEP = 1e-7
-STOP_RELATIVE_DECREASE = 1e-6
+STOP_SIGMAS = 0.1
+"""A step of this many of the pose's own standard deviations is the last. Steps shrink at least
+threefold, also with a third of outliers: what is left is a twentieth of the noise."""
+SLACK = 1e-2
+"""Relative growth of the cost that refuses no step. The whitening depends on the pose, and outliers
+gain from a pose that is less certain; the scores leave that out, so near the solution the cost
+does not follow them."""
 FIRST_DAMPING = 1e-6
 MAX_DAMPING = 1e6
 
@@ -35,114 +43,82 @@ class PoseEstimate:
     T: Sim3
     """T_fk: keyframe to frame."""
     covariance: Array
-    """[6, 6] of the left tangent [translation, rotation]."""
+    """[6, 6] of the left tangent [translation, rotation]; [7, 7] with log-scale if that is free.
+    Huge, never singular, along a direction that the matches say nothing about."""
     inlier_share: float
     residual_px: float
     """Median reprojection error."""
     conditioning: float
-    """Smallest over largest eigenvalue of the scaled normal matrix: 0 for degenerate motion."""
-
-
-@dataclass(frozen=True)
-class PoseProblem:
-    """Matches of one frame with points of one keyframe."""
-
-    points: Array
-    """[M, 3] keyframe camera frame."""
-    rho_variance: Array
-    """[M] variance of the points' inverse depths in the keyframe."""
-    pixels: Array
-    """[M, 2] px, where the points are seen in the frame."""
-    weights: Array
-    """[M] match confidence in [0, 1]."""
-    camera: CameraModel
-    sigma_px: float
+    """Smallest over largest eigenvalue, translation in median depths: 0 for degenerate motion."""
+    degeneracy: Degeneracy
 
 
 def solve_pose(
-    problem: PoseProblem, initial: Sim3, stop_converged: bool = True
+    problem: PoseProblem,
+    initial: Sim3,
+    stop_converged: bool = True,
+    residual: PoseResidual = "pixel",
+    free_scale: bool = False,
 ) -> PoseEstimate | None:
     """Levenberg-Marquardt from ``initial``; None without matches, or when the normal equations stay
-    unsolvable. Without ``stop_converged`` it takes all MAX_ITERATIONS."""
-    if len(problem.points) == 0:
+    unsolvable. Without ``stop_converged`` it takes all MAX_ITERATIONS.
+
+    A match that is no number is left out. With ``free_scale`` the pose is a similarity; the
+    ``pixel`` and ``ray`` residuals see its scale only through the frame's own points.
+
+    Raises:
+        ValueError: ``point`` is asked for and the problem has no points of the frame's own.
+    """
+    matches = Matches(problem, residual, free_scale)
+    if len(matches) == 0 or not initial.is_finite():
         return None
+    linearise = ROWS[residual]
     T, damping = initial, FIRST_DAMPING
-    residual, J = _linearise(problem, T)
-    cost = _cost(residual, problem.weights)
+    rows = linearise(matches, T)
+    cost = _cost(rows.residual, matches.weights)
     for _ in range(MAX_ITERATIONS):
-        H, g = _normal_equations(residual, J, problem.weights)
+        H, g = _normal_equations(rows, matches.weights)
         step = _damped_step(H, g, damping)
         if step is None:
             return None
-        candidate = Sim3(so3_exp(step[3:]) @ T.R, so3_exp(step[3:]) @ T.t + step[:3])
-        new_residual, new_J = _linearise(problem, candidate)
-        new_cost = _cost(new_residual, problem.weights)
-        if not np.isfinite(new_cost) or new_cost > cost:
+        candidate = _moved(T, step)
+        new_rows = linearise(matches, candidate)
+        new_cost = _cost(new_rows.residual, matches.weights)
+        still = stop_converged and float(step @ H @ step) < STOP_SIGMAS**2
+        if not np.isfinite(new_cost) or new_cost > cost * (1.0 + SLACK):
             damping *= 10.0
-            if damping > MAX_DAMPING:
+            if still or damping > MAX_DAMPING:
                 break
             continue
-        decrease = (cost - new_cost) / max(cost, 1e-12)
-        T, residual, J, cost = candidate, new_residual, new_J, new_cost
+        T, rows, cost = candidate, new_rows, new_cost
         damping = max(damping * 0.1, 1e-9)
-        still = decrease < STOP_RELATIVE_DECREASE or float(np.linalg.norm(step)) < STOP_STEP
-        if still and stop_converged:
+        if still:
             break
-    return _summary(problem, T, residual, J)
+    return _summary(problem, matches, T, rows)
 
 
-def _linearise(problem: PoseProblem, T: Sim3) -> tuple[Array, Array]:
-    """Whitened residuals [M, 2] and Jacobians [M, 2, 6] (left tangent).
-
-    An error of the keyframe's inverse depth moves the projection along one direction, the epipolar
-    one: there the residual is divided by the larger sigma, across it by the matching noise alone.
-    """
-    camera = problem.camera
-    rotated = problem.points @ T.R.T
-    Y = rotated + T.t
-    inverse_z = 1.0 / np.maximum(Y[:, 2], 1e-6)
-    x, y = Y[:, 0] * inverse_z, Y[:, 1] * inverse_z
-    error = np.stack([camera.fx * x + camera.cx, camera.fy * y + camera.cy], -1) - problem.pixels
-
-    projection = np.zeros((len(Y), 2, 3))
-    projection[:, 0, 0] = camera.fx * inverse_z
-    projection[:, 0, 2] = -camera.fx * x * inverse_z
-    projection[:, 1, 1] = camera.fy * inverse_z
-    projection[:, 1, 2] = -camera.fy * y * inverse_z
-
-    # X = ray / rho  =>  dX/drho = -X / rho = -X z, and z = X_z of the keyframe's point.
-    depth = problem.points[:, 2]
-    along = np.einsum("nij,nj->ni", projection, -rotated * depth[:, None])
-    spread = np.linalg.norm(along, axis=1)
-    e = along / np.maximum(spread, 1e-12)[:, None]
-    sigma_along = np.sqrt(problem.sigma_px**2 + problem.rho_variance * spread**2)
-    rows = np.stack(
-        [e / sigma_along[:, None], np.stack([-e[:, 1], e[:, 0]], -1) / problem.sigma_px], axis=1
-    )
-    # A point with no parallax direction (spread 0) has both rows zero: use the axes instead.
-    still = spread < 1e-12
-    rows[still] = np.eye(2) / problem.sigma_px
-    residual = np.einsum("nij,nj->ni", rows, error)
-    dY = np.concatenate([np.broadcast_to(np.eye(3), (len(Y), 3, 3)), -hat(Y)], axis=2)
-    return residual, rows @ projection @ dY
+def _moved(T: Sim3, step: Array) -> Sim3:
+    """First-order retraction of the left tangent."""
+    R = so3_exp(step[3:6])
+    growth = float(np.exp(step[6])) if len(step) == 7 else 1.0
+    return Sim3(R @ T.R, growth * (R @ T.t) + step[:3], growth * T.scale)
 
 
 def _huber_weights(residual: Array) -> Array:
-    size = np.abs(residual)
-    return np.where(size <= HUBER, 1.0, HUBER / np.maximum(size, 1e-12))
+    return HUBER / np.maximum(np.abs(residual), HUBER)
 
 
 def _cost(residual: Array, weights: Array) -> float:
     size = np.abs(residual)
-    loss = np.where(size <= HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER))
-    return float((loss.sum(1) * weights).sum())
+    near = np.minimum(size, HUBER)
+    # Half the square up to HUBER, the tangent from there on.
+    return float(((size - 0.5 * near) * near).sum(0) @ weights)
 
 
-def _normal_equations(residual: Array, J: Array, weights: Array) -> tuple[Array, Array]:
-    w = _huber_weights(residual) * weights[:, None]
-    flat = J.reshape(-1, 6)
-    weighted = flat * w.reshape(-1, 1)
-    return weighted.T @ flat, weighted.T @ residual.reshape(-1)
+def _normal_equations(rows: Rows, weights: Array) -> tuple[Array, Array]:
+    root = np.sqrt(_huber_weights(rows.residual) * weights)
+    J = (rows.J * root).reshape(len(rows.J), -1)
+    return J @ J.T, J @ (rows.residual * root).reshape(-1)
 
 
 def _damped_step(H: Array, g: Array, damping: float) -> Array | None:
@@ -159,17 +135,23 @@ def _damped_step(H: Array, g: Array, damping: float) -> Array | None:
     return None
 
 
-def _summary(problem: PoseProblem, T: Sim3, residual: Array, J: Array) -> PoseEstimate | None:
-    H, _ = _normal_equations(residual, J, problem.weights)
+def _summary(problem: PoseProblem, matches: Matches, T: Sim3, rows: Rows) -> PoseEstimate | None:
+    H, _ = _normal_equations(rows, matches.weights)
     if not (np.isfinite(H).all() and T.is_finite()):
         return None
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-12))
-    eigenvalues = np.linalg.eigvalsh(H * scale[:, None] * scale[None, :])
-    conditioning = float(max(eigenvalues[0], 0.0) / max(eigenvalues[-1], 1e-12))
-    covariance = np.linalg.pinv(H, hermitian=True).astype(np.float64, copy=False)
-    Y = T.apply(problem.points)
-    in_front = Y[:, 2] > 1e-3
-    error = np.linalg.norm(problem.camera.project(Y) - problem.pixels, axis=1)
-    inlier = in_front & (np.abs(residual) < INLIER).all(1)
-    residual_px = float(np.median(error[inlier])) if inlier.any() else float("inf")
-    return PoseEstimate(T, covariance, float(inlier.mean()), residual_px, conditioning)
+    Y = T.scale * (T.R @ matches.X) + T.t[:, None]
+    in_front = Y[2] > 0.0
+    depth = float(np.median(Y[2][in_front])) if in_front.any() else 1.0
+    pull = _huber_weights(rows.residual) * rows.residual * matches.weights
+    scores, camera = (rows.J * pull).sum(1), matches.camera
+    cells = cell_sums(scores, matches.u, matches.v, camera.width, camera.height)
+    covariance, degeneracy = certainty(H, cells, T, depth)
+
+    inlier = in_front & (np.abs(rows.residual) < INLIER).all(0)
+    residual_px = float("inf")
+    if inlier.any():
+        seen = camera.project(Y[:, inlier].T)
+        error_u, error_v = seen[:, 0] - matches.u[inlier], seen[:, 1] - matches.v[inlier]
+        residual_px = float(np.median(np.hypot(error_u, error_v)))
+    share = float(inlier.sum()) / len(problem.points)
+    return PoseEstimate(T, covariance, share, residual_px, degeneracy.conditioning, degeneracy)

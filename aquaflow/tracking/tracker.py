@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
@@ -13,33 +11,34 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
 from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, PairGeometry, Prior
-from aquaflow.tracking.frames import FrameClass, Quality, Tracked
+from aquaflow.tracking.frames import FrameClass, Link, Quality, Tracked
 from aquaflow.tracking.fusion import fuse, transfer
 from aquaflow.tracking.initialisation import Initialised, Initialiser, calibrated
-from aquaflow.tracking.relocate import pose_from_scratch
-from aquaflow.tracking.solver import PoseEstimate, PoseProblem, solve_pose
+from aquaflow.tracking.matcher import KeyframeMatcher, Matched
+from aquaflow.tracking.places import Places
 
 MAX_ORPHANS = 60
 """Frames without a pose that are kept for back-filling; bounds memory while nothing moves."""
 
 
-@dataclass(frozen=True)
-class _Solved:
-    estimate: PoseEstimate
-    pair: PairGeometry
-    share: float
-    parallax_px: float
-
-
 class Tracker:
     """One camera, one stream; a loss starts a new sub-map instead of failing."""
 
-    def __init__(self, prior: Prior, keyframes: KeyframeStore, config: TrackingConfig) -> None:
+    def __init__(
+        self,
+        prior: Prior,
+        keyframes: KeyframeStore,
+        config: TrackingConfig,
+        places: Places | None = None,
+    ) -> None:
+        """Without ``places``, what was lost is never found again, only begun anew."""
         self.sub_map = 0
         self.camera: CameraModel | None = None
         """The camera as refined by initialisation, once known."""
         self.focal_sigma = 0.0
         self._prior, self._keyframes, self._config = prior, keyframes, config
+        self._places, self._matcher = places, KeyframeMatcher(config)
+        self._sub_maps = 1
         self._initialiser: Initialiser | None = None
         self._orphans: list[Frame] = []
         self._keyframe: Keyframe | None = None
@@ -55,15 +54,21 @@ class Tracker:
         """Poses that this frame makes known: none while waiting, several when waiting ends."""
         encoding = self._prior.encode(frame.image, self.camera or frame.camera)
         if self._keyframe is None:
-            return self._initialise(frame, encoding)
+            return self._find_again(frame, encoding) or self._initialise(frame, encoding)
         tracked = self._follow(frame, encoding)
-        if tracked is not None:
+        found = [tracked] if tracked is not None else self._find_again(frame, encoding)
+        if found:
             lost, self._lost = self._lost, []
-            return [self._as_lost(past) for past in lost] + [tracked]
+            return [self._as_lost(past) for past in lost] + found
         self._lost.append(frame)
         if len(self._lost) >= self._config.lost_after:
             return self._start_sub_map()
         return []
+
+    @property
+    def lost(self) -> bool:
+        """True while the latest frames found no place on the keyframe in use."""
+        return bool(self._lost)
 
     def finish(self) -> list[Tracked]:
         """Account for the frames that never got a pose; tries one last time with what there is."""
@@ -163,6 +168,36 @@ class Tracker:
         forgotten, self._orphans = self._orphans[:surplus], self._orphans[surplus:]
         return [self._as_lost(frame, "no parallax yet") for frame in forgotten]
 
+    # --- finding a place again ----------------------------------------------------------------
+
+    def _find_again(self, frame: Frame, encoding: Encoding) -> list[Tracked]:
+        """Go on at an earlier keyframe that shows the lost frame's place; nothing if none does.
+
+        Frames that waited for a new sub-map get their poses there too, where they can.
+        """
+        if self._places is None or self.camera is None:
+            return []
+        found = self._places.of_frame(encoding, self.camera)
+        if found is None:
+            return []
+        before = (self._keyframe, self._T_fk, self._velocity, self._predicted)
+        self._keyframe = self._keyframes.hold(found.keyframe.number)
+        self._T_fk, self._velocity, self._predicted = found.estimate.T, Sim3.identity(), None
+        self._mapped_parallax_px, self._keyframe_image = 0.0, None
+        tracked = self._follow(frame, encoding)
+        if tracked is None:
+            self._keyframe, self._T_fk, self._velocity, self._predicted = before
+            if self._keyframe is not None:
+                self._keyframes.hold(self._keyframe.number)
+            return []
+        if self._initialiser is not None:
+            self._orphans += self._waiting_frames(self._initialiser)
+            self._initialiser = None
+        here = (self._T_fk, self._predicted)
+        filled = self._back_fill()
+        self._T_fk, self._predicted = here
+        return [*filled, tracked]
+
     # --- following a keyframe -----------------------------------------------------------------
 
     def _follow(
@@ -188,63 +223,32 @@ class Tracker:
             T_fk,
             self.camera,
         )
+        link = None
         if frame_class is FrameClass.KEYFRAME:
+            link = Link(self._number, T_fk, solved.estimate.covariance)
+            self.sub_map = self._keyframe.sub_map
             T_wc = self._keyframe.T_wc @ T_fk.inverse()
             self._make_keyframe(frame, encoding, T_wc, pointmap)
         else:
             self._mapped_parallax_px = solved.parallax_px
-        return self._tracked(frame, frame_class, solved, pointmap.copy())
+        return self._tracked(frame, frame_class, solved, pointmap.copy(), link)
 
-    def _solve(self, encoding: Encoding, pair: PairGeometry | None) -> _Solved | None:
-        """Match against the keyframe and solve the pose; from scratch where prediction fails."""
+    def _solve(self, encoding: Encoding, pair: PairGeometry | None) -> Matched | None:
+        """Match against the keyframe and solve the pose."""
         keyframe, camera = self._keyframe, self.camera
         assert keyframe is not None
         assert camera is not None
         if pair is None:
             seed = self._predicted if self._config.seed_matching else None
             pair = self._prior.decode(self._reference(keyframe), encoding, seed)
-        problem, pixels_k = self._problem(keyframe, pair, camera)
-        if len(problem.points) < self._config.min_matches:
-            return None
-        stop = self._config.stop_converged
-        estimate = solve_pose(problem, self._velocity @ self._T_fk, stop)
-        if estimate is None or estimate.inlier_share < self._config.min_inlier_share:
-            estimate = solve_pose(problem, pose_from_scratch(problem) or self._T_fk, stop)
-        if estimate is None or estimate.inlier_share < self._config.min_inlier_share:
-            return None
-        share = _matched_share(keyframe.encoding, pair)
-        if share * estimate.inlier_share < self._config.min_support:
-            return None
-        displacement = np.linalg.norm(problem.pixels - pixels_k, axis=1)
-        return _Solved(estimate, pair, share, float(displacement.mean()))
+        return self._matcher.pose(keyframe, camera, pair, self._velocity @ self._T_fk, self._T_fk)
 
     def _reference(self, keyframe: Keyframe) -> Encoding:
-        if self._config.reuse_encodings:
+        if self._config.reuse_encodings or self._keyframe_image is None:
             return keyframe.encoding
-        assert self._keyframe_image is not None
         return self._prior.encode(self._keyframe_image, keyframe.pointmap.camera)
 
-    def _problem(
-        self, keyframe: Keyframe, pair: PairGeometry, camera: CameraModel
-    ) -> tuple[PoseProblem, npt.NDArray[np.float64]]:
-        """At most ``matches`` matches whose depth is known, and their keyframe pixels."""
-        usable = pair.valid & keyframe.pointmap.known(self._config.known_sigma)
-        rows, columns = np.nonzero(usable)
-        step = max(1, -(-len(rows) // self._config.matches))
-        rows, columns = rows[::step], columns[::step]
-        pixels_k = np.stack([columns + 0.5, rows + 0.5], -1)
-        rho = keyframe.pointmap.rho[rows, columns]
-        problem = PoseProblem(
-            camera.unproject(pixels_k) / rho[:, None],
-            keyframe.pointmap.variance[rows, columns],
-            pair.matches[rows, columns].astype(np.float64),
-            pair.C[rows, columns].astype(np.float64),
-            camera,
-            self._config.sigma_px,
-        )
-        return problem, pixels_k
-
-    def _classify(self, solved: _Solved) -> FrameClass:
+    def _classify(self, solved: Matched) -> FrameClass:
         """The paper's rules: keyframe by matched share, mapping frame by parallax."""
         if solved.share < self._config.keyframe_share:
             return FrameClass.KEYFRAME
@@ -271,7 +275,12 @@ class Tracker:
         self._T_fk, self._predicted, self._mapped_parallax_px = Sim3.identity(), None, 0.0
 
     def _tracked(
-        self, frame: Frame, frame_class: FrameClass, solved: _Solved, pointmap: Pointmap | None
+        self,
+        frame: Frame,
+        frame_class: FrameClass,
+        solved: Matched,
+        pointmap: Pointmap | None,
+        link: Link | None = None,
     ) -> Tracked:
         assert self._keyframe is not None
         # A new keyframe already is self._keyframe, with the identity as its relative pose.
@@ -280,13 +289,14 @@ class Tracker:
         quality = Quality(
             estimate.inlier_share, estimate.residual_px, solved.share, estimate.conditioning
         )
-        return Tracked(frame, frame_class, self.sub_map, self._number, T_wc, quality, pointmap)
+        sub_map, number = self._keyframe.sub_map, self._number
+        return Tracked(frame, frame_class, sub_map, number, T_wc, quality, pointmap, link=link)
 
     def _start_sub_map(self) -> list[Tracked]:
         """Give the lost frames to a new sub-map that starts where the old one ended."""
         assert self._keyframe is not None
         self._origin = self._keyframe.T_wc @ self._T_fk.inverse()
-        self.sub_map += 1
+        self.sub_map, self._sub_maps = self._sub_maps, self._sub_maps + 1
         self._keyframe, self._predicted, self._velocity = None, None, Sim3.identity()
         lost, self._lost = self._lost, []
         tracked = []
@@ -296,13 +306,3 @@ class Tracker:
 
     def _as_lost(self, frame: Frame, reason: str = "no pose found") -> Tracked:
         return Tracked(frame, FrameClass.LOST, self.sub_map, reason=reason)
-
-
-def _matched_share(encoding: Encoding, pair: PairGeometry) -> float:
-    """min(valid matches, distinct matched pixels) over the pixels looked at (DESIGN section 4)."""
-    looked_at = encoding.interesting
-    matched = looked_at & pair.valid
-    targets = np.floor(pair.matches[matched]).astype(np.int64)
-    hit = np.zeros_like(looked_at)
-    hit[targets[:, 1], targets[:, 0]] = True
-    return min(int(matched.sum()), int(hit.sum())) / max(int(looked_at.sum()), 1)
