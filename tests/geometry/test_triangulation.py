@@ -32,7 +32,7 @@ def seen(rays: Array, depth: Array, T_ba: Sim3) -> Array:
 
 
 def assert_finite(points: Triangulation) -> None:
-    for values in (points.rho, points.variance, points.parallax_rad):
+    for values in (points.rho, points.variance, points.sin_parallax):
         assert np.isfinite(values).all()
 
 
@@ -50,7 +50,7 @@ def test_the_parallax_is_the_angle_between_the_rays() -> None:
     X = rays * depth[:, None]
     from_b = X + SIDEWAYS.R.T @ SIDEWAYS.t
     cosine = (X * from_b).sum(1) / np.linalg.norm(X, axis=1) / np.linalg.norm(from_b, axis=1)
-    np.testing.assert_allclose(points.parallax_rad, np.arccos(cosine), atol=1e-7)
+    np.testing.assert_allclose(points.sin_parallax, np.sqrt(1.0 - cosine**2), atol=1e-7)
 
 
 def test_the_stated_variance_is_the_spread_under_noise() -> None:
