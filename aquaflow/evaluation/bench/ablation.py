@@ -42,6 +42,10 @@ def _tracking(**settings: object) -> dict[str, Any]:
     return {"tracking": settings}
 
 
+def _gate(**settings: object) -> dict[str, Any]:
+    return _tracking(gate=settings)
+
+
 NEVER_AGREES = 1e-9
 """Relative range difference: no map is this close, so no ray counts as explained."""
 
@@ -53,12 +57,16 @@ PARTS = (
     Part("without water fit", _medium(fit=False)),
     Part("without pose refinement", {"mapping": {"optimiser": {"poses": 0.0}}}),
     Part("without depth loss", {"mapping": {"loss": {"depth": 0.0}}}),
+    Part("without loop closure", _tracking(graph={"enabled": False})),
     Part("without distance embedding", built=False),
     Part("without LGPD (an MLP instead)", built=False),
     Part("without learned prior", built=False),
     Part("skip off: insertion only where the map is wrong", _insertion(agreement=NEVER_AGREES)),
-    Part("skip off: duplicate and stationary frames", built=False),
-    Part("skip off: dark, blurred or blinded frames", built=False),
+    Part("skip off: duplicate and stationary frames", _gate(skip_duplicates=False)),
+    Part(
+        "skip off: dark, blurred or blinded frames",
+        _gate(skip_dark=False, skip_blurred=False, skip_blinded=False),
+    ),
     Part("skip off: encoder features reused", _tracking(reuse_encodings=False)),
     Part("skip off: matching seeded by motion", _tracking(seed_matching=False)),
     Part("skip off: solver stops when converged", _tracking(stop_converged=False)),
