@@ -21,9 +21,11 @@ from aquaflow.geometry.two_view import (
     pose_candidates,
     rotation_compensated_parallax_px,
 )
+from aquaflow.keyframes import Pointmap
 from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, PairGeometry, Prior
 from aquaflow.tracking.bundle import Bundle, BundleResult, adjust
+from aquaflow.tracking.fusion import fuse
 from aquaflow.tracking.solver import PoseProblem, solve_pose
 
 Array = npt.NDArray[np.float64]
@@ -233,3 +235,14 @@ def _grid_samples(
     grid[step // 2 :: step, step // 2 :: step] = True
     rows, columns = np.nonzero(grid & interesting)
     return rows, columns
+
+
+def fused_pointmap(solution: Initialised, camera: CameraModel, sigma_px: float) -> Pointmap:
+    """The reference's pointmap from all waiting frames, best parallax first."""
+    pointmap = Pointmap.unknown(camera)
+    pairs = sorted(
+        zip(solution.waiting, solution.T, strict=True), key=lambda item: -item[0].parallax_px
+    )
+    for waiting, T in pairs:
+        fuse(pointmap, waiting.pair, T, camera, sigma_px)
+    return pointmap

@@ -13,7 +13,7 @@ from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, PairGeometry, Prior
 from aquaflow.tracking.frames import FrameClass, Link, Quality, Tracked
 from aquaflow.tracking.fusion import fuse, transfer
-from aquaflow.tracking.initialisation import Initialised, Initialiser, calibrated
+from aquaflow.tracking.initialisation import Initialiser, calibrated, fused_pointmap
 from aquaflow.tracking.matcher import KeyframeMatcher, Matched
 from aquaflow.tracking.places import Places
 
@@ -111,7 +111,7 @@ class Tracker:
             self.camera, self.focal_sigma = camera, solution.focal_sigma
         reference = initialiser.frame
         encoding = self._prior.encode(reference.image, camera)
-        pointmap = self._fused(solution, camera)
+        pointmap = fused_pointmap(solution, camera, self._config.sigma_px)
         self._orphans += initialiser.thinned
         self._initialiser = None
         self._make_keyframe(reference, encoding, self._origin, pointmap)
@@ -132,16 +132,6 @@ class Tracker:
             result = self._follow(waiting.frame, encoded, waiting.pair if on_reference else None)
             tracked.append(result or self._as_lost(waiting.frame))
         return tracked
-
-    def _fused(self, solution: Initialised, camera: CameraModel) -> Pointmap:
-        """The reference's pointmap from all waiting frames, best parallax first."""
-        pointmap = Pointmap.unknown(camera)
-        pairs = sorted(
-            zip(solution.waiting, solution.T, strict=True), key=lambda item: -item[0].parallax_px
-        )
-        for waiting, T in pairs:
-            fuse(pointmap, waiting.pair, T, camera, self._config.sigma_px)
-        return pointmap
 
     def _back_fill(self) -> list[Tracked]:
         """Poses of earlier frames that could not start a map, against the first keyframe."""
