@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from aquaflow.render.contract import Rendering, check_inputs
-from aquaflow.render.library import Library, load_library, pointer
+from aquaflow.render.library import STAGES, Library, load_library, pointer
 
 
 class _ContextPool:
@@ -19,6 +19,7 @@ class _ContextPool:
 
     def __init__(self, library: Library) -> None:
         self.library = library
+        self.stage_ms = [0.0] * len(STAGES)  # of the native call that ended last
         self.idle: deque[int] = deque()  # append and pop are atomic: renderers may share threads
         weakref.finalize(self, _free_all, library, self.idle)
 
@@ -41,6 +42,11 @@ class _Lease:
     def __del__(self) -> None:
         if hasattr(self, "context"):
             self.pool.idle.append(self.context)
+
+    def call(self, kernel: str, *arguments: object) -> None:
+        """Run a kernel on the context and keep its stage times, which outlive the lease."""
+        self.pool.library.call(kernel, self.context, *arguments)
+        self.pool.stage_ms = self.pool.library.stage_ms(self.context)
 
 
 class CpuRenderer:
@@ -86,6 +92,14 @@ class CpuRenderer:
         )
         return Rendering(image, alpha, visible, radius_px)
 
+    def stage_ms(self) -> dict[str, float]:
+        """Wall time of each stage, milliseconds, by the names of ``library.STAGES``.
+
+        Of the pass that ended last: after a backward pass all stages of that picture; after a
+        forward pass backward's are zero.
+        """
+        return dict(zip(STAGES, self._pool.stage_ms, strict=True))
+
 
 class _Rasterise(torch.autograd.Function):
     @staticmethod
@@ -114,7 +128,7 @@ class _Rasterise(torch.autograd.Function):
         sizes = (n, channels, width, height, threads)
         tensors = (*gaussians, viewmat, intrinsics, image, alpha, visible, radius_px)
         mask = None if active is None else pointer(active)
-        pool.library.call("aq_forward", lease.context, *sizes, *map(pointer, tensors), mask)
+        lease.call("aq_forward", *sizes, *map(pointer, tensors), mask)
         ctx.save_for_backward(*gaussians, image)
         ctx.lease = lease
         ctx.mark_non_differentiable(visible, radius_px)
@@ -126,9 +140,5 @@ class _Rasterise(torch.autograd.Function):
         *gaussians, image = ctx.saved_tensors
         gradients = [*(torch.empty_like(tensor) for tensor in gaussians), torch.empty(4, 4)]
         incoming = [g_image.contiguous(), g_alpha.contiguous()]
-        ctx.lease.pool.library.call(
-            "aq_backward",
-            ctx.lease.context,
-            *map(pointer, (*gaussians, image, *incoming, *gradients)),
-        )
+        ctx.lease.call("aq_backward", *map(pointer, (*gaussians, image, *incoming, *gradients)))
         return (*gradients, *[None] * 6)

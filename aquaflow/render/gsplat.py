@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
+import re
+from importlib import metadata
 
 import torch
 from torch import Tensor
@@ -11,10 +12,46 @@ from aquaflow.errors import AquaFlowError
 from aquaflow.render.activity import active_pixels, touches_active
 from aquaflow.render.contract import DILATION_PX2, NEAR_PLANE_M, Rendering, check_inputs
 
+OLDEST = (1, 5)
+"""The first version with the features used here."""
+
+
+def missing() -> str | None:
+    """Why this machine cannot draw with gsplat and what to do, in one sentence; None: it can.
+
+    The first call in a process may take minutes: where gsplat comes without kernels that fit torch,
+    it compiles them when they are imported.
+    """
+    if not torch.cuda.is_available():
+        return "Renderer gsplat needs a CUDA device and torch sees none; use renderer cpu."
+    try:
+        version = metadata.version("gsplat")
+    except metadata.PackageNotFoundError:
+        return "Renderer gsplat is not installed; run `pip install --no-deps 'gsplat>=1.5'`."
+    if tuple(map(int, re.findall(r"\d+", version)[:2])) < OLDEST:
+        return (
+            f"gsplat {version} is too old for AquaFlow; "
+            "run `pip install --no-deps --upgrade 'gsplat>=1.5'`."
+        )
+    return _missing_kernels()
+
+
+def _missing_kernels() -> str | None:
+    """gsplat without a compiler imports all the same, and fails at the first picture."""
+    remedy = "install the CUDA toolkit (nvcc) that fits torch, or use renderer cpu."
+    try:
+        from gsplat.cuda._backend import _C
+    except Exception as error:  # the import runs compilers and linkers
+        cause = str(error).strip().partition("\n")[0] or type(error).__name__
+        return f"gsplat's CUDA kernels do not load ({cause}); {remedy}"
+    if _C is None:
+        return f"gsplat has no CUDA kernels and cannot compile them; {remedy}"
+    return None
+
 
 def available() -> bool:
-    """Whether this machine has a CUDA device and gsplat is installed."""
-    return torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
+    """Whether this machine has a CUDA device, and gsplat with kernels for it."""
+    return missing() is None
 
 
 class GsplatRenderer:
@@ -31,15 +68,10 @@ class GsplatRenderer:
     threads = 1
 
     def __init__(self) -> None:
-        """Raises AquaFlowError when CUDA or gsplat is missing."""
-        if not torch.cuda.is_available():
-            raise AquaFlowError(
-                "Renderer gsplat needs a CUDA device and torch sees none; use renderer cpu."
-            )
-        if importlib.util.find_spec("gsplat") is None:
-            raise AquaFlowError(
-                "Renderer gsplat is not installed; run `pip install --no-deps 'gsplat>=1.5'`."
-            )
+        """Raises AquaFlowError, saying what to do, when something is missing."""
+        reason = missing()
+        if reason is not None:
+            raise AquaFlowError(reason)
 
     def __call__(
         self,

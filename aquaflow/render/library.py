@@ -23,6 +23,7 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "aq_context_free": (None, [_POINTER]),
     "aq_forward": (_INT, [_POINTER] + [_INT] * 5 + [_POINTER] * 12),
     "aq_backward": (_INT, [_POINTER] * 15),
+    "aq_stage_ms": (None, [_POINTER] * 2),
     "aq_photometric": (_INT, [_POINTER] * 4 + [_INT] * 2 + [_FLOAT, _INT] + [_POINTER] * 2),
     "aq_compose_water": (_INT, [_POINTER] * 3 + [_INT] * 2 + [_POINTER] * 2),
     "aq_compose_water_backward": (_INT, [_POINTER] * 3 + [_INT] * 2 + [_POINTER] * 5),
@@ -32,6 +33,9 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     ),
 }
 _BUILD_LOCK = threading.Lock()
+
+STAGES = ("project", "sort and bin", "blend", "blend backward", "project backward")
+"""Stages of drawing and differentiating, in the order of ``aq_stage_ms``."""
 
 
 class NativeUnavailableError(AquaFlowError):
@@ -66,6 +70,12 @@ class Library:
 
     def free_context(self, context: int) -> None:
         self._dll.aq_context_free(context)
+
+    def stage_ms(self, context: int) -> list[float]:
+        """Wall time of each of STAGES in the last passes of ``context``, milliseconds."""
+        out = (ctypes.c_double * len(STAGES))()
+        self._dll.aq_stage_ms(context, out)
+        return list(out)
 
     def constants(self) -> list[float]:
         """The constants compiled in, in the order of ``aq_constants``."""

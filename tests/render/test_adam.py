@@ -116,16 +116,37 @@ def test_state_follows_growth_and_pruning() -> None:
     assert torch.allclose(grown["means"][20:], torch.tensor(-1e-2), rtol=1e-4)
 
 
+def stepped(threads: int) -> tuple[dict[str, Tensor], Tensor]:
+    """A map of more than one chunk and thread, after steps that see parts of it."""
+    rows = 20_000
+    groups = tensors(rows)
+    adam = SelectiveAdam(groups, threads=threads)
+    rng = torch.Generator().manual_seed(9)
+    for it in range(3):
+        views = torch.rand(rows // 100, generator=rng) < 0.4
+        seen = views.repeat_interleave(100) & (torch.rand(rows, generator=rng) < 0.7)
+        grads = gradients(groups, it)
+        broken = torch.randint(rows, (5,), generator=rng)
+        grads["means"][broken, 1] = float("nan")
+        assert adam.step(seen, grads) == int(seen[broken].sum())
+    return {name: tensor for name, (tensor, _) in groups.items()}, adam.steps
+
+
 def test_the_result_does_not_depend_on_the_number_of_threads() -> None:
-    results = []
-    for threads in (1, 2, 5):
-        groups = tensors(2000)
-        adam = SelectiveAdam(groups, threads=threads)
-        for it in range(3):
-            adam.step(torch.ones(2000, dtype=torch.bool), gradients(groups, it))
-        results.append(groups["features"][0])
-    assert torch.equal(results[0], results[1])
-    assert torch.equal(results[0], results[2])
+    wanted, wanted_steps = stepped(1)
+    for threads in (2, 5):
+        got, steps = stepped(threads)
+        assert torch.equal(steps, wanted_steps)
+        assert all(torch.equal(got[name], wanted[name]) for name in wanted)
+
+
+def test_kernel_and_torch_take_the_same_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    got, steps = stepped(2)
+    monkeypatch.setattr("aquaflow.render.adam.library_or_none", lambda: None)
+    wanted, wanted_steps = stepped(2)
+    assert torch.equal(steps, wanted_steps)
+    for name in wanted:
+        assert torch.allclose(got[name], wanted[name], rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.usefixtures("implementation")

@@ -59,10 +59,15 @@ def test_equal_images_have_no_loss_and_no_gradient() -> None:
     assert rendered.grad.abs().max() < 1e-6
 
 
-def test_loss_does_not_depend_on_the_number_of_threads() -> None:
-    rendered, target, weight, mask = images(50, 43)
-    losses = [photometric_loss(rendered, target, weight, mask, 0.2, n).item() for n in (1, 2, 5)]
-    assert losses[0] == losses[1] == losses[2]
+@pytest.mark.parametrize("threads", [2, 3, 5, 40])
+def test_loss_and_gradient_do_not_depend_on_the_number_of_threads(threads: int) -> None:
+    rendered, target, weight, mask = images(51, 43)
+    results = []
+    for count in (1, threads):
+        leaf = rendered.clone().requires_grad_()
+        loss = photometric_loss(leaf, target, weight, mask, 0.2, count)
+        results.append((loss, *torch.autograd.grad(loss, leaf)))
+    assert all(map(torch.equal, *results))
 
 
 def test_ssim_of_constant_images_has_its_closed_form() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from functools import cache
 
@@ -22,7 +23,7 @@ from aquaflow.errors import AquaFlowError
 from aquaflow.render import contract
 from aquaflow.render.contract import Renderer, Rendering
 from aquaflow.render.cpu import CpuRenderer
-from aquaflow.render.library import load_library
+from aquaflow.render.library import STAGES, load_library
 from aquaflow.render.native import build as native
 from aquaflow.render.reference import ReferenceRenderer
 from aquaflow.render.tiles import TileRenderer
@@ -233,6 +234,32 @@ def test_contexts_return_to_the_pool_when_their_graph_is_gone() -> None:
         with torch.no_grad():
             renderer(*random_scene(1).leaves(), WIDTH, HEIGHT)
     assert len(renderer._pool.idle) == 1
+
+
+@needs_compiler
+@pytest.mark.parametrize("isa", native.supported_isas())
+def test_stage_times_are_those_of_the_last_pass_and_fit_into_it(isa: str) -> None:
+    renderer = CpuRenderer(1, isa)
+    assert renderer.stage_ms() == dict.fromkeys(STAGES, 0.0)
+    begin = time.perf_counter()
+    draw_and_differentiate(renderer, random_scene(0, n=2000))
+    passed_ms = 1e3 * (time.perf_counter() - begin)
+    both = renderer.stage_ms()
+    assert all(0 < both[stage] < passed_ms for stage in STAGES)
+    assert sum(both.values()) < passed_ms
+    with torch.no_grad():
+        renderer(*random_scene(1).leaves(), WIDTH, HEIGHT)
+    forward = renderer.stage_ms()
+    assert list(forward) == list(STAGES)
+    assert [stage for stage in STAGES if forward[stage] == 0] == list(STAGES[3:])
+
+
+@needs_compiler
+def test_stages_that_did_not_run_took_no_time() -> None:
+    renderer = CpuRenderer(1)
+    draw_and_differentiate(renderer, random_scene(0))
+    draw_and_differentiate(renderer, random_scene(0, n=0))  # backward has nothing to do
+    assert not any(renderer.stage_ms()[stage] for stage in STAGES[3:])
 
 
 @needs_compiler

@@ -91,16 +91,3 @@ def test_auto_takes_the_compiled_kernels_with_the_threads_asked_for() -> None:
         native.supported_isas()[0],
         1,
     )
-
-
-def test_gsplat_without_cuda_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    with pytest.raises(AquaFlowError, match="CUDA"):
-        select_renderer("gsplat")
-
-
-def test_gsplat_without_the_package_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(AquaFlowError, match=r"gsplat>=1\.5"):
-        select_renderer("gsplat")

@@ -1,7 +1,9 @@
 // Adam over the rows (Gaussians) that were visible, each with its own step count, so that a Gaussian's
 // first visible step is a proper first step.
 //
-// Row-wise and without sums across rows: the result does not depend on the number of threads.
+// In chunks of rows: rows are judged one by one, then short rows (means, scales, ...) are stepped as one
+// flat array, with each row's coefficients repeated over its elements. Without sums across rows: the
+// result does not depend on the number of threads.
 #pragma once
 
 namespace aq {
@@ -17,6 +19,9 @@ struct AdamGroup {
 };
 
 constexpr float kLargestGradient = 1e18f;  // its square is still finite; NaN fails the comparison too
+constexpr int kAdamRows = 8192;            // of a chunk: long runs of each array; its gradients stay cached
+constexpr int kAdamBlock = 64;             // rows stepped or passed over together
+constexpr int kAdamRowsPerThread = 4096;   // fewer are done before another thread is awake
 
 struct AdamStep {
   int groups;
@@ -30,48 +35,158 @@ struct AdamStep {
   int bias_rows;           // later steps use the last row, where both are 1
 };
 
-AQ_INLINE bool finite_row(const AdamStep& s, int row) {
-  bool finite = true;
-  for (int g = 0; g < s.groups; g++) {
-    const float* gradient = s.group[g].gradient + (size_t)row * s.group[g].dim;
-    for (int d = 0; d < s.group[g].dim; d++) finite &= std::fabs(gradient[d]) < kLargestGradient;
-  }
-  return finite;
+// Bias corrections of a chunk's rows; zero, which they never are, for a row that is not stepped.
+struct ChunkBias {
+  float first[kAdamRows], second[kAdamRows];
+};
+
+struct AdamCoefficients {
+  float take1, take2, learning_rate, eps;
+  AdamCoefficients(const AdamStep& s, const AdamGroup& g)
+      : take1((float)(1 - s.beta1)), take2((float)(1 - s.beta2)), learning_rate(g.learning_rate),
+        eps(s.eps) {}
+};
+
+// Always writes, if only what was there: processors are slow at masked stores.
+AQ_INLINE void step_element(const AdamCoefficients& k, float bias1, float bias2, float gradient, float& param,
+                            float& first_moment, float& second_moment) {
+  const bool stepped = bias1 > 0;
+  const float x = stepped ? gradient : 0.0f;  // what is not stepped may be NaN
+  const float take1 = stepped ? k.take1 : 0.0f, take2 = stepped ? k.take2 : 0.0f;
+  const float m = first_moment + take1 * (x - first_moment);
+  const float v = second_moment + take2 * (x * x - second_moment);
+  const float change = k.learning_rate * bias1 * m / (std::sqrt(v) * bias2 + k.eps);
+  first_moment = m;
+  second_moment = v;
+  param -= stepped ? change : 0.0f;
 }
 
-AQ_INLINE void update_row(const AdamStep& s, const AdamGroup& g, int row, const float* bias) {
-  const size_t at = (size_t)row * g.dim;
-  const float keep1 = (float)s.beta1, take1 = (float)(1 - s.beta1);
-  const float keep2 = (float)s.beta2, take2 = (float)(1 - s.beta2);
-  const float step_size = g.learning_rate * bias[0];
-  for (int d = 0; d < g.dim; d++) {
-    const float x = g.gradient[at + d];
-    const float m = keep1 * g.first_moment[at + d] + take1 * x;
-    const float v = keep2 * g.second_moment[at + d] + take2 * x * x;
-    g.first_moment[at + d] = m;
-    g.second_moment[at + d] = v;
-    g.param[at + d] -= step_size * m / (std::sqrt(v) * bias[1] + s.eps);
+// Calls visit(first row, rows) for the blocks of [begin, begin + rows) with a visible row.
+template <class Visit>
+AQ_INLINE void each_visible_block(const AdamStep& s, int begin, int rows, const Visit& visit) {
+  for (int row = begin; row < begin + rows; row += kAdamBlock) {
+    const int size = std::min(kAdamBlock, begin + rows - row);
+    if (std::memchr(s.visible + row, 1, size)) visit(row, size);
   }
+}
+
+AQ_INLINE bool sound(const float* gradient, int count) {
+  int broken = 0;
+#pragma omp simd reduction(| : broken)
+  for (int i = 0; i < count; i++) broken |= !(std::fabs(gradient[i]) < kLargestGradient);
+  return !broken;
+}
+
+AQ_INLINE bool sound_row(const AdamStep& s, int row) {
+  bool all = true;
+  for (int g = 0; g < s.groups; g++)
+    all &= sound(s.group[g].gradient + (size_t)row * s.group[g].dim, s.group[g].dim);
+  return all;
+}
+
+// Whether the visible blocks of rows [begin, begin + rows) have sound gradients in all groups.
+static bool sound_rows(const AdamStep& s, int begin, int rows) {
+  bool all = true;
+  for (int g = 0; g < s.groups; g++)
+    each_visible_block(s, begin, rows, [&](int row, int size) {
+      all &= sound(s.group[g].gradient + (size_t)row * s.group[g].dim, size * s.group[g].dim);
+    });
+  return all;
+}
+
+// Counts the steps of the rows and returns how many are visible but not sound.
+static int start_rows(const AdamStep& s, int begin, int rows, bool all_sound, float* bias1, float* bias2) {
+  const uint8_t* visible = s.visible + begin;
+  int32_t* steps = s.steps + begin;
+  int skipped = 0;
+  for (int j = 0; j < rows; j++) {
+    const bool stepped = visible[j] & (all_sound || sound_row(s, begin + j));
+    const float* at = s.bias + 2 * (size_t)std::min(steps[j], s.bias_rows - 1);
+    bias1[j] = at[0] * stepped;
+    bias2[j] = at[1] * stepped;
+    steps[j] += stepped;
+    skipped += visible[j] - stepped;
+  }
+  return skipped;
+}
+
+// Each row's value once for each of its elements; what is there already, or in `buffer`.
+template <int Dim>
+AQ_INLINE const float* repeated(const float* per_row, int rows, float* buffer) {
+  if (Dim == 1) return per_row;
+#pragma omp simd
+  for (int j = 0; j < rows; j++) {
+#pragma GCC unroll 4
+    for (int d = 0; d < Dim; d++) buffer[Dim * j + d] = per_row[j];
+  }
+  return buffer;
+}
+
+// Rows of Dim elements, as one array.
+template <int Dim>
+static void step_short_rows(const AdamCoefficients& k, const AdamGroup& g, int begin, int rows,
+                            const float* bias1, const float* bias2) {
+  float buffer1[Dim * kAdamBlock], buffer2[Dim * kAdamBlock];
+  const float* first = repeated<Dim>(bias1, rows, buffer1);
+  const float* second = repeated<Dim>(bias2, rows, buffer2);
+  const size_t at = (size_t)begin * Dim;
+  float *param = g.param + at, *m = g.first_moment + at, *v = g.second_moment + at;
+  const float* gradient = g.gradient + at;
+#pragma omp simd
+  for (int i = 0; i < Dim * rows; i++)
+    step_element(k, first[i], second[i], gradient[i], param[i], m[i], v[i]);
+}
+
+static void step_long_rows(const AdamCoefficients& k, const AdamGroup& g, int begin, int rows,
+                           const float* bias1, const float* bias2) {
+  for (int j = 0; j < rows; j++) {
+    if (bias1[j] == 0) continue;
+    const size_t at = (size_t)(begin + j) * g.dim;
+    float *param = g.param + at, *m = g.first_moment + at, *v = g.second_moment + at;
+    const float* gradient = g.gradient + at;
+#pragma omp simd
+    for (int i = 0; i < g.dim; i++)
+      step_element(k, bias1[j], bias2[j], gradient[i], param[i], m[i], v[i]);
+  }
+}
+
+static void step_rows(const AdamStep& s, const AdamGroup& g, int begin, int rows, const float* bias1,
+                      const float* bias2) {
+  const AdamCoefficients k(s, g);
+  switch (g.dim) {
+    case 1: return step_short_rows<1>(k, g, begin, rows, bias1, bias2);
+    case 2: return step_short_rows<2>(k, g, begin, rows, bias1, bias2);
+    case 3: return step_short_rows<3>(k, g, begin, rows, bias1, bias2);
+    case 4: return step_short_rows<4>(k, g, begin, rows, bias1, bias2);
+    default: step_long_rows(k, g, begin, rows, bias1, bias2);
+  }
+}
+
+static int step_chunk(const AdamStep& s, int begin, int rows) {
+  ChunkBias bias;
+  const bool all_sound = sound_rows(s, begin, rows);
+  int skipped = 0;
+  each_visible_block(s, begin, rows, [&](int row, int size) {
+    const int at = row - begin;
+    skipped += start_rows(s, row, size, all_sound, bias.first + at, bias.second + at);
+  });
+  for (int g = 0; g < s.groups; g++)
+    each_visible_block(s, begin, rows, [&](int row, int size) {
+      step_rows(s, s.group[g], row, size, bias.first + row - begin, bias.second + row - begin);
+    });
+  return skipped;
 }
 
 static int adam_step(const AdamStep& s, int threads) {
-  constexpr int kGrain = 256;
+  const int parts = std::min(threads, 1 + s.rows / kAdamRowsPerThread);
   int skipped[kMaxThreads] = {};
-  Pool::run(threads, [&](int part) {
-    const int end = part_begin(s.rows, kGrain, threads, part + 1);
-    for (int row = part_begin(s.rows, kGrain, threads, part); row < end; row++) {
-      if (!s.visible[row]) continue;
-      if (!finite_row(s, row)) {
-        skipped[part]++;
-        continue;
-      }
-      const int step = s.steps[row]++;
-      const float* bias = s.bias + 2 * (size_t)std::min(step, s.bias_rows - 1);
-      for (int g = 0; g < s.groups; g++) update_row(s, s.group[g], row, bias);
-    }
+  Pool::run(parts, [&](int part) {
+    const int end = part_begin(s.rows, kAdamBlock, parts, part + 1);
+    for (int row = part_begin(s.rows, kAdamBlock, parts, part); row < end; row += kAdamRows)
+      skipped[part] += step_chunk(s, row, std::min(kAdamRows, end - row));
   });
   int total = 0;
-  for (int part = 0; part < threads; part++) total += skipped[part];
+  for (int part = 0; part < parts; part++) total += skipped[part];
   return total;
 }
 

@@ -23,6 +23,8 @@
 #include "blend.h"
 #include "project_backward.h"
 
+#include "row_ring.h"
+
 #include "photometric.h"
 
 #include "adam.h"
@@ -94,9 +96,11 @@ AQ_EXPORT int aq_forward(void* context, int count, int channels, int width, int 
     ctx.camera = make_camera(viewmat, intrinsics, width, height);
     ctx.tiles_x = (width + kTile - 1) / kTile, ctx.tiles_y = (height + kTile - 1) / kTile;
     ctx.active.set(active, ctx.tiles_x, ctx.tiles_y);
-    project(ctx, {means, quats, scales, opacities, colours}, visible, radius_px);
-    build_tile_lists(ctx);
-    channels == 3 ? blend<3>(ctx, image, alpha) : blend<4>(ctx, image, alpha);
+    std::fill_n(ctx.stage_ms, (int)kStages, 0.0);
+    const GaussianInputs in{means, quats, scales, opacities, colours};
+    ctx.timed(kProject, [&] { project(ctx, in, visible, radius_px); });
+    ctx.timed(kTileLists, [&] { build_tile_lists(ctx); });
+    ctx.timed(kBlend, [&] { channels == 3 ? blend<3>(ctx, image, alpha) : blend<4>(ctx, image, alpha); });
   });
 }
 
@@ -113,10 +117,19 @@ AQ_EXPORT int aq_backward(void* context, const float* means, const float* quats,
       clear_gradients(ctx, out);
       return;
     }
-    const ImageGradients in{image, g_image, g_alpha};
-    const float* gradient = ctx.channels == 3 ? blend_backward<3>(ctx, in) : blend_backward<4>(ctx, in);
-    project_backward(ctx, {means, quats, scales, opacities, colours}, gradient, out, g_viewmat);
+    const ImageGradients pixels{image, g_image, g_alpha};
+    const GaussianInputs in{means, quats, scales, opacities, colours};
+    const float* gradient = nullptr;
+    ctx.timed(kBlendBackward, [&] {
+      gradient = ctx.channels == 3 ? blend_backward<3>(ctx, pixels) : blend_backward<4>(ctx, pixels);
+    });
+    ctx.timed(kProjectBackward, [&] { project_backward(ctx, in, gradient, out, g_viewmat); });
   });
+}
+
+// [5] milliseconds of the context's last passes, by Stage; backward's are zero where it has not run.
+AQ_EXPORT void aq_stage_ms(void* context, double* out) {
+  std::copy_n(static_cast<const Context*>(context)->stage_ms, (int)kStages, out);
 }
 
 // See photometric.h. g_rendered may be null when no gradient is wanted.

@@ -1,9 +1,12 @@
 // What a forward pass leaves for its backward pass: projected Gaussians and tile lists.
 #pragma once
 #include <algorithm>
+#include <chrono>
 #include <vector>
 
 namespace aq {
+
+enum Stage { kProject, kTileLists, kBlend, kBlendBackward, kProjectBackward, kStages };
 
 constexpr int kBlocksX = kTile / kBlockW, kBlocksY = kTile / kBlockH;
 constexpr int kBlocks = kBlocksX * kBlocksY;
@@ -74,6 +77,7 @@ struct AlignedBuffer {
 };
 
 struct Context {
+  double stage_ms[kStages] = {};          // wall time; backward's are zero until it has run
   int count = 0, visible = 0, threads = 1, channels = 3;
   int tiles_x = 0, tiles_y = 0;
   Camera camera{};
@@ -92,6 +96,14 @@ struct Context {
 
   int tiles() const { return tiles_x * tiles_y; }
 
+  template <class Work>
+  void timed(Stage stage, const Work& work) {
+    const auto start = std::chrono::steady_clock::now();
+    work();
+    const std::chrono::duration<double, std::milli> passed = std::chrono::steady_clock::now() - start;
+    stage_ms[stage] = passed.count();
+  }
+
   // Contiguous runs of tiles with about equal work, as the forward pass found it; contiguity keeps
   // splats in the core's cache.
   int first_tile(int part) const {
@@ -100,10 +112,11 @@ struct Context {
   }
 };
 
-// The tiles that the box around a splat's ellipse touches on the picture.
+// The tiles that the box around a splat's ellipse touches on the picture; some tile for a culled splat,
+// whose numbers may be none (zero comes first: it wins against NaN).
 AQ_INLINE TileBox tile_box(const Context& ctx, const Splat& s) {
   const auto clamped = [](float pixel, int tiles) {
-    return (int)std::min(std::max(pixel * (1.0f / kTile), 0.0f), (float)(tiles - 1));
+    return (int)std::min(std::max(0.0f, pixel * (1.0f / kTile)), (float)(tiles - 1));
   };
   return {clamped(s.u - s.extent_x, ctx.tiles_x), clamped(s.u + s.extent_x, ctx.tiles_x),
           clamped(s.v - s.extent_y, ctx.tiles_y), clamped(s.v + s.extent_y, ctx.tiles_y)};

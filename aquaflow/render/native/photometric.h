@@ -4,13 +4,12 @@
 //
 // SSIM as Wang et al. 2004: 11 x 11 Gaussian window, sigma 1.5, images padded with zeros, mean over all
 // pixels and channels. Images are [H, W, 3]: a horizontal tap is three floats away, so no plane is ever
-// transposed. Rows stream through rings of eleven, so intermediate maps stay in the core's cache.
+// transposed. Rows stream through rings, two at a time, so intermediate maps stay in the core's cache.
 #pragma once
 
 namespace aq {
 
-constexpr int kSsimRadius = kSsimWindow / 2, kChannels = 3;
-constexpr int kRowPad = 16;  // at least kSsimRadius * kChannels zeros on either side of a row
+constexpr int kStrip = 256;  // floats of a row whose window sums are kept at a time
 
 struct PhotometricInput {
   const float* rendered;  // [H, W, 3]
@@ -33,24 +32,6 @@ struct SsimTaps {
   }
 };
 
-// One map row of 3 W floats between zero pads, in a ring addressed by image row.
-template <int Maps>
-class RowRing {
- public:
-  explicit RowRing(int floats) : stride_(floats + 2 * kRowPad), data_((size_t)kSsimWindow * Maps * stride_) {}
-  float* row(int y, int map) {
-    const int slot = (y % kSsimWindow + kSsimWindow) % kSsimWindow;
-    return data_.data() + ((size_t)slot * Maps + map) * stride_ + kRowPad;
-  }
-  void clear(int y) {
-    for (int map = 0; map < Maps; map++) std::fill_n(row(y, map) - kRowPad, stride_, 0.0f);
-  }
-
- private:
-  size_t stride_;
-  std::vector<float> data_;
-};
-
 enum StatisticMap { kMeanX, kMeanY, kSquares, kProduct, kStatistics };
 enum PartialMap { kDMean, kDVariance, kDCovariance, kPartials };
 
@@ -62,20 +43,18 @@ class PhotometricBand {
         l1_scale_((float)((1.0 - in.ssim_weight) / ((double)n_ * in.height))),
         ssim_scale_((float)(in.ssim_weight / ((double)n_ * in.height))), row_loss_(row_loss),
         gradient_(gradient), weight_(n_), mask_(n_, 1.0f), masked_(n_), squares_(n_), product_(n_),
-        blurred_(n_), partials_(n_), column_((size_t)kPartials * (n_ + 2 * kRowPad)) {}
+        blurred_(n_), partials_(n_), columns_(n_) {}
 
   void run(int first, int last) {
-    for (int y = first - 2 * kSsimRadius; y < last + 2 * kSsimRadius; y++) {
-      blur_row(y);
-      const int middle = y - kSsimRadius;
-      if (middle >= first - kSsimRadius) ssim_row(middle, middle >= first && middle < last);
-      const int done = y - 2 * kSsimRadius;
-      if (done >= first) finish_row(done);
+    for (int y = first - 2 * kSsimRadius; y < last + 2 * kSsimRadius; y += kRowsAtOnce) {
+      for (int row = y; row < y + kRowsAtOnce; row++) blur_row(row);
+      const int middle = y - kSsimRadius, done = middle - kSsimRadius;
+      if (middle + kRowsAtOnce > first - kSsimRadius) ssim_rows(middle, first, last);
+      if (done >= first) finish_rows(done, std::min(done + kRowsAtOnce, last));
     }
   }
 
  private:
-  float* column(int map) { return column_.data() + (size_t)map * (n_ + 2 * kRowPad) + kRowPad; }
   bool inside(int y) const { return y >= 0 && y < in_.height; }
 
   // One row of a per-pixel map, repeated for the channels.
@@ -125,29 +104,51 @@ class PhotometricBand {
     }
   }
 
-  // Vertical window sums, SSIM, and its derivatives by mean, variance and covariance.
-  void ssim_row(int y, bool counted) {
-    if (!inside(y)) return partials_.clear(y);
-    const float* rows[kStatistics][kSsimWindow];
-    for (int map = 0; map < kStatistics; map++)
-      for (int k = 0; k < kSsimWindow; k++) rows[map][k] = blurred_.row(y + k - kSsimRadius, map);
-    float *d_mean = partials_.row(y, kDMean), *d_var = partials_.row(y, kDVariance);
-    float* d_cov = partials_.row(y, kDCovariance);
+  // Vertical window sums of a ring's map for rows y and y + 1, floats [begin, begin + size).
+  template <int Maps>
+  void window_sums(RowRing<Maps>& ring, int map, int y, int begin, int size, float* first, float* second) const {
+    const float* rows[kSsimWindow + 1];
+    for (int k = 0; k <= kSsimWindow; k++) rows[k] = ring.row(y + k - kSsimRadius, map) + begin;
     const SsimTaps taps = taps_;
+#pragma omp simd
+    for (int i = 0; i < size; i++) {
+      float a = taps.g[0] * rows[0][i], b = taps.g[kSsimWindow - 1] * rows[kSsimWindow][i];
+#pragma GCC unroll 10
+      for (int k = 1; k < kSsimWindow; k++) {
+        a += taps.g[k] * rows[k][i];
+        b += taps.g[k - 1] * rows[k][i];
+      }
+      first[i] = a;
+      second[i] = b;
+    }
+  }
+
+  // SSIM of rows y and y + 1, and its derivatives; its sum counts in rows [first, last).
+  void ssim_rows(int y, int first, int last) {
+    double total[kRowsAtOnce] = {};
+    for (int begin = 0; begin < n_; begin += kStrip) {
+      const int size = std::min(kStrip, n_ - begin);
+      float sums[kRowsAtOnce][kStatistics][kStrip];
+      for (int map = 0; map < kStatistics; map++)
+        window_sums(blurred_, map, y, begin, size, sums[0][map], sums[1][map]);
+      for (int r = 0; r < kRowsAtOnce; r++) total[r] += ssim_strip(y + r, begin, size, sums[r]);
+    }
+    for (int r = 0; r < kRowsAtOnce; r++) {
+      if (!inside(y + r)) partials_.clear(y + r);
+      if (y + r >= first && y + r < last) row_loss_[y + r] += (double)ssim_scale_ * (n_ - total[r]);
+    }
+  }
+
+  // SSIM summed over a strip, and its derivatives by mean, variance and covariance.
+  float ssim_strip(int y, int begin, int size, const float (*sums)[kStrip]) {
+    float *d_mean = partials_.row(y, kDMean) + begin, *d_var = partials_.row(y, kDVariance) + begin;
+    float* d_cov = partials_.row(y, kDCovariance) + begin;
     float total = 0;
 #pragma omp simd reduction(+ : total)
-    for (int i = 0; i < n_; i++) {
-      float mx = 0, my = 0, squares = 0, product = 0;
-#pragma GCC unroll 11
-      for (int k = 0; k < kSsimWindow; k++) {
-        mx += taps.g[k] * rows[kMeanX][k][i];
-        my += taps.g[k] * rows[kMeanY][k][i];
-        squares += taps.g[k] * rows[kSquares][k][i];
-        product += taps.g[k] * rows[kProduct][k][i];
-      }
-      const float means_sq = mx * mx + my * my;
-      const float a1 = 2 * mx * my + kSsimC1, a2 = 2 * (product - mx * my) + kSsimC2;
-      const float b1 = means_sq + kSsimC1, b2 = squares - means_sq + kSsimC2;
+    for (int i = 0; i < size; i++) {
+      const float mx = sums[kMeanX][i], my = sums[kMeanY][i], means_sq = mx * mx + my * my;
+      const float a1 = 2 * mx * my + kSsimC1, a2 = 2 * (sums[kProduct][i] - mx * my) + kSsimC2;
+      const float b1 = means_sq + kSsimC1, b2 = sums[kSquares][i] - means_sq + kSsimC2;
       const float inverse = 1.0f / (b1 * b2), ssim = a1 * a2 * inverse;
       total += ssim;
       const float by_var = -ssim * b1 * inverse, by_cov = 2 * a1 * inverse;
@@ -155,28 +156,15 @@ class PhotometricBand {
       d_cov[i] = by_cov;
       d_mean[i] = 2 * (my * a2 - mx * ssim * b2) * inverse - 2 * mx * by_var - my * by_cov;
     }
-    if (counted) row_loss_[y] += (double)ssim_scale_ * (n_ - (double)total);
+    return total;
   }
 
   // The window sums of the SSIM derivatives (the window is symmetric: its adjoint is itself), then
   // d/dx = S(d_mean) + 2 x S(d_var) + y S(d_cov) at masked x, y.
   void ssim_gradient_row(int y) {
     const SsimTaps taps = taps_;
-    const float* rows[kPartials][kSsimWindow];
-    for (int map = 0; map < kPartials; map++)
-      for (int k = 0; k < kSsimWindow; k++) rows[map][k] = partials_.row(y + k - kSsimRadius, map);
-    for (int map = 0; map < kPartials; map++) {
-      float* to = column(map);
-#pragma omp simd
-      for (int i = 0; i < n_; i++) {
-        float total = 0;
-#pragma GCC unroll 11
-        for (int k = 0; k < kSsimWindow; k++) total += taps.g[k] * rows[map][k][i];
-        to[i] = total;
-      }
-    }
     const float* from[kPartials];
-    for (int map = 0; map < kPartials; map++) from[map] = column(map) - kSsimRadius * kChannels;
+    for (int map = 0; map < kPartials; map++) from[map] = columns_.row(y, map) - kSsimRadius * kChannels;
     const float *x = masked_.row(y, 0), *t = masked_.row(y, 1);
     float* to = gradient_ + (size_t)y * n_;
     const float scale = -ssim_scale_;
@@ -191,6 +179,13 @@ class PhotometricBand {
       }
       to[i] = scale * (mean + 2 * x[i] * var + t[i] * cov);
     }
+  }
+
+  void finish_rows(int begin, int end) {
+    if (gradient_)
+      for (int map = 0; map < kPartials; map++)
+        window_sums(partials_, map, begin, 0, n_, columns_.row(begin, map), columns_.row(begin + 1, map));
+    for (int y = begin; y < end; y++) finish_row(y);
   }
 
   // Adds L1 and its gradient to row y, and puts the gradient under the mask.
@@ -224,17 +219,17 @@ class PhotometricBand {
   RowRing<1> squares_, product_;      // x^2 + y^2, x y
   RowRing<kStatistics> blurred_;
   RowRing<kPartials> partials_;
-  std::vector<float> column_;
+  RowRing<kPartials> columns_;        // vertical window sums of the partials
   const SsimTaps taps_;
 };
 
 // Returns the loss; writes dL/drendered [H, W, 3] unless `gradient` is null. Rows are summed in order,
-// so the loss does not depend on the number of threads.
+// and bands begin at the first of two rows: nothing depends on the number of threads.
 static float photometric(const PhotometricInput& in, int threads, float* gradient) {
   std::vector<double> row_loss(in.height, 0.0);
   Pool::run(threads, [&](int part) {
-    const int first = part_begin(in.height, 1, threads, part);
-    const int last = part_begin(in.height, 1, threads, part + 1);
+    const int first = part_begin(in.height, kRowsAtOnce, threads, part);
+    const int last = part_begin(in.height, kRowsAtOnce, threads, part + 1);
     if (first < last) PhotometricBand(in, row_loss.data(), gradient).run(first, last);
   });
   double loss = 0;

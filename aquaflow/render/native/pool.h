@@ -1,8 +1,10 @@
 // A small persistent pool of threads with a static schedule.
 //
 // run(n, job) calls job(0) ... job(n - 1) once each. What a part computes depends on its number only,
-// never on the thread that ran it, so results repeat bit for bit at a given n. When the pool is busy
-// (another Python thread renders) the caller runs all parts itself, with the same result. A job whose
+// never on the thread that ran it, so results repeat bit for bit at a given n. Part k is offered to
+// thread k, whose cache may still hold what it worked on before; the caller takes what nobody has begun
+// when its own part is done, so that a machine busy with other programs costs no wait. When the pool is
+// busy (another Python thread renders) the caller runs all parts itself, with the same result. A job whose
 // parts draw their work from a counter must itself see to it that the result does not depend on who drew.
 #pragma once
 #include <atomic>
@@ -36,6 +38,7 @@ class Pool {
         std::unique_lock<std::mutex> turn(pool->turn_, std::try_to_lock);
         if (turn.owns_lock() && pool->start(parts - 1, &call<Job>, &job)) {
           pool->attempt(0);
+          for (int part = 1; part < parts; part++) pool->take(part, pool->round_);
           pool->finish();
           if (pool->failed_.exchange(false)) throw std::bad_alloc();
           return;
@@ -79,14 +82,23 @@ class Pool {
     }
     call_ = call;
     job_ = job;
-    helpers_ = helpers;
-    running_.store((int)threads_.size(), std::memory_order_relaxed);
+    unfinished_.store(helpers, std::memory_order_relaxed);
+    const uint64_t round = round_ + 1;
+    for (int part = 1; part <= helpers; part++) offered_[part].store(round, std::memory_order_release);
     {
       std::lock_guard<std::mutex> lock(sleep_);
-      round_.fetch_add(1, std::memory_order_release);
+      round_.store(round, std::memory_order_release);
     }
     wake_.notify_all();
     return true;
+  }
+
+  // Runs the part if it is still on offer in this round. A thread that wakes too late finds nothing: the
+  // round does not end, and its job does not go away, before every part has been taken.
+  void take(int part, uint64_t round) {
+    if (!offered_[part].compare_exchange_strong(round, 0, std::memory_order_acq_rel)) return;
+    attempt(part);
+    unfinished_.fetch_sub(1, std::memory_order_release);
   }
 
   // An exception must leave neither a thread (it would end the process) nor run() while others work on
@@ -100,7 +112,7 @@ class Pool {
   }
 
   void finish() {
-    for (int spins = 0; running_.load(std::memory_order_acquire) != 0; spins++) {
+    for (int spins = 0; unfinished_.load(std::memory_order_acquire) != 0; spins++) {
       if (spins < kSpinsBeforeSleep) spin_pause();
       else std::this_thread::yield();
     }
@@ -116,21 +128,20 @@ class Pool {
         std::unique_lock<std::mutex> lock(sleep_);
         wake_.wait(lock, [&] { return round_.load(std::memory_order_acquire) != seen; });
       }
-      seen++;
-      if (number <= helpers_) attempt(number);
-      running_.fetch_sub(1, std::memory_order_release);
+      seen = round_.load(std::memory_order_acquire);
+      take(number, seen);
     }
   }
 
   std::mutex turn_, sleep_;
   std::condition_variable wake_;
   std::atomic<uint64_t> round_{0};
-  std::atomic<int> running_{0};
+  std::atomic<uint64_t> offered_[kMaxThreads] = {};  // by part: the round it waits in, 0 once taken
+  std::atomic<int> unfinished_{0};
   std::atomic<bool> failed_{false};
   std::vector<std::thread> threads_;
   Call call_ = nullptr;
   const void* job_ = nullptr;
-  int helpers_ = 0;
 };
 
 // [begin, end) of part number `part` when `count` items are cut into `parts` runs of whole `grain`s.

@@ -89,16 +89,21 @@ static void project_chunk(Context& ctx, const GaussianInputs& in, int begin, int
     project_one(cam, W, {means[3 * j], means[3 * j + 1], means[3 * j + 2]},
                 {quats[4 * j], quats[4 * j + 1], quats[4 * j + 2], quats[4 * j + 3]},
                 {scales[3 * j], scales[3 * j + 1], scales[3 * j + 2]}, opacities[j], p, j);
+  int32_t seen[kChunk];
   for (int j = 0; j < size; j++) {
     const int i = begin + j;
     const float* colour = in.colours + (size_t)i * ctx.channels;
-    bool ok = p.depth[j] > 0;
-    for (int k = 0; k < ctx.channels; k++) ok &= std::fabs(colour[k]) < HUGE_VALF;
+    bool finite = true;
+    for (int k = 0; k < ctx.channels; k++) finite &= std::fabs(colour[k]) < HUGE_VALF;
     ctx.splats[i] = make_splat(p, j, colour, ctx.channels);
-    ok = ok && ctx.active.touch(tile_box(ctx, ctx.splats[i]));
-    ctx.depth[i] = ok ? p.depth[j] : -1.0f;
-    visible[i] = ok;
-    radius_px[i] = ok ? p.radius[j] : 0.0f;
+    seen[j] = (p.depth[j] > 0) & finite & ctx.active.touch(tile_box(ctx, ctx.splats[i]));
+  }
+  // a loop of its own has no branches to predict: under a mask they go either way
+#pragma omp simd
+  for (int j = 0; j < size; j++) {
+    ctx.depth[begin + j] = seen[j] ? p.depth[j] : -1.0f;
+    radius_px[begin + j] = seen[j] ? p.radius[j] : 0.0f;
+    visible[begin + j] = (uint8_t)seen[j];
   }
 }
 
