@@ -15,16 +15,16 @@ import numpy as np
 from aquaflow.config import GraphConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
-from aquaflow.tracking.pose_graph_equations import Array, Index, Rows, poses_of
+from aquaflow.tracking.pose_graph_equations import Array, Rows, poses_of
 from aquaflow.tracking.pose_graph_optimisation import Optimisation
 from aquaflow.tracking.pose_graph_table import (
     EDGE,
     NODE,
     TRUST,
     GraphResult,
+    Join,
     Snapshot,
     Table,
-    differ,
     write_poses,
 )
 
@@ -73,22 +73,6 @@ def _information_and_covariance(information: Array) -> tuple[Array, Array]:
     return (vectors * values) @ vectors.T, (vectors * inverse) @ vectors.T
 
 
-@dataclass(frozen=True)
-class Join:
-    """A component that became part of another: its poses went to S @ T."""
-
-    moved: int
-    into: int
-    S: Sim3
-
-    def apply(self, nodes: Rows) -> Index:
-        """Move the component's nodes into the frame of the other, in place; which they were."""
-        rows = np.flatnonzero(nodes["component"] == self.moved)
-        write_poses(nodes, rows, Sim3Batch.of([self.S]) @ poses_of(nodes[rows]))
-        nodes["component"][rows] = self.into
-        return rows
-
-
 class PoseGraph:
     """Keyframes and edges; one thread adds and applies, any thread may solve a snapshot."""
 
@@ -104,6 +88,8 @@ class PoseGraph:
         self._version = 0
         self._joins: list[Join] = []
         self._shifted: set[int] = set()
+        self._members: Counter[int] = Counter()
+        self._seen = 0
 
     def add_keyframe(self, number: int, T_wc: Sim3) -> bool:
         """A keyframe, a component of its own until an edge joins it. False if it was refused."""
@@ -112,6 +98,7 @@ class PoseGraph:
         if not T_wc.is_finite():
             return self._refuse("keyframe pose is not finite")
         self._row[number] = len(self._nodes)
+        self._members[number] = 1
         self._nodes.append(number=number, component=number, R=T_wc.R, t=T_wc.t, scale=T_wc.scale)
         return True
 
@@ -148,8 +135,11 @@ class PoseGraph:
 
     def pose(self, number: int) -> Sim3:
         """T_wc of a keyframe as the graph has it now."""
+        return self._poses(number).element(0)
+
+    def _poses(self, number: int) -> Sim3Batch:
         row = self._row[number]
-        return poses_of(self._nodes.rows[row : row + 1]).element(0)
+        return poses_of(self._nodes.rows[row : row + 1])
 
     def component_of(self, number: int) -> int:
         """The first keyframe of the component that a keyframe belongs to."""
@@ -157,6 +147,7 @@ class PoseGraph:
 
     def snapshot(self) -> Snapshot:
         """The graph as it is, to be solved anywhere; costs nothing."""
+        self._seen = len(self._nodes)
         return Snapshot(
             self._nodes.rows,
             self._edges.rows,
@@ -218,14 +209,20 @@ class PoseGraph:
     def _join(self, edge: Edge) -> None:
         """Move the later of the edge's two components to where the edge says."""
         at_a, at_b = self.component_of(edge.a), self.component_of(edge.b)
-        S = self.pose(edge.a) @ edge.T_ab @ self.pose(edge.b).inverse()
+        T_wa, T_wb = (self._poses(number) for number in (edge.a, edge.b))
+        S = T_wa @ Sim3Batch.of([edge.T_ab]) @ T_wb.inverse()
         join = Join(at_b, at_a, S) if at_a < at_b else Join(at_a, at_b, S.inverse())
-        before, nodes = self._nodes.rows, self._nodes.rows.copy()
+        new = self._row[join.moved]
+        alone = self._members[join.moved] == 1 and new >= self._seen
+        # A keyframe that nobody has seen yet, the usual case, is changed where it stands.
+        nodes = self._nodes.unseen(new) if alone else self._nodes.rows.copy()
         rows = join.apply(nodes)
-        moved = rows[differ(nodes[rows], before[rows])]
-        self._shifted |= {int(number) for number in nodes["number"][moved]}
-        self._nodes.replace(nodes)
-        self._joins.append(join)
+        if not join.still:
+            self._shifted |= {int(number) for number in nodes["number"][rows]}
+        if not alone:
+            self._nodes.replace(nodes)
+            self._joins.append(join)
+        self._members[join.into] += self._members.pop(join.moved)
 
     def _refuse(self, reason: str) -> bool:
         self.refused[reason] += 1

@@ -34,6 +34,10 @@ ANNEALING = 0.5
 """phi over the phi of the step before."""
 SETTLING = 0.002
 """Relative fall of the cost below which the next step uses the last factor again."""
+INSIDE = 0.3
+"""Share of the tolerance to which the active poses are solved, root mean square."""
+WHOLE = 0.7
+"""Largest squared step in sigmas, of all poses together, at which a descent ends."""
 FIRST_REACH = 4
 """Hops that the active set grows at first; doubled each time."""
 
@@ -114,6 +118,7 @@ class Descent:
             [N] the active set at the end.
         """
         tolerance, damping = self._config.tolerance_sigmas, DAMPING
+        settled = (INSIDE * tolerance) ** 2
         around, misfit = self._around(counts, active & self._may_move, asked)
         level, again = self._level(misfit.strain), False
         limit = self.iterations + self._config.max_iterations
@@ -136,7 +141,7 @@ class Descent:
             fall = before - trial.cost(level)
             misfit = trial
             self._keep(around, misfit)
-            if level == 0.0 and gain < around.active.sum() * tolerance**2:
+            if level == 0.0 and gain < min(settled * around.active.sum(), WHOLE):
                 break
             again = level == 0.0 and damping == DAMPING and fall < SETTLING * before
             damping = max(DAMPING, 0.1 * damping)

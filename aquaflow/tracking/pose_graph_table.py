@@ -10,7 +10,7 @@ import numpy as np
 from aquaflow.config import GraphConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
-from aquaflow.tracking.pose_graph_equations import Index, Mask, Rows
+from aquaflow.tracking.pose_graph_equations import Index, Mask, Rows, poses_of
 
 _SIM3 = [("R", np.float64, (3, 3)), ("t", np.float64, 3), ("scale", np.float64)]
 
@@ -32,6 +32,9 @@ EDGE = np.dtype(
 TRUST = np.dtype([("trust", np.float64), ("allowed", np.float64)])
 """Switch variable of an edge, 0 for a loop that is not (yet) believed; and its phi, the squared
 residual that a loop may keep at full trust."""
+
+ROUNDING = 1e-9
+"""Move, in m, rad and log-scale, that is none."""
 
 
 class Table:
@@ -60,6 +63,10 @@ class Table:
         view = self._buffer[: self._count]
         view.flags.writeable = False
         return view
+
+    def unseen(self, first: int) -> Rows:
+        """Writable view of the rows from ``first`` on, which no view handed out may hold."""
+        return self._buffer[first : self._count]
 
     def replace(self, rows: Rows) -> None:
         """Other contents for the same rows; views handed out before keep the old."""
@@ -112,9 +119,24 @@ def write_poses(rows: Rows, where: Index | Mask | slice, poses: Sim3Batch) -> No
     rows["R"][where], rows["t"][where], rows["scale"][where] = poses.R, poses.t, poses.scale
 
 
-def differ(nodes: Rows, others: Rows) -> Mask:
-    """[N] which poses are not the same in both."""
-    turned = (nodes["R"] != others["R"]).any(axis=(1, 2))
-    return np.asarray(
-        turned | (nodes["t"] != others["t"]).any(axis=1) | (nodes["scale"] != others["scale"])
-    )
+@dataclass(frozen=True)
+class Join:
+    """A component that became part of another: its poses went to S @ T."""
+
+    moved: int
+    into: int
+    S: Sim3Batch
+    """[1]"""
+
+    @property
+    def still(self) -> bool:
+        """True if the poses are where they should be already, but for rounding."""
+        return bool(np.abs(self.S.log()).max() < ROUNDING)
+
+    def apply(self, nodes: Rows) -> Index:
+        """Move the component's nodes into the frame of the other, in place; which they were."""
+        rows = np.flatnonzero(nodes["component"] == self.moved)
+        if not self.still:
+            write_poses(nodes, rows, (self.S @ poses_of(nodes[rows])).on_group())
+        nodes["component"][rows] = self.into
+        return rows

@@ -20,6 +20,17 @@ SIGMA = np.array([0.01] * 3 + [0.002] * 4)
 """Of sequential edges: m, rad, log-scale."""
 LOOP_SIGMA = 2.0 * SIGMA
 
+INFORMATION = np.diag(SIGMA**-2)
+EXACT = GraphConfig(tolerance_sigmas=1e-6)
+
+
+def moved(T: Sim3, x: float = 0.0) -> Sim3:
+    return T @ Sim3.exp(np.array([x, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+
+
+def largest_gap(one: Sim3Batch, other: Sim3Batch) -> float:
+    return float(np.abs((one.inverse() @ other).log()).max())
+
 
 def circle(count: int) -> Sim3Batch:
     """Keyframes that look along a circle, the last beside the first."""
@@ -46,27 +57,31 @@ class Dive:
         self.truth = circle(self.count)
         self.rng = np.random.default_rng(self.seed)
         self.graph = PoseGraph(self.config)
-        self.graph.add_keyframe(0, Sim3.identity())
+        ahead = np.arange(1, self.count)
+        links = self.truth[ahead - 1].inverse() @ self.truth[ahead] @ self.errors(self.count - 1)
+        T_wc = Sim3Batch.of([Sim3.identity()])
+        self.graph.add_keyframe(0, T_wc.element(0))
         for number in range(1, self.count):
-            self.extend(number)
+            T_wc = T_wc @ links[number - 1 : number]
+            self.graph.add_keyframe(number, T_wc.element(0))
+            T = links.element(number - 1)
+            assert self.graph.add_edge(Edge(number - 1, number, T, np.diag(SIGMA**-2)))
 
-    def measured(self, a: int, b: int, sigma: Array, bias: float = 0.0) -> Sim3:
-        """T_ab with noise."""
-        error = sigma * self.noise * self.rng.normal(size=7)
-        error += bias * sigma * np.array([0, 0, 0, 0, 0, 1, 1])
+    def errors(self, count: int) -> Sim3Batch:
+        """What sequential edges are wrong by."""
+        error = SIGMA * self.noise * self.rng.normal(size=(count, 7))
+        return Sim3Batch.exp(error + self.bias * SIGMA * np.array([0, 0, 0, 0, 0, 1, 1]))
+
+    def loop(self, a: int, b: int) -> Sim3:
+        """A true T_ab with the noise of a loop edge."""
+        error = LOOP_SIGMA * self.noise * self.rng.normal(size=7)
         return self.truth.element(a).inverse() @ self.truth.element(b) @ Sim3.exp(error)
-
-    def extend(self, number: int) -> None:
-        """The next keyframe where tracking saw it, and its sequential edge."""
-        T = self.measured(number - 1, number, SIGMA, self.bias)
-        self.graph.add_keyframe(number, self.graph.pose(number - 1) @ T)
-        assert self.graph.add_edge(Edge(number - 1, number, T, np.diag(SIGMA**-2)))
 
     def close(self, *pairs: tuple[int, int]) -> None:
         """True loop edges."""
         for a, b in pairs:
-            T = self.measured(a, b, LOOP_SIGMA)
-            assert self.graph.add_edge(Edge(a, b, T, np.diag(LOOP_SIGMA**-2), loop=True))
+            claim = Edge(a, b, self.loop(a, b), np.diag(LOOP_SIGMA**-2), loop=True)
+            assert self.graph.add_edge(claim)
 
     def plant(self, *pairs: tuple[int, int]) -> None:
         """False loop edges: two places said to be nearly the same."""
