@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import shutil
 import sys
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from aquaflow import doctor
-from aquaflow.doctor import Finding, Machine, examine, isa_level, print_findings, to_json
+from aquaflow.doctor import Finding, Machine, examine, print_findings, to_json
+from aquaflow.doctor.computer import isa_level
+from aquaflow.doctor.machine import renderer_name
 
 V4 = "avx512f avx512bw avx512cd avx512dq avx512vl"
 CPUINFO = f"processor\t: 0\nmodel name\t: Test CPU\nflags\t\t: fpu {V4}\nprocessor\t: 1\n"
@@ -103,7 +106,7 @@ def test_renderer_in_use_and_its_variants_are_named(machine):
 def test_absent_render_package_is_no_error(monkeypatch):
     monkeypatch.setitem(sys.modules, "aquaflow.render", None)
 
-    assert doctor._renderer_name() is None
+    assert renderer_name() is None
 
 
 @pytest.mark.parametrize(
@@ -147,7 +150,7 @@ def test_cameras_are_named_once_whatever_their_number_of_nodes(machine):
 def test_device_without_permission_is_advised_on(machine, monkeypatch):
     put(machine.root, "dev/video0")
     put(machine.root, "dev/ttyACM0")
-    monkeypatch.setattr(doctor.os, "access", lambda path, mode: False)
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
 
     assert "-aG video" in named(machine, "USB and CSI cameras").advice
     assert "-aG dialout" in named(machine, "serial ports").advice
@@ -184,7 +187,7 @@ def test_can_is_told_from_ethernet_and_brought_up(machine):
 
 def test_full_disk_is_advised_on(machine, monkeypatch):
     usage = type("Usage", (), {"free": 1e9})
-    monkeypatch.setattr(doctor.shutil, "disk_usage", lambda path: usage)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
 
     assert "free some space" in named(machine, "disk").advice
 

@@ -1,0 +1,56 @@
+"""``aquaflow doctor``: what this machine has, what AquaFlow will use of it, and what is missing."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from aquaflow.doctor import computer, devices
+from aquaflow.doctor.machine import Finding, Machine
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+__all__ = ["Finding", "Machine", "examine", "print_findings", "to_json"]
+
+
+def examine(machine: Machine | None = None) -> list[Finding]:
+    """Look at everything AquaFlow can make use of; never raises for something absent."""
+    machine = machine or Machine()
+    probes = (
+        *(
+            computer.processor,
+            computer.memory,
+            computer.compiler,
+            computer.renderer,
+            computer.gpu,
+            devices.video,
+        ),
+        *(devices.cameras, devices.oak, devices.serial, devices.can, computer.disk),
+    )
+    return [probe(machine) for probe in probes]
+
+
+def to_json(findings: list[Finding]) -> dict[str, Any]:
+    """Stable keys for ``aquaflow doctor --json``."""
+    return {"findings": [{**asdict(finding), "ok": finding.ok} for finding in findings]}
+
+
+def print_findings(findings: list[Finding], console: Console) -> None:
+    """A table for people: what is there, what it is used for, what to do."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 1, 0))
+    table.add_column("")
+    table.add_column("found", overflow="fold")
+    table.add_column("what AquaFlow does", overflow="fold")
+    for finding in findings:
+        mark = "[green]" if finding.ok else "[yellow]"
+        advice = f"\n[yellow]{escape(finding.advice)}[/]" if finding.advice else ""
+        table.add_row(
+            f"{mark}{escape(finding.name)}[/]",
+            escape(finding.found),
+            escape(finding.used_for) + advice,
+        )
+    console.print(table)

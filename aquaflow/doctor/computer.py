@@ -1,0 +1,122 @@
+"""Processor, memory, compiler, renderer, GPU and disk."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+
+from aquaflow.doctor.machine import Finding, Machine
+
+ISA_LEVELS = (
+    ("x86-64-v4", {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}),
+    ("x86-64-v3", {"avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe"}),
+    ("x86-64-v2", {"cx16", "lahf_lm", "popcnt", "sse4_1", "sse4_2", "ssse3"}),
+)
+"""Linux flag names of the x86-64 psABI's levels, the highest first."""
+
+COMPILERS = ("g++", "clang++", "c++")
+
+LOW_MEMORY_GB = 4.0
+LOW_DISK_GB = 5.0
+"""An hour of 1080p recording at 10 Mbit/s takes 4.5 GB."""
+
+
+def isa_level(cpuinfo: str) -> str:
+    """Instruction set level that ``/proc/cpuinfo`` announces."""
+    for line in cpuinfo.splitlines():
+        key, _, value = line.partition(":")
+        if key.strip() == "flags":
+            flags = set(value.split())
+            return next((name for name, needs in ISA_LEVELS if needs <= flags), "x86-64")
+        if key.strip() == "Features":
+            return "aarch64 with NEON" if "asimd" in value.split() else "arm"
+    return "unknown"
+
+
+def processor(machine: Machine) -> Finding:
+    cpuinfo = machine.text("proc/cpuinfo")
+    rows = [line.partition(":") for line in cpuinfo.splitlines()]
+    names = [value.strip() for key, _, value in rows if key.strip() == "model name"]
+    board = machine.text("proc/device-tree/model")
+    cores = sum(1 for key, _, _ in rows if key.strip() == "processor")
+    name = names[0] if names else board or "unknown processor"
+    found = f"{name}, {cores or os.cpu_count() or 1} cores, {isa_level(cpuinfo)}"
+    return Finding("processor", found, "runs tracking and mapping")
+
+
+def memory(machine: Machine) -> Finding:
+    gigabytes = {
+        key: float(value.split()[0]) * 1024.0 / 1e9
+        for key, _, value in (line.partition(":") for line in _lines(machine, "proc/meminfo"))
+        if value.split()
+    }
+    total, free = (gigabytes.get(key, 0.0) for key in ("MemTotal", "MemAvailable"))
+    advice = (
+        f"map at a smaller resolution: {total:.1f} GB is little"
+        if 0 < total < LOW_MEMORY_GB
+        else ""
+    )
+    return Finding("memory", f"{total:.1f} GB, {free:.1f} GB free", "holds the map", advice)
+
+
+def _lines(machine: Machine, path: str) -> Iterator[str]:
+    yield from machine.text(path).splitlines()
+
+
+def compiler(machine: Machine) -> Finding:
+    for name in COMPILERS:
+        if place := machine.which(name):
+            return Finding("C++ compiler", place, "builds the fast rasteriser at installation")
+    return Finding(
+        "C++ compiler",
+        "none",
+        "a rasteriser that came compiled with the package is used as it is",
+        "" if _variants(machine) else "install g++ and reinstall aquaflow for the fast rasteriser",
+    )
+
+
+def _variants(machine: Machine) -> list[str]:
+    return sorted(path.name for path in machine.native.glob("*.so"))
+
+
+def renderer(machine: Machine) -> Finding:
+    variants = ", ".join(_variants(machine)) or "no compiled variant"
+    chosen = machine.renderer()
+    if chosen is None:
+        return Finding(
+            "renderer",
+            "none",
+            "nothing can be mapped",
+            "reinstall aquaflow: its renderers are missing",
+        )
+    return Finding("renderer", f"{chosen} (of {variants})", f"maps are rendered with: {chosen}")
+
+
+def gpu(machine: Machine) -> Finding:
+    usable = machine.gpu()
+    gsplat = machine.module_present("gsplat")
+    if usable and gsplat:
+        return Finding("GPU", f"{usable}, gsplat", "the map is optimised on the GPU")
+    if usable:
+        return Finding(
+            "GPU",
+            f"{usable}, no gsplat",
+            "the GPU runs the prior; the map stays on the processor",
+            "run 'pip install --no-deps gsplat' to map on the GPU",
+        )
+    driver = machine.which("nvidia-smi") or machine.paths("proc/driver/nvidia/version")
+    if driver:
+        return Finding(
+            "GPU",
+            "an NVIDIA driver, but torch cannot use the GPU",
+            "everything runs on the processor",
+            "install a CUDA build of torch that fits the driver (see pytorch.org)",
+        )
+    return Finding("GPU", "none", "everything runs on the processor")
+
+
+def disk(machine: Machine) -> Finding:
+    free_gb = shutil.disk_usage(machine.disk).free / 1e9
+    advice = "free some space or write dives elsewhere" if free_gb < LOW_DISK_GB else ""
+    return Finding("disk", f"{free_gb:.0f} GB free at {machine.disk}", "holds the dives", advice)

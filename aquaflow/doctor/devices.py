@@ -1,0 +1,100 @@
+"""What can be plugged in: cameras, serial ports, CAN; and the libraries that read recordings."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from aquaflow.doctor.machine import Finding, Machine
+
+LUXONIS_USB_VENDOR = "03e7"
+ARPHRD_CAN = "280"
+"""Value of ``/sys/class/net/*/type`` for a CAN interface (linux/if_arp.h)."""
+
+
+def video(machine: Machine) -> Finding:
+    if not machine.module_present("cv2"):
+        return Finding(
+            "video files",
+            "no OpenCV",
+            "neither videos nor images can be read",
+            "run 'pip install opencv-python-headless'",
+        )
+    import cv2
+
+    backends = {cv2.videoio_registry.getBackendName(b) for b in cv2.videoio_registry.getBackends()}
+    found = f"OpenCV {cv2.__version__}"
+    if "FFMPEG" not in backends:
+        return Finding(
+            "video files",
+            f"{found} without FFmpeg",
+            "folders of images are read, videos are not",
+            "run 'pip install opencv-python-headless', which carries FFmpeg",
+        )
+    return Finding("video files", f"{found} with FFmpeg", "videos and images are read")
+
+
+def cameras(machine: Machine) -> Finding:
+    # A camera has several nodes; the first (index 0) is the one that captures.
+    nodes = [
+        node
+        for node in machine.paths("dev/video*")
+        if machine.text(f"sys/class/video4linux/{node.name}/index") in {"", "0"}
+    ]
+    if not nodes:
+        return Finding("USB and CSI cameras", "none", "recordings are mapped")
+    names = [machine.text(f"sys/class/video4linux/{node.name}/name") for node in nodes]
+    found = ", ".join(
+        f"/dev/{node.name} ({name or 'no name'})" for node, name in zip(nodes, names, strict=True)
+    )
+    return Finding(
+        "USB and CSI cameras", found, "seen by the system; not read yet", _access(nodes, "video")
+    )
+
+
+def oak(machine: Machine) -> Finding:
+    products = [
+        machine.text(f"sys/bus/usb/devices/{vendor.parent.name}/product") or "unnamed"
+        for vendor in machine.paths("sys/bus/usb/devices/*/idVendor")
+        if machine.text(str(vendor.relative_to(machine.root))) == LUXONIS_USB_VENDOR
+    ]
+    if not products:
+        return Finding("OAK cameras", "none on USB", "no OAK is used")
+    advice = "" if machine.module_present("depthai") else "run 'pip install depthai' to use it"
+    return Finding("OAK cameras", ", ".join(products), "seen by the system; not read yet", advice)
+
+
+def serial(machine: Machine) -> Finding:
+    ports = machine.paths(
+        "dev/serial/by-id/*", "dev/ttyUSB*", "dev/ttyACM*", "dev/ttyAMA*", "dev/ttyTHS*"
+    )
+    if not ports:
+        return Finding("serial ports", "none", "no telemetry over serial")
+    found = ", ".join("/" + str(port.relative_to(machine.root)) for port in ports)
+    used = "can carry MAVLink, NMEA or a DVL, which give the map its scale"
+    return Finding("serial ports", found, used, _access(ports, "dialout"))
+
+
+def _access(nodes: list[Path], group: str) -> str:
+    """What to do if a device exists but this user may not open it."""
+    barred = [node for node in nodes if not os.access(node, os.R_OK | os.W_OK)]
+    if not barred:
+        return ""
+    return (
+        f"you may not open {barred[0].name}; run 'sudo usermod -aG {group} $USER' and log in again"
+    )
+
+
+def can(machine: Machine) -> Finding:
+    found = [
+        f"{kind.parent.name} ({machine.text(f'sys/class/net/{kind.parent.name}/operstate') or '?'})"
+        for kind in machine.paths("sys/class/net/*/type")
+        if machine.text(str(kind.relative_to(machine.root))) == ARPHRD_CAN
+    ]
+    if not found:
+        return Finding("CAN", "none", "no telemetry over CAN")
+    down = [name for name in found if "down" in name]
+    advice = (
+        f"run 'sudo ip link set {down[0].split()[0]} up type can bitrate 500000'" if down else ""
+    )
+    return Finding("CAN", ", ".join(found), "can carry vehicle telemetry", advice)
