@@ -26,7 +26,9 @@ OTHER_SHAPE = "P"
 FRONT = "#868e96"
 MARKER_SIZE = 52.0
 FEW_DIGITS = 10.0
-"""Ratio of an axis' ends above which not every digit is labelled."""
+"""Ratio of an axis' ends above which not every digit is labelled: 1, 2 and 5 are."""
+LONE_DIGITS = 1000.0
+"""Ratio above which 1 alone is: the labels of four decades would run into each other."""
 MARGIN = 0.025
 """Height at which failed runs are marked, as a share of the axes."""
 
@@ -95,7 +97,9 @@ def _plain_numbers(axis: Axis) -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     low, high = axis.get_view_interval()
-    subs = (1.0, 2.0, 5.0) if high > FEW_DIGITS * low else tuple(float(k) for k in range(1, 10))
+    subs = tuple(float(k) for k in range(1, 10))
+    if high > FEW_DIGITS * low:
+        subs = (1.0,) if high > LONE_DIGITS * low else (1.0, 2.0, 5.0)
     axis.set_major_locator(LogLocator(subs=subs))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
