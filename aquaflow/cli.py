@@ -8,8 +8,6 @@ from __future__ import annotations
 import json
 import logging
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,6 +17,7 @@ from aquaflow import __version__
 from aquaflow.cli_bench import register as register_bench
 from aquaflow.cli_stress import register as register_stress
 from aquaflow.errors import AquaFlowError
+from aquaflow.terminal import Json, progress_bars
 
 if TYPE_CHECKING:
     from aquaflow.config import Config
@@ -29,8 +28,6 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-
-Json = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON.")]
 
 
 def main() -> None:
@@ -99,7 +96,7 @@ def map_command(
 
     from aquaflow.pipeline import map_recording  # loads torch: after what can be refused without it
 
-    with _progress(quiet=as_json) as progress:
+    with progress_bars(quiet=as_json) as progress:
         replayed = map_recording(
             recording, source.name, out, settings, calibration, overwrite, progress, trace=profile
         )
@@ -137,7 +134,7 @@ def synth(
     except ValidationError as error:
         first = error.errors()[0]
         raise ConfigError(f"--{first['loc'][0]}: {first['msg'].lower()}") from error
-    with _progress(quiet=as_json) as progress:
+    with progress_bars(quiet=as_json) as progress:
         write_dive(out, config, lambda done, total: progress("render", done, total))
     if as_json:
         typer.echo(json.dumps({"out": str(out), "frames": config.frames}))
@@ -214,32 +211,6 @@ def _configured(path: Path | None, preset: str | None, overrides: dict[str, Any]
     return parse_config(presets.merged(base, overrides), "command line")
 
 
-@contextmanager
-def _progress(quiet: bool) -> Iterator[Any]:
-    """A function (stage, done, total) that draws one bar per stage where somebody looks on."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description:>8}"), BarColumn(), MofNCompleteColumn())
-    hidden = quiet or not console.is_terminal
-    with Progress(*columns, TimeRemainingColumn(), console=console, disable=hidden) as bars:
-        tasks: dict[str, Any] = {}
-
-        def advance(stage: str, done: int, total: int | None) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=total)
-            bars.update(tasks[stage], completed=done, total=total)
-
-        yield advance
-
-
 def _print_summary(metrics: dict[str, Any], notes: list[str]) -> None:
     quality = (
         "no held-out frames"
@@ -254,5 +225,5 @@ def _print_summary(metrics: dict[str, Any], notes: list[str]) -> None:
         typer.echo(f"Note: {note}.")
 
 
-register_bench(app, _progress)
+register_bench(app)
 register_stress(app)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,12 +11,11 @@ import typer
 from typer.core import TyperGroup
 
 from aquaflow.errors import InputError
+from aquaflow.terminal import Json, progress_bars, table_console
 
-Json = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON.")]
 Suite = Annotated[str | None, typer.Option(help="ci (synthetic) | real DATA_DIR")]
 Data = Annotated[Path | None, typer.Argument(help="Of --suite real: a folder for each clip.")]
 Scenes = Annotated[list[Path] | None, typer.Option("--scene", help="Recording; may be repeated.")]
-Bars = Callable[[bool], AbstractContextManager[Any]]
 
 DIVES = "dives"
 
@@ -34,102 +31,104 @@ class _DivesUnlessNamed(TyperGroup):
         return super().parse_args(ctx, args if named else [DIVES, *args])
 
 
-def register(app: typer.Typer, bars: Bars) -> None:
-    """Add the commands to ``app``; ``bars(quiet)`` is how it shows progress."""
-
+def register(app: typer.Typer) -> None:
+    """Add the commands to ``app``."""
     bench = typer.Typer(
         cls=_DivesUnlessNamed, help="Run time against error; `bench render`: of the renderer."
     )
+    bench.command(DIVES)(dives)
+    bench.command()(render)
     app.add_typer(bench, name="bench")
+    app.command()(ablate)
 
-    @bench.command(DIVES)
-    def dives(
-        data: Data = None,
-        suite: Suite = None,
-        scene: Scenes = None,
-        preset: Annotated[list[str] | None, typer.Option(help="May be repeated.")] = None,
-        repeats: Annotated[int, typer.Option(min=1, help="Runs of each, interleaved.")] = 1,
-        peers: Annotated[bool, typer.Option(help="Run COLMAP and two-view odometry too.")] = True,
-        out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("out/bench"),
-        readme: Annotated[
-            Path | None, typer.Option(help="Write table and picture into this file's section.")
-        ] = None,
-        as_json: Json = False,
-    ) -> None:
-        """Run time against error: scenes x presets as a table, a picture and bench.json.
 
-        `aquaflow bench` alone does this too; `aquaflow bench render` times the renderer.
-        """
-        from aquaflow.evaluation.bench import benchmark as bm
-        from aquaflow.presets import PRESETS
+def dives(
+    data: Data = None,
+    suite: Suite = None,
+    scene: Scenes = None,
+    preset: Annotated[list[str] | None, typer.Option(help="May be repeated.")] = None,
+    repeats: Annotated[int, typer.Option(min=1, help="Runs of each, interleaved.")] = 1,
+    peers: Annotated[bool, typer.Option(help="Run COLMAP and two-view odometry too.")] = True,
+    out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("out/bench"),
+    readme: Annotated[
+        Path | None, typer.Option(help="Write table and picture into this file's section.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Run time against error: scenes x presets as a table, a picture and bench.json.
 
-        if data is not None and suite is None and not scene:
-            raise InputError(
-                f"bench knows neither a command nor a suite '{data}'; "
-                "give render, --suite real DATA_DIR, or --scene PATH"
-            )
+    `aquaflow bench` alone does this too; `aquaflow bench render` times the renderer.
+    """
+    from aquaflow.evaluation.bench import benchmark as bm
+    from aquaflow.presets import PRESETS
 
-        contenders = bm.contenders_of(preset or list(PRESETS), peers)
-        with bars(as_json) as progress:
-            scenes = bm.scenes_of(suite, data, scene or [], out, progress)
-            result = bm.benchmark(scenes, contenders, repeats, out, progress)
-        if readme is not None:
-            _into_readme(readme, out / bm.PICTURE_FILE, result)
-        if as_json:
-            typer.echo(json.dumps(result))
-            return
-        from aquaflow.evaluation.bench.table import print_table
+    if data is not None and suite is None and not scene:
+        raise InputError(
+            f"bench knows neither a command nor a suite '{data}'; "
+            "give render, --suite real DATA_DIR, or --scene PATH"
+        )
 
-        print_table(result["runs"], _console())
-        typer.echo(f"Look at {out / bm.PICTURE_FILE}; all numbers are in {out / bm.JSON_FILE}.")
+    contenders = bm.contenders_of(preset or list(PRESETS), peers)
+    with progress_bars(as_json) as progress:
+        scenes = bm.scenes_of(suite, data, scene or [], out, progress)
+        result = bm.benchmark(scenes, contenders, repeats, out, progress)
+    if readme is not None:
+        _into_readme(readme, out / bm.PICTURE_FILE, result)
+    if as_json:
+        typer.echo(json.dumps(result))
+        return
+    from aquaflow.evaluation.bench.table import print_table
 
-    @bench.command()
-    def render(
-        quick: Annotated[bool, typer.Option("--quick", help="Only the bars' two sizes.")] = False,
-        repeats: Annotated[int, typer.Option(min=1, help="Runs of each, interleaved.")] = 7,
-        opensplat: Annotated[
-            str | None, typer.Option(help="Program that times your OpenSplat build; see README.")
-        ] = None,
-        out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("out/bench_render"),
-        as_json: Json = False,
-    ) -> None:
-        """Forward and backward ms of every renderer here: table, picture, render_bench.json."""
-        from aquaflow.evaluation.bench.render import benchmark as bm
-        from aquaflow.evaluation.bench.render.scene import QUICK_SIZES, SIZES
+    print_table(result["runs"], table_console())
+    typer.echo(f"Look at {out / bm.PICTURE_FILE}; all numbers are in {out / bm.JSON_FILE}.")
 
-        sizes = QUICK_SIZES if quick else SIZES
-        with bars(as_json) as progress:
-            result = bm.bench_render(sizes, repeats, out, opensplat, progress)
-        if as_json:
-            typer.echo(json.dumps(result))
-            return
-        from aquaflow.evaluation.bench.render.table import print_result
 
-        print_result(result, _console())
-        typer.echo(f"Look at {out / bm.PICTURE_FILE}; all numbers are in {out / bm.JSON_FILE}.")
+def render(
+    quick: Annotated[bool, typer.Option("--quick", help="Only the bars' two sizes.")] = False,
+    repeats: Annotated[int, typer.Option(min=1, help="Runs of each, interleaved.")] = 7,
+    opensplat: Annotated[
+        str | None, typer.Option(help="Program that times your OpenSplat build; see README.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("out/bench_render"),
+    as_json: Json = False,
+) -> None:
+    """Forward and backward ms of every renderer here: table, picture, render_bench.json."""
+    from aquaflow.evaluation.bench.render import benchmark as bm
+    from aquaflow.evaluation.bench.render.scene import QUICK_SIZES, SIZES
 
-    @app.command()
-    def ablate(
-        data: Data = None,
-        suite: Suite = None,
-        scene: Scenes = None,
-        out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("out/ablation"),
-        as_json: Json = False,
-    ) -> None:
-        """What each part is worth: everything once without it, error and time against full."""
-        from aquaflow.evaluation.bench import ablation
-        from aquaflow.evaluation.bench.benchmark import scenes_of
+    sizes = QUICK_SIZES if quick else SIZES
+    with progress_bars(as_json) as progress:
+        result = bm.bench_render(sizes, repeats, out, opensplat, progress)
+    if as_json:
+        typer.echo(json.dumps(result))
+        return
+    from aquaflow.evaluation.bench.render.table import print_result
 
-        with bars(as_json) as progress:
-            scenes = scenes_of(suite, data, scene or [], out, progress)
-            if suite == "ci":
-                scenes = [s for s in scenes if s.name in ablation.CI_SCENES] or scenes
-            result = ablation.ablate(scenes, out, progress)
-        (out / "ablate.json").write_text(json.dumps(result, indent=2) + "\n")
-        if as_json:
-            typer.echo(json.dumps(result))
-        else:
-            ablation.print_ablation(result["rows"], _console())
+    print_result(result, table_console())
+    typer.echo(f"Look at {out / bm.PICTURE_FILE}; all numbers are in {out / bm.JSON_FILE}.")
+
+
+def ablate(
+    data: Data = None,
+    suite: Suite = None,
+    scene: Scenes = None,
+    out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("out/ablation"),
+    as_json: Json = False,
+) -> None:
+    """What each part is worth: everything once without it, error and time against full."""
+    from aquaflow.evaluation.bench import ablation
+    from aquaflow.evaluation.bench.benchmark import scenes_of
+
+    with progress_bars(as_json) as progress:
+        scenes = scenes_of(suite, data, scene or [], out, progress)
+        if suite == "ci":
+            scenes = [s for s in scenes if s.name in ablation.CI_SCENES] or scenes
+        result = ablation.ablate(scenes, out, progress)
+    (out / "ablate.json").write_text(json.dumps(result, indent=2) + "\n")
+    if as_json:
+        typer.echo(json.dumps(result))
+    else:
+        ablation.print_ablation(result["rows"], table_console())
 
 
 def _into_readme(readme: Path, picture: Path, result: dict[str, Any]) -> None:
@@ -140,11 +139,3 @@ def _into_readme(readme: Path, picture: Path, result: dict[str, Any]) -> None:
     kept.parent.mkdir(exist_ok=True)
     shutil.copyfile(picture, kept)
     write_readme(readme, kept, result["machine"], result["runs"])
-
-
-def _console() -> Any:
-    """As wide as the table where nobody looks on a terminal: a log must not cut numbers."""
-    from rich.console import Console
-
-    console = Console()
-    return console if console.is_terminal else Console(width=200)

@@ -7,14 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from aquaflow.terminal import Json, table_console
+
 if TYPE_CHECKING:
     from rich.console import Console
 
     from aquaflow.evaluation.stress.suite import Result
-
-
-LOG_WIDTH = 140
-"""Columns of the table where nobody looks on a terminal: a log must not fold it."""
 
 
 def register(app: typer.Typer) -> None:
@@ -29,7 +27,7 @@ def stress(
     case: Annotated[str | None, typer.Option(help="Only the case of this name.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of every random draw.")] = 0,
     long: Annotated[bool, typer.Option("--long", help="Also the cases that take minutes.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print machine-readable JSON.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Feed AquaFlow what no sane dive has, and see that it stays finite and keeps its word."""
     from rich.console import Console
@@ -45,8 +43,7 @@ def stress(
     if as_json:
         typer.echo(json.dumps({"cases": [result.to_json() for result in results]}))
     else:
-        out = Console()
-        _print(results, out if out.is_terminal else Console(width=LOG_WIDTH))
+        _print(results, table_console())
     if not all(result.outcome.passed for result in results):
         raise typer.Exit(1)
 

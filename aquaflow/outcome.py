@@ -214,21 +214,5 @@ def metrics(
     }
 
 
-def pace(frame_ms: list[float], first_pose_s: float | None, wall_s: float) -> dict[str, Any]:
-    """Milliseconds per frame and seconds to the first pose.
-
-    ``p50`` and ``p95`` are of one frame while frames come in; ``total`` is the whole run, refining
-    included, over its frames.
-    """
-    return {
-        "ms_per_frame": {
-            "p50": round(float(np.percentile(frame_ms, 50)), 3),
-            "p95": round(float(np.percentile(frame_ms, 95)), 3),
-            "total": round(1e3 * wall_s / len(frame_ms), 3),
-        },
-        "time_to_first_pose_s": None if first_pose_s is None else round(first_pose_s, 3),
-    }
-
-
 def _mean(values: list[float]) -> float | None:
     return round(float(np.mean(values)), 4) if values else None

@@ -21,12 +21,11 @@ from aquaflow.outcome import (
     examine_held_out,
     largest_sub_map,
     metrics,
-    pace,
     refined_poses,
     summarise_water,
 )
 from aquaflow.preparation import Preparation
-from aquaflow.profiler import Profiler
+from aquaflow.profiler import Profiler, pace
 from aquaflow.reporting import report_data
 from aquaflow.slam import MIN_VIEWS, Slam
 from aquaflow.sources import RecordedCamera
@@ -262,7 +261,7 @@ class _Replay:
         wall_s = time.monotonic() - started
         numbers = metrics(self.slam, self.results, self.dropped, held_out, wall_s)
         numbers["cpu_s"] = round(time.process_time() - self._cpu_before_s, 3)  # of all threads
-        return numbers | pace(self.frame_ms, self.first_pose_s, wall_s)
+        return numbers | pace(self.frame_ms, len(self.frame_ms), self.first_pose_s, wall_s)
 
 
 def _fix_threads(threads: int) -> None:

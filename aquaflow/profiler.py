@@ -118,3 +118,20 @@ class _Stage:
 
     def __exit__(self, *_: object) -> None:
         self._profiler._leave(self._name, self._started_s, self._depth)
+
+
+def pace(
+    frame_ms: list[float], count: int, first_pose_s: float | None, wall_s: float
+) -> dict[str, Any]:
+    """Milliseconds per frame and seconds to the first pose.
+
+    ``p50`` and ``p95`` are of one frame while frames come in, None where single frames were not
+    timed; ``total`` is the whole run, refining included, over its ``count`` frames.
+    """
+    half, most = (
+        round(float(np.percentile(frame_ms, q)), 3) if frame_ms else None for q in (50, 95)
+    )
+    return {
+        "ms_per_frame": {"p50": half, "p95": most, "total": round(1e3 * wall_s / count, 3)},
+        "time_to_first_pose_s": None if first_pose_s is None else round(first_pose_s, 3),
+    }

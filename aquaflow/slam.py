@@ -134,8 +134,14 @@ class Slam:
             sub_map = self.tracker.sub_map
             return Tracked(frame, FrameClass.SKIPPED, sub_map, reason=verdict.reason)
         self._T_kf[frame.index] = self._T_kf[before.frame.index]
-        skipped = replace(before, frame=frame, frame_class=FrameClass.SKIPPED, pointmap=None)
-        return replace(skipped, link=None, reason=verdict.reason)
+        return replace(
+            before,
+            frame=frame,
+            frame_class=FrameClass.SKIPPED,
+            pointmap=None,
+            reason=verdict.reason,
+            link=None,
+        )
 
     def _follow(self, correction: Correction) -> None:
         """Gaussians and views go where their keyframes went; merged sub-maps become one map."""

@@ -12,6 +12,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
     {"cli"},
     {"cli_bench", "cli_stress"},
+    {"terminal"},
     {"evaluation", "service", "doctor"},
     {"pipeline", "viewer"},
     {"reporting"},

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from aquaflow.config import TrackingConfig
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import CameraModel
-from aquaflow.keyframes import Keyframe, KeyframeStore
+from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
 from aquaflow.prior.contract import Encoding
 from aquaflow.tracking.retrieval import Retrieval
 from aquaflow.tracking.solver import PoseEstimate
@@ -45,24 +45,21 @@ class Places:
 
     def of_keyframe(self, keyframe: Keyframe, exclude: Callable[[int], bool]) -> list[Found]:
         """Earlier keyframes that show what ``keyframe`` shows, scales compared."""
-        encoding = keyframe.encoding
+        encoding, pointmap = keyframe.encoding, keyframe.pointmap
         numbers = [found.number for found in self._retrieval.candidates(encoding, exclude)]
-        found = [self._verified(number, encoding, None, keyframe) for number in numbers]
+        found = [self._verified(n, encoding, encoding.camera, pointmap) for n in numbers]
         return [place for place in found if place is not None]
 
     def _verified(
         self,
         number: int,
         encoding: Encoding,
-        camera: CameraModel | None,
-        own: Keyframe | None = None,
+        camera: CameraModel,
+        pointmap: Pointmap | None = None,
     ) -> Found | None:
         past = self._keyframes[number]
-        pointmap = None if own is None else own.pointmap
         try:
-            proof = verify(
-                past, encoding, camera or encoding.camera, self._config.verification, pointmap
-            )
+            proof = verify(past, encoding, camera, self._config.verification, pointmap)
         except InputError:
             return None  # a keyframe that cannot be read back costs itself
         return None if proof is None else Found(past, proof.estimate)

@@ -180,15 +180,7 @@ def pixel_rows(matches: Matches, T: Sim3) -> Rows:
     error_u = camera.fx * x + (camera.cx - matches.u)
     error_v = camera.fy * y + (camera.cy - matches.v)
 
-    # d pixel / d rho: X = ray / rho, so dY / drho = -z (Y - t).
-    lever = iz * z
-    along_u = camera.fx * lever * (T.t[0] - x * T.t[2])
-    along_v = camera.fy * lever * (T.t[1] - y * T.t[2])
-    spread = np.sqrt(along_u * along_u + along_v * along_v)
-    # A point with no parallax direction (spread 0) takes the axes instead.
-    still = spread < 1e-12
-    shorten = 1.0 / np.where(still, 1.0, spread)
-    along_u, along_v = np.where(still, 1.0, along_u * shorten), along_v * shorten
+    along_u, along_v, spread = _epipolar(camera, T, x, y, iz * z)
     along = along_u * error_u + along_v * error_v
     precision = 1.0 / (matches.sigma_px**2 + variance * spread * spread)
     inverse_along, inverse_across = np.sqrt(precision), 1.0 / matches.sigma_px
@@ -225,6 +217,26 @@ def pixel_rows(matches: Matches, T: Sim3) -> Rows:
     if behind.any():
         rows.residual[:, behind], rows.J[:, :, behind] = BEHIND, 0.0
     return rows
+
+
+def _epipolar(
+    camera: CameraModel,
+    T: Sim3,
+    x: Array,  # [M]
+    y: Array,  # [M] image at z = 1
+    lever: Array,  # [M] the point's depth in the keyframe over that in the frame
+) -> tuple[Array, Array, Array]:
+    """d pixel / d rho: its direction (u, v) and its length, [M] each.
+
+    X = ray / rho, so dY / drho = -z (Y - t). A point with no parallax direction (length 0) takes
+    the axes instead.
+    """
+    u = camera.fx * lever * (T.t[0] - x * T.t[2])
+    v = camera.fy * lever * (T.t[1] - y * T.t[2])
+    spread = np.sqrt(u * u + v * v)
+    still = spread < 1e-12
+    shorten = 1.0 / np.where(still, 1.0, spread)
+    return np.where(still, 1.0, u * shorten), v * shorten, spread
 
 
 def _image_row(J: Array, p: Array, q: Array, x: Array, y: Array, iz: Array) -> None:

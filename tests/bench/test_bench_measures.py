@@ -8,15 +8,16 @@ import numpy as np
 
 from aquaflow.evaluation.bench.measure import depth_error
 from aquaflow.evaluation.bench.summary import attenuation_error_pct
-from aquaflow.outcome import pace
+from aquaflow.profiler import pace
 
 
 def test_the_pace_counts_the_whole_run_and_single_frames() -> None:
-    found = pace([10.0, 20.0, 30.0], 0.5, 0.9)
+    found = pace([10.0, 20.0, 30.0], 3, 0.5, 0.9)
     assert found["ms_per_frame"]["p50"] == 20.0
     assert found["ms_per_frame"]["total"] == 300.0
     assert found["time_to_first_pose_s"] == 0.5
-    assert pace([10.0], None, 1.0)["time_to_first_pose_s"] is None
+    assert pace([10.0], 1, None, 1.0)["time_to_first_pose_s"] is None
+    assert pace([], 2, 0.5, 1.0)["ms_per_frame"] == {"p50": None, "p95": None, "total": 500.0}
 
 
 def test_the_depth_error_is_relative_and_over_what_both_know(tmp_path: Path) -> None:

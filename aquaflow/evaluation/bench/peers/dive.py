@@ -19,6 +19,7 @@ from aquaflow.geometry.camera import load_camera
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.messages import Frame
 from aquaflow.preparation import Preparation
+from aquaflow.profiler import pace
 from aquaflow.sources import open_recording
 
 FEWEST_POSES = 3
@@ -91,19 +92,10 @@ def write_dive(out: Path, recording: Prepared, result: PeerResult) -> dict[str, 
 
 
 def _metrics(count: int, result: PeerResult) -> dict[str, Any]:
-    def percentile(q: float) -> float | None:
-        return round(float(np.percentile(result.frame_ms, q)), 3) if result.frame_ms else None
-
     return {
         "frames": count,
         "tracked": len(result.poses),
         "lost": count - len(result.poses),
         "wall_s": round(result.wall_s, 3),
         "fps": round(count / max(result.wall_s, 1e-9), 3),
-        "ms_per_frame": {
-            "p50": percentile(50),
-            "p95": percentile(95),
-            "total": round(1e3 * result.wall_s / count, 3),
-        },
-        "time_to_first_pose_s": round(result.first_pose_s, 3),
-    }
+    } | pace(result.frame_ms, count, result.first_pose_s, result.wall_s)
