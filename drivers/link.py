@@ -1,0 +1,71 @@
+"""Byte links to devices: what every transport offers, what is counted, what decodes the bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol, TypeAlias
+
+from aquaflow.messages import TelemetrySample
+
+MAX_READ_BYTES = 65_536
+"""Most that one read returns: the largest UDP datagram."""
+
+RawTap: TypeAlias = Callable[[str, int, bytes], None]
+"""Gets every read as it came: name of the link, arrival_ns, bytes. Must not block."""
+
+
+class LinkLostError(Exception):
+    """The device or its peer went away; opening the link again may bring it back."""
+
+
+@dataclass
+class LinkCounters:
+    """What happened on a link since it was first opened."""
+
+    bytes: int = 0
+    messages: int = 0
+    """Packets or sentences with a good checksum."""
+    samples: int = 0
+    """Telemetry samples handed over."""
+    bad_checksums: int = 0
+    garbage_bytes: int = 0
+    """Bytes that belong to no packet, skipped to find the next one."""
+    invalid_values: int = 0
+    """Good packets whose values are impossible, or that the device itself calls invalid."""
+    dropped_samples: int = 0
+    """Oldest samples dropped because nobody fetched them."""
+    reconnects: int = 0
+
+
+class ByteLink(Protocol):
+    """An open serial port, socket or pty."""
+
+    name: str
+    """For logs and the recorder, stable over reconnects."""
+
+    def read(self, timeout_s: float) -> bytes:
+        """What has arrived, at most MAX_READ_BYTES; empty when ``timeout_s`` passed without any.
+
+        Raises:
+            LinkLostError: the device or the peer is gone.
+        """
+        ...
+
+    def write(self, data: bytes) -> None:
+        """Send ``data`` whole; raises LinkLostError as ``read`` does."""
+        ...
+
+    def close(self) -> None:
+        """Close; may be called again."""
+        ...
+
+
+class Decoder(Protocol):
+    """Turns the bytes of one link into samples; resynchronises by itself, its buffer is bounded."""
+
+    counters: LinkCounters
+
+    def feed(self, data: bytes, arrival_ns: int) -> list[TelemetrySample]:
+        """Samples that ``data`` completes. Never raises for what the bytes hold."""
+        ...
