@@ -75,7 +75,9 @@ class Timed:
         return self.most is None or size.n * size.pixels <= self.most
 
     def sample(self, scene: SplatScene) -> Sample:
-        with torch_threads(self.threads):
+        # The kernels have a pool of their own, and idle threads of torch spin on its processors.
+        ours = isinstance(self.renderer, CpuRenderer)
+        with torch_threads(1 if ours else self.threads):
             device = "cuda" if self.isa == "cuda" else "cpu"
             return time_renderer(self.renderer, scene, device, self.clock)
 
