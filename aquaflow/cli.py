@@ -15,6 +15,7 @@ import typer
 
 from aquaflow import __version__
 from aquaflow.cli_bench import register as register_bench
+from aquaflow.cli_prior import register as register_prior
 from aquaflow.cli_stress import register as register_stress
 from aquaflow.errors import AquaFlowError
 from aquaflow.terminal import Json, progress_bars
@@ -226,4 +227,5 @@ def _print_summary(metrics: dict[str, Any], notes: list[str]) -> None:
 
 
 register_bench(app)
+register_prior(app)
 register_stress(app)

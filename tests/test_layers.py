@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 FLOORS = (
     {"cli"},
-    {"cli_bench", "cli_stress"},
+    {"cli_bench", "cli_prior", "cli_stress"},
     {"terminal"},
     {"evaluation", "service", "doctor"},
     {"pipeline", "viewer"},
