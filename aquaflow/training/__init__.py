@@ -1,0 +1,1 @@
+"""Training and fine-tuning of two-view priors (paper, Sec. 3.1)."""
