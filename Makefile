@@ -16,10 +16,10 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export XDG_CACHE_HOME := $(CURDIR)/$(VENV)/cache
 export MPLCONFIGDIR := $(CURDIR)/$(VENV)/cache/matplotlib
 
-.PHONY: help setup run test test-all check clean
+.PHONY: help setup run test test-all test-kernel check clean
 
 help: ## Show this list.
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 setup: $(INSTALLED) ## Make .venv and install AquaFlow with the tested versions.
 
@@ -41,10 +41,14 @@ run: setup
 endif
 
 test: setup ## Run the tests that take seconds.
-	$(BIN)/pytest -m 'not slow'
+	$(BIN)/pytest -m 'not slow and not kernel'
 
 test-all: setup ## Run all tests, also those on whole recordings.
 	$(BIN)/pytest
+
+test-kernel: setup ## Run the drivers on a real Linux kernel under qemu: V4L2, CAN.
+	tests/kernel/prepare.sh $(VENV)/cache/kernel
+	$(BIN)/pytest tests/kernel -rs
 
 check: setup ## Lint, formatting, types.
 	$(BIN)/ruff check

@@ -15,7 +15,9 @@ import typer
 
 from aquaflow import __version__
 from aquaflow.cli_bench import register as register_bench
+from aquaflow.cli_devices import register as register_devices
 from aquaflow.cli_prior import register as register_prior
+from aquaflow.cli_record import register as register_record
 from aquaflow.cli_stress import register as register_stress
 from aquaflow.errors import AquaFlowError
 from aquaflow.terminal import Json, progress_bars
@@ -227,5 +229,7 @@ def _print_summary(metrics: dict[str, Any], notes: list[str]) -> None:
 
 
 register_bench(app)
+register_devices(app)
 register_prior(app)
+register_record(app)
 register_stress(app)

@@ -7,7 +7,7 @@ device tells it; ``arrival_ns`` is when the sample reached this process.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -22,11 +22,23 @@ __all__ = [
     "CameraModel",
     "Depth",
     "Dropped",
+    "Encoded",
     "Frame",
     "Lights",
     "TelemetrySample",
     "Velocity",
 ]
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """A picture's bytes as the camera or the file had them, for the recorder."""
+
+    format: Literal["jpeg", "png", "webp", "h264"]
+    data: bytes
+    """A whole file, or for h264 one access unit (Annex B)."""
+    key: bool = True
+    """True if it can be decoded without those before it."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +56,8 @@ class Frame:
     gain: float | None = None
     mask: npt.NDArray[np.bool_] | None = None
     """[H, W], True where the pixel shows the scene (False: vehicle frame, gripper)."""
+    encoded: Encoded | None = None
+    """What ``image`` was decoded from, where the source keeps it."""
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,9 @@ class Preparation:
         mask = frame.mask
         if mask is not None:
             mask = self._rectifier.mask(mask[y : y + h, x : x + w])
-        return replace(frame, image=image, camera=self._rectifier.camera, mask=mask)
+        # The camera's own bytes are no longer those of this picture.
+        camera = self._rectifier.camera
+        return replace(frame, image=image, camera=camera, mask=mask, encoded=None)
 
     def _plan(self, width: int, height: int) -> Rectifier:
         self._box = crop_box(self._config.crop, width, height)

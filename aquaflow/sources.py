@@ -6,16 +6,23 @@ so that a site can add its own without touching this package.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
+from aquaflow.config.cameras import CameraConfig
+from aquaflow.config.telemetry import TelemetryConfig
 from aquaflow.errors import InputError
 from aquaflow.messages import CameraModel, Dropped, Frame, TelemetrySample
 
 CAMERAS = "aquaflow.cameras"
 TELEMETRY = "aquaflow.telemetry"
+LINKS = "links"
+"""The entry point of live telemetry; the others of its group read recordings."""
+
+Tap: TypeAlias = Callable[[str, int, bytes], None]
+"""As ``drivers.link.RawTap``: name of the link, arrival_ns, bytes of a read."""
 
 
 @runtime_checkable
@@ -64,12 +71,55 @@ class RecordedCamera(CameraSource, Protocol):
         ...
 
 
+class LiveSource(CameraSource, Protocol):
+    """A camera source that opens a device; ``frames`` yields the newest picture until ``close``."""
+
+    @classmethod
+    def configured(cls, name: str, config: Any) -> LiveSource:
+        """The camera that ``config`` of this driver's kind describes; opens nothing yet."""
+        ...
+
+    def connect(self) -> None:
+        """Open the device now; without it, ``frames`` waits until the device is there.
+
+        Raises:
+            InputError: the device is not there or refuses.
+        """
+        ...
+
+
 class TelemetrySource(Protocol):
     """Yields telemetry in the order of arrival."""
 
     def samples(self) -> Iterator[TelemetrySample]: ...
 
     def close(self) -> None: ...
+
+
+class RecordedTelemetry(TelemetrySource, Protocol):
+    """A telemetry source that opens something recorded on disk; every pass begins anew."""
+
+    specificity: int
+    """As of :class:`RecordedCamera`."""
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences for the user about what was left out, complete once iteration ends."""
+        ...
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """True if this class is the right reader for ``path``."""
+        ...
+
+    @classmethod
+    def open(cls, path: Path, starts_s: float = 0.0) -> RecordedTelemetry:
+        """Open ``path``, whose clock begins ``starts_s`` after that of whoever asks.
+
+        Raises:
+            InputError: the recording cannot be read at all.
+        """
+        ...
 
 
 def open_recording(path: Path, fps: float | None = None) -> RecordedCamera:
@@ -80,10 +130,67 @@ def open_recording(path: Path, fps: float | None = None) -> RecordedCamera:
     """
     if not path.exists():
         raise InputError(f"there is nothing at {path}; give a folder of images or a video file")
+    reader = camera_reader(path)
+    if reader is not None:
+        return reader.open(path, fps=fps)
+    names = ", ".join(sorted(entry.name for entry in entry_points(group=CAMERAS)))
+    known = names or "none; reinstall aquaflow"
+    raise InputError(f"no installed source reads {path}; installed sources are: {known}")
+
+
+def camera_reader(path: Path) -> type[RecordedCamera] | None:
+    """The registered source that recognises ``path`` best; None if it is no recording."""
     entries = sorted(entry_points(group=CAMERAS), key=lambda entry: entry.name)
     readers: list[type[RecordedCamera]] = [entry.load() for entry in entries]
     fitting = [cls for cls in readers if hasattr(cls, "recognises") and cls.recognises(path)]
-    if fitting:
-        return max(fitting, key=lambda cls: cls.specificity).open(path, fps=fps)
-    names = ", ".join(entry.name for entry in entries) or "none; reinstall aquaflow"
-    raise InputError(f"no installed source reads {path}; installed sources are: {names}")
+    return max(fitting, key=lambda cls: cls.specificity) if fitting else None
+
+
+def open_camera(name: str, config: CameraConfig) -> LiveSource:
+    """The live camera that ``config`` describes, behind the entry point named as its ``kind``.
+
+    Raises:
+        InputError: no driver of this kind is installed.
+        ConfigError: the calibration that ``config`` names is malformed.
+    """
+    for entry in entry_points(group=CAMERAS):
+        if entry.name == config.kind:
+            driver: type[LiveSource] = entry.load()
+            return driver.configured(name, config)
+    raise InputError(f"no driver for cameras of kind '{config.kind}'; reinstall aquaflow")
+
+
+def open_links(config: TelemetryConfig, tap: Tap | None = None) -> TelemetrySource:
+    """The live telemetry devices of ``config``; ``tap`` gets the raw bytes of every link.
+
+    Raises:
+        InputError: no driver for links is installed, or a library that one needs.
+        ConfigError: a DBC file is not as the config says.
+    """
+    for entry in entry_points(group=TELEMETRY):
+        if entry.name == LINKS:
+            driver: Callable[[TelemetryConfig, Tap | None], TelemetrySource] = entry.load()
+            return driver(config, tap)
+    raise InputError("no driver for telemetry links is installed; reinstall aquaflow")
+
+
+def open_recorded_telemetry(path: Path, starts_s: float = 0.0) -> RecordedTelemetry:
+    """Open the telemetry at ``path`` with the registered source that recognises it best.
+
+    Raises:
+        InputError: nothing is there, or no installed source finds telemetry in it.
+    """
+    found = telemetry_reader(path)
+    if found is None:
+        raise InputError(f"no installed source finds telemetry in {path}")
+    return found.open(path, starts_s)
+
+
+def telemetry_reader(path: Path) -> type[RecordedTelemetry] | None:
+    """The registered source that recognises ``path`` best; None if it holds no telemetry."""
+    if not path.exists():
+        raise InputError(f"there is nothing at {path}; give a recording with telemetry")
+    entries = sorted(entry_points(group=TELEMETRY), key=lambda entry: entry.name)
+    readers: list[type[RecordedTelemetry]] = [entry.load() for entry in entries]
+    fitting = [cls for cls in readers if hasattr(cls, "recognises") and cls.recognises(path)]
+    return max(fitting, key=lambda cls: cls.specificity) if fitting else None

@@ -15,9 +15,11 @@ from aquaflow.messages import CameraModel, Dropped, Frame
 from sim_drivers.picture import (
     EXTENSIONS,
     UnreadablePictureError,
+    decode_picture,
     grey_16_white,
     probe_size,
     read_picture,
+    received_as,
     to_rgb,
 )
 
@@ -86,8 +88,9 @@ class ImageFolder:
         t_ns = self._times_ns[index]
         if index not in self._reasons:
             try:
-                picture = read_picture(self.files[index])
-            except UnreadablePictureError as error:
+                data = self.files[index].read_bytes()
+                picture = decode_picture(data)
+            except (UnreadablePictureError, OSError) as error:
                 self._reasons[index] = f"{self.name_of(index)} {error}"
                 self._update_notes()
         if index in self._reasons:
@@ -96,7 +99,9 @@ class ImageFolder:
             self._white = self._folder_white()
         image = to_rgb(picture, self._white or 0)
         camera = self.camera or guess_camera(image.shape[1], image.shape[0])
-        return Frame(index, t_ns, t_ns, image, camera)
+        # 16-bit grey means nothing without the white of its folder.
+        encoded = received_as(data) if picture.ndim == 3 else None
+        return Frame(index, t_ns, t_ns, image, camera, encoded=encoded)
 
     def _folder_white(self) -> int:
         """White of the first 16-bit grey picture: one value for all, or brightness would jump."""

@@ -5,11 +5,14 @@ Pillow decodes, also TIFF: OpenCV prints a warning to stderr for every private t
 
 from __future__ import annotations
 
+import io
 import warnings
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+
+from aquaflow.messages import Encoded
 
 EXTENSIONS = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm"})
 
@@ -41,19 +44,31 @@ def probe_size(path: Path) -> tuple[int, int]:
 
 
 def read_picture(path: Path) -> npt.NDArray[np.uint8 | np.int32]:
+    """Decode a file; see :func:`decode_picture`.
+
+    Raises:
+        UnreadablePictureError: the file is damaged or its pixel type is unknown.
+    """
+    try:
+        return decode_picture(path.read_bytes())
+    except OSError as error:
+        raise UnreadablePictureError("cannot be read") from error
+
+
+def decode_picture(data: bytes) -> npt.NDArray[np.uint8 | np.int32]:
     """Decode to [H, W, 3] uint8 RGB, or, for 16-bit grey, to [H, W] int32 as stored.
 
     Grey becomes RGB, transparency is dropped, 16-bit colour keeps its high byte.
 
     Raises:
-        UnreadablePictureError: the file is damaged or its pixel type is unknown.
+        UnreadablePictureError: the data are damaged or their pixel type is unknown.
     """
     from PIL import Image
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            with Image.open(path) as picture:
+            with Image.open(io.BytesIO(data)) as picture:
                 if picture.mode in GREY_16_MODES:
                     return np.asarray(picture).astype(np.int32)
                 if picture.mode != "F":
@@ -62,6 +77,17 @@ def read_picture(path: Path) -> npt.NDArray[np.uint8 | np.int32]:
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
             raise UnreadablePictureError("is damaged or cut off") from error
     raise UnreadablePictureError(f"has pixels of type {mode}; convert it to 8 bits per channel")
+
+
+def received_as(data: bytes) -> Encoded | None:
+    """``data`` for the recorder, if they are a file of a format that it keeps as it is."""
+    if data.startswith(b"\xff\xd8"):
+        return Encoded("jpeg", data)
+    if data.startswith(b"\x89PNG"):
+        return Encoded("png", data)
+    if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
+        return Encoded("webp", data)
+    return None
 
 
 def grey_16_white(

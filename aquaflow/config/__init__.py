@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from aquaflow.config.mapping import (
     DecoderConfig,
@@ -21,7 +21,7 @@ from aquaflow.config.mapping import (
     VoxelConfig,
 )
 from aquaflow.config.source import SourceConfig
-from aquaflow.config.stage import Stage
+from aquaflow.config.stage import Stage, validated
 from aquaflow.config.tracking import (
     GateConfig,
     GraphConfig,
@@ -51,6 +51,7 @@ __all__ = [
     "dump_config",
     "load_config",
     "parse_config",
+    "read_yaml",
 ]
 
 
@@ -71,13 +72,7 @@ def parse_config(data: dict[str, Any], origin: str) -> Config:
     Raises:
         ConfigError: with the path of the first key that is unknown or out of range.
     """
-    try:
-        return Config.model_validate(data)
-    except ValidationError as error:
-        first = error.errors()[0]
-        path = ".".join(str(part) for part in first["loc"])
-        problem = "is not a known key" if first["type"] == "extra_forbidden" else first["msg"]
-        raise ConfigError(f"{origin}: '{path}' {problem.lower()}; see `aquaflow config`") from error
+    return validated(Config, data, origin)
 
 
 def load_config(path: Path) -> Config:
@@ -86,6 +81,16 @@ def load_config(path: Path) -> Config:
     Raises:
         InputError: the file cannot be read, or is not YAML.
         ConfigError: a key is unknown or a value out of range.
+    """
+    return parse_config(read_yaml(path), str(path))
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The mapping that a YAML file holds; empty for an empty file.
+
+    Raises:
+        InputError: the file cannot be read, or is not YAML.
+        ConfigError: it holds something else.
     """
     try:
         data = yaml.safe_load(path.read_text()) or {}
@@ -96,7 +101,7 @@ def load_config(path: Path) -> Config:
         raise InputError(f"{path} is not YAML; write `key: value` lines") from error
     if not isinstance(data, dict):
         raise ConfigError(f"{path} holds no key: value pairs; see `aquaflow config`")
-    return parse_config(data, str(path))
+    return data
 
 
 def dump_config(config: Config, path: Path) -> None:

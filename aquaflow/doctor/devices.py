@@ -47,9 +47,8 @@ def cameras(machine: Machine) -> Finding:
     found = ", ".join(
         f"/dev/{node.name} ({name or 'no name'})" for node, name in zip(nodes, names, strict=True)
     )
-    return Finding(
-        "USB and CSI cameras", found, "seen by the system; not read yet", _access(nodes, "video")
-    )
+    used = "read live, driver v4l2; `aquaflow devices` tells its id"
+    return Finding("USB and CSI cameras", found, used, _access(nodes, "video"))
 
 
 def oak(machine: Machine) -> Finding:
@@ -60,8 +59,10 @@ def oak(machine: Machine) -> Finding:
     ]
     if not products:
         return Finding("OAK cameras", "none on USB", "no OAK is used")
-    advice = "" if machine.module_present("depthai") else "run 'pip install depthai' to use it"
-    return Finding("OAK cameras", ", ".join(products), "seen by the system; not read yet", advice)
+    present = machine.module_present("depthai")
+    advice = "" if present else "run `pip install 'aquaflow[oak]'` to use it (depthai, 366 MB)"
+    used = "read live, driver oak" if present else "no OAK is used"
+    return Finding("OAK cameras", ", ".join(products), used, advice)
 
 
 def serial(machine: Machine) -> Finding:

@@ -1,0 +1,113 @@
+"""Settings of live cameras: one model for each kind of driver, told apart by ``kind``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal, TypeAlias
+
+from pydantic import Field, model_validator
+
+from aquaflow.config.stage import Stage
+from aquaflow.config.telemetry import MountingConfig
+
+
+class LiveCameraConfig(Stage):
+    """What all live cameras have in common."""
+
+    calibration: Path | None = Field(
+        None, description="camera.yaml, made in water; None: the device's own, or a guess"
+    )
+    stall_s: float = Field(
+        3.0,
+        gt=0,
+        description="without a picture for so long, the device is opened anew; an auto exposure in "
+        "the dark makes 2 s pauses on UVC cameras",
+    )
+    first_retry_s: float = Field(0.5, gt=0, description="wait before a lost device is looked for")
+    last_retry_s: float = Field(
+        8.0, gt=0, description="the wait doubles up to this; a tether is plugged in within minutes"
+    )
+
+
+class V4l2Config(LiveCameraConfig):
+    """A USB or CSI camera of the Linux kernel."""
+
+    kind: Literal["v4l2"]
+    device: str | None = Field(
+        None,
+        description="an id as `aquaflow devices` prints it: a name in /dev/v4l/by-id, a USB serial "
+        "number, or the bus; never videoN, which changes. None: the only camera there is",
+    )
+    width: int = Field(1280, ge=16, description="px; the camera may choose another size")
+    height: int = Field(720, ge=16, description="px")
+    fps: float = Field(30.0, gt=0, description="pictures/s asked for")
+    pixels: Literal["YUYV", "MJPG", "GREY"] = Field(
+        "MJPG",
+        description="measured at 720p on one core: YUYV 2 ms a picture, MJPG 19 ms; USB 2 carries "
+        "YUYV up to 640x480 at 30 pictures/s",
+    )
+    exposure_s: float | None = Field(
+        None, gt=0, description="fixed exposure: lamps on a vehicle confuse the automatic; None: it"
+    )
+    gain: int | None = Field(None, ge=0, description="in the camera's own units; None: automatic")
+    white_balance_k: int | None = Field(
+        None, ge=1000, le=20000, description="kelvin; fixed, or colours change with the view"
+    )
+    buffers: int = Field(
+        4, ge=4, le=32, description="one waits, one is decoded, two stay with the kernel"
+    )
+
+
+class OakConfig(LiveCameraConfig):
+    """A Luxonis OAK camera."""
+
+    kind: Literal["oak"]
+    device: str | None = Field(None, description="its id or IP address; None: the first found")
+    socket: Literal["CAM_A", "CAM_B", "CAM_C", "CAM_D"] = Field(
+        "CAM_A", description="CAM_A is the colour camera of an OAK-D, B and C its stereo pair"
+    )
+    width: int = Field(1280, ge=16, description="px")
+    height: int = Field(720, ge=16, description="px")
+    fps: float = Field(15.0, gt=0, description="pictures/s; a mapper uses no more")
+    exposure_s: float | None = Field(
+        None, gt=0, le=0.033, description="fixed exposure, needs iso; None: automatic"
+    )
+    iso: int | None = Field(None, ge=100, le=1600, description="fixed sensitivity, needs exposure")
+    white_balance_k: int | None = Field(None, ge=1000, le=12000, description="kelvin, fixed")
+    imu_rate_hz: int = Field(
+        200, ge=0, le=400, description="accelerometer and gyroscope readings/s; 0: none"
+    )
+    mounting: MountingConfig = Field(
+        MountingConfig(), description="of the camera; without it, it looks forward"
+    )
+
+    @model_validator(mode="after")
+    def _exposure_and_iso_go_together(self) -> OakConfig:
+        if (self.exposure_s is None) != (self.iso is None):
+            raise ValueError("exposure_s and iso are set together or not at all")
+        return self
+
+
+class StreamConfig(LiveCameraConfig):
+    """A video stream from the network, for vehicles whose pilot owns the camera."""
+
+    kind: Literal["stream"]
+    url: str = Field(
+        pattern=r"^(rtsps?|https?|udp|tcp)://.+|^.+\.sdp$",
+        description="rtsp://, http://, udp:// (MPEG-TS), or an .sdp file for bare RTP",
+    )
+    transport: Literal["tcp", "udp"] = Field(
+        "tcp", description="of RTSP; udp is quicker, tcp loses nothing on a tether"
+    )
+    latency_s: float = Field(
+        0.0,
+        ge=0,
+        le=2.0,
+        description="from exposure to arrival, taken off the times; streams do not tell it. "
+        "Measure: film a clock beside its own picture",
+    )
+
+
+CameraConfig: TypeAlias = Annotated[
+    V4l2Config | OakConfig | StreamConfig, Field(discriminator="kind")
+]

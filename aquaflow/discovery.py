@@ -1,0 +1,53 @@
+"""Devices that are plugged in, with the lines that make a config use them.
+
+Every driver that can look for its devices registers a function behind the entry point group
+``aquaflow.discovery``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib.metadata import entry_points
+from typing import Any, TypeAlias
+
+DISCOVERY = "aquaflow.discovery"
+
+
+@dataclass(frozen=True)
+class FoundDevice:
+    """One camera or link."""
+
+    kind: str
+    """As in the config: v4l2, oak, serial, can."""
+    id: str
+    """Stays the same when it is plugged in again."""
+    name: str
+    detail: str
+    """What it delivers, or why it cannot be used now."""
+    config: dict[str, Any] = field(default_factory=dict)
+    """To paste into the config: of a camera, or of a device's link."""
+
+
+Discover: TypeAlias = Callable[[], list[FoundDevice]]
+
+
+@dataclass(frozen=True)
+class Found:
+    """Everything found, and the kinds that could not be looked for."""
+
+    devices: list[FoundDevice]
+    problems: list[str]
+
+
+def discover() -> Found:
+    """Ask every installed driver; one that fails costs only its own devices."""
+    devices: list[FoundDevice] = []
+    problems: list[str] = []
+    for entry in sorted(entry_points(group=DISCOVERY), key=lambda each: each.name):
+        try:
+            look: Discover = entry.load()
+            devices += look()
+        except Exception as error:  # a broken driver of a site must not hide the others
+            problems.append(f"{entry.name}: {error}")
+    return Found(devices, problems)

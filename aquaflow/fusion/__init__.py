@@ -1,0 +1,1 @@
+"""Telemetry meets the map: device clocks, metric scale, gravity, velocity."""

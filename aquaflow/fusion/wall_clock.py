@@ -1,0 +1,46 @@
+"""The wall clock, watched: it jumps during dives, and nothing but the log depends on it."""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import dataclass
+
+log = logging.getLogger(__name__)
+
+JUMP_NS = 500_000_000
+"""NTP slews by 0.5 ms/s; more than this between two looks is a clock being set."""
+
+
+@dataclass(frozen=True)
+class WallClockReading:
+    """One look at both clocks."""
+
+    monotonic_ns: int
+    offset_ns: int
+    """CLOCK_REALTIME minus CLOCK_MONOTONIC."""
+    jump_ns: int
+    """Change since the look before, if that is a jump; else 0."""
+
+
+class WallClockWatch:
+    """Offset of the wall clock as a series; jumps are logged and counted, and do nothing else."""
+
+    def __init__(self) -> None:
+        self.jumps = 0
+        self._last_offset_ns: int | None = None
+
+    def look(
+        self, monotonic_ns: int | None = None, realtime_ns: int | None = None
+    ) -> WallClockReading:
+        """Read both clocks, or take what a recording says they were."""
+        monotonic = time.monotonic_ns() if monotonic_ns is None else monotonic_ns
+        realtime = time.time_ns() if realtime_ns is None else realtime_ns
+        offset = realtime - monotonic
+        change = 0 if self._last_offset_ns is None else offset - self._last_offset_ns
+        self._last_offset_ns = offset
+        if abs(change) < JUMP_NS:
+            return WallClockReading(monotonic, offset, 0)
+        self.jumps += 1
+        log.warning("the wall clock was set by %+.3f s; the dive's clock goes on", change * 1e-9)
+        return WallClockReading(monotonic, offset, change)

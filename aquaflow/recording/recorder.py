@@ -1,0 +1,141 @@
+"""The recorder: takes from any thread without making it wait, writes from a thread of its own.
+
+Topics: ``/CAMERA/image`` or ``/CAMERA/video`` (foxglove schemas), ``/CAMERA/calibration``,
+``/CAMERA/exposure``, ``/CAMERA/mask``, ``/CAMERA/dropped``, ``/telemetry/SOURCE/KIND`` (JSON),
+``/links/LINK`` (raw bytes), ``/clock`` and ``/recorder``. A message's log time is its arrival, its
+publish time the moment of exposure or measurement, both CLOCK_MONOTONIC.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from aquaflow.config.recording import RecordingConfig
+from aquaflow.errors import InputError
+from aquaflow.messages import Dropped, Frame, TelemetrySample
+from aquaflow.recording.disk import free_bytes
+from aquaflow.recording.dive_file import require_mcap
+from aquaflow.recording.status import RecorderStatus
+from aquaflow.recording.waiting import Item, LinkBytes, Picture, Sample, Waiting
+from aquaflow.recording.writing import DiveWriter
+
+log = logging.getLogger(__name__)
+
+MB = 1_000_000
+
+
+class Recorder:
+    """Writes a folder of MCAP files; ``frame``, ``sample`` and ``raw`` never block."""
+
+    def __init__(
+        self,
+        folder: Path,
+        settings: RecordingConfig,
+        free: Callable[[Path], int] = free_bytes,
+    ) -> None:
+        """Begin the recording; ``free`` tells the free bytes of the disk under a folder.
+
+        Raises:
+            InputError: the folder holds a recording, cannot be written, or the disk is full.
+        """
+        require_mcap()
+        self.status = RecorderStatus()
+        self._settings, self._folder, self._free = settings, folder, free
+        self._prepare_folder()
+        self._waiting = Waiting(settings.queue_mb * MB)
+        self._writer = DiveWriter(folder, settings, self.status)
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        self._thread.start()
+
+    def frame(self, camera: str, frame: Frame | Dropped) -> None:
+        """Record a picture; its ``image`` must not change afterwards."""
+        self._put(Picture(camera, frame))
+
+    def sample(self, sample: TelemetrySample) -> None:
+        """Record a decoded sample."""
+        self._put(Sample(sample))
+
+    def raw(self, link: str, arrival_ns: int, data: bytes) -> None:
+        """Record what one read of a link returned; a ``RawTap`` of ``drivers.link``."""
+        self._put(LinkBytes(link, arrival_ns, bytes(data)))
+
+    def close(self) -> RecorderStatus:
+        """Write what waits, end the last file, and tell what was done; may be called again."""
+        self._closing.set()
+        self._waiting.wake()
+        self._thread.join()
+        self.status.dropped = self._waiting.dropped()
+        return self.status
+
+    def _prepare_folder(self) -> None:
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            if any(self._folder.glob("*.mcap")):
+                raise InputError(f"{self._folder} already holds a recording; give another --out")
+            full = self._full()
+        except OSError as error:
+            raise InputError(
+                f"cannot record to {self._folder}: {error.strerror}; give another --out"
+            ) from error
+        if full is not None:
+            raise InputError(full)
+
+    def _put(self, item: Item) -> None:
+        if self.status.stopped is None and not self._closing.is_set():
+            self._waiting.put(item)
+
+    def _run(self) -> None:
+        """The thread: write, flush every so often, until closed or the disk is full."""
+        try:
+            self._write_until_closed()
+            self._writer.close()
+        except OSError as error:
+            self._stop(f"the disk takes no more: {error.strerror}")
+            self._writer.abandon()
+        except Exception as error:
+            self._stop(f"the recorder failed: {error}")
+            log.exception("the recorder failed")
+            self._writer.abandon()
+
+    def _write_until_closed(self) -> None:
+        due = time.monotonic()
+        while self.status.stopped is None:
+            item = self._waiting.take(due - time.monotonic())
+            if item is not None:
+                self._write(item)
+            elif self._closing.is_set():
+                return
+            if time.monotonic() >= due:
+                self.status.dropped = self._waiting.dropped()
+                self._writer.flush()
+                due = time.monotonic() + self._settings.flush_s
+                full = self._full()
+                if full is not None:
+                    self._stop(full)
+
+    def _write(self, item: Item) -> None:
+        try:
+            self._writer.write(item)
+        except OSError:
+            raise
+        except Exception as error:  # one message that cannot be encoded costs itself
+            self._waiting.refuse(item.topic)
+            log.warning("not recorded, of %s: %s", item.topic, error)
+
+    def _stop(self, reason: str) -> None:
+        self.status.stopped = reason
+        log.error("recording stopped: %s", reason)
+
+    def _full(self) -> str | None:
+        free = self._free(self._folder)
+        if free >= self._settings.reserve_mb * MB:
+            return None
+        return (
+            f"the disk of {self._folder} has {free // MB} MB left, and {self._settings.reserve_mb} "
+            "MB are kept free; delete old recordings or lower recording.reserve_mb"
+        )

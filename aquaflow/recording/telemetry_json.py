@@ -1,0 +1,78 @@
+"""Telemetry samples as JSON messages with a JSON schema each; reading back gives equal samples."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields
+from typing import Any
+
+from aquaflow.messages import (
+    Acceleration,
+    Altitude,
+    AngularRate,
+    Attitude,
+    Depth,
+    Lights,
+    TelemetrySample,
+    Velocity,
+)
+
+KINDS: dict[str, type[TelemetrySample]] = {
+    "depth": Depth,
+    "attitude": Attitude,
+    "angular_rate": AngularRate,
+    "acceleration": Acceleration,
+    "velocity": Velocity,
+    "altitude": Altitude,
+    "lights": Lights,
+}
+KIND_OF: dict[type[TelemetrySample], str] = {sample: kind for kind, sample in KINDS.items()}
+
+LENGTHS = {"wxyz": 4, "rate_rad_s": 3, "acceleration_m_s2": 3, "velocity_m_s": 3}
+"""Fields that are arrays."""
+
+
+def sample_schema(kind: str) -> bytes:
+    """JSON schema of one kind of sample."""
+    properties: dict[str, Any] = {
+        "t_ns": {"type": "integer", "description": "CLOCK_MONOTONIC of the measurement"},
+        "arrival_ns": {"type": "integer", "description": "CLOCK_MONOTONIC of its arrival"},
+        "source": {"type": "string"},
+    }
+    for field in fields(KINDS[kind]):
+        number: dict[str, Any] = {"type": "number"}
+        length = LENGTHS.get(field.name)
+        if length is not None:
+            number = {"type": "array", "items": number, "minItems": length, "maxItems": length}
+        properties.setdefault(field.name, number)
+    schema = {"title": KINDS[kind].__name__, "type": "object", "properties": properties}
+    return json.dumps(schema | {"required": list(properties)}).encode()
+
+
+def sample_to_json(sample: TelemetrySample) -> bytes:
+    """The sample as one JSON object; floats keep every bit.
+
+    Raises:
+        ValueError: a value is not finite.
+    """
+    return json.dumps(vars(sample), allow_nan=False, separators=(",", ":")).encode()
+
+
+def sample_from_json(kind: str, data: bytes) -> TelemetrySample:
+    """The sample that ``sample_to_json`` wrote.
+
+    Raises:
+        ValueError: the data are not such a sample.
+    """
+    sample_type = KINDS[kind]
+    try:
+        values = json.loads(data)
+        known = {field.name: values[field.name] for field in fields(sample_type)}
+    except (KeyError, TypeError, UnicodeDecodeError) as error:
+        raise ValueError(f"not a sample of kind {kind}") from error
+    for name, length in LENGTHS.items():
+        if name in known:
+            known[name] = tuple(float(value) for value in known[name])
+            if len(known[name]) != length:
+                raise ValueError(f"{name} holds {len(known[name])} values, not {length}")
+    return sample_type(**known)

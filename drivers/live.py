@@ -1,0 +1,245 @@
+"""A live camera as a CameraSource: its thread, its state, and how it comes back when it is lost.
+
+A driver brings a function that opens its device (:mod:`drivers.capture`); all else is here and
+the same for every kind of camera.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from enum import Enum
+
+from aquaflow.config.cameras import LiveCameraConfig
+from aquaflow.errors import InputError
+from aquaflow.geometry.camera import guess_camera, load_camera
+from aquaflow.messages import CameraModel, Dropped, Frame
+from drivers.capture import Capture, OpenCapture, RawPicture, UnusablePictureError
+from drivers.exposure_clock import ExposureClock
+from drivers.newest import NewestPicture
+from drivers.sequence import SequenceGaps
+
+READ_S = 0.2
+"""Longest wait for a picture before the thread looks whether it shall end."""
+
+JOIN_S = 2.0
+"""Longest wait for the thread; one that hangs in a device's library ends with the process."""
+
+log = logging.getLogger(__name__)
+
+
+class CameraState(Enum):
+    CLOSED = "closed"
+    CONNECTING = "connecting"
+    STREAMING = "streaming"
+    LOST = "lost"
+
+
+@dataclass
+class CameraCounters:
+    """Pictures since the source was made; every received one ends in exactly one other counter,
+    but for the one that may be waiting or held by the consumer."""
+
+    received: int = 0
+    delivered: int = 0
+    overtaken: int = 0
+    """A newer one came before the consumer took it."""
+    passed_over: int = 0
+    """Not asked for: sub-sampling."""
+    unusable: int = 0
+    """Damaged, or of another size than those before."""
+    duplicates: int = 0
+    lost: int = 0
+    """Never received: gaps in the device's own counter."""
+    stamps_repaired: int = 0
+    reconnects: int = 0
+
+
+class LiveCamera:
+    """Frames of a device that may be slow, absent, or unplugged at any time."""
+
+    frame_count: int | None = None
+
+    def __init__(
+        self,
+        name: str,
+        config: LiveCameraConfig,
+        open_capture: OpenCapture,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """Nothing is opened yet.
+
+        Raises:
+            ConfigError, InputError: the calibration named in ``config`` cannot be read.
+        """
+        self.name = name
+        self.camera: CameraModel | None = (
+            None if config.calibration is None else load_camera(config.calibration)
+        )
+        self.notes: list[str] = []
+        self.state = CameraState.CLOSED
+        self.reason = ""
+        """Why the camera is lost, for people."""
+        self._config = config
+        self._open_capture = open_capture
+        self._now_ns = now_ns
+        self._opened: Capture | None = None
+        self._size: tuple[int, int] | None = None
+        self._counts = CameraCounters()
+        self._clock = ExposureClock()
+        self._newest = NewestPicture()
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._failure: Exception | None = None
+        self._index = 0
+        self._sequence = SequenceGaps()
+
+    @property
+    def counters(self) -> CameraCounters:
+        self._counts.overtaken = self._newest.overtaken
+        self._counts.stamps_repaired = self._clock.repaired
+        return self._counts
+
+    def connect(self) -> None:
+        """Open the device now, so that a wrong id is told before the dive.
+
+        Without it, :meth:`frames` waits until the device is there.
+
+        Raises:
+            InputError: the device is not there or refuses.
+        """
+        if self._opened is None and self._thread is None:
+            try:
+                self._opened = self._open()
+            except OSError as error:
+                raise InputError(f"camera '{self.name}': {error}") from error
+
+    def frames(
+        self, every: int = 1, start: int = 0, stop: int | None = None
+    ) -> Iterator[Frame | Dropped]:
+        """The newest picture, again and again, until :meth:`close` or index ``stop``.
+
+        An index counts what the device took, so it jumps where pictures were lost or overtaken.
+
+        Raises:
+            Exception: what went wrong in the driver, if it was not the device.
+        """
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name=self.name, daemon=True)
+            self._thread.start()
+        while (picture := self._newest.take()) is not None:
+            try:
+                ended = stop is not None and picture.index >= stop
+                asked = picture.index >= start and (picture.index - start) % every == 0
+                frame = self._frame(picture) if asked and not ended else None
+            finally:
+                picture.release()
+            if frame is not None:
+                yield frame
+            else:
+                self._counts.passed_over += 1
+            if ended:
+                return
+        if self._failure is not None:
+            raise self._failure
+
+    def close(self) -> None:
+        """End iteration and give the device back; may be called from any thread, and again."""
+        self._closing.set()
+        self._newest.end()
+        if self._thread is not None:
+            self._thread.join(JOIN_S)
+        elif self._opened is not None:
+            self._opened.close()
+        self._opened = None
+        self.state = CameraState.CLOSED
+
+    def _frame(self, picture: RawPicture) -> Frame | Dropped:
+        try:
+            image = picture.decode()
+            height, width = image.shape[:2]
+            self._size = self._size or (width, height)
+            if (width, height) != self._size:
+                raise UnusablePictureError(f"is {width} x {height} px, not {self._size}")
+        except UnusablePictureError as error:
+            self._counts.unusable += 1
+            return Dropped(picture.index, picture.t_ns, f"{self.name}#{picture.index} {error}")
+        self._counts.delivered += 1
+        camera = self.camera or guess_camera(width, height)
+        return Frame(
+            picture.index,
+            picture.t_ns,
+            picture.arrival_ns,
+            image,
+            camera if (camera.width, camera.height) == self._size else camera.scaled(width, height),
+            picture.exposure_s,
+            picture.gain,
+            encoded=picture.received(),
+        )
+
+    def _run(self) -> None:
+        """The thread: open, stream until the device is lost, wait, and again."""
+        retry_s = self._config.first_retry_s
+        try:
+            while not self._closing.is_set():
+                received = self._counts.received
+                try:
+                    self._stream()
+                except OSError as error:
+                    self._lost(error)
+                    if self._counts.received > received:
+                        retry_s = self._config.first_retry_s
+                    self._closing.wait(retry_s)
+                    retry_s = min(2.0 * retry_s, self._config.last_retry_s)
+        except Exception as error:  # a consumer must hear of it, not wait forever
+            self._failure = error
+        finally:
+            self._newest.end()
+
+    def _lost(self, error: OSError) -> None:
+        if str(error) != self.reason:
+            log.warning("camera '%s' is lost: %s", self.name, error)
+        self.state, self.reason = CameraState.LOST, str(error)
+
+    def _open(self) -> Capture:
+        self.state = CameraState.CONNECTING
+        capture = self._open_capture()
+        # Calibration is frozen: what is mapped with one camera model stays with it.
+        self.camera = self.camera or capture.camera
+        self.notes = [*dict.fromkeys([*self.notes, *capture.notes])]
+        return capture
+
+    def _stream(self) -> None:
+        """Pictures from one opening of the device; ends by OSError or by :meth:`close`."""
+        capture, self._opened = self._opened or self._open(), None
+        try:
+            self._sequence = SequenceGaps()
+            heard_ns = self._now_ns()
+            while not self._closing.is_set():
+                picture = capture.read(min(READ_S, self._config.stall_s))
+                if picture is not None:
+                    heard_ns = self._now_ns()
+                    self._received(picture)
+                elif self._now_ns() - heard_ns > self._config.stall_s * 1e9:
+                    raise TimeoutError(f"no picture for {self._config.stall_s:g} s")
+        finally:
+            capture.close()
+
+    def _received(self, picture: RawPicture) -> None:
+        if self.state is not CameraState.STREAMING:
+            self._counts.reconnects += self._counts.received > 0
+            self.state, self.reason = CameraState.STREAMING, ""
+        self._counts.received += 1
+        lost = self._sequence.before(picture.sequence)
+        if lost is None:
+            self._counts.duplicates += 1
+            picture.release()
+            return
+        self._counts.lost += lost
+        picture.index = self._index + lost
+        self._index = picture.index + 1
+        picture.t_ns = self._clock.stamp(picture.exposed_ns, picture.device_ns, picture.arrival_ns)
+        self._newest.put(picture)

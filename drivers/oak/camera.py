@@ -1,0 +1,146 @@
+"""An OAK camera as a live CameraSource and, for its IMU, as a TelemetrySource."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.config.cameras import OakConfig
+from aquaflow.messages import Acceleration, AngularRate, CameraModel, TelemetrySample
+from drivers.capture import RawPicture, UnusablePictureError
+from drivers.latest import LatestQueue
+from drivers.live import LiveCamera
+from drivers.mounting import BodyFrame, Mounting
+from drivers.oak.backend import ImuReading, OakBackend, OakPicture, OpenBackend
+from drivers.oak.dai_backend import DaiBackend
+
+MAX_SAMPLES = 8_000
+"""IMU samples kept until fetched, then the oldest go: 10 s of both sensors at 400 Hz."""
+
+BODY_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""Axes (forward, right, down) from (right, down, forward): a camera that looks ahead."""
+
+log = logging.getLogger(__name__)
+
+
+class OakCapture:
+    """One opening of the device; hands its IMU readings on while pictures are read."""
+
+    def __init__(self, camera: OakCamera, backend: OakBackend) -> None:
+        self._owner = camera
+        self._backend = backend
+        self.camera: CameraModel | None = backend.calibration()
+        self._rotation = backend.imu_to_camera()
+        # Axes that nobody knows are worse than none.
+        self.notes: tuple[str, ...] = (
+            ("its IMU is not used: the camera does not tell the IMU's axes",)
+            if self._rotation is None
+            else ()
+        )
+
+    def read(self, timeout_s: float) -> RawPicture | None:
+        picture = self._backend.read(timeout_s)
+        arrival_ns = time.monotonic_ns()
+        if (readings := self._backend.imu()) and self._rotation is not None:
+            self._owner.take_imu(readings, self._rotation, arrival_ns)
+        if picture is None:
+            return None
+        return RawPicture(
+            arrival_ns=arrival_ns,
+            decode=lambda: _decoded(picture),
+            exposed_ns=picture.exposed_ns,
+            device_ns=picture.device_ns,
+            sequence=picture.sequence,
+            exposure_s=picture.exposure_s,
+            gain=picture.iso,
+        )
+
+    def close(self) -> None:
+        self._backend.close()
+
+
+class OakCamera(LiveCamera):
+    """Pictures with their exposure, and the IMU's samples in body axes.
+
+    The calibration is that of the first opening: the library may rewrite it at run time, and a map
+    holds together only under one camera model.
+    """
+
+    def __init__(
+        self, name: str, config: OakConfig, open_backend: OpenBackend | None = None
+    ) -> None:
+        self._oak = config
+        self._open_backend = open_backend or DaiBackend
+        self._mounting, self._body = Mounting(config.mounting), BodyFrame()
+        self._samples: LatestQueue[TelemetrySample] = LatestQueue(MAX_SAMPLES, self._drop)
+        self.dropped_samples = 0
+        """Oldest samples dropped because nobody fetched them."""
+        self._last_imu_ns = -1
+        super().__init__(name, config, self._open_device)
+
+    @classmethod
+    def configured(cls, name: str, config: OakConfig) -> OakCamera:
+        """The camera of :func:`aquaflow.sources.open_camera`."""
+        return cls(name, config)
+
+    def samples(self) -> Iterator[TelemetrySample]:
+        """Specific force and angular rate, in the order of arrival, until :meth:`close`."""
+        while (sample := self._samples.take()) is not None:
+            yield sample
+
+    def close(self) -> None:
+        super().close()
+        self._samples.end()
+
+    def take_imu(
+        self,
+        readings: Sequence[ImuReading],
+        imu_to_camera: npt.NDArray[np.float64],  # [3, 3]
+        arrival_ns: int,
+    ) -> None:
+        """Queue ``readings`` as samples; those that go back in time are left out."""
+        rotation = BODY_FROM_CAMERA @ imu_to_camera
+        for reading in readings:
+            t_ns = min(reading.t_ns, arrival_ns)
+            if t_ns > self._last_imu_ns:
+                self._last_imu_ns = t_ns
+                self._queue_sample(reading, rotation, t_ns, arrival_ns)
+
+    def _queue_sample(
+        self,
+        reading: ImuReading,
+        rotation: npt.NDArray[np.float64],
+        t_ns: int,
+        arrival_ns: int,
+    ) -> None:
+        force, rate = (
+            tuple(float(each) for each in rotation @ np.array(vector))
+            for vector in (reading.acceleration_m_s2, reading.rate_rad_s)
+        )
+        samples: list[TelemetrySample] = [
+            AngularRate(t_ns, arrival_ns, self.name, (rate[0], rate[1], rate[2])),
+            Acceleration(t_ns, arrival_ns, self.name, (force[0], force[1], force[2])),
+        ]
+        self._samples.put([self._body.refer(sample, self._mounting) for sample in samples])
+
+    def _drop(self, sample: TelemetrySample) -> None:
+        self.dropped_samples += 1
+
+    def _open_device(self) -> OakCapture:
+        capture = OakCapture(self, self._open_backend(self._oak))
+        if self.camera is not None and capture.camera not in (None, self.camera):
+            log.warning(
+                "camera '%s': its calibration differs from the one in use, which is kept", self.name
+            )
+        return capture
+
+
+def _decoded(picture: OakPicture) -> npt.NDArray[np.uint8]:
+    try:
+        return picture.decode()
+    except ValueError as error:
+        raise UnusablePictureError(f"cannot be decoded: {error}") from error

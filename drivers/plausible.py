@@ -1,0 +1,56 @@
+"""What no underwater vehicle can measure: such samples are counted and go no further."""
+
+from __future__ import annotations
+
+import math
+
+from aquaflow.messages import (
+    Acceleration,
+    Altitude,
+    AngularRate,
+    Attitude,
+    Depth,
+    Lights,
+    TelemetrySample,
+    Velocity,
+)
+
+DEPTH_M = (-20.0, 11_500.0)
+"""Above the surface only by a wrong surface pressure; the deepest sea is 10,935 m."""
+MAX_ALTITUDE_M = 11_500.0
+MAX_SPEED_M_S = 20.0
+"""The fastest vehicles do 10 m/s."""
+MAX_RATE_RAD_S = 40.0
+"""Gyros saturate at 2000 deg/s = 35 rad/s."""
+MAX_ACCELERATION_M_S2 = 320.0
+"""MAVLink's 16 bit milli-g end at 321 m/s^2."""
+NORM_TOLERANCE = 0.1
+"""A quaternion further from length 1 was damaged on its way."""
+
+
+def plausible(sample: TelemetrySample) -> bool:
+    """False for values that are not finite or that no vehicle can have; a NaN fails every test."""
+    if isinstance(sample, Attitude):
+        return abs(math.hypot(*sample.wxyz) - 1.0) <= NORM_TOLERANCE
+    if isinstance(sample, Velocity) and not 0.0 <= sample.figure_of_merit_m_s < math.inf:
+        return False
+    values, low, high = _limits(sample)
+    return all(low <= value <= high for value in values)
+
+
+def _limits(
+    sample: Depth | AngularRate | Acceleration | Velocity | Altitude | Lights,
+) -> tuple[tuple[float, ...], float, float]:
+    match sample:
+        case Depth():
+            return (sample.depth_m,), *DEPTH_M
+        case Altitude():
+            return (sample.altitude_m,), 0.0, MAX_ALTITUDE_M
+        case Lights():
+            return (sample.level,), 0.0, 1.0
+        case Velocity():
+            return sample.velocity_m_s, -MAX_SPEED_M_S, MAX_SPEED_M_S
+        case AngularRate():
+            return sample.rate_rad_s, -MAX_RATE_RAD_S, MAX_RATE_RAD_S
+        case Acceleration():
+            return sample.acceleration_m_s2, -MAX_ACCELERATION_M_S2, MAX_ACCELERATION_M_S2

@@ -1,0 +1,110 @@
+"""Any CAN bus that a DBC file describes; the config says which signals make which sample.
+
+CAN tells no time of measurement, so ``t_ns`` is the arrival.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from aquaflow.config.telemetry import DbcConfig, DbcSignal
+from aquaflow.errors import ConfigError
+from aquaflow.messages import (
+    Acceleration,
+    Altitude,
+    AngularRate,
+    Attitude,
+    Depth,
+    Lights,
+    TelemetrySample,
+    Velocity,
+)
+from drivers.extra import load
+from drivers.protocol.can_records import CanFraming, frame_of
+from drivers.protocol.packets import PacketDecoder
+from drivers.rotation import Vector, from_euler, normalised
+
+SCALARS: dict[str, Callable[[int, int, str, float], TelemetrySample]] = {
+    "depth": Depth,
+    "altitude": Altitude,
+    "lights": Lights,
+}
+VECTORS: dict[str, Callable[[int, int, str, Vector], TelemetrySample]] = {
+    "angular_rate": AngularRate,
+    "acceleration": Acceleration,
+}
+
+
+class DbcDecoder(PacketDecoder):
+    """Samples of the mapped messages; other frames are counted.
+
+    Raises:
+        InputError: cantools is not installed.
+        ConfigError: the DBC file cannot be read, or has no such message or signal.
+    """
+
+    def __init__(self, name: str, config: DbcConfig) -> None:
+        super().__init__(name, CanFraming())
+        self._cantools = load("cantools", f"the CAN device '{name}'")
+        database = self._opened(config.database)
+        self._mapped: dict[tuple[int, bool], tuple[Any, list[DbcSignal]]] = {}
+        for mapping in config.samples:
+            message = _message(database, mapping, config.database)
+            key = (message.frame_id, message.is_extended_frame)
+            self._mapped.setdefault(key, (message, []))[1].append(mapping)
+
+    def decode(self, packet: bytes, arrival_ns: int) -> list[TelemetrySample]:
+        frame = frame_of(packet)
+        if (frame.identifier, frame.extended) not in self._mapped:
+            return []
+        message, mappings = self._mapped[frame.identifier, frame.extended]
+        try:
+            values = message.decode(frame.data, decode_choices=False)
+        except self._cantools.database.DecodeError as error:
+            raise ValueError(str(error)) from error
+        source = self.source(message.name)
+        # A multiplexed message holds only some of its signals.
+        told = [mapping for mapping in mappings if all(name in values for name in mapping.signals)]
+        return [_sample(mapping, values, arrival_ns, source) for mapping in told]
+
+    def _opened(self, path: str) -> Any:
+        try:
+            return self._cantools.database.load_file(path, database_format="dbc")
+        except (OSError, ValueError, self._cantools.Error) as error:
+            reason = " ".join(str(error).split())
+            raise ConfigError(f"cannot read the DBC file {path}: {reason}") from error
+
+
+def _message(database: Any, mapping: DbcSignal, path: str) -> Any:
+    try:
+        message = database.get_message_by_name(mapping.message)
+    except KeyError:
+        known = ", ".join(sorted(message.name for message in database.messages))
+        raise ConfigError(
+            f"{path} has no message '{mapping.message}'; its messages are {known}"
+        ) from None
+    known_signals = [signal.name for signal in message.signals]
+    for signal in mapping.signals:
+        if signal not in known_signals:
+            raise ConfigError(
+                f"{path}: message '{mapping.message}' has no signal '{signal}'; its signals are "
+                f"{', '.join(known_signals)}"
+            )
+    return message
+
+
+def _sample(
+    mapping: DbcSignal, values: dict[str, float], t_ns: int, source: str
+) -> TelemetrySample:
+    scale = mapping.scale * (len(mapping.signals) // len(mapping.scale))
+    told = [factor * values[name] for factor, name in zip(scale, mapping.signals, strict=True)]
+    if mapping.sample == "velocity":
+        return Velocity(t_ns, t_ns, source, (told[0], told[1], told[2]), mapping.sigma_m_s)
+    if mapping.sample == "euler":
+        return Attitude(t_ns, t_ns, source, from_euler(*told))
+    if mapping.sample == "attitude":
+        return Attitude(t_ns, t_ns, source, normalised((told[0], told[1], told[2], told[3])))
+    if mapping.sample in VECTORS:
+        return VECTORS[mapping.sample](t_ns, t_ns, source, (told[0], told[1], told[2]))
+    return SCALARS[mapping.sample](t_ns, t_ns, source, told[0])

@@ -1,0 +1,110 @@
+"""An autopilot that speaks MAVLink: samples, and a clock agreed on by TIMESYNC."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+from aquaflow.config.telemetry import MavlinkConfig
+from aquaflow.messages import TelemetrySample
+from drivers.device_clock import DeviceClock
+from drivers.extra import load
+from drivers.protocol.mavlink_frames import MavlinkFraming, header_of
+from drivers.protocol.mavlink_samples import MavlinkSamples, Stamp
+from drivers.protocol.packets import PacketDecoder
+
+DIALECT = "pymavlink.dialects.v20.ardupilotmega"
+OUR_COMPONENT = 197
+"""MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY."""
+TALK_EVERY_NS = 1_000_000_000
+"""Heartbeats at 1 Hz, as the standard has it; TIMESYNC requests go with them."""
+OPEN_REQUESTS = 16
+"""TIMESYNC requests that an answer may still come to."""
+MAX_OUTGOING_BYTES = 1024
+"""A flood of TIMESYNC requests is answered as far as this goes, between two writes."""
+SINCE_1970_US = 1_000_000_000_000_000
+"""A time_usec above is not the time since boot: that would be 31 years."""
+
+
+class MavlinkDecoder(PacketDecoder):
+    """The autopilot that ``config`` names; what others on the link say is counted, not used."""
+
+    def __init__(self, name: str, config: MavlinkConfig) -> None:
+        self._dialect = load(DIALECT, f"the MAVLink device '{name}'")
+        super().__init__(name, MavlinkFraming(self._dialect))
+        self.clock: DeviceClock = DeviceClock(name)
+        self._config = config
+        self._samples = MavlinkSamples(config)
+        # Numbers, since most packets are of no interest and need not be unpacked.
+        self._wanted = {
+            number: message.msgname
+            for number, message in self._dialect.mavlink_map.items()
+            if message.msgname in self._samples.wanted | {"TIMESYNC", "SYSTEM_TIME"}
+        }
+        self._wire = self._dialect.MAVLink(None, config.system_id, OUR_COMPONENT)
+        self._requests: deque[int] = deque(maxlen=OPEN_REQUESTS)
+        self._outgoing = b""
+        self._talk_at_ns: int | None = None
+
+    def decode(self, packet: bytes, arrival_ns: int) -> list[TelemetrySample]:
+        header = header_of(packet)
+        sender = (self._config.system_id, self._config.component_id)
+        if (header.system, header.component) != sender or header.message_id not in self._wanted:
+            return []
+        message = self._unpacked(packet)
+        name = self._wanted[header.message_id]
+        if name == "TIMESYNC":
+            self._synchronise(message, arrival_ns)
+            return []
+        t_ns = self._moment(name, message, arrival_ns)
+        if name == "SYSTEM_TIME":
+            return []  # only its time since boot matters: the wall clock jumps
+        return self._samples.of(message, Stamp(t_ns, arrival_ns, self.source(name)))
+
+    def outgoing(self, now_ns: int) -> bytes:
+        """What is to be written now: answers to TIMESYNC, and once a second our own request."""
+        if not self._config.talk:
+            return b""
+        data, self._outgoing = self._outgoing, b""
+        if self._talk_at_ns is not None and now_ns < self._talk_at_ns:
+            return data
+        self._talk_at_ns = now_ns + TALK_EVERY_NS
+        self._requests.append(now_ns)
+        heartbeat = self._dialect.MAVLink_heartbeat_message(
+            type=self._dialect.MAV_TYPE_ONBOARD_CONTROLLER,
+            autopilot=self._dialect.MAV_AUTOPILOT_INVALID,
+            base_mode=0,
+            custom_mode=0,
+            system_status=self._dialect.MAV_STATE_ACTIVE,
+            mavlink_version=3,
+        )
+        request = self._dialect.MAVLink_timesync_message(tc1=0, ts1=now_ns)
+        return data + self._packed(heartbeat) + self._packed(request)
+
+    def _unpacked(self, packet: bytes) -> Any:
+        try:
+            return self._wire.decode(bytearray(packet))
+        except self._dialect.MAVError as error:
+            raise ValueError(str(error)) from error
+
+    def _packed(self, message: Any) -> bytes:
+        data = bytes(message.pack(self._wire))
+        self._wire.seq = (self._wire.seq + 1) % 256
+        return data
+
+    def _synchronise(self, message: Any, arrival_ns: int) -> None:
+        """mavlink.io/en/services/timesync.html: tc1 is 0 in requests, ts1 is the asker's clock."""
+        if message.tc1 == 0:
+            answer = self._dialect.MAVLink_timesync_message(tc1=arrival_ns, ts1=message.ts1)
+            if len(self._outgoing) < MAX_OUTGOING_BYTES:
+                self._outgoing += self._packed(answer)
+        elif message.ts1 in self._requests:
+            self._requests.remove(message.ts1)
+            self.clock.mapping.add(message.tc1, arrival_ns, arrival_ns - message.ts1)
+
+    def _moment(self, name: str, message: Any, arrival_ns: int) -> int:
+        boot_ns = getattr(message, "time_boot_ms", 0) * 1_000_000
+        # SERVO_OUTPUT_RAW's 32 bits of microseconds start again every 71 minutes.
+        if name in ("RAW_IMU", "HIGHRES_IMU") and message.time_usec < SINCE_1970_US:
+            boot_ns = message.time_usec * 1000
+        return self.clock.stamp(boot_ns, arrival_ns) if boot_ns > 0 else arrival_ns

@@ -1,0 +1,74 @@
+"""MAVLink 1 and 2 on the wire (mavlink.io/en/guide/serialization.html).
+
+The framing is our own: pymavlink's parser trusts a damaged length and swallows the packets behind
+it. Message definitions, checksum seeds and unpackers are pymavlink's.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from typing import Any, NamedTuple
+
+from drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing
+
+MARK_1, MARK_2 = 0xFE, 0xFD
+MARKS = re.compile(b"[\xfd\xfe]")
+HEADER_1, HEADER_2 = 6, 10
+CHECKSUM = 2
+SIGNED = 0x01
+SIGNATURE = 13
+
+
+class Header(NamedTuple):
+    """Who sent what."""
+
+    message_id: int
+    system: int
+    component: int
+    payload_end: int
+    """Bytes from the packet's start."""
+
+
+class MavlinkFraming(Framing):
+    """Packets of messages that the dialect knows: without its seed no checksum can be tested."""
+
+    longest = HEADER_2 + 255 + CHECKSUM + SIGNATURE
+
+    def __init__(self, dialect: Any) -> None:
+        self._crc = dialect.x25crc
+        self._seeds: dict[int, int] = {
+            number: message.crc_extra for number, message in dialect.mavlink_map.items()
+        }
+
+    def find(self, buffer: bytes, at: int) -> int:
+        found = MARKS.search(buffer, at)
+        return found.start() if found else -1
+
+    def length(self, buffer: bytes, at: int) -> int:
+        header = HEADER_2 if buffer[at] == MARK_2 else HEADER_1
+        if len(buffer) - at < header:
+            return INCOMPLETE
+        if header_of(buffer, at).message_id not in self._seeds:
+            return NO_PACKET
+        length = header + buffer[at + 1] + CHECKSUM
+        if header == HEADER_1:
+            return length
+        flags = buffer[at + 2]
+        if flags & ~SIGNED:
+            return NO_PACKET  # the standard: drop what has flags that are not understood
+        return length + SIGNATURE * (flags & SIGNED)
+
+    def intact(self, packet: bytes) -> bool:
+        header = header_of(packet)
+        (sent,) = struct.unpack_from("<H", packet, header.payload_end)
+        seed = bytes([self._seeds[header.message_id]])
+        return bool(self._crc(packet[1 : header.payload_end] + seed).crc == sent)
+
+
+def header_of(buffer: bytes, at: int = 0) -> Header:
+    """The header that starts at ``at``."""
+    if buffer[at] == MARK_2:
+        number = int.from_bytes(buffer[at + 7 : at + 10], "little")
+        return Header(number, buffer[at + 5], buffer[at + 6], at + HEADER_2 + buffer[at + 1])
+    return Header(buffer[at + 5], buffer[at + 3], buffer[at + 4], at + HEADER_1 + buffer[at + 1])

@@ -1,0 +1,152 @@
+"""What each MAVLink message tells, in DESIGN's units and frames.
+
+MAVLink's body frame is forward-right-down and its world NED, so only units change; layouts are in
+mavlink.io/en/messages/common.html.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
+
+from aquaflow.config.telemetry import MavlinkConfig
+from aquaflow.messages import (
+    Acceleration,
+    Altitude,
+    AngularRate,
+    Attitude,
+    Depth,
+    Lights,
+    TelemetrySample,
+    Velocity,
+)
+from drivers.rotation import Quaternion, from_euler, inverse, normalised, rotate
+
+GRAVITY_M_S2 = 9.80665
+MILLI_G = GRAVITY_M_S2 / 1000.0
+HPA = 100.0
+DOWN = 25
+"""MAV_SENSOR_ROTATION_PITCH_270: a range finder that looks down."""
+INVALID_SIGNAL = 1
+"""DISTANCE_SENSOR.signal_quality: 0 unknown, 1 invalid, 100 perfect."""
+HIGHRES_ACCELERATION, HIGHRES_GYRO = 0x07, 0x38
+"""Bits of HIGHRES_IMU.fields_updated."""
+ATTITUDE_LIFE_NS = 500_000_000
+SERVOS_PER_PORT = 16
+
+
+class Stamp(NamedTuple):
+    """The first three fields of every sample."""
+
+    t_ns: int
+    arrival_ns: int
+    source: str
+
+
+Samples: TypeAlias = list[TelemetrySample]
+
+
+class MavlinkSamples:
+    """Samples of the messages that the config asks for."""
+
+    def __init__(self, config: MavlinkConfig) -> None:
+        self._config = config
+        self._attitude: tuple[int, Quaternion] | None = None
+        known: dict[str, Callable[[Any, Stamp], Samples]] = {
+            "ATTITUDE": self._euler,
+            "ATTITUDE_QUATERNION": self._quaternion,
+            "RAW_IMU": _milli_imu,
+            "SCALED_IMU2": _milli_imu,
+            "HIGHRES_IMU": _highres_imu,
+            "LOCAL_POSITION_NED": self._local_position,
+            "VFR_HUD": lambda message, stamp: [Depth(*stamp, -message.alt)],
+            "DISTANCE_SENSOR": _distance,
+        }
+        self._converters = {str(name): known[name] for name in config.messages}
+        if config.external_pressure is not None:
+            self._converters[config.external_pressure] = self._pressure
+        if config.lights is not None:
+            self._converters[config.lights.message] = self._lights
+
+    @property
+    def wanted(self) -> frozenset[str]:
+        """Names of the messages that make samples."""
+        return frozenset(self._converters)
+
+    def of(self, message: Any, stamp: Stamp) -> Samples:
+        """Samples of a decoded pymavlink message; ValueError where it says itself it is invalid."""
+        return self._converters[message.get_type()](message, stamp)
+
+    def _euler(self, message: Any, stamp: Stamp) -> Samples:
+        return self._orientation(
+            from_euler(message.roll, message.pitch, message.yaw), message, stamp
+        )
+
+    def _quaternion(self, message: Any, stamp: Stamp) -> Samples:
+        q = normalised((message.q1, message.q2, message.q3, message.q4))
+        return self._orientation(q, message, stamp)
+
+    def _orientation(self, q: Quaternion, message: Any, stamp: Stamp) -> Samples:
+        self._attitude = (stamp.t_ns, q)
+        rate = (message.rollspeed, message.pitchspeed, message.yawspeed)
+        return [Attitude(*stamp, q), AngularRate(*stamp, rate)]
+
+    def _pressure(self, message: Any, stamp: Stamp) -> Samples:
+        over_surface_pa = message.press_abs * HPA - self._config.surface_pressure_pa
+        depth_m = over_surface_pa / (self._config.water_density_kg_m3 * GRAVITY_M_S2)
+        return [Depth(*stamp, depth_m)]
+
+    def _local_position(self, message: Any, stamp: Stamp) -> Samples:
+        samples: Samples = [Depth(*stamp, message.z)]
+        if self._attitude and abs(stamp.t_ns - self._attitude[0]) < ATTITUDE_LIFE_NS:
+            v_ned = (message.vx, message.vy, message.vz)
+            v_body = rotate(inverse(self._attitude[1]), v_ned)
+            samples.append(Velocity(*stamp, v_body, self._config.local_velocity_sigma_m_s))
+        return samples
+
+    def _lights(self, message: Any, stamp: Stamp) -> Samples:
+        lights = self._config.lights
+        assert lights is not None
+        if lights.message == "RC_CHANNELS":
+            pulse_us = getattr(message, f"chan{lights.channel}_raw")
+        elif message.port == 0:
+            pulse_us = getattr(message, f"servo{lights.channel}_raw")
+        else:
+            return []  # servos 17 to 32
+        if pulse_us in (0, 0xFFFF):
+            return []  # the channel is not in use
+        level = (pulse_us - lights.off_us) / (lights.full_us - lights.off_us)
+        return [Lights(*stamp, min(max(level, 0.0), 1.0))]
+
+
+def _milli_imu(message: Any, stamp: Stamp) -> Samples:
+    acceleration = (message.xacc, message.yacc, message.zacc)
+    gyro = (message.xgyro, message.ygyro, message.zgyro)
+    samples: Samples = []
+    # Free fall for good is a sensor that is not there; SCALED_IMU2 is often only a compass.
+    if any(acceleration):
+        x, y, z = (value * MILLI_G for value in acceleration)
+        samples.append(Acceleration(*stamp, (x, y, z)))
+    if any(acceleration) or any(gyro):
+        x, y, z = (value * 1e-3 for value in gyro)
+        samples.append(AngularRate(*stamp, (x, y, z)))
+    return samples
+
+
+def _highres_imu(message: Any, stamp: Stamp) -> Samples:
+    samples: Samples = []
+    if message.fields_updated & HIGHRES_ACCELERATION == HIGHRES_ACCELERATION:
+        samples.append(Acceleration(*stamp, (message.xacc, message.yacc, message.zacc)))
+    if message.fields_updated & HIGHRES_GYRO == HIGHRES_GYRO:
+        samples.append(AngularRate(*stamp, (message.xgyro, message.ygyro, message.zgyro)))
+    return samples
+
+
+def _distance(message: Any, stamp: Stamp) -> Samples:
+    if message.orientation != DOWN:
+        return []
+    if message.signal_quality == INVALID_SIGNAL:
+        raise ValueError("the range finder calls its signal invalid")
+    if not message.min_distance <= message.current_distance <= message.max_distance:
+        raise ValueError("the range finder sees no bottom within its range")
+    return [Altitude(*stamp, message.current_distance / 100.0)]

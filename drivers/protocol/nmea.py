@@ -1,0 +1,120 @@
+"""Echo sounders, compasses and AHRS that speak NMEA 0183.
+
+They tell no time of measurement, so ``t_ns`` is the arrival.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from aquaflow.config.telemetry import NmeaConfig
+from aquaflow.messages import Altitude, Depth, TelemetrySample
+from drivers.protocol.nmea_sentence import framing, parse
+from drivers.protocol.packets import PacketDecoder
+from drivers.protocol.partial import PartialMotion
+
+KNOT_M_S = 1852.0 / 3600.0
+FOOT_M, FATHOM_M = 0.3048, 1.8288
+
+Fields = list[str]
+
+
+class NmeaDecoder(PacketDecoder):
+    """DBT DBS DBK DPT, HDT HDG, ROT, VBW, XDR, PRDID, PASHR; other sentences are counted."""
+
+    def __init__(self, name: str, config: NmeaConfig) -> None:
+        super().__init__(name, framing(config.require_checksum))
+        self._config = config
+        self._motion = PartialMotion(config.assume)
+        self._sentences: dict[str, Callable[[Fields, int, str], list[TelemetrySample]]] = {
+            "DBT": self._below,
+            "DBS": self._below,
+            "DBK": self._below,
+            "DPT": self._below,
+            "HDT": self._true_heading,
+            "HDG": self._magnetic_heading,
+            "ROT": self._rate_of_turn,
+            "VBW": self._ground_speed,
+            "XDR": self._transducers,
+            "PRDID": self._rdi_attitude,
+            "PASHR": self._ashtech_attitude,
+        }
+
+    def decode(self, packet: bytes, arrival_ns: int) -> list[TelemetrySample]:
+        sentence = parse(packet)
+        convert = self._sentences.get(sentence.kind)
+        if convert is None:
+            return []
+        return convert(sentence.fields, arrival_ns, sentence.kind)
+
+    def _below(self, fields: Fields, t_ns: int, kind: str) -> list[TelemetrySample]:
+        metres = number(fields[0]) if kind == "DPT" else _in_metres(fields)
+        if kind in self._config.depth_sentences:
+            return [Depth(t_ns, t_ns, self.source(kind), metres)]
+        return [Altitude(t_ns, t_ns, self.source(kind), metres)]
+
+    def _true_heading(self, fields: Fields, t_ns: int, kind: str) -> list[TelemetrySample]:
+        return self._motion.heading(t_ns, self.source(kind), math.radians(number(fields[0])))
+
+    def _magnetic_heading(self, fields: Fields, t_ns: int, kind: str) -> list[TelemetrySample]:
+        """HDG: sensor heading, deviation and its E or W, variation and its E or W."""
+        deviation = _eastward(fields[1], fields[2])
+        variation = _eastward(fields[3], fields[4])
+        degrees = number(fields[0]) + deviation + variation
+        return self._motion.heading(t_ns, self.source(kind), math.radians(degrees))
+
+    def _rate_of_turn(self, fields: Fields, t_ns: int, kind: str) -> list[TelemetrySample]:
+        """ROT: degrees per minute, negative to port; A: valid."""
+        if fields[1] != "A":
+            raise ValueError("the gyro calls its rate of turn invalid")
+        rate_rad_s = math.radians(number(fields[0])) / 60.0
+        return self._motion.turn(t_ns, self.source(kind), rate_rad_s)
+
+    def _ground_speed(self, fields: Fields, t_ns: int, kind: str) -> list[TelemetrySample]:
+        """VBW: through water ahead, sideways, status; over ground ahead, sideways, status."""
+        if fields[5] != "A":
+            raise ValueError("the log calls its speed over ground invalid")
+        forward, right = (number(field) * KNOT_M_S for field in fields[3:5])
+        return self._motion.speed(t_ns, self.source(kind), forward, right)
+
+    def _transducers(self, fields: Fields, t_ns: int, kind: str) -> list[TelemetrySample]:
+        """XDR: type, value, unit, name again and again; roll and pitch complete the heading."""
+        quads = zip(fields[0::4], fields[1::4], fields[2::4], fields[3::4], strict=False)
+        degrees = {name.upper()[:4]: value for _, value, unit, name in quads if unit == "D"}
+        pitch = degrees.get("PTCH", degrees.get("PITC"))
+        if pitch is not None and "ROLL" in degrees:
+            roll_rad, pitch_rad = (math.radians(number(v)) for v in (degrees["ROLL"], pitch))
+            self._motion.tilt(t_ns, roll_rad, pitch_rad)
+        return []
+
+    def _rdi_attitude(self, fields: Fields, t_ns: int, kind: str) -> list[TelemetrySample]:
+        """PRDID: pitch, bow up positive; roll, port side up positive; heading; degrees."""
+        pitch, roll, yaw = (math.radians(number(field)) for field in fields[:3])
+        return self._motion.attitude(t_ns, self.source(kind), roll, pitch, yaw)
+
+    def _ashtech_attitude(self, fields: Fields, t_ns: int, kind: str) -> list[TelemetrySample]:
+        """PASHR: time, heading, T, roll, pitch, heave, three accuracies, quality."""
+        yaw, roll, pitch = (math.radians(number(fields[k])) for k in (1, 3, 4))
+        return self._motion.attitude(t_ns, self.source(kind), roll, pitch, yaw)
+
+
+def number(field: str) -> float:
+    """ValueError for an empty field, which is how NMEA says 'not available'."""
+    return float(field)
+
+
+def _in_metres(fields: Fields) -> float:
+    """``feet,f,metres,M,fathoms,F`` of which some may be empty."""
+    units = {"f": FOOT_M, "M": 1.0, "F": FATHOM_M}
+    told = {unit: value for value, unit in zip(fields[::2], fields[1::2], strict=False) if value}
+    for unit in ("M", "f", "F"):
+        if unit in told:
+            return number(told[unit]) * units[unit]
+    raise ValueError("no depth in any unit")
+
+
+def _eastward(value: str, direction: str) -> float:
+    if not value:
+        return 0.0
+    return number(value) * {"E": 1.0, "W": -1.0}[direction]

@@ -1,0 +1,98 @@
+"""Instruments on an NMEA 2000 bus.
+
+The five groups read here fit into one frame each, so no fast packet has to be put together. They
+tell no time of measurement, so ``t_ns`` is the arrival.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+
+from aquaflow.config.telemetry import Nmea2000Config
+from aquaflow.messages import Altitude, TelemetrySample
+from drivers.protocol.can_records import CanFraming, frame_of
+from drivers.protocol.packets import PacketDecoder
+from drivers.protocol.partial import PartialMotion
+
+HEADING, RATE_OF_TURN, ATTITUDE, SPEED, WATER_DEPTH = 127250, 127251, 127257, 128259, 128267
+
+NOT_AVAILABLE = {"H": 0xFFFF, "h": 0x7FFF, "I": 0xFFFF_FFFF, "i": 0x7FFF_FFFF}
+RESERVED = 2
+"""The two values below 'not available' mean 'out of range' and 'reserved'."""
+TRUE, MAGNETIC = 0, 1
+ANGLE_RAD, RATE_RAD_S, SPEED_M_S, DEPTH_M = 1e-4, 3.125e-8, 0.01, 0.01
+
+
+def group_of(identifier: int) -> int:
+    """The parameter group number in a 29 bit identifier."""
+    group = identifier >> 8 & 0x3FFFF
+    # Below 0xF0 the low byte is the addressee.
+    return group & 0x3FF00 if group >> 8 & 0xFF < 0xF0 else group
+
+
+class Nmea2000Decoder(PacketDecoder):
+    """Attitude, heading, rate of turn, speed and altitude."""
+
+    def __init__(self, name: str, config: Nmea2000Config) -> None:
+        super().__init__(name, CanFraming())
+        self._motion = PartialMotion(config.assume)
+        self._groups: dict[int, Callable[[bytes, int], list[TelemetrySample]]] = {
+            HEADING: self._heading,
+            RATE_OF_TURN: self._rate_of_turn,
+            ATTITUDE: self._attitude,
+            SPEED: self._speed,
+            WATER_DEPTH: self._depth,
+        }
+
+    def decode(self, packet: bytes, arrival_ns: int) -> list[TelemetrySample]:
+        frame = frame_of(packet)
+        convert = self._groups.get(group_of(frame.identifier)) if frame.extended else None
+        return convert(frame.data, arrival_ns) if convert else []
+
+    def _heading(self, data: bytes, t_ns: int) -> list[TelemetrySample]:
+        yaw = _value("H", data, 1) * ANGLE_RAD
+        reference = data[7] & 0b11
+        if reference == MAGNETIC:
+            yaw += sum(_value_or_zero("h", data, at) * ANGLE_RAD for at in (3, 5))
+        elif reference != TRUE:
+            raise ValueError("neither a true nor a magnetic heading")
+        return self._motion.heading(t_ns, self.source(str(HEADING)), yaw)
+
+    def _rate_of_turn(self, data: bytes, t_ns: int) -> list[TelemetrySample]:
+        rate_rad_s = _value("i", data, 1) * RATE_RAD_S
+        return self._motion.turn(t_ns, self.source(str(RATE_OF_TURN)), rate_rad_s)
+
+    def _attitude(self, data: bytes, t_ns: int) -> list[TelemetrySample]:
+        pitch, roll = (_value("h", data, at) * ANGLE_RAD for at in (3, 5))
+        if _missing("h", data, 1):
+            self._motion.tilt(t_ns, roll, pitch)
+            return []
+        yaw = _value("h", data, 1) * ANGLE_RAD
+        return self._motion.attitude(t_ns, self.source(str(ATTITUDE)), roll, pitch, yaw)
+
+    def _speed(self, data: bytes, t_ns: int) -> list[TelemetrySample]:
+        if _missing("H", data, 3):
+            return []  # a paddle wheel: it knows the speed through water only
+        forward_m_s = _value("H", data, 3) * SPEED_M_S
+        return self._motion.speed(t_ns, self.source(str(SPEED)), forward_m_s, None)
+
+    def _depth(self, data: bytes, t_ns: int) -> list[TelemetrySample]:
+        """Below the transducer; its offset to the waterline or the keel is the mounting's."""
+        metres = _value("I", data, 1) * DEPTH_M
+        return [Altitude(t_ns, t_ns, self.source(str(WATER_DEPTH)), metres)]
+
+
+def _missing(code: str, data: bytes, at: int) -> bool:
+    value = struct.unpack_from("<" + code, data, at)[0]
+    return bool(value >= NOT_AVAILABLE[code] - RESERVED)
+
+
+def _value(code: str, data: bytes, at: int) -> int:
+    if _missing(code, data, at):
+        raise ValueError("the instrument calls its value not available")
+    return int(struct.unpack_from("<" + code, data, at)[0])
+
+
+def _value_or_zero(code: str, data: bytes, at: int) -> int:
+    return 0 if _missing(code, data, at) else _value(code, data, at)

@@ -1,0 +1,120 @@
+"""Bottom track of a Teledyne DVL that sends PD0 ensembles (Teledyne's PD0 output data format).
+
+Ship and instrument axes are x starboard, y forward, z up.
+"""
+
+from __future__ import annotations
+
+import calendar
+import struct
+from datetime import datetime
+
+from aquaflow.config.telemetry import Pd0Config
+from aquaflow.messages import Altitude, TelemetrySample, Velocity
+from drivers.device_clock import DeviceClock
+from drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing, PacketDecoder
+
+MARK = b"\x7f\x7f"
+HEADER = 6
+CHECKSUM = 2
+LONGEST = 8192
+"""Bytes; a water profile of 128 cells has about 3000."""
+MAX_TYPES = 16
+FIXED_LEADER, VARIABLE_LEADER, BOTTOM_TRACK = 0x0000, 0x0080, 0x0600
+INSTRUMENT, SHIP = 1, 2
+"""Bits 3 and 4 of the fixed leader's byte 25; 0 is beam, 3 is earth coordinates."""
+BAD_VELOCITY = -32_768
+MIN_BEAMS = 3
+"""With three of four beams the velocity and the mean range are still right."""
+
+
+class Pd0Framing(Framing):
+    """An ensemble: header with the offsets of its parts, the parts, a sum of all bytes."""
+
+    longest = LONGEST
+
+    def find(self, buffer: bytes, at: int) -> int:
+        found = buffer.find(MARK, at)
+        if found < 0 and buffer.endswith(MARK[:1]):
+            return len(buffer) - 1
+        return found
+
+    def length(self, buffer: bytes, at: int) -> int:
+        if len(buffer) - at < HEADER:
+            return INCOMPLETE
+        size, types = struct.unpack_from("<HxB", buffer, at + 2)
+        if not 1 <= types <= MAX_TYPES or size + CHECKSUM > LONGEST:
+            return NO_PACKET
+        first = HEADER + 2 * types
+        if len(buffer) - at < first:
+            return INCOMPLETE
+        offsets = struct.unpack_from(f"<{types}H", buffer, at + HEADER)
+        in_order = list(offsets) == sorted(set(offsets))
+        if not in_order or offsets[0] < first or offsets[-1] + 2 > size:
+            return NO_PACKET
+        return int(size) + CHECKSUM
+
+    def intact(self, packet: bytes) -> bool:
+        (sent,) = struct.unpack_from("<H", packet, len(packet) - CHECKSUM)
+        return sum(packet[:-CHECKSUM]) & 0xFFFF == int(sent)
+
+
+class Pd0Decoder(PacketDecoder):
+    """Velocity over ground and altitude."""
+
+    def __init__(self, name: str, config: Pd0Config) -> None:
+        super().__init__(name, Pd0Framing())
+        self.clock: DeviceClock = DeviceClock(name)
+        self._sign = -1.0 if config.velocity_of == "bottom" else 1.0
+        self._sigma_m_s = config.sigma_m_s
+
+    def decode(self, packet: bytes, arrival_ns: int) -> list[TelemetrySample]:
+        parts = _parts(packet)
+        bottom = parts[BOTTOM_TRACK]
+        coordinates = parts[FIXED_LEADER][25] >> 3 & 0b11
+        t_ns = self._moment(parts[VARIABLE_LEADER], arrival_ns)
+        source = self.source("bottom_track")
+        samples: list[TelemetrySample] = []
+        if (altitude_m := _altitude(bottom)) is not None:
+            samples.append(Altitude(t_ns, arrival_ns, source, altitude_m))
+        x, y, z, error = struct.unpack_from("<4h", bottom, 24)
+        if coordinates not in (INSTRUMENT, SHIP) or BAD_VELOCITY in (x, y, z):
+            self.counters.invalid_values += 1
+            return samples
+        velocity = tuple(self._sign * 1e-3 * value for value in (y, x, -z))
+        # The error velocity is scaled so that its spread is that of the horizontal velocity.
+        error_m_s = 0.0 if error == BAD_VELOCITY else error * 1e-3
+        merit = (self._sigma_m_s**2 + error_m_s**2) ** 0.5
+        return [
+            Velocity(t_ns, arrival_ns, source, (velocity[0], velocity[1], velocity[2]), merit),
+            *samples,
+        ]
+
+    def _moment(self, leader: bytes, arrival_ns: int) -> int:
+        """When the ensemble was pinged, by the clock of the DVL."""
+        year, month, day, hour, minute, second, hundredths = leader[4:11]
+        try:
+            date = datetime(2000 + year, month, day, hour, minute, second)
+        except ValueError:
+            return arrival_ns  # a clock that was never set need not cost the velocity
+        device_ns = calendar.timegm(date.timetuple()) * 1_000_000_000 + hundredths * 10_000_000
+        return self.clock.stamp(device_ns, arrival_ns)
+
+
+def _parts(packet: bytes) -> dict[int, bytes]:
+    """The parts of an ensemble by their identifier."""
+    offsets = struct.unpack_from(f"<{packet[5]}H", packet, HEADER)
+    ends = (*offsets[1:], len(packet) - CHECKSUM)
+    return {
+        struct.unpack_from("<H", packet, start)[0]: packet[start:end]
+        for start, end in zip(offsets, ends, strict=True)
+    }
+
+
+def _altitude(bottom: bytes) -> float | None:
+    """Mean vertical range, metres; a range of 0 is a beam that saw no bottom."""
+    low = struct.unpack_from("<4H", bottom, 16)
+    high = bottom[77:81] or bytes(4)  # old firmware ends before
+    ranges = [lsb + (msb << 16) for lsb, msb in zip(low, high, strict=True)]
+    seen = [centimetres / 100.0 for centimetres in ranges if centimetres > 0]
+    return sum(seen) / len(seen) if len(seen) >= MIN_BEAMS else None

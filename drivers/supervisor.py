@@ -1,0 +1,137 @@
+"""Keeps the link of one device alive: opens, reads, decodes, answers, and opens anew when lost."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Protocol, TypeAlias, runtime_checkable
+
+from aquaflow.messages import TelemetrySample
+from drivers.link import ByteLink, Decoder, LinkCounters, LinkLostError, RawTap
+from drivers.transport import OpenLink
+
+log = logging.getLogger(__name__)
+
+READ_TIMEOUT_S = 0.1
+"""How soon a link notices that it shall close."""
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 5.0
+"""Between attempts to open a link; doubled after each that brought no byte."""
+
+Deliver: TypeAlias = Callable[[list[TelemetrySample]], None]
+"""Gets the samples of one read. Must not block."""
+
+
+class SupervisedDecoder(Decoder, Protocol):
+    """A decoder that is told when the stream starts anew."""
+
+    def reset(self) -> None: ...
+
+
+@runtime_checkable
+class Talker(Protocol):
+    """A decoder whose device wants to be spoken to."""
+
+    def outgoing(self, now_ns: int) -> bytes:
+        """What is to be written now; often nothing."""
+        ...
+
+
+class Supervisor:
+    """Runs in a thread of its own, :meth:`run`, until :meth:`stop`; nothing raises through it."""
+
+    def __init__(
+        self,
+        name: str,
+        open_link: OpenLink,
+        decoder: SupervisedDecoder,
+        deliver: Deliver,
+        tap: RawTap | None = None,
+        silence_s: float | None = None,
+    ) -> None:
+        self.name = name
+        self.state = "nothing heard yet"
+        """For health reports: connected, or why not."""
+        self.is_open = False
+        self._open_link = open_link
+        self._decoder = decoder
+        self._deliver = deliver
+        self._tap = tap
+        self._silence_s = silence_s
+        self._stopping = threading.Event()
+        self._pause_s = FIRST_PAUSE_S
+        self._heard_before = False
+
+    @property
+    def counters(self) -> LinkCounters:
+        return self._decoder.counters
+
+    def stop(self) -> None:
+        """Ask :meth:`run` to return; it does within one read."""
+        self._stopping.set()
+
+    def run(self) -> None:
+        while not self._stopping.is_set():
+            try:
+                self._serve_one_link()
+            except LinkLostError as error:
+                self._note(str(error), logging.WARNING)
+            # The thread has nobody to raise to, and the other links shall live on.
+            except Exception as error:
+                log.exception("%s: the driver failed; the link is opened anew", self.name)
+                self._note(f"the driver failed: {error}", logging.ERROR)
+            self._stopping.wait(self._pause_s)
+            self._pause_s = min(2 * self._pause_s, LONGEST_PAUSE_S)
+        self.state = "closed"
+
+    def _serve_one_link(self) -> None:
+        """From opening the link to losing it, or to being told to stop."""
+        link = self._open_link()
+        self._decoder.reset()
+        self.is_open = True
+        try:
+            self._serve(link)
+        finally:
+            self.is_open = False
+            link.close()
+
+    def _serve(self, link: ByteLink) -> None:
+        heard, last_s = False, time.monotonic()
+        while not self._stopping.is_set():
+            self._answer(link)
+            data = link.read(READ_TIMEOUT_S)
+            arrival_ns = time.monotonic_ns()
+            if data:
+                if not heard:
+                    self._note_heard()
+                heard, last_s = True, time.monotonic()
+                self._take(data, arrival_ns)
+            elif self._silence_s is not None and time.monotonic() - last_s > self._silence_s:
+                raise LinkLostError(f"no byte for {self._silence_s:g} s")
+
+    def _take(self, data: bytes, arrival_ns: int) -> None:
+        if self._tap is not None:
+            self._tap(self.name, arrival_ns, data)
+        samples = self._decoder.feed(data, arrival_ns)
+        if samples:
+            self._deliver(samples)
+
+    def _answer(self, link: ByteLink) -> None:
+        if isinstance(self._decoder, Talker):
+            data = self._decoder.outgoing(time.monotonic_ns())
+            if data:
+                link.write(data)
+
+    def _note_heard(self) -> None:
+        """The link is up; one that opens but stays silent is not."""
+        self.counters.reconnects += self._heard_before
+        self._heard_before = True
+        self._pause_s = FIRST_PAUSE_S
+        self._note("connected", logging.INFO)
+
+    def _note(self, state: str, level: int) -> None:
+        """Say what changed; a device that stays away is not repeated."""
+        if state != self.state:
+            log.log(level, "%s: %s", self.name, state)
+        self.state = state

@@ -1,0 +1,131 @@
+"""The telemetry of a vehicle: every configured device on a link and a thread of its own."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from typing import NamedTuple
+
+from aquaflow.config.telemetry import AnyDevice, TelemetryConfig
+from aquaflow.fusion.clock import ClockReport
+from aquaflow.messages import TelemetrySample
+from drivers.latest import LatestQueue
+from drivers.link import LinkCounters, RawTap
+from drivers.mounting import BodyFrame, Mounting
+from drivers.protocol.packets import PacketDecoder
+from drivers.supervisor import Deliver, Supervisor
+from drivers.transport import OpenLink, opener
+
+log = logging.getLogger(__name__)
+
+CLOSE_TIMEOUT_S = 5.0
+"""A thread that is stuck in a system call longer is left behind; it can do no harm any more."""
+
+
+class _Waiting(NamedTuple):
+    """A sample on its way to the consumer, and the link it came by."""
+
+    sample: TelemetrySample
+    mounting: Mounting
+    counters: LinkCounters
+
+
+DECODERS = {
+    "mavlink": "drivers.protocol.mavlink:MavlinkDecoder",
+    "nmea0183": "drivers.protocol.nmea:NmeaDecoder",
+    "waterlinked_serial": "drivers.protocol.waterlinked_serial:WaterLinkedSerialDecoder",
+    "waterlinked_json": "drivers.protocol.waterlinked_json:WaterLinkedJsonDecoder",
+    "pd0": "drivers.protocol.pd0:Pd0Decoder",
+    "nmea2000": "drivers.protocol.nmea2000:Nmea2000Decoder",
+    "dbc": "drivers.protocol.dbc:DbcDecoder",
+}
+"""By the device's ``kind``; imported when a device needs it."""
+
+
+def decoder_of(name: str, config: AnyDevice) -> PacketDecoder:
+    """The decoder of device ``name``.
+
+    Raises:
+        InputError: the library that it needs is not installed.
+        ConfigError: the DBC file is not as the config says.
+    """
+    module, _, decoder = DECODERS[config.kind].partition(":")
+    built = getattr(import_module(module), decoder)(name, config)
+    assert isinstance(built, PacketDecoder)
+    return built
+
+
+class LinkTelemetry:
+    """A TelemetrySource of real devices, or of simulated ones that speak the same protocols.
+
+    Args:
+        config: the devices.
+        tap: gets the raw bytes of every link, for the recorder.
+        links: how to open some of the links otherwise than ``config`` says, by device.
+
+    Raises:
+        InputError: a library that a device needs is not installed.
+        ConfigError: a DBC file is not as the config says.
+    """
+
+    def __init__(
+        self,
+        config: TelemetryConfig,
+        tap: RawTap | None = None,
+        links: Mapping[str, OpenLink] | None = None,
+    ) -> None:
+        self._queue: LatestQueue[_Waiting] = LatestQueue(config.queue_samples, _count_dropped)
+        self._body = BodyFrame()
+        self.decoders = {name: decoder_of(name, device) for name, device in config.devices.items()}
+        self.links: dict[str, Supervisor] = {}
+        for name, device in config.devices.items():
+            decoder = self.decoders[name]
+            open_link = (links or {}).get(name) or opener(name, device.link)
+            deliver = self._deliverer(Mounting(device.mounting), decoder.counters)
+            self.links[name] = Supervisor(name, open_link, decoder, deliver, tap, device.silence_s)
+        self._threads = [
+            threading.Thread(target=link.run, name=f"telemetry {name}", daemon=True)
+            for name, link in self.links.items()
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def samples(self) -> Iterator[TelemetrySample]:
+        """Samples of all devices in the order of arrival, in the body frame, until closed."""
+        while (waiting := self._queue.take()) is not None:
+            yield self._body.refer(waiting.sample, waiting.mounting)
+
+    def counters(self) -> dict[str, LinkCounters]:
+        """What happened on each link."""
+        return {name: link.counters for name, link in self.links.items()}
+
+    def clocks(self) -> dict[str, ClockReport]:
+        """What is known of the clocks of the devices that have one and have been heard."""
+        reports = {
+            name: decoder.clock.mapping.report()
+            for name, decoder in self.decoders.items()
+            if decoder.clock is not None
+        }
+        return {name: report for name, report in reports.items() if report is not None}
+
+    def close(self) -> None:
+        """Stop all links; samples that wait can still be fetched. May be called again."""
+        for link in self.links.values():
+            link.stop()
+        for thread in self._threads:
+            thread.join(CLOSE_TIMEOUT_S)
+            if thread.is_alive():
+                log.warning("%s: still busy after %g s; left behind", thread.name, CLOSE_TIMEOUT_S)
+        self._queue.end()
+
+    def _deliverer(self, mounting: Mounting, counters: LinkCounters) -> Deliver:
+        def deliver(samples: list[TelemetrySample]) -> None:
+            self._queue.put([_Waiting(sample, mounting, counters) for sample in samples])
+
+        return deliver
+
+
+def _count_dropped(waiting: _Waiting) -> None:
+    waiting.counters.dropped_samples += 1

@@ -1,0 +1,178 @@
+"""Structures and numbers of linux/videodev2.h that a camera needs; 64-bit kernels only.
+
+Sizes are those of LP64 (x86-64, aarch64); a test holds them to the kernel's.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from ctypes import c_int32, c_uint8, c_uint32, c_uint64
+
+VIDEO_CAPTURE = 1
+MEMORY_MMAP = 1
+
+CAP_VIDEO_CAPTURE = 0x00000001
+CAP_STREAMING = 0x04000000
+CAP_DEVICE_CAPS = 0x80000000
+"""Set where ``device_caps`` speaks for this node alone."""
+
+BUF_FLAG_ERROR = 0x0040
+BUF_FLAG_TIMESTAMP_MASK = 0xE000
+BUF_FLAG_TIMESTAMP_MONOTONIC = 0x2000
+BUF_FLAG_TSTAMP_SRC_MASK = 0x70000
+BUF_FLAG_TSTAMP_SRC_SOE = 0x10000
+"""The stamp is that of the start of exposure; without it, of the end of the frame."""
+
+FRMSIZE_DISCRETE = 1
+
+CID_AUTO_WHITE_BALANCE = 0x0098090C
+CID_AUTOGAIN = 0x00980912
+CID_GAIN = 0x00980913
+CID_WHITE_BALANCE_TEMPERATURE = 0x0098091A
+CID_EXPOSURE_AUTO = 0x009A0901
+CID_EXPOSURE_ABSOLUTE = 0x009A0902
+EXPOSURE_MANUAL = 1
+EXPOSURE_UNIT_S = 100e-6
+"""Unit of CID_EXPOSURE_ABSOLUTE."""
+
+
+def fourcc(name: str) -> int:
+    """``YUYV`` as the kernel writes it."""
+    return int.from_bytes(name.encode("ascii"), "little")
+
+
+class Capability(ctypes.Structure):
+    _fields_ = (
+        ("driver", ctypes.c_char * 16),
+        ("card", ctypes.c_char * 32),
+        ("bus_info", ctypes.c_char * 32),
+        ("version", c_uint32),
+        ("capabilities", c_uint32),
+        ("device_caps", c_uint32),
+        ("reserved", c_uint32 * 3),
+    )
+
+
+class PixFormat(ctypes.Structure):
+    _fields_ = tuple(
+        (name, c_uint32)
+        for name in (
+            *("width", "height", "pixelformat", "field", "bytesperline", "sizeimage"),
+            *("colorspace", "priv", "flags", "ycbcr_enc", "quantization", "xfer_func"),
+        )
+    )
+
+
+class _FormatUnion(ctypes.Union):
+    # The kernel's union holds pointers: it starts at a multiple of eight.
+    _fields_ = (("pix", PixFormat), ("raw", c_uint8 * 200), ("_align", c_uint64))
+
+
+class Format(ctypes.Structure):
+    _fields_ = (("type", c_uint32), ("fmt", _FormatUnion))
+
+
+class Fraction(ctypes.Structure):
+    _fields_ = (("numerator", c_uint32), ("denominator", c_uint32))
+
+
+class StreamParameters(ctypes.Structure):
+    _fields_ = (
+        ("type", c_uint32),
+        ("capability", c_uint32),
+        ("capturemode", c_uint32),
+        ("timeperframe", Fraction),
+        ("raw", c_uint8 * 184),
+    )
+
+
+class RequestBuffers(ctypes.Structure):
+    _fields_ = (
+        ("count", c_uint32),
+        ("type", c_uint32),
+        ("memory", c_uint32),
+        ("capabilities", c_uint32),
+        ("flags", c_uint32),
+    )
+
+
+class Buffer(ctypes.Structure):
+    _fields_ = (
+        ("index", c_uint32),
+        ("type", c_uint32),
+        ("bytesused", c_uint32),
+        ("flags", c_uint32),
+        ("field", c_uint32),
+        ("seconds", ctypes.c_int64),
+        ("microseconds", ctypes.c_int64),
+        ("timecode", c_uint8 * 16),
+        ("sequence", c_uint32),
+        ("memory", c_uint32),
+        ("offset", c_uint64),  # a union; its lower half is the offset of memory-mapped buffers
+        ("length", c_uint32),
+        ("reserved", c_uint32 * 2),
+    )
+
+
+class Control(ctypes.Structure):
+    _fields_ = (("id", c_uint32), ("value", c_int32))
+
+
+class QueryControl(ctypes.Structure):
+    _fields_ = (
+        ("id", c_uint32),
+        ("type", c_uint32),
+        ("name", ctypes.c_char * 32),
+        ("minimum", c_int32),
+        ("maximum", c_int32),
+        ("step", c_int32),
+        ("default_value", c_int32),
+        ("flags", c_uint32),
+        ("reserved", c_uint32 * 2),
+    )
+
+
+class FormatDescription(ctypes.Structure):
+    _fields_ = (
+        ("index", c_uint32),
+        ("type", c_uint32),
+        ("flags", c_uint32),
+        ("description", ctypes.c_char * 32),
+        ("pixelformat", c_uint32),
+        ("reserved", c_uint32 * 4),
+    )
+
+
+class FrameSize(ctypes.Structure):
+    _fields_ = (
+        ("index", c_uint32),
+        ("pixelformat", c_uint32),
+        ("type", c_uint32),
+        ("width", c_uint32),
+        ("height", c_uint32),
+        ("stepwise", c_uint32 * 4),
+        ("reserved", c_uint32 * 2),
+    )
+
+
+def _request(
+    direction: int, number: int, argument: type[ctypes._SimpleCData[int] | ctypes.Structure]
+) -> int:
+    """_IOR (2), _IOW (1) or _IOWR (3) of asm-generic/ioctl.h for type 'V'."""
+    return direction << 30 | ctypes.sizeof(argument) << 16 | ord("V") << 8 | number
+
+
+QUERYCAP = _request(2, 0, Capability)
+ENUM_FMT = _request(3, 2, FormatDescription)
+S_FMT = _request(3, 5, Format)
+REQBUFS = _request(3, 8, RequestBuffers)
+QUERYBUF = _request(3, 9, Buffer)
+QBUF = _request(3, 15, Buffer)
+DQBUF = _request(3, 17, Buffer)
+STREAMON = _request(1, 18, c_int32)
+STREAMOFF = _request(1, 19, c_int32)
+S_PARM = _request(3, 22, StreamParameters)
+G_CTRL = _request(3, 27, Control)
+S_CTRL = _request(3, 28, Control)
+QUERYCTRL = _request(3, 36, QueryControl)
+ENUM_FRAMESIZES = _request(3, 74, FrameSize)

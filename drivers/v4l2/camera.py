@@ -1,0 +1,39 @@
+"""A V4L2 camera as a live CameraSource."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from aquaflow.config.cameras import V4l2Config
+from drivers.live import LiveCamera
+from drivers.v4l2.capture import V4l2Capture
+from drivers.v4l2.discovery import explained, find_camera
+from drivers.v4l2.system import Kernel, System
+
+
+class V4l2Camera(LiveCamera):
+    """The camera with the id in its config, wherever it is plugged in this time."""
+
+    def __init__(
+        self,
+        name: str,
+        config: V4l2Config,
+        system: System | None = None,
+        root: Path = Path("/"),
+    ) -> None:
+        self._system = system or Kernel()
+        self._root = root
+        self._v4l2 = config
+        super().__init__(name, config, self._open_device)
+
+    @classmethod
+    def configured(cls, name: str, config: V4l2Config) -> V4l2Camera:
+        """The camera of :func:`aquaflow.sources.open_camera`."""
+        return cls(name, config)
+
+    def _open_device(self) -> V4l2Capture:
+        node = find_camera(self._system, self._v4l2.device, self._root)
+        try:
+            return V4l2Capture(self._system, str(node.path), self._v4l2)
+        except OSError as error:
+            raise explained(error, node.path) from error

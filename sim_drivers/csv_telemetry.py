@@ -1,0 +1,144 @@
+"""Tables of telemetry: what ``aquaflow synth`` writes, ``rostopic echo -p``, and GoPro extracts."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TypeAlias
+
+from aquaflow.errors import InputError
+from aquaflow.messages import (
+    Acceleration,
+    Altitude,
+    AngularRate,
+    Depth,
+    TelemetrySample,
+    Velocity,
+)
+from aquaflow.synthetic.telemetry import HEADER, read_telemetry
+from sim_drivers.telemetry_log import LogTime, TelemetryLog
+
+Line: TypeAlias = dict[str, str]
+Convert: TypeAlias = Callable[[Line, int, int, str], list[TelemetrySample]]
+Samples: TypeAlias = Iterator[TelemetrySample]
+
+NAVQUEST_SHARE, NAVQUEST_SIGMA_M_S = 0.002, 0.001
+"""LinkQuest NavQuest 600, data sheet: 0.2 % of the velocity and 1 mm/s."""
+
+TIME, STAMP = "%time", "field.header.stamp"
+
+
+class CsvTelemetry(TelemetryLog):
+    """One table; the header says which. Velocities are in the instrument's own axes."""
+
+    suffixes = frozenset({".csv"})
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        return super().recognises(path) and _reader_of(path) is not None
+
+    def samples(self) -> Iterator[TelemetrySample]:
+        """Samples in the order of the lines; a line that holds no numbers costs itself.
+
+        Raises:
+            InputError: the table's header is not known.
+        """
+        reader = _reader_of(self.path)
+        if reader is None:
+            raise InputError(f"{self.path} is no table of telemetry that AquaFlow knows")
+        self.notes = []
+        yield from reader(self)
+
+    def lines(self, convert: Convert, stamps_of: Callable[[Line], tuple[int, int]]) -> Samples:
+        """Every line converted; ``stamps_of`` gives arrival and measurement, ns."""
+        clock, bad = LogTime(self.starts_s), 0
+        with self.path.open(newline="", encoding="utf-8", errors="replace") as file:
+            for line in csv.DictReader(file):
+                try:
+                    arrival_stamp, stamp = stamps_of(line)
+                    arrival_ns = clock.at(arrival_stamp)
+                    t_ns = arrival_ns + min(stamp - arrival_stamp, 0)
+                    found = convert(line, t_ns, arrival_ns, self.path.stem)
+                except (KeyError, TypeError, ValueError):
+                    bad += 1
+                    continue
+                yield from found
+        if bad:
+            self.notes.append(f"{bad} lines of {self.path.name} were left out")
+
+
+Reader: TypeAlias = Callable[[CsvTelemetry], Samples]
+
+
+def _reader_of(path: Path) -> Reader | None:
+    """How to read the table, by its header."""
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            header = tuple(file.readline(10_000).strip().split(","))
+    except OSError:
+        return None
+    if header == HEADER:
+        return lambda table: read_telemetry(table.path)
+    if header[0] == TIME and "field.depth" in header:
+        return lambda table: table.lines(_ros_depth, _ros_stamps)
+    if header[0] == TIME and "field.velocityInst0" in header:
+        return lambda table: table.lines(_ros_dvl, _ros_stamps)
+    if header == ("t_s", "c0", "c1", "c2"):
+        convert = {"gyro": _gopro_rate, "accl": _gopro_force}.get(path.stem.rpartition("_")[2])
+        if convert is not None:
+            return lambda table: table.lines(convert, _gopro_stamps)
+    return None
+
+
+def _ros_stamps(line: Line) -> tuple[int, int]:
+    return int(line[TIME]), int(line.get(STAMP) or line[TIME])
+
+
+def _gopro_stamps(line: Line) -> tuple[int, int]:
+    stamp = round(float(line["t_s"]) * 1e9)
+    return stamp, stamp
+
+
+def _numbers(line: Line, *columns: str) -> tuple[float, ...]:
+    numbers = tuple(float(line[column]) for column in columns)
+    if not all(map(math.isfinite, numbers)):
+        raise ValueError("not finite")
+    return numbers
+
+
+def _ros_depth(line: Line, t_ns: int, arrival_ns: int, source: str) -> list[TelemetrySample]:
+    (depth_m,) = _numbers(line, "field.depth")
+    return [Depth(t_ns, arrival_ns, source, depth_m)]
+
+
+def _ros_dvl(line: Line, t_ns: int, arrival_ns: int, source: str) -> list[TelemetrySample]:
+    """LinkQuest's message: velocity over ground where the flag is 1; altitude 0 means none."""
+    found: list[TelemetrySample] = []
+    if line["field.velocityInstFlag"] == "1":
+        x, y, z = _numbers(line, *(f"field.velocityInst{axis}" for axis in range(3)))
+        sigma = NAVQUEST_SHARE * math.hypot(x, y, z) + NAVQUEST_SIGMA_M_S
+        found.append(Velocity(t_ns, arrival_ns, source, (x, y, z), sigma))
+    (altitude_m,) = _numbers(line, "field.altitude")
+    if altitude_m > 0.0:
+        found.append(Altitude(t_ns, arrival_ns, source, altitude_m))
+    return found
+
+
+def _gopro_body(line: Line) -> tuple[float, float, float]:
+    """GoPro's axes in those of the camera's body: forward, right, down.
+
+    Found by fitting the gyro of shared/data/reef_clip to the rotations of its poses_sfm.tum; the
+    accelerometer then shows gravity downwards and a camera that looks 23 degrees down.
+    """
+    c0, c1, c2 = _numbers(line, "c0", "c1", "c2")
+    return -c2, -c1, -c0
+
+
+def _gopro_rate(line: Line, t_ns: int, arrival_ns: int, source: str) -> list[TelemetrySample]:
+    return [AngularRate(t_ns, arrival_ns, source, _gopro_body(line))]
+
+
+def _gopro_force(line: Line, t_ns: int, arrival_ns: int, source: str) -> list[TelemetrySample]:
+    return [Acceleration(t_ns, arrival_ns, source, _gopro_body(line))]

@@ -1,0 +1,150 @@
+"""A simulated device: says the samples of a log in its own protocol, in time, and answers."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterable
+from typing import Generic, Protocol, TypeAlias, TypeVar
+
+from aquaflow.messages import TelemetrySample
+
+Packet = TypeVar("Packet")
+"""bytes on serial lines and sockets, can.Message on a bus."""
+
+Clock: TypeAlias = Callable[[int], int]
+"""Nanoseconds since the device started to what its own clock then shows."""
+
+POLL_S = 0.005
+"""How soon a request is answered."""
+CLOSE_TIMEOUT_S = 5.0
+
+
+class Speaker(Protocol[Packet]):
+    """What a device says; times are those of its own clock."""
+
+    def say(self, sample: TelemetrySample, measured_ns: int, now_ns: int) -> list[Packet]:
+        """Packets that tell ``sample``; none where the protocol cannot."""
+        ...
+
+    def hear(self, packet: Packet, now_ns: int) -> list[Packet]:
+        """Answers to what came in."""
+        ...
+
+    def beat(self, now_ns: int) -> list[Packet]:
+        """What is to be said without being asked, by now."""
+        ...
+
+
+class Wire(Protocol[Packet]):
+    """The device's end of a link."""
+
+    def send(self, packet: Packet) -> None:
+        """Loses the packet where nobody listens, as a wire does; never raises."""
+        ...
+
+    def receive(self) -> Packet | None:
+        """What has come in, without waiting."""
+        ...
+
+    def close(self) -> None: ...
+
+
+def boot_clock(since_start_ns: int) -> int:
+    """A device that was switched on ten minutes before."""
+    return 600_000_000_000 + since_start_ns
+
+
+class SimulatedDevice(Generic[Packet]):
+    """Runs in a thread until closed.
+
+    Args:
+        samples: in the order of arrival; the first is said at once.
+        speed: of time, 1: as it was; None: as fast as the wire takes them.
+        clock: the device's own clock.
+    """
+
+    def __init__(
+        self,
+        speaker: Speaker[Packet],
+        wire: Wire[Packet],
+        samples: Iterable[TelemetrySample],
+        speed: float | None = 1.0,
+        clock: Clock = boot_clock,
+    ) -> None:
+        self.said = 0
+        """Packets sent."""
+        self.finished = threading.Event()
+        """Set once all samples are said; requests are answered until it is closed."""
+        self._speaker, self._wire, self._samples = speaker, wire, samples
+        self._speed, self._clock = speed, clock
+        self._stopping = threading.Event()
+        self._started_ns = time.monotonic_ns()
+        self._elapsed_ns = 0
+        self._thread = threading.Thread(target=self._run, name="simulated device", daemon=True)
+
+    def start(self) -> SimulatedDevice[Packet]:
+        self._started_ns = time.monotonic_ns()
+        self._thread.start()
+        return self
+
+    def close(self) -> None:
+        """Stop speaking and leave the wire."""
+        self._stopping.set()
+        if self._thread.ident is not None:
+            self._thread.join(CLOSE_TIMEOUT_S)
+        self._wire.close()
+
+    def _run(self) -> None:
+        first_ns: int | None = None
+        for sample in self._samples:
+            first_ns = sample.arrival_ns if first_ns is None else first_ns
+            self._wait_until(sample.arrival_ns - first_ns)
+            if self._stopping.is_set():
+                return
+            measured_ns = self._clock(sample.t_ns - first_ns)
+            self._send(self._speaker.say(sample, measured_ns, self._now_ns()))
+        self.finished.set()
+        while not self._stopping.wait(POLL_S):
+            self._converse()
+
+    def _wait_until(self, elapsed_ns: int) -> None:
+        """Converse until the log has come so far."""
+        if self._speed is None:
+            self._elapsed_ns = elapsed_ns
+            self._converse()
+            return
+        while not self._stopping.is_set():
+            self._converse()
+            left_s = (elapsed_ns - self._elapsed()) / self._speed * 1e-9
+            if left_s <= 0:
+                return
+            self._stopping.wait(min(left_s, POLL_S))
+
+    def _elapsed(self) -> int:
+        if self._speed is None:
+            return self._elapsed_ns
+        return round((time.monotonic_ns() - self._started_ns) * self._speed)
+
+    def _now_ns(self) -> int:
+        return self._clock(self._elapsed())
+
+    def _converse(self) -> None:
+        self._send(self._speaker.beat(self._now_ns()))
+        while (heard := self._wire.receive()) is not None:
+            self._send(self._speaker.hear(heard, self._now_ns()))
+
+    def _send(self, packets: list[Packet]) -> None:
+        for packet in packets:
+            self._wire.send(packet)
+            self.said += 1
+
+
+class Listener(Generic[Packet]):
+    """A speaker that neither answers nor says anything unasked."""
+
+    def hear(self, packet: Packet, now_ns: int) -> list[Packet]:
+        return []
+
+    def beat(self, now_ns: int) -> list[Packet]:
+        return []

@@ -1,0 +1,132 @@
+"""``replay.yaml``: a camera's recording and the telemetry logs that were made beside it.
+
+    camera: dive.mp4
+    telemetry:
+      - {file: dive.tlog, starts_s: -3.2}
+      - file: sounder.nmea
+        device: {kind: nmea0183, link: {port: log}, depth_sentences: [DBT]}
+
+``starts_s`` is when the log begins, in seconds after the first picture.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from aquaflow.config.stage import Stage, validated
+from aquaflow.config.telemetry import AnyDevice
+from aquaflow.errors import ConfigError, InputError
+from aquaflow.messages import TelemetrySample
+from aquaflow.sources import (
+    RecordedCamera,
+    RecordedTelemetry,
+    Tap,
+    open_recorded_telemetry,
+    open_recording,
+)
+from sim_drivers.telemetry_log import ByteLog
+
+MANIFEST = "replay.yaml"
+
+
+class LogEntry(Stage):
+    """One telemetry log."""
+
+    file: str
+    starts_s: float = 0.0
+    device: AnyDevice | None = None
+    """What speaks in a log of bytes; None: the usual for its kind."""
+
+
+class Manifest(Stage):
+    """What lies in the folder."""
+
+    camera: str | None = None
+    telemetry: tuple[LogEntry, ...] = ()
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """The folder's ``replay.yaml``.
+
+    Raises:
+        InputError: it cannot be read.
+        ConfigError: a key is unknown or a value out of range.
+    """
+    path = folder / MANIFEST
+    try:
+        data: Any = yaml.safe_load(path.read_text()) or {}
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InputError(f"cannot read {path}; write `camera:` and `telemetry:` lines") from error
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path} holds no key: value pairs")
+    return validated(Manifest, data, str(path))
+
+
+class ManifestCamera:
+    """The camera that a manifest names, read by whoever reads it."""
+
+    specificity = 3
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        return (path / MANIFEST).is_file()
+
+    @classmethod
+    def open(cls, path: Path, fps: float | None = None) -> RecordedCamera:
+        """Raises InputError if the manifest names no camera, or nothing reads it."""
+        manifest = read_manifest(path)
+        if manifest.camera is None:
+            raise InputError(f"{path / MANIFEST} names no camera")
+        return open_recording(path / manifest.camera, fps)
+
+
+class ManifestTelemetry:
+    """All logs that a manifest names, merged in the order of arrival."""
+
+    specificity = 3
+
+    def __init__(self, folder: Path, starts_s: float = 0.0) -> None:
+        """Raises InputError or ConfigError where the manifest or a log cannot be used."""
+        self.logs = [_log(folder, entry, starts_s) for entry in read_manifest(folder).telemetry]
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        return ManifestCamera.recognises(path)
+
+    @classmethod
+    def open(cls, path: Path, starts_s: float = 0.0) -> ManifestTelemetry:
+        return cls(path, starts_s)
+
+    @property
+    def notes(self) -> list[str]:
+        return [note for log in self.logs for note in log.notes]
+
+    def tap_bytes(self, tap: Tap) -> None:
+        """Hand the bytes of every log of bytes to ``tap`` as well."""
+        for log in self.logs:
+            if isinstance(log, ByteLog):
+                log.tap_bytes(tap)
+
+    def samples(self) -> Iterator[TelemetrySample]:
+        """Samples of all logs; of equal arrivals those of the log named first."""
+        streams = [log.samples() for log in self.logs]
+        return heapq.merge(*streams, key=lambda sample: sample.arrival_ns)
+
+    def close(self) -> None:
+        for log in self.logs:
+            log.close()
+
+
+def _log(folder: Path, entry: LogEntry, starts_s: float) -> RecordedTelemetry:
+    path = folder / entry.file
+    log = open_recorded_telemetry(path, entry.starts_s + starts_s)
+    if entry.device is None:
+        return log
+    if not isinstance(log, ByteLog):
+        raise ConfigError(f"{path} is no log of bytes; it takes no `device`")
+    return type(log)(path, entry.starts_s + starts_s, entry.device)

@@ -1,0 +1,147 @@
+"""Every fault against every live camera: nothing hangs, every picture is counted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from camera_scenes import COUNT, KINDS, Pictures, live, settled, until
+
+from aquaflow.messages import Dropped, Frame
+from drivers.exposure_clock import MAX_LATENCY_NS
+from drivers.live import CameraState
+from sim_drivers.camera_feed import CameraFaults, first_images
+
+every_kind = pytest.mark.parametrize("kind", KINDS)
+
+TELLING = [kind for kind in KINDS if kind != "stream"]
+"""Cameras that tell a picture's number and moment; a stream tells neither."""
+
+
+def increasing(values: list[int]) -> bool:
+    return bool(np.all(np.diff(values) > 0))
+
+
+@every_kind
+def test_without_faults_every_picture_comes_or_is_counted(kind: str, tmp_path: Path) -> None:
+    with live(kind, CameraFaults(), tmp_path) as camera:
+        seen = until(camera, 20)
+    assert settled(camera)
+    n = camera.counters
+    assert (n.lost, n.unusable, n.duplicates, n.reconnects, n.stamps_repaired) == (0, 0, 0, 0, 0)
+    assert all(isinstance(frame, Frame) for frame in seen)
+    assert increasing([frame.index for frame in seen])
+    assert camera.state is CameraState.CLOSED
+
+
+@every_kind
+def test_pictures_are_those_of_the_recording(kind: str, tmp_path: Path) -> None:
+    with live(kind, CameraFaults(), tmp_path, fps=50.0) as camera:
+        seen = until(camera, 10)
+    filmed = [image.astype(int) for image in first_images(Pictures(), COUNT)]
+    for frame in seen:
+        assert isinstance(frame, Frame)
+        assert frame.image.dtype == np.uint8
+        assert frame.image.shape == (48, 64, 3)
+        # A stream's index counts from where FFmpeg joined it; the others count with the camera.
+        number = frame.index
+        if kind == "stream":
+            number = round(float(frame.image[:, 0].mean()) / 5.0)
+        assert np.abs(frame.image.astype(int) - filmed[number]).max() <= 4
+
+
+@pytest.mark.parametrize("kind", TELLING)
+def test_dropped_pictures_are_counted_by_the_gap_that_they_leave(kind: str, tmp_path: Path) -> None:
+    faults = CameraFaults(drop=frozenset({3, 4, 9}))
+    with live(kind, faults, tmp_path) as camera:
+        seen = until(camera, 17)
+    assert settled(camera)
+    assert camera.counters.lost == 3
+    assert not {3, 4, 9} & {frame.index for frame in seen}
+    assert increasing([frame.index for frame in seen])
+
+
+def test_a_stream_goes_on_after_pictures_that_never_came(tmp_path: Path) -> None:
+    with live("stream", CameraFaults(drop=frozenset({3, 4, 9})), tmp_path) as camera:
+        until(camera, 15)
+    assert settled(camera)
+    assert camera.counters.lost == 0
+
+
+@every_kind
+def test_a_duplicate_changes_no_time_and_no_order(kind: str, tmp_path: Path) -> None:
+    with live(kind, CameraFaults(duplicate=frozenset({2, 5})), tmp_path) as camera:
+        seen = until(camera, 15)
+    assert settled(camera)
+    assert camera.counters.duplicates == (0 if kind == "stream" else 2)
+    assert increasing([frame.t_ns for frame in seen])
+    assert camera.counters.lost == 0
+
+
+@every_kind
+def test_a_delayed_picture_keeps_the_moment_of_its_exposure(kind: str, tmp_path: Path) -> None:
+    faults = CameraFaults(delay_s={12: 0.3})
+    with live(kind, faults, tmp_path, fps=50.0) as camera:
+        seen = until(camera, 20)
+    assert settled(camera)
+    assert camera.counters.stamps_repaired == 0
+    assert increasing([frame.t_ns for frame in seen])
+    late = [f.arrival_ns - f.t_ns for f in seen if isinstance(f, Frame) and f.index >= 12]
+    if kind == "stream":
+        assert max(late) == 0
+    else:
+        assert max(late) > 0.1e9
+
+
+@every_kind
+def test_a_damaged_picture_costs_only_itself(kind: str, tmp_path: Path) -> None:
+    damaged = frozenset(range(4, 10))
+    with live(kind, CameraFaults(corrupt=damaged), tmp_path, fps=50.0) as camera:
+        seen = until(camera, 18)
+    assert settled(camera)
+    assert camera.counters.unusable >= 1
+    dropped = [frame for frame in seen if isinstance(frame, Dropped)]
+    assert len(dropped) == camera.counters.unusable <= len(damaged)
+    assert all(frame.reason.startswith("front#") for frame in dropped)
+    assert camera.counters.reconnects == 0
+    assert isinstance(seen[-1], Frame)
+
+
+@every_kind
+def test_an_unplugged_camera_comes_back(kind: str, tmp_path: Path) -> None:
+    faults = CameraFaults(disconnect=frozenset({6, 13}), away_s=0.1)
+    with live(kind, faults, tmp_path) as camera:
+        seen = until(camera, 25)
+    assert settled(camera)
+    assert camera.counters.reconnects == 2
+    assert increasing([frame.index for frame in seen])
+    assert increasing([frame.t_ns for frame in seen])
+
+
+@pytest.mark.parametrize("kind", TELLING)
+def test_a_jump_of_the_cameras_clock_is_repaired(kind: str, tmp_path: Path) -> None:
+    faults = CameraFaults(clock_jump_s={5: 10.0, 10: -20.0, 15: 10.0})
+    with live(kind, faults, tmp_path) as camera:
+        seen = until(camera, 20)
+    assert settled(camera)
+    assert camera.counters.stamps_repaired == 10
+    assert increasing([frame.t_ns for frame in seen])
+    for frame in seen:
+        assert isinstance(frame, Frame)
+        assert -1 <= frame.arrival_ns - frame.t_ns < MAX_LATENCY_NS
+
+
+@every_kind
+def test_a_flood_is_overtaken_by_its_newest_picture(kind: str, tmp_path: Path) -> None:
+    with live(kind, CameraFaults(flood=range(2, 120)), tmp_path, fps=400.0) as camera:
+        frames = camera.frames()
+        next(frames)
+        while camera.counters.received < 125:  # a consumer that is busy elsewhere
+            assert camera.state is not CameraState.CLOSED, "gave up"
+            camera._closing.wait(0.02)
+        newest = next(frames)
+        camera.close()
+    assert settled(camera)
+    assert camera.counters.overtaken >= 120
+    assert newest.index >= 123

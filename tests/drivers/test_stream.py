@@ -1,0 +1,117 @@
+"""Network streams: HTTP, RTSP and MPEG-TS over UDP from servers on this computer."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from camera_scenes import COUNT, HEIGHT, WIDTH, Pictures, closing, feed, settled, stream, until
+
+from aquaflow.errors import InputError
+from aquaflow.messages import Frame
+from drivers import stream as driver
+from drivers.stream import without_password
+from sim_drivers.camera_feed import CameraFeed, first_images
+from sim_drivers.mjpeg_server import MjpegServer
+from sim_drivers.transport_stream import RtspCamera, UdpCamera
+
+
+def free_port(kind: socket.SocketKind) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@pytest.mark.parametrize("kind", ["rtsp", "udp"])
+def test_a_stream_is_shown_and_comes_back_when_it_broke(kind: str) -> None:
+    images = first_images(Pictures(), COUNT)
+    port = free_port(socket.SOCK_DGRAM)
+    server = RtspCamera(images) if kind == "rtsp" else UdpCamera(port, images)
+    url = server.url if isinstance(server, RtspCamera) else f"udp://127.0.0.1:{port}"
+    with server, closing(stream(url, stall_s=0.5)) as camera:
+        frames = camera.frames()
+        first = next(frames)
+        assert isinstance(first, Frame)
+        assert first.image.shape == (HEIGHT, WIDTH, 3)
+        server.plugged_in.clear()
+        while not camera.reason:
+            assert not camera._closing.wait(0.02), "gave up"
+        server.plugged_in.set()
+        while camera.counters.reconnects == 0:
+            next(frames)
+    assert settled(camera)
+
+
+def test_a_picture_is_stamped_when_it_arrives_less_the_latency() -> None:
+    with MjpegServer(feed()) as server, closing(stream(server.url, latency_s=0.25)) as camera:
+        seen = until(camera, 5)
+    for frame in seen[1:]:
+        assert isinstance(frame, Frame)
+        assert frame.arrival_ns - frame.t_ns == 250_000_000
+    assert camera.counters.stamps_repaired == 0
+
+
+def test_nobody_there_is_one_sentence_without_the_password() -> None:
+    port = free_port(socket.SOCK_STREAM)
+    with pytest.raises(InputError) as caught:
+        stream(f"http://pilot:secret@127.0.0.1:{port}/video").connect()
+    assert str(caught.value) == f"camera 'front': no video from http://127.0.0.1:{port}/video"
+
+
+@pytest.mark.parametrize(
+    ("url", "shown"),
+    [
+        ("rtsp://user:pass@10.0.0.5:554/a?b=1", "rtsp://10.0.0.5:554/a?b=1"),
+        ("rtsp://user@host/a", "rtsp://host/a"),
+        ("udp://0.0.0.0:5600", "udp://0.0.0.0:5600"),
+        ("/etc/camera.sdp", "/etc/camera.sdp"),
+    ],
+)
+def test_passwords_are_not_shown(url: str, shown: str) -> None:
+    assert without_password(url) == shown
+
+
+def test_what_is_no_video_is_refused() -> None:
+    refusing = socket.create_server(("127.0.0.1", 0))
+
+    def answer() -> None:
+        client, _ = refusing.accept()
+        with client:
+            client.recv(1000)
+            client.sendall(b"HTTP/1.0 200 OK\r\nContent-Type: text/html\r\n\r\n<p>hello</p>")
+
+    thread = threading.Thread(target=answer, daemon=True)
+    thread.start()
+    with refusing, pytest.raises(InputError, match="no video from"):
+        stream(f"http://127.0.0.1:{refusing.getsockname()[1]}/").connect()
+
+
+def test_options_of_ffmpeg_are_given_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    port = free_port(socket.SOCK_STREAM)
+    for before in (None, "hwaccel;none"):
+        if before is not None:
+            monkeypatch.setenv(driver.OPTIONS, before)
+        with pytest.raises(InputError):
+            stream(f"http://127.0.0.1:{port}/").connect()
+        assert os.environ.get(driver.OPTIONS) == before
+
+
+def test_nothing_is_written_to_stderr(
+    capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    shots = CameraFeed(Pictures(), 100.0)
+    with caplog.at_level(logging.WARNING), MjpegServer(shots) as server:
+        camera = stream(server.url, stall_s=0.2, last_retry_s=0.02)
+        with closing(camera):
+            next(camera.frames())
+            server.ending.set()
+            while not camera.reason:
+                camera._closing.wait(0.02)
+    assert capfd.readouterr().err == ""
+    assert "camera 'front' is lost" in caplog.text
+    assert np.all([record.levelno == logging.WARNING for record in caplog.records])

@@ -1,0 +1,184 @@
+"""``aquaflow record`` as a user types it, and the session behind it."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Cli, refused
+from killed import sentence, under_way, write_source
+
+from aquaflow.config.recording import RecordingConfig
+from aquaflow.config.telemetry import TelemetryConfig
+from aquaflow.errors import InputError
+from aquaflow.geometry.camera import guess_camera
+from aquaflow.messages import Depth, Dropped, Frame, TelemetrySample
+from aquaflow.recording import Recorder
+from aquaflow.recording.session import Session
+from aquaflow.sources import open_links
+from sim_drivers.mcap_camera import McapCamera
+from sim_drivers.mcap_messages import McapMessages, mcap_files
+from sim_drivers.mcap_telemetry import McapTelemetry
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("source")
+    write_source(folder, 20.0, 64, 48)
+    return folder
+
+
+def test_a_recording_is_recorded_with_its_telemetry_and_its_bytes(
+    aquaflow: Cli, source: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    ran = aquaflow("record", "--source", source, "--out", out, "--seconds", 1.5, "--json")
+    assert ran.code == 0, ran.err
+    told = json.loads(ran.out)
+    assert told["stopped"] is None
+    assert told["dropped"] == {}
+    telemetry = McapTelemetry(out)
+    assert len(list(McapCamera(out).frames())) == told["frames"] > 0
+    assert len(list(telemetry.samples())) == told["samples"] > 0
+    assert sum(len(read.data) for read in telemetry.link_bytes()) == told["link_bytes"] > 0
+    assert told["files"] == [str(file) for file in mcap_files(out)]
+
+
+def test_systemds_sigterm_ends_it_cleanly_with_one_line(source: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    script = Path(sys.executable).with_name("aquaflow")
+    process = subprocess.Popen(
+        [str(script), "record", "--source", str(source), "--out", str(out)],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 60.0
+    while not under_way(out) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    printed, _ = process.communicate(timeout=60.0)
+    assert process.returncode == 0
+    (line,) = printed.splitlines()
+    assert line.startswith("Recorded ")
+    assert str(out) in line
+    assert McapMessages(mcap_files(out)).counts() is not None
+
+
+def test_nothing_to_record_is_said(aquaflow: Cli, tmp_path: Path) -> None:
+    refused(aquaflow("record", "--out", tmp_path / "out"), "--config")
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unknown_way_to_keep_pictures_is_refused(
+    aquaflow: Cli, source: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    refused(aquaflow("record", "--source", source, "--out", out, "--picture", "gif"), "picture")
+
+
+def test_a_full_disk_is_an_error_and_not_a_summary(
+    aquaflow: Cli, source: Path, tmp_path: Path
+) -> None:
+    config = tmp_path / "rov.yaml"
+    config.write_text("recording: {reserve_mb: 1000000000}\n")
+    out = tmp_path / "out"
+    refused(aquaflow("record", "--source", source, "--config", config, "--out", out), out, "MB")
+
+
+def test_a_missing_source_is_named(aquaflow: Cli, tmp_path: Path) -> None:
+    refused(aquaflow("record", "--source", tmp_path / "no", "--out", tmp_path / "out"), "no")
+    assert not (tmp_path / "out").exists()
+
+
+class LiveCamera:
+    """A device that delivers until it is closed."""
+
+    camera = None
+    frame_count = None
+    notes: list[str] = []  # noqa: RUF012
+
+    def __init__(self, fails_at: int = 10**9) -> None:
+        self.closed = threading.Event()
+        self._fails_at = fails_at
+
+    def frames(
+        self, every: int = 1, start: int = 0, stop: int | None = None
+    ) -> Iterator[Frame | Dropped]:
+        index = 0
+        while not self.closed.wait(0.01):
+            if index == self._fails_at:
+                raise InputError("the lens fell off")
+            now = time.monotonic_ns()
+            image = np.zeros((4, 4, 3), np.uint8)
+            yield Frame(index, now, now, image, guess_camera(4, 4))
+            index += 1
+
+    def close(self) -> None:
+        self.closed.set()
+
+
+class CameraWithImu(LiveCamera):
+    def samples(self) -> Iterator[TelemetrySample]:
+        while not self.closed.wait(0.01):
+            yield Depth(1, time.monotonic_ns(), "imu", 1.0)
+
+
+def session_of(out: Path) -> Session:
+    return Session(Recorder(out, RecordingConfig(picture="raw", reserve_mb=0)))
+
+
+def test_live_sources_are_recorded_until_time_is_up_and_then_closed(tmp_path: Path) -> None:
+    cameras = {"front": LiveCamera(), "down": CameraWithImu()}
+    session = session_of(tmp_path)
+    session.add_live(cameras, [])
+    session.run(seconds=0.5)
+    assert all(camera.closed.is_set() for camera in cameras.values())
+    assert session.recorder.status.samples > 0
+    for name in cameras:
+        assert list(McapCamera(tmp_path, camera=name).frames())
+
+
+def test_live_links_are_recorded_with_their_bytes(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    link = {"kind": "udp", "host": "127.0.0.1", "port": port}
+    device = {"kind": "nmea0183", "link": link}
+    config = TelemetryConfig.model_validate({"devices": {"compass": device}})
+    session = session_of(tmp_path)
+    session.add_live({}, [open_links(config, session.recorder.raw)])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as talker:
+
+        def talk() -> None:
+            deadline = time.monotonic() + 30.0
+            while session.recorder.status.samples < 3 and time.monotonic() < deadline:
+                talker.sendto(f"{sentence(10.0)}\r\n".encode(), ("127.0.0.1", port))
+                time.sleep(0.02)
+            session.stopping.set()
+
+        thread = threading.Thread(target=talk)
+        thread.start()
+        session.run()
+        thread.join()
+    telemetry = McapTelemetry(tmp_path)
+    assert len(list(telemetry.samples())) >= 3
+    again = list(telemetry.decoded_again(config.devices))
+    assert [s.source for s in again[:3]] == [s.source for s in telemetry.samples()][:3]
+
+
+def test_a_camera_that_fails_does_not_end_the_others(tmp_path: Path) -> None:
+    session = session_of(tmp_path)
+    session.add_live({"bad": LiveCamera(fails_at=3), "good": LiveCamera()}, [])
+    session.run(seconds=0.8)
+    assert session.notes == ["camera 'bad' failed: the lens fell off"]
+    good = len(list(McapCamera(tmp_path, camera="good").frames()))
+    assert good > len(list(McapCamera(tmp_path, camera="bad").frames())) == 3

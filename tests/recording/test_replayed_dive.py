@@ -1,0 +1,55 @@
+"""A recorded dive, mapped: the same each time, and the same as its source."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+from conftest import QUICK, Cli
+
+from aquaflow.config.recording import RecordingConfig
+from aquaflow.recording import Recorder
+from aquaflow.sources import open_recorded_telemetry, open_recording
+from sim_drivers.mcap_telemetry import McapTelemetry
+
+SAME = ("trajectory.tum", "map.ply", "map_clear.ply", "medium.json")
+
+
+@pytest.fixture(scope="module")
+def recorded(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small synthetic dive, some hours after the computer was started."""
+    out = tmp_path_factory.mktemp("recorded")
+    recorder = Recorder(out, RecordingConfig(picture="raw", keep_received=False, reserve_mb=0))
+    for frame in open_recording(small_recording).frames():
+        recorder.frame("camera", frame)
+    for sample in open_recorded_telemetry(small_recording).samples():
+        recorder.sample(sample)
+    assert recorder.close().dropped == {}
+    return out
+
+
+def rows_without_names(dive: Path) -> list[list[str]]:
+    """frames.csv but for the names of the pictures, which a recording does not keep."""
+    with (dive / "frames.csv").open() as file:
+        table = list(csv.DictReader(file))
+    return [[value for key, value in row.items() if key != "source"] for row in table]
+
+
+def test_a_recorded_dive_maps_twice_to_the_same_and_to_what_its_source_maps_to(
+    aquaflow: Cli, recorded: Path, small_dive: Path, tmp_path: Path
+) -> None:
+    dives = [tmp_path / "once", tmp_path / "twice"]
+    for dive in dives:
+        ran = aquaflow("map", recorded, "--out", dive, *QUICK)
+        assert ran.code == 0, ran.err
+    for name in SAME:
+        once, twice, source = ((dive / name).read_bytes() for dive in (*dives, small_dive))
+        assert once == twice == source, name
+    assert (dives[0] / "frames.csv").read_bytes() == (dives[1] / "frames.csv").read_bytes()
+    assert rows_without_names(dives[0]) == rows_without_names(small_dive)
+
+
+def test_its_telemetry_is_that_of_its_source(recorded: Path, small_recording: Path) -> None:
+    source = list(open_recorded_telemetry(small_recording).samples())
+    assert list(McapTelemetry(recorded).samples()) == source
