@@ -22,7 +22,8 @@ from aquaflow.tracking.frames import FrameClass, Tracked
 
 PROTOCOL = {
     "held_out": "i % n == 0 and i != 0 of the used frames: tracked, never mapped; pose refined "
-    "photometrically against the frozen map",
+    "photometrically against the frozen map; exposure, where views differ in it, that between the "
+    "mapped frames before and after",
     "resolution": "the width that was mapped, undistorted",
     "ssim": "11x11 Gaussian window, sigma 1.5 px, zero-padded, mean over channels",
     "psnr": "mean over held-out frames of the PSNR of each",
@@ -188,7 +189,7 @@ def metrics(
     return counts | {
         "sub_maps": len({t.sub_map for t in results if t.T_wc is not None}),
         "skipped_by": dict(slam.skipped) | ({"dropped": len(dropped)} if dropped else {}),
-        "loops": slam.loops,
+        "loops": slam.graph.loops,
         "gaussians": sum(len(mapper.gaussians) for mapper in slam.mappers.values()),
         "steps": sum(mapper.steps for mapper in slam.mappers.values()),
         "steps_undone": sum(mapper.undone for mapper in slam.mappers.values()),

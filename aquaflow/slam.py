@@ -1,4 +1,4 @@
-"""AquaFlow, the algorithm: frames in, poses and maps out. No threads, no clocks."""
+"""AquaFlow, the algorithm: frames in, poses and maps out. No clocks decide a replay's results."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from aquaflow.profiler import Profiler
 from aquaflow.render import select_renderer
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.tracking.gate import FrameGate, Verdict
-from aquaflow.tracking.keyframe_graph import Correction, KeyframeGraph
+from aquaflow.tracking.keyframe_graph import KeyframeGraph
 from aquaflow.tracking.places import Places
 from aquaflow.tracking.tracker import Tracker
 
@@ -33,9 +33,16 @@ class Slam:
     """One dive: a tracker, its keyframes and their graph, and a map for every sub-map."""
 
     def __init__(
-        self, config: Config, profiler: Profiler | None = None, work: Path | None = None
+        self,
+        config: Config,
+        profiler: Profiler | None = None,
+        work: Path | None = None,
+        live: bool = False,
     ) -> None:
         """What does not fit into memory waits in the folder ``work``, if there is one.
+
+        A ``live`` run takes over an optimised keyframe graph as soon as it is there; a replay waits
+        for it at the next keyframe, and so repeats bit for bit.
 
         Raises:
             ConfigError: the prior cannot give what the config asks tracking for.
@@ -59,7 +66,7 @@ class Slam:
         """Per sub-map, the views that were tracked but never mapped."""
         self.skipped: Counter[str] = Counter()
         """Frames that the gate kept from tracking, by its reason's kind."""
-        self.loops = 0
+        self._live = live
         self._views = ViewStore(work)
         self._sequence: dict[int, int] = {}
         self._T_kf: dict[int, Sim3] = {}
@@ -69,6 +76,10 @@ class Slam:
 
     def process(self, frame: Frame) -> list[Tracked]:
         """Everything the paper does with one frame; returns the frames whose fate it decided."""
+        # Sec. 3.2: what was optimised beside tracking; keyframes move, and the map follows.
+        if self._live:
+            self._correct(wait=False)
+
         # Not in the paper: is the frame worth looking at (DESIGN section 6)?
         with self.profiler.stage("gate"):
             verdict = self.gate.judge(frame.image, frame.mask)
@@ -82,7 +93,7 @@ class Slam:
         if self.tracker.lost:
             self.gate.forget()
 
-        # Sec. 3.2: loops between keyframes, graph optimisation, and a map that follows.
+        # Sec. 3.2: loops between keyframes, which start the next optimisation of their graph.
         # Sec. 3.3 and 3.4: grow and optimise the map.
         return self._place_all(decided)
 
@@ -91,15 +102,18 @@ class Slam:
         with self.profiler.stage("track"):
             decided = self.tracker.finish()
         placed = self._place_all(decided)
+        while self.graph.optimising:
+            self._correct(wait=True)
         self._retire_keyframes()
         with self.profiler.stage("refine"):
             for mapper in self.mappers.values():
                 if len(mapper.views) >= MIN_VIEWS:
                     mapper.refine(progress)
-        return placed
+        return self.settled(placed)
 
     def close(self) -> None:
-        """Remove what waits in the work folder."""
+        """End the work beside tracking, and remove what waits in the work folder."""
+        self.graph.close()
         self.keyframes.close()
         self._views.close()
 
@@ -119,8 +133,10 @@ class Slam:
             self._latest = None
             return tracked
         if tracked.frame_class is FrameClass.KEYFRAME:
+            if not self._live:
+                self._correct(wait=True)
             with self.profiler.stage("graph"):
-                self._follow(self.graph.add(tracked.keyframe, tracked.link))
+                self.graph.add(tracked.keyframe, tracked.link)
         self._latest = self._settled(tracked)
         if self.config.mapping.enabled:
             self._map(self._latest)
@@ -134,18 +150,13 @@ class Slam:
             sub_map = self.tracker.sub_map
             return Tracked(frame, FrameClass.SKIPPED, sub_map, reason=verdict.reason)
         self._T_kf[frame.index] = self._T_kf[before.frame.index]
-        return replace(
-            before,
-            frame=frame,
-            frame_class=FrameClass.SKIPPED,
-            pointmap=None,
-            reason=verdict.reason,
-            link=None,
-        )
+        skipped = replace(self._settled(before), frame=frame, frame_class=FrameClass.SKIPPED)
+        return replace(skipped, pointmap=None, reason=verdict.reason, link=None)
 
-    def _follow(self, correction: Correction) -> None:
+    def _correct(self, wait: bool) -> None:
         """Gaussians and views go where their keyframes went; merged sub-maps become one map."""
-        self.loops += correction.loops
+        with self.profiler.stage("correct"):
+            correction = self.graph.correction(wait)
         if not correction.moves:
             return
         for mapper in self.mappers.values():

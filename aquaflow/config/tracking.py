@@ -199,6 +199,46 @@ class TrackingConfig(Stage):
         lt=1,
         description="tau_keyframe: matched share below which a keyframe is made; paper: 0.7",
     )
+    min_seen: float = Field(
+        0.55,
+        ge=0,
+        lt=1,
+        description="of what a frame should show of its keyframe, by their poses, the share "
+        "matched as the pose says, below which something hides the scene and no keyframe is made; "
+        "measured where a keyframe falls due: reef, Curasao and surveys over 0.89, IUI3 (weak "
+        "calibration) over 0.64; snow over 40 % of the pixels of the reef clip below 0.49",
+    )
+    keyframe_overlap: float = Field(
+        0.5,
+        ge=0,
+        lt=1,
+        description="predicted share of the keyframe in view below which a new one is made even of "
+        "a frame that hides the scene; a keyframe full of flakes loses the depth under them, so "
+        "late: on the reef clip, one made at 0.8 kept the depth of 15 % of its pixels",
+    )
+    return_overlap: float = Field(
+        0.75,
+        gt=0,
+        le=1,
+        description="predicted share of an earlier keyframe in view from which it is tried again "
+        "before a new one is made; above keyframe_share, for what is in view is not all matched",
+    )
+    return_share: float = Field(
+        0.75,
+        gt=0,
+        le=1,
+        description="matched share from which it is used again; above keyframe_share, so that it "
+        "is not left at the next frame",
+    )
+    return_widths: float = Field(
+        0.03,
+        gt=0,
+        description="distance over width between where the graph and where the matches put its "
+        "points; further, the graph has drifted, and a new keyframe closes the loop",
+    )
+    return_candidates: int = Field(
+        2, ge=0, description="earlier keyframes tried, each for one more matching; 0: none"
+    )
     mapping_parallax_widths: float = Field(
         30.0 / 512.0, gt=0, description="tau_mapframe over width; paper: 30 px at 512 px"
     )
@@ -219,7 +259,9 @@ class TrackingConfig(Stage):
     known_sigma: float = Field(
         0.15, gt=0, description="relative depth sigma of points that poses are solved from"
     )
-    sigma_px: float = Field(0.5, gt=0, description="noise of a checked DIS match")
+    sigma_px: float = Field(
+        0.2, gt=0, description="noise of a refined match; 0.15 px measured on synthetic dives"
+    )
     residual: PoseResidual = Field(
         "pixel",
         description="what poses are solved from; point is the paper's and needs the frame's own "

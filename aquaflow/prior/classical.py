@@ -23,8 +23,8 @@ from aquaflow.prior.contract import Encoding, Float, Keypoints, Mask
 GOOD_SHARE = 0.5
 """A candidate flow that matches this part of the picture needs no rival."""
 
-MATCH_SIGMA_PX = 0.5
-"""Noise of a checked DIS match (prior_notes.md section 2)."""
+MATCH_SIGMA_PX = 0.2
+"""Noise of a refined match: 0.15 px on synthetic dives (prior.refinement)."""
 
 POSE_SAMPLES = 2000
 """Matches that the two-view pose is estimated from."""
@@ -75,7 +75,7 @@ class ClassicalPair:
         back = self.flow.backward + dense.sample(self.flow.forward, self.matches_back)
         height, width = self._a.grey.shape
         inside = ((self.matches_back > 0.0) & (self.matches_back < (width, height))).all(-1)
-        close = np.linalg.norm(back, axis=-1) < dense.FORWARD_BACKWARD_PX
+        close = np.linalg.norm(back, axis=-1) < dense.OCCLUSION_PX
         return np.asarray(inside & close)
 
     @cached_property

@@ -23,6 +23,8 @@ GATE_SIGMAS = 3.0
 DISAGREEMENT_INFLATION = 1.3
 TRANSFER_INFLATION = 1.5
 """Variance growth when a pointmap moves to another keyframe through matches."""
+MIN_KNOWN_NEIGHBOURS = 0.25
+"""Bilinear weight of the known pixels from which a depth between pixels is known too."""
 FORGETTING_VARIANCE_SIGMAS = 0.5
 """A depth whose relative sigma grew past this by disagreement is replaced by the newcomer."""
 
@@ -75,26 +77,49 @@ def transfer(
     T_ba: Sim3,
     camera_b: CameraModel,
 ) -> Pointmap:
-    """The pointmap seen from b: every reliable pixel of b takes the depth of its match in a.
-
-    The nearest pixel's depth is taken, never a mean across a depth edge.
-    """
-    camera_a = pointmap.camera
-    column = np.clip(np.floor(source_pixels[..., 0]).astype(int), 0, camera_a.width - 1)
-    row = np.clip(np.floor(source_pixels[..., 1]).astype(int), 0, camera_a.height - 1)
-    rho_a, variance_a = pointmap.rho[row, column], pointmap.variance[row, column]
-    known = reliable & (rho_a > 1e-6) & (variance_a < UNKNOWN_VARIANCE)
-
-    moved = Pointmap.unknown(camera_b)
-    # The depth of the neighbouring pixel is taken along the ray of the exact source position.
-    rays = camera_a.unproject(source_pixels[known].astype(np.float64))
-    depth_a = 1.0 / rho_a[known]
-    depth_b = T_ba.apply(rays * depth_a[:, None])[:, 2]
-    in_front = depth_b > 1e-3
-    rho_b = np.where(in_front, 1.0 / np.maximum(depth_b, 1e-3), 0.0)
+    """The pointmap seen from b: every reliable pixel of b takes the depth of its match in a."""
+    source = source_pixels[reliable].astype(np.float64)
+    rho_a, variance_a = _interpolated(pointmap, source)
+    known = rho_a > 1e-6
+    rays = pointmap.camera.unproject(source)
+    depth_b = T_ba.apply(rays / np.where(known, rho_a, 1.0)[:, None])[:, 2]
+    seen = known & (depth_b > 1e-3)
+    rho_b = np.where(seen, 1.0 / np.maximum(depth_b, 1e-3), 0.0)
     # d rho_b / d rho_a = (rho_b / rho_a)^2 to first order, along rays that are nearly parallel.
-    gain = (rho_b / rho_a[known]) ** 4
-    spread = variance_a[known] * gain * TRANSFER_INFLATION
-    moved.rho[known] = rho_b
-    moved.variance[known] = np.where(in_front, spread, UNKNOWN_VARIANCE)
+    gain = (rho_b / np.where(known, rho_a, 1.0)) ** 4
+    moved = Pointmap.unknown(camera_b)
+    moved.rho[reliable] = rho_b
+    moved.variance[reliable] = np.where(seen, variance_a * gain, UNKNOWN_VARIANCE)
     return moved
+
+
+def _interpolated(
+    pointmap: Pointmap,
+    pixels: Array,  # [M, 2] px
+) -> tuple[Array, Array]:
+    """Inverse depth [M] between the four pixels around, and its variance; 0 where unknown.
+
+    On a plane the inverse depth is linear in the picture: the mean is exact there, where the
+    nearest pixel's depth is half a pixel's slope off. Across a depth edge neither is right, and
+    the spread of the four says by how much.
+    """
+    height, width = pointmap.rho.shape
+    at = np.clip(pixels - 0.5, 0.0, (width - 1.0, height - 1.0))
+    column = np.minimum(at[:, 0].astype(np.intp), max(width - 2, 0))
+    row = np.minimum(at[:, 1].astype(np.intp), max(height - 2, 0))
+    right, below = at[:, 0] - column, at[:, 1] - row
+    weights = np.stack(
+        [(1 - right) * (1 - below), right * (1 - below), (1 - right) * below, right * below]
+    )
+    rows, columns = np.stack([row, row, row + 1, row + 1]), np.stack([column, column + 1] * 2)
+    rho, variance = pointmap.rho[rows, columns], pointmap.variance[rows, columns]
+    weights = np.where((rho > 1e-6) & (variance < UNKNOWN_VARIANCE), weights, 0.0)
+    total = weights.sum(0)
+    known = total >= MIN_KNOWN_NEIGHBOURS
+    weights /= np.where(known, total, 1.0)
+    mean = (weights * rho).sum(0)
+    spread = (weights * (rho - mean) ** 2).sum(0)
+    return (
+        np.where(known, mean, 0.0),
+        TRANSFER_INFLATION * (weights * variance).sum(0) + spread,
+    )

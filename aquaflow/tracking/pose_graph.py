@@ -186,7 +186,10 @@ class PoseGraph:
         self._settled = len(result.edge_trust)
         self._version += 1
         self._joins, self._shifted = [], set()
-        return replace(result, poses={number: self.pose(number) for number in sorted(numbers)})
+        ordered = sorted(numbers)
+        poses = poses_of(self._nodes.rows[[self._row[number] for number in ordered]])
+        found = {number: poses.element(i) for i, number in enumerate(ordered)}
+        return replace(result, poses=found)
 
     def _carry(self, nodes: Rows, result: GraphResult) -> set[int]:
         """Move keyframes that are newer than a result with the one before them, in place."""

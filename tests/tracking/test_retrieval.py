@@ -9,8 +9,7 @@ import pytest
 
 from aquaflow.config import RetrievalConfig
 from aquaflow.prior.contract import Keypoints
-from aquaflow.tracking import retrieval as module
-from aquaflow.tracking.retrieval import Retrieval
+from aquaflow.tracking.retrieval import Retrieval, _similarity
 
 DIMENSION = 48
 SIZE = 400
@@ -104,19 +103,21 @@ def test_the_plausible_similarity_follows_the_neighbours_on_the_path() -> None:
     assert grown([place(descriptors(i)) for i in range(5)]).plausible == floor
 
 
-def test_sorted_blocks_say_what_comparing_one_by_one_says(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_inverted_file_says_what_comparing_one_by_one_says() -> None:
     places = path(23)
     query = revisit(places[9])
-    config = RetrievalConfig(min_similarity=0.0, neighbour_share=0.0)
-    one_by_one = grown(places, config).candidates(query, nothing, 23)
-    monkeypatch.setattr(module, "BLOCK_KEYFRAMES", 5)
-    in_blocks = grown(places, config).candidates(query, nothing, 23)
-    assert [c.number for c in in_blocks] == [c.number for c in one_by_one]
-    np.testing.assert_allclose(
-        [c.similarity for c in in_blocks], [c.similarity for c in one_by_one], rtol=1e-12
-    )
+    retrieval = grown(places, RetrievalConfig(min_similarity=0.0, neighbour_share=0.0))
+    wanted = retrieval._signature(query)
+    assert wanted is not None
+    one_by_one = {}
+    for number, there in enumerate(places):
+        signature = retrieval._signature(there)
+        assert signature is not None
+        one_by_one[number] = _similarity(signature, wanted)
+    found = retrieval.candidates(query, nothing, 23)
+    assert len(found) == 23
+    for candidate in found:
+        assert candidate.similarity == pytest.approx(one_by_one[candidate.number], rel=1e-12)
 
 
 def test_numbers_need_not_be_consecutive() -> None:

@@ -1,0 +1,46 @@
+"""When Slam takes over what was optimised beside tracking."""
+
+from __future__ import annotations
+
+import pytest
+from test_slam import OPEN_GATE, ToldTracker, config, frame_of
+
+from aquaflow.slam import Slam
+from aquaflow.tracking.frames import Link
+from aquaflow.tracking.keyframe_graph import Correction
+
+
+class ToldGraph:
+    """Says what it was asked; an optimisation is at work from the first keyframe to the end."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+        self.optimising = False
+
+    def add(self, number: int, link: Link | None) -> None:
+        self.asked.append(f"add {number}")
+        self.optimising = True
+
+    def correction(self, wait: bool) -> Correction:
+        self.asked.append("wait" if wait else "look")
+        self.optimising &= not wait
+        return Correction()
+
+
+@pytest.mark.parametrize(
+    ("live", "asked"),
+    [
+        (False, ["wait", "add 0", "wait", "add 1", "wait"]),
+        (True, ["look", "add 0", "look", "look", "add 1", "look", "wait"]),
+    ],
+)
+def test_only_a_replay_waits_for_the_graph_and_only_at_keyframes(
+    live: bool, asked: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slam, graph = Slam(config(OPEN_GATE, enabled=False), live=live), ToldGraph()
+    monkeypatch.setattr(slam, "tracker", ToldTracker(slam, "KCKC"))
+    monkeypatch.setattr(slam, "graph", graph)
+    for index in range(4):
+        slam.process(frame_of(index))
+    slam.finish()
+    assert graph.asked == asked

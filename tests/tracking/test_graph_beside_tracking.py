@@ -1,0 +1,212 @@
+"""The keyframe graph is optimised beside tracking: nothing waits for it that was not told to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent import futures
+from dataclasses import dataclass, field
+from threading import Event
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+from graph_scenes import LOOP_SIGMA, SIGMA, circle
+
+from aquaflow.config import TrackingConfig
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
+from aquaflow.prior.contract import Encoding
+from aquaflow.tracking import keyframe_graph
+from aquaflow.tracking.frames import Link
+from aquaflow.tracking.keyframe_graph import Correction, KeyframeGraph
+from aquaflow.tracking.places import Found, Places
+from aquaflow.tracking.pose_graph_table import GraphResult, Snapshot
+from aquaflow.tracking.solver import Degeneracy, PoseEstimate
+
+COUNT = 24
+TRUTH = circle(COUNT)
+CAMERA = CameraModel(4, 3, 4.0, 4.0, 2.0, 1.5)
+SOLVE = keyframe_graph.solve
+KNOWN = cast(Degeneracy, None)
+
+
+def between(a: int, b: int) -> Sim3:
+    return TRUTH.element(a).inverse() @ TRUTH.element(b)
+
+
+@dataclass
+class KnownPlaces:
+    """By keyframe: the earlier one whose place it is proven to show."""
+
+    store: KeyframeStore
+    again: dict[int, int]
+
+    def add(self, keyframe: Keyframe) -> None:
+        pass
+
+    def of_keyframe(self, keyframe: Keyframe, exclude: Callable[[int], bool]) -> list[Found]:
+        number = keyframe.number
+        if number not in self.again:
+            return []
+        past = self.again[number]
+        covariance = np.diag(LOOP_SIGMA**2)
+        estimate = PoseEstimate(between(number, past), covariance, 1.0, 0.0, 1.0, KNOWN)
+        return [Found(self.store[past], estimate)]
+
+
+@dataclass
+class Drifting:
+    """Keyframes on a circle whose links all err the same way, and the loops that close it."""
+
+    loops: dict[int, int]
+    store: KeyframeStore = field(default_factory=KeyframeStore)
+
+    def __post_init__(self) -> None:
+        places = cast(Places, KnownPlaces(self.store, self.loops))
+        self.graph = KeyframeGraph(self.store, places, TrackingConfig())
+        self.link_T = [
+            (between(i, i + 1) @ Sim3.exp(SIGMA * np.array([0, 0, 0, 0, 0, 1, 1]))).inverse()
+            for i in range(COUNT - 1)
+        ]
+
+    def add(self, number: int) -> None:
+        link, T_wc = None, Sim3.identity()
+        if number:
+            T_fk = self.link_T[number - 1]
+            T_wc = self.store[number - 1].T_wc @ T_fk.inverse()
+            link = Link(number - 1, T_fk, np.diag(SIGMA[:6] ** 2))
+        nothing = cast(Encoding, SimpleNamespace(camera=CAMERA))
+        self.store.add(number, number, nothing, T_wc, Pointmap.unknown(CAMERA), 0)
+        self.graph.add(number, link)
+
+    def seam_m(self, a: int, b: int) -> float:
+        found = self.store[a].T_wc.inverse() @ self.store[b].T_wc
+        return float(np.linalg.norm(found.t - between(a, b).t))
+
+
+@dataclass
+class Held:
+    """Lets every optimisation wait until it is told to go on."""
+
+    go_on: Event = field(default_factory=Event)
+    solved: list[int] = field(default_factory=list)
+    """Keyframes in each snapshot."""
+
+    def solve(self, snapshot: Snapshot) -> GraphResult:
+        assert self.go_on.wait(60.0)
+        self.solved.append(len(snapshot.nodes))
+        return SOLVE(snapshot)
+
+
+@pytest.fixture
+def held(monkeypatch: pytest.MonkeyPatch) -> Iterator[Held]:
+    held = Held()
+    monkeypatch.setattr(keyframe_graph, "solve", held.solve)
+    yield held
+    held.go_on.set()  # lets the thread end if the test has failed
+
+
+def test_tracking_goes_on_while_a_loop_is_optimised(held: Held) -> None:
+    dive = Drifting({20: 0})
+    for number in range(COUNT):
+        dive.add(number)
+        assert dive.graph.correction(wait=False) == Correction()
+    assert dive.graph.optimising
+    assert held.solved == []
+
+
+def test_keyframes_that_came_meanwhile_go_along_with_the_result(held: Held) -> None:
+    dive = Drifting({20: 0})
+    for number in range(COUNT):
+        dive.add(number)
+    before = {number: dive.store[number].T_wc for number in range(COUNT)}
+    drifted = dive.seam_m(0, 20)
+    held.go_on.set()
+    moves = dive.graph.correction(wait=True).moves
+    assert dive.seam_m(0, 20) < drifted / 3.0
+    assert set(range(20, COUNT)) <= set(moves)
+    for number, S in moves.items():
+        moved = S @ before[number]
+        np.testing.assert_allclose(moved.matrix, dive.store[number].T_wc.matrix, atol=1e-9)
+    for number in range(21, COUNT):  # still linked as they were
+        T = dive.store[number].T_wc.inverse() @ dive.store[number - 1].T_wc
+        np.testing.assert_allclose(T.matrix, dive.link_T[number - 1].matrix, atol=1e-9)
+
+
+def test_loops_that_came_meanwhile_start_the_next_optimisation(held: Held) -> None:
+    dive = Drifting({20: 0, 21: 1, 23: 2})
+    for number in range(COUNT):
+        dive.add(number)
+    held.go_on.set()
+    while dive.graph.optimising:
+        dive.graph.correction(wait=True)
+    assert held.solved == [21, COUNT]
+    assert dive.graph.loops == 3
+
+
+def test_a_correction_is_told_once() -> None:
+    dive = Drifting({20: 0})
+    for number in range(21):
+        dive.add(number)
+    assert dive.graph.correction(wait=True).moves
+    assert not dive.graph.optimising
+    assert dive.graph.correction(wait=True) == Correction()
+
+
+def test_without_a_loop_nothing_is_optimised() -> None:
+    dive = Drifting({})
+    for number in range(COUNT):
+        dive.add(number)
+    assert not dive.graph.optimising
+
+
+def test_waiting_at_the_next_keyframe_gives_the_same_poses_however_long_it_took(
+    held: Held,
+) -> None:
+    def swum(slow: bool) -> list[bytes]:
+        dive = Drifting({16: 0, 20: 1, 22: 2})
+        for number in range(COUNT):
+            if slow:
+                held.go_on.clear()
+            dive.add(number)
+            if not slow and dive.graph._optimisation is not None:
+                futures.wait([dive.graph._optimisation])
+            held.go_on.set()
+            dive.graph.correction(wait=True)
+        return [keyframe.T_wc.matrix.tobytes() for keyframe in dive.store.keyframes]
+
+    slowly = swum(slow=True)
+    assert swum(slow=False) == slowly
+    assert len(held.solved) == 6
+
+
+def test_what_is_raised_in_the_thread_is_raised_where_the_result_is_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def too_large(snapshot: Snapshot) -> GraphResult:
+        raise MemoryError("no room for the factor")
+
+    dive = Drifting({20: 0, 22: 1})
+    monkeypatch.setattr(keyframe_graph, "solve", too_large)
+    for number in range(21):
+        dive.add(number)
+    with pytest.raises(MemoryError, match="no room for the factor"):
+        dive.graph.correction(wait=True)
+    assert not dive.graph.optimising
+    monkeypatch.setattr(keyframe_graph, "solve", SOLVE)
+    for number in range(21, 23):
+        dive.add(number)
+    drifted = dive.seam_m(0, 20)
+    assert dive.graph.correction(wait=True).moves  # the next loop takes up what was left
+    assert dive.seam_m(0, 20) < drifted / 3.0
+
+
+def test_closing_ends_the_thread() -> None:
+    dive = Drifting({20: 0})
+    for number in range(21):
+        dive.add(number)
+    dive.graph.close()
+    with pytest.raises(RuntimeError, match="shutdown"):
+        dive.graph._beside.submit(print)
