@@ -23,6 +23,7 @@ from aquaflow.export.report import ReportData, write_report
 from aquaflow.export.tum import write_tum
 from aquaflow.geometry.camera import CameraModel, save_camera
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.mapping.gaussians import radiance
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.outcome import HeldOut, WaterSummary, water_of
 
@@ -167,20 +168,28 @@ class DiveFolder:
             save_camera(calibration, self.path / "calibration.yaml")
 
     def write_map(self, mapper: Mapper, water: WaterSummary | None, suffix: str = "") -> None:
-        """map.ply as seen through water at the median range, map_clear.ply without water."""
+        """map.ply as seen through water at the median range, map_clear.ply without water; where
+        there is a decoder, each Gaussian as the mapped view nearest to it sees it."""
         with torch.no_grad():
-            clear = mapper.gaussians.colours
+            plain = mapper.scene.baked(mapper.views)
+            clear = radiance(plain["raw_colours"])
             seen = clear
             if water is not None:
                 medium = water_of(water)
                 z = torch.full((len(clear),), water.range_median)
                 seen = clear * medium.transmission(z) + medium.backscatter(z)
             for name, colours in (("map", seen), ("map_clear", clear)):
-                write_ply(self.path / f"{name}{suffix}.ply", _splats(mapper, colours))
+                write_ply(self.path / f"{name}{suffix}.ply", _splats(plain, colours))
 
-    def write_medium(self, water: WaterSummary | None, scale_source: str) -> None:
-        """medium.json: parameters, their units, and the range at which map.ply is shown."""
+    def write_medium(
+        self, water: WaterSummary | None, scale_source: str, evidence: float | None = None
+    ) -> None:
+        """medium.json: parameters, their units, and the range at which map.ply is shown.
+
+        ``evidence``: for water against none, units of the log likelihood; below 0 it is off.
+        """
         data: dict[str, Any] = {"active": water is not None, "scale_source": scale_source}
+        data["evidence"] = evidence
         if water is not None:
             data |= {
                 "attenuation_per_unit": water.beta_a,
@@ -223,13 +232,15 @@ class DiveFolder:
         write_report(self.path / "report.html", data)
 
 
-def _splats(mapper: Mapper, colours: torch.Tensor) -> Splats:
-    gaussians = mapper.gaussians
+def _splats(
+    parameters: Mapping[str, torch.Tensor],  # of a GaussianMap
+    colours: torch.Tensor,  # [N, 3]
+) -> Splats:
     return Splats(
-        gaussians.means.numpy(),
-        torch.nn.functional.normalize(gaussians.parameters["quats"], dim=-1).numpy(),
-        gaussians.scales.numpy(),
-        gaussians.opacities.numpy(),
+        parameters["means"].numpy(),
+        torch.nn.functional.normalize(parameters["quats"], dim=-1).numpy(),
+        torch.exp(parameters["log_scales"]).numpy(),
+        torch.sigmoid(parameters["opacity_logits"][:, 0]).numpy(),
         colours.numpy(),
     )
 

@@ -244,7 +244,9 @@ class _Replay:
             self.folder.write_held_out(held_out)
         with self.profiler.stage("report"):
             numbers = self._numbers(held_out, started)
-            self.folder.write_medium(water, numbers["scale_source"])
+            mapper = self.slam.mappers.get(main)
+            evidence = None if mapper is None else mapper.scene.water_evidence
+            self.folder.write_medium(water, numbers["scale_source"], evidence)
             self.folder.write_report(
                 report_data(
                     self.name, self.slam, self.results, self.dropped, poses, held_out, water,

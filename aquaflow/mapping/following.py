@@ -13,14 +13,14 @@ from aquaflow.mapping.views import View
 
 
 @torch.no_grad()
-def move_gaussians(gaussians: GaussianMap, moves: Mapping[int, Sim3]) -> int:
+def move_gaussians(gaussians: GaussianMap, moves: Mapping[int, Sim3]) -> torch.Tensor:
     """Move what belongs to the keyframes in ``moves``, place, orientation and size, in place.
 
     ``moves`` holds for a keyframe's number the similarity that maps its old world to its new one.
-    Returns the number of Gaussians moved; the cost grows with it.
+    Returns the rows [M] that were moved; the cost grows with M.
     """
     if not moves or len(gaussians) == 0:
-        return 0
+        return torch.zeros(0, dtype=torch.int64)
     numbers = torch.tensor(sorted(moves), dtype=torch.int64)
     rows = torch.nonzero(torch.isin(gaussians.keyframes, numbers))[:, 0]
     which = torch.searchsorted(numbers, gaussians.keyframes[rows])
@@ -34,7 +34,7 @@ def move_gaussians(gaussians: GaussianMap, moves: Mapping[int, Sim3]) -> int:
     means[rows] = (scale * turned + t).float()
     quats[rows] = quaternion_product(turn, quats[rows].double()).float()
     gaussians.parameters["log_scales"][rows] += torch.log(scale).float()
-    return len(rows)
+    return rows
 
 
 def move_views(views: Iterable[View], moves: Mapping[int, Sim3]) -> None:

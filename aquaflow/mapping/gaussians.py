@@ -30,10 +30,12 @@ class GaussianMap:
         "raw_colours": 3,
     }
 
-    def __init__(self) -> None:
+    def __init__(self, local_width: int = 0) -> None:
         self.parameters = {name: torch.zeros(0, self.WIDTHS[name]) for name in self.NAMES}
         self.keyframes = torch.zeros(0, dtype=torch.int64)
         """[N] number of the keyframe each Gaussian belongs to."""
+        self.local_features = torch.zeros(0, local_width)
+        """[N, F] what a decoder knows of each Gaussian, zero to begin with; F = 0 without one."""
 
     def __len__(self) -> int:
         return len(self.keyframes)
@@ -64,13 +66,15 @@ class GaussianMap:
             self.parameters[name] = torch.cat([self.parameters[name], new[name]]).contiguous()
         owner = torch.full((count,), keyframe, dtype=torch.int64)
         self.keyframes = torch.cat([self.keyframes, owner])
+        self._extend_features(count)
 
     def append(self, other: GaussianMap) -> None:
-        """Append all Gaussians of ``other``, which keep their keyframes."""
+        """Append all Gaussians of ``other``, which keep their keyframes but not their features."""
         for name in self.NAMES:
             both = [self.parameters[name], other.parameters[name]]
             self.parameters[name] = torch.cat(both).contiguous()
         self.keyframes = torch.cat([self.keyframes, other.keyframes])
+        self._extend_features(len(other))
 
     def keep(
         self,
@@ -80,6 +84,11 @@ class GaussianMap:
         for name in self.NAMES:
             self.parameters[name] = self.parameters[name][mask].contiguous()
         self.keyframes = self.keyframes[mask]
+        self.local_features = self.local_features[mask].contiguous()
+
+    def _extend_features(self, count: int) -> None:
+        new = self.local_features.new_zeros(count, self.local_features.shape[1])
+        self.local_features = torch.cat([self.local_features, new]).contiguous()
 
 
 def radiance(

@@ -13,6 +13,9 @@ from torch import Tensor
 from aquaflow.config import MappingConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
+from aquaflow.mapping.attention import look, tiles_to_draw
+from aquaflow.mapping.decoding import DECODED
+from aquaflow.mapping.exposure import log_gain_at
 from aquaflow.mapping.following import move_gaussians, move_views
 from aquaflow.mapping.gaussians import GaussianMap
 from aquaflow.mapping.insertion import (
@@ -24,9 +27,11 @@ from aquaflow.mapping.insertion import (
     thin,
 )
 from aquaflow.mapping.medium import Medium
+from aquaflow.mapping.neural import NeuralGaussians
 from aquaflow.mapping.objective import Objective
 from aquaflow.mapping.rendering import Shown
 from aquaflow.mapping.scene import Scene
+from aquaflow.mapping.schedule import sampled_views, shuffled_views
 from aquaflow.mapping.views import View, refine_pose
 from aquaflow.render.adam import SelectiveAdam
 from aquaflow.render.contract import Renderer
@@ -56,6 +61,11 @@ class Mapper:
             rates.betas,
             threads=renderer.threads,
         )
+        if config.decoder.enabled:
+            drawn = torch.Generator().manual_seed(seed)  # its own: insertion is as without it
+            self.scene.neural = NeuralGaussians(
+                config.decoder, self.gaussians, rates.betas, drawn, renderer.threads
+            )
         self._medium_optimiser = torch.optim.Adam(self.medium.parameters(), lr=config.medium.rate)
         self._next_water_fit = config.medium.first_fit_views
         self._objective = Objective(config.loss, renderer.threads)
@@ -64,6 +74,8 @@ class Mapper:
 
     def add_view(self, view: View) -> None:
         """Let later optimisation steps use ``view``."""
+        if self.views:
+            view.log_gain = self.views[-1].log_gain
         self.views.append(view)
         if len(self.views) >= self._next_water_fit:
             self.fit_water()
@@ -74,7 +86,7 @@ class Mapper:
         """Medium-guided insertion (paper, Sec. 3.3.3); returns the number of new Gaussians."""
         own_range, known = range_of(pointmap, self.config.insertion.known_sigma)
         prior_range = own_range * view.T_wc.scale
-        shown = self.scene.show(view)
+        shown = self.scene.show(view, learn=True)
         covered = shown.alpha > self.config.insertion.covered_alpha
         z = torch.where(known, prior_range, torch.where(covered, shown.z, 0.0))
         restored, recoverable = self.scene.restore(view, z)
@@ -99,6 +111,8 @@ class Mapper:
         new = new_gaussians(view, rows, columns, z, restored, confidence, P, self.config.insertion)
         self.gaussians.extend(new, view.keyframe)
         self._optimiser.extend(len(rows))
+        if self.neural is not None:
+            self.neural.insert(torch.from_numpy(view.T_wc.t).to(torch.float32), len(rows))
         self._optimiser.bind(self._parameters)
         return len(rows)
 
@@ -106,28 +120,35 @@ class Mapper:
         """Estimate the water from views spread over the dive so far."""
         count = self.config.medium.fit_views
         chosen = np.linspace(0, len(self.views) - 1, min(count, len(self.views))).astype(int)
-        estimate = self.scene.fit_water([self.views[i] for i in chosen], self._random)
+        estimate = self.scene.fit_water([self.views[i] for i in chosen], self._random, self.views)
         if estimate is not None:
             log.info(
-                "water fitted: beta_a %s per map unit (relative sigma %s)",
+                "water fitted: %s, beta_a %s per map unit (relative sigma %s)",
+                estimate.model,
                 estimate.beta_a.round(3).tolist(),
-                estimate.beta_a_sigma.round(2).tolist(),
+                estimate.beta_a_sigma,
             )
 
     # --- following the keyframes --------------------------------------------------------------
 
     def move(self, moves: Mapping[int, Sim3]) -> None:
         """Let Gaussians and views follow keyframes that were moved (see following.py)."""
-        move_gaussians(self.gaussians, moves)
+        moved = move_gaussians(self.gaussians, moves)
+        if self.neural is not None:
+            self.neural.move(moved)
         move_views(self.views, moves)
 
     def absorb(self, other: Mapper) -> None:
         """Take over another sub-map's Gaussians and views, already moved into this one's world.
 
-        The water stays this map's own: it is the same water, and is fitted again to all views.
+        The water stays this map's own: it is the same water, and is fitted again to all views. So
+        does the decoder: what the other's says of its Gaussians, seen from its own views, is kept.
         """
+        count, centres = len(other.gaussians), other.scene.bake(other.views)
         self.gaussians.append(other.gaussians)
-        self._optimiser.extend(len(other.gaussians))
+        self._optimiser.extend(count)
+        if self.neural is not None:
+            self.neural.insert(centres, count)
         self._optimiser.bind(self._parameters)
         self.views = sorted([*self.views, *other.views], key=lambda view: view.frame_index)
         self.steps, self.undone = self.steps + other.steps, self.undone + other.undone
@@ -136,40 +157,50 @@ class Mapper:
 
     def optimise(self, steps: int) -> None:
         """Steps on the newest view now and then, else on any (paper, Sec. 3.4)."""
-        for _ in range(steps if self.views and len(self.gaussians) else 0):
-            newest = torch.rand((), generator=self._random) < self.config.optimiser.newest_share
-            index = int(torch.randint(len(self.views), (), generator=self._random))
-            self._step(self.views[-1 if newest else index], refine_poses=False)
+        if len(self.gaussians) == 0:
+            return
+        share = self.config.optimiser.newest_share
+        chosen = sampled_views(self.views, steps, share, self._random)
+        with self.scene.learning_from(chosen):
+            for view in chosen:
+                self._step(view, refine_poses=False)
 
     def refine(self, progress: Callable[[int, int], None] | None = None) -> None:
         """The final refinement: all views in random order, rates falling, poses included."""
         steps, limit = self.config.optimiser.refine_steps, self.config.optimiser.refine_seconds
         started = time.monotonic()
-        order: list[int] = []
         self.fit_water()
-        for step in range(steps if self.views and len(self.gaussians) else 0):
-            if limit is not None and time.monotonic() - started > limit:
-                break
-            if not order:
-                order = torch.randperm(len(self.views), generator=self._random).tolist()
-            factor = self.config.optimiser.means_final ** (step / max(steps - 1, 1))
-            self._optimiser.learning_rates["means"] = self.config.optimiser.means * factor
-            self._step(self.views[order.pop()], refine_poses=self.config.optimiser.poses > 0.0)
-            if progress is not None:
-                progress(step + 1, steps)
+        order = shuffled_views(self.views, steps, self._random) if len(self.gaussians) else []
+        with self.scene.learning_from(order):
+            for step, view in enumerate(order):
+                if limit is not None and time.monotonic() - started > limit:
+                    break
+                factor = self.config.optimiser.means_final ** (step / max(steps - 1, 1))
+                self._optimiser.learning_rates["means"] = self.config.optimiser.means * factor
+                if self.neural is not None:
+                    self.neural.slow_down(factor)
+                self._step(view, refine_poses=self.config.optimiser.poses > 0.0)
+                if progress is not None:
+                    progress(step + 1, steps)
 
     def _step(self, view: View, refine_poses: bool) -> None:
         """Render, compare, differentiate, move; undone when anything is not finite."""
         if len(self.gaussians) == 0:  # all pruned since the steps began
             return
         leaves = {
-            name: tensor.detach().requires_grad_()
+            name: tensor.detach().requires_grad_(self._is_optimised(name))
             for name, tensor in self.gaussians.parameters.items()
         }
         viewmat = view.viewmat().requires_grad_(refine_poses)
         self._medium_optimiser.zero_grad(set_to_none=True)
-        shown = self.scene.draw(view, leaves, viewmat)
-        loss = self._objective.total(view, shown, leaves)
+        active = tiles_to_draw(view, self.config.optimiser)
+        if self.config.optimiser.skip_explained and active is not None and not active.any():
+            view.looks += 1
+            return
+        seen = leaves if self.neural is None else self.neural.decode(view, leaves, viewmat)
+        shown = self.scene.draw(view, seen, viewmat, learn=True, active=active)
+        look(view, shown.image, self.config.optimiser)
+        loss = self._objective.total(view, shown, seen)
         if not is_number(loss):
             self._undo("loss", view)
             self._drop_unsound()
@@ -183,6 +214,11 @@ class Mapper:
         self.steps += 1
         if self.steps % self.config.optimiser.prune_every == 0:
             self._prune(shown, view)
+
+    def _is_optimised(self, name: str) -> bool:
+        """Places and opacities always are; beside residuals, the rest only if so configured."""
+        frozen = self.neural is not None and not self.config.decoder.optimise_initial
+        return not (frozen and name in DECODED)
 
     def _step_medium(self, view: View) -> None:
         if not self.medium.active:
@@ -216,7 +252,7 @@ class Mapper:
     def _keep(self, keep: Tensor) -> None:
         """Drop the Gaussians where ``keep`` [N] is False, their optimiser state with them."""
         if not bool(keep.all()):
-            self.gaussians.keep(keep)
+            (self.neural or self.gaussians).keep(keep)
             self._optimiser.keep(keep)
             self._optimiser.bind(self._parameters)
 
@@ -227,13 +263,22 @@ class Mapper:
         return self.scene.show(view)
 
     def register(self, view: View) -> None:
-        """Refine the pose of a held-out view photometrically against the frozen map."""
+        """Refine the pose of a held-out view photometrically against the frozen map.
+
+        Its exposure is that of its neighbours in time, as the peers do it (field_notes.md 2.7).
+        """
         config = self.config.optimiser
+        if self.views:
+            view.log_gain = log_gain_at(view.frame_index, self.views)
         for _ in range(config.heldout_steps if len(self.gaussians) else 0):
             viewmat = view.viewmat().requires_grad_()
             loss = self._objective.photometric(view, self.scene.draw(view, viewmat=viewmat))
             (gradient,) = torch.autograd.grad(loss, viewmat)
             refine_pose(view, gradient, config.heldout_rate)
+
+    @property
+    def neural(self) -> NeuralGaussians | None:
+        return self.scene.neural
 
     @property
     def gaussians(self) -> GaussianMap:

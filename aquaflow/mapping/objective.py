@@ -11,6 +11,7 @@ from aquaflow.config import LossConfig
 from aquaflow.mapping.losses import depth_loss, outlier_mask, radial_weight, scale_loss
 from aquaflow.mapping.rendering import Shown
 from aquaflow.mapping.views import View
+from aquaflow.render.activity import active_pixels
 from aquaflow.render.photometric import photometric_loss
 
 
@@ -24,7 +25,9 @@ class Objective:
     def total(self, view: View, shown: Shown, parameters: Mapping[str, Tensor]) -> Tensor:
         """L1, SSIM, depth and scale terms of ``shown``, the map drawn from ``view``."""
         config, target = self.config, view.target()
-        mask = self.scene_mask(view)
+        mask = view.scene_mask()
+        if shown.active is not None:
+            mask &= active_pixels(shown.active, view.camera.width, view.camera.height)
         if view.robust:
             mask &= outlier_mask(shown.image, target, self.radial(view), config.tau_e)
         loss = self._pictures(view, shown, target, mask)
@@ -41,7 +44,7 @@ class Objective:
 
     def photometric(self, view: View, shown: Shown) -> Tensor:
         """L1 and SSIM alone, nothing masked but the vehicle."""
-        return self._pictures(view, shown, view.target(), self.scene_mask(view))
+        return self._pictures(view, shown, view.target(), view.scene_mask())
 
     def _pictures(self, view: View, shown: Shown, target: Tensor, mask: Tensor) -> Tensor:
         return photometric_loss(
@@ -54,10 +57,3 @@ class Objective:
         if size not in self._K_rad:
             self._K_rad[size] = radial_weight(*size)
         return self._K_rad[size]
-
-    @staticmethod
-    def scene_mask(view: View) -> Tensor:
-        """[H, W] bool, a fresh one: True where the view shows the scene and not the vehicle."""
-        if view.mask is None:
-            return torch.ones(view.camera.height, view.camera.width, dtype=torch.bool)
-        return torch.from_numpy(view.mask.copy())

@@ -31,6 +31,8 @@ class Shown:
     """[N] bool"""
     radius_px: Tensor
     """[N]"""
+    active: Tensor | None = None
+    """[rows, columns] bool, the tiles that were drawn; None: all."""
 
 
 def show(
@@ -40,6 +42,7 @@ def show(
     renderer: Renderer,
     view: View,
     viewmat: Tensor,  # [4, 4] world to camera
+    active: Tensor | None = None,  # [rows, columns] bool, the tiles to draw
 ) -> Shown:
     """Draw the map; differentiable in the parameters, the water and the view matrix.
 
@@ -59,6 +62,7 @@ def show(
         view.K(),
         view.camera.width,
         view.camera.height,
+        active,
     )
     clean = drawn.image[..., :3]
     if water is None:
@@ -67,4 +71,4 @@ def show(
         image, z = compose_water(drawn.image, drawn.alpha, water.stacked(), renderer.threads)
     if gain is not None:
         image = image * gain[..., None]
-    return Shown(image, clean, drawn.alpha, z, drawn.visible, drawn.radius_px)
+    return Shown(image, clean, drawn.alpha, z, drawn.visible, drawn.radius_px, active)

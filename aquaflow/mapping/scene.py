@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from aquaflow.config import MediumConfig
-from aquaflow.mapping.gaussians import GaussianMap, raw_colour
+from aquaflow.mapping.exposure import gain_of, learn_gain, set_log_gains
+from aquaflow.mapping.gaussians import GaussianMap, radiance, raw_colour
 from aquaflow.mapping.image_formation import Water
 from aquaflow.mapping.medium import Medium
+from aquaflow.mapping.neural import NeuralGaussians
 from aquaflow.mapping.rendering import Shown, show
 from aquaflow.mapping.shading import TERMS, gain_map
 from aquaflow.mapping.sightings import sight
 from aquaflow.mapping.views import View
-from aquaflow.mapping.water_estimation import WaterEstimate, estimate_water
+from aquaflow.mapping.water_estimation import WaterEstimate, estimate_water, models_for
 from aquaflow.render.contract import Renderer
 
 
@@ -28,9 +32,15 @@ class Scene:
     ) -> None:
         self.config, self.renderer = config, renderer
         self.gaussians = GaussianMap()
+        self.neural: NeuralGaussians | None = None
+        """What is added to the Gaussians by where they are seen from; None: nothing is."""
         self.medium = Medium(config, generator)
         self.shading = np.zeros(TERMS)
         """Coefficients of the log-gain over the picture."""
+        self.exposes = False
+        """True once the sightings told of views that are brighter than others."""
+        self.water_evidence: float | None = None
+        """For water against none, in units of the log likelihood; None before the first fit."""
         self.beta_a_sigma: list[float] | None = None
         """Relative standard deviation of beta_a in the last fit; None before it."""
         self._gains: dict[tuple[int, int], Tensor] = {}
@@ -56,21 +66,78 @@ class Scene:
         view: View,
         parameters: Mapping[str, Tensor] | None = None,
         viewmat: Tensor | None = None,  # [4, 4]
+        learn: bool = False,
+        active: Tensor | None = None,  # [rows, columns] bool, the tiles to draw
     ) -> Shown:
-        """The scene from ``view``; differentiable in what is given, and in the medium."""
-        return show(
-            parameters if parameters is not None else self.gaussians.parameters,
-            self.water(view),
-            self.gain(view),
-            self.renderer,
-            view,
-            view.viewmat() if viewmat is None else viewmat,
+        """The scene from ``view``; differentiable in what is given, and in the medium.
+
+        ``parameters`` are decoded ones, where there is a decoder. With ``learn``, the view's
+        exposure is set from its picture in passing.
+        """
+        viewmat = view.viewmat() if viewmat is None else viewmat
+        if parameters is None:
+            parameters = self.seen_from(view, viewmat)
+        shown = show(
+            parameters, self.water(view), self.gain(view), self.renderer, view, viewmat, active
         )
+        if not self.exposes:
+            return shown
+        if learn:
+            learn_gain(view, shown.image, shown.alpha)
+        return replace(shown, image=shown.image * gain_of(view))
+
+    def seen_from(
+        self,
+        view: View,
+        viewmat: Tensor,  # [4, 4]
+    ) -> Mapping[str, Tensor]:
+        """The Gaussians' parameters as ``view`` sees them; no gradient."""
+        if self.neural is None:
+            return self.gaussians.parameters
+        return self.neural.seen_from(view, viewmat)
+
+    def _attributes(self, view: View) -> Mapping[str, Tensor]:
+        return self.seen_from(view, view.viewmat())
+
+    def baked(self, views: list[View]) -> Mapping[str, Tensor]:
+        """The parameters as plain Gaussians, each as seen from the nearest of ``views``."""
+        if self.neural is None or not views:
+            return self.gaussians.parameters
+        return self.neural.baked(self._nearest(views)[0])
 
     @torch.no_grad()
-    def show(self, view: View) -> Shown:
+    def bake(self, views: list[View]) -> Tensor:
+        """Let the Gaussians themselves be as :meth:`baked`; the decoder no longer fits them.
+
+        Returns the centres [N, 3] that they were seen from.
+        """
+        baked = self.baked(views)
+        for name, tensor in self.gaussians.parameters.items():
+            tensor.copy_(baked[name])
+        self.neural = None
+        return self._nearest(views)[0] if views else torch.zeros_like(self.gaussians.means)
+
+    def _nearest(self, views: Sequence[View]) -> tuple[Tensor, Tensor, Tensor]:
+        """Of the camera nearest to each Gaussian: centre [N, 3], distance [N], number [N]."""
+        centres = torch.from_numpy(np.stack([view.T_wc.t for view in views])).to(torch.float32)
+        z, which = torch.cdist(self.gaussians.means, centres).min(dim=1)
+        return centres[which], z, which
+
+    @contextmanager
+    def learning_from(self, views: Sequence[View]) -> Iterator[None]:
+        """Steps on ``views`` in their order; what they say of features is applied by the end."""
+        if self.neural is not None:
+            self.neural.expect(views)
+        try:
+            yield
+        finally:
+            if self.neural is not None:
+                self.neural.settle()
+
+    @torch.no_grad()
+    def show(self, view: View, learn: bool = False) -> Shown:
         """The scene from ``view``, for looking."""
-        return self.draw(view)
+        return self.draw(view, learn=learn)
 
     @torch.no_grad()
     def restore(
@@ -82,51 +149,61 @@ class Scene:
         image, gain, water = view.target(), self.gain(view), self.water(view)
         if gain is not None:
             image = image / gain[..., None]
+        if self.exposes:
+            image = image / gain_of(view)
         if water is None:
             return image, torch.ones(image.shape[:2], dtype=torch.bool)
         return water.restore(image, z)
 
-    def fit_water(self, views: list[View], generator: torch.Generator) -> WaterEstimate | None:
-        """Estimate water and shading from what the views saw; the pictures stay as they are.
+    def fit_water(
+        self,
+        views: list[View],
+        generator: torch.Generator,
+        dive: Sequence[View] | None = None,
+    ) -> WaterEstimate | None:
+        """Estimate water, shading and exposure from what ``views`` saw; pictures stay as they are.
 
-        None, and nothing changes, while too few Gaussians are seen over a span of ranges.
+        All views of the ``dive`` get an exposure. None, and nothing changes, while too few
+        Gaussians are seen over a span of ranges.
         """
-        wanted = self.config.fit and self.medium.active
-        if not wanted or not views or len(self.gaussians) == 0:
+        if not self.config.fit or not views or len(self.gaussians) == 0:
             return None
-        seen = sight(self.gaussians, views, self.renderer, generator)
-        old = self.water(views[0])
-        assert old is not None
+        with torch.no_grad():
+            sea = self.medium(torch.from_numpy(views[0].T_wc.R).to(torch.float32))
         estimate = estimate_water(
-            seen,
-            old.B_res.detach().double().numpy(),
-            old.d.detach().double().numpy(),
-            float(old.beta_a.detach().mean()),
-            self.config.shading,
+            sight(self._attributes, views, self.renderer, generator),
+            sea.B_res.double().numpy(),
+            sea.d.double().numpy(),
+            float(sea.beta_a.mean()),
+            models_for(self.config),
         )
-        if estimate is None:
-            return None
-        beta_a, B_inf, b = (
-            torch.from_numpy(values).to(torch.float32)
-            for values in (estimate.beta_a, estimate.B_inf, estimate.b)
-        )
-        self.medium.set_water(beta_a, B_inf, b)
-        self.shading = estimate.shading
-        self.beta_a_sigma = estimate.beta_a_sigma.tolist()
-        self._gains.clear()
-        self._recolour(views, old)
+        if estimate is not None:
+            self._adopt(estimate, views, views if dive is None else dive)
         return estimate
 
     @torch.no_grad()
-    def _recolour(self, views: list[View], old: Water) -> None:
-        """Give every Gaussian the radiance that looks the same through the new water.
+    def _adopt(self, estimate: WaterEstimate, fitted: Sequence[View], dive: Sequence[View]) -> None:
+        """Let the estimate hold, and give every Gaussian the radiance that looks the same in it.
 
-        The range is that from the camera nearest to it: where it is seen best.
+        The same from the camera nearest to it: where it is seen best.
         """
-        new = self.water(views[0])
-        assert new is not None
-        centres = torch.from_numpy(np.stack([view.T_wc.t for view in views])).to(torch.float32)
-        z = torch.cdist(self.gaussians.means, centres).amin(dim=1)
-        seen = self.gaussians.colours * old.transmission(z) + old.backscatter(z)
-        clear, _ = new.restore(seen, z)
-        self.gaussians.parameters["raw_colours"].copy_(raw_colour(clear))
+        shown, (_, z, nearest) = self.baked(list(fitted))["raw_colours"], self._nearest(fitted)
+        old, old_gains = self.water(fitted[0]), torch.stack([gain_of(view) for view in fitted])
+        self.medium.active = estimate.model.water
+        if estimate.model.water:
+            found = (estimate.beta_a, estimate.B_inf, estimate.b)
+            self.medium.set_water(*(torch.from_numpy(v).to(torch.float32) for v in found))
+        self.shading, self.exposes = estimate.shading, estimate.model.exposure
+        self.beta_a_sigma, self.water_evidence = estimate.beta_a_sigma, estimate.evidence
+        self._gains.clear()
+        set_log_gains(dive, fitted, estimate.exposure)
+
+        seen, new = radiance(shown), self.water(fitted[0])
+        if old is not None:
+            seen = seen * old.transmission(z) + old.backscatter(z)
+        new_gains = torch.stack([gain_of(view) for view in fitted])
+        seen = seen * (old_gains / new_gains)[nearest]
+        wanted = raw_colour(seen if new is None else new.restore(seen, z)[0])
+        raw = self.gaussians.parameters["raw_colours"]
+        # A decoder's residuals come on top again.
+        raw.copy_(wanted if self.neural is None else wanted + (raw - shown))

@@ -3,18 +3,27 @@
 The derivative of a rendered picture with respect to a Gaussian's colour is its blending weight at
 every pixel. Weighing the real picture with it gives the colour seen over the Gaussian's own
 footprint, occlusion included, in far views and near ones over the same piece of sea floor.
+
+A footprint takes in some of the neighbours, more of them from afar, and contrast that is lost to
+them looks like water. How the neighbours change the colour is known from the map itself.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from aquaflow.mapping.gaussians import GaussianMap
+from aquaflow.mapping.gaussians import radiance
+from aquaflow.mapping.sighted_points import Observations
 from aquaflow.mapping.views import View
-from aquaflow.mapping.water_estimation import Observations
 from aquaflow.render.contract import Renderer
+
+SeenFrom = Callable[[View], Mapping[str, Tensor]]
+"""The parameters of a GaussianMap as a view sees them."""
 
 POINTS = 2500
 """Gaussians looked at; more change nothing and cost time."""
@@ -24,15 +33,18 @@ MIN_VIEWS = 4
 BORDER = 0.97
 """Gaussians whose centre is further out than this share of the picture are cut by its edge."""
 
+HALF_SOLID = 0.5
+"""Alpha below which the map says little of what is there."""
+
 
 def sight(
-    gaussians: GaussianMap,
+    seen_from: SeenFrom,
     views: list[View],
     renderer: Renderer,
     generator: torch.Generator,
 ) -> Observations:
     """Sightings of a random choice of the Gaussians that several of ``views`` see well."""
-    seen = [_sighting(gaussians, view, renderer) for view in views]
+    seen = [_sighting(seen_from(view), view, renderer) for view in views]
     weight = torch.stack([sighting[0] for sighting in seen])
     good = weight > MIN_WEIGHT_PX
     candidates = torch.nonzero(good.sum(0) >= MIN_VIEWS)[:, 0]
@@ -40,37 +52,59 @@ def sight(
     chosen = candidates[order.sort().values]
     view_of, number = torch.nonzero(good[:, chosen], as_tuple=True)
     row = chosen[number]
+    colour, z, xy, blend = (
+        torch.stack([sighting[k] for sighting in seen])[view_of, row].double().numpy()
+        for k in range(1, 5)
+    )
     return Observations(
-        number.numpy(),
-        torch.stack([sighting[1] for sighting in seen])[view_of, row].double().numpy(),
-        torch.stack([sighting[2] for sighting in seen])[view_of, row].double().numpy(),
-        torch.stack([sighting[3] for sighting in seen])[view_of, row].double().numpy(),
+        number.numpy(), view_of.numpy(), colour, z, xy, _less_mean(blend, number.numpy())
     )
 
 
+def _less_mean(
+    values: npt.NDArray[np.float64],  # [M, 3]
+    point: npt.NDArray[np.int64],  # [M]
+) -> npt.NDArray[np.float64]:
+    """Every value less the mean of its point's [M, 3]."""
+    count = np.bincount(point)
+    sums = np.stack([np.bincount(point, values[:, c]) for c in range(3)], axis=-1)
+    return np.asarray(values - (sums / np.maximum(count, 1)[:, None])[point])
+
+
 def _sighting(
-    gaussians: GaussianMap, view: View, renderer: Renderer
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Weight [N] px, colour [N, 3], range [N] and picture position [N, 2] in one view."""
-    colours = torch.zeros(len(gaussians), 4, requires_grad=True)
+    parameters: Mapping[str, Tensor],  # of a GaussianMap
+    view: View,
+    renderer: Renderer,
+) -> tuple[Tensor, ...]:
+    """Of every Gaussian in one view: weight [N] px, colour [N, 3], range [N], picture position
+    [N, 2], and the map's clean colour over the same footprint [N, 3]."""
+    means = parameters["means"]
+    clean = radiance(parameters["raw_colours"])
+    colours = torch.cat([clean, torch.ones_like(clean[:, :1])], dim=-1).requires_grad_()
     drawn = renderer(
-        gaussians.means,
-        gaussians.parameters["quats"],
-        gaussians.scales,
-        gaussians.opacities,
+        means,
+        parameters["quats"],
+        torch.exp(parameters["log_scales"]),
+        torch.sigmoid(parameters["opacity_logits"][:, 0]),
         colours,
         view.viewmat(),
         view.K(),
         view.camera.width,
         view.camera.height,
     )
-    target = view.target()
-    picture = torch.cat([target, torch.ones_like(target[..., :1])], dim=-1)
-    (sums,) = torch.autograd.grad((drawn.image * picture).sum(), colours)
-    local = (gaussians.means.double().numpy() - view.T_wc.t) @ view.T_wc.R
+    one = torch.ones_like(drawn.alpha[..., None])
+    weighed = [
+        torch.autograd.grad((drawn.image * picture).sum(), colours, retain_graph=True)[0]
+        for picture in (
+            torch.cat([view.target(), one], dim=-1),
+            drawn.image.detach() / drawn.alpha.detach().clamp_min(HALF_SOLID)[..., None],
+        )
+    ]
+    local = (means.double().numpy() - view.T_wc.t) @ view.T_wc.R
     half = np.array([view.camera.width, view.camera.height]) / 2.0
     xy = torch.from_numpy(view.camera.project(local) / half - 1.0)
     inside = (xy.abs() < BORDER).all(dim=-1)
-    weight = torch.where(inside, sums[:, 3], 0.0)
+    sums = weighed[0][:, 3]
+    seen, blend = (part[:, :3] / sums[:, None].clamp_min(1e-6) for part in weighed)
     z = torch.from_numpy(np.linalg.norm(local, axis=1))
-    return weight, sums[:, :3] / sums[:, 3:].clamp_min(1e-6), z, xy
+    return torch.where(inside, sums, 0.0), seen, z, xy, blend

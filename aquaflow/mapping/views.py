@@ -52,6 +52,12 @@ class View:
         """Number of the keyframe that the pose hangs on."""
         self.robust = robust
         """True for common frames, whose outliers are masked (paper, M)."""
+        self.log_gain = np.zeros(3)
+        """How much brighter than the mean of the views, RGB (see exposure.py)."""
+        self.looks = 0
+        """Steps of the optimiser that looked at this view."""
+        self.explained: Tensor | None = None
+        """[rows, columns] bool, the tiles in which the last full look found nothing but noise."""
         self.moments = (np.zeros(6), np.zeros(6), 0)
         """Adam's first and second moments of the pose, and its step count."""
         self._lies_in: dict[int, Pixels] | Spill[Pixels] = {frame_index: Pixels(image, mask)}
@@ -104,6 +110,12 @@ class View:
     def target(self) -> Tensor:
         """[H, W, 3] float32 in [0, 1]."""
         return torch.from_numpy(self.image).to(torch.float32).div_(255.0)
+
+    def scene_mask(self) -> Tensor:
+        """[H, W] bool, a fresh one: True where the view shows the scene and not the vehicle."""
+        if self.mask is None:
+            return torch.ones(self.camera.height, self.camera.width, dtype=torch.bool)
+        return torch.from_numpy(self.mask.copy())
 
     def viewmat(self) -> Tensor:
         """[4, 4] world to camera, rigid: the scale of a pose is the scale of its map."""

@@ -27,6 +27,8 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "aq_photometric": (_INT, [_POINTER] * 4 + [_INT] * 2 + [_FLOAT, _INT] + [_POINTER] * 2),
     "aq_compose_water": (_INT, [_POINTER] * 3 + [_INT] * 2 + [_POINTER] * 2),
     "aq_compose_water_backward": (_INT, [_POINTER] * 3 + [_INT] * 2 + [_POINTER] * 5),
+    "aq_decode_view": (_INT, [_POINTER, _INT] + [_POINTER] * 3),
+    "aq_decode_view_backward": (_INT, [_POINTER, _INT, _POINTER]),
     "aq_adam_step": (
         _INT,
         [_INT, _POINTER, _INT] + [_POINTER] * 2 + [_DOUBLE] * 2 + [_FLOAT, _POINTER] + [_INT] * 2,

@@ -81,7 +81,7 @@ def test_outliers_on_common_frames_count_as_masked_and_on_other_frames_they_teac
     maps = []
     wrong = np.where(picture(floor(), path(1)[0]) < 128, 255, 0).astype(np.uint8)
     for robust, mask in ((True, None), (False, np.zeros((48, 64), bool)), (False, None)):
-        mapper = grown(settings(), count=1)
+        mapper = grown(settings(optimiser={"noise_floor": 0.0}), count=1)
         mapper.optimise(60)
         mapper.views = [view_of(wrong, robust=robust)]
         mapper.views[0].mask = mask
@@ -92,7 +92,7 @@ def test_outliers_on_common_frames_count_as_masked_and_on_other_frames_they_teac
 
 
 def test_masked_pixels_teach_nothing() -> None:
-    mapper = grown(settings(loss={"scale": 0.0}), count=1)
+    mapper = grown(settings(loss={"scale": 0.0}, optimiser={"noise_floor": 0.0}), count=1)
     before = copied(mapper)
     mapper.views[0].mask = np.zeros((48, 64), bool)
     mapper.optimise(3)

@@ -114,7 +114,7 @@ def test_a_fit_looks_at_views_spread_over_the_whole_dive(monkeypatch: pytest.Mon
     mapper.views = [view_of(np.zeros((2, 2, 3), np.uint8), index=i) for i in range(31)]
     looked: list[int] = []
     monkeypatch.setattr(
-        mapper.scene, "fit_water", lambda views, _: looked.extend(v.frame_index for v in views)
+        mapper.scene, "fit_water", lambda views, *_: looked.extend(v.frame_index for v in views)
     )
     mapper.fit_water()
     assert looked == [0, 10, 20, 30]

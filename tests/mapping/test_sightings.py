@@ -9,9 +9,9 @@ from mapping_scenes import CAMERA, gaussians_at, pose, renderer, view_of
 
 from aquaflow.mapping import sightings
 from aquaflow.mapping.gaussians import GaussianMap
+from aquaflow.mapping.sighted_points import Observations
 from aquaflow.mapping.sightings import MIN_VIEWS, sight
 from aquaflow.mapping.views import View
-from aquaflow.mapping.water_estimation import Observations
 
 STEPS = [pose((0.0, 0.0, -0.15 * i)) for i in range(MIN_VIEWS)]
 """Cameras that back away from the points."""
@@ -40,7 +40,9 @@ def painted(gaussians: GaussianMap, colours: torch.Tensor) -> list[View]:
 
 
 def looked(gaussians: GaussianMap, views: list[View]) -> Observations:
-    return sight(gaussians, views, renderer(), torch.Generator().manual_seed(0))
+    return sight(
+        lambda view: gaussians.parameters, views, renderer(), torch.Generator().manual_seed(0)
+    )
 
 
 def test_the_sighted_colour_is_the_pictures_and_not_the_maps() -> None:
@@ -50,6 +52,20 @@ def test_the_sighted_colour_is_the_pictures_and_not_the_maps() -> None:
     assert seen.points == 12
     assert len(seen.point) == 12 * MIN_VIEWS
     np.testing.assert_allclose(seen.colour, colours[seen.point], atol=0.01)
+
+
+def test_the_blend_is_what_neighbours_add_to_a_point_from_afar() -> None:
+    gaussians = isolated()
+    alone = looked(gaussians, painted(gaussians, gaussians.colours))
+    bright = gaussians_at(
+        gaussians.means + torch.tensor([0.08, 0.0, 0.0]), torch.ones(12, 3), 0.055
+    )
+    gaussians.extend(bright.parameters, keyframe=0)
+    crowded = looked(gaussians, painted(gaussians, gaussians.colours))
+    few, many = (float(np.abs(seen.blend).mean()) for seen in (alone, crowded))
+    assert many > 2.0 * few
+    sums = np.stack([np.bincount(crowded.point, crowded.blend[:, c]) for c in range(3)])
+    np.testing.assert_allclose(sums, 0.0, atol=1e-6)
 
 
 def test_range_and_place_are_those_of_the_gaussians_centre() -> None:

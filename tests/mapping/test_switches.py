@@ -7,14 +7,15 @@ import torch
 from mapping_scenes import flat_pointmap, floor, grown, path, picture, renderer, settings, view_of
 from test_water_estimation import B_RES, LAMP, D, sighted
 
+from aquaflow.config import MediumConfig
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.water_estimation import estimate_water
+from aquaflow.mapping.water_estimation import estimate_water, models_for
 
 
 def test_without_shading_the_fit_knows_no_lamp() -> None:
     seen = sighted(shading=LAMP)
     with_lamp = estimate_water(seen, B_RES, D, 0.1)
-    without = estimate_water(seen, B_RES, D, 0.1, shading=False)
+    without = estimate_water(seen, B_RES, D, 0.1, models_for(MediumConfig(shading=False)))
     assert with_lamp is not None
     assert without is not None
     assert np.abs(with_lamp.shading).max() > 0.1

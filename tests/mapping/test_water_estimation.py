@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
+from aquaflow.config import MediumConfig
 from aquaflow.mapping.shading import TERMS, shading_basis
+from aquaflow.mapping.sighted_points import Observations
 from aquaflow.mapping.water_estimation import (
+    EVERY_MODEL,
     MIN_POINTS,
-    MIN_RANGE_RATIO,
-    Observations,
     WaterEstimate,
     estimate_water,
-    informative,
+    models_for,
 )
+from aquaflow.mapping.water_model import Model
 
 Array = npt.NDArray[np.float64]
 
@@ -33,8 +36,10 @@ def sighted(
     sightings: int = 4,
     noise: float = 0.005,
     shading: Array | None = None,
+    water: bool = True,
+    log_gains: Array | None = None,  # [sightings, 3], view k holds the k-th sighting of each point
 ) -> Observations:
-    """Sightings of points whose colours span black to bright, through known water."""
+    """Sightings of points whose colours span black to bright, through known water or none."""
     rng = np.random.default_rng(seed)
     J = rng.uniform(0.0, 0.9, (points, 1)) * rng.uniform(0.7, 1.0, (points, 3))
     point = np.repeat(np.arange(points), sightings)
@@ -42,13 +47,17 @@ def sighted(
     xy = rng.uniform(-0.95, 0.95, (len(point), 2))
     # Near ground is seen near the lower edge: the case in which a lamp looks like water.
     xy[:, 1] = np.clip(0.95 - 0.5 * z + 0.4 * xy[:, 1], -0.95, 0.95)
-    path = z[:, None]
-    seen = (
-        J[point] * np.exp(-BETA * path) + B_INF * -np.expm1(-B * path) + B_RES * np.exp(-D * path)
-    )
+    path, seen = z[:, None], J[point]
+    view = np.tile(np.arange(sightings), points)
+    if water:
+        veil = B_INF * -np.expm1(-B * path) + B_RES * np.exp(-D * path)
+        seen = seen * np.exp(-BETA * path) + veil
+    if log_gains is not None:
+        seen = seen * np.exp(log_gains)[view]
     if shading is not None:
         seen = seen * np.exp(shading_basis(xy) @ shading)[:, None]
-    return Observations(point, seen + noise * rng.normal(size=seen.shape), z, xy)
+    noisy = seen + noise * rng.normal(size=seen.shape)
+    return Observations(point, view, noisy, z, xy, np.zeros_like(noisy))
 
 
 def fitted(seen: Observations) -> WaterEstimate:
@@ -105,25 +114,15 @@ def test_too_few_points_give_no_estimate() -> None:
 
 def test_points_that_are_all_at_one_range_give_no_estimate() -> None:
     seen = sighted()
-    flat = Observations(seen.point, seen.colour, np.full(len(seen.z), 1.5), seen.xy)
-    assert informative(flat).points == 0
+    flat = replace(seen, z=np.full(len(seen.z), 1.5))
     assert estimate_water(flat, B_RES, D, 0.1) is None
 
 
 def test_no_sightings_at_all_give_no_estimate() -> None:
-    nothing = Observations(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2)))
+    number, colour = np.zeros(0, np.int64), np.zeros((0, 3))
+    nothing = Observations(number, number, colour, np.zeros(0), np.zeros((0, 2)), colour)
     assert nothing.points == 0
     assert estimate_water(nothing, B_RES, D, 0.1) is None
-
-
-def test_only_points_seen_over_a_span_of_ranges_are_kept_and_renumbered() -> None:
-    just, over = MIN_RANGE_RATIO, MIN_RANGE_RATIO + 0.01
-    z = np.array([1.0, 1.0, 1.0, just, over, 2.0, 2.0 * over, 3.0])
-    point = np.array([0, 1, 2, 0, 1, 3, 3, 4])
-    kept = informative(Observations(point, np.arange(24.0).reshape(8, 3), z, np.zeros((8, 2))))
-    assert kept.point.tolist() == [0, 0, 1, 1]
-    assert kept.z.tolist() == [1.0, over, 2.0, 2.0 * over]
-    assert kept.colour[:, 0].tolist() == [3.0, 12.0, 15.0, 18.0]
 
 
 def test_sightings_without_noise_fit_perfectly_and_stay_finite() -> None:
@@ -135,15 +134,70 @@ def test_sightings_without_noise_fit_perfectly_and_stay_finite() -> None:
 
 def test_black_pictures_give_finite_water() -> None:
     seen = sighted(points=140, sightings=3)
-    black = Observations(seen.point, np.zeros_like(seen.colour), seen.z, seen.xy)
-    estimate = fitted(black)
-    for values in (estimate.beta_a, estimate.B_inf, estimate.b, estimate.beta_a_sigma):
-        assert np.isfinite(values).all()
-    assert (estimate.B_inf < 0.1).all()
+    black = replace(seen, colour=np.zeros_like(seen.colour))
+    for models in (EVERY_MODEL, [Model(water=True)]):
+        estimate = estimate_water(black, B_RES, D, 0.1, models)
+        assert estimate is not None
+        for values in (estimate.beta_a, estimate.B_inf, estimate.b, estimate.exposure):
+            assert np.isfinite(values).all()
+        assert (estimate.B_inf < 0.1).all()
 
 
-def test_shading_stays_out_when_it_is_switched_off() -> None:
-    seen = sighted(points=140, sightings=3, shading=LAMP)
-    estimate = estimate_water(seen, B_RES, D, 0.1, shading=False)
+DIMMED = np.array([[0.0] * 3] * 3 + [[-0.6, -0.5, -0.4]] * 2)
+"""Log-gains of five views: the lamps go down, and turn redder in doing so."""
+
+
+@pytest.mark.parametrize("shading", [None, LAMP])
+def test_light_that_changes_is_found_and_the_water_in_spite_of_it(shading: Array | None) -> None:
+    estimate = fitted(sighted(sightings=5, shading=shading, log_gains=DIMMED))
+    assert estimate.model == Model(water=True, shading=shading is not None, exposure=True)
+    np.testing.assert_allclose(estimate.exposure, DIMMED - DIMMED.mean(axis=0), atol=0.05)
+    np.testing.assert_allclose(estimate.beta_a, BETA, rtol=0.15)
+
+
+def test_the_mean_exposure_is_one_whatever_the_light() -> None:
+    estimate = fitted(sighted(sightings=5, log_gains=DIMMED + 0.3))
+    np.testing.assert_allclose(estimate.exposure.mean(axis=0), 0.0, atol=1e-9)
+
+
+def test_even_light_gets_no_exposures() -> None:
+    assert not any(estimate.exposure.any() for estimate in [plain(), shaded(), *repeats()])
+
+
+@pytest.mark.parametrize("shading", [None, LAMP])
+@pytest.mark.parametrize("log_gains", [None, DIMMED])
+def test_where_there_is_no_water_none_is_found(
+    shading: Array | None, log_gains: Array | None
+) -> None:
+    seen = sighted(sightings=5, shading=shading, water=False, log_gains=log_gains)
+    estimate = fitted(seen)
+    assert not estimate.model.water
+    assert estimate.evidence is not None
+    assert estimate.evidence < 0.0
+    assert estimate.beta_a_sigma is None
+    assert not estimate.beta_a.any()
+    assert not estimate.B_inf.any()
+
+
+def test_the_evidence_speaks_for_water_where_there_is_some() -> None:
+    evidence = [plain().evidence, shaded().evidence]
+    assert all(value is not None and value > 100.0 for value in evidence)
+
+
+def test_no_evidence_is_claimed_when_nothing_else_was_tried() -> None:
+    seen = sighted(points=140, sightings=3)
+    estimate = estimate_water(seen, B_RES, D, 0.1, [Model(water=True)])
     assert estimate is not None
-    assert not estimate.shading.any()
+    assert estimate.evidence is None
+
+
+def test_the_config_decides_what_may_be_found() -> None:
+    assert models_for(MediumConfig()) == list(EVERY_MODEL)
+    assert models_for(MediumConfig(enabled=False, shading=False)) == [
+        Model(),
+        Model(exposure=True),
+    ]
+    assert models_for(MediumConfig(off_when_clear=False, exposure=False)) == [
+        Model(water=True),
+        Model(water=True, shading=True),
+    ]

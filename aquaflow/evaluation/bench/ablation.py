@@ -34,6 +34,10 @@ def _medium(**settings: object) -> dict[str, Any]:
     return {"mapping": {"medium": settings}}
 
 
+def _decoder(**settings: object) -> dict[str, Any]:
+    return {"mapping": {"decoder": {"enabled": True, **settings}}}
+
+
 def _insertion(**settings: object) -> dict[str, Any]:
     return {"mapping": {"insertion": settings}}
 
@@ -58,8 +62,10 @@ PARTS = (
     Part("without pose refinement", {"mapping": {"optimiser": {"poses": 0.0}}}),
     Part("without depth loss", {"mapping": {"loss": {"depth": 0.0}}}),
     Part("without loop closure", _tracking(graph={"enabled": False})),
-    Part("without distance embedding", built=False),
-    Part("without LGPD (an MLP instead)", built=False),
+    Part("with neural Gaussians (LGPD)", _decoder()),
+    Part("with neural Gaussians, base held as inserted", _decoder(optimise_initial=False)),
+    Part("with neural Gaussians, without distance embedding", _decoder(distance=False)),
+    Part("with neural Gaussians, an MLP instead of LGPD", _decoder(variant="mlp")),
     Part("without learned prior", built=False),
     Part("skip off: insertion only where the map is wrong", _insertion(agreement=NEVER_AGREES)),
     Part("skip off: duplicate and stationary frames", _gate(skip_duplicates=False)),
@@ -71,12 +77,25 @@ PARTS = (
     Part("skip off: matching seeded by motion", _tracking(seed_matching=False)),
     Part("skip off: solver stops when converged", _tracking(stop_converged=False)),
     Part("skip off: retrieval only at keyframes", built=False),
-    Part("skip off: medium off in clear water", built=False),
+    Part("without exposure of each view", _medium(exposure=False)),
+    Part("skip off: medium off in clear water", _medium(off_when_clear=False)),
     Part("skip off: no Gaussians in open water", built=False),
-    Part("skip off: only voxel groups in view", built=False),
-    Part("skip off: views already explained", built=False),
-    Part("skip off: tiles at the noise floor", built=False),
-    Part("skip off: decoded attributes cached", built=False),
+    Part(
+        "with neural Gaussians, skip off: only voxel groups in view",
+        _decoder(visible_groups=False),
+    ),
+    Part(
+        "skip off: views already explained",
+        {"mapping": {"optimiser": {"skip_explained": False}}},
+    ),
+    Part(
+        "skip off: tiles at the noise floor",
+        {"mapping": {"optimiser": {"noise_floor": 0.0}}},
+    ),
+    Part(
+        "with neural Gaussians, skip off: trunk cached over several views",
+        _decoder(views_per_trunk=1),
+    ),
 )
 """In the order of the table; a part lights up once it has a switch in the config."""
 

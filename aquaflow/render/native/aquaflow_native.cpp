@@ -30,6 +30,9 @@
 #include "adam.h"
 #include "image_formation.h"
 
+#include "decode_view.h"
+#include "decode_view_backward.h"
+
 #ifndef AQ_SOURCE_HASH
 #error "build with aquaflow/render/native/build.py, which passes AQ_SOURCE_HASH"
 #endif
@@ -157,6 +160,17 @@ AQ_EXPORT int aq_compose_water_backward(const float* drawn, const float* alpha, 
     compose_water_backward({drawn, alpha, water, pixels}, std::min(std::max(threads, 1), kMaxThreads),
                            g_image, g_range, g_drawn, g_alpha, g_water);
   });
+}
+
+// See decode_view.h: the attributes come in as the initial ones.
+AQ_EXPORT int aq_decode_view(const DecoderView* in, int threads, float* quats, float* log_scales, float* raw_colours) {
+  return guarded([&] {
+    decode_view(*in, std::min(std::max(threads, 1), kMaxThreads), quats, log_scales, raw_colours);
+  });
+}
+
+AQ_EXPORT int aq_decode_view_backward(const DecoderView* in, int threads, const DecoderGradients* out) {
+  return guarded([&] { decode_view_backward(*in, std::min(std::max(threads, 1), kMaxThreads), *out); });
 }
 
 // See adam.h. Returns the number of visible rows skipped for a non-finite gradient.

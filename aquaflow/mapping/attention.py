@@ -1,0 +1,44 @@
+"""Which tiles of a view a step looks at: not those that show the vehicle, nor those explained.
+
+A tile whose error is no more than the camera's own noise can teach the map nothing; it is neither
+drawn nor differentiated until the next full look at its view, which may find that the map around it
+has changed.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from aquaflow.config import OptimiserConfig
+from aquaflow.mapping.views import View
+from aquaflow.render.contract import TILE_PX
+
+
+def tiles_to_draw(view: View, config: OptimiserConfig) -> Tensor | None:
+    """[rows, columns] bool of the view's tiles for its next step; None: all of them."""
+    if config.noise_floor == 0.0:
+        return None
+    full = view.looks % config.full_look_every == 0
+    explained = None if full else view.explained
+    if view.mask is None:
+        return None if explained is None else ~explained
+    scene = F.max_pool2d(view.scene_mask()[None].float(), TILE_PX, ceil_mode=True)[0] > 0.0
+    return scene if explained is None else scene & ~explained
+
+
+@torch.no_grad()
+def look(
+    view: View,
+    image: Tensor,  # [H, W, 3] the map from this view
+    config: OptimiserConfig,
+) -> None:
+    """Count the step, and remember after a full look which tiles are explained."""
+    if view.looks % config.full_look_every == 0:
+        error = (image - view.target()).abs().mean(dim=-1)
+        if view.mask is not None:
+            error *= view.scene_mask()
+        tiles = F.avg_pool2d(error[None], TILE_PX, ceil_mode=True)[0]
+        view.explained = tiles < config.noise_floor
+    view.looks += 1

@@ -1,0 +1,117 @@
+"""What sightings should look like, and how that changes with every parameter."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_water_estimation import B_RES, D
+
+from aquaflow.mapping.shading import TERMS
+from aquaflow.mapping.sighted_points import MIN_RANGE_RATIO, Observations, informative
+from aquaflow.mapping.water_model import Model, WaterModel
+
+POINTS, SIGHTINGS, VIEWS = 40, 6, 5
+
+
+def scattered(seed: int = 0) -> Observations:
+    """Points of any colour in any place, each in six pictures out of five views."""
+    rng = np.random.default_rng(seed)
+    count = POINTS * SIGHTINGS
+    return Observations(
+        np.repeat(np.arange(POINTS), SIGHTINGS),
+        rng.integers(0, VIEWS, count),
+        rng.uniform(0.3, 0.9, (count, 3)),
+        rng.uniform(0.5, 3.0, count),
+        rng.uniform(-0.9, 0.9, (count, 2)),
+        rng.normal(0.0, 0.03, (count, 3)),
+    )
+
+
+def exact(model: Model) -> tuple[WaterModel, np.ndarray]:
+    """A model, and parameters that explain its sightings but for what is drawn from J."""
+    seen = scattered()
+    problem = WaterModel(seen, model, B_RES, D, start_beta=0.2)
+    x = problem.start + np.random.default_rng(1).normal(0.0, 0.2, problem.size)
+    for c in range(3):
+        seen.colour[:, c] += problem.look(x, c)[0]
+    return problem, x
+
+
+EVERY = [
+    Model(water=True),
+    Model(shading=True),
+    Model(exposure=True),
+    Model(water=True, shading=True, exposure=True),
+]
+
+
+@pytest.mark.parametrize("model", EVERY)
+@pytest.mark.parametrize("channel", [0, 2])
+def test_derivatives_are_those_of_the_errors_and_of_the_points(model: Model, channel: int) -> None:
+    problem, x = exact(model)
+    by_error, by_J = problem.derivatives(x, channel)
+    for row, k in enumerate(problem.of_channel(channel)):
+        step = 1e-6 * (np.arange(problem.size) == k)
+        plus, minus = problem.look(x + step, channel), problem.look(x - step, channel)
+        np.testing.assert_allclose(by_error[row], (plus[0] - minus[0]) / 2e-6, atol=1e-6)
+        np.testing.assert_allclose(by_J[row], (plus[1] - minus[1]) / 2e-6, atol=1e-6)
+
+
+def test_channels_share_nothing_but_the_shading() -> None:
+    problem, _ = exact(EVERY[-1])
+    red, blue = set(problem.of_channel(0)), set(problem.of_channel(2))
+    assert len(red & blue) == TERMS
+    assert len(red) == 3 + TERMS + VIEWS
+
+
+def test_the_priors_derivatives_are_those_of_the_priors() -> None:
+    problem, x = exact(EVERY[-1])
+    _, rows = problem.priors(x)
+    for k in range(problem.size):
+        step = 1e-4 * (np.arange(problem.size) == k)
+        change = (problem.priors(x + step)[0] - problem.priors(x - step)[0]) / 2e-4
+        np.testing.assert_allclose(rows[:, k], change, atol=1e-8)
+
+
+def test_brighter_views_and_brighter_points_are_not_told_apart() -> None:
+    problem, x = exact(Model(exposure=True))
+    assert problem.free == problem.size - 3
+    np.testing.assert_allclose(problem.trial(x).exposure.mean(axis=0), 0.0, atol=1e-12)
+    brighter = problem.look(x + 0.3, 1)[0]
+    np.testing.assert_allclose(brighter, problem.look(x, 1)[0], atol=1e-9)
+
+
+def test_a_fit_hands_on_the_parameters_that_both_models_have() -> None:
+    simple, x = exact(Model(water=True))
+    rich = WaterModel(simple.seen, EVERY[-1], B_RES, D, start_beta=0.2)
+    adopted = rich.adopt(simple, x)
+    for c in range(3):
+        np.testing.assert_allclose(rich.look(adopted, c)[0], simple.look(x, c)[0], atol=1e-12)
+
+
+@pytest.mark.parametrize("extreme", [-1e6, 1e6])
+def test_extreme_parameters_give_finite_numbers(extreme: float) -> None:
+    problem, x = exact(EVERY[-1])
+    wild = np.full(len(x), extreme)
+    wild[-1] = -extreme
+    for c in range(3):
+        for values in (*problem.look(wild, c), *problem.derivatives(wild, c)):
+            assert np.isfinite(values).all()
+
+
+def test_no_point_is_darker_than_black() -> None:
+    problem, x = exact(Model(water=True))
+    problem.seen.colour[:] = 0.0
+    assert min(problem.look(x, c)[1].min() for c in range(3)) == 0.0
+
+
+def test_only_points_seen_over_a_span_of_ranges_are_kept_and_renumbered() -> None:
+    just, over = MIN_RANGE_RATIO, MIN_RANGE_RATIO + 0.01
+    z = np.array([1.0, 1.0, 1.0, just, over, 2.0, 2.0 * over, 3.0])
+    point = np.array([0, 1, 2, 0, 1, 3, 3, 4])
+    colour = np.arange(24.0).reshape(8, 3)
+    kept = informative(Observations(point, np.arange(8), colour, z, np.zeros((8, 2)), colour))
+    assert kept.point.tolist() == [0, 0, 1, 1]
+    assert kept.view.tolist() == [1, 4, 5, 6]
+    assert kept.z.tolist() == [1.0, over, 2.0, 2.0 * over]
+    assert kept.colour[:, 0].tolist() == kept.blend[:, 0].tolist() == [3.0, 12.0, 15.0, 18.0]
