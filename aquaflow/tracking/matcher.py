@@ -11,10 +11,11 @@ from aquaflow.config import TrackingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe
-from aquaflow.prior.contract import Encoding, PairGeometry
+from aquaflow.prior.contract import Encoding, Mask, PairGeometry
 from aquaflow.tracking.relocate import pose_from_scratch
 from aquaflow.tracking.solver import PoseEstimate, PoseProblem, solve_pose
 from aquaflow.tracking.verification import pose_problem
+from aquaflow.tracking.visibility import Visibility, visibility
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,9 @@ class Matched:
     """Matched part of what the keyframe shows."""
     parallax_px: float
     """Mean displacement of the matches."""
+    points: npt.NDArray[np.float64]
+    """[M, 3] of the keyframe that the pose was solved from."""
+    visibility: Visibility
 
 
 class KeyframeMatcher:
@@ -47,7 +51,8 @@ class KeyframeMatcher:
         """The pose from ``predicted``; from the matches alone, or from ``fallback``, where that
         fails; None where too little speaks for any."""
         config = self._config
-        problem, pixels_k = self._problem(keyframe, pair, camera)
+        known = keyframe.pointmap.known(config.known_sigma)
+        problem, pixels_k = self._problem(keyframe, pair, camera, known)
         if len(problem.points) < config.min_matches:
             return None
         estimate = self._solve(problem, predicted)
@@ -59,17 +64,20 @@ class KeyframeMatcher:
         if share * estimate.inlier_share < config.min_support:
             return None
         displacement = np.linalg.norm(problem.pixels - pixels_k, axis=1)
-        return Matched(estimate, pair, share, float(displacement.mean()))
+        looked_at = keyframe.encoding.interesting & known
+        visible = visibility(
+            keyframe.pointmap, looked_at, pair.matches, pair.valid, estimate.T, camera
+        )
+        return Matched(estimate, pair, share, float(displacement.mean()), problem.points, visible)
 
     def _solve(self, problem: PoseProblem, initial: Sim3) -> PoseEstimate | None:
         return solve_pose(problem, initial, self._config.stop_converged, self._config.residual)
 
     def _problem(
-        self, keyframe: Keyframe, pair: PairGeometry, camera: CameraModel
+        self, keyframe: Keyframe, pair: PairGeometry, camera: CameraModel, known: Mask
     ) -> tuple[PoseProblem, npt.NDArray[np.float64]]:
         """At most ``matches`` matches whose depth is known, and their keyframe pixels."""
-        usable = pair.valid & keyframe.pointmap.known(self._config.known_sigma)
-        rows, columns = np.nonzero(usable)
+        rows, columns = np.nonzero(pair.valid & known)
         step = max(1, -(-len(rows) // self._config.matches))
         rows, columns = rows[::step], columns[::step]
         pixels_k = np.stack([columns + 0.5, rows + 0.5], -1)

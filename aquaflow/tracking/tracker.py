@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import numpy as np
-import numpy.typing as npt
+from dataclasses import replace
 
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
+from aquaflow.keyframes import KeyframeStore, Pointmap
 from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, PairGeometry, Prior
+from aquaflow.tracking.attachment import Attachment, Follower
 from aquaflow.tracking.frames import FrameClass, Link, Quality, Tracked
-from aquaflow.tracking.fusion import fuse, transfer
 from aquaflow.tracking.initialisation import Initialiser, calibrated, fused_pointmap
-from aquaflow.tracking.matcher import KeyframeMatcher, Matched
+from aquaflow.tracking.matcher import Matched
 from aquaflow.tracking.places import Places
 
 MAX_ORPHANS = 60
@@ -37,23 +36,18 @@ class Tracker:
         """The camera as refined by initialisation, once known."""
         self.focal_sigma = 0.0
         self._prior, self._keyframes, self._config = prior, keyframes, config
-        self._places, self._matcher = places, KeyframeMatcher(config)
+        self._places, self._follower = places, Follower(prior, keyframes, config)
         self._sub_maps = 1
         self._initialiser: Initialiser | None = None
         self._orphans: list[Frame] = []
-        self._keyframe: Keyframe | None = None
-        self._keyframe_image: npt.NDArray[np.uint8] | None = None
-        self._T_fk = Sim3.identity()
-        self._velocity = Sim3.identity()
-        self._predicted: npt.NDArray[np.float32] | None = None
-        self._mapped_parallax_px = 0.0
+        self._at: Attachment | None = None
         self._lost: list[Frame] = []
         self._origin = Sim3.identity()
 
     def track(self, frame: Frame) -> list[Tracked]:
         """Poses that this frame makes known: none while waiting, several when waiting ends."""
         encoding = self._prior.encode(frame.image, self.camera or frame.camera)
-        if self._keyframe is None:
+        if self._at is None:
             return self._find_again(frame, encoding) or self._initialise(frame, encoding)
         tracked = self._follow(frame, encoding)
         found = [tracked] if tracked is not None else self._find_again(frame, encoding)
@@ -73,11 +67,11 @@ class Tracker:
     def finish(self) -> list[Tracked]:
         """Account for the frames that never got a pose; tries one last time with what there is."""
         tracked: list[Tracked] = []
-        if self._keyframe is None and self._initialiser is not None and self._initialiser.waiting:
+        if self._at is None and self._initialiser is not None and self._initialiser.waiting:
             tracked = self._begin(self._initialiser)
         left = self._orphans + self._lost
         self._orphans, self._lost = [], []
-        if self._keyframe is None and self._initialiser is not None:
+        if self._at is None and self._initialiser is not None:
             left += self._waiting_frames(self._initialiser)
         return tracked + [self._as_lost(frame) for frame in left]
 
@@ -91,7 +85,7 @@ class Tracker:
         if matched and not self._initialiser.ready:
             return self._forget_oldest_orphans()
         tracked = self._begin(self._initialiser) if self._initialiser.waiting else []
-        if self._keyframe is None:
+        if self._at is None:
             if not matched:
                 self._orphans += self._waiting_frames(self._initialiser)
                 self._restart(frame, encoding)
@@ -115,39 +109,38 @@ class Tracker:
         self._orphans += initialiser.thinned
         self._initialiser = None
         self._make_keyframe(reference, encoding, self._origin, pointmap)
+        assert self._at is not None
+        start = self._at
+        number, shown = start.keyframe.number, pointmap.copy()
         first = Tracked(
-            reference,
-            FrameClass.KEYFRAME,
-            self.sub_map,
-            self._number,
-            self._origin,
-            pointmap=pointmap.copy(),
+            reference, FrameClass.KEYFRAME, self.sub_map, number, self._origin, pointmap=shown
         )
         tracked = [first, *self._back_fill()]
         for waiting, T in zip(solution.waiting, solution.T, strict=True):
-            on_reference = self._number == first.keyframe
+            on_reference = self._at is start
             if on_reference:
-                self._T_fk = T
+                start.T_fk = T
             encoded = self._prior.encode(waiting.frame.image, camera)
             result = self._follow(waiting.frame, encoded, waiting.pair if on_reference else None)
             tracked.append(result or self._as_lost(waiting.frame))
         return tracked
 
     def _back_fill(self) -> list[Tracked]:
-        """Poses of earlier frames that could not start a map, against the first keyframe."""
-        assert self._keyframe is not None
+        """Poses of earlier frames that could not start a map, against the keyframe in use."""
+        assert self._at is not None
         assert self.camera is not None
-        orphans, self._orphans = self._orphans, []
+        (orphans, self._orphans), now = (self._orphans, []), self._at
         tracked = []
+        self._at = replace(now)
         for frame in reversed(orphans):
             encoding = self._prior.encode(frame.image, self.camera)
-            solved = self._solve(encoding, None)
+            solved = self._follower.place(self._at, encoding, self.camera)
             if solved is None:
                 tracked.append(self._as_lost(frame))
                 continue
-            self._T_fk = solved.estimate.T
+            self._at.T_fk = solved.estimate.T
             tracked.append(self._tracked(frame, FrameClass.COMMON, solved, None))
-        self._T_fk = Sim3.identity()
+        self._at = now
         return tracked[::-1]
 
     def _waiting_frames(self, initialiser: Initialiser) -> list[Frame]:
@@ -170,23 +163,20 @@ class Tracker:
         found = self._places.of_frame(encoding, self.camera)
         if found is None:
             return []
-        before = (self._keyframe, self._T_fk, self._velocity, self._predicted)
-        self._keyframe = self._keyframes.hold(found.keyframe.number)
-        self._T_fk, self._velocity, self._predicted = found.estimate.T, Sim3.identity(), None
-        self._mapped_parallax_px, self._keyframe_image = 0.0, None
+        before = self._at
+        self._at = Attachment(self._keyframes.hold(found.keyframe.number), T_fk=found.estimate.T)
         tracked = self._follow(frame, encoding)
         if tracked is None:
-            self._keyframe, self._T_fk, self._velocity, self._predicted = before
-            if self._keyframe is not None:
-                self._keyframes.hold(self._keyframe.number)
+            self._at = before
+            if before is not None:
+                self._keyframes.hold(before.keyframe.number)
             return []
+        if before is not None:
+            self._follower.leave(before)
         if self._initialiser is not None:
             self._orphans += self._waiting_frames(self._initialiser)
             self._initialiser = None
-        here = (self._T_fk, self._predicted)
-        filled = self._back_fill()
-        self._T_fk, self._predicted = here
-        return [*filled, tracked]
+        return [*self._back_fill(), tracked]
 
     # --- following a keyframe -----------------------------------------------------------------
 
@@ -194,75 +184,46 @@ class Tracker:
         self, frame: Frame, encoding: Encoding, pair: PairGeometry | None = None
     ) -> Tracked | None:
         """Pose, fusion and class of one frame; None when it cannot be placed."""
-        solved = self._solve(encoding, pair)
+        assert self._at is not None
+        assert self.camera is not None
+        at, camera, follower = self._at, self.camera, self._follower
+        solved = follower.place(at, encoding, camera, pair)
         if solved is None:
             return None
-        assert self._keyframe is not None
-        assert self.camera is not None
-        T_fk = solved.estimate.T
-        self._velocity = T_fk @ self._T_fk.inverse()
-        self._T_fk, self._predicted = T_fk, solved.pair.matches
-        fuse(self._keyframe.pointmap, solved.pair, T_fk, self.camera, self._config.sigma_px)
-        frame_class = self._classify(solved)
+        follower.take(at, solved, camera)
+        if follower.hidden(solved):  # the map learns from what is not
+            shown = follower.shown(at, solved, camera)
+            frame = replace(frame, mask=shown if frame.mask is None else shown & frame.mask)
+        frame_class = follower.classify(at, solved, camera)
+        if frame_class is FrameClass.KEYFRAME:
+            earlier = follower.earlier(at, encoding, camera)
+            if earlier is not None:
+                follower.leave(at)
+                self._at, solved = earlier
+                frame_class = FrameClass.COMMON
         if frame_class is FrameClass.COMMON:
             return self._tracked(frame, frame_class, solved, None)
-        pointmap = transfer(
-            self._keyframe.pointmap,
-            solved.pair.matches_back,
-            solved.pair.valid_back,
-            T_fk,
-            self.camera,
-        )
+        pointmap = follower.pointmap(at, solved, camera)
         link = None
         if frame_class is FrameClass.KEYFRAME:
-            link = Link(self._number, T_fk, solved.estimate.covariance)
-            self.sub_map = self._keyframe.sub_map
-            T_wc = self._keyframe.T_wc @ T_fk.inverse()
-            self._make_keyframe(frame, encoding, T_wc, pointmap)
+            link = Link(at.keyframe.number, solved.estimate.T, solved.estimate.covariance)
+            self.sub_map = at.keyframe.sub_map
+            follower.leave(at)
+            self._make_keyframe(frame, encoding, at.T_wc, pointmap)
         else:
-            self._mapped_parallax_px = solved.parallax_px
+            at.mapped_parallax_px = solved.parallax_px
         return self._tracked(frame, frame_class, solved, pointmap.copy(), link)
 
-    def _solve(self, encoding: Encoding, pair: PairGeometry | None) -> Matched | None:
-        """Match against the keyframe and solve the pose."""
-        keyframe, camera = self._keyframe, self.camera
-        assert keyframe is not None
-        assert camera is not None
-        if pair is None:
-            seed = self._predicted if self._config.seed_matching else None
-            pair = self._prior.decode(self._reference(keyframe), encoding, seed)
-        return self._matcher.pose(keyframe, camera, pair, self._velocity @ self._T_fk, self._T_fk)
-
-    def _reference(self, keyframe: Keyframe) -> Encoding:
-        if self._config.reuse_encodings or self._keyframe_image is None:
-            return keyframe.encoding
-        return self._prior.encode(self._keyframe_image, keyframe.pointmap.camera)
-
-    def _classify(self, solved: Matched) -> FrameClass:
-        """The paper's rules: keyframe by matched share, mapping frame by parallax."""
-        if solved.share < self._config.keyframe_share:
-            return FrameClass.KEYFRAME
-        assert self.camera is not None
-        threshold = self._config.mapping_parallax_widths * self.camera.width
-        if solved.parallax_px - self._mapped_parallax_px > threshold:
-            return FrameClass.MAPPING
-        return FrameClass.COMMON
-
     # --- bookkeeping --------------------------------------------------------------------------
-
-    @property
-    def _number(self) -> int:
-        assert self._keyframe is not None
-        return self._keyframe.number
 
     def _make_keyframe(
         self, frame: Frame, encoding: Encoding, T_wc: Sim3, pointmap: Pointmap
     ) -> None:
-        self._keyframe = self._keyframes.add(
+        keyframe = self._keyframes.add(
             frame.index, frame.t_ns, encoding, T_wc, pointmap, self.sub_map
         )
-        self._keyframe_image = frame.image
-        self._T_fk, self._predicted, self._mapped_parallax_px = Sim3.identity(), None, 0.0
+        motion = Sim3.identity() if self._at is None else self._at.motion
+        self._at = Attachment(keyframe, frame.image, motion=motion)
 
     def _tracked(
         self,
@@ -272,22 +233,22 @@ class Tracker:
         pointmap: Pointmap | None,
         link: Link | None = None,
     ) -> Tracked:
-        assert self._keyframe is not None
-        # A new keyframe already is self._keyframe, with the identity as its relative pose.
-        T_wc = self._keyframe.T_wc @ self._T_fk.inverse()
-        estimate = solved.estimate
+        # A new keyframe is already in use, with the identity as its relative pose.
+        assert self._at is not None
+        keyframe, estimate = self._at.keyframe, solved.estimate
         quality = Quality(
             estimate.inlier_share, estimate.residual_px, solved.share, estimate.conditioning
         )
-        sub_map, number = self._keyframe.sub_map, self._number
+        sub_map, number, T_wc = keyframe.sub_map, keyframe.number, self._at.T_wc
         return Tracked(frame, frame_class, sub_map, number, T_wc, quality, pointmap, link=link)
 
     def _start_sub_map(self) -> list[Tracked]:
         """Give the lost frames to a new sub-map that starts where the old one ended."""
-        assert self._keyframe is not None
-        self._origin = self._keyframe.T_wc @ self._T_fk.inverse()
+        assert self._at is not None
+        self._origin = self._at.T_wc
         self.sub_map, self._sub_maps = self._sub_maps, self._sub_maps + 1
-        self._keyframe, self._predicted, self._velocity = None, None, Sim3.identity()
+        self._follower.leave(self._at)
+        self._at = None
         lost, self._lost = self._lost, []
         tracked = []
         for frame in lost:

@@ -19,7 +19,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping import gaussians, image_formation, losses, mapper, medium, views
 from aquaflow.prior import flow, homography
 from aquaflow.render import adam, reference, water
-from aquaflow.tracking import bundle, initialisation, solver
+from aquaflow.tracking import attachment, bundle, initialisation, solver
 
 INFINITY = float("inf")
 
@@ -107,6 +107,7 @@ GUARDS: list[tuple[str, list[tuple[object, str, object]]]] = [
     ("black", [(flow, "MIN_TEXTURE", -1.0)]),
     ("white", [(flow, "MIN_TEXTURE", -1.0)]),
     ("pure_rotation", [(initialisation.Initialiser, "_trustworthy", always)]),
+    ("snow", [(attachment.Follower, "hidden", lambda *_: False)]),
     ("teleport", [(swim, "TrackingConfig", lambda: TrackingConfig(min_support=0.0))]),
 ]
 

@@ -10,6 +10,7 @@ import numpy as np
 from aquaflow.config import SourceConfig
 from aquaflow.errors import InputError
 from aquaflow.evaluation.stress.case import Check, case
+from aquaflow.evaluation.stress.snow import marine_snow
 from aquaflow.evaluation.stress.swim import (
     CAMERA,
     FRAMES,
@@ -142,6 +143,20 @@ def exposure_steps(check: Check, seed: int) -> None:
     """Exposure jumps by a factor of three from frame to frame."""
     gains = (0.5, 1.5, 0.8)
     _hard(check, seed, lambda p, i: np.clip(p * gains[i % 3], 0, 255).astype(np.uint8), share=0.7)
+
+
+@case("images", "tracking.attachment.Follower.classify")
+def snow(check: Check, seed: int) -> None:
+    """Two seconds of marine snow over two fifths of the picture: it makes no keyframe."""
+    camera, poses, snowy = CAMERA.scaled(320, 240), path(34, step_m=0.015), range(8, 28)
+    clear = film(Floor(seed), poses, camera)
+    frames = spoiled(clear, snowy, marine_snow(camera, 0.4, seed))
+    result = track(frames)
+    sound(check, frames, result)
+    only_these_lost(check, result, (), share=0.9)
+    on_path(check, result, poses, bound=0.02)
+    keyframes = {k.frame_index for k in result.keyframes.keyframes}
+    check.true("no keyframe shows snow", not keyframes & set(snowy))
 
 
 @case("images", "preparation.check_picture")

@@ -1,0 +1,127 @@
+"""Which keyframe is in use: snow makes none, and a place that was left is taken up again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from tracked_clips import PLACED, QUICK, SMALL, error_share, path, plane_depth, run, told
+from tracking_scenes import KnownPair, KnownPrior, KnownView, pose
+
+from aquaflow.errors import InputError
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes import KeyframeStore
+from aquaflow.tracking.frames import FrameClass
+from aquaflow.tracking.tracker import Tracker
+
+SNOWED = range(6, 12)
+HIDDEN = 0.55
+"""Share of the matches that snow takes."""
+
+
+def snowed(poses: Sequence[Sim3], which: Sequence[int]) -> KnownPrior:
+    """A prior whose matches onto the frames ``which``, or from them, have holes."""
+    prior = told(poses)
+    plain, hidden = prior.decode, [prior.views[i].T_wc for i in which]
+
+    def holed(a: KnownView, b: KnownView, predicted: np.ndarray | None = None) -> KnownPair:
+        pair = plain(a, b, predicted)
+        rng = np.random.default_rng(len(prior.predictions))
+        for view in (a, b):
+            if any(view.T_wc is T for T in hidden):
+                pair.valid &= rng.random(pair.valid.shape) > HIDDEN
+                pair.valid_back &= rng.random(pair.valid.shape) > HIDDEN
+        return pair
+
+    prior.decode = holed  # type: ignore[method-assign]
+    return prior
+
+
+def test_what_is_hidden_in_plain_view_makes_no_keyframe() -> None:
+    poses = path(16, step=0.02)
+    prior = snowed(poses, SNOWED)
+    result = run(prior.frames(SMALL), QUICK, prior)
+    tracked = result.by_index()
+    assert {tracked[i].frame_class for i in SNOWED} == {FrameClass.COMMON}
+    assert not {k.frame_index for k in result.store.keyframes} & set(SNOWED)
+    assert error_share(result.tracked, poses) < 0.01
+
+
+def test_of_a_hidden_picture_the_map_gets_what_agrees_and_of_a_clear_one_everything() -> None:
+    poses = path(16, step=0.02)
+    prior = snowed(poses, SNOWED)
+    result = run(prior.frames(SMALL), QUICK, prior).by_index()
+    for index, tracked in result.items():
+        mask = tracked.frame.mask
+        assert (mask is not None) is (index in SNOWED)
+        assert mask is None or 0.2 < mask.mean() < 0.6
+
+
+def test_a_keyframe_that_goes_out_of_view_is_replaced_even_by_a_frame_with_snow() -> None:
+    """What the new one takes over is what agrees with its pose, and that is right."""
+    poses = path(30, step=0.06)
+    prior = snowed(poses, range(8, 20))
+    result = run(prior.frames(SMALL), QUICK, prior)
+    assert {t.frame_class for t in result.tracked} <= PLACED
+    snowy = [k for k in result.store.keyframes if k.frame_index >= 8]
+    assert snowy
+    scale = 1.0 / result.store[0].pointmap.rho[36, 48] / plane_depth(poses[0])[36, 48]
+    for keyframe in snowy:
+        known = keyframe.pointmap.known(0.15)
+        truth = scale * plane_depth(poses[keyframe.frame_index])[known]
+        assert known.any()
+        assert np.median(np.abs(1.0 / keyframe.pointmap.rho[known] / truth - 1.0)) < 0.02
+    assert error_share(result.tracked, poses) < 0.01
+
+
+# --- keyframes taken up again ---------------------------------------------------------------------
+
+THERE = path(12)
+HOVER = [*THERE, *(THERE[::-1] + THERE) * 2]
+"""Out, and twice back and out again."""
+
+
+def test_hovering_over_one_place_adds_no_keyframes() -> None:
+    prior, once = told(HOVER), told(THERE)
+    result = run(prior.frames(SMALL), QUICK, prior)
+    first = run(once.frames(SMALL), QUICK, once)
+    assert len(result.store) == len(first.store) > 1
+    assert {t.frame_class for t in result.tracked} <= PLACED
+    assert error_share(result.tracked, HOVER) < 0.01
+    used = [t.keyframe for t in result.tracked]
+    assert used[len(THERE) :].count(0) > 2
+
+
+def test_a_keyframe_that_is_in_another_place_than_thought_is_not_taken_up_again() -> None:
+    """A new one is made: the loop between the two is for the graph to close."""
+    prior = told(HOVER[:24])
+    frames = prior.frames(SMALL)
+    store = KeyframeStore()
+    tracker = Tracker(prior, store, QUICK)
+    for frame in frames[:12]:
+        tracker.track(frame)
+    left = len(store)
+    store[0].T_wc = pose((0.0, 0.0, 0.0), (0.25, 0.0, 0.0)) @ store[0].T_wc
+    for frame in frames[12:]:
+        tracker.track(frame)
+    assert len(store) > left
+
+
+def test_a_keyframe_that_cannot_be_read_back_costs_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    prior = told(HOVER[:24])
+    frames = prior.frames(SMALL)
+    store = KeyframeStore()
+    tracker = Tracker(prior, store, QUICK)
+    tracked = [t for frame in frames[:12] for t in tracker.track(frame)]
+    left, content = len(store), store.content
+
+    def unreadable(number: int) -> object:
+        if number < left - 1:
+            raise InputError("the disk is full of sand")
+        return content(number)
+
+    monkeypatch.setattr(store, "content", unreadable)
+    tracked += [t for frame in frames[12:] for t in tracker.track(frame)]
+    assert len(store) > left
+    assert {t.frame_class for t in tracked} <= PLACED
