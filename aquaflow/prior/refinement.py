@@ -23,6 +23,9 @@ CONTRAST_WINDOW_PX = 15
 change more slowly than that."""
 GREY_NOISE = 2.0
 """Grey levels of contrast that noise alone makes."""
+LEAST_WINDOWS = 8
+"""Windows along the picture's shorter side below which nothing is refined: one of them then spans
+too much of the scene to move as one (64 x 48 px: the residual rises from 0.6 to 1.0 px)."""
 MAX_STEP_PX = 1.0
 """The picture is linear over no more than this; DIS is seldom further off."""
 SINGULAR = 1e-3
@@ -40,6 +43,8 @@ def refine(
     step in one): noise and blur of either picture then shorten no step, and a to b errs like
     b to a. The warp carries the slope and turn of the flow; a window moves only by what is left.
     """
+    if min(a.shape) < LEAST_WINDOWS * WINDOW_PX:
+        return flow
     # One array for each coordinate, as OpenCV's gradients and remap want them.
     u, v = flow[..., 0].copy(), flow[..., 1].copy()
     here = _contrast_normalised(a.astype(np.float32))

@@ -56,6 +56,11 @@ class Initialised:
     focal_sigma: float
 
 
+RETRY_GROWTH = 1.05
+"""Growth of the parallax after which a geometry that could not be trusted is tried again: an
+attempt takes seconds, and the next frame alone changes little."""
+
+
 class Initialiser:
     """Collects frames against one reference and says when the geometry is decided."""
 
@@ -72,6 +77,8 @@ class Initialiser:
         """Frames that were let go to bound memory; their poses can be filled in later."""
         self._prior, self._config = prior, config
         self._predicted: npt.NDArray[np.float32] | None = None
+        self._tried_px = 0.0
+        """Parallax at the last attempt."""
         self._samples = _grid_samples(reference.interesting, config.points)
 
     def add(self, frame: Frame, encoding: Encoding) -> bool:
@@ -100,10 +107,12 @@ class Initialiser:
         return (
             len(self.waiting) >= self._config.min_views
             and self.parallax_px >= self._config.parallax_widths * self.reference.camera.width
+            and self.parallax_px >= RETRY_GROWTH * self._tried_px
         )
 
     def solve(self) -> Initialised | None:
         """The best explanation of all waiting frames; None when none is good enough."""
+        self._tried_px = self.parallax_px
         best: tuple[float, BundleResult] | None = None
         best_rank = (-1.0, 0.0)
         for start in self._starts():

@@ -75,3 +75,9 @@ def test_no_step_is_longer_than_the_picture_is_linear() -> None:
     start = true_flow(H) + np.float32([9.0, 0.0])
     step = refine(*grey_pair(H), start) - start
     assert np.linalg.norm(step, axis=-1).max() < MAX_STEP_PX * 1.001
+
+
+def test_a_picture_of_few_windows_is_left_as_it_is() -> None:
+    a, b = (cv2.resize(grey, (64, 48)) for grey in grey_pair(shift(5.3, -2.6)))
+    flow = np.ones((48, 64, 2), np.float32)
+    assert refine(a, b, flow) is flow

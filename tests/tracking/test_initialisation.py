@@ -150,6 +150,16 @@ def test_a_geometry_that_explains_or_knows_too_little_is_refused(limit: dict[str
     assert initialiser.solve() is None
 
 
+def test_a_geometry_that_was_refused_is_not_tried_again_before_the_parallax_has_grown() -> None:
+    refusing = CONFIG.model_copy(update={"min_explained": 1.0, "parallax_widths": 0.005})
+    initialiser = started(prior_of(MOVING[:4], noise_px=0.5), refusing)
+    assert initialiser.ready
+    assert initialiser.solve() is None
+    assert not initialiser.ready
+    initialiser.waiting += started(prior_of(MOVING, noise_px=0.5), refusing).waiting[-1:]
+    assert initialiser.ready
+
+
 def test_nothing_waiting_is_no_solution() -> None:
     prior = prior_of(MOVING)
     frame = prior.frames(CAMERA)[0]
