@@ -186,7 +186,7 @@ class DiveFolder:
     ) -> None:
         """medium.json: parameters, their units, and the range at which map.ply is shown.
 
-        ``evidence``: for water against none, units of the log likelihood; below 0 it is off.
+        ``evidence``: for water against none, units of the log likelihood; below -10 it is off.
         """
         data: dict[str, Any] = {"active": water is not None, "scale_source": scale_source}
         data["evidence"] = evidence

@@ -32,6 +32,10 @@ POINTS_PER_VALUE = 10.0
 """Neighbouring points share the map's errors, so that this many say what one could alone. Were all
 independent, dives without water would get some: it saves them up to 14 % of the error, where true
 water, the clearest of Jerlov's too, saves 30 to 60 %."""
+WATER_IS_USUAL = 10.0
+"""Log odds for water before anything is seen: a dive is in water until very strong evidence (5,
+Kass and Raftery 1995), twice over, speaks against it. Clear dives give -14 and -20, Curasao, where
+a shading of the picture explains as much, -6 to 17, other dives in water over 100."""
 MAX_STEPS = 30
 LEAST_GAIN = 1e-5
 """Relative fall of the cost at which a fit has converged."""
@@ -60,7 +64,7 @@ class WaterEstimate:
     exposure: Array
     """[V, 3] log-gain of each view, of mean zero."""
     evidence: float | None
-    """For water against none, in units of the log likelihood; negative: none is likelier; None:
+    """For water against none, in units of the log likelihood, WATER_IS_USUAL not counted; None:
     only one of the two was tried."""
 
 
@@ -106,7 +110,7 @@ def estimate_water(
     fits: list[_Fit] = []
     for model in models:
         fits.append(_solve(WaterModel(seen, model, B_res, d, start_beta), fits))
-    best = min(fits, key=lambda fit: fit.criterion)
+    best = min(fits, key=lambda fit: fit.criterion - 2.0 * WATER_IS_USUAL * fit.problem.model.water)
     trial = best.problem.trial(best.x)
     return WaterEstimate(
         best.problem.model,
