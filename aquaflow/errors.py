@@ -15,3 +15,12 @@ class ConfigError(AquaFlowError):
 
 class NotMappedError(AquaFlowError):
     """The input was read, but no map could be made of it."""
+
+
+MAX_QUOTED = 160
+"""Characters of another library's message that one of our sentences quotes."""
+
+
+def first_line(error: BaseException) -> str:
+    """What another library said, short enough for a sentence; its kind if it said nothing."""
+    return (str(error).splitlines() or [type(error).__name__])[0][:MAX_QUOTED]

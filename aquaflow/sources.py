@@ -21,8 +21,8 @@ TELEMETRY = "aquaflow.telemetry"
 LINKS = "links"
 """The entry point of live telemetry; the others of its group read recordings."""
 
-Tap: TypeAlias = Callable[[str, int, bytes], None]
-"""As ``drivers.link.RawTap``: name of the link, arrival_ns, bytes of a read."""
+RawTap: TypeAlias = Callable[[str, int, bytes], None]
+"""Gets every read of a link as it came: name of the link, arrival_ns, bytes. Must not block."""
 
 
 @runtime_checkable
@@ -43,6 +43,11 @@ class CameraSource(Protocol):
         ...
 
     def close(self) -> None: ...
+
+
+def is_asked(index: int, every: int, start: int) -> bool:
+    """True for the indices ``start, start + every, ...`` of :meth:`CameraSource.frames`."""
+    return index >= start and (index - start) % every == 0
 
 
 class RecordedCamera(CameraSource, Protocol):
@@ -140,10 +145,8 @@ def open_recording(path: Path, fps: float | None = None) -> RecordedCamera:
 
 def camera_reader(path: Path) -> type[RecordedCamera] | None:
     """The registered source that recognises ``path`` best; None if it is no recording."""
-    entries = sorted(entry_points(group=CAMERAS), key=lambda entry: entry.name)
-    readers: list[type[RecordedCamera]] = [entry.load() for entry in entries]
-    fitting = [cls for cls in readers if hasattr(cls, "recognises") and cls.recognises(path)]
-    return max(fitting, key=lambda cls: cls.specificity) if fitting else None
+    reader: type[RecordedCamera] | None = _best_reader(CAMERAS, path)
+    return reader
 
 
 def open_camera(name: str, config: CameraConfig) -> LiveSource:
@@ -160,7 +163,7 @@ def open_camera(name: str, config: CameraConfig) -> LiveSource:
     raise InputError(f"no driver for cameras of kind '{config.kind}'; reinstall aquaflow")
 
 
-def open_links(config: TelemetryConfig, tap: Tap | None = None) -> TelemetrySource:
+def open_links(config: TelemetryConfig, tap: RawTap | None = None) -> TelemetrySource:
     """The live telemetry devices of ``config``; ``tap`` gets the raw bytes of every link.
 
     Raises:
@@ -169,7 +172,7 @@ def open_links(config: TelemetryConfig, tap: Tap | None = None) -> TelemetrySour
     """
     for entry in entry_points(group=TELEMETRY):
         if entry.name == LINKS:
-            driver: Callable[[TelemetryConfig, Tap | None], TelemetrySource] = entry.load()
+            driver: Callable[[TelemetryConfig, RawTap | None], TelemetrySource] = entry.load()
             return driver(config, tap)
     raise InputError("no driver for telemetry links is installed; reinstall aquaflow")
 
@@ -190,7 +193,13 @@ def telemetry_reader(path: Path) -> type[RecordedTelemetry] | None:
     """The registered source that recognises ``path`` best; None if it holds no telemetry."""
     if not path.exists():
         raise InputError(f"there is nothing at {path}; give a recording with telemetry")
-    entries = sorted(entry_points(group=TELEMETRY), key=lambda entry: entry.name)
-    readers: list[type[RecordedTelemetry]] = [entry.load() for entry in entries]
+    reader: type[RecordedTelemetry] | None = _best_reader(TELEMETRY, path)
+    return reader
+
+
+def _best_reader(group: str, path: Path) -> Any:
+    """Of the entry points of ``group``, the class of highest specificity that recognises it."""
+    entries = sorted(entry_points(group=group), key=lambda entry: entry.name)
+    readers = [entry.load() for entry in entries]
     fitting = [cls for cls in readers if hasattr(cls, "recognises") and cls.recognises(path)]
     return max(fitting, key=lambda cls: cls.specificity) if fitting else None

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias
+from typing import Protocol
 
 from aquaflow.messages import TelemetrySample
 
 MAX_READ_BYTES = 65_536
 """Most that one read returns: the largest UDP datagram."""
-
-RawTap: TypeAlias = Callable[[str, int, bytes], None]
-"""Gets every read as it came: name of the link, arrival_ns, bytes. Must not block."""
 
 
 class LinkLostError(Exception):

@@ -17,6 +17,7 @@ from aquaflow.config.cameras import LiveCameraConfig
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import guess_camera, load_camera
 from aquaflow.messages import CameraModel, Dropped, Frame
+from aquaflow.sources import is_asked
 from drivers.capture import Capture, OpenCapture, RawPicture, UnusablePictureError
 from drivers.exposure_clock import ExposureClock
 from drivers.newest import NewestPicture
@@ -133,7 +134,7 @@ class LiveCamera:
         while (picture := self._newest.take()) is not None:
             try:
                 ended = stop is not None and picture.index >= stop
-                asked = picture.index >= start and (picture.index - start) % every == 0
+                asked = is_asked(picture.index, every, start)
                 frame = self._frame(picture) if asked and not ended else None
             finally:
                 picture.release()

@@ -9,7 +9,8 @@ from collections.abc import Callable
 from typing import Protocol, TypeAlias, runtime_checkable
 
 from aquaflow.messages import TelemetrySample
-from drivers.link import ByteLink, Decoder, LinkCounters, LinkLostError, RawTap
+from aquaflow.sources import RawTap
+from drivers.link import ByteLink, Decoder, LinkCounters, LinkLostError
 from drivers.transport import OpenLink
 
 log = logging.getLogger(__name__)

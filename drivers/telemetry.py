@@ -11,8 +11,9 @@ from typing import NamedTuple
 from aquaflow.config.telemetry import AnyDevice, TelemetryConfig
 from aquaflow.fusion.clock import ClockReport
 from aquaflow.messages import TelemetrySample
+from aquaflow.sources import RawTap
 from drivers.latest import LatestQueue
-from drivers.link import LinkCounters, RawTap
+from drivers.link import LinkCounters
 from drivers.mounting import BodyFrame, Mounting
 from drivers.protocol.packets import PacketDecoder
 from drivers.supervisor import Deliver, Supervisor

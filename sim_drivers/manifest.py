@@ -23,9 +23,9 @@ from aquaflow.config.telemetry import AnyDevice
 from aquaflow.errors import ConfigError, InputError
 from aquaflow.messages import TelemetrySample
 from aquaflow.sources import (
+    RawTap,
     RecordedCamera,
     RecordedTelemetry,
-    Tap,
     open_recorded_telemetry,
     open_recording,
 )
@@ -106,7 +106,7 @@ class ManifestTelemetry:
     def notes(self) -> list[str]:
         return [note for log in self.logs for note in log.notes]
 
-    def tap_bytes(self, tap: Tap) -> None:
+    def tap_bytes(self, tap: RawTap) -> None:
         """Hand the bytes of every log of bytes to ``tap`` as well."""
         for log in self.logs:
             if isinstance(log, ByteLog):

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import CameraModel, Port, guess_camera
 from aquaflow.messages import Dropped, Encoded, Frame
+from aquaflow.sources import is_asked
 from sim_drivers.h264 import decode_units, is_key
 from sim_drivers.mcap_messages import McapMessage, McapMessages, mcap_files
 from sim_drivers.mcap_payload import Payloads, UnreadablePayloadError
@@ -90,7 +91,7 @@ class McapCamera:
         for frame in pictures:
             if stop is not None and frame.index >= stop:
                 break
-            if _asked(frame.index, every, start):
+            if is_asked(frame.index, every, start):
                 yield frame
         self.notes = list(self._messages.notes)
 
@@ -152,7 +153,7 @@ class McapCamera:
 
     def _pictures(self, every: int, start: int) -> Iterator[Frame | Dropped]:
         for place, found in self._placed():
-            if not _asked(place.index, every, start):
+            if not is_asked(place.index, every, start):
                 continue
             if isinstance(found, str):
                 yield Dropped(place.index, place.t_ns, found)
@@ -198,10 +199,6 @@ class McapCamera:
         camera = self._stated or guess_camera(width, height)
         frame = Frame(place.index, place.t_ns, place.arrival_ns, image, camera, encoded=encoded)
         return replace(frame, exposure_s=place.exposure_s, gain=place.gain, mask=place.mask)
-
-
-def _asked(index: int, every: int, start: int) -> bool:
-    return index >= start and (index - start) % every == 0
 
 
 def _numbered(messages: Iterator[McapMessage], topic: str) -> Iterator[tuple[int, McapMessage]]:

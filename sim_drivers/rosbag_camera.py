@@ -12,6 +12,7 @@ import numpy.typing as npt
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import CameraModel, DistortionModel, guess_camera
 from aquaflow.messages import Dropped, Encoded, Frame
+from aquaflow.sources import is_asked
 from sim_drivers.picture import UnreadablePictureError, received_as
 from sim_drivers.picture_message import compressed_picture, raw_picture
 from sim_drivers.rosbag import (
@@ -86,7 +87,7 @@ class RosbagCamera:
             for index, (connection, received_ns, data) in enumerate(messages):
                 if stop is not None and index >= stop:
                     return
-                if index >= start and (index - start) % every == 0:
+                if is_asked(index, every, start):
                     message = decoded(reader, connection, data)
                     yield self._frame(index, message, received_ns, connection.msgtype)
 

@@ -9,7 +9,8 @@ from typing import ClassVar, NamedTuple
 
 from aquaflow.config.telemetry import AnyDevice
 from aquaflow.messages import TelemetrySample
-from drivers.link import LinkCounters, RawTap
+from aquaflow.sources import RawTap
+from drivers.link import LinkCounters
 from drivers.mounting import BodyFrame, Mounting
 from drivers.telemetry import decoder_of
 

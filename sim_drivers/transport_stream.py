@@ -6,9 +6,9 @@ import socket
 import struct
 import tempfile
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 import numpy.typing as npt
@@ -44,7 +44,7 @@ def encoded(
         return path.read_bytes()
 
 
-class _Sender:
+class _Sender(ABC):
     """A thread that sends a stream over and over at its own pace, while it is plugged in."""
 
     def __init__(self, images: list[npt.NDArray[np.uint8]], fps: float) -> None:
@@ -60,18 +60,14 @@ class _Sender:
         self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._ending.set()
         self.plugged_in.set()
         self._thread.join()
 
+    @abstractmethod
     def _run(self) -> None:
-        raise NotImplementedError
+        """The thread."""
 
     def _paced(self) -> Iterator[bytes]:
         """Datagrams, each at its time, until the end."""

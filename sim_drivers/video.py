@@ -13,6 +13,7 @@ import numpy as np
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import ASPECT_TOLERANCE, guess_camera, load_camera
 from aquaflow.messages import CameraModel, Dropped, Frame
+from aquaflow.sources import is_asked
 from sim_drivers.images import CALIBRATION, DEFAULT_FPS, NS_PER_S
 
 # OpenCV reads this once, when it first meets a video; -8 is FFmpeg's AV_LOG_QUIET.
@@ -88,7 +89,7 @@ class VideoFile:
                     self._note_early_end(index)
                     break
                 t_ns = clock.tick(_position_ms(capture))
-                if index >= start and (index - start) % every == 0:
+                if is_asked(index, every, start):
                     yield self._frame(capture, index, t_ns)
                 index += 1
             if clock.repaired:

@@ -144,10 +144,12 @@ class Mapper:
         The water stays this map's own: it is the same water, and is fitted again to all views. So
         does the decoder: what the other's says of its Gaussians, seen from its own views, is kept.
         """
-        count, centres = len(other.gaussians), other.scene.bake(other.views)
+        count = len(other.gaussians)
+        # Only a decoder needs to know from where each is seen: cameras times Gaussians.
+        centres = None if self.neural is None else other.scene.bake(other.views)
         self.gaussians.append(other.gaussians)
         self._optimiser.extend(count)
-        if self.neural is not None:
+        if self.neural is not None and centres is not None:
             self.neural.insert(centres, count)
         self._optimiser.bind(self._parameters)
         self.views = sorted([*self.views, *other.views], key=lambda view: view.frame_index)

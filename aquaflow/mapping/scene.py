@@ -111,11 +111,16 @@ class Scene:
 
         Returns the centres [N, 3] that they were seen from.
         """
-        baked = self.baked(views)
-        for name, tensor in self.gaussians.parameters.items():
-            tensor.copy_(baked[name])
-        self.neural = None
-        return self._nearest(views)[0] if views else torch.zeros_like(self.gaussians.means)
+        if not views:
+            self.neural = None
+            return torch.zeros_like(self.gaussians.means)
+        centres = self._nearest(views)[0]
+        if self.neural is not None:
+            baked = self.neural.baked(centres)
+            for name, tensor in self.gaussians.parameters.items():
+                tensor.copy_(baked[name])
+            self.neural = None
+        return centres
 
     def _nearest(self, views: Sequence[View]) -> tuple[Tensor, Tensor, Tensor]:
         """Of the camera nearest to each Gaussian: centre [N, 3], distance [N], number [N]."""

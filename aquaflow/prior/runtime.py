@@ -16,7 +16,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.errors import AquaFlowError, InputError
+from aquaflow.errors import AquaFlowError, InputError, first_line
 
 Device: TypeAlias = Literal["auto", "cpu", "cuda", "tensorrt"]
 
@@ -62,7 +62,7 @@ class Session:
             )
         except Exception as error:  # onnxruntime's errors share no base of their own
             raise InputError(
-                f"{path} cannot be run ({_first_line(error)}); export it again"
+                f"{path} cannot be run ({first_line(error)}); export it again"
             ) from error
         obtained = self._session.get_providers()[0]
         if obtained != PROVIDERS[device]:
@@ -120,7 +120,3 @@ def _providers(device: str, engine_cache: Path | None) -> list[Any]:
         }
     slower = FASTEST_FIRST[FASTEST_FIRST.index(device) :]
     return [(PROVIDERS[name], settings[name]) for name in slower]
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:160]

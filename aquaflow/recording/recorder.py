@@ -61,7 +61,7 @@ class Recorder:
         self._put(Sample(sample))
 
     def raw(self, link: str, arrival_ns: int, data: bytes) -> None:
-        """Record what one read of a link returned; a ``RawTap`` of ``drivers.link``."""
+        """Record what one read of a link returned; a ``RawTap`` of ``aquaflow.sources``."""
         self._put(LinkBytes(link, arrival_ns, bytes(data)))
 
     def close(self) -> RecorderStatus:

@@ -11,7 +11,7 @@ from typing import Protocol, TypeAlias, runtime_checkable
 from aquaflow.messages import Dropped, Frame, TelemetrySample
 from aquaflow.recording.playback import Event, Playback, arrival_of, arrived
 from aquaflow.recording.recorder import Recorder
-from aquaflow.sources import CameraSource, Tap, TelemetrySource
+from aquaflow.sources import CameraSource, RawTap, TelemetrySource
 
 log = logging.getLogger(__name__)
 
@@ -138,4 +138,4 @@ class HasSamples(Protocol):
 class TapsBytes(Protocol):
     """A recorded telemetry source that knows the bytes its samples came from."""
 
-    def tap_bytes(self, tap: Tap) -> None: ...
+    def tap_bytes(self, tap: RawTap) -> None: ...

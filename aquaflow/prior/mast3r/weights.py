@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from aquaflow.errors import InputError
+from aquaflow.errors import InputError, first_line
 from aquaflow.prior.mast3r.network import Mast3r
 from aquaflow.prior.mast3r.settings import FULL, NetworkSize
 
@@ -63,14 +63,10 @@ def _tensors_of(path: Path) -> dict[str, Tensor]:
             content: Any = torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError) as error:
         raise InputError(
-            f"{path} cannot be read as a checkpoint of tensors ({_first_line(error)}); "
+            f"{path} cannot be read as a checkpoint of tensors ({first_line(error)}); "
             "download it again"
         ) from error
     state = content.get("model", content) if isinstance(content, dict) else None
     if not isinstance(state, dict) or not all(isinstance(x, Tensor) for x in state.values()):
         raise InputError(f"{path} holds no tensors by name; give the downloaded .pth file")
     return state
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:120]
