@@ -21,6 +21,9 @@ MAX_REPROJECTION_PX = 1.5
 MIN_DEPTH = 1e-3
 """Nearer points, and those behind a camera, are no measurement."""
 
+MIN_RHO, MAX_RHO = 1e-9, 1e6
+"""Inverse depths outside are no measurement; held there, their inverse is finite."""
+
 MIN_CROSS_SQ = 1e-12
 """Squared sine of the angle below which rays are parallel: their depth is rounding noise."""
 
@@ -45,11 +48,14 @@ def triangulate(
     T_ba: Sim3,
     camera_b: CameraModel,
     sigma_px: float,
+    expected_rho: Array | None = None,  # [M] 1 / z in a; 0 where nothing is expected
 ) -> Triangulation:
     """Point on each ray of a that is nearest to the matched ray of b.
 
     The variance is first order: ``sigma_px`` along the epipolar line moves the inverse depth by
-    (sigma / f) * rho / sin(parallax).
+    (sigma / f) * rho / sin(parallax). It and the parallax are taken at ``expected_rho`` where there
+    is one: taken at the measurement, noise would choose its own weight, the nearer the surer, and
+    far points of a forward view would come out near.
     """
     # One array for each coordinate: several times faster than [M, 3] arrays, and it is the frame's
     # whole picture that comes through here.
@@ -60,25 +66,31 @@ def triangulate(
     )
     ax, ay, az = (row[0] * xa + row[1] * ya + row[2] for row in T_ba.R)
     tx, ty, tz = T_ba.t
-    # x_b ~ z_a a_in_b + t  =>  x_b x (z_a a_in_b + t) = 0, solved for z_a by least squares.
+    # x_b ~ a_in_b + rho t  =>  x_b x (a_in_b + rho t) = 0, solved for rho by least squares. Solved
+    # for z, the noise of x_b would be in the divisor, and every depth too small by its variance.
     cx, cy, cz = yb * az - ay, ax - xb * az, xb * ay - yb * ax
     dx, dy, dz = yb * tz - ty, tx - xb * tz, xb * ty - yb * tx
     cc = cx * cx + cy * cy + cz * cz
-    z = -(cx * dx + cy * dy + cz * dz) / np.maximum(cc, 1e-18)
-    z_safe = np.maximum(z, 1e-6)
-    rho = 1.0 / z_safe
+    dd = dx * dx + dy * dy + dz * dz
+    rho = -(cx * dx + cy * dy + cz * dz) / np.maximum(dd, 1e-18)
+    z_safe = 1.0 / np.clip(rho, MIN_RHO, MAX_RHO)
 
-    sine = _sin_parallax(xa, ya, z_safe, -(T_ba.R.T @ T_ba.t))
+    expected_z = z_safe
+    if expected_rho is not None:
+        expected_z = np.where(
+            expected_rho > MIN_RHO, 1.0 / np.maximum(expected_rho, MIN_RHO), z_safe
+        )
+    sine = _sin_parallax(xa, ya, expected_z, -(T_ba.R.T @ T_ba.t))
     in_b_z = z_safe * az + tz
     inverse = 1.0 / np.maximum(in_b_z, MIN_DEPTH)
     off_u = camera_b.fx * ((z_safe * ax + tx) * inverse - xb)
     off_v = camera_b.fy * ((z_safe * ay + ty) * inverse - yb)
-    good = (z > MIN_DEPTH) & (in_b_z > MIN_DEPTH)
+    good = (rho > MIN_RHO) & (z_safe > MIN_DEPTH) & (in_b_z > MIN_DEPTH)
     good &= off_u * off_u + off_v * off_v < MAX_REPROJECTION_PX**2
     # Parallel rays meet nowhere; their z is rounding noise over the guard.
     good &= (sine > np.sin(MIN_PARALLAX_RAD)) & (cc > MIN_CROSS_SQ)
-    sigma = (sigma_px / camera_b.fx) * rho / np.maximum(sine, 1e-6)
-    return Triangulation(rho, sigma * sigma, good, sine)
+    sigma = (sigma_px / camera_b.fx) / (expected_z * np.maximum(sine, 1e-6))
+    return Triangulation(1.0 / z_safe, sigma * sigma, good, sine)
 
 
 def _sin_parallax(

@@ -29,6 +29,15 @@ not, scale drifts four times as fast (synthetic survey, 20 keyframes: -1 against
 CONFIDENCE_SIGMA_PX = 0.2
 """Forward-backward error at which a match's confidence has fallen to exp(-1/2)."""
 
+EDGE_WINDOW_PX = 7
+"""Half of a refined match's window to either side: an edge of the depth within it is in the match,
+and what is behind takes on some of the motion of what is in front."""
+
+EDGE_WEIGHT = 2.0
+"""Error of a match per pixel that the flow around departs from its mean. Without it far points of a
+forward view come out 1.4 % near, with it 0.9 %, and the scale drifts -6 against -4 % per 100
+keyframes (synthetic reef, 25 degrees down; 42 degrees down: -2.2 against -0.1 %)."""
+
 MIN_TEXTURE = 30.0
 """Smoothed squared Sobel gradient of the normalised grey image below which flow only guesses."""
 
@@ -87,6 +96,21 @@ def sample(
     return np.asarray(
         cv2.remap(field, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     )
+
+
+def confidence(
+    flow: Flow,
+) -> Float:
+    """[H, W] in [0, 1]: falls with the forward-backward error, and towards edges of the flow.
+
+    The mean around a pixel is the flow itself where that is affine, however much it turns or grows.
+    """
+    window = (EDGE_WINDOW_PX, EDGE_WINDOW_PX)
+    departure = flow.forward - cv2.blur(flow.forward, window)
+    size = np.sqrt(departure[..., 0] ** 2 + departure[..., 1] ** 2)
+    edge = cv2.dilate(size, np.ones(window, np.uint8)) * (EDGE_WEIGHT / CONFIDENCE_SIGMA_PX)
+    certain = np.exp(-0.5 * (flow.error / CONFIDENCE_SIGMA_PX) ** 2) / (1.0 + edge * edge)
+    return np.where(flow.valid, certain, 0.0).astype(np.float32)
 
 
 class FlowMatcher:

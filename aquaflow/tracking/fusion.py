@@ -46,14 +46,16 @@ def fuse(
     camera = pointmap.camera
     rays = camera.unproject(np.stack([columns + 0.5, rows + 0.5], -1))
     matched = pair.matches[rows, columns].astype(np.float64)
-    new = triangulate(rays, matched, T_ba, camera_b, sigma_px)
-    confidence = np.maximum(pair.C[rows, columns].astype(np.float64), 0.05)
-    variance = np.maximum(new.variance / confidence, (MEASUREMENT_FLOOR * new.rho) ** 2)
-
     old_rho, old_variance = pointmap.rho[rows, columns], pointmap.variance[rows, columns]
     fresh = (old_variance >= UNKNOWN_VARIANCE) | (
         old_variance > (FORGETTING_VARIANCE_SIGMAS * old_rho) ** 2
     )
+    expected = np.where(fresh, 0.0, old_rho)
+    new = triangulate(rays, matched, T_ba, camera_b, sigma_px, expected)
+    confidence = np.maximum(pair.C[rows, columns].astype(np.float64), 0.05)
+    floor = MEASUREMENT_FLOOR * np.where(fresh, new.rho, old_rho)
+    variance = np.maximum(new.variance / confidence, floor**2)
+
     distance = np.abs(new.rho - old_rho)
     agrees = fresh | (distance < GATE_SIGMAS * np.sqrt(variance + old_variance))
     merged_variance = variance * old_variance / (variance + old_variance)

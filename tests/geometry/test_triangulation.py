@@ -129,3 +129,30 @@ def test_a_match_off_its_epipolar_line_is_no_measurement(off_px: float, good: bo
 def test_no_matches_give_no_points() -> None:
     points = triangulate(np.zeros((0, 3)), np.zeros((0, 2)), SIDEWAYS, CAMERA, NOISE_PX)
     assert points.good.shape == points.rho.shape == (0,)
+
+
+def test_far_points_come_out_neither_near_nor_far_under_noise() -> None:
+    """A depth of 30 baselines, half a pixel of noise on six of parallax: solved for the depth
+    itself, the mean inverse depth would be 0.7 % too large."""
+    count = 40_000
+    rays = np.broadcast_to([0.1, -0.2, 1.0], (count, 3))
+    T_ba = Sim3(np.eye(3), np.array([-0.14, 0.0, 0.0]))
+    exact = seen(rays, np.full(count, 6.0), T_ba)
+    noisy = exact + np.random.default_rng(0).normal(0.0, NOISE_PX, exact.shape)
+    points = triangulate(rays, noisy, T_ba, CAMERA, NOISE_PX)
+    assert float((6.0 * points.rho).mean()) == pytest.approx(1.0, abs=0.002)
+
+
+def test_weights_come_from_the_expected_depth_and_not_from_the_noise() -> None:
+    """Ahead of a vehicle that swims forward, what noise puts nearer would also look surer."""
+    forward = Sim3(np.eye(3), np.array([0.0, 0.0, -0.4]))
+    rays = np.broadcast_to([0.3, 0.2, 1.0], (2, 3))
+    depth = np.array([2.0, 3.0])
+    pixels = seen(rays, depth, forward)
+    expected = np.full(2, 1.0 / 2.5)
+    variance = triangulate(rays, pixels, forward, CAMERA, NOISE_PX, expected).variance
+    own = triangulate(rays, pixels, forward, CAMERA, NOISE_PX).variance
+    assert variance[0] == pytest.approx(variance[1])
+    assert own[0] != pytest.approx(own[1])
+    unknown = triangulate(rays, pixels, forward, CAMERA, NOISE_PX, np.zeros(2)).variance
+    np.testing.assert_array_equal(unknown, own)

@@ -22,6 +22,7 @@ from aquaflow.prior.flow import (
     BORDER_PX,
     Flow,
     FlowMatcher,
+    confidence,
     normalised_grey,
     pixel_grid,
     sample,
@@ -147,3 +148,31 @@ def test_inside_of_these_tests_agrees_with_the_matcher_border() -> None:
     flow = flow_between(*moved_pair(shift(0.0, 0.0)))
     target = pixel_centres() + flow.forward
     assert not (flow.valid & ~inside(target, BORDER_PX)).any()
+
+
+def perfect(forward: np.ndarray) -> Flow:
+    shape = forward.shape[:2]
+    everywhere = np.ones(shape, dtype=bool)
+    return Flow(forward, -forward, np.zeros(shape, np.float32), everywhere)
+
+
+def test_a_match_is_less_certain_beside_an_edge_of_the_flow() -> None:
+    forward = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+    forward[:, WIDTH // 2 :, 0] = 2.0
+    certain = confidence(perfect(forward))
+    assert (certain[:, : WIDTH // 2 - 8] == 1.0).all()
+    assert (certain[:, WIDTH // 2 - 1 : WIDTH // 2 + 1] < 0.05).all()
+
+
+def test_a_turning_growing_flow_without_edges_is_certain() -> None:
+    grid = pixel_grid(HEIGHT, WIDTH)
+    forward = grid @ np.array([[0.05, -0.3], [0.3, 0.05]], np.float32)
+    certain = confidence(perfect(forward))
+    assert certain[8:-8, 8:-8].min() > 0.99
+
+
+def test_what_is_not_matched_has_no_confidence() -> None:
+    forward = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+    flow = perfect(forward)
+    flow.valid[3:5] = False
+    assert (confidence(flow)[3:5] == 0.0).all()

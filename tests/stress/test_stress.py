@@ -106,7 +106,13 @@ GUARDS: list[tuple[str, list[tuple[object, str, object]]]] = [
     ("one_by_one", [(preparation, "check_picture", always)]),
     ("black", [(flow, "MIN_TEXTURE", -1.0)]),
     ("white", [(flow, "MIN_TEXTURE", -1.0)]),
-    ("pure_rotation", [(initialisation.Initialiser, "_trustworthy", always)]),
+    (
+        "pure_rotation",
+        [
+            (initialisation.Initialiser, "_trustworthy", always),
+            (triangulation, "MIN_PARALLAX_RAD", -1.0),
+        ],
+    ),
     ("snow", [(attachment.Follower, "hidden", lambda *_: False)]),
 ]
 
