@@ -16,8 +16,11 @@ import typer
 from aquaflow import __version__
 from aquaflow.cli_bench import register as register_bench
 from aquaflow.cli_devices import register as register_devices
+from aquaflow.cli_export import register as register_export
 from aquaflow.cli_prior import register as register_prior
 from aquaflow.cli_record import register as register_record
+from aquaflow.cli_service import map_realtime, tell_finished
+from aquaflow.cli_service import register as register_service
 from aquaflow.cli_stress import register as register_stress
 from aquaflow.errors import AquaFlowError
 from aquaflow.terminal import Json, progress_bars
@@ -77,6 +80,9 @@ def map_command(
     ] = None,
     tracking_only: Annotated[bool, typer.Option(help="Trajectory without a map.")] = False,
     overwrite: Annotated[bool, typer.Option(help="Replace the dive in --out.")] = False,
+    realtime: Annotated[
+        bool, typer.Option(help="As the live loop would: newest frame, mapping beside.")
+    ] = False,
     profile: Annotated[bool, typer.Option(help="Write trace.json for Chrome's tracing.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -95,6 +101,9 @@ def map_command(
     from aquaflow.sources import open_recording
 
     calibration = None if calib is None else load_camera(calib)
+    if realtime:
+        tell_finished(map_realtime(source, settings, calibration, out, overwrite, as_json), as_json)
+        return
     recording = open_recording(source, fps=settings.source.fps)
 
     from aquaflow.pipeline import map_recording  # loads torch: after what can be refused without it
@@ -230,6 +239,8 @@ def _print_summary(metrics: dict[str, Any], notes: list[str]) -> None:
 
 register_bench(app)
 register_devices(app)
+register_export(app)
 register_prior(app)
 register_record(app)
+register_service(app)
 register_stress(app)

@@ -7,7 +7,7 @@ import io
 import json
 import logging
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,10 @@ import numpy as np
 import torch
 
 from aquaflow.config import Config, dump_config
+from aquaflow.dive_log import JsonLog
 from aquaflow.errors import InputError
 from aquaflow.export.atomic import atomic_write
+from aquaflow.export.map_file import write_map_file
 from aquaflow.export.ply import Splats, write_ply
 from aquaflow.export.report import ReportData, write_report
 from aquaflow.export.tum import write_tum
@@ -27,6 +29,8 @@ from aquaflow.mapping.gaussians import radiance
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.outcome import HeldOut, WaterSummary, water_of
 
+log = logging.getLogger(__name__)
+
 FRAME_COLUMNS = ("index", "source", "t_s", "class", "sub_map", "keyframe", "quality", "reason")
 MARKER = "frames.csv"
 """The file by which a folder is known to be a dive."""
@@ -35,16 +39,17 @@ TRACE = "trace.json"
 """Every run of every stage, in Chrome's trace event format; written when asked for."""
 
 RESULTS = (
-    *("trajectory.tum", "camera.yaml", "calibration.yaml", "map*.ply", "medium.json"),
+    *("trajectory.tum", "camera.yaml", "calibration.yaml", "map*.ply", "map*.aqf", "medium.json"),
     *("metrics.json", "report.html", "heldout/*.png", "heldout/*.npz", TRACE),
+    "restored/*.png",
 )
 """What a run writes at its end; of an earlier run in the same folder nothing must remain."""
 
+CHECKPOINT = "checkpoint"
+"""Folder of what a live run can be resumed from."""
+
 WORK = "work"
 """Folder of what waits for a long dive's memory; gone when the run has ended."""
-
-LOGGERS = ("aquaflow", "py.warnings")
-"""Loggers whose records go to log.jsonl."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +66,18 @@ class FrameRow:
     """Inlier share of the pose's matches."""
     reason: str = ""
 
+    @staticmethod
+    def of_cells(cells: Sequence[str]) -> FrameRow:
+        """The row that :meth:`cells` wrote."""
+        index, source, t_s, frame_class, sub_map, keyframe, quality, reason = cells
+        return FrameRow(
+            int(index), source, float(t_s), frame_class,
+            int(sub_map) if sub_map else None,
+            int(keyframe) if keyframe else None,
+            float(quality) if quality else None,
+            reason,
+        )  # fmt: skip
+
     def cells(self) -> list[str]:
         quality = "" if self.quality is None else f"{self.quality:.3f}"
         sub_map = "" if self.sub_map is None else str(self.sub_map)
@@ -71,23 +88,55 @@ class FrameRow:
         ]  # fmt: skip
 
 
+def read_rows(path: Path) -> list[FrameRow]:
+    """The rows of frames.csv; a last one that was cut short is left out.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as stream:
+            whole = [cells for cells in csv.reader(stream) if len(cells) == len(FRAME_COLUMNS)]
+        return [FrameRow.of_cells(cells) for cells in whole[1:]]
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read {path}: {error}; start with --new") from error
+
+
+def _or_lost(row: FrameRow, known: Container[int]) -> FrameRow:
+    if row.index in known or row.frame_class == "dropped":
+        return row
+    return FrameRow(row.index, row.source, row.t_s, "dropped", reason="lost in a restart")
+
+
 class DiveFolder:
     """Writes one dive; everything decided is on disk at once, final files are atomic."""
 
-    def __init__(self, path: Path, config: Config, overwrite: bool = False) -> None:
-        """Make the folder.
+    def __init__(
+        self,
+        path: Path,
+        config: Config,
+        overwrite: bool = False,
+        resume: Container[int] | None = None,
+    ) -> None:
+        """Make the folder; or go on with the dive in it, of which these frames are known to
+        ``resume`` from: the later ones were lost.
 
         Raises:
-            InputError: it cannot be made, holds something else, or holds a dive and ``overwrite``
-                is not set.
+            InputError: it cannot be made, holds something else, or holds a dive and neither
+                ``overwrite`` nor ``resume`` is set.
         """
         self.path = path
-        self._claim(overwrite)
-        dump_config(config, path / "config.yaml")
-        self._frames = (path / MARKER).open("w", newline="", encoding="utf-8")
         self._rows: list[FrameRow] = []
-        self._write_rows(self._frames, [FRAME_COLUMNS])
-        self._log = _JsonLog(path / "log.jsonl")
+        self.unwritten = 0
+        """Rows that the disk did not take when they came."""
+        if resume is None:
+            self._claim(overwrite)
+        else:
+            self._rows = [_or_lost(row, resume) for row in read_rows(path / MARKER)]
+        dump_config(config, path / "config.yaml")
+        self._rewrite_frames(self._rows)
+        self._frames = (path / MARKER).open("a", newline="", encoding="utf-8")
+        self._log = JsonLog(path / "log.jsonl", append=resume is not None)
         self._log.attach()
 
     def _claim(self, overwrite: bool) -> None:
@@ -109,18 +158,25 @@ class DiveFolder:
         for pattern in RESULTS:
             for old in self.path.glob(pattern):
                 old.unlink()
-        shutil.rmtree(self.work, ignore_errors=True)  # of a run that was stopped
+        for folder in (WORK, CHECKPOINT):  # of a run that was stopped
+            shutil.rmtree(self.path / folder, ignore_errors=True)
 
     @property
     def work(self) -> Path:
         """Where a run may put what does not fit into memory."""
         return self.path / WORK
 
-    def close(self) -> None:
-        """Release the open files; what was written stays."""
-        shutil.rmtree(self.work, ignore_errors=True)
+    def close(self, keep_work: bool = False) -> None:
+        """Release the open files; what was written stays, with ``keep_work`` for a resumption."""
+        if not keep_work:
+            shutil.rmtree(self.work, ignore_errors=True)
         self._log.close()
         self._frames.close()
+
+    @property
+    def rows(self) -> Sequence[FrameRow]:
+        """What was recorded so far."""
+        return self._rows
 
     # --- while the dive runs ------------------------------------------------------------------
 
@@ -128,8 +184,12 @@ class DiveFolder:
         """Append frames in the order in which their fate was decided."""
         new = list(rows)
         self._rows += new
-        self._write_rows(self._frames, [row.cells() for row in new])
-        self._frames.flush()
+        try:
+            self._write_rows(self._frames, [row.cells() for row in new])
+            self._frames.flush()
+        except OSError as error:  # a full disk ends no dive; all rows are written at its end
+            self.unwritten += len(new)
+            log.warning("frames.csv takes no more for now: %s", error.strerror)
 
     @staticmethod
     def _write_rows(stream: Any, rows: Iterable[Sequence[str]]) -> None:
@@ -140,11 +200,13 @@ class DiveFolder:
     def write_frames(self, sub_maps: Mapping[int, int]) -> None:
         """frames.csv once more: in the order of the recording, each posed frame in the sub-map that
         it ended up in (``sub_maps`` by frame index)."""
-        text = io.StringIO(newline="")
         rows = [replace(row, sub_map=sub_maps.get(row.index, row.sub_map)) for row in self._rows]
-        rows.sort(key=lambda row: row.index)
-        self._write_rows(text, [FRAME_COLUMNS, *(row.cells() for row in rows)])
         self._frames.close()
+        self._rewrite_frames(sorted(rows, key=lambda row: row.index))
+
+    def _rewrite_frames(self, rows: Iterable[FrameRow]) -> None:
+        text = io.StringIO(newline="")
+        self._write_rows(text, [FRAME_COLUMNS, *(row.cells() for row in rows)])
         with atomic_write(self.path / MARKER) as stream:
             stream.write(text.getvalue().encode("utf-8"))
 
@@ -168,8 +230,10 @@ class DiveFolder:
             save_camera(calibration, self.path / "calibration.yaml")
 
     def write_map(self, mapper: Mapper, water: WaterSummary | None, suffix: str = "") -> None:
-        """map.ply as seen through water at the median range, map_clear.ply without water; where
-        there is a decoder, each Gaussian as the mapped view nearest to it sees it."""
+        """map.aqf, the exact map; map.ply as seen through water at the median range, map_clear.ply
+        without water, where there is a decoder each Gaussian as the mapped view nearest to it
+        sees it."""
+        write_map_file(self.path / f"map{suffix}.aqf", mapper)
         with torch.no_grad():
             plain = mapper.scene.baked(mapper.views)
             clear = radiance(plain["raw_colours"])
@@ -200,6 +264,13 @@ class DiveFolder:
                 "attenuation_relative_sigma": water.beta_a_sigma,
                 "identifiable": water.beta_a_sigma is not None,
                 "shading_log_gain": water.shading,
+                "backscatter_log_gain": water.unevenness,
+                "log_gain_terms": ["x", "y", "x^2", "x y", "y^2"],
+                "units": {
+                    "attenuation, b, d": "1/map unit",
+                    "B_inf, B_res": "share of the camera's full scale",
+                    "log gains": "natural logarithm; x and y run from -1 to 1 over the picture",
+                },
                 "range_p5": water.range_p5,
                 "range_p95": water.range_p95,
                 "map_ply_reference_range": water.range_median,
@@ -207,7 +278,7 @@ class DiveFolder:
         self.write_json("medium.json", data)
 
     def write_held_out(self, examples: list[HeldOut]) -> None:
-        """heldout/: what the camera saw, what the map shows, its range, the map without water."""
+        """heldout/: what the camera saw, also without its water, what the map shows, its range."""
         import cv2
 
         folder = self.path / "heldout"
@@ -243,38 +314,3 @@ def _splats(
         torch.sigmoid(parameters["opacity_logits"][:, 0]).numpy(),
         colours.numpy(),
     )
-
-
-class _JsonLog(logging.Handler):
-    """One JSON object a line, flushed at once."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(logging.INFO)
-        self._stream = path.open("w", encoding="utf-8")
-        self._levels_before: dict[str, int] = {}
-
-    def attach(self) -> None:
-        """Receive what AquaFlow logs from here on, until closed."""
-        for name in LOGGERS:
-            logger = logging.getLogger(name)
-            self._levels_before[name] = logger.level
-            logger.setLevel(logging.INFO)
-            logger.addHandler(self)
-
-    def emit(self, record: logging.LogRecord) -> None:
-        entry = {
-            "t": round(record.created, 3),
-            "level": record.levelname.lower(),
-            "logger": record.name,
-            "message": record.getMessage(),
-        }
-        self._stream.write(json.dumps(entry) + "\n")
-        self._stream.flush()
-
-    def close(self) -> None:
-        for name, level in self._levels_before.items():
-            logger = logging.getLogger(name)
-            logger.removeHandler(self)
-            logger.setLevel(level)
-        self._stream.close()
-        super().close()

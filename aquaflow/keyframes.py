@@ -178,6 +178,33 @@ class KeyframeStore:
         """Size of the encodings and pointmaps in memory; asks the prior."""
         return self._contents.resident_bytes
 
+    def save(self) -> list[Path]:
+        """Write what is only in memory; the files that are new."""
+        return self._contents.save()
+
+    def adopt(
+        self,
+        frame_index: int,
+        t_ns: int,
+        T_wc: Sim3,
+        sub_map: int,
+        cameras: tuple[CameraModel, CameraModel],
+    ) -> Keyframe:
+        """Append a keyframe that an earlier run saved; ``cameras`` of encoding and pointmap.
+
+        Raises:
+            InputError: its file is not there.
+        """
+        number = len(self.keyframes)
+        self._contents.adopt(number)
+        self._cameras.append(cameras)
+        self.keyframes.append(Keyframe(number, frame_index, t_ns, T_wc, sub_map, self))
+        return self.keyframes[number]
+
+    def cameras_of(self, number: int) -> tuple[CameraModel, CameraModel]:
+        """Of encoding and pointmap."""
+        return self._cameras[number]
+
     def close(self, keep: bool = False) -> None:
         """Remove the files; or, to ``keep`` them, write what is only in memory too."""
         self._contents.close(keep)

@@ -15,6 +15,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.image_metrics import lpips, lpips_network, psnr, ssim
 from aquaflow.mapping.image_formation import Water
 from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.restoration import common_exposure, restored_picture, to_bytes
 from aquaflow.mapping.views import View
 from aquaflow.messages import Dropped
 from aquaflow.slam import Slam
@@ -22,8 +23,8 @@ from aquaflow.tracking.frames import FrameClass, Tracked
 
 PROTOCOL = {
     "held_out": "i % n == 0 and i != 0 of the used frames: tracked, never mapped; pose refined "
-    "photometrically against the frozen map; exposure, where views differ in it, that between the "
-    "mapped frames before and after",
+    "photometrically against the frozen map; exposure and sunlight, where views differ in them, "
+    "those between the mapped frames before and after",
     "resolution": "the width that was mapped, undistorted",
     "ssim": "11x11 Gaussian window, sigma 1.5 px, zero-padded, mean over channels",
     "psnr": "mean over held-out frames of the PSNR of each",
@@ -31,8 +32,6 @@ PROTOCOL = {
 }
 
 RANGE_PERCENTILES = (5.0, 95.0)
-BRIGHT_QUANTILE, BRIGHT_LEVEL = 0.995, 0.95
-"""This share of the restored values is shown no brighter than this level."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +65,8 @@ class WaterSummary:
     """Relative standard deviation of beta_a; None if the ranges seen never allowed a fit."""
     shading: list[float]
     """Log-gain of the camera over the picture: x, y, x^2, x y, y^2 with x, y from -1 to 1."""
+    unevenness: list[float]
+    """Log-gain of the backscatter over the picture, in the same terms."""
 
 
 def largest_sub_map(results: list[Tracked]) -> int:
@@ -90,27 +91,19 @@ def examine_held_out(slam: Slam, sub_map: int) -> list[HeldOut]:
     views = sorted(slam.held_out.get(sub_map, []), key=lambda view: view.frame_index)
     for view in views:
         mapper.register(view)
-    exposure = restored_exposure(mapper, views)
+    exposure = common_exposure(
+        restored_picture(mapper.scene, view, mapper.show(view)) for view in views
+    )
     return [_examine(mapper, view, exposure) for view in views]
-
-
-def restored_exposure(mapper: Mapper, views: list[View]) -> float:
-    """One gain for all restored pictures, so that the bright end of the dive is not cut off.
-
-    Without water a scene may be brighter than the camera's white; 1 where it is not.
-    """
-    if not views:
-        return 1.0
-    pictures = [mapper.show(view).radiance.numpy() for view in views]
-    brightest = max(float(np.quantile(picture, BRIGHT_QUANTILE)) for picture in pictures)
-    return min(1.0, BRIGHT_LEVEL / max(brightest, 1e-6))
 
 
 def _examine(mapper: Mapper, view: View, exposure: float) -> HeldOut:
     shown = mapper.show(view)
     real = view.target().numpy()
     rendered = shown.image.clamp(0.0, 1.0).numpy()
-    restored = to_bytes(exposure * shown.radiance.numpy()) if mapper.medium.active else None
+    restored = None
+    if mapper.medium.active:
+        restored = to_bytes(exposure * restored_picture(mapper.scene, view, shown).numpy())
     perceptual, _ = lpips(rendered, real)
     return HeldOut(
         view.frame_index,
@@ -122,11 +115,6 @@ def _examine(mapper: Mapper, view: View, exposure: float) -> HeldOut:
         perceptual,
         torch.where(shown.alpha > 0.5, shown.z, 0.0).to(torch.float32).numpy(),
     )
-
-
-def to_bytes(image: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:
-    """[H, W, 3] in [0, 1] as 8-bit."""
-    return np.asarray(np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
 @torch.no_grad()
@@ -152,6 +140,7 @@ def summarise_water(mapper: Mapper) -> WaterSummary | None:
         float(high),
         mapper.scene.beta_a_sigma,
         mapper.scene.shading.tolist(),
+        mapper.medium.unevenness.tolist(),
     )
 
 

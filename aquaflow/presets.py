@@ -22,7 +22,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     "accurate": {
         "mapping": {
             "max_gaussians": 300_000,
-            "insertion": {"density": 0.7},
             "optimiser": {
                 "steps_keyframe": 30, "steps_mapping": 30, "steps_common": 10,
                 "refine_steps": 4000,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from array import array
 from collections import defaultdict
 from typing import Any, NamedTuple, TypedDict
 
@@ -44,7 +45,8 @@ class Profiler:
     def __init__(self, trace: bool = False) -> None:
         self.top_level_s = 0.0
         """Time inside stages, what nests counted once; of the thread that made the profiler."""
-        self._durations: dict[str, list[float]] = defaultdict(list)
+        self._durations: dict[str, array[float]] = defaultdict(lambda: array("d"))
+        self._totals_ms: dict[str, float] = defaultdict(float)
         self._events: list[_Event] | None = [] if trace else None
         self._nesting = _Nesting()
         self._owner = threading.get_ident()
@@ -65,6 +67,10 @@ class Profiler:
             )
             for name, values in self._durations.items()
         }
+
+    def totals_ms(self) -> dict[str, float]:
+        """Milliseconds in each stage so far; cheap, and for any thread to ask."""
+        return dict(self._totals_ms)
 
     def chrome_trace(self) -> dict[str, Any]:
         """The runs in Chrome's trace event format; times in microseconds since the start.
@@ -96,7 +102,9 @@ class Profiler:
     def _leave(self, name: str, started_s: float, depth: int) -> None:
         ended_s = time.perf_counter()
         self._nesting.depth = depth
-        self._durations[name].append((ended_s - started_s) * 1e3)
+        took_ms = (ended_s - started_s) * 1e3
+        self._durations[name].append(took_ms)
+        self._totals_ms[name] += took_ms
         thread = threading.get_ident()
         if depth == 0 and thread == self._owner:
             self.top_level_s += ended_s - started_s
@@ -132,6 +140,6 @@ def pace(
         round(float(np.percentile(frame_ms, q)), 3) if frame_ms else None for q in (50, 95)
     )
     return {
-        "ms_per_frame": {"p50": half, "p95": most, "total": round(1e3 * wall_s / count, 3)},
+        "ms_per_frame": {"p50": half, "p95": most, "total": round(1e3 * wall_s / max(count, 1), 3)},
         "time_to_first_pose_s": None if first_pose_s is None else round(first_pose_s, 3),
     }

@@ -11,12 +11,12 @@ from pathlib import Path
 from aquaflow.config import Config
 from aquaflow.errors import ConfigError
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes import KeyframeStore, Pointmap
-from aquaflow.mapping.following import move_views
+from aquaflow.keyframes import KeyframeStore
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.views import View, ViewStore
+from aquaflow.mapping.views import View
+from aquaflow.maps import Growth, Insertion, Maps, MapWork
 from aquaflow.messages import Frame
-from aquaflow.prior.classical import ClassicalPrior
+from aquaflow.prior.choice import make_prior
 from aquaflow.profiler import Profiler
 from aquaflow.render import select_renderer
 from aquaflow.tracking.frames import FrameClass, Tracked
@@ -24,9 +24,6 @@ from aquaflow.tracking.gate import FrameGate, Verdict
 from aquaflow.tracking.keyframe_graph import KeyframeGraph
 from aquaflow.tracking.places import Places
 from aquaflow.tracking.tracker import Tracker
-
-MIN_VIEWS = 3
-"""Fewer posed frames are not a map, and not worth refining."""
 
 
 class Slam:
@@ -38,11 +35,12 @@ class Slam:
         profiler: Profiler | None = None,
         work: Path | None = None,
         live: bool = False,
+        maps: MapWork | None = None,
     ) -> None:
         """What does not fit into memory waits in the folder ``work``, if there is one.
 
         A ``live`` run takes over an optimised keyframe graph as soon as it is there; a replay waits
-        for it at the next keyframe, and so repeats bit for bit.
+        for it at the next keyframe, and so repeats bit for bit. ``maps`` may do their work beside.
 
         Raises:
             ConfigError: the prior cannot give what the config asks tracking for.
@@ -54,20 +52,19 @@ class Slam:
             )
         self.config = config
         self.profiler = profiler or Profiler()
-        self.prior = ClassicalPrior()
+        self.prior = make_prior(config.prior)
+        if live:
+            self.prior.warm_up()
         self.keyframes = KeyframeStore(work, self.prior)
         places = Places(self.keyframes, config.tracking)
         self.gate = FrameGate(config.tracking.gate)
         self.tracker = Tracker(self.prior, self.keyframes, config.tracking, places)
         self.graph = KeyframeGraph(self.keyframes, places, config.tracking)
         self.renderer = select_renderer(config.mapping.renderer, config.threads or os.cpu_count())
-        self.mappers: dict[int, Mapper] = {}
-        self.held_out: dict[int, list[View]] = {}
-        """Per sub-map, the views that were tracked but never mapped."""
+        self.maps: MapWork = maps or Maps(config, self.renderer, self.profiler, work)
         self.skipped: Counter[str] = Counter()
         """Frames that the gate kept from tracking, by its reason's kind."""
         self._live = live
-        self._views = ViewStore(work)
         self._sequence: dict[int, int] = {}
         self._T_kf: dict[int, Sim3] = {}
         """By frame index: the pose against the frame's keyframe, which later corrections leave."""
@@ -104,18 +101,42 @@ class Slam:
         placed = self._place_all(decided)
         while self.graph.optimising:
             self._correct(wait=True)
-        self._retire_keyframes()
-        with self.profiler.stage("refine"):
-            for mapper in self.mappers.values():
-                if len(mapper.views) >= MIN_VIEWS:
-                    mapper.refine(progress)
+        for insertion in self._retired_keyframes():
+            self.maps.insert(insertion)
+        self.maps.refine(progress)
         return self.settled(placed)
 
-    def close(self) -> None:
-        """End the work beside tracking, and remove what waits in the work folder."""
+    def close(self, keep: bool = False) -> None:
+        """End the work beside tracking; remove what waits in the work folder, or ``keep`` it."""
         self.graph.close()
-        self.keyframes.close()
-        self._views.close()
+        self.keyframes.close(keep)
+        self.maps.close(keep)
+
+    @property
+    def mappers(self) -> dict[int, Mapper]:
+        """By sub-map; complete after ``finish``."""
+        return self.maps.mappers
+
+    @property
+    def held_out(self) -> dict[int, list[View]]:
+        """Per sub-map, the views that were tracked but never mapped."""
+        return self.maps.held_out
+
+    # --- an earlier run -----------------------------------------------------------------------
+
+    def anchor(self, index: int) -> Sim3 | None:
+        """A frame's pose against its keyframe, T_kf; None without one."""
+        return self._T_kf.get(index)
+
+    @property
+    def used(self) -> int:
+        """Frames that passed the gate so far."""
+        return len(self._sequence)
+
+    def resume(self, T_kf: dict[int, Sim3], used: int) -> None:
+        """Take over the anchors of an earlier run's frames; ``used`` of them passed the gate."""
+        self._T_kf = T_kf
+        self._sequence = {-1 - i: i for i in range(used)}
 
     # --- poses --------------------------------------------------------------------------------
 
@@ -154,19 +175,11 @@ class Slam:
         return replace(skipped, pointmap=None, reason=verdict.reason, link=None)
 
     def _correct(self, wait: bool) -> None:
-        """Gaussians and views go where their keyframes went; merged sub-maps become one map."""
+        """The map follows its keyframes."""
         with self.profiler.stage("correct"):
             correction = self.graph.correction(wait)
-        if not correction.moves:
-            return
-        for mapper in self.mappers.values():
-            mapper.move(correction.moves)
-        for views in self.held_out.values():
-            move_views(views, correction.moves)
-        for source, target in correction.merged.items():
-            if source in self.mappers:
-                self._mapper(target).absorb(self.mappers.pop(source))
-            self.held_out.setdefault(target, []).extend(self.held_out.pop(source, []))
+        if correction.moves:
+            self.maps.correct(correction.moves, correction.merged)
 
     def settled(self, results: Iterable[Tracked]) -> list[Tracked]:
         """The frames with pose and sub-map as they are now, after all corrections of keyframes."""
@@ -184,45 +197,27 @@ class Slam:
     def _map(self, tracked: Tracked) -> None:
         view = self._view(tracked)
         if self.is_held_out(tracked.frame):
-            self.held_out.setdefault(tracked.sub_map, []).append(view)
+            self.maps.hold_out(view, tracked.sub_map)
             return
-        with self.profiler.stage("view"):  # now and then a view makes the water be fitted again
-            mapper = self._mapper(tracked.sub_map)
-            mapper.add_view(view)
-
-        # Sec. 3.3.3: medium-guided insertion, from this frame and from the keyframe it retires,
-        # whose pointmap has been fused over its whole life.
+        retired: list[Insertion] = []
         if tracked.frame_class is FrameClass.KEYFRAME:
-            self._retire_keyframes()
+            retired = self._retired_keyframes()
             self._keyframe_views = {view.keyframe: view}
-        if tracked.pointmap is not None:
-            self._insert(mapper, view, tracked.pointmap)
-
-        # Sec. 3.4: joint optimisation of Gaussians and water.
-        with self.profiler.stage("optimise"):
-            mapper.optimise(self._steps(tracked.frame_class))
+        steps = self._steps(tracked.frame_class)
+        self.maps.grow(Growth(view, tracked.sub_map, steps, tracked.pointmap, tuple(retired)))
 
     def is_held_out(self, frame: Frame) -> bool:
         """i % n == 0 and i != 0, i counting the frames that were used (DESIGN section 4)."""
         every, i = self.config.mapping.hold_out_every, self._sequence[frame.index]
         return every > 0 and i != 0 and i % every == 0
 
-    def _retire_keyframes(self) -> None:
-        """Insert once more from the keyframe in use, with its pointmap as fused until now."""
-        for number, view in self._keyframe_views.items():
-            keyframe = self.keyframes[number]
-            self._insert(self._mapper(keyframe.sub_map), view, keyframe.pointmap)
-        self._keyframe_views.clear()
-
-    def _insert(self, mapper: Mapper, view: View, pointmap: Pointmap) -> None:
-        with self.profiler.stage("insert"):
-            mapper.insert(view, pointmap)
-
-    def _mapper(self, sub_map: int) -> Mapper:
-        if sub_map not in self.mappers:
-            seed = self.config.seed + sub_map
-            self.mappers[sub_map] = Mapper(self.config.mapping, self.renderer, seed)
-        return self.mappers[sub_map]
+    def _retired_keyframes(self) -> list[Insertion]:
+        """The keyframe in use, with its pointmap as fused until now; from here on it is not."""
+        retired, self._keyframe_views = self._keyframe_views, {}
+        return [
+            Insertion(view, self.keyframes[number].sub_map, self.keyframes[number].pointmap)
+            for number, view in retired.items()
+        ]
 
     def _steps(self, frame_class: FrameClass) -> int:
         optimiser = self.config.mapping.optimiser
@@ -235,7 +230,7 @@ class Slam:
         assert tracked.T_wc is not None
         assert tracked.keyframe is not None
         camera = self.tracker.camera or tracked.frame.camera
-        view = View(
+        return View(
             tracked.frame.index,
             tracked.frame.image,
             camera,
@@ -244,4 +239,3 @@ class Slam:
             robust=tracked.frame_class is FrameClass.COMMON,
             mask=tracked.frame.mask,
         )
-        return self._views.keep(view)

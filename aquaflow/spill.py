@@ -101,6 +101,25 @@ class Spill(Generic[T]):
         things = self._resident.values()
         return sum(array.nbytes for thing in things for array in self._pack(thing).values())
 
+    def save(self) -> list[Path]:
+        """Write what is only in memory, where it stays too; the files that are new."""
+        if self._folder is None:
+            return []
+        saved = [number for number in sorted(self._unsaved) if self._save(number, self._folder)]
+        if self._pinned is not None:
+            self._unsaved.add(self._pinned)  # it may be changed in place from here on
+        return [self._file(number) for number in saved]
+
+    def adopt(self, number: int) -> None:
+        """A thing that an earlier run saved in the same folder; read back when it is asked for.
+
+        Raises:
+            InputError: its file is not there.
+        """
+        if not self._file(number).is_file():
+            raise InputError(f"{self._file(number)} is gone; start with --new")
+        self._saved.add(number)
+
     def close(self, keep: bool = False) -> None:
         """Remove the files; or, to ``keep`` them, write what is only in memory too."""
         if self._folder is None:

@@ -12,6 +12,7 @@ from aquaflow.config.telemetry import AnyDevice, TelemetryConfig
 from aquaflow.fusion.clock import ClockReport
 from aquaflow.messages import TelemetrySample
 from aquaflow.sources import RawTap
+from aquaflow.vehicle_words import Hears, Word
 from drivers.latest import LatestQueue
 from drivers.link import LinkCounters
 from drivers.mounting import BodyFrame, Mounting
@@ -110,6 +111,12 @@ class LinkTelemetry:
             if decoder.clock is not None
         }
         return {name: report for name, report in reports.items() if report is not None}
+
+    def tell(self, word: Word) -> bool:
+        """Tell every device that understands it; see :class:`aquaflow.vehicle_words.Hears`."""
+        hearing = [decoder for decoder in self.decoders.values() if isinstance(decoder, Hears)]
+        told = [decoder.tell(word) for decoder in hearing]
+        return any(told)
 
     def close(self) -> None:
         """Stop all links; samples that wait can still be fetched. May be called again."""

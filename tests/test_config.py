@@ -52,7 +52,9 @@ def test_the_config_has_the_stages_that_these_tests_walk() -> None:
     [
         ("threads", 0),
         ("seed", "many"),
-        ("prior", "clairvoyant"),
+        ("prior.kind", "clairvoyant"),
+        ("prior", {"kind": "folder"}),
+        ("prior.threads", 0),
         ("source.every", 0),
         ("source.start", -1),
         ("source.width", 63),

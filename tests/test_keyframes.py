@@ -16,7 +16,8 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
 from aquaflow.messages import Frame
-from aquaflow.prior.classical import ClassicalEncoding, ClassicalPrior
+from aquaflow.prior.classical import ClassicalPrior
+from aquaflow.prior.flow_pair import FlowEncoding
 from aquaflow.tracking.tracker import Tracker
 
 CAMERA = CameraModel(96, 72, 80.0, 80.0, 48.0, 36.0)
@@ -53,7 +54,7 @@ def test_encoding_and_pointmap_come_back_bit_for_bit(tmp_path: Path) -> None:
     assert len(list((tmp_path / "keyframes").iterdir())) == 4  # one used last, one held
     for number, keyframe in enumerate(store.keyframes):
         wanted, got = PRIOR.encode(picture(number), GUESS), keyframe.encoding
-        assert isinstance(got, ClassicalEncoding)
+        assert isinstance(got, FlowEncoding)
         np.testing.assert_array_equal(got.grey, wanted.grey)
         np.testing.assert_array_equal(got.texture, wanted.texture)
         np.testing.assert_array_equal(got.interesting, wanted.interesting)
@@ -157,7 +158,7 @@ def test_memory_after_2000_keyframes_is_that_after_500(tmp_path: Path) -> None:
     encoding = PRIOR.encode(picture(0), CAMERA)
     tracemalloc.start()
     for number in range(2000):
-        copied = ClassicalEncoding(CAMERA, encoding.grey.copy(), encoding.texture.copy())
+        copied = FlowEncoding(CAMERA, encoding.grey.copy(), encoding.texture.copy())
         store.add(number, number, copied, Sim3.identity(), Pointmap.unknown(CAMERA), 0)
         _ = store[max(number - 100, 0)].pointmap
         if number + 1 in (500, 2000):

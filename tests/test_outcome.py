@@ -17,7 +17,6 @@ from aquaflow.outcome import (
     largest_sub_map,
     metrics,
     refined_poses,
-    to_bytes,
     water_of,
 )
 from aquaflow.slam import Slam
@@ -98,11 +97,6 @@ def test_a_dive_without_a_map_has_nothing_to_examine(slam: Slam) -> None:
     assert examine_held_out(slam, 0) == []
 
 
-def test_bytes_are_rounded_and_kept_in_range() -> None:
-    image = np.array([[[-1.0, 0.5, 2.0]]])
-    assert to_bytes(image).tolist() == [[[0, 128, 255]]]
-
-
 def test_a_summary_becomes_the_water_it_describes() -> None:
     summary = WaterSummary(
         beta_a=[0.4, 0.2, 0.1],
@@ -115,6 +109,7 @@ def test_a_summary_becomes_the_water_it_describes() -> None:
         range_p95=2.0,
         beta_a_sigma=None,
         shading=[0.0] * 5,
+        unevenness=[0.0] * 5,
     )
     water = water_of(summary)
     z = torch.tensor([1.0])

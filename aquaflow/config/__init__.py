@@ -6,7 +6,7 @@ Every default says where it comes from: ``paper``, a peer (field_notes.md), or a
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import yaml
 from pydantic import Field
@@ -18,8 +18,11 @@ from aquaflow.config.mapping import (
     MappingConfig,
     MediumConfig,
     OptimiserConfig,
+    SunlightConfig,
     VoxelConfig,
+    WaterPriorsConfig,
 )
+from aquaflow.config.prior import PriorConfig
 from aquaflow.config.source import SourceConfig
 from aquaflow.config.stage import Stage, validated
 from aquaflow.config.tracking import (
@@ -43,11 +46,14 @@ __all__ = [
     "MappingConfig",
     "MediumConfig",
     "OptimiserConfig",
+    "PriorConfig",
     "RetrievalConfig",
     "SourceConfig",
+    "SunlightConfig",
     "TrackingConfig",
     "VerificationConfig",
     "VoxelConfig",
+    "WaterPriorsConfig",
     "dump_config",
     "load_config",
     "parse_config",
@@ -60,7 +66,7 @@ class Config(Stage):
 
     seed: int = 0
     threads: int | None = Field(None, ge=1, description="None: every core")
-    prior: Literal["classical"] = "classical"
+    prior: PriorConfig = PriorConfig()
     source: SourceConfig = SourceConfig()
     tracking: TrackingConfig = TrackingConfig()
     mapping: MappingConfig = MappingConfig()

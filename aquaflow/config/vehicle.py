@@ -9,8 +9,10 @@ from pydantic import Field
 from aquaflow.config import Config, read_yaml
 from aquaflow.config.cameras import CameraConfig
 from aquaflow.config.recording import RecordingConfig
+from aquaflow.config.service import ServiceConfig
 from aquaflow.config.stage import validated
 from aquaflow.config.telemetry import TelemetryConfig
+from aquaflow.config.viewer import ViewerConfig
 
 
 class VehicleConfig(Config):
@@ -19,6 +21,8 @@ class VehicleConfig(Config):
     cameras: dict[str, CameraConfig] = Field({}, description="by the name that logs call them")
     telemetry: TelemetryConfig = TelemetryConfig()
     recording: RecordingConfig = RecordingConfig()
+    service: ServiceConfig = ServiceConfig()
+    viewer: ViewerConfig = ViewerConfig()
 
 
 def load_vehicle(path: Path) -> VehicleConfig:

@@ -55,11 +55,14 @@ class Water:
         self,
         image: Tensor,  # [H, W, 3]
         z: Tensor,  # [H, W] range
+        uneven: Tensor | None = None,  # [H, W] gain of the backscatter
     ) -> tuple[Tensor, Tensor]:
         """J-hat [H, W, 3] of the paper, and where it can be believed [H, W]."""
-        transmission = self.transmission(z)
+        transmission, veil = self.transmission(z), self.backscatter(z)
+        if uneven is not None:
+            veil = veil * uneven[..., None]
         recoverable = (transmission > MIN_TRANSMISSION).all(dim=-1)
-        restored = (image - self.backscatter(z)) / transmission.clamp_min(MIN_TRANSMISSION)
+        restored = (image - veil) / transmission.clamp_min(MIN_TRANSMISSION)
         return restored.clamp(0.0, MAX_RESTORED), recoverable
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from aquaflow.config import InsertionConfig
 from aquaflow.keyframes import Pointmap
-from aquaflow.mapping.gaussians import raw_colour
+from aquaflow.mapping.gaussians import GaussianMap, raw_colour
 from aquaflow.mapping.views import View
 
 LOG_GAIN = 3.0
@@ -71,6 +71,18 @@ def thin(
         return rows, columns
     chosen = torch.randperm(len(rows), generator=generator)[: max(room, 0)].sort().values
     return rows[chosen], columns[chosen]
+
+
+def worth_keeping(gaussians: GaussianMap, count: int) -> Tensor:
+    """[N] bool: the ``count`` Gaussians without which most of the pictures would be missing.
+
+    That is opacity times cross-section, of the two longer axes and in units of the map.
+    """
+    scales = gaussians.scales
+    worth = gaussians.opacities * scales.prod(dim=-1) / scales.amin(dim=-1)
+    keep = torch.ones(len(worth), dtype=torch.bool)
+    keep[torch.argsort(worth, stable=True)[: len(worth) - count]] = False
+    return keep
 
 
 def new_gaussians(

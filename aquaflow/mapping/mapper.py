@@ -15,7 +15,6 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
 from aquaflow.mapping.attention import look, tiles_to_draw
 from aquaflow.mapping.decoding import DECODED
-from aquaflow.mapping.exposure import log_gain_at
 from aquaflow.mapping.following import move_gaussians, move_views
 from aquaflow.mapping.gaussians import GaussianMap
 from aquaflow.mapping.insertion import (
@@ -25,14 +24,16 @@ from aquaflow.mapping.insertion import (
     range_of,
     select,
     thin,
+    worth_keeping,
 )
 from aquaflow.mapping.medium import Medium
 from aquaflow.mapping.neural import NeuralGaussians
 from aquaflow.mapping.objective import Objective
+from aquaflow.mapping.registration import register
 from aquaflow.mapping.rendering import Shown
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.schedule import sampled_views, shuffled_views
-from aquaflow.mapping.views import View, refine_pose
+from aquaflow.mapping.views import View, in_time, refine_pose
 from aquaflow.render.adam import SelectiveAdam
 from aquaflow.render.contract import Renderer
 
@@ -50,7 +51,7 @@ class Mapper:
     def __init__(self, config: MappingConfig, renderer: Renderer, seed: int) -> None:
         self.config, self.renderer = config, renderer
         self._random = torch.Generator().manual_seed(seed)
-        self.scene = Scene(config.medium, renderer, self._random)
+        self.scene = Scene(config.medium, renderer, self._random, config.sunlight)
         self.views: list[View] = []
         self.steps = 0
         self.undone = 0
@@ -75,10 +76,11 @@ class Mapper:
     def add_view(self, view: View) -> None:
         """Let later optimisation steps use ``view``."""
         if self.views:
-            view.log_gain = self.views[-1].log_gain
+            view.log_gain, view.light = self.views[-1].log_gain, self.views[-1].light
         self.views.append(view)
         if len(self.views) >= self._next_water_fit:
             self.fit_water()
+            self.scene.sunlight.judge(in_time(self.views))
             self._next_water_fit *= 2
 
     @torch.no_grad()
@@ -101,8 +103,10 @@ class Mapper:
         if view.mask is not None:
             allowed &= torch.from_numpy(view.mask)
         rows, columns = select(P, allowed, self.config.insertion, self._random)
-        room = self.config.max_gaussians - len(self.gaussians)
-        rows, columns = thin(rows, columns, room, self._random)
+        if len(rows) > self.config.max_gaussians - len(self.gaussians):
+            bare = solid[rows, columns] < self.config.insertion.covered_alpha
+            rows, columns = rows[bare], columns[bare]
+        rows, columns = thin(rows, columns, self._room_for(len(rows)), self._random)
         confidence = confidence_of(pointmap)
         view.inverse_range = torch.where(known, 1.0 / own_range.clamp_min(1e-6), 0.0)
         view.range_confidence = confidence
@@ -116,11 +120,20 @@ class Mapper:
         self._optimiser.bind(self._parameters)
         return len(rows)
 
+    def _room_for(self, wanted: int) -> int:
+        """How many Gaussians may come: at the hard cap, those least worth make room for them."""
+        room = self.config.max_gaussians - len(self.gaussians)
+        given = min(wanted - room, int(self.config.insertion.recycle * len(self.gaussians)))
+        if given <= 0:
+            return room
+        self._keep(worth_keeping(self.gaussians, len(self.gaussians) - given))
+        return room + given
+
     def fit_water(self) -> None:
         """Estimate the water from views spread over the dive so far."""
-        count = self.config.medium.fit_views
-        chosen = np.linspace(0, len(self.views) - 1, min(count, len(self.views))).astype(int)
-        estimate = self.scene.fit_water([self.views[i] for i in chosen], self._random, self.views)
+        count, views = self.config.medium.fit_views, in_time(self.views)
+        chosen = np.linspace(0, len(views) - 1, min(count, len(views))).astype(int)
+        estimate = self.scene.fit_water([views[i] for i in chosen], self._random, views)
         if estimate is not None:
             log.info(
                 "water fitted: %s, beta_a %s per map unit (relative sigma %s)",
@@ -152,7 +165,7 @@ class Mapper:
         if self.neural is not None and centres is not None:
             self.neural.insert(centres, count)
         self._optimiser.bind(self._parameters)
-        self.views = sorted([*self.views, *other.views], key=lambda view: view.frame_index)
+        self.views = in_time([*self.views, *other.views])
         self.steps, self.undone = self.steps + other.steps, self.undone + other.undone
 
     # --- optimising ---------------------------------------------------------------------------
@@ -177,6 +190,8 @@ class Mapper:
             for step, view in enumerate(order):
                 if limit is not None and time.monotonic() - started > limit:
                     break
+                if step % len(self.views) == 0:  # light shows once the map has lost its errors
+                    self.scene.sunlight.judge(in_time(self.views))
                 factor = self.config.optimiser.means_final ** (step / max(steps - 1, 1))
                 self._optimiser.learning_rates["means"] = self.config.optimiser.means * factor
                 if self.neural is not None:
@@ -265,18 +280,8 @@ class Mapper:
         return self.scene.show(view)
 
     def register(self, view: View) -> None:
-        """Refine the pose of a held-out view photometrically against the frozen map.
-
-        Its exposure is that of its neighbours in time, as the peers do it (field_notes.md 2.7).
-        """
-        config = self.config.optimiser
-        if self.views:
-            view.log_gain = log_gain_at(view.frame_index, self.views)
-        for _ in range(config.heldout_steps if len(self.gaussians) else 0):
-            viewmat = view.viewmat().requires_grad_()
-            loss = self._objective.photometric(view, self.scene.draw(view, viewmat=viewmat))
-            (gradient,) = torch.autograd.grad(loss, viewmat)
-            refine_pose(view, gradient, config.heldout_rate)
+        """Refine the pose of a held-out view photometrically against the frozen map."""
+        register(view, self.scene, in_time(self.views), self._objective, self.config.optimiser)
 
     @property
     def neural(self) -> NeuralGaussians | None:

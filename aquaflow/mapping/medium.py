@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from aquaflow.config import MediumConfig
 from aquaflow.mapping.encoding import BANDS, sinusoidal_encoding
 from aquaflow.mapping.image_formation import Water
+from aquaflow.mapping.shading import TERMS
 
 MIN_RATE = 1e-4
 """1 / map unit; a rate of zero has no finite parameter."""
@@ -43,6 +44,9 @@ class Medium(nn.Module):
         self.d_raw = nn.Parameter(
             torch.full((3,), _inverse_softplus(config.initial_residual_decay))
         )
+        self.unevenness: Tensor
+        self.register_buffer("unevenness", torch.zeros(TERMS))
+        """Coefficients of the backscatter's log-gain over the picture."""
         self.active = config.enabled
 
     def forward(
@@ -61,12 +65,19 @@ class Medium(nn.Module):
         )
 
     @torch.no_grad()
-    def set_water(self, beta_a: Tensor, B_inf: Tensor, b: Tensor) -> None:
-        """Start from an estimate (each [3]); the residual term is left as it is."""
+    def set_water(
+        self,
+        beta_a: Tensor,  # [3]
+        B_inf: Tensor,  # [3]
+        b: Tensor,  # [3]
+        unevenness: Tensor | None = None,  # [5]
+    ) -> None:
+        """Start from an estimate; the residual term is left as it is."""
         self.output.weight.zero_()
         self.output.bias.copy_(inverse_softplus(beta_a))
         self.B_inf_logit.copy_(torch.logit(B_inf.clamp(*B_INF_RANGE)))
         self.b_raw.copy_(inverse_softplus(b))
+        self.unevenness.zero_() if unevenness is None else self.unevenness.copy_(unevenness)
 
 
 def inverse_softplus(y: Tensor) -> Tensor:

@@ -256,6 +256,15 @@ class NeuralGaussians:
             self.groups.move(rows, self.gaussians.means)
             self._bind()
 
+    def adopt(
+        self,
+        local: Tensor,  # [N, F_l]
+    ) -> None:
+        """Take over local features, and groups that were restored, with optimisers at step 0."""
+        self.gaussians.local_features = local
+        self._local.extend(len(local) - len(self._local.steps))
+        self._bind()
+
     def _bind(self) -> None:
         self._shared.extend(len(self.groups) - len(self._shared.steps))
         self._shared.bind({"shared": self.groups.features})

@@ -11,7 +11,7 @@ from torch import Tensor
 from aquaflow.mapping.gaussians import radiance
 from aquaflow.mapping.image_formation import Water
 from aquaflow.mapping.views import View
-from aquaflow.render.contract import Renderer
+from aquaflow.render.contract import Renderer, Rendering
 from aquaflow.render.water import MIN_SOLID, compose_water
 
 
@@ -43,6 +43,7 @@ def show(
     view: View,
     viewmat: Tensor,  # [4, 4] world to camera
     active: Tensor | None = None,  # [rows, columns] bool, the tiles to draw
+    uneven: Tensor | None = None,  # [H, W] gain of the backscatter
 ) -> Shown:
     """Draw the map; differentiable in the parameters, the water and the view matrix.
 
@@ -68,7 +69,23 @@ def show(
     if water is None:
         image, z = clean, drawn.image[..., 3] / drawn.alpha.clamp_min(MIN_SOLID)
     else:
-        image, z = compose_water(drawn.image, drawn.alpha, water.stacked(), renderer.threads)
+        image, z = _through(water, uneven, drawn, renderer)
     if gain is not None:
         image = image * gain[..., None]
     return Shown(image, clean, drawn.alpha, z, drawn.visible, drawn.radius_px, active)
+
+
+def _through(
+    water: Water,
+    uneven: Tensor | None,  # [H, W]
+    drawn: Rendering,
+    renderer: Renderer,
+) -> tuple[Tensor, Tensor]:
+    """Image [H, W, 3] and range [H, W]."""
+    if uneven is None:
+        return compose_water(drawn.image, drawn.alpha, water.stacked(), renderer.threads)
+    # J T + u B = u (J / u T + B)
+    u = uneven[..., None]
+    lit = torch.cat([drawn.image[..., :3] / u, drawn.image[..., 3:]], dim=-1)
+    image, z = compose_water(lit, drawn.alpha, water.stacked(), renderer.threads)
+    return image * u, z

@@ -7,10 +7,11 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from aquaflow.config import MediumConfig
+from aquaflow.config import MediumConfig, SunlightConfig
 from aquaflow.mapping.exposure import gain_of, learn_gain, set_log_gains
 from aquaflow.mapping.gaussians import GaussianMap, radiance, raw_colour
 from aquaflow.mapping.image_formation import Water
@@ -19,6 +20,7 @@ from aquaflow.mapping.neural import NeuralGaussians
 from aquaflow.mapping.rendering import Shown, show
 from aquaflow.mapping.shading import TERMS, gain_map
 from aquaflow.mapping.sightings import sight
+from aquaflow.mapping.sunlight import Sunlight
 from aquaflow.mapping.views import View
 from aquaflow.mapping.water_estimation import WaterEstimate, estimate_water, models_for
 from aquaflow.render.contract import Renderer
@@ -28,7 +30,11 @@ class Scene:
     """One sub-map's contents; draws them, and fits the water to what the views saw."""
 
     def __init__(
-        self, config: MediumConfig, renderer: Renderer, generator: torch.Generator
+        self,
+        config: MediumConfig,
+        renderer: Renderer,
+        generator: torch.Generator,
+        sunlight: SunlightConfig | None = None,
     ) -> None:
         self.config, self.renderer = config, renderer
         self.gaussians = GaussianMap()
@@ -39,11 +45,12 @@ class Scene:
         """Coefficients of the log-gain over the picture."""
         self.exposes = False
         """True once the sightings told of views that are brighter than others."""
+        self.sunlight = Sunlight(sunlight or SunlightConfig())
         self.water_evidence: float | None = None
         """For water against none, in units of the log likelihood; None before the first fit."""
         self.beta_a_sigma: list[float] | None = None
         """Relative standard deviation of beta_a in the last fit; None before it."""
-        self._gains: dict[tuple[int, int], Tensor] = {}
+        self._gains: dict[tuple[str, int, int], Tensor] = {}
 
     def water(self, view: View) -> Water | None:
         """The medium for this view, or None while it is switched off."""
@@ -54,12 +61,26 @@ class Scene:
 
     def gain(self, view: View) -> Tensor | None:
         """The shading [H, W] of this view's pictures; None where there is none."""
-        if not self.shading.any():
+        return self._gain_map("shading", self.shading, view)
+
+    def uneven(self, view: View) -> Tensor | None:
+        """The gain [H, W] of the backscatter in this view's pictures; None where it is even."""
+        if not self.medium.active:
             return None
-        size = (view.camera.height, view.camera.width)
-        if size not in self._gains:
-            self._gains[size] = torch.from_numpy(gain_map(self.shading, *size))
-        return self._gains[size]
+        return self._gain_map("uneven", self.medium.unevenness.double().numpy(), view)
+
+    def _gain_map(
+        self,
+        name: str,
+        coefficients: npt.NDArray[np.float64],  # [5]
+        view: View,
+    ) -> Tensor | None:
+        if not coefficients.any():
+            return None
+        key = (name, view.camera.height, view.camera.width)
+        if key not in self._gains:
+            self._gains[key] = torch.from_numpy(gain_map(coefficients, *key[1:]))
+        return self._gains[key]
 
     def draw(
         self,
@@ -72,19 +93,19 @@ class Scene:
         """The scene from ``view``; differentiable in what is given, and in the medium.
 
         ``parameters`` are decoded ones, where there is a decoder. With ``learn``, the view's
-        exposure is set from its picture in passing.
+        exposure and its light are set from its picture in passing.
         """
         viewmat = view.viewmat() if viewmat is None else viewmat
         if parameters is None:
             parameters = self.seen_from(view, viewmat)
-        shown = show(
-            parameters, self.water(view), self.gain(view), self.renderer, view, viewmat, active
-        )
-        if not self.exposes:
-            return shown
-        if learn:
-            learn_gain(view, shown.image, shown.alpha)
-        return replace(shown, image=shown.image * gain_of(view))
+        water, gain, uneven = self.water(view), self.gain(view), self.uneven(view)
+        shown = show(parameters, water, gain, self.renderer, view, viewmat, active, uneven)
+        image = shown.image
+        if self.exposes:
+            if learn:
+                learn_gain(view, image, shown.alpha)
+            image = image * gain_of(view)
+        return replace(shown, image=self.sunlight.shine(view, image, shown.alpha, learn))
 
     def seen_from(
         self,
@@ -156,9 +177,10 @@ class Scene:
             image = image / gain[..., None]
         if self.exposes:
             image = image / gain_of(view)
+        image = self.sunlight.evened(view, image)
         if water is None:
             return image, torch.ones(image.shape[:2], dtype=torch.bool)
-        return water.restore(image, z)
+        return water.restore(image, z, self.uneven(view))
 
     def fit_water(
         self,
@@ -175,12 +197,14 @@ class Scene:
             return None
         with torch.no_grad():
             sea = self.medium(torch.from_numpy(views[0].T_wc.R).to(torch.float32))
+        beta_a = sea.beta_a.double().numpy() if self.medium.active else np.zeros(3)
         estimate = estimate_water(
-            sight(self._attributes, views, self.renderer, generator),
+            sight(self._attributes, views, self.renderer, generator, beta_a),
             sea.B_res.double().numpy(),
             sea.d.double().numpy(),
             float(sea.beta_a.mean()),
             models_for(self.config),
+            self.config.priors,
         )
         if estimate is not None:
             self._adopt(estimate, views, views if dive is None else dive)
@@ -196,7 +220,7 @@ class Scene:
         old, old_gains = self.water(fitted[0]), torch.stack([gain_of(view) for view in fitted])
         self.medium.active = estimate.model.water
         if estimate.model.water:
-            found = (estimate.beta_a, estimate.B_inf, estimate.b)
+            found = (estimate.beta_a, estimate.B_inf, estimate.b, estimate.unevenness)
             self.medium.set_water(*(torch.from_numpy(v).to(torch.float32) for v in found))
         self.shading, self.exposes = estimate.shading, estimate.model.exposure
         self.beta_a_sigma, self.water_evidence = estimate.beta_a_sigma, estimate.evidence

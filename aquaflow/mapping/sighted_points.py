@@ -29,12 +29,21 @@ class Observations:
     xy: Array
     """[M, 2] where in the picture, each axis from -1 to 1."""
     blend: Array
-    """[M, 3] how much brighter than the point its footprint is without water, neighbours included.
-    """
+    """[M, 3] how much brighter than the point its footprint is, neighbours included, as it would
+    look at the point's mean range."""
 
     @property
     def points(self) -> int:
         return int(self.point.max()) + 1 if len(self.point) else 0
+
+
+def mean_by(
+    point: Index,  # [M]
+    values: Array,  # [M, K]
+) -> Array:
+    """[P, K] mean over each point's sightings."""
+    count = np.maximum(np.bincount(point), 1)
+    return np.stack([np.bincount(point, column) / count for column in values.T], axis=-1)
 
 
 def informative(observations: Observations) -> Observations:

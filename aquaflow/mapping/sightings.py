@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from aquaflow.mapping.gaussians import radiance
-from aquaflow.mapping.sighted_points import Observations
+from aquaflow.mapping.sighted_points import Observations, mean_by
 from aquaflow.mapping.views import View
 from aquaflow.render.contract import Renderer
 
@@ -42,6 +42,7 @@ def sight(
     views: list[View],
     renderer: Renderer,
     generator: torch.Generator,
+    beta_a: npt.NDArray[np.float64],  # [3] per map unit, of the water that the map was made for
 ) -> Observations:
     """Sightings of a random choice of the Gaussians that several of ``views`` see well."""
     seen = [_sighting(seen_from(view), view, renderer) for view in views]
@@ -56,19 +57,11 @@ def sight(
         torch.stack([sighting[k] for sighting in seen])[view_of, row].double().numpy()
         for k in range(1, 5)
     )
-    return Observations(
-        number.numpy(), view_of.numpy(), colour, z, xy, _less_mean(blend, number.numpy())
-    )
-
-
-def _less_mean(
-    values: npt.NDArray[np.float64],  # [M, 3]
-    point: npt.NDArray[np.int64],  # [M]
-) -> npt.NDArray[np.float64]:
-    """Every value less the mean of its point's [M, 3]."""
-    count = np.bincount(point)
-    sums = np.stack([np.bincount(point, values[:, c]) for c in range(3)], axis=-1)
-    return np.asarray(values - (sums / np.maximum(count, 1)[:, None])[point])
+    point = number.numpy()
+    own_range = mean_by(point, z[:, None])[point]
+    # Other water would need another map to look the same, but what is seen is seen.
+    blend = (blend - mean_by(point, blend)[point]) * np.exp(-beta_a * own_range)
+    return Observations(point, view_of.numpy(), colour, z, xy, blend)
 
 
 def _sighting(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,8 @@ class View:
         """True for common frames, whose outliers are masked (paper, M)."""
         self.log_gain = np.zeros(3)
         """How much brighter than the mean of the views, RGB (see exposure.py)."""
+        self.light: Tensor | None = None
+        """[3, rows, columns] log-gain of the sunlight over the picture (see sunlight.py)."""
         self.looks = 0
         """Steps of the optimiser that looked at this view."""
         self.explained: Tensor | None = None
@@ -65,6 +68,10 @@ class View:
     def move_pixels(self, store: Spill[Pixels]) -> None:
         """Let the pixels lie in ``store``, under the frame's index."""
         store[self.frame_index] = self._pixels
+        self._lies_in = store
+
+    def lie_in(self, store: Spill[Pixels]) -> None:
+        """The pixels lie in ``store`` already, under the frame's index."""
         self._lies_in = store
 
     @property
@@ -128,6 +135,11 @@ class View:
         return torch.from_numpy(self.camera.K).to(torch.float32)
 
 
+def in_time(views: Iterable[View]) -> list[View]:
+    """In the order of their frames; the first views of a map come in another."""
+    return sorted(views, key=lambda view: view.frame_index)
+
+
 class ViewStore:
     """Where the pixels of a dive's views lie: the last used in memory, the others, with a work
     folder, in its ``views`` folder. They come back bit for bit."""
@@ -139,6 +151,20 @@ class ViewStore:
     def keep(self, view: View) -> View:
         """Take over the view's pixels; no other view of the dive may have its frame index."""
         view.move_pixels(self._pixels)
+        return view
+
+    def save(self) -> list[Path]:
+        """Write what is only in memory; the files that are new."""
+        return self._pixels.save()
+
+    def adopt(self, view: View) -> View:
+        """Let a view have the pixels that an earlier run saved of it.
+
+        Raises:
+            InputError: their file is not there.
+        """
+        self._pixels.adopt(view.frame_index)
+        view.lie_in(self._pixels)
         return view
 
     @property

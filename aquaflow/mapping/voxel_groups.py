@@ -153,6 +153,29 @@ class VoxelGroups:
             self._groups_of.setdefault(voxel, []).append(group)
         return taken
 
+    def order(self) -> Tensor:
+        """[G] groups voxel by voxel, in the order in which each voxel's are filled."""
+        listed = [group for groups in self._groups_of.values() for group in groups]
+        return torch.tensor(listed, dtype=torch.int64)
+
+    def restore(
+        self,
+        group: Tensor,  # [N]
+        slot: Tensor,  # [N]
+        table: Tensor,  # [G, K]
+        fill: Tensor,  # [G]
+        voxel: Tensor,  # [G]
+        features: Tensor,  # [G, F]
+        order: Tensor,  # [G]
+    ) -> None:
+        """Be as the groups were that gave these tensors."""
+        self._group, self._slot = GrowingRows(group), GrowingRows(slot)
+        self._table, self._fill = GrowingRows(table), GrowingRows(fill)
+        self._voxel, self._features = GrowingRows(voxel), GrowingRows(features)
+        self._groups_of = {}
+        for number in order.tolist():
+            self._groups_of.setdefault(int(voxel[number]), []).append(number)
+
     def _place(
         self,
         rows: Tensor,  # [M] int64, in no group

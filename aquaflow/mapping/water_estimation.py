@@ -6,9 +6,9 @@ towards B_inf. Photometric gradients alone hardly move the water, because every 
 can follow its error.
 
 Lamps and lenses darken the picture towards its edge, and near ground is seen near the edge: left
-out, that looks like water. So does light that changes while the vehicle climbs. And in air or clear
-water there is nothing to find at all. Which of the three are there is chosen by the Bayesian
-information criterion.
+out, that looks like water. So does light that changes while the vehicle climbs. Sunlit water shines
+more brightly the less one looks down. And in air or clear water there is nothing to find at all.
+Which of the four are there is chosen by the Bayesian information criterion.
 """
 
 from __future__ import annotations
@@ -20,29 +20,34 @@ from itertools import product
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.config import MediumConfig
+from aquaflow.config import MediumConfig, WaterPriorsConfig
 from aquaflow.mapping.sighted_points import Observations, informative
-from aquaflow.mapping.water_model import DARK_SIGMA, NOISE, Model, WaterModel
+from aquaflow.mapping.water_model import BELIEVED, NOISE, WaterModel
+from aquaflow.mapping.water_parameters import Model
 
 Array = npt.NDArray[np.float64]
 
 MIN_POINTS = 100
 """Fewer points seen at several ranges say nothing about the water."""
-POINTS_PER_VALUE = 10.0
-"""Neighbouring points share the map's errors, so that this many say what one could alone. Were all
-independent, dives without water would get some: it saves them up to 14 % of the error, where true
-water, the clearest of Jerlov's too, saves 30 to 60 %."""
+POINTS_PER_VALUE = 5.0
+"""Neighbouring points share the map's errors, so that this many say what one could alone. Evidence
+for water on a clear reef and clear sand with 10: -22 to -25, with 5: -21 to -27, with 2: -12 to
+-28; on Curasao and IUI3 0 to 22, 10 to 60 and 47 to 190."""
 WATER_IS_USUAL = 10.0
 """Log odds for water before anything is seen: a dive is in water until very strong evidence (5,
-Kass and Raftery 1995), twice over, speaks against it. Clear dives give -14 and -20, Curasao, where
-a shading of the picture explains as much, -6 to 17, other dives in water over 100."""
+Kass and Raftery 1995), twice over, speaks against it."""
 MAX_STEPS = 30
 LEAST_GAIN = 1e-5
 """Relative fall of the cost at which a fit has converged."""
 DAMPING = 1e-3, 1e6
 """Levenberg-Marquardt's first damping, and the one at which no step helps any more."""
-EVERY_MODEL = tuple(Model(*parts) for parts in product((False, True), repeat=3))
-"""With and without water, shading and changing exposure."""
+EVERY_MODEL = (
+    *(Model(*parts) for parts in product((False, True), repeat=3)),
+    Model(water=True, uneven=True),
+    Model(water=True, exposure=True, uneven=True),
+)
+"""With and without water, shading and changing exposure; and the unevenness of the backscatter,
+which looks so much like shading that no dive tells of both."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +62,8 @@ class WaterEstimate:
     """[3]"""
     b: Array
     """[3]"""
+    unevenness: Array
+    """[5] coefficients of the backscatter's log-gain over the picture."""
     beta_a_sigma: list[float] | None
     """[3] relative standard deviation of beta_a; None without water."""
     shading: Array
@@ -92,6 +99,7 @@ def models_for(config: MediumConfig) -> list[Model]:
         for model in EVERY_MODEL
         if model.water in water
         and (config.shading or not model.shading)
+        and (config.uneven or not model.uneven)
         and (config.exposure or not model.exposure)
     ]
 
@@ -102,6 +110,7 @@ def estimate_water(
     d: Array,  # [3] 1 / map unit
     start_beta: float,
     models: Sequence[Model] = EVERY_MODEL,
+    priors: WaterPriorsConfig = BELIEVED,
 ) -> WaterEstimate | None:
     """Fit ``models`` and keep the likeliest; None where too few points span a range."""
     seen = informative(observations)
@@ -109,7 +118,7 @@ def estimate_water(
         return None
     fits: list[_Fit] = []
     for model in models:
-        fits.append(_solve(WaterModel(seen, model, B_res, d, start_beta), fits))
+        fits.append(_solve(WaterModel(seen, model, B_res, d, start_beta, priors), fits))
     best = min(fits, key=lambda fit: fit.criterion - 2.0 * WATER_IS_USUAL * fit.problem.model.water)
     trial = best.problem.trial(best.x)
     return WaterEstimate(
@@ -117,6 +126,7 @@ def estimate_water(
         trial.beta_a,
         trial.B_inf,
         trial.b,
+        trial.unevenness,
         _beta_a_sigma(best) if best.problem.model.water else None,
         trial.shading,
         trial.exposure,
@@ -171,18 +181,18 @@ def _descend(problem: WaterModel, x: Array, noise: float) -> Array:
 def _cost(problem: WaterModel, x: Array, noise: float) -> float:
     """Soft L1 of the sightings' whitened errors and squares of the priors', together."""
     total = float((problem.priors(x)[0] ** 2).sum())
-    for c in range(3):
-        errors, J = problem.look(x, c)
+    looks = [problem.look(x, c) for c in range(3)]
+    for errors, _ in looks:
         total += float(2.0 * (np.sqrt(1.0 + (errors / noise) ** 2) - 1.0).sum())
-        dark = problem.darkest(J)
-        total += 0.0 if dark is None else dark[1] ** 2
-    return total
+    colours = np.stack([J for _, J in looks])
+    return total + sum(belief.residual**2 for belief in problem.beliefs(colours))
 
 
 def _normal_equations(problem: WaterModel, x: Array, noise: float) -> tuple[Array, Array]:
     """J^T W J and J^T W r of the same cost, the weights those of soft L1."""
     residuals, rows = problem.priors(x)
     H, g = rows.T @ rows, rows.T @ residuals
+    colours, colours_change = [], []
     for c in range(3):
         own = problem.of_channel(c)
         errors, J = problem.look(x, c)
@@ -190,11 +200,15 @@ def _normal_equations(problem: WaterModel, x: Array, noise: float) -> tuple[Arra
         weight = 1.0 / (noise**2 * np.sqrt(1.0 + (errors / noise) ** 2))
         H[np.ix_(own, own)] += (weight * by_error) @ by_error.T
         g[own] += by_error @ (weight * errors)
-        dark = problem.darkest(J)
-        if dark is not None:
-            row = by_J[:, dark[0]] / DARK_SIGMA
-            H[np.ix_(own, own)] += np.outer(row, row)
-            g[own] += row * dark[1]
+        colours.append(J)
+        colours_change.append((own, by_J))
+    for belief in problem.beliefs(np.stack(colours)):
+        row = np.zeros(problem.size)
+        for c, slope in belief.by_J.items():
+            own, by_J = colours_change[c]
+            row[own] += by_J @ slope
+        H += np.outer(row, row)
+        g += row * belief.residual
     return H, g
 
 

@@ -5,131 +5,17 @@ It is the safety net, and the baseline that every trained prior has to beat.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
-from aquaflow.geometry.triangulation import triangulate
-from aquaflow.geometry.two_view import relative_pose
 from aquaflow.prior import flow as dense
-from aquaflow.prior import homography as sparse
-from aquaflow.prior.contract import Encoding, Float, Keypoints, Mask
-
-GOOD_SHARE = 0.5
-"""A candidate flow that matches this part of the picture needs no rival."""
-
-MATCH_SIGMA_PX = 0.2
-"""Noise of a refined match: 0.15 px on synthetic dives (prior.refinement)."""
-
-POSE_SAMPLES = 2000
-"""Matches that the two-view pose is estimated from."""
-
-
-@dataclass
-class ClassicalEncoding:
-    """A picture made ready for flow; keypoints are detected when first needed."""
-
-    camera: CameraModel
-    grey: npt.NDArray[np.uint8]
-    texture: Float
-
-    @cached_property
-    def interesting(self) -> Mask:
-        return self.texture > dense.MIN_TEXTURE
-
-    @cached_property
-    def keypoints(self) -> Keypoints:
-        return sparse.detect(self.grey)
-
-
-class ClassicalPair:
-    """Matches at once; pointmaps, up to scale, when somebody asks for them."""
-
-    D_a: Float | None = None
-    D_b: Float | None = None
-
-    def __init__(self, a: ClassicalEncoding, b: ClassicalEncoding, flow: dense.Flow) -> None:
-        self._a, self._b, self.flow = a, b, flow
-
-    @cached_property
-    def matches(self) -> Float:
-        height, width = self._a.grey.shape
-        return dense.pixel_grid(height, width) + self.flow.forward
-
-    @property
-    def valid(self) -> Mask:
-        return self.flow.valid
-
-    @cached_property
-    def matches_back(self) -> Float:
-        height, width = self._b.grey.shape
-        return dense.pixel_grid(height, width) + self.flow.backward
-
-    @cached_property
-    def valid_back(self) -> Mask:
-        back = self.flow.backward + dense.sample(self.flow.forward, self.matches_back)
-        height, width = self._a.grey.shape
-        inside = ((self.matches_back > 0.0) & (self.matches_back < (width, height))).all(-1)
-        close = np.linalg.norm(back, axis=-1) < dense.OCCLUSION_PX
-        return np.asarray(inside & close)
-
-    @cached_property
-    def C(self) -> Float:
-        confidence = np.exp(-0.5 * (self.flow.error / dense.CONFIDENCE_SIGMA_PX) ** 2)
-        return np.where(self.flow.valid, confidence, 0.0).astype(np.float32)
-
-    @cached_property
-    def _geometry(self) -> tuple[Float, Float]:
-        """(X_a, Q_a): two-view pose from the matches, every valid match triangulated."""
-        height, width = self._a.grey.shape
-        X = np.full((height, width, 3), np.nan, np.float32)
-        Q = np.zeros((height, width), np.float32)
-        rows, columns = np.nonzero(self.valid)
-        if len(rows) == 0:
-            return X, Q
-        pixels_a = np.stack([columns + 0.5, rows + 0.5], -1)
-        pixels_b = self.matches[rows, columns].astype(np.float64)
-        step = max(1, len(rows) // POSE_SAMPLES)
-        T_ba = relative_pose(pixels_a[::step], pixels_b[::step], self._a.camera, self._b.camera)
-        if T_ba is None:
-            return X, Q
-        rays = self._a.camera.unproject(pixels_a)
-        points = triangulate(rays, pixels_b, T_ba, self._b.camera, MATCH_SIGMA_PX)
-        good = points.good
-        X[rows[good], columns[good]] = rays[good] / points.rho[good, None]
-        Q[rows[good], columns[good]] = points.rho[good] ** 2 / points.variance[good]
-        return X, Q
-
-    @property
-    def X_a(self) -> Float:
-        return self._geometry[0]
-
-    @property
-    def Q_a(self) -> Float:
-        return self._geometry[1]
-
-    @cached_property
-    def _in_b(self) -> tuple[Float, Float]:
-        """(X_b, Q_b): b's pixels take the point of the pixel of a that they match."""
-        height, width = self._a.grey.shape
-        column = np.clip(np.floor(self.matches_back[..., 0]).astype(int), 0, width - 1)
-        row = np.clip(np.floor(self.matches_back[..., 1]).astype(int), 0, height - 1)
-        known = self.valid_back
-        X = np.where(known[..., None], self.X_a[row, column], np.nan).astype(np.float32)
-        return X, np.where(known, self.Q_a[row, column], 0.0).astype(np.float32)
-
-    @property
-    def X_b(self) -> Float:
-        return self._in_b[0]
-
-    @property
-    def Q_b(self) -> Float:
-        return self._in_b[1]
+from aquaflow.prior.candidates import best_flow, from_homography, from_prediction
+from aquaflow.prior.contract import Encoding, Float
+from aquaflow.prior.flow_pair import FlowEncoding, FlowPair
 
 
 class ClassicalPrior:
@@ -145,64 +31,40 @@ class ClassicalPrior:
         self,
         image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
         camera: CameraModel,
-    ) -> ClassicalEncoding:
+    ) -> FlowEncoding:
         grey = dense.normalised_grey(image)
-        return ClassicalEncoding(camera, grey, dense.texture(grey))
+        return FlowEncoding(camera, grey, dense.texture(grey))
 
     def pack(self, encoding: Encoding) -> dict[str, npt.NDArray[Any]]:
         """Grey and texture; keypoints only if they were detected."""
-        assert isinstance(encoding, ClassicalEncoding)
-        arrays: dict[str, npt.NDArray[Any]] = {"grey": encoding.grey, "texture": encoding.texture}
-        keypoints = vars(encoding).get("keypoints")
-        if keypoints is not None:
-            arrays |= {"pixels": keypoints.pixels, "descriptors": keypoints.descriptors}
-        return arrays
+        assert isinstance(encoding, FlowEncoding)
+        return encoding.pack()
 
-    def unpack(
-        self, arrays: Mapping[str, npt.NDArray[Any]], camera: CameraModel
-    ) -> ClassicalEncoding:
+    def unpack(self, arrays: Mapping[str, npt.NDArray[Any]], camera: CameraModel) -> FlowEncoding:
         """The encoding with all that was computed of it."""
-        encoding = ClassicalEncoding(camera, arrays["grey"], arrays["texture"])
-        if "pixels" in arrays:
-            encoding.keypoints = Keypoints(arrays["pixels"], arrays["descriptors"])
+        encoding = FlowEncoding(camera, arrays["grey"], arrays["texture"])
+        encoding.restore(arrays)
         return encoding
+
+    def warm_up(self) -> None:
+        """Nothing is prepared here."""
 
     def decode(
         self,
         a: Encoding,
         b: Encoding,
         predicted: Float | None = None,  # [H, W, 2] px, expected matches of a in b
-    ) -> ClassicalPair:
-        """Flow from the prediction; where it fails, from a SIFT homography; the better is kept."""
-        assert isinstance(a, ClassicalEncoding)
-        assert isinstance(b, ClassicalEncoding)
-        height, width = a.grey.shape
-        start = None if predicted is None else predicted - dense.pixel_grid(height, width)
-        best = self._flow(a, b, start)
-        if best.share < GOOD_SHARE:
-            H = sparse.homography(a.keypoints, b.keypoints)
-            if H is not None:
-                rival = self._flow(a, b, sparse.flow_of_homography(H, height, width))
-                best = max(best, rival, key=lambda flow: flow.share)
-        if best.share < GOOD_SHARE and start is not None:
-            best = max(best, self._flow(a, b, None), key=lambda flow: flow.share)
-        return ClassicalPair(a, b, best)
-
-    def _flow(self, a: ClassicalEncoding, b: ClassicalEncoding, start: Float | None) -> dense.Flow:
-        back = None if start is None else _reverse(start)
-        return self._matcher(a.grey, b.grey, a.texture, b.texture, start, back)
+    ) -> FlowPair:
+        """Flow from the prediction; where it fails, from a SIFT homography, then from nothing."""
+        assert isinstance(a, FlowEncoding)
+        assert isinstance(b, FlowEncoding)
+        return FlowPair(a, b, best_flow(self._matcher, a, b, _starts(a, b, predicted)))
 
 
-def _reverse(
-    flow: Float,  # [H, W, 2] px, a to b
-) -> Float:
-    """[H, W, 2] approximate flow from b to a: the negated flow, looked up where it arrives.
-
-    Three fixed-point rounds of r(x) = -flow(x + r(x)); exact enough to start DIS from.
-    """
-    height, width = flow.shape[:2]
-    grid = dense.pixel_grid(height, width)
-    reverse = -flow
-    for _ in range(3):
-        reverse = -dense.sample(flow, grid + reverse)
-    return reverse
+def _starts(a: FlowEncoding, b: FlowEncoding, predicted: Float | None) -> Iterator[Float | None]:
+    yield from from_prediction(predicted)
+    if predicted is None:
+        yield None
+    yield from from_homography(a, b)
+    if predicted is not None:
+        yield None

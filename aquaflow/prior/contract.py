@@ -130,3 +130,7 @@ class Prior(Protocol):
     def unpack(self, arrays: Mapping[str, npt.NDArray[Any]], camera: CameraModel) -> Encoding:
         """The encoding that ``pack`` took apart, equal in every bit; ``arrays`` become its own."""
         ...
+
+    def warm_up(self) -> None:
+        """Do what the first pictures would otherwise wait for; a live run begins with it."""
+        ...

@@ -7,6 +7,7 @@ and mapping on a small machine. The wheel holds a telemetry client, which is swi
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,7 +19,10 @@ import numpy.typing as npt
 
 from aquaflow.errors import AquaFlowError, InputError, first_line
 
+log = logging.getLogger(__name__)
+
 Device: TypeAlias = Literal["auto", "cpu", "cuda", "tensorrt"]
+Precision: TypeAlias = Literal["auto", "fp32", "int8"]
 
 PROVIDERS: dict[str, str] = {
     "cpu": "CPUExecutionProvider",
@@ -28,12 +32,16 @@ PROVIDERS: dict[str, str] = {
 FASTEST_FIRST = ("tensorrt", "cuda", "cpu")
 LOG_ERRORS_ONLY = 3
 
+TENSORRT_WORKSPACE_BYTES = 1 << 30
+"""Scratch memory of TensorRT's kernels: a Jetson shares its memory with everything else."""
+
 
 @dataclass(frozen=True)
 class RuntimeSettings:
     """Where and how networks run."""
 
     device: Device = "auto"
+    precision: Precision = "auto"
     threads: int = 1
     engine_cache: Path | None = None
     """Folder that TensorRT keeps its engines in: building one takes minutes."""
@@ -64,22 +72,38 @@ class Session:
             raise InputError(
                 f"{path} cannot be run ({first_line(error)}); export it again"
             ) from error
-        obtained = self._session.get_providers()[0]
-        if obtained != PROVIDERS[device]:
-            raise AquaFlowError(
-                f"{path.name} was to run on {device} but onnxruntime fell back to {obtained}; "
-                "repair its GPU libraries or set device: auto"
-            )
-        self.device = device
-        self.inputs = [value.name for value in self._session.get_inputs()]
+        self.device = _obtained(self._session, device, settings.device, path.name)
+        self.inputs = {value.name: tuple(value.shape) for value in self._session.get_inputs()}
+        """Shape of each; a name in it is a size that may change."""
         self.outputs = [value.name for value in self._session.get_outputs()]
 
     def __call__(
         self, inputs: Mapping[str, npt.NDArray[Any]]
     ) -> dict[str, npt.NDArray[np.float32]]:
-        """All outputs by name."""
-        values = self._session.run(self.outputs, dict(inputs))
+        """All outputs by name, in the processor's own memory."""
+        if self.device == "cpu":
+            values = self._session.run(self.outputs, dict(inputs))
+        else:
+            values = [value.numpy() for value in self.on_device(inputs).values()]
         return dict(zip(self.outputs, values, strict=True))
+
+    def on_device(self, inputs: Mapping[str, Any]) -> dict[str, Any]:
+        """All outputs by name, left where they were computed, as onnxruntime's own values.
+
+        Inputs are arrays or such values: what one network hands to another is not copied there and
+        back (IO binding).
+        """
+        binding = self._session.io_binding()
+        for name, value in inputs.items():
+            if isinstance(value, np.ndarray):
+                binding.bind_cpu_input(name, value)
+            else:
+                binding.bind_ortvalue_input(name, value)
+        memory = "cpu" if self.device == "cpu" else "cuda"
+        for name in self.outputs:
+            binding.bind_output(name, memory)
+        self._session.run_with_iobinding(binding)
+        return dict(zip(self.outputs, binding.get_outputs(), strict=True))
 
 
 def _onnxruntime() -> Any:
@@ -88,7 +112,8 @@ def _onnxruntime() -> Any:
         import onnxruntime as ort
     except ImportError as error:
         raise AquaFlowError(
-            "learned priors need onnxruntime; pip install 'aquaflow[prior]' or set prior: classical"
+            "learned priors need onnxruntime; pip install 'aquaflow[prior]' "
+            "or set prior.kind: classical"
         ) from error
     ort.disable_telemetry_events()
     return ort
@@ -106,10 +131,36 @@ def _device(ort: Any, asked: Device) -> str:
     return asked
 
 
+def _obtained(session: Any, wanted: str, asked: Device, what: str) -> str:
+    """The processor that the session runs on; a library that does not load makes it a slower one.
+
+    Raises:
+        AquaFlowError: it is not the one that was asked for by name.
+    """
+    provider = session.get_providers()[0]
+    device = next((name for name in FASTEST_FIRST if PROVIDERS[name] == provider), provider)
+    if device == wanted:
+        return device
+    if asked != "auto":
+        raise AquaFlowError(
+            f"{what} was to run on {wanted} but onnxruntime fell back to {provider}; "
+            "repair its GPU libraries or set device: auto"
+        )
+    log.warning("%s runs on %s: onnxruntime cannot use %s here", what, device, wanted)
+    return device
+
+
 def _providers(device: str, engine_cache: Path | None) -> list[Any]:
-    """The chosen one first; what it cannot do falls to the next slower one."""
+    """The chosen one first; what it cannot do falls to the next slower one.
+
+    An engine fits one GPU and one TensorRT: onnxruntime names its file after both, so a folder may
+    serve several machines.
+    """
     settings: dict[str, dict[str, Any]] = {
-        "tensorrt": {"trt_fp16_enable": True},
+        "tensorrt": {
+            "trt_fp16_enable": True,
+            "trt_max_workspace_size": TENSORRT_WORKSPACE_BYTES,
+        },
         "cuda": {"device_id": 0, "cudnn_conv_algo_search": "HEURISTIC"},
         "cpu": {},
     }
@@ -117,6 +168,8 @@ def _providers(device: str, engine_cache: Path | None) -> list[Any]:
         settings["tensorrt"] |= {
             "trt_engine_cache_enable": True,
             "trt_engine_cache_path": str(engine_cache),
+            "trt_timing_cache_enable": True,
+            "trt_timing_cache_path": str(engine_cache),
         }
     slower = FASTEST_FIRST[FASTEST_FIRST.index(device) :]
     return [(PROVIDERS[name], settings[name]) for name in slower]

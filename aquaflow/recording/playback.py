@@ -6,6 +6,7 @@ import heapq
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import chain, dropwhile
 from typing import TypeAlias
 
 from aquaflow.messages import Dropped, Frame, TelemetrySample
@@ -33,9 +34,16 @@ class Playback:
         self._now_ns, self._sleep_s = now_ns, sleep_s
 
     def events(self, every: int = 1, start: int = 0, stop: int | None = None) -> Iterator[Event]:
-        """Everything in the order of arrival; of equals the picture first, then as listed."""
-        pictures = () if self._camera is None else self._camera.frames(every, start, stop)
-        streams: list[Iterator[Event]] = [iter(pictures), *(t.samples() for t in self._telemetry)]
+        """Everything in the order of arrival; of equals the picture first, then as listed.
+
+        From a later ``start`` on, telemetry of before its picture is left out.
+        """
+        pictures = iter(() if self._camera is None else self._camera.frames(every, start, stop))
+        since_ns = None
+        if start > 0 and (first := next(pictures, None)) is not None:
+            since_ns, pictures = arrival_of(first), chain([first], pictures)
+        samples = (_since(since_ns, source.samples()) for source in self._telemetry)
+        streams: list[Iterator[Event]] = [pictures, *samples]
         began: tuple[int, int] | None = None
         for event in heapq.merge(*streams, key=arrival_of):
             # The clock starts with the first event, not with the reading of it.
@@ -52,6 +60,12 @@ class Playback:
         for source in [self._camera, *self._telemetry]:
             if source is not None:
                 source.close()
+
+
+def _since(since_ns: int | None, samples: Iterator[TelemetrySample]) -> Iterator[TelemetrySample]:
+    if since_ns is None:
+        return samples
+    return dropwhile(lambda sample: sample.arrival_ns < since_ns, samples)
 
 
 def arrival_of(event: Event) -> int:

@@ -8,6 +8,7 @@ does the three in one go.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -90,6 +91,31 @@ class PoseGraph:
         self._shifted: set[int] = set()
         self._members: Counter[int] = Counter()
         self._seen = 0
+
+    def __contains__(self, number: int) -> bool:
+        return number in self._row
+
+    def tables(self) -> dict[str, Rows]:
+        """All that there is, for a file: read-only, and never changed later."""
+        self._seen = len(self._nodes)
+        return {"nodes": self._nodes.rows, "edges": self._edges.rows, "trust": self._trust.rows}
+
+    @classmethod
+    def of_tables(cls, tables: Mapping[str, Rows], config: GraphConfig) -> PoseGraph:
+        """The graph that ``tables`` took apart; every edge counts as new to the next solving."""
+        graph = cls(config)
+        for table, rows in (
+            (graph._nodes, tables["nodes"].astype(NODE)),
+            (graph._edges, tables["edges"].astype(EDGE)),
+            (graph._trust, tables["trust"].astype(TRUST)),
+        ):
+            if len(rows):
+                table.replace(rows)
+        graph._row = {int(number): row for row, number in enumerate(graph._nodes.rows["number"])}
+        graph._members = Counter(graph._nodes.rows["component"].tolist())
+        graph._settled = 0
+        graph._seen = len(graph._nodes)
+        return graph
 
     def add_keyframe(self, number: int, T_wc: Sim3) -> bool:
         """A keyframe, a component of its own until an edge joins it. False if it was refused."""

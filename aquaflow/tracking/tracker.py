@@ -7,7 +7,7 @@ from dataclasses import replace
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes import KeyframeStore, Pointmap
+from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
 from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, PairGeometry, Prior
 from aquaflow.tracking.attachment import Attachment, Follower
@@ -63,6 +63,22 @@ class Tracker:
     def lost(self) -> bool:
         """True while the latest frames found no place on the keyframe in use."""
         return bool(self._lost)
+
+    @property
+    def sub_maps(self) -> int:
+        """Sub-maps that were begun so far."""
+        return self._sub_maps
+
+    def resume(self, camera: CameraModel, focal_sigma: float, sub_maps: int, T_wc: Sim3) -> None:
+        """Go on with keyframes of an earlier run: look for a known place, and until one is found
+        grow a new sub-map from ``T_wc``, the last pose."""
+        self.camera, self.focal_sigma = camera, focal_sigma
+        self.sub_map, self._sub_maps = sub_maps, sub_maps + 1
+        self._origin = T_wc
+
+    def recall(self, keyframe: Keyframe) -> None:
+        """An earlier run's keyframe may be taken up again."""
+        self._follower.leave(Attachment(keyframe))
 
     def finish(self) -> list[Tracked]:
         """Account for the frames that never got a pose; tries one last time with what there is."""

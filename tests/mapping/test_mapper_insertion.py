@@ -61,8 +61,23 @@ def test_the_cap_is_hard_and_cuts_no_corner_of_the_picture_off() -> None:
     assert mapper.insert(view, flat_pointmap()) == 1000
     rows = CAMERA.project(mapper.gaussians.means.numpy())[:, 1]
     assert 0.3 < float((rows > 24.0).mean()) < 0.7
-    assert mapper.insert(view_of(view.image, pose((0.0, 0.0, -9.0))), flat_pointmap()) == 0
-    assert len(mapper.gaussians) == 1000
+
+
+def test_at_the_cap_what_is_least_worth_makes_room_where_the_picture_is_bare() -> None:
+    for share, expected in ((0.1, 100), (0.0, 0)):
+        config = dense(max_gaussians=1000)
+        insertion = config.insertion.model_copy(update={"recycle": share})
+        mapper = Mapper(config.model_copy(update={"insertion": insertion}), renderer(), 0)
+        view = view_of(np.full((48, 64, 3), 120, np.uint8))
+        mapper.insert(view, flat_pointmap())
+        mapper.gaussians.parameters["opacity_logits"][:300] = -3.0
+        elsewhere = view_of(view.image, pose((0.0, 0.0, -9.0)))
+        elsewhere.keyframe = 1
+        assert mapper.insert(elsewhere, flat_pointmap()) == expected
+        assert len(mapper.gaussians) == len(mapper._optimiser.steps) == 1000
+        faint = mapper.gaussians.opacities < 0.1
+        assert int(faint.sum()) == 300 - expected
+        assert int((mapper.gaussians.keyframes == 1).sum()) == expected
 
 
 def test_a_surface_elsewhere_than_the_map_says_gets_gaussians_again() -> None:

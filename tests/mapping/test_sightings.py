@@ -39,10 +39,9 @@ def painted(gaussians: GaussianMap, colours: torch.Tensor) -> list[View]:
     return views
 
 
-def looked(gaussians: GaussianMap, views: list[View]) -> Observations:
-    return sight(
-        lambda view: gaussians.parameters, views, renderer(), torch.Generator().manual_seed(0)
-    )
+def looked(gaussians: GaussianMap, views: list[View], beta_a: float = 0.0) -> Observations:
+    random, water = torch.Generator().manual_seed(0), np.full(3, beta_a)
+    return sight(lambda view: gaussians.parameters, views, renderer(), random, water)
 
 
 def test_the_sighted_colour_is_the_pictures_and_not_the_maps() -> None:
@@ -66,6 +65,15 @@ def test_the_blend_is_what_neighbours_add_to_a_point_from_afar() -> None:
     assert many > 2.0 * few
     sums = np.stack([np.bincount(crowded.point, crowded.blend[:, c]) for c in range(3)])
     np.testing.assert_allclose(sums, 0.0, atol=1e-6)
+
+
+def test_the_blend_is_as_it_looks_through_the_maps_own_water_at_the_mean_range() -> None:
+    gaussians = isolated()
+    views = painted(gaussians, gaussians.colours)
+    in_air, in_water = looked(gaussians, views), looked(gaussians, views, beta_a=0.7)
+    mean = np.bincount(in_air.point, in_air.z) / MIN_VIEWS
+    faded = in_air.blend * np.exp(-0.7 * mean[in_air.point])[:, None]
+    np.testing.assert_allclose(in_water.blend, faded, rtol=1e-9)
 
 
 def test_range_and_place_are_those_of_the_gaussians_centre() -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 from functools import cache
+from itertools import product
 
 import numpy as np
 import numpy.typing as npt
@@ -11,15 +12,20 @@ import pytest
 
 from aquaflow.config import MediumConfig
 from aquaflow.mapping.shading import TERMS, shading_basis
-from aquaflow.mapping.sighted_points import Observations
+from aquaflow.mapping.sighted_points import Observations, informative, mean_by
 from aquaflow.mapping.water_estimation import (
     EVERY_MODEL,
     MIN_POINTS,
     WaterEstimate,
+    _cost,
+    _Fit,
+    _normal_equations,
+    _solve,
     estimate_water,
     models_for,
 )
-from aquaflow.mapping.water_model import Model
+from aquaflow.mapping.water_model import WaterModel
+from aquaflow.mapping.water_parameters import Model
 
 Array = npt.NDArray[np.float64]
 
@@ -106,6 +112,47 @@ def test_the_reported_sigma_is_the_scatter_of_repeats_within_a_factor_of_three()
     reported = np.mean([repeat.beta_a_sigma for repeat in repeats()], axis=0)
     assert (reported < 3.0 * scatter).all()
     assert (reported > scatter / 3.0).all()
+
+
+@pytest.mark.parametrize("trust", [0.4, 1.0])
+def test_neighbours_light_is_weighed_by_how_much_of_it_the_sightings_show(trust: float) -> None:
+    """Light from neighbours that grows with range: taken as the map has it, it looks like water."""
+    seen = sighted(shading=LAMP)
+    blend = 0.1 * np.random.default_rng(3).normal(size=(seen.points, 3))[seen.point]
+    blend *= (seen.z - mean_by(seen.point, seen.z[:, None])[seen.point, 0])[:, None]
+    lamp = np.exp(shading_basis(seen.xy) @ LAMP)[:, None]
+    shown = (
+        lamp
+        * blend
+        * np.exp(-BETA * (seen.z - mean_by(seen.point, seen.z[:, None])[seen.point, 0])[:, None])
+    )
+    estimate = fitted(replace(seen, colour=seen.colour + trust * shown, blend=blend))
+    np.testing.assert_allclose(estimate.beta_a, BETA, rtol=0.1)
+    np.testing.assert_allclose(estimate.B_inf, B_INF, atol=0.03)
+
+
+def test_no_simpler_model_explains_more_than_a_richer_one_that_contains_it() -> None:
+    """A fit that stops before its minimum passes for one."""
+    seen = informative(sighted(sightings=5, shading=LAMP, log_gains=DIMMED, noise=0.02))
+    costs: dict[Model, float] = {}
+    fits: list[_Fit] = []
+    for model in EVERY_MODEL:
+        problem = WaterModel(seen, model, B_RES, D, 0.1)
+        fits.append(_solve(problem, fits))
+        costs[model] = _cost(problem, fits[-1].x, noise=0.03)
+    for poor, rich in product(EVERY_MODEL, EVERY_MODEL):
+        if all(has <= may for has, may in zip(astuple(poor), astuple(rich), strict=True)):
+            assert costs[rich] <= costs[poor] + 1.0
+
+
+def test_the_normal_equations_hold_the_gradient_of_the_cost() -> None:
+    problem = WaterModel(informative(sighted(noise=0.02)), Model(True, True, True), B_RES, D, 0.3)
+    x, noise = problem.start + 0.1, 0.02
+    _, gradient = _normal_equations(problem, x, noise)
+    for k in range(problem.size):
+        step = 1e-5 * (np.arange(problem.size) == k)
+        change = (_cost(problem, x + step, noise) - _cost(problem, x - step, noise)) / 2e-5
+        assert 2.0 * gradient[k] == pytest.approx(change, rel=1e-3, abs=0.5)
 
 
 def test_too_few_points_give_no_estimate() -> None:
@@ -197,7 +244,7 @@ def test_the_config_decides_what_may_be_found() -> None:
         Model(),
         Model(exposure=True),
     ]
-    assert models_for(MediumConfig(off_when_clear=False, exposure=False)) == [
+    assert models_for(MediumConfig(off_when_clear=False, exposure=False, uneven=False)) == [
         Model(water=True),
         Model(water=True, shading=True),
     ]

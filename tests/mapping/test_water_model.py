@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_water_estimation import B_RES, D
 
 from aquaflow.mapping.shading import TERMS
-from aquaflow.mapping.sighted_points import MIN_RANGE_RATIO, Observations, informative
-from aquaflow.mapping.water_model import Model, WaterModel
+from aquaflow.mapping.sighted_points import MIN_RANGE_RATIO, Observations, informative, mean_by
+from aquaflow.mapping.water_model import WaterModel
+from aquaflow.mapping.water_parameters import MAX_LOG_RATE, Model
 
 POINTS, SIGHTINGS, VIEWS = 40, 6, 5
 
@@ -47,8 +50,12 @@ EVERY = [
 
 @pytest.mark.parametrize("model", EVERY)
 @pytest.mark.parametrize("channel", [0, 2])
-def test_derivatives_are_those_of_the_errors_and_of_the_points(model: Model, channel: int) -> None:
+@pytest.mark.parametrize("error", [0.0, 0.1])
+def test_derivatives_are_those_of_the_errors_and_of_the_points(
+    model: Model, channel: int, error: float
+) -> None:
     problem, x = exact(model)
+    problem.seen.colour[:] += np.random.default_rng(2).normal(0.0, error, (len(problem.seen.z), 3))
     by_error, by_J = problem.derivatives(x, channel)
     for row, k in enumerate(problem.of_channel(channel)):
         step = 1e-6 * (np.arange(problem.size) == k)
@@ -57,11 +64,11 @@ def test_derivatives_are_those_of_the_errors_and_of_the_points(model: Model, cha
         np.testing.assert_allclose(by_J[row], (plus[1] - minus[1]) / 2e-6, atol=1e-6)
 
 
-def test_channels_share_nothing_but_the_shading() -> None:
+def test_channels_share_the_shading_and_the_trust_in_neighbours() -> None:
     problem, _ = exact(EVERY[-1])
     red, blue = set(problem.of_channel(0)), set(problem.of_channel(2))
-    assert len(red & blue) == TERMS
-    assert len(red) == 3 + TERMS + VIEWS
+    assert len(red & blue) == TERMS + 1
+    assert len(red) == 3 + TERMS + 1 + VIEWS
 
 
 def test_the_priors_derivatives_are_those_of_the_priors() -> None:
@@ -77,7 +84,8 @@ def test_brighter_views_and_brighter_points_are_not_told_apart() -> None:
     problem, x = exact(Model(exposure=True))
     assert problem.free == problem.size - 3
     np.testing.assert_allclose(problem.trial(x).exposure.mean(axis=0), 0.0, atol=1e-12)
-    brighter = problem.look(x + 0.3, 1)[0]
+    views = np.arange(problem.size) >= problem.size - 3 * VIEWS
+    brighter = problem.look(x + 0.3 * views, 1)[0]
     np.testing.assert_allclose(brighter, problem.look(x, 1)[0], atol=1e-9)
 
 
@@ -103,6 +111,31 @@ def test_no_point_is_darker_than_black() -> None:
     problem, x = exact(Model(water=True))
     problem.seen.colour[:] = 0.0
     assert min(problem.look(x, c)[1].min() for c in range(3)) == 0.0
+
+
+@pytest.mark.parametrize("ranges", [(0.5, 3.0), (0.1, 1e3)])
+def test_the_blend_fades_with_the_distance_from_the_points_mean_range(
+    ranges: tuple[float, float],
+) -> None:
+    """As it looks there is known; what it is without water is not."""
+    seen = scattered()
+    z = np.where(np.arange(len(seen.z)) % 2, *ranges)
+    seen = replace(seen, z=z, blend=np.full_like(seen.blend, 0.01))
+    alone = WaterModel(replace(seen, blend=0.0 * seen.blend), Model(water=True), B_RES, D, 0.2)
+    beside = WaterModel(seen, Model(water=True), B_RES, D, 0.2)
+    x = beside.start.copy()
+    x[0] = MAX_LOG_RATE if ranges[1] > 10.0 else np.log(0.2)
+    changed, _ = beside.derivatives(x, 0)
+    assert np.isfinite(changed).all()
+    if ranges[1] < 10.0:
+        x[:3], x[3:6] = np.log(0.2), np.log(0.2)
+        seen.colour[:] += 1.0  # no point is black
+        added = beside.look(x, 0)[0] - alone.look(x, 0)[0]
+        own = 0.01 * np.exp(-0.2 * (z - mean_by(seen.point, z[:, None])[seen.point, 0]))
+        T = np.exp(-0.2 * z)
+        # The best J takes what of the blend looks like a brighter point.
+        taken = np.bincount(seen.point, own * T) / np.bincount(seen.point, T * T)
+        np.testing.assert_allclose(added, own - T * taken[seen.point], atol=1e-9)
 
 
 def test_only_points_seen_over_a_span_of_ranges_are_kept_and_renumbered() -> None:

@@ -15,9 +15,13 @@ import torch
 from typer.testing import CliRunner
 
 from aquaflow import cli
+from aquaflow.config import PriorConfig
 from aquaflow.errors import AquaFlowError, InputError
+from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior import runtime
+from aquaflow.prior.choice import make_prior
 from aquaflow.prior.folder import CARD, DECODER, ENCODER, read_card
+from aquaflow.prior.hybrid import HybridEncoding
 from aquaflow.prior.mast3r.export import OUTPUTS, export, parity_of, relative_difference
 from aquaflow.prior.mast3r.network import Mast3r
 from aquaflow.prior.mast3r.settings import TINY
@@ -61,6 +65,19 @@ def test_a_session_gives_what_the_network_gives(folder: Path) -> None:
         first, second = network(*image)
     for name, expected in zip(OUTPUTS, (*first, *second), strict=True):
         np.testing.assert_allclose(found[name], expected, rtol=1e-3, atol=1e-4)
+
+
+def test_the_papers_network_tells_cells_apart_behind_the_hybrid_prior(folder: Path) -> None:
+    prior = make_prior(PriorConfig(kind="folder", folder=folder, device="cpu"))
+    assert (prior.name, prior.metric) == ("mast3r", True)
+    camera = CameraModel(96, 64, 90.0, 90.0, 48.0, 32.0)
+    image = np.random.default_rng(0).integers(0, 256, (64, 96, 3)).astype(np.uint8)
+    a, b = prior.encode(image, camera), prior.encode(image, camera)
+    assert isinstance(a, HybridEncoding)
+    cells, same = a.describer.cells(a.features, b.features)
+    assert cells.shape == same.shape == (HEIGHT // 8, WIDTH // 8, TINY.descriptor)
+    np.testing.assert_allclose(np.linalg.norm(cells, axis=-1), 1.0, atol=1e-4)
+    assert prior.decode(a, b).matches.shape == (64, 96, 2)
 
 
 def test_other_weights_are_found_out(folder: Path) -> None:

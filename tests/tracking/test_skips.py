@@ -10,8 +10,9 @@ from aquaflow.config import TrackingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.messages import Frame
-from aquaflow.prior.classical import ClassicalEncoding, ClassicalPair, ClassicalPrior
+from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.contract import Encoding
+from aquaflow.prior.flow_pair import FlowEncoding, FlowPair
 from aquaflow.tracking.tracker import Tracker
 
 
@@ -22,13 +23,11 @@ class Counting(ClassicalPrior):
         super().__init__()
         self.encoded = self.seeded = 0
 
-    def encode(self, image: np.ndarray, camera: CameraModel) -> ClassicalEncoding:
+    def encode(self, image: np.ndarray, camera: CameraModel) -> FlowEncoding:
         self.encoded += 1
         return super().encode(image, camera)
 
-    def decode(
-        self, a: Encoding, b: Encoding, predicted: np.ndarray | None = None
-    ) -> ClassicalPair:
+    def decode(self, a: Encoding, b: Encoding, predicted: np.ndarray | None = None) -> FlowPair:
         self.seeded += predicted is not None
         return super().decode(a, b, predicted)
 

@@ -10,8 +10,9 @@ from tracking_scenes import CAMERA, SeaFloor, pose
 from aquaflow.config import VerificationConfig
 from aquaflow.geometry.similarity import Sim3, so3_log
 from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
-from aquaflow.prior.classical import ClassicalEncoding, ClassicalPrior
+from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.contract import Keypoints
+from aquaflow.prior.flow_pair import FlowEncoding
 from aquaflow.tracking.keypoints import match_keypoints
 from aquaflow.tracking.verification import verify
 
@@ -21,7 +22,7 @@ HERE = pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 CONFIG = VerificationConfig()
 
 
-def seen(T_wc: Sim3, floor: SeaFloor = FLOOR) -> ClassicalEncoding:
+def seen(T_wc: Sim3, floor: SeaFloor = FLOOR) -> FlowEncoding:
     return PRIOR.encode(floor.picture(T_wc), CAMERA)
 
 

@@ -78,6 +78,7 @@ PARTS = (
     Part("skip off: solver stops when converged", _tracking(stop_converged=False)),
     Part("skip off: retrieval only at keyframes", built=False),
     Part("without exposure of each view", _medium(exposure=False)),
+    Part("without sunlight on each view", {"mapping": {"sunlight": {"enabled": False}}}),
     Part("skip off: medium off in clear water", _medium(off_when_clear=False)),
     Part("skip off: no Gaussians in open water", built=False),
     Part(

@@ -6,25 +6,19 @@ frames. Parity with torch is measured on a random pair as the files come out.
 
 from __future__ import annotations
 
-import logging
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from aquaflow.errors import AquaFlowError, InputError
+from aquaflow.errors import InputError
 from aquaflow.prior.folder import DECODER, ENCODER, PriorCard, sha256_of, write_card
 from aquaflow.prior.mast3r.network import Mast3r, ViewGeometry
 from aquaflow.prior.mast3r.settings import PATCH_PX, TINY
+from aquaflow.prior.onnx_file import OPSET, relative_difference, write_onnx
 from aquaflow.prior.runtime import RuntimeSettings, Session
 
-OPSET = 18
-INLINE_BYTES = 1 << 30
-"""Weights up to this lie in the ONNX file itself, larger ones beside it: a file ends at 2 GiB."""
 OUTPUTS = tuple(f"{symbol}_{view}" for view in "ab" for symbol in ViewGeometry._fields)
 
 TINY_PX = (48, 32)
@@ -82,12 +76,12 @@ def export(
     encoder, decoder = _graphs(network, width, height)
     image = torch.zeros(1, 3, height, width)
     progress("export", 0, 3)
-    _write(encoder, (image,), ["image"], ["tokens"], folder / ENCODER)
+    write_onnx(encoder, (image,), ["image"], ["tokens"], folder / ENCODER)
     progress("export", 1, 3)
     tokens = encoder(image)
     # Two tensors: the exporter would make one input of the same tensor given twice.
     pair = (tokens, tokens.clone())
-    _write(decoder, pair, ["tokens_a", "tokens_b"], OUTPUTS, folder / DECODER)
+    write_onnx(decoder, pair, ["tokens_a", "tokens_b"], OUTPUTS, folder / DECODER)
     progress("export", 2, 3)
     files = {path.name: sha256_of(path) for path in sorted(folder.iterdir())}
     card = PriorCard(
@@ -126,42 +120,6 @@ def verify_tiny(folder: Path, progress: Progress) -> dict[str, float]:
     return export(Mast3r(TINY), folder, *TINY_PX, licence="none", progress=progress).parity
 
 
-def relative_difference(expected: npt.NDArray[np.float32], found: npt.NDArray[np.float32]) -> float:
-    """Largest difference, relative to the largest expected value."""
-    scale = max(float(np.abs(expected).max()), float(np.finfo(np.float32).tiny))
-    return float(np.abs(expected - found).max()) / scale
-
-
 def _graphs(network: Mast3r, width: int, height: int) -> tuple[EncoderGraph, DecoderGraph]:
     network = network.eval()
     return EncoderGraph(network), DecoderGraph(network, height // PATCH_PX, width // PATCH_PX)
-
-
-def _write(
-    graph: nn.Module,
-    example: tuple[Tensor, ...],
-    inputs: Sequence[str],
-    outputs: Sequence[str],
-    path: Path,
-) -> None:
-    try:
-        import onnxscript  # noqa: F401  # the exporter's own message names no remedy
-    except ImportError as error:
-        raise AquaFlowError(
-            "export needs onnx and onnxscript; pip install 'aquaflow[export]'"
-        ) from error
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # its remarks on torchvision
-    size = sum(tensor.numel() * tensor.element_size() for tensor in graph.state_dict().values())
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the exporter's remarks on itself are of no use here
-        torch.onnx.export(
-            graph,
-            example,
-            str(path),
-            input_names=inputs,
-            output_names=outputs,
-            opset_version=OPSET,
-            dynamo=True,
-            external_data=size > INLINE_BYTES,
-            verbose=False,
-        )

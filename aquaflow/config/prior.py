@@ -1,0 +1,45 @@
+"""Settings of the two-view prior."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from aquaflow.config.stage import Stage
+
+
+class PriorConfig(Stage):
+    """Which prior tracks, and where its network runs (paper, Sec. 3.1)."""
+
+    kind: Literal["compact", "classical", "folder"] = Field(
+        "classical",
+        description="compact: learned coarse matches, refined by flow; without its weights or "
+        "onnxruntime, classical takes its place and says so. classical: SIFT homography and flow, "
+        "no network. folder: the exported prior in `folder`, or an error",
+    )
+    folder: Path | None = Field(
+        None,
+        description="what `aquaflow prior export` or `prior train` wrote; None: what ships",
+    )
+    device: Literal["auto", "cpu", "cuda", "tensorrt"] = Field(
+        "auto", description="auto: the fastest that onnxruntime has; any other is that or an error"
+    )
+    precision: Literal["auto", "fp32", "int8"] = Field(
+        "auto",
+        description="of the compact network; auto: int8 on a processor, fp32 on a GPU, where "
+        "TensorRT makes it fp16 itself",
+    )
+    threads: int = Field(
+        1, ge=1, description="of the network; mapping beside it has a use for the other cores"
+    )
+    engine_cache: Path | None = Field(
+        None, description="folder that TensorRT keeps its engines in; building one takes minutes"
+    )
+
+    @model_validator(mode="after")
+    def _folder_is_named(self) -> PriorConfig:
+        if self.kind == "folder" and self.folder is None:
+            raise ValueError("kind folder needs a folder")
+        return self

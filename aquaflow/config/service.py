@@ -1,0 +1,129 @@
+"""Settings of the onboard service: dives, survival, health, and what it may take of the machine."""
+
+from __future__ import annotations
+
+import ipaddress
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from aquaflow.config.link import Port
+from aquaflow.config.stage import Stage
+from aquaflow.config.telemetry import MountingConfig
+
+
+def is_loopback(host: str) -> bool:
+    """True if nobody but this machine reaches a socket bound to ``host``."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+class ListenConfig(Stage):
+    """Where a server listens. Beyond loopback only with a token."""
+
+    enabled: bool = True
+    host: str = Field("127.0.0.1", description="address to bind; 0.0.0.0: every interface")
+    port: Port
+    token_file: Path | None = Field(
+        None, description="file that holds the token, readable by the service's user only"
+    )
+
+    @model_validator(mode="after")
+    def _others_need_a_token(self) -> ListenConfig:
+        if self.enabled and not is_loopback(self.host) and self.token_file is None:
+            raise ValueError(f"{self.host} can be reached from outside: set token_file as well")
+        return self
+
+
+class LiveMappingConfig(Stage):
+    """How mapping goes along beside tracking."""
+
+    backlog: int = Field(
+        8, ge=1, description="frames that wait for mapping; then common frames are left out, at "
+        "three times as many mapping frames too, at eight times keyframes",
+    )  # fmt: skip
+    steps_per_view: int = Field(
+        40, ge=0, description="steps of the optimiser for each view in the end, as far as time "
+        "allows: what 1500 steps of refining and 20 a frame are to a clip of 75 views",
+    )  # fmt: skip
+    nice: int = Field(
+        0,
+        ge=0,
+        le=19,
+        description="of the mapping thread. More than a little is unwise: where other programs are "
+        "busy, it would be stopped while tracking waits for Python's lock that it holds (measured "
+        "on two cores with ten busy processes: at 10, no step of mapping ended for a minute)",
+    )
+    refine_seconds: float | None = Field(
+        20.0,
+        ge=0,
+        description="s; refining when the dive ends, within systemd's TimeoutStopSec (None: as "
+        "long as mapping.optimiser says)",
+    )
+
+
+class CheckpointConfig(Stage):
+    """What a kill or a power cut may cost."""
+
+    every_s: float = Field(10.0, gt=0, description="s between checkpoints, and so the most lost")
+    resume_h: float = Field(
+        12.0, ge=0, description="h; an unfinished dive that is older is left as it is (0: always)"
+    )
+
+
+class LimitsConfig(Stage):
+    """When the service takes less for itself, and how it climbs back."""
+
+    disk_mb: int = Field(1500, ge=0, description="MB free, below which nothing new is written")
+    memory_share: float = Field(
+        0.10, ge=0, lt=1, description="of the machine's or the unit's memory that must stay free"
+    )
+    gpu_memory_share: float = Field(0.05, ge=0, lt=1, description="of the GPU's, likewise")
+    temperature_c: float = Field(
+        92.0, gt=0, description="degC of the hottest zone; a Jetson throttles itself at 97 to 99"
+    )
+    look_s: float = Field(2.0, gt=0, description="s between looks; each may go down one step")
+    calm_s: float = Field(20.0, gt=0, description="s without need until it climbs up one step")
+
+
+class PoseConfig(Stage):
+    """The vehicle's pose back to its autopilot. Off unless asked for, and only in metres."""
+
+    enabled: bool = False
+    message: Literal["odometry", "vision_position_delta"] = "odometry"
+    mounting: MountingConfig = Field(
+        MountingConfig(), description="of the camera; without it, it looks forward"
+    )
+    jump_m: float = Field(
+        0.2, gt=0, description="m; a correction that moves the pose further bumps reset_counter"
+    )
+
+
+class VehicleReportConfig(Stage):
+    """What the pilot is told over MAVLink."""
+
+    status_text: bool = Field(True, description="STATUSTEXT when the state changes")
+    values: bool = Field(True, description="NAMED_VALUE_FLOAT once a second: AQ_STATE, AQ_LAG, ...")
+
+
+class ServiceConfig(Stage):
+    """What ``aquaflow run`` does beside mapping."""
+
+    dives: Path = Field(Path("dives"), description="folder that gets a folder for each dive")
+    camera: str | None = Field(None, description="name of the camera that maps; None: the first")
+    record: bool = Field(False, description="record cameras and telemetry beside, as `record` does")
+    hang_s: float = Field(
+        60.0, gt=0, description="s without a sign of life of a stage until the process gives up; "
+        "one fit of the water may take 10 s on two cores",
+    )  # fmt: skip
+    health: ListenConfig = ListenConfig(port=8230)
+    mapping: LiveMappingConfig = LiveMappingConfig()
+    checkpoint: CheckpointConfig = CheckpointConfig()
+    limits: LimitsConfig = LimitsConfig()
+    pose: PoseConfig = PoseConfig()
+    report: VehicleReportConfig = VehicleReportConfig()

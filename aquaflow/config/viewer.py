@@ -1,0 +1,21 @@
+"""Settings of the window into a dive."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from aquaflow.config.service import ListenConfig
+
+
+class ViewerConfig(ListenConfig):
+    """The live view in a browser; off unless asked for."""
+
+    enabled: bool = False
+    port: int = Field(8231, ge=0, le=65535, description="0: any that is free")
+    splats: int = Field(
+        60_000, ge=100, description="Gaussians shown at most; browsers give up at some millions, a "
+        "tether sooner: 32 bytes each",
+    )  # fmt: skip
+    refresh_s: float = Field(3.0, gt=0, description="s between pictures of the whole map")
+    pose_hz: float = Field(4.0, gt=0, le=30, description="frustum and trajectory")
+    picture_width: int = Field(240, ge=16, le=1920, description="px of the current picture")

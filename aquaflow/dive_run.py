@@ -1,0 +1,216 @@
+"""One run into a dive folder, live or replayed: the fate of each frame, the results at the end."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from aquaflow.config import Config
+from aquaflow.dive import TRACE, DiveFolder, FrameRow
+from aquaflow.errors import InputError, NotMappedError
+from aquaflow.maps import MIN_VIEWS, Progress
+from aquaflow.messages import CameraModel, Dropped, Frame
+from aquaflow.outcome import (
+    HeldOut,
+    examine_held_out,
+    largest_sub_map,
+    metrics,
+    refined_poses,
+    summarise_water,
+)
+from aquaflow.preparation import Preparation
+from aquaflow.profiler import pace
+from aquaflow.reporting import report_data
+from aquaflow.slam import Slam
+from aquaflow.tracking.frames import Tracked
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A finished run."""
+
+    dive: Path
+    metrics: dict[str, Any]
+    notes: list[str]
+
+
+class DiveRun:
+    """Frames go through ``slam`` and into ``folder``; ``finish`` writes what came of them."""
+
+    def __init__(
+        self,
+        name: str,
+        folder: DiveFolder,
+        config: Config,
+        slam: Slam,
+        calibration: CameraModel | None,
+        name_of: Callable[[int], str],
+        trace: bool = False,
+    ) -> None:
+        """``name_of`` a frame's index: its file, or where it is in the film."""
+        self.name, self.folder, self.slam = name, folder, slam
+        self.calibration = calibration
+        self.preparation = Preparation(config.source, calibration)
+        self.profiler = slam.profiler
+        self.results: list[Tracked] = []
+        self.dropped: list[Dropped] = []
+        self.notes: list[str] = []
+        self.live: dict[str, Any] | None = None
+        """What a live run says of itself in metrics.json."""
+        self.started = time.monotonic()
+        self.frame_ms: list[float] = []
+        """Of every frame that was read: preparing, tracking and mapping it."""
+        self.first_pose_s: float | None = None
+        """Seconds from the start of the run."""
+        self._name_of, self._trace = name_of, trace
+        self._cpu_before_s = time.process_time()
+
+    # --- while frames come --------------------------------------------------------------------
+
+    def frame(self, frame: Frame) -> list[Tracked]:
+        """One frame's way, and whose fate it decided; a picture that cannot be prepared costs
+        itself, not the dive."""
+        begun = time.monotonic()
+        try:
+            with self.profiler.stage("prepare"):
+                prepared = self.preparation(frame)
+        except InputError as error:
+            self.drop(Dropped(frame.index, frame.t_ns, str(error)))
+            return []
+        decided = self.slam.process(prepared)
+        self.decide(decided)
+        self._time_frame(begun)
+        return decided
+
+    def _time_frame(self, begun: float) -> None:
+        now = time.monotonic()
+        self.frame_ms.append(1e3 * (now - begun))
+        if self.first_pose_s is None and any(t.T_wc is not None for t in self.results):
+            self.first_pose_s = now - self.started
+
+    def drop(self, frame: Dropped) -> None:
+        """A frame that reached nobody."""
+        self.dropped.append(frame)
+        log.warning("frame %d left out: %s", frame.index, frame.reason)
+        row = FrameRow(
+            frame.index,
+            self._name_of(frame.index),
+            frame.t_ns * 1e-9,
+            "dropped",
+            reason=frame.reason,
+        )
+        self.folder.record([row])
+
+    def decide(self, decided: list[Tracked]) -> None:
+        """Frames whose fate is known."""
+        self.results += [tracked.bare() for tracked in decided]
+        with self.profiler.stage("record"):
+            self.folder.record(self._row(tracked) for tracked in decided)
+
+    def _row(self, tracked: Tracked) -> FrameRow:
+        posed = tracked.T_wc is not None
+        return FrameRow(
+            tracked.frame.index,
+            self._name_of(tracked.frame.index),
+            tracked.frame.t_ns * 1e-9,
+            tracked.frame_class.value,
+            tracked.sub_map if posed else None,
+            tracked.keyframe,
+            tracked.quality.inlier_share if posed else None,
+            tracked.reason,
+        )
+
+    # --- the end ------------------------------------------------------------------------------
+
+    def finish(self, notes: list[str], progress: Progress | None = None) -> Finished:
+        """Refine and write; ``notes`` of the source go to the user with the run's own.
+
+        Raises:
+            NotMappedError: too few frames could be placed; the folder says why.
+        """
+        self.decide(self.slam.finish(progress))
+        with self.profiler.stage("write"):
+            self.results = self.slam.settled(self.results)
+            self._note_what_was_left_out(notes)
+            self.folder.write_frames({t.frame.index: t.sub_map for t in self.results if t.T_wc})
+        if sum(tracked.T_wc is not None for tracked in self.results) < MIN_VIEWS:
+            raise NotMappedError(self._why_not())
+        return self._write()
+
+    def _note_what_was_left_out(self, notes: list[str]) -> None:
+        self.notes += notes
+        lost = sum(tracked.T_wc is None for tracked in self.results)
+        if lost:
+            self.notes.append(f"{lost} of {len(self.results)} frames got no pose")
+        sub_maps = {tracked.sub_map for tracked in self.results if tracked.T_wc is not None}
+        if len(sub_maps) > 1:
+            self.notes.append(
+                f"tracking was lost {len(sub_maps) - 1} times: the dive has {len(sub_maps)} "
+                "sub-maps without a common scale"
+            )
+        if self.calibration is None and self.slam.tracker.camera is not None:
+            focal, sigma = self.slam.tracker.camera.fx, self.slam.tracker.focal_sigma
+            self.notes.append(
+                "no calibration was given: the focal length was guessed and refined to "
+                f"{focal:.0f} px ({100.0 * sigma:.0f} % formal uncertainty), distortion ignored"
+            )
+        for note in self.notes:
+            log.info(note)
+
+    def _why_not(self) -> str:
+        read = len(self.results)
+        if read == 0:
+            return f"{self.name}: no frame could be read, see {self.folder.path}/frames.csv"
+        if read < MIN_VIEWS:
+            return f"{self.name} has {read} usable frames; a map needs at least {MIN_VIEWS}"
+        return (
+            f"{self.name}: none of {read} frames could be placed; the pictures need texture and "
+            "the camera must move sideways, see frames.csv for each frame"
+        )
+
+    def _write(self) -> Finished:
+        main = largest_sub_map(self.results)
+        with self.profiler.stage("evaluate"):
+            held_out = examine_held_out(self.slam, main)
+            waters = {n: summarise_water(mapper) for n, mapper in self.slam.mappers.items()}
+            water = waters.get(main)
+            poses = refined_poses(self.slam, self.results)
+        times = {tracked.frame.index: tracked.frame.t_ns * 1e-9 for tracked in self.results}
+        with self.profiler.stage("write"):
+            self.folder.write_trajectory([times[i] for i in poses], list(poses.values()))
+            assert self.slam.tracker.camera is not None
+            self.folder.write_cameras(self.slam.tracker.camera, self.calibration)
+            for sub_map, mapped in self.slam.mappers.items():
+                suffix = "" if sub_map == main else f"_{sub_map}"
+                self.folder.write_map(mapped, waters[sub_map], suffix)
+            self.folder.write_held_out(held_out)
+        with self.profiler.stage("report"):
+            numbers = self._numbers(held_out)
+            mapper = self.slam.mappers.get(main)
+            evidence = None if mapper is None else mapper.scene.water_evidence
+            self.folder.write_medium(water, numbers["scale_source"], evidence)
+            self.folder.write_report(
+                report_data(
+                    self.name, self.slam, self.results, self.dropped, poses, held_out, water,
+                    numbers, self.notes, calibrated=self.calibration is not None,
+                )
+            )  # fmt: skip
+        numbers = self._numbers(held_out)  # the report's own time included
+        self.folder.write_json("metrics.json", numbers)
+        if self._trace:
+            self.folder.write_json(TRACE, self.profiler.chrome_trace())
+        return Finished(self.folder.path, numbers, self.notes)
+
+    def _numbers(self, held_out: list[HeldOut]) -> dict[str, Any]:
+        wall_s = time.monotonic() - self.started
+        numbers = metrics(self.slam, self.results, self.dropped, held_out, wall_s)
+        numbers["cpu_s"] = round(time.process_time() - self._cpu_before_s, 3)  # of all threads
+        if self.live is not None:
+            numbers["live"] = self.live
+        return numbers | pace(self.frame_ms, len(self.frame_ms), self.first_pose_s, wall_s)

@@ -1,0 +1,48 @@
+"""Which prior tracks: the one that the config asks for, or the safety net, never unannounced."""
+
+from __future__ import annotations
+
+import logging
+from importlib.util import find_spec
+from pathlib import Path
+
+from aquaflow.config.prior import PriorConfig
+from aquaflow.prior.classical import ClassicalPrior
+from aquaflow.prior.contract import Prior
+from aquaflow.prior.folder import CARD
+from aquaflow.prior.runtime import RuntimeSettings
+
+log = logging.getLogger(__name__)
+
+SHIPPED = Path(__file__).parent / "weights" / "compact"
+"""The compact prior's export, which is part of the package."""
+
+
+def make_prior(config: PriorConfig) -> Prior:
+    """The prior of ``config``; classical, with a warning, where the compact one cannot be had.
+
+    Raises:
+        InputError: the asked-for folder is no prior, or a file in it was changed.
+        AquaFlowError: the processor asked for is not there.
+    """
+    if config.kind == "classical":
+        return ClassicalPrior()
+    folder = config.folder or SHIPPED
+    missing = _missing(folder) if config.kind == "compact" else None
+    if missing is not None:
+        log.warning("tracking with the classical prior: %s", missing)
+        return ClassicalPrior()
+    from aquaflow.prior.describers import describer_in
+    from aquaflow.prior.hybrid import HybridPrior
+
+    settings = RuntimeSettings(config.device, config.precision, config.threads, config.engine_cache)
+    return HybridPrior(describer_in(folder, settings))
+
+
+def _missing(folder: Path) -> str | None:
+    """What the compact prior lacks here, with its remedy."""
+    if find_spec("onnxruntime") is None:
+        return "onnxruntime is not installed; pip install 'aquaflow[prior]' for the learned one"
+    if not (folder / CARD).is_file():
+        return f"there are no weights in {folder}; train them with `aquaflow prior train compact`"
+    return None

@@ -1,0 +1,199 @@
+"""The compact prior's network: a siamese encoder, and a head that compares two encodings.
+
+The encoder sees pictures whose local mean and contrast are made equal, and never where a pixel
+lies: descriptors that know their position learn nothing else (prior_notes.md section 3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from aquaflow.prior.compact.blocks import Residual, Up, convolved, locally_normalised
+
+STRIDE = 16
+"""Sides of a picture are multiples of it, px."""
+FINE, COARSE = 2, 8
+"""Pixels between descriptors along a side."""
+SHARPEST = 4.6
+"""Largest logarithm of an inverse temperature."""
+
+
+@dataclass(frozen=True)
+class NetworkSize:
+    """Channels by level; defaults are those of the weights that ship."""
+
+    levels: tuple[int, int, int, int] = (16, 32, 64, 128)
+    """At 1/2, 1/4, 1/8 and 1/16."""
+    merged: tuple[int, int, int] = (64, 40, 24)
+    """On the way back, at 1/8, 1/4 and 1/2."""
+    fine: int = 24
+    """Numbers of a fine descriptor."""
+    coarse: int = 64
+    """Numbers of a coarse descriptor."""
+    head: int = 32
+    """Channels of the range head."""
+
+
+class Encoded(NamedTuple):
+    """What is kept of a picture."""
+
+    D: Tensor
+    """[B, fine, H/2, W/2] unit descriptors"""
+    Dc: Tensor
+    """[B, coarse, H/8, W/8] unit descriptors"""
+    C: Tensor
+    """[B, H/2, W/2] in (0, 1): how likely the pixel's match is found"""
+
+
+class Compared(NamedTuple):
+    """One way of a pair, by the coarse cells of the first picture."""
+
+    pixels: Tensor
+    """[B, 2, H/8, W/8] px in the other picture where the cell's centre is seen"""
+    ray: Tensor
+    """[B, 2, H/8, W/8] the same in ray units: x / z, y / z in the other camera"""
+    score: Tensor
+    """[B, H/8, W/8] in [0, 1]: probability of that place and its neighbours"""
+    log_range: Tensor
+    """[B, H/8, W/8] logarithm of the distance, up to the pair's scale"""
+    log_variance: Tensor
+    """[B, H/8, W/8] of log_range"""
+
+
+class CompactPrior(nn.Module):
+    """Both parts and the temperatures that matching is trained with."""
+
+    def __init__(self, size: NetworkSize | None = None) -> None:
+        super().__init__()
+        size = size or NetworkSize()
+        self.size = size
+        self.encoder = Encoder(size)
+        self.comparison = Comparison(size)
+        self.fine_sharpness = nn.Parameter(torch.tensor(2.6))
+
+    def encode(
+        self,
+        image: Tensor,  # [B, 3, H, W] RGB in [0, 1], sides multiples of 16
+    ) -> Encoded:
+        """Nothing of it depends on another picture."""
+        encoded: Encoded = self.encoder(image)
+        return encoded
+
+
+class Encoder(nn.Module):
+    """Residual levels down to 1/16, and back up by sums to 1/2."""
+
+    def __init__(self, size: NetworkSize) -> None:
+        super().__init__()
+        a, b, c, d = size.levels
+        e, f, g = size.merged
+        self.down_2 = nn.Sequential(convolved(3, a, 5, 2), Residual(a))
+        self.down_4 = nn.Sequential(convolved(a, b, 3, 2), Residual(b))
+        self.down_8 = nn.Sequential(convolved(b, c, 3, 2), Residual(c), Residual(c))
+        self.down_16 = nn.Sequential(convolved(c, d, 3, 2), Residual(d), Residual(d), Residual(d))
+        self.up_8, self.up_4, self.up_2 = Up(d, c, e), Up(e, b, f), Up(f, a, g)
+        self.coarse = nn.Conv2d(e, size.coarse, 1)
+        self.fine = nn.Conv2d(g, size.fine, 1)
+        self.trust = nn.Conv2d(g, 1, 3, padding=1)
+
+    def forward(
+        self,
+        image: Tensor,  # [B, 3, H, W]
+    ) -> Encoded:
+        at_2 = self.down_2(locally_normalised(image))
+        at_4 = self.down_4(at_2)
+        at_8 = self.down_8(at_4)
+        merged_8 = self.up_8(self.down_16(at_8), at_8)
+        merged_2 = self.up_2(self.up_4(merged_8, at_4), at_2)
+        D = F.normalize(self.fine(merged_2).float(), dim=1)
+        Dc = F.normalize(self.coarse(merged_8).float(), dim=1)
+        return Encoded(D, Dc, torch.sigmoid(self.trust(merged_2.detach()).float())[:, 0])
+
+
+class Comparison(nn.Module):
+    """Coarse matches of a pair, and from them and the rays a rough range."""
+
+    def __init__(self, size: NetworkSize) -> None:
+        super().__init__()
+        self.sharpness = nn.Parameter(torch.tensor(2.6))
+        self.range = nn.Sequential(
+            convolved(size.coarse + 5, size.head, 3, 1),
+            Residual(size.head, dilation=2),
+            Residual(size.head, dilation=4),
+            nn.Conv2d(size.head, 2, 1),
+        )
+
+    def scores(
+        self,
+        Dc_a: Tensor,  # [B, d, h, w]
+        Dc_b: Tensor,  # [B, d, h, w]
+    ) -> Tensor:
+        """[B, cells of a, cells of b] products of descriptors over the temperature."""
+        products = Dc_a.flatten(2).mT @ Dc_b.flatten(2)
+        return products * self.sharpness.clamp_max(SHARPEST).exp()
+
+    def forward(
+        self,
+        Dc_a: Tensor,  # [B, d, h, w]
+        Dc_b: Tensor,  # [B, d, h, w]
+        rays_a: Tensor,  # [B, 2, h, w] x / z, y / z of the cells' centres
+        rays_b: Tensor,  # [B, 2, h, w]
+    ) -> tuple[Compared, Compared]:
+        """From a to b, and from b to a."""
+        scores = self.scores(Dc_a, Dc_b)
+        one, other = torch.softmax(scores, 2), torch.softmax(scores, 1)
+        both = one * other
+        return (
+            self._one_way(Dc_a, rays_a, rays_b, one, both),
+            self._one_way(Dc_b, rays_b, rays_a, other.mT, both.mT),
+        )
+
+    def _one_way(
+        self,
+        Dc: Tensor,  # [B, d, h, w]
+        rays: Tensor,  # [B, 2, h, w]
+        rays_other: Tensor,  # [B, 2, h, w]
+        one: Tensor,  # [B, cells, cells of the other] probabilities
+        both: Tensor,  # [B, cells, cells of the other] mutual ones
+    ) -> Compared:
+        height, width = rays_other.shape[-2:]
+        column, row = _cells(height, width, Dc)
+        best = both.argmax(2, keepdim=True)
+        near = ((column - column[best]).abs() < 1.5) & ((row - row[best]).abs() < 1.5)
+        weight = torch.where(near, one, 0.0)
+        score = weight.sum(2, keepdim=True)
+        weight = weight / score.clamp_min(1e-6)
+        pixels = torch.stack([(column + 0.5) * COARSE, (row + 0.5) * COARSE], -1)
+        places = torch.cat([pixels.expand(len(Dc), -1, -1), rays_other.flatten(2).mT], -1)
+        shape = (len(Dc), -1, *rays.shape[-2:])
+        pixels, ray = (weight @ places).mT.reshape(shape).chunk(2, 1)
+        score = score.mT.reshape(shape)
+        known = torch.cat([Dc, ray - rays, rays, score], 1).detach()
+        log_range, log_variance = self.range(known).float().unbind(1)
+        return Compared(pixels, ray, score[:, 0], log_range, log_variance)
+
+
+def cell_rays(
+    K: Tensor,  # [B, 3, 3] px
+    height: int,
+    width: int,
+) -> Tensor:
+    """[B, 2, H/8, W/8] x / z and y / z of the centres of the coarse cells of a pinhole camera."""
+    rows, columns = height // COARSE, width // COARSE
+    u = (torch.arange(columns, device=K.device) + 0.5) * COARSE
+    v = (torch.arange(rows, device=K.device) + 0.5) * COARSE
+    x = (u - K[:, 0, 2, None]) / K[:, 0, 0, None]
+    y = (v - K[:, 1, 2, None]) / K[:, 1, 1, None]
+    return torch.stack([x[:, None].expand(-1, rows, -1), y[:, :, None].expand(-1, -1, columns)], 1)
+
+
+def _cells(height: int, width: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """[height * width] column and row of each cell, as numbers that can be averaged."""
+    column = torch.arange(width, device=like.device, dtype=like.dtype)
+    row = torch.arange(height, device=like.device, dtype=like.dtype)
+    return column.expand(height, width).flatten(), row[:, None].expand(height, width).flatten()

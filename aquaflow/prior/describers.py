@@ -1,0 +1,215 @@
+"""Exported networks as describers of pictures' cells: the compact one, and the paper's.
+
+The compact one describes a picture without looking at the other; the paper's looks at both, so that
+what it keeps of a picture are tokens, and descriptors come with the pair.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.errors import InputError
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.prior.compact.quantise import INT8_ENCODER
+from aquaflow.prior.contract import Float
+from aquaflow.prior.folder import DECODER, ENCODER, read_card
+from aquaflow.prior.hybrid import Describer, Half, Picture
+from aquaflow.prior.learned_range import MOST_LOG, LearnedRange
+from aquaflow.prior.runtime import RuntimeSettings, Session
+
+MULTIPLE_PX = 16
+"""Sides of the pictures that the compact network takes."""
+
+CELL_PX = 8
+"""Pixels of a cell, across and down, in the pictures that the networks take."""
+
+MIDDLE = slice(CELL_PX // 2, None, CELL_PX)
+"""Pixels beside the cells' centres."""
+
+POINTS_ALPHA = 0.2
+"""Metres: the reward of log Q in the loss that the paper's network was trained with."""
+
+SHORTEST = 1e-6
+"""Length below which a descriptor has no direction."""
+
+
+class CompactDescriber:
+    """The compact network: descriptors of a picture's cells, whatever the other picture is."""
+
+    metric = False
+
+    def __init__(self, folder: Path, settings: RuntimeSettings) -> None:
+        """Load the exported ``folder``.
+
+        Raises:
+            InputError: it is no prior, its files were changed, or it is not there in 8 bits.
+            AquaFlowError: onnxruntime is not installed, or lacks the processor asked for.
+        """
+        card = read_card(folder)
+        self.name, self._pixels = card.name, card.width * card.height
+        self._folder, self._settings = folder, settings
+        self._encoder = _encoder(folder, INT8_ENCODER in card.files, settings)
+        [(self._input, shape)] = self._encoder.inputs.items()
+        self._fixed = shape[2:] if all(isinstance(n, int) for n in shape[2:]) else None
+
+    def fitted(
+        self,
+        image: Picture,  # [H, W, 3] RGB
+    ) -> Picture:
+        """[h, w, 3] of the size that was exported; if any may be, of so many pixels as that."""
+        height, width = image.shape[:2]
+        if self._fixed is not None:
+            height, width = self._fixed
+        else:
+            scale = min((self._pixels / (height * width)) ** 0.5, 1.0)
+            height, width = (_multiple(scale * side) for side in (height, width))
+        return resized(image, height, width)
+
+    def features(
+        self,
+        picture: Picture,  # [h, w, 3] as fitted
+    ) -> Half:
+        """[h / 8, w / 8, d] unit descriptors."""
+        found = self._encoder({self._input: as_input(picture)})["Dc"][0]
+        return np.ascontiguousarray(unit(found.transpose(1, 2, 0)).astype(np.float16))
+
+    def cells(self, a: Half, b: Half) -> tuple[Float, Float]:
+        """The features themselves."""
+        return a.astype(np.float32), b.astype(np.float32)
+
+    def range_of(
+        self, a: Half, b: Half, camera_a: CameraModel, camera_b: CameraModel
+    ) -> LearnedRange:
+        """By comparing rays: nearly monocular, and up to a factor (prior_notes.md section 3)."""
+        found = self._decoder(
+            {
+                "Dc_a": _channels_first(a.astype(np.float32)),
+                "Dc_b": _channels_first(b.astype(np.float32)),
+                "rays_a": _channels_first(cell_rays(camera_a, *a.shape[:2])),
+                "rays_b": _channels_first(cell_rays(camera_b, *b.shape[:2])),
+            }
+        )
+        variance = np.exp(np.clip(found["log_variance_ab"][0], -MOST_LOG, MOST_LOG))
+        return LearnedRange(found["log_range_ab"][0], variance, self.metric)
+
+    @cached_property
+    def _decoder(self) -> Session:
+        return Session(self._folder / DECODER, self._settings)
+
+
+class Mast3rDescriber:
+    """The paper's network: descriptors of both pictures, after each has looked at the other."""
+
+    metric = True
+
+    def __init__(self, folder: Path, settings: RuntimeSettings) -> None:
+        """Load the exported ``folder``; raises as the compact one."""
+        card = read_card(folder)
+        self.name, self._size = card.name, (card.height, card.width)
+        self._encoder = Session(folder / ENCODER, settings)
+        self._decoder = Session(folder / DECODER, settings)
+
+    def fitted(
+        self,
+        image: Picture,  # [H, W, 3] RGB
+    ) -> Picture:
+        """[h, w, 3] of the size that was exported."""
+        return resized(image, *self._size)
+
+    def features(
+        self,
+        picture: Picture,  # [h, w, 3] as fitted
+    ) -> Half:
+        """[1, N, D] tokens."""
+        return self._encoder({"image": as_input(picture)})["tokens"].astype(np.float16)
+
+    def cells(self, a: Half, b: Half) -> tuple[Float, Float]:
+        """[h / 8, w / 8, d] the descriptors at the cells' centres."""
+        found = self._decoded(a, b)
+        return found["D_a"][0, MIDDLE, MIDDLE], found["D_b"][0, MIDDLE, MIDDLE]
+
+    def range_of(
+        self, a: Half, b: Half, camera_a: CameraModel, camera_b: CameraModel
+    ) -> LearnedRange:
+        """Of its points, in metres. Its confidence Q weighed errors while it was trained, so that
+        an error of POINTS_ALPHA / Q metres is what it expects."""
+        found = self._decoded(a, b)
+        distance = np.linalg.norm(found["X_a"][0, MIDDLE, MIDDLE], axis=-1)
+        distance = np.maximum(distance, SHORTEST)
+        expected = POINTS_ALPHA / found["Q_a"][0, MIDDLE, MIDDLE]
+        return LearnedRange(np.log(distance), (expected / distance) ** 2, self.metric)
+
+    def _decoded(self, a: Half, b: Half) -> dict[str, Float]:
+        tokens = {"tokens_a": a.astype(np.float32), "tokens_b": b.astype(np.float32)}
+        return self._decoder(tokens)
+
+
+def _encoder(folder: Path, has_int8: bool, settings: RuntimeSettings) -> Session:
+    """In 8 bits where that was asked for, or nothing was and it runs on a processor."""
+    if settings.precision == "int8" and not has_int8:
+        raise InputError(f"{folder} has no {INT8_ENCODER}; use precision: fp32")
+    if not has_int8 or settings.precision == "fp32":
+        return Session(folder / ENCODER, settings)
+    encoder = Session(folder / INT8_ENCODER, settings)
+    if settings.precision == "auto" and encoder.device != "cpu":
+        return Session(folder / ENCODER, settings)
+    return encoder
+
+
+def describer_in(folder: Path, settings: RuntimeSettings) -> Describer:
+    """The describer for the network that ``folder`` holds; raises as they do."""
+    kinds: dict[str, Any] = {"compact": CompactDescriber, "mast3r": Mast3rDescriber}
+    describer: Describer = kinds[read_card(folder).name](folder, settings)
+    return describer
+
+
+def cell_rays(camera: CameraModel, rows: int, columns: int) -> Float:
+    """[rows, columns, 2] x / z and y / z of the centres of cells that cover the picture."""
+    v, u = np.mgrid[:rows, :columns] + 0.5
+    pixels = np.stack([u * camera.width / columns, v * camera.height / rows], -1)
+    return camera.unproject(pixels)[..., :2].astype(np.float32)
+
+
+def _channels_first(
+    field: Float,  # [h, w, c]
+) -> Float:
+    """[1, c, h, w]"""
+    return np.ascontiguousarray(field.transpose(2, 0, 1)[None])
+
+
+def as_input(
+    picture: Picture,  # [h, w, 3]
+) -> npt.NDArray[np.float32]:
+    """[1, 3, h, w] in [0, 1]"""
+    return np.ascontiguousarray(picture.transpose(2, 0, 1)[None], dtype=np.float32) / 255.0
+
+
+def resized(
+    image: Picture,  # [H, W, 3]
+    height: int,
+    width: int,
+) -> Picture:
+    """[height, width, 3]; pixels are averaged where it becomes smaller."""
+    if image.shape[:2] == (height, width):
+        return image
+    shrinks = height < image.shape[0]
+    way = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(image, (width, height), interpolation=way), dtype=np.uint8)
+
+
+def unit(
+    descriptors: Float,  # [..., d]
+) -> Float:
+    """[..., d] of length 1."""
+    length = np.linalg.norm(descriptors, axis=-1, keepdims=True)
+    return np.asarray(descriptors / np.maximum(length, SHORTEST), dtype=np.float32)
+
+
+def _multiple(side: float) -> int:
+    return max(MULTIPLE_PX, round(side / MULTIPLE_PX) * MULTIPLE_PX)

@@ -1,0 +1,160 @@
+"""The learned prior that tracks: descriptors say where to look, flow says where exactly.
+
+A network tells every cell of a picture from every other, whatever the water, the light and the
+distance did to it; but cells are coarse. Dense flow is exact to a fifth of a pixel, but only finds
+what is near where it starts. So flow starts where the descriptors say (prior_notes.md section 3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.prior import flow as dense
+from aquaflow.prior.candidates import best_flow, from_homography, from_prediction
+from aquaflow.prior.coarse import coarse_flow
+from aquaflow.prior.contract import Encoding, Float
+from aquaflow.prior.flow_pair import FlowEncoding, FlowPair
+from aquaflow.prior.learned_range import LearnedRange, filled
+
+Picture = npt.NDArray[np.uint8]
+Half = npt.NDArray[np.float16]
+
+WARM_UP = (240, 320, 3)
+"""Shape of a picture to warm up with."""
+
+
+class Describer(Protocol):
+    """A network that tells the cells of pictures apart."""
+
+    name: str
+    metric: bool
+
+    def fitted(
+        self,
+        image: Picture,  # [H, W, 3] RGB
+    ) -> Picture:
+        """[h, w, 3] the picture at a size that the network takes."""
+        ...
+
+    def features(
+        self,
+        picture: Picture,  # [h, w, 3] as fitted
+    ) -> Half:
+        """What is computed once for a picture and kept with it."""
+        ...
+
+    def cells(self, a: Half, b: Half) -> tuple[Float, Float]:
+        """[rows, columns, d] unit descriptors of cells that cover each picture, from features."""
+        ...
+
+    def range_of(
+        self, a: Half, b: Half, camera_a: CameraModel, camera_b: CameraModel
+    ) -> LearnedRange:
+        """Distances in the first picture; cameras are those of the pictures before fitting."""
+        ...
+
+
+@dataclass
+class HybridEncoding(FlowEncoding):
+    """A picture made ready for flow; the network looks at it when first needed."""
+
+    picture: Picture
+    describer: Describer
+
+    @cached_property
+    def features(self) -> Half:
+        """What the network says of the picture alone."""
+        return self.describer.features(self.picture)
+
+    def pack(self) -> dict[str, npt.NDArray[Any]]:
+        """Its arrays, not copied; keypoints and features only if they were computed."""
+        arrays = super().pack() | {"picture": self.picture}
+        features = vars(self).get("features")
+        return arrays if features is None else arrays | {"features": features}
+
+    def restore(self, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Take back what was computed when first asked for, and packed."""
+        super().restore(arrays)
+        if "features" in arrays:
+            self.features = arrays["features"]
+
+
+class HybridPair(FlowPair):
+    """Matches at once; points of all pixels of a, learned where parallax sees none."""
+
+    def __init__(self, a: HybridEncoding, b: HybridEncoding, flow: dense.Flow) -> None:
+        super().__init__(a, b, flow)
+        self._encodings = a, b
+
+    @cached_property
+    def _geometry(self) -> tuple[Float, Float]:
+        """(X_a, Q_a)"""
+        a, b = self._encodings
+        learned = a.describer.range_of(a.features, b.features, a.camera, b.camera)
+        return filled(*self._triangulated(), a.camera, learned)
+
+
+class HybridPrior:
+    """Flow that starts from learned matches, behind the prior contract."""
+
+    def __init__(self, describer: Describer) -> None:
+        self.name, self.metric = describer.name, describer.metric
+        self._describer = describer
+        self._matcher = dense.FlowMatcher()
+
+    def encode(
+        self,
+        image: Picture,  # [H, W, 3] RGB
+        camera: CameraModel,
+    ) -> HybridEncoding:
+        grey = dense.normalised_grey(image)
+        fitted = self._describer.fitted(image)
+        return HybridEncoding(camera, grey, dense.texture(grey), fitted, self._describer)
+
+    def pack(self, encoding: Encoding) -> dict[str, npt.NDArray[Any]]:
+        """Grey, texture and the picture; keypoints and features only if they were computed."""
+        assert isinstance(encoding, HybridEncoding)
+        return encoding.pack()
+
+    def unpack(self, arrays: Mapping[str, npt.NDArray[Any]], camera: CameraModel) -> HybridEncoding:
+        """The encoding with all that was computed of it."""
+        encoding = HybridEncoding(
+            camera, arrays["grey"], arrays["texture"], arrays["picture"], self._describer
+        )
+        encoding.restore(arrays)
+        return encoding
+
+    def decode(
+        self,
+        a: Encoding,
+        b: Encoding,
+        predicted: Float | None = None,  # [H, W, 2] px, expected matches of a in b
+    ) -> HybridPair:
+        """Flow from the prediction; where it fails, from the descriptors, then from keypoints."""
+        assert isinstance(a, HybridEncoding)
+        assert isinstance(b, HybridEncoding)
+        return HybridPair(a, b, best_flow(self._matcher, a, b, _starts(a, b, predicted)))
+
+    def warm_up(self) -> None:
+        """Run the network once: the first picture of a dive then waits for no preparation."""
+        features = self._describer.features(self._describer.fitted(np.zeros(WARM_UP, np.uint8)))
+        self._describer.cells(features, features)
+
+
+def _starts(
+    a: HybridEncoding, b: HybridEncoding, predicted: Float | None
+) -> Iterator[Float | None]:
+    yield from from_prediction(predicted)
+    height, width = a.grey.shape
+    flow = coarse_flow(*a.describer.cells(a.features, b.features), height, width)
+    if flow is not None:
+        yield flow
+    yield from from_homography(a, b)
+    yield None

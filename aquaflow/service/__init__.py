@@ -1,0 +1,1 @@
+"""The onboard service: the live loop, its health, and how it survives."""

@@ -1,0 +1,66 @@
+"""Similarities, cameras, numbers as plain arrays and JSON: what a file without pickle holds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.geometry.camera import CameraModel, Port
+from aquaflow.geometry.similarity import Sim3
+
+Array = npt.NDArray[Any]
+Arrays = dict[str, Array]
+
+SIM3 = 13
+"""Numbers of a similarity: R row by row, t, scale."""
+
+
+def of_sim3(poses: Sequence[Sim3]) -> npt.NDArray[np.float64]:
+    """[N, 13]"""
+    rows = [np.concatenate([T.R.ravel(), T.t, [T.scale]]) for T in poses]
+    return np.array(rows, np.float64).reshape(-1, SIM3)
+
+
+def to_sim3(row: Array) -> Sim3:
+    """The similarity in one row of :func:`of_sim3`."""
+    return Sim3(row[:9].reshape(3, 3).copy(), row[9:12].copy(), float(row[12]))
+
+
+def of_camera(camera: CameraModel) -> dict[str, Any]:
+    return asdict(camera)
+
+
+def to_camera(values: dict[str, Any]) -> CameraModel:
+    """Raises TypeError, ValueError where the values are no camera."""
+    tuples = {"distortion": tuple(values["distortion"]), "port": Port(**values["port"])}
+    return CameraModel(**{**values, **tuples})
+
+
+class Cameras:
+    """The few distinct cameras of many views, by number."""
+
+    def __init__(self) -> None:
+        self.known: list[CameraModel] = []
+
+    def number(self, camera: CameraModel) -> int:
+        if camera not in self.known:
+            self.known.append(camera)
+        return self.known.index(camera)
+
+    def to_json(self) -> list[dict[str, Any]]:
+        return [of_camera(camera) for camera in self.known]
+
+
+def prefixed(prefix: str, arrays: Arrays) -> Arrays:
+    """The same arrays under ``prefix.name``."""
+    return {f"{prefix}.{name}": array for name, array in arrays.items()}
+
+
+def under(prefix: str, arrays: Arrays) -> Arrays:
+    """What :func:`prefixed` put there."""
+    start = f"{prefix}."
+    return {name[len(start) :]: array for name, array in arrays.items() if name.startswith(start)}

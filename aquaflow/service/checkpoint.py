@@ -1,0 +1,197 @@
+"""Checkpoints: what a kill or a power cut leaves, and how the next start goes on from there.
+
+``checkpoint/state.npz`` replaces its predecessor as a whole and holds no pickle; its size is that
+of the map and a row for every frame. Pictures and depths lie in ``work/``, one file for each
+keyframe and view, and are on the disk before a state that names them is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import time
+import zipfile
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aquaflow import __version__
+from aquaflow.dive import CHECKPOINT
+from aquaflow.dive_run import DiveRun
+from aquaflow.errors import InputError
+from aquaflow.export.atomic import atomic_write
+from aquaflow.maps import Maps
+from aquaflow.service import map_state, tracking_state
+from aquaflow.service.arrays import Arrays, prefixed, under
+from aquaflow.service.map_thread import Correction, MapThread
+from aquaflow.service.moment import Moment
+from aquaflow.slam import Slam
+
+log = logging.getLogger(__name__)
+
+STATE = "state.npz"
+FORMAT = 1
+FACTS = "facts"
+
+
+def state_file(dive: Path) -> Path:
+    """Where a dive's checkpoint lies."""
+    return dive / CHECKPOINT / STATE
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint as it was read."""
+
+    facts: dict[str, Any]
+    arrays: Arrays
+
+    @property
+    def moment(self) -> Moment:
+        """When it was taken."""
+        return Moment(**self.facts["moment"])
+
+    @property
+    def frames(self) -> set[int]:
+        """Indices of the frames that it knows."""
+        return {int(index) for index in self.arrays["tracking.frames"]["index"]}
+
+
+class Checkpointer:
+    """Takes checkpoints: tracking's part in the loop, the map's part and the writing beside."""
+
+    def __init__(
+        self,
+        dive: Path,
+        run: DiveRun,
+        slam: Slam,
+        maps: MapThread,
+        every_s: float,
+        more: Callable[[], dict[str, Any]] = dict,
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """``more``: facts of others, for whoever reads the checkpoint (clock mappings)."""
+        self.taken = 0
+        self.failures = 0
+        self.size_bytes = 0
+        self.wrote_s = 0.0
+        """How long the last writing took."""
+        self._dive, self._run, self._slam, self._maps = dive, run, slam, maps
+        self._every_s, self._more, self._now_s = every_s, more, now_s
+        self._table = tracking_state.FrameTable()
+        self._due_s = now_s() + every_s
+        self._writing = False
+
+    def look(self, disk_is_full: bool) -> None:
+        """Take a checkpoint if it is time, the last one is done, and there is room."""
+        if self._now_s() < self._due_s or self._writing or disk_is_full:
+            return
+        self._due_s = self._now_s() + self._every_s
+        self.take()
+
+    def take(self) -> None:
+        """Take one now; what the map still waits for, but corrections, is not in it."""
+        with self._run.profiler.stage("checkpoint"):
+            parts = tracking_state.take_apart(self._slam, self._run, self._table)
+            if parts is None:
+                return
+            facts, arrays = parts
+            files = self._slam.keyframes.save()
+        self._writing = True
+        head = {"format": FORMAT, "version": __version__, "moment": Moment.now().to_json()}
+        head |= {"tracking": facts, "more": self._more()}
+        arrays = prefixed("tracking", arrays)
+
+        def write(maps: Maps, lacking: list[Correction]) -> None:
+            self._write(maps, lacking, head, arrays, files)
+
+        self._maps.look("write a checkpoint", write)
+
+    def _write(
+        self,
+        maps: Maps,
+        lacking: list[Correction],
+        head: dict[str, Any],
+        arrays: Arrays,
+        files: list[Path],
+    ) -> None:
+        """In the mapping thread."""
+        began = time.monotonic()
+        try:
+            facts, own = map_state.take_apart(maps)
+            facts["lacking"], more = map_state.corrections_apart(lacking)
+            own |= more
+            bring_to_disk([*files, *maps.views.save()])
+            write_state(self._dive, head | {"mapping": facts}, arrays | prefixed("mapping", own))
+            self.taken += 1
+            self.size_bytes = state_file(self._dive).stat().st_size
+        except (InputError, OSError) as error:
+            self.failures += 1
+            log.warning("no checkpoint: %s", error)
+        finally:
+            self.wrote_s = time.monotonic() - began
+            self._writing = False
+
+
+def write_state(dive: Path, facts: dict[str, Any], arrays: Arrays) -> None:
+    """Replace the checkpoint of ``dive``.
+
+    Raises:
+        InputError, OSError: it cannot be written; the one before stays.
+    """
+    path = state_file(dive)
+    path.parent.mkdir(exist_ok=True)
+    text = json.dumps(facts, allow_nan=False).encode()
+    with atomic_write(path) as stream:
+        np.savez(stream, allow_pickle=False, **{FACTS: np.frombuffer(text, np.uint8)}, **arrays)
+    bring_to_disk([path.parent])
+
+
+def read_state(dive: Path) -> Checkpoint:
+    """The checkpoint of ``dive``.
+
+    Raises:
+        InputError: there is none, or it cannot be used.
+    """
+    path = state_file(dive)
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        facts = json.loads(arrays.pop(FACTS).tobytes())
+        known = facts["format"] == FORMAT
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"cannot resume from {path}: {error}; start with --new") from error
+    if not known:
+        raise InputError(f"{path} was written by version {facts.get('version')}; start with --new")
+    return Checkpoint(facts, arrays)
+
+
+def restore(checkpoint: Checkpoint, slam: Slam, run: DiveRun, maps: Maps) -> None:
+    """Let fresh ``slam``, ``run`` and ``maps`` go on from ``checkpoint``.
+
+    Raises:
+        InputError: it does not fit, or a file of ``work/`` is gone.
+    """
+    facts, arrays = checkpoint.facts, checkpoint.arrays
+    try:
+        tracking_state.put_together(slam, run, facts["tracking"], under("tracking", arrays))
+        map_state.put_together(maps, facts["mapping"], under("mapping", arrays))
+        map_state.catch_up(maps, facts["mapping"]["lacking"], under("mapping", arrays))
+    except (KeyError, ValueError, TypeError, IndexError, RuntimeError) as error:
+        raise InputError(f"the checkpoint cannot be used: {error}; start with --new") from error
+
+
+def bring_to_disk(paths: Iterable[Path]) -> None:
+    """What a power cut must not take (fsync); a file that is gone by now is none of it."""
+    for path in paths:
+        with contextlib.suppress(FileNotFoundError):
+            descriptor = os.open(path, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)

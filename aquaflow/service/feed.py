@@ -1,0 +1,253 @@
+"""Where frames and telemetry come from: threads pump, and none of them ever waits for mapping."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import Protocol
+
+from aquaflow.config import SourceConfig
+from aquaflow.messages import CameraModel, Dropped, Frame, TelemetrySample
+from aquaflow.recording.playback import Playback, arrived
+from aquaflow.recording.recorder import Recorder
+from aquaflow.recording.session import HasSamples
+from aquaflow.service.continued import Continued
+from aquaflow.service.newest import Newest
+from aquaflow.sources import CameraSource, TelemetrySource
+from aquaflow.vehicle_words import Hears, Word
+
+log = logging.getLogger(__name__)
+
+ASK_S = 0.5
+"""How often a pump that waits to be asked looks whether it shall end."""
+JOIN_S = 3.0
+"""Longest wait for a pump; one that hangs in a device's library ends with the process."""
+
+
+class Heard:
+    """The newest sample of every telemetry source; written by pumps, read by anyone."""
+
+    def __init__(self) -> None:
+        self.samples = 0
+        self._latest: dict[tuple[str, str], TelemetrySample] = {}
+
+    def take(self, sample: TelemetrySample) -> None:
+        self.samples += 1
+        self._latest[sample.source, type(sample).__name__] = sample
+
+    def latest(self) -> list[TelemetrySample]:
+        """The newest of each source and kind."""
+        return list(self._latest.values())
+
+
+class Feed(Protocol):
+    """One camera's newest frame, and telemetry beside it."""
+
+    newest: Newest[Frame | Dropped]
+    heard: Heard
+    notes: list[str]
+    failure: str | None
+    """Why no more frames will come, if that was not their end."""
+
+    @property
+    def calibration(self) -> CameraModel | None: ...
+
+    def name_of(self, index: int) -> str:
+        """Of a frame, for frames.csv."""
+        ...
+
+    def describe(self) -> dict[str, dict[str, object]]:
+        """State and counters of each device, for health."""
+        ...
+
+    def go_on(self, continued: Continued) -> None:
+        """Count frames and time on from an earlier run; before the start."""
+        ...
+
+    def tell(self, word: Word) -> bool:
+        """Tell the vehicle; False if nobody there understands."""
+        ...
+
+    def start(self) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class _Pumps:
+    """Threads that end when the feed is closed."""
+
+    def __init__(self) -> None:
+        self.newest: Newest[Frame | Dropped] = Newest()
+        self.heard = Heard()
+        self.notes: list[str] = []
+        self.failure: str | None = None
+        self.continued = Continued()
+        self.closing = threading.Event()
+        self._threads: list[threading.Thread] = []
+
+    def go_on(self, continued: Continued) -> None:
+        self.continued = continued
+
+    def pump(self, name: str, work: Callable[[], None], last: bool = False) -> None:
+        """Run ``work``; with ``last``, no frame comes after its end."""
+
+        def guarded() -> None:
+            try:
+                work()
+            except Exception as error:
+                log.exception("%s failed", name)
+                self.failure = f"{name} failed: {error}" if last else self.failure
+                self.notes.append(f"{name} failed: {error}")
+            finally:
+                if last:
+                    self.newest.end()
+
+        thread = threading.Thread(target=guarded, name=name, daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+    def join(self) -> None:
+        self.closing.set()
+        self.newest.end()
+        for thread in self._threads:
+            thread.join(JOIN_S)
+
+
+class LiveFeed(_Pumps):
+    """Devices. The camera's picture is decoded when somebody waits for it, so that it is the
+    newest; with a recorder every picture is."""
+
+    def __init__(
+        self,
+        name: str,
+        cameras: Mapping[str, CameraSource],
+        telemetry: TelemetrySource | None,
+        source: SourceConfig,
+        recorder: Recorder | None = None,
+    ) -> None:
+        """``name``: of the camera that maps; the others are recorded only."""
+        super().__init__()
+        self.name, self._cameras, self._telemetry = name, cameras, telemetry
+        self._source, self._recorder = source, recorder
+
+    @property
+    def calibration(self) -> CameraModel | None:
+        return self._cameras[self.name].camera
+
+    def name_of(self, index: int) -> str:
+        return f"{self.name}#{index}"
+
+    def describe(self) -> dict[str, dict[str, object]]:
+        devices: dict[str, dict[str, object]] = {}
+        for name, camera in self._cameras.items():
+            devices[name] = {"kind": "camera", **_state_of(camera)}
+        for name, link in getattr(self._telemetry, "links", {}).items():
+            devices[name] = {"kind": "link", **_state_of(link)}
+        if self._recorder is not None:
+            status = self._recorder.status
+            devices["recorder"] = {"kind": "recorder", "state": status.stopped or "recording"}
+        return devices
+
+    def tell(self, word: Word) -> bool:
+        return isinstance(self._telemetry, Hears) and self._telemetry.tell(word)
+
+    def start(self) -> None:
+        for name, camera in self._cameras.items():
+            mapped = name == self.name
+            if mapped or self._recorder is not None:
+                self.pump(f"camera '{name}'", partial(self._frames, name, mapped), mapped)
+            if isinstance(camera, HasSamples):
+                self.pump(f"IMU of '{name}'", partial(self._samples, camera))
+        if self._telemetry is not None:
+            self.pump("telemetry", partial(self._samples, self._telemetry))
+
+    def close(self) -> None:
+        self.closing.set()
+        for camera in self._cameras.values():
+            camera.close()
+        if self._telemetry is not None:
+            self._telemetry.close()
+        self.join()
+        if self._recorder is not None:
+            self._recorder.close()
+
+    def _frames(self, name: str, mapped: bool) -> None:
+        frames = self._cameras[name].frames(self._source.every if mapped else 1)
+        for frame in self._when_asked(frames) if self._recorder is None else frames:
+            if self._recorder is not None:
+                self._recorder.frame(name, frame)
+            if mapped:
+                self.newest.put(self.continued.counted(frame))
+
+    def _when_asked(self, frames: Iterator[Frame | Dropped]) -> Iterator[Frame | Dropped]:
+        while not self.closing.is_set():
+            if self.newest.asked(ASK_S):
+                frame = next(frames, None)
+                if frame is None:
+                    return
+                yield frame
+
+    def _samples(self, source: HasSamples) -> None:
+        for sample in source.samples():
+            self.heard.take(sample)
+            if self._recorder is not None:
+                self._recorder.sample(sample)
+
+
+class PlaybackFeed(_Pumps):
+    """A recording as if it happened now: moments keep their distances, arrivals are what they are
+    here."""
+
+    def __init__(
+        self,
+        playback: Playback,
+        source: SourceConfig,
+        calibration: CameraModel | None,
+        name_of: Callable[[int], str],
+        notes: list[str],
+    ) -> None:
+        """Goes on with the first frame that an earlier run did not see."""
+        super().__init__()
+        self.calibration, self.name_of, self._notes = calibration, name_of, notes
+        self._playback, self._source = playback, source
+
+    def describe(self) -> dict[str, dict[str, object]]:
+        return {}
+
+    def tell(self, word: Word) -> bool:
+        return False
+
+    def start(self) -> None:
+        self.pump("recording", self._events, last=True)
+
+    def close(self) -> None:
+        self.join()
+        self._playback.close()
+
+    def _events(self) -> None:
+        source = self._source
+        start = source.start
+        while start < self.continued.first_index:
+            start += source.every
+        for event in self._playback.events(source.every, start, source.stop):
+            if self.closing.is_set():
+                return
+            # Moments stay as recorded, so that frames.csv can be compared with a replay's.
+            now = arrived(event, 0, time.monotonic_ns())
+            if isinstance(now, (Frame, Dropped)):
+                self.newest.put(now)
+            else:
+                self.heard.take(now)
+        self.notes += self._notes
+
+
+def _state_of(device: object) -> dict[str, object]:
+    """What a driver says of itself, as far as it does."""
+    state = getattr(device, "state", "")
+    said: dict[str, object] = {"state": getattr(state, "value", state)}
+    said["reason"] = getattr(device, "reason", "")
+    counters = getattr(device, "counters", None)
+    return said | ({} if counters is None else vars(counters))

@@ -1,0 +1,101 @@
+"""How the service is: one state with its reason, every change of it with a reason too."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+
+log = logging.getLogger(__name__)
+
+KEPT = 50
+"""Changes of state that are remembered."""
+
+
+class State(str, Enum):
+    """What the service does at the moment."""
+
+    STARTING = "starting"
+    WAITING = "waiting for camera"
+    INITIALISING = "initialising"
+    TRACKING = "tracking"
+    LOST = "lost"
+    DEGRADED = "degraded"
+    STOPPING = "stopping"
+
+    @property
+    def number(self) -> int:
+        """For NAMED_VALUE_FLOAT and Prometheus."""
+        return list(State).index(self)
+
+
+@dataclass(frozen=True)
+class Change:
+    """From one state to another, and why."""
+
+    t_s: float
+    """CLOCK_MONOTONIC."""
+    before: State
+    after: State
+    reason: str
+
+
+class Health:
+    """The state machine; to be written by the loop alone, read by anyone."""
+
+    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
+        self.state = State.STARTING
+        self.reason = "the service starts"
+        self.changes: deque[Change] = deque(maxlen=KEPT)
+        self.visits: Counter[State] = Counter({State.STARTING: 1})
+        self._now_s = now_s
+        self.since_s = now_s()
+
+    def set(self, state: State, reason: str) -> bool:
+        """Be in ``state``; True if it was another before. A new reason alone is no change."""
+        if self.state is State.STOPPING:  # nothing comes after the end
+            return False
+        before, self.reason = self.state, reason
+        if state is before:
+            return False
+        self.since_s = self._now_s()
+        self.changes.append(Change(self.since_s, before, state, reason))
+        self.visits[state] += 1
+        self.state = state
+        fields = {"event": "state", "before": before.value, "after": state.value}
+        log.info("%s -> %s: %s", before.value, state.value, reason, extra={"fields": fields})
+        return True
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What the state is judged by."""
+
+    frame_age_s: float
+    """Since the last frame, or since the start."""
+    patience_s: float
+    """So long may a camera be silent."""
+    camera: str
+    """What the driver says of a camera that is silent."""
+    posed: bool
+    """The newest frame has a pose."""
+    ever_posed: bool
+    troubles: list[str]
+    """Why things are done by halves."""
+
+
+def judged(facts: Facts) -> tuple[State, str]:
+    """The state that the facts make, and its reason."""
+    if facts.frame_age_s > facts.patience_s:
+        said = f": {facts.camera}" if facts.camera else ""
+        return State.WAITING, f"no picture for {facts.frame_age_s:.0f} s{said}"
+    if not facts.ever_posed:
+        return State.INITIALISING, "no pose yet: the camera must move sideways over texture"
+    if not facts.posed:
+        return State.LOST, "the newest frames have no pose; the place is being looked for"
+    if facts.troubles:
+        return State.DEGRADED, "; ".join(facts.troubles)
+    return State.TRACKING, "every frame has a pose"

@@ -1,0 +1,246 @@
+"""Mapping beside tracking: one thread that does in order what tracking asked for.
+
+Tracking never waits for it. What is asked for and too much is left out and counted, common frames
+first; between requests the thread goes on optimising until every view has had its steps.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+
+from aquaflow.config.service import LiveMappingConfig
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.views import View
+from aquaflow.maps import Growth, Insertion, Maps, Progress
+from aquaflow.service.beats import Beats
+from aquaflow.service.half_size import halved
+from aquaflow.service.ladder import Level
+
+log = logging.getLogger(__name__)
+
+STAGE = "mapping"
+IDLE_S = 0.2
+"""How often an idle thread says that it lives."""
+STEPS_AT_ONCE = 4
+"""Of idle time: a new request waits for no more, about 0.1 s at 480 px."""
+FEWER = 4
+"""At the level of fewer steps, one step of so many is done."""
+JOIN_S = 30.0
+"""Longest wait for the thread at the end of a dive."""
+MAPPING_AT, KEYFRAME_AT = 3, 8
+"""Backlogs after which mapping frames, and then keyframes, are left out."""
+
+Job = Callable[[Maps], None]
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Keyframes that moved, and sub-maps that became one."""
+
+    moves: Mapping[int, Sim3]
+    merged: Mapping[int, int]
+
+    def __call__(self, maps: Maps) -> None:
+        maps.correct(self.moves, self.merged)
+
+
+class MapThread:
+    """The :class:`aquaflow.maps.MapWork` of a live run."""
+
+    def __init__(
+        self,
+        maps: Maps,
+        config: LiveMappingConfig,
+        beats: Beats,
+        level: Callable[[], Level] = lambda: Level.FULL,
+    ) -> None:
+        self.left_out: Counter[str] = Counter()
+        """Frames that the map never saw, by reason."""
+        self.failures = 0
+        """Requests that raised; each costs itself."""
+        self.last_failure = ""
+        self.failing = False
+        """The last request raised."""
+        self._maps, self._config, self._beats, self._level = maps, config, beats, level
+        self._jobs: deque[tuple[str, Job]] = deque()
+        self._whole: set[int] = set()
+        """Frames whose views may be inserted from once more."""
+        self._growing = 0
+        """Growths that wait."""
+        self._newest: int | None = None
+        """The sub-map that grew last."""
+        self._changed = threading.Condition()
+        self._ending = False
+        self._thread = threading.Thread(target=self._run, name=STAGE, daemon=True)
+        self._thread.start()
+
+    # --- what tracking asks for -----------------------------------------------------------------
+
+    def grow(self, growth: Growth) -> None:
+        refused = self._refused(growth)
+        if refused is not None:
+            self.left_out[refused] += 1
+            return
+        level = self._level()
+        growth = replace(growth, retired=tuple(self._owned(growth.retired)))
+        if level >= Level.FEWER_STEPS:
+            growth = replace(growth, steps=growth.steps // FEWER)
+        if level >= Level.SMALLER_IMAGES:
+            growth = halved(growth)
+        elif growth.pointmap is not None:
+            self._whole.add(growth.view.frame_index)
+        with self._changed:
+            self._growing += 1
+        self._post("grow", partial(self._grow, growth))
+
+    def hold_out(self, view: View, sub_map: int) -> None:
+        if self._level() < Level.TRACKING_ONLY:
+            self._post("hold out", lambda maps: maps.hold_out(view, sub_map))
+
+    def insert(self, insertion: Insertion) -> None:
+        for own in self._owned((insertion,)):
+            self._post("insert", partial(_insert, own))
+
+    def correct(self, moves: Mapping[int, Sim3], merged: Mapping[int, int]) -> None:
+        self._post("correct", Correction(moves, merged))
+
+    def look(self, name: str, job: Callable[[Maps, list[Correction]], None]) -> None:
+        """Let ``job`` see the maps before anything else is done to them; it is also told which
+        corrections they still lack to agree with tracking as it is now."""
+        with self._changed:
+            lacking = [job for _, job in self._jobs if isinstance(job, Correction)]
+            self._jobs.appendleft((name, lambda maps: job(maps, lacking)))
+            self._changed.notify()
+
+    def refine(self, progress: Progress | None = None) -> None:
+        self._end()
+        if self._level() is Level.FULL:
+            self._maps.refine(self._beating(progress))
+        self._beats.retire(STAGE)
+
+    def close(self, keep: bool = False) -> None:
+        self._end()
+        self._beats.retire(STAGE)
+        self._maps.close(keep)
+
+    @property
+    def mappers(self) -> dict[int, Mapper]:
+        return self._maps.mappers
+
+    @property
+    def held_out(self) -> dict[int, list[View]]:
+        return self._maps.held_out
+
+    @property
+    def waiting(self) -> int:
+        """Requests that wait."""
+        return len(self._jobs)
+
+    def _owned(self, insertions: Iterable[Insertion]) -> Iterator[Insertion]:
+        """Those whose view the map has, at its full size. Their pointmaps are copied: tracking goes
+        on fusing into that of a keyframe which it takes up again."""
+        for each in insertions:
+            if each.view.frame_index in self._whole:
+                self._whole.discard(each.view.frame_index)
+                yield replace(each, pointmap=each.pointmap.copy())
+
+    # --- the thread -----------------------------------------------------------------------------
+
+    def _refused(self, growth: Growth) -> str | None:
+        if self._level() >= Level.TRACKING_ONLY:
+            return "tracking only"
+        backlog, waiting = self._config.backlog, self._growing
+        if waiting >= backlog and growth.view.robust:
+            return "common frame, mapping was behind"
+        if waiting >= MAPPING_AT * backlog and not growth.retired:
+            return "mapping frame, mapping was behind"
+        if waiting >= KEYFRAME_AT * backlog:
+            return "keyframe, mapping was behind"
+        return None
+
+    def _post(self, name: str, job: Job) -> None:
+        with self._changed:
+            self._jobs.append((name, job))
+            self._changed.notify()
+
+    def _grow(self, growth: Growth, maps: Maps) -> None:
+        with self._changed:
+            self._growing -= 1
+        maps.grow(growth)
+        self._newest = growth.sub_map
+
+    def _run(self) -> None:
+        with contextlib.suppress(OSError):  # a sandbox may forbid it
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self._config.nice)
+        while True:
+            self._beats.beat(STAGE)
+            job = self._next()
+            if job is not None:
+                self._do(*job)
+            elif self._ending:
+                return
+            else:
+                self._do("optimise", self._optimise)
+
+    def _next(self) -> tuple[str, Job] | None:
+        """The next request; none if there is something better to do than to wait for it."""
+        with self._changed:
+            idle = self.failing or not self._wanting()
+            if not self._jobs and not self._ending and idle:
+                self._changed.wait(IDLE_S)
+            return self._jobs.popleft() if self._jobs else None
+
+    def _do(self, name: str, job: Job) -> None:
+        try:
+            job(self._maps)
+            self.failing = False
+        # A request that fails (a GPU that is gone, a file that cannot be read) costs itself.
+        except Exception as error:
+            said, self.last_failure = self.last_failure, f"{name}: {error}"
+            if not self.failing or self.last_failure != said:  # what goes on failing is said once
+                log.exception("mapping failed to %s", name)
+            self.failures, self.failing = self.failures + 1, True
+
+    def _wanting(self) -> Mapper | None:
+        """The map that is to have steps in idle time."""
+        if self._newest is None or self._level() is not Level.FULL:
+            return None
+        mapper = self._maps.mappers.get(self._newest)
+        if mapper is None or len(mapper.gaussians) == 0:
+            return None
+        wanted = self._config.steps_per_view * len(mapper.views)
+        return mapper if mapper.steps < wanted else None
+
+    def _optimise(self, maps: Maps) -> None:
+        mapper = self._wanting()
+        if mapper is not None:
+            with maps.profiler.stage("optimise"):
+                mapper.optimise(STEPS_AT_ONCE)
+
+    def _beating(self, progress: Progress | None) -> Progress:
+        def beat(done: int, total: int) -> None:
+            self._beats.beat(STAGE)
+            if progress is not None:
+                progress(done, total)
+
+        return beat
+
+    def _end(self) -> None:
+        """Do what was asked for and end; nobody else may touch the maps before."""
+        with self._changed:
+            self._ending = True
+            self._changed.notify()
+        while self._thread.is_alive():  # the guard ends the process if the thread hangs
+            self._thread.join(JOIN_S)
+
+
+def _insert(insertion: Insertion, maps: Maps) -> None:
+    maps.insert(insertion)

@@ -1,0 +1,47 @@
+"""The dive's clock over a restart: CLOCK_MONOTONIC begins anew with every boot."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+LEAST_GAP_NS = 1_000_000_000
+"""From the last moment before another boot to the first after it, if the wall clock says less."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A moment on both clocks, and which boot it belongs to."""
+
+    monotonic_ns: int
+    wall_ns: int
+    boot: str
+
+    @staticmethod
+    def now(boot_id: Path = BOOT_ID) -> Moment:
+        try:
+            boot = boot_id.read_text().strip()
+        except OSError:
+            boot = ""
+        return Moment(time.monotonic_ns(), time.time_ns(), boot)
+
+    def shift_ns(self, now: Moment) -> int:
+        """What to add to ``now``'s monotonic clock so that the dive's clock goes on from here.
+
+        Nothing after a restart of the process. After one of the machine, what the wall clock says
+        has passed; if that was set back meanwhile, a second.
+        """
+        if self.boot == now.boot and now.monotonic_ns >= self.monotonic_ns:
+            return 0
+        passed = max(now.wall_ns - self.wall_ns, LEAST_GAP_NS)
+        return self.monotonic_ns + passed - now.monotonic_ns
+
+    def age_h(self, now: Moment) -> float:
+        """Hours until ``now``; 0 where the wall clock was set back."""
+        return max(now.wall_ns - self.wall_ns, 0) / 3.6e12
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)

@@ -1,0 +1,57 @@
+"""Everything that is told of a running service, in one object: /health, /metrics, `status`."""
+
+from __future__ import annotations
+
+import resource
+import time
+from dataclasses import asdict
+from typing import Any
+
+from aquaflow import __version__
+from aquaflow.service.health import State
+from aquaflow.service.session import Parts
+
+GOOD = (State.TRACKING, State.INITIALISING)
+"""States in which nothing is to be done about it."""
+CHANGES_TOLD = 10
+
+
+def report(parts: Parts, hang_s: float, now_s: float | None = None) -> dict[str, Any]:
+    """Stable keys; may be asked for from any thread."""
+    loop, now = parts.loop, time.monotonic() if now_s is None else now_s
+    health, hung = loop.health, loop.beats.hung(hang_s)
+    return {
+        "version": __version__,
+        "state": health.state.value,
+        "reason": health.reason,
+        "ok": health.state in GOOD and hung is None,
+        "hung_stage": hung,
+        "since_s": round(now - health.since_s, 1),
+        "changes": [
+            {
+                "ago_s": round(now - change.t_s, 1),
+                "before": change.before.value,
+                "after": change.after.value,
+                "reason": change.reason,
+            }
+            for change in list(health.changes)[-CHANGES_TOLD:]
+        ],
+        "dive": parts.choice.folder.name,
+        "resumed": parts.choice.checkpoint is not None,
+        **loop.status(),
+        "keyframes": len(parts.slam.keyframes),
+        "gaussians": sum(len(mapper.gaussians) for mapper in list(parts.maps.mappers.values())),
+        "checkpoint": {
+            "taken": parts.checkpointer.taken,
+            "failures": parts.checkpointer.failures,
+            "bytes": parts.checkpointer.size_bytes,
+            "seconds": round(parts.checkpointer.wrote_s, 3),
+        },
+        "machine": asdict(loop.pressure) | {"peak_rss_mb": _peak_rss_mb()},
+        "devices": loop.feed.describe(),
+        "telemetry_samples": loop.feed.heard.samples,
+    }
+
+
+def _peak_rss_mb() -> float:
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)

@@ -1,0 +1,180 @@
+"""One live dive from its folder to its report: everything is made, run, and ended here."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import shutil
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from aquaflow.config import Config, parse_config
+from aquaflow.config.service import ServiceConfig
+from aquaflow.config.vehicle import VehicleConfig
+from aquaflow.dive import CHECKPOINT, DiveFolder
+from aquaflow.dive_run import DiveRun, Finished
+from aquaflow.errors import InputError, NotMappedError
+from aquaflow.maps import Maps, Progress
+from aquaflow.messages import Dropped
+from aquaflow.pipeline import fix_threads
+from aquaflow.profiler import Profiler
+from aquaflow.render import select_renderer
+from aquaflow.service.beats import Beats, Guard
+from aquaflow.service.checkpoint import Checkpointer, restore
+from aquaflow.service.choice import Choice
+from aquaflow.service.continued import Continued
+from aquaflow.service.feed import Feed
+from aquaflow.service.ladder import Ladder
+from aquaflow.service.live import LiveLoop
+from aquaflow.service.map_thread import MapThread
+from aquaflow.service.notify import Notifier
+from aquaflow.service.pressure import Machine
+from aquaflow.slam import Slam
+
+log = logging.getLogger(__name__)
+
+SWITCH_S = 0.0005
+"""Longest that a thread of Python's keeps the others waiting; with the usual 5 ms tracking, which
+gives way at every call of a kernel, would wait for mapping a dozen times a frame."""
+FINISHING_S = 300.0
+"""Asked of systemd when a dive ends: refining, evaluating, the report."""
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What a live dive consists of, for those who look on."""
+
+    loop: LiveLoop
+    slam: Slam
+    run: DiveRun
+    maps: MapThread
+    checkpointer: Checkpointer
+    choice: Choice
+
+
+class LiveDive:
+    """Made, then :meth:`run`, then :meth:`close`; a context manager does the last."""
+
+    def __init__(
+        self,
+        name: str,
+        choice: Choice,
+        feed: Feed,
+        config: VehicleConfig,
+        overwrite: bool = False,
+    ) -> None:
+        """Make everything.
+
+        Raises:
+            InputError: the folder or the checkpoint cannot be used.
+        """
+        service = config.service
+        fix_threads(config.threads or os.cpu_count() or 1)
+        sys.setswitchinterval(SWITCH_S)
+        known = None if choice.checkpoint is None else choice.checkpoint.frames
+        self._plain = plain(config)
+        self.folder = DiveFolder(choice.folder, self._plain, overwrite, known)
+        self.feed, self._service = feed, service
+        self._beats, self._ladder = Beats(), Ladder(service.limits)
+        self._notifier = Notifier()
+        self.parts = self._assembled(name, choice, service)
+        self._guard = Guard(self._beats, service.hang_s)
+        self._finished = False
+
+    def _assembled(self, name: str, choice: Choice, service: ServiceConfig) -> Parts:
+        config, feed, profiler = self._plain, self.feed, Profiler()
+        # A core is left for tracking, where there is more than one.
+        threads = config.threads or max(1, (os.cpu_count() or 1) - 1)
+        renderer = select_renderer(config.mapping.renderer, threads)
+        maps = Maps(config, renderer, profiler, self.folder.work)
+        thread = MapThread(maps, service.mapping, self._beats, lambda: self._ladder.level)
+        slam = Slam(config, profiler, self.folder.work, live=True, maps=thread)
+        run = DiveRun(name, self.folder, config, slam, feed.calibration, feed.name_of)
+        continued = Continued()
+        if choice.checkpoint is not None:
+            restore(choice.checkpoint, slam, run, maps)
+            continued = Continued.after(choice.checkpoint.moment, self.folder.rows)
+            run.dropped += [
+                Dropped(row.index, round(row.t_s * 1e9), row.reason)
+                for row in self.folder.rows
+                if row.frame_class == "dropped"
+            ]
+            log.info("resumed %s with %d keyframes", self.folder.path, len(slam.keyframes))
+        feed.go_on(continued)
+        loop = LiveLoop(
+            run, feed, thread, service, self._beats, self._ladder,
+            Machine(self.folder.path), self._notifier,
+        )  # fmt: skip
+        every_s = service.checkpoint.every_s
+        checkpointer = Checkpointer(self.folder.path, run, slam, thread, every_s)
+        loop.watchers.append(
+            lambda live: checkpointer.look(live.pressure.disk_is_full(service.limits))
+        )
+        return Parts(loop, slam, run, thread, checkpointer, choice)
+
+    def run(self, progress: Progress | None = None) -> Finished | None:
+        """Until the source ends or somebody says stop; None where nothing could be mapped.
+
+        Raises:
+            AquaFlowError: the source or the loop failed; the checkpoint stays.
+        """
+        parts = self.parts
+        with told_to_stop(parts.loop):
+            parts.loop.run()
+        source_ended = not parts.loop.stopping.is_set()
+        parts.loop.stop("the recording ended" if source_ended else "told to stop")
+        self._notifier.more_time(FINISHING_S)
+        if not source_ended:
+            parts.checkpointer.take()
+        self.feed.close()
+        parts.run.live = parts.loop.status()
+        try:
+            finished = parts.run.finish(self.feed.notes, progress)
+        except NotMappedError as error:
+            log.warning("%s", error)
+            finished = None
+        self._finished = source_ended
+        return finished
+
+    def close(self) -> None:
+        """Give everything back; an unfinished dive keeps what it can be resumed from."""
+        self._guard.close()
+        with contextlib.suppress(InputError):
+            self.feed.close()
+        self.parts.slam.close(keep=not self._finished)
+        self.folder.close(keep_work=not self._finished)
+        if self._finished:  # a recording came to its end: there is nothing to go on with
+            shutil.rmtree(self.folder.path / CHECKPOINT, ignore_errors=True)
+        self._notifier.close()
+
+    def __enter__(self) -> LiveDive:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def plain(vehicle: VehicleConfig) -> Config:
+    """The settings of mapping alone, refining limited as the service says."""
+    settings = vehicle.model_dump(include=set(Config.model_fields))
+    optimiser = settings["mapping"]["optimiser"]
+    if optimiser["refine_seconds"] is None:
+        optimiser["refine_seconds"] = vehicle.service.mapping.refine_seconds
+    return parse_config(settings, "config")
+
+
+@contextlib.contextmanager
+def told_to_stop(loop: LiveLoop) -> Iterator[None]:
+    """Ctrl-C and systemd's SIGTERM end the dive instead of breaking it off."""
+    asked = (signal.SIGINT, signal.SIGTERM)
+    before: list[Callable[..., object] | int | None] = []
+    with contextlib.suppress(ValueError):  # not in the main thread: somebody else listens
+        before = [signal.signal(each, lambda *_: loop.stopping.set()) for each in asked]
+    try:
+        yield
+    finally:
+        for each, handler in zip(asked, before, strict=False):
+            signal.signal(each, handler)

@@ -1,0 +1,76 @@
+"""What AquaFlow tells a vehicle: sentences, numbers, and where it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Protocol, TypeAlias, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+LONGEST_SENTENCE, LONGEST_NAME = 50, 10
+"""Characters that MAVLink has room for."""
+
+
+@dataclass(frozen=True)
+class Sentence:
+    """For the pilot; longer ones are cut."""
+
+    severity: Literal["error", "warning", "notice", "info"]
+    text: str
+
+
+@dataclass(frozen=True)
+class Number:
+    """A named number that a ground station can plot."""
+
+    t_ns: int
+    name: str
+    value: float
+
+
+@dataclass(frozen=True)
+class BodyPose:
+    """Pose of the body (forward, right, down) in a local frame of the same axes, metres."""
+
+    t_ns: int
+    """CLOCK_MONOTONIC, moment of exposure."""
+    R: Array
+    """[3, 3] body to local."""
+    t_m: Array
+    """[3]"""
+    covariance: Array
+    """[6, 6] position then rotation vector, m and rad."""
+    quality: float
+    """0 to 1."""
+    reset_counter: int
+    """Changes, modulo 256, whenever the pose jumped."""
+
+
+@dataclass(frozen=True)
+class BodyMotion:
+    """Change of the body's pose since the one before, in the axes of the earlier body."""
+
+    t_ns: int
+    since_ns: int
+    """Time between the two poses."""
+    rotation: Array
+    """[3] rotation vector, rad"""
+    translation_m: Array
+    """[3]"""
+    quality: float
+    """0 to 1."""
+
+
+Word: TypeAlias = Sentence | Number | BodyPose | BodyMotion
+
+
+@runtime_checkable
+class Hears(Protocol):
+    """A telemetry source whose devices can be told something."""
+
+    def tell(self, word: Word) -> bool:
+        """Queue a word for every device that understands it; False if none does. Never waits."""
+        ...

@@ -1,0 +1,1 @@
+"""The window into a dive: splats, trajectory, camera and health in a browser."""

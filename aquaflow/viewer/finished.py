@@ -1,0 +1,125 @@
+"""A finished dive in the window: ``aquaflow view DIVE``."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.config.viewer import ViewerConfig
+from aquaflow.errors import InputError
+from aquaflow.export.ply import read_ply
+from aquaflow.geometry.camera import CameraModel, load_camera
+from aquaflow.geometry.similarity import Sim3, rotation_from_quaternion
+from aquaflow.viewer.splats import Splats, splats
+from aquaflow.viewer.window import Window
+
+
+@dataclass(frozen=True)
+class Dive:
+    """What the window shows of a dive folder."""
+
+    splats: Splats
+    poses: list[Sim3]
+    quality: npt.NDArray[np.float64]
+    """[N] inlier share of each pose."""
+    pictures: list[Path | None]
+    """What the camera saw at each pose, where the dive keeps it."""
+    camera: CameraModel
+    summary: str
+
+
+def read_dive(folder: Path, budget: int) -> Dive:
+    """The finished dive in ``folder``.
+
+    Raises:
+        InputError: there is none.
+    """
+    for name in ("map.ply", "trajectory.tum", "camera.yaml", "frames.csv"):
+        if not (folder / name).is_file():
+            raise InputError(f"{folder} holds no finished dive: {name} is missing")
+    poses, times = _poses(folder / "trajectory.tum")
+    quality, pictures = _of_frames(folder, times)
+    shown = _splats(folder, budget)
+    summary = f"**{folder.name}**\n\n{len(poses)} poses, {len(shown)} of the map's Gaussians"
+    return Dive(shown, poses, quality, pictures, load_camera(folder / "camera.yaml"), summary)
+
+
+def show_dive(dive: Dive, config: ViewerConfig) -> Window:
+    """A window on ``dive``, with a slider along its path."""
+    window = Window(config, "AquaFlow")
+    window.show_health(dive.summary)
+    window.show_splats(dive.splats)
+    window.show_path(np.array([pose.t for pose in dive.poses]).reshape(-1, 3), dive.quality)
+    move = _mover(dive, window)
+    if dive.poses:
+        with_picture = [i for i, picture in enumerate(dive.pictures) if picture is not None]
+        first = with_picture[len(with_picture) // 2] if with_picture else 0
+        move(first)
+        window.add_slider("Along the path", len(dive.poses), first, move)
+    return window
+
+
+def _mover(dive: Dive, window: Window) -> Callable[[int], None]:
+    def move(number: int) -> None:
+        picture = dive.pictures[number]
+        image = None if picture is None else _picture(picture)
+        window.show_camera(dive.poses[number], dive.camera, image)
+
+    return move
+
+
+def _splats(folder: Path, budget: int) -> Splats:
+    water = read_ply(folder / "map.ply")
+    colours = {"water": np.asarray(water.colours, np.float32)}
+    if (folder / "map_clear.ply").is_file():
+        clear = read_ply(folder / "map_clear.ply")
+        if len(clear.means) == len(water.means):
+            colours["clear"] = np.asarray(clear.colours, np.float32)
+    return splats(
+        np.asarray(water.means, np.float32),
+        np.asarray(water.wxyz, np.float32),
+        np.asarray(water.scales, np.float32),
+        np.asarray(water.opacities, np.float32),
+        colours,
+        budget,
+    )
+
+
+def _poses(path: Path) -> tuple[list[Sim3], npt.NDArray[np.float64]]:
+    try:
+        rows = np.loadtxt(path, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read {path}: {error}") from error
+    rows = rows.reshape(-1, 8)
+    poses = [Sim3(rotation_from_quaternion(np.roll(row[4:8], 1)), row[1:4]) for row in rows]
+    return poses, rows[:, 0]
+
+
+def _of_frames(
+    folder: Path, times: npt.NDArray[np.float64]
+) -> tuple[npt.NDArray[np.float64], list[Path | None]]:
+    """Quality and picture of the frame at each time."""
+    by_time: dict[int, dict[str, Any]] = {}
+    with (folder / "frames.csv").open(newline="", encoding="utf-8") as stream:
+        for row in csv.DictReader(stream):
+            by_time[round(float(row["t_s"]) * 1e6)] = row
+    quality, pictures = [], []
+    for t_s in times:
+        row = by_time.get(round(float(t_s) * 1e6), {})
+        quality.append(float(row.get("quality") or 1.0))
+        picture = folder / "heldout" / f"{int(row.get('index') or 0):06d}_real.png"
+        pictures.append(picture if picture.is_file() else None)
+    return np.array(quality), pictures
+
+
+def _picture(path: Path) -> npt.NDArray[np.uint8] | None:
+    import cv2
+
+    image = cv2.imread(str(path))
+    return None if image is None else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)

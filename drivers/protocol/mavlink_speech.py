@@ -1,0 +1,79 @@
+"""What AquaFlow tells an autopilot, as MAVLink messages (mavlink.io/en/messages/common.html)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from aquaflow.vehicle_words import (
+    LONGEST_NAME,
+    LONGEST_SENTENCE,
+    BodyMotion,
+    BodyPose,
+    Number,
+    Sentence,
+    Word,
+)
+
+SEVERITIES = {"error": 3, "warning": 4, "notice": 5, "info": 6}
+LOCAL_FRD, BODY_FRD = 20, 12
+"""MAV_FRAME of the world and of the body."""
+ESTIMATOR_VISION = 2
+UNKNOWN = float("nan")
+ROWS, COLUMNS = np.triu_indices(6)
+LARGEST = 1e6
+"""Metres; beyond is no position."""
+
+
+def message_of(dialect: Any, word: Word, boot_ns: int | None) -> Any | None:
+    """The message that says ``word``; None for one that is not finite.
+
+    ``boot_ns``: the word's moment on the autopilot's own clock, if that is known.
+    """
+    if isinstance(word, Sentence):
+        text = word.text.encode("ascii", "replace")[:LONGEST_SENTENCE]
+        return dialect.MAVLink_statustext_message(severity=SEVERITIES[word.severity], text=text)
+    t_ns = word.t_ns if boot_ns is None else boot_ns
+    if isinstance(word, Number):
+        name = word.name.encode("ascii", "replace")[:LONGEST_NAME]
+        boot_ms = (t_ns // 1_000_000) % 2**32
+        return dialect.MAVLink_named_value_float_message(boot_ms, name, word.value)
+    if isinstance(word, BodyMotion):
+        return _delta(dialect, word, t_ns)
+    return _odometry(dialect, word, t_ns)
+
+
+def _delta(dialect: Any, motion: BodyMotion, t_ns: int) -> Any | None:
+    if not (np.isfinite(motion.rotation).all() and np.isfinite(motion.translation_m).all()):
+        return None
+    return dialect.MAVLink_vision_position_delta_message(
+        time_usec=t_ns // 1000,
+        time_delta_usec=motion.since_ns // 1000,
+        angle_delta=[float(v) for v in motion.rotation],
+        position_delta=[float(v) for v in motion.translation_m],
+        confidence=100.0 * min(max(motion.quality, 0.0), 1.0),
+    )
+
+
+def _odometry(dialect: Any, pose: BodyPose, t_ns: int) -> Any | None:
+    finite = np.isfinite(pose.R).all() and np.isfinite(pose.covariance).all()
+    if not finite or not bool(np.all(np.abs(pose.t_m) < LARGEST)):
+        return None
+    x, y, z = (float(v) for v in pose.t_m)
+    q = Rotation.from_matrix(pose.R).as_quat(canonical=True, scalar_first=True)
+    return dialect.MAVLink_odometry_message(
+        time_usec=t_ns // 1000,
+        frame_id=LOCAL_FRD,
+        child_frame_id=BODY_FRD,
+        x=x, y=y, z=z,
+        q=[float(v) for v in q],
+        vx=UNKNOWN, vy=UNKNOWN, vz=UNKNOWN,
+        rollspeed=UNKNOWN, pitchspeed=UNKNOWN, yawspeed=UNKNOWN,
+        pose_covariance=[float(v) for v in pose.covariance[ROWS, COLUMNS]],
+        velocity_covariance=[UNKNOWN] + [0.0] * 20,
+        reset_counter=pose.reset_counter % 256,
+        estimator_type=ESTIMATOR_VISION,
+        quality=round(100.0 * min(max(pose.quality, 0.0), 1.0)),
+    )  # fmt: skip

@@ -1,0 +1,101 @@
+"""Frames without their water, from a dive folder and, if it is given, its recording."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+from typer.testing import CliRunner
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "mapping"))
+from mapping_scenes import floor, renderer, view_of
+
+from aquaflow.cli import app
+from aquaflow.config import Config, MappingConfig, dump_config
+from aquaflow.errors import InputError
+from aquaflow.export.map_file import write_map_file
+from aquaflow.export.restored import export_restored
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.restoration import to_bytes
+
+Dive = tuple[Path, Path, npt.NDArray[np.uint8]]
+
+
+@pytest.fixture
+def dive(tmp_path: Path) -> Dive:
+    """A dive folder of three frames, its recording, and the first picture without water."""
+    mapper = Mapper(MappingConfig(), renderer(), seed=0)
+    mapper.scene.gaussians = floor(columns=40, rows=30, scale=0.06)
+    murk = (torch.tensor(v) for v in ((0.4, 0.2, 0.15), (0.1, 0.25, 0.3), (0.4, 0.3, 0.2)))
+    mapper.medium.set_water(*murk)
+    blank = np.zeros((48, 64, 3), np.uint8)
+    mapper.views = [view_of(blank, index=index) for index in (0, 2, 4)]
+    shown = mapper.show(mapper.views[0])
+    recording, folder = tmp_path / "pictures", tmp_path / "dive"
+    recording.mkdir()
+    folder.mkdir()
+    for index in range(5):
+        cv2.imwrite(str(recording / f"{index:06d}.png"), to_bytes(shown.image.numpy())[..., ::-1])
+    write_map_file(folder / "map.aqf", mapper)
+    dump_config(Config.model_validate({"source": {"width": 64}}), folder / "config.yaml")
+    return folder, recording, to_bytes(shown.radiance.clamp(0.0, 1.0).numpy())
+
+
+def pictures(folder: Path) -> dict[str, npt.NDArray[np.uint8]]:
+    return {path.name: cv2.imread(str(path))[..., ::-1] for path in sorted(folder.iterdir())}
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_every_mapped_frame_is_written_as_it_would_look_without_water(
+    dive: Dive, tmp_path: Path, recorded: bool
+) -> None:
+    folder, recording, clean = dive
+    steps: list[tuple[int, int]] = []
+    count = export_restored(
+        folder, tmp_path / "out", recording if recorded else None, lambda *step: steps.append(step)
+    )
+    found = pictures(tmp_path / "out")
+    assert list(found) == ["000000.png", "000002.png", "000004.png"]
+    assert count == 3
+    assert steps == [(1, 3), (2, 3), (3, 3)]
+    first = found["000000.png"].astype(float)
+    gain = np.median(first[first > 50] / clean[first > 50])
+    assert np.abs(first / gain - clean).mean() < 3.0
+
+
+def test_a_recording_without_the_frames_is_refused(dive: Dive, tmp_path: Path) -> None:
+    folder, recording, _ = dive
+    (recording / "000004.png").unlink()
+    with pytest.raises(InputError, match="no readable frame 4"):
+        export_restored(folder, tmp_path / "out", recording)
+
+
+def test_a_recording_of_another_shape_is_refused(dive: Dive, tmp_path: Path) -> None:
+    folder, recording, _ = dive
+    for path in recording.iterdir():
+        cv2.imwrite(str(path), np.zeros((64, 64, 3), np.uint8))
+    with pytest.raises(InputError, match="64 x 64 once prepared"):
+        export_restored(folder, tmp_path / "out", recording)
+
+
+def test_a_clear_dive_has_nothing_to_restore(dive: Dive, tmp_path: Path) -> None:
+    mapper = Mapper(MappingConfig(), renderer(), seed=0)
+    mapper.medium.active = False
+    write_map_file(dive[0] / "map.aqf", mapper)
+    with pytest.raises(InputError, match="no water to remove"):
+        export_restored(dive[0], tmp_path / "out")
+
+
+def test_the_command_writes_into_the_dive_and_says_so(dive: Dive) -> None:
+    asked = ["export", str(dive[0]), "--format", "restored"]
+    result = CliRunner().invoke(app, [*asked, "--json"])
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.output) == {"out": str(dive[0] / "restored"), "frames": 3}
+    assert len(pictures(dive[0] / "restored")) == 3
+    assert "3 restored frames" in CliRunner().invoke(app, asked).output

@@ -1,0 +1,48 @@
+"""Backscatter that is brighter on one side of the picture than on the other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from test_water_estimation import B_INF, BETA, LAMP, B, fitted, sighted
+
+from aquaflow.config import MediumConfig
+from aquaflow.mapping.shading import TERMS, shading_basis
+from aquaflow.mapping.water_estimation import EVERY_MODEL, WaterEstimate, models_for
+from aquaflow.mapping.water_parameters import Model
+
+BRIGHTER_ABOVE = np.array([0.0, -0.7, 0.0, 0.0, 0.1])
+
+
+@cache
+def sunlit() -> WaterEstimate:
+    """Water that shines upwards twice as brightly as downwards."""
+    seen = sighted(points=600)
+    veil = B_INF * -np.expm1(-B * seen.z[:, None])
+    more = np.expm1(shading_basis(seen.xy) @ BRIGHTER_ABOVE)[:, None]
+    return fitted(replace(seen, colour=seen.colour + more * veil))
+
+
+def test_uneven_backscatter_is_found_and_the_water_in_spite_of_it() -> None:
+    assert sunlit().model == Model(water=True, uneven=True)
+    np.testing.assert_allclose(sunlit().beta_a, BETA, rtol=0.1)
+    edge = shading_basis(np.array([[0.0, -0.8], [0.0, 0.8]]))
+    np.testing.assert_allclose(edge @ sunlit().unevenness, edge @ BRIGHTER_ABOVE, atol=0.2)
+
+
+def test_even_backscatter_and_a_lamp_are_not_taken_for_it() -> None:
+    for estimate in (fitted(sighted()), fitted(sighted(shading=LAMP))):
+        assert not estimate.model.uneven
+        assert estimate.unevenness.tolist() == [0.0] * TERMS
+
+
+def test_unevenness_takes_water_and_is_never_told_beside_shading() -> None:
+    uneven = [model for model in EVERY_MODEL if model.uneven]
+    assert uneven
+    assert all(model.water and not model.shading for model in uneven)
+
+
+def test_the_config_forbids_it() -> None:
+    assert not any(model.uneven for model in models_for(MediumConfig(uneven=False)))

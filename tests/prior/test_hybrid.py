@@ -1,0 +1,151 @@
+"""The hybrid prior: flow starts where descriptors say, and only when it has to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from patch_describer import PatchDescriber
+from textured_pictures import HEIGHT, WIDTH, Picture, moved_pair, pixel_centres, shift
+
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes import KeyframeStore, Pointmap
+from aquaflow.prior import homography
+from aquaflow.prior.classical import ClassicalPrior
+from aquaflow.prior.hybrid import HybridEncoding, HybridPrior
+
+CAMERA = CameraModel(WIDTH, HEIGHT, 200.0, 200.0, 120.0, 90.0)
+FAR = (0.4 * WIDTH, -20.0)
+
+
+class Mute(PatchDescriber):
+    """A network that says the same of every cell."""
+
+    def features(self, picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.float16]:
+        return np.full((HEIGHT // 8, WIDTH // 8, 4), 0.5, np.float16)
+
+
+def encoded(prior: HybridPrior, pictures: tuple[Picture, Picture]) -> tuple[HybridEncoding, ...]:
+    return tuple(prior.encode(picture, CAMERA) for picture in pictures)
+
+
+@pytest.fixture
+def no_sift(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise AssertionError("SIFT ran though the descriptors were good")
+
+    monkeypatch.setattr(homography, "detect", refuse)
+
+
+@pytest.mark.usefixtures("no_sift")
+def test_descriptors_find_what_moved_too_far_for_flow() -> None:
+    prior = HybridPrior(PatchDescriber())
+    pair = prior.decode(*encoded(prior, moved_pair(shift(*FAR))))
+    assert pair.valid.mean() > 0.5
+    error = np.linalg.norm(pair.matches - pixel_centres() - FAR, axis=-1)
+    assert np.median(error[pair.valid]) < 0.1
+
+
+@pytest.mark.usefixtures("no_sift")
+def test_a_good_prediction_keeps_the_network_from_running() -> None:
+    describer = PatchDescriber()
+    prior = HybridPrior(describer)
+    predicted = (pixel_centres() + FAR).astype(np.float32)
+    pair = prior.decode(*encoded(prior, moved_pair(shift(*FAR))), predicted)
+    assert pair.valid.mean() > 0.5
+    assert describer.asked == 0
+
+
+def test_a_picture_is_described_once() -> None:
+    describer = PatchDescriber()
+    prior = HybridPrior(describer)
+    a, b = encoded(prior, moved_pair(shift(*FAR)))
+    prior.decode(a, b)
+    prior.decode(b, a)
+    assert describer.asked == 2
+
+
+def test_where_descriptors_say_nothing_keypoints_do() -> None:
+    prior = HybridPrior(Mute())
+    pair = prior.decode(*encoded(prior, moved_pair(shift(*FAR))))
+    assert pair.valid.mean() > 0.5
+
+
+def test_where_nothing_helps_flow_starts_from_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(homography, "homography", lambda *_: None)
+    hybrid, classical = HybridPrior(Mute()), ClassicalPrior()
+    pictures = moved_pair(shift(3.0, 1.0))
+    plain = classical.decode(*(classical.encode(picture, CAMERA) for picture in pictures))
+    found = hybrid.decode(*encoded(hybrid, pictures))
+    np.testing.assert_array_equal(found.matches, plain.matches)
+
+
+def test_decoding_twice_gives_the_same_bit_for_bit() -> None:
+    found = []
+    for _ in range(2):
+        prior = HybridPrior(PatchDescriber())
+        found.append(prior.decode(*encoded(prior, moved_pair(shift(*FAR)))).matches)
+    np.testing.assert_array_equal(*found)
+
+
+def test_what_is_packed_comes_back_and_is_not_computed_again() -> None:
+    describer = PatchDescriber()
+    prior = HybridPrior(describer)
+    a, b = encoded(prior, moved_pair(shift(*FAR)))
+    before = prior.decode(a, b)
+    again = [prior.unpack(prior.pack(encoding), CAMERA) for encoding in (a, b)]
+    asked = describer.asked
+    np.testing.assert_array_equal(prior.decode(*again).matches, before.matches)
+    assert describer.asked == asked
+
+
+def test_what_was_never_described_can_be_after_it_came_back() -> None:
+    prior = HybridPrior(PatchDescriber())
+    a, b = encoded(prior, moved_pair(shift(*FAR)))
+    assert "features" not in prior.pack(a)
+    again = prior.unpack(prior.pack(a), CAMERA)
+    np.testing.assert_array_equal(prior.decode(again, b).matches, prior.decode(a, b).matches)
+
+
+def test_encodings_wait_in_files_with_their_keyframes(tmp_path: Path) -> None:
+    prior = HybridPrior(PatchDescriber())
+    store = KeyframeStore(tmp_path, prior, resident=1)
+    pictures = moved_pair(shift(*FAR))
+    features = []
+    for number, picture in enumerate((*pictures, *pictures)):
+        encoding = prior.encode(picture, CAMERA)
+        features.append(encoding.features)
+        store.add(number, 0, encoding, Sim3.identity(), Pointmap.unknown(CAMERA), 0)
+    for number, expected in enumerate(features):
+        back = store[number].encoding
+        assert isinstance(back, HybridEncoding)
+        np.testing.assert_array_equal(back.features, expected)
+
+
+def test_warming_up_asks_the_network_once() -> None:
+    describer = PatchDescriber()
+    HybridPrior(describer).warm_up()
+    assert describer.asked == 1
+
+
+@pytest.mark.parametrize("value", [0, 128, 255])
+def test_pictures_of_one_colour_give_no_matches(value: int) -> None:
+    prior = HybridPrior(PatchDescriber())
+    flat = np.full((HEIGHT, WIDTH, 3), value, np.uint8)
+    pair = prior.decode(*encoded(prior, (flat, flat)))
+    assert not pair.valid.any()
+    assert np.isfinite(pair.matches).all()
+
+
+def test_points_are_triangulated_where_there_is_parallax_and_learned_elsewhere() -> None:
+    prior = HybridPrior(PatchDescriber())
+    still = moved_pair(shift(0.0, 0.0))[0]
+    pair = prior.decode(*encoded(prior, (still, still)))
+    np.testing.assert_allclose(np.linalg.norm(pair.X_a, axis=-1), 3.0, rtol=1e-4)
+    np.testing.assert_allclose(pair.Q_a, 1.0 / 0.09, rtol=1e-3)
+    known = np.isfinite(pair.X_b).all(-1)
+    assert known.mean() > 0.8
+    np.testing.assert_allclose(pair.X_b[known], pair.X_a[known], atol=0.02)

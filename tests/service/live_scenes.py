@@ -1,0 +1,168 @@
+"""A service that is told everything: frames without pictures' cost, pressure, and time."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from aquaflow.config import Config, parse_config
+from aquaflow.config.service import ServiceConfig
+from aquaflow.dive import DiveFolder
+from aquaflow.dive_run import DiveRun
+from aquaflow.geometry.camera import guess_camera
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.maps import Growth, Insertion, Maps
+from aquaflow.messages import CameraModel, Dropped, Frame
+from aquaflow.service.beats import Beats
+from aquaflow.service.continued import Continued
+from aquaflow.service.feed import Heard
+from aquaflow.service.ladder import Ladder
+from aquaflow.service.live import LiveLoop
+from aquaflow.service.map_thread import MapThread
+from aquaflow.service.newest import Newest
+from aquaflow.service.notify import Notifier
+from aquaflow.service.pressure import Pressure
+from aquaflow.slam import Slam
+from aquaflow.tracking.frames import FrameClass, Tracked
+from aquaflow.vehicle_words import Word
+
+WIDTH, HEIGHT = 64, 48
+CALM = Pressure(free_memory_share=0.5, disk_free_mb=50_000.0, temperature_c=40.0)
+SETTINGS = parse_config({"threads": 1, "mapping": {"medium": {"enabled": False}}}, "test")
+
+
+class Clock:
+    """Time that passes when it is told to."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+    def pass_(self, seconds: float) -> None:
+        self.now += seconds
+
+
+def frame_of(index: int) -> Frame:
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    return Frame(index, index * 100_000_000, 0, image, guess_camera(WIDTH, HEIGHT))
+
+
+class ToldFeed:
+    """Frames that the test puts there itself."""
+
+    def __init__(self) -> None:
+        self.newest: Newest[Frame | Dropped] = Newest()
+        self.heard, self.notes = Heard(), []
+        self.failure: str | None = None
+        self.calibration: CameraModel | None = None
+        self.devices: dict[str, dict[str, object]] = {}
+        self.continued = Continued()
+        self.told: list[Word] = []
+
+    def name_of(self, index: int) -> str:
+        return f"told#{index}"
+
+    def describe(self) -> dict[str, dict[str, object]]:
+        return self.devices
+
+    def go_on(self, continued: Continued) -> None:
+        self.continued = continued
+
+    def tell(self, word: Word) -> bool:
+        self.told.append(word)
+        return True
+
+    def start(self) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class ToldRun(DiveRun):
+    """Decides as it is told: 'p' a pose, 'l' lost, 's' skipped, 'x' an exception."""
+
+    said = ""
+
+    def frame(self, frame: Frame) -> list[Tracked]:
+        said, self.said = self.said[:1] or "p", self.said[1:]
+        if said == "x":
+            raise ValueError("told so")
+        if said == "p":
+            tracked = Tracked(frame, FrameClass.COMMON, 0, 0, Sim3.identity())
+        else:
+            kind = FrameClass.LOST if said == "l" else FrameClass.SKIPPED
+            tracked = Tracked(frame, kind, 0)
+        self.decide([tracked])
+        return [tracked]
+
+
+class Told:
+    """A live loop of which the test holds every end."""
+
+    def __init__(self, folder: Path, config: Config = SETTINGS, **service: object) -> None:
+        self.clock, self.feed, self.beats = Clock(), ToldFeed(), Beats()
+        self.pressure = CALM
+        self.config = ServiceConfig.model_validate(service)
+        self.ladder = Ladder(self.config.limits, self.clock)
+        self.maps = MapThread(
+            Maps(config), self.config.mapping, self.beats, lambda: self.ladder.level
+        )
+        self.dive = DiveFolder(folder, config)
+        self.slam = Slam(config, live=True, maps=self.maps)
+        self.run = ToldRun("told", self.dive, config, self.slam, None, self.feed.name_of)
+        self.notifier = Notifier({})
+        self.loop = LiveLoop(
+            self.run, self.feed, self.maps, self.config, self.beats, self.ladder,
+            lambda: self.pressure, self.notifier, self.clock,
+        )  # fmt: skip
+
+    def frames(self, said: str, first: int = 0, every_s: float = 0.1) -> None:
+        """One turn of the loop for each letter."""
+        for i, letter in enumerate(said):
+            self.run.said = letter
+            self.clock.pass_(every_s)
+            self.loop.take(frame_of(first + i))
+
+    def idle(self, seconds: float, turns: int = 1) -> None:
+        """Turns of the loop without a frame."""
+        for _ in range(turns):
+            self.clock.pass_(seconds / turns)
+            self.loop.take(None)
+
+    def close(self) -> None:
+        self.slam.close()
+        self.dive.close()
+
+
+class RecordedMaps(Maps):
+    """Maps that only remember what they were asked to do."""
+
+    def __init__(self) -> None:
+        super().__init__(SETTINGS)
+        self.asked: list[str] = []
+        self.fail, self.failed = False, threading.Event()
+
+    def grow(self, growth: Growth) -> None:
+        if self.fail:
+            self.failed.set()
+            raise RuntimeError("the GPU is gone")
+        size = growth.view.camera.width
+        self.asked.append(f"grow {growth.view.frame_index} {size}px {growth.steps}")
+        for each in growth.retired:
+            self.insert(each)
+
+    def insert(self, insertion: Insertion) -> None:
+        self.asked.append(f"insert {insertion.view.frame_index}")
+
+
+def visited(told: Told) -> list[str]:
+    """The states that the service was in, in their order."""
+    return ["starting", *(change.after.value for change in told.loop.health.changes)]
+
+
+def rows_of(folder: Path) -> Iterable[str]:
+    return (folder / "frames.csv").read_text().splitlines()[1:]

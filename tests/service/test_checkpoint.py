@@ -1,0 +1,253 @@
+"""A dive that is cut off and goes on: what the checkpoint holds, and what becomes of it."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from live_scenes import ToldFeed
+
+from aquaflow.config.service import CheckpointConfig
+from aquaflow.config.vehicle import VehicleConfig
+from aquaflow.config.viewer import ViewerConfig
+from aquaflow.dive import read_rows
+from aquaflow.errors import InputError
+from aquaflow.messages import Frame
+from aquaflow.service.checkpoint import read_state, state_file
+from aquaflow.service.choice import choose, is_unfinished, resumed, tidy
+from aquaflow.service.moment import Moment
+from aquaflow.service.prometheus import exposition
+from aquaflow.service.report import report
+from aquaflow.service.session import LiveDive
+from aquaflow.service.window import LiveWindow, in_words
+from aquaflow.sources import open_recording
+
+FEW = {"steps_keyframe": 2, "steps_mapping": 2, "steps_common": 1, "refine_steps": 4}
+VEHICLE = VehicleConfig.model_validate(
+    {
+        "threads": 1,
+        "mapping": {"optimiser": FEW, "medium": {"fit": False}},
+        "service": {
+            "health": {"enabled": False, "port": 8230},
+            "mapping": {"backlog": 100, "steps_per_view": 0, "nice": 0},
+        },
+    }
+)
+CUT = 16
+"""Frames before the cut."""
+
+
+def caught_up(dive: LiveDive) -> None:
+    """Wait until mapping has done all that was asked for."""
+    done = threading.Event()
+    dive.parts.maps._post("wait", lambda maps: done.set())
+    assert done.wait(60.0)
+
+
+@dataclass
+class Cut:
+    """A dive up to its checkpoint; nobody closed it."""
+
+    folder: Path
+    dive: LiveDive
+    frames: list[Frame]
+    rows: int
+
+
+@pytest.fixture(scope="module")
+def cut(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cut]:
+    recording, folder = open_recording(small_recording), tmp_path_factory.mktemp("dives") / "cut"
+    frames = [frame for frame in recording.frames() if isinstance(frame, Frame)]
+    dive = LiveDive("cut", resumed(folder, new=False), ToldFeed(), VEHICLE)
+    for frame in frames[:CUT]:
+        dive.parts.loop.take(frame)
+    caught_up(dive)
+    dive.parts.checkpointer.take()
+    caught_up(dive)
+    rows = len(read_rows(folder / "frames.csv"))
+    dive.parts.loop.take(frames[CUT])  # after the checkpoint: lost
+    yield Cut(folder, dive, frames, rows)
+    dive.close()
+
+
+@pytest.fixture(scope="module")
+def back(cut: Cut) -> Iterator[LiveDive]:
+    dive = LiveDive("cut", resumed(cut.folder, new=False), ToldFeed(), VEHICLE)
+    yield dive
+    dive.close()
+
+
+def test_the_map_comes_back_bit_for_bit(cut: Cut, back: LiveDive) -> None:
+    old, new = cut.dive.parts.maps.mappers[0], back.parts.maps.mappers[0]
+    saved = read_state(cut.folder).arrays
+    assert len(new.gaussians) > 100
+    for name, tensor in new.gaussians.parameters.items():
+        assert np.array_equal(tensor.numpy(), saved[f"mapping.map0.gaussians.{name}"]), name
+    assert len(new.views) == len(saved["mapping.map0.views.numbers"])
+    for mine, theirs in zip(new.views, old.views, strict=False):
+        assert np.array_equal(mine.image, theirs.image)
+        assert mine.frame_index == theirs.frame_index
+    assert new.medium.active == old.medium.active
+
+
+def test_the_optimisers_and_the_random_state_come_back(cut: Cut, back: LiveDive) -> None:
+    new, saved = back.parts.maps.mappers[0], read_state(cut.folder).arrays
+    for kind, moments in (
+        ("first", new._optimiser.first_moments),
+        ("second", new._optimiser.second_moments),
+    ):
+        for name, tensor in moments.items():
+            assert np.array_equal(tensor.numpy(), saved[f"mapping.map0.adam.{kind}.{name}"])
+        assert any(bool(tensor.any()) for tensor in moments.values())
+    assert torch.equal(new._random.get_state(), torch.from_numpy(saved["mapping.map0.random"]))
+
+
+def test_keyframes_poses_and_graph_come_back(cut: Cut, back: LiveDive) -> None:
+    old, new = cut.dive.parts.slam, back.parts.slam
+    count = len(new.keyframes)
+    assert count >= 2
+    for mine, theirs in zip(new.keyframes.keyframes, old.keyframes.keyframes, strict=False):
+        assert np.array_equal(mine.T_wc.t, theirs.T_wc.t)
+        assert np.array_equal(mine.encoding.grey, theirs.encoding.grey)  # type: ignore[attr-defined]
+    assert sum(t.T_wc is not None for t in back.parts.run.results) == cut.rows
+    tables = new.graph.graph.tables()
+    assert len(tables["nodes"]) == count
+    assert len(tables["edges"]) >= count - 1
+
+
+def test_what_was_decided_after_the_checkpoint_is_told_to_be_lost(cut: Cut, back: LiveDive) -> None:
+    lost = [row for row in read_rows(cut.folder / "frames.csv") if row.frame_class == "dropped"]
+    assert [row.reason for row in lost] == ["lost in a restart"]
+    assert back.feed.continued.first_index == lost[0].index + 1  # type: ignore[attr-defined]
+
+
+def test_the_dive_goes_on_at_its_old_place_and_ends_as_one(cut: Cut, back: LiveDive) -> None:
+    for frame in cut.frames[CUT + 1 :]:
+        back.parts.loop.take(frame)
+    caught_up(back)
+    states = [change.after.value for change in back.parts.loop.health.changes]
+    assert states[0] in {"lost", "tracking"}
+    assert states[-1] == "tracking"
+    finished = back.parts.run.finish([])
+    assert finished.metrics["tracked"] >= len(cut.frames) - 3
+    sub_maps = {t.sub_map for t in back.parts.run.results if t.T_wc is not None}
+    assert sub_maps == {0}
+    assert (cut.folder / "map.ply").is_file()
+
+
+@pytest.mark.parametrize("damage", [b"", b"PK\x03\x04 cut short", b"\x80\x04pickle"])
+def test_a_damaged_checkpoint_is_refused_and_the_next_dive_is_new(
+    tmp_path: Path, damage: bytes
+) -> None:
+    file = state_file(tmp_path / "old")
+    file.parent.mkdir(parents=True)
+    file.write_bytes(damage)
+    with pytest.raises(InputError, match="--new"):
+        resumed(tmp_path / "old", new=False)
+    choice = choose(tmp_path, CheckpointConfig(), new=False, now=Moment.now())
+    assert choice.checkpoint is None
+    assert choice.folder != tmp_path / "old"
+
+
+def test_the_newest_unfinished_dive_is_chosen_unless_it_is_old_or_new_is_asked_for(
+    cut: Cut,
+) -> None:
+    dives, config, now = cut.folder.parent, CheckpointConfig(), Moment.now()
+    assert choose(dives, config, False, now).folder == cut.folder
+    assert choose(dives, config, True, now).folder != cut.folder
+    later = replace(now, wall_ns=now.wall_ns + round(13 * 3.6e12))
+    assert choose(dives, config, False, later).folder != cut.folder
+    assert choose(dives, CheckpointConfig(resume_h=0.0), False, later).folder == cut.folder
+
+
+def test_a_dive_that_was_cut_off_before_its_first_checkpoint_may_begin_anew(
+    cut: Cut, tmp_path: Path
+) -> None:
+    assert not is_unfinished(cut.folder)
+    (tmp_path / "frames.csv").touch()
+    assert is_unfinished(tmp_path)
+    (tmp_path / "metrics.json").touch()
+    assert not is_unfinished(tmp_path)
+
+
+@pytest.mark.parametrize("told", ["the recording ended", "told to stop"])
+def test_only_a_dive_that_was_told_to_stop_can_be_resumed(tmp_path: Path, told: str) -> None:
+    feed = ToldFeed()
+    dive = LiveDive("dive", resumed(tmp_path / "dive", new=False), feed, VEHICLE)
+    for name in ("work", "checkpoint"):
+        (tmp_path / "dive" / name).mkdir()
+    if told == "told to stop":
+        dive.parts.loop.stopping.set()
+    feed.newest.end()
+    with dive:
+        assert dive.run() is None  # not one frame: nothing was mapped
+    assert dive.parts.loop.health.reason == told
+    assert (tmp_path / "dive" / "checkpoint").exists() == (told == "told to stop")
+
+
+def test_finished_dives_keep_no_files_for_a_resumption(tmp_path: Path) -> None:
+    for name in ("old", "current"):
+        (tmp_path / name / "work").mkdir(parents=True)
+        (tmp_path / name / "checkpoint").mkdir()
+        (tmp_path / name / "report.html").touch()
+    tidy(tmp_path, tmp_path / "current")
+    assert sorted(path.name for path in (tmp_path / "old").iterdir()) == ["report.html"]
+    assert (tmp_path / "current" / "checkpoint").is_dir()
+
+
+def test_a_full_disk_writes_no_checkpoint(cut: Cut) -> None:
+    checkpointer, taken = cut.dive.parts.checkpointer, cut.dive.parts.checkpointer.taken
+    checkpointer._due_s = 0.0
+    checkpointer.look(disk_is_full=True)
+    caught_up(cut.dive)
+    assert checkpointer.taken == taken
+
+
+@pytest.mark.parametrize(
+    ("boot", "later_ns", "wall_ns", "shift_ns"),
+    [
+        ("a", 5_000, 10**15, 0),  # the wall clock jumps, the process alone was restarted
+        ("b", -900, 60 * 10**9, 60 * 10**9 + 900),  # another boot, a minute later
+        ("b", -900, -(10**15), 10**9 + 900),  # another boot, and the wall clock was set back
+    ],
+)
+def test_the_dives_clock_goes_on_over_restarts_and_jumps(
+    boot: str, later_ns: int, wall_ns: int, shift_ns: int
+) -> None:
+    before = Moment(1_000_000, 10**18, "a")
+    now = Moment(1_000_000 + later_ns, 10**18 + wall_ns, boot)
+    assert before.shift_ns(now) == shift_ns
+
+
+# --- whoever looks on -----------------------------------------------------------------------------
+
+
+def test_the_report_of_a_real_dive_is_json_and_prometheus(cut: Cut) -> None:
+    told = report(cut.dive.parts, hang_s=1e6)
+    assert json.loads(json.dumps(told))["keyframes"] == len(cut.dive.parts.slam.keyframes)
+    assert told["gaussians"] > 100
+    assert f"aquaflow_gaussians {told['gaussians']}" in exposition(told)
+
+
+def test_the_live_window_shows_map_path_and_health(cut: Cut) -> None:
+    pytest.importorskip("viser", reason="viser is not installed")
+    parts = cut.dive.parts
+    config = ViewerConfig(port=0, splats=300)
+    window = LiveWindow(config, parts.maps, lambda: report(parts, hang_s=1e6))
+    try:
+        window.look(parts.loop)
+        deadline = time.monotonic() + 60.0
+        while window.splats_shown == 0:
+            assert time.monotonic() < deadline, "no splats were shown"
+            time.sleep(0.05)
+        assert window.splats_shown <= 300
+    finally:
+        window.close()
+    assert "lag" in in_words(report(parts, hang_s=1e6))

@@ -1,0 +1,153 @@
+"""What the service tells, whom it tells, and that a client who hangs costs nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import re
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import Cli
+
+from aquaflow.access import Access, read_token
+from aquaflow.config.service import ListenConfig, ServiceConfig
+from aquaflow.config.stage import validated
+from aquaflow.errors import ConfigError
+from aquaflow.service.health import State
+from aquaflow.service.http import MOST_CLIENTS, HealthServer
+from aquaflow.service.prometheus import exposition
+
+TOKEN = "correct-horse-battery"
+REPORT: dict[str, Any] = {
+    "state": "tracking", "reason": "every frame has a pose", "ok": True, "frames": 120,
+    "failures": 1, "overtaken": 3, "mapping_failures": 0, "steps_down": 1, "steps_up": 1,
+    "telemetry_samples": 9, "fps": 9.5, "mapping_waits": 2, "keyframes": 7, "gaussians": 1000,
+    "lag_ms": {"p50": 80.0, "p95": 120.0}, "classes": {"common": 100},
+    "left_out_of_the_map": {'said "so"\n': 2}, "visits": {"tracking": 1},
+    "stage_shares": {"track": 0.4}, "changes": [],
+}  # fmt: skip
+
+
+@pytest.fixture
+def server() -> Iterator[HealthServer]:
+    config = ListenConfig.model_construct(host="127.0.0.1", port=0, token_file=None)
+    server = HealthServer(config, lambda: REPORT)
+    yield server
+    server.close()
+
+
+@pytest.fixture
+def token_file(tmp_path: Path) -> Path:
+    file = tmp_path / "token"
+    file.write_text(f"{TOKEN}\n")
+    file.chmod(0o600)
+    return file
+
+
+def get(port: int, target: str, **headers: str) -> tuple[int, str, dict[str, str]]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+    connection.request("GET", target, headers=headers)
+    answer = connection.getresponse()
+    body = answer.read().decode()
+    connection.close()
+    return answer.status, body, dict(answer.getheaders())
+
+
+def test_health_is_json_and_metrics_are_prometheus(server: HealthServer) -> None:
+    status, body, _ = get(server.port, "/health")
+    assert (status, json.loads(body)) == (200, REPORT)
+    status, body, headers = get(server.port, "/metrics")
+    assert status == 200
+    assert headers["Content-Type"].startswith("text/plain; version=0.0.4")
+    assert 'aquaflow_state{state="tracking"} 1' in body
+
+
+def test_every_line_of_the_metrics_is_well_formed() -> None:
+    line = re.compile(r'^(# (HELP|TYPE) \w+ .+|\w+(\{\w+="([^"\\\n]|\\.)*"\})? -?[\d.e+-]+)$')
+    lines = exposition(REPORT).splitlines()
+    assert [text for text in lines if not line.match(text)] == []
+    assert sum(text.startswith("aquaflow_state{") for text in lines) == len(State)
+
+
+def test_the_page_and_blueos_are_served_and_nothing_else(server: HealthServer) -> None:
+    assert "AquaFlow" in get(server.port, "/")[1]
+    assert json.loads(get(server.port, "/register_service")[1])["name"] == "AquaFlow"
+    assert get(server.port, "/etc/passwd")[0] == 404
+
+
+def test_a_page_of_elsewhere_cannot_read_a_socket_of_this_machine(server: HealthServer) -> None:
+    assert get(server.port, "/health", Host="evil.example")[0] == 403
+    assert get(server.port, "/health", Host="[::1]:8230")[0] == 200
+
+
+def test_a_token_is_asked_for_in_header_cookie_or_address(token_file: Path) -> None:
+    config = ListenConfig.model_construct(host="127.0.0.1", port=0, token_file=token_file)
+    server = HealthServer(config, lambda: REPORT)
+    try:
+        assert get(server.port, "/health")[0] == 403
+        assert get(server.port, "/health", Authorization="Bearer wrong")[0] == 403
+        assert get(server.port, "/health", Authorization=f"Bearer {TOKEN}")[0] == 200
+        status, _, headers = get(server.port, f"/health?token={TOKEN}")
+        assert status == 200
+        cookie = headers["Set-Cookie"]
+        assert "HttpOnly" in cookie
+        assert get(server.port, "/health", Cookie=cookie.partition(";")[0])[0] == 200
+        assert get(server.port, "/health", Host="elsewhere", Cookie="aquaflow_token=x")[0] == 403
+    finally:
+        server.close()
+
+
+def test_clients_that_hang_keep_nobody_else_out(server: HealthServer) -> None:
+    hanging = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(5)]
+    for client in hanging:
+        client.sendall(b"GET /health HTTP/1.1\r\n")  # and never another byte
+    assert get(server.port, "/health")[0] == 200
+    for client in hanging:
+        client.close()
+
+
+def test_more_clients_than_there_is_room_for_are_turned_away(server: HealthServer) -> None:
+    hanging = [
+        socket.create_connection(("127.0.0.1", server.port)) for _ in range(MOST_CLIENTS + 4)
+    ]
+    last = hanging[-1]
+    last.settimeout(20.0)
+    last.sendall(b"GET")
+    with contextlib.suppress(ConnectionError):  # turned away before it was heard
+        assert last.recv(1) == b""
+    for client in hanging:
+        client.close()
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "192.168.2.2", "::", "vehicle.local"])
+def test_no_socket_beyond_loopback_without_a_token(host: str) -> None:
+    with pytest.raises(ConfigError, match="token_file"):
+        validated(ServiceConfig, {"health": {"host": host, "port": 8230}}, "test")
+
+
+def test_a_token_that_others_may_read_or_guess_is_refused(token_file: Path) -> None:
+    assert read_token(token_file) == TOKEN
+    token_file.chmod(0o644)
+    with pytest.raises(ConfigError, match="chmod"):
+        read_token(token_file)
+    token_file.chmod(0o600)
+    token_file.write_text("1234")
+    with pytest.raises(ConfigError, match="shorter"):
+        Access(ListenConfig(port=1, token_file=token_file))
+
+
+def test_status_prints_the_report_and_its_exit_code_says_if_all_is_well(
+    aquaflow: Cli, server: HealthServer
+) -> None:
+    url = f"http://127.0.0.1:{server.port}"
+    asked = aquaflow("status", "--url", url)
+    assert asked.code == 0
+    assert "tracking: every frame has a pose" in asked.out
+    asked = aquaflow("status", "--url", "http://127.0.0.1:1")
+    assert asked.code == 1
+    assert "no service answers" in asked.err

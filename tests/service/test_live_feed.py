@@ -1,0 +1,166 @@
+"""Devices behind the feed: the newest picture, unplugged and back; links that are flooded."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from live_scenes import HEIGHT, WIDTH
+
+from aquaflow.config import SourceConfig
+from aquaflow.config.cameras import V4l2Config
+from aquaflow.config.telemetry import parse_telemetry
+from aquaflow.geometry.camera import guess_camera
+from aquaflow.messages import CameraModel, Depth, Dropped, Frame, TelemetrySample
+from aquaflow.recording.playback import Playback
+from aquaflow.service.continued import Continued
+from aquaflow.service.feed import LiveFeed, PlaybackFeed
+from drivers.telemetry import LinkTelemetry
+from drivers.transport import opener
+from drivers.v4l2 import V4l2Camera
+from sim_drivers.camera_feed import CameraFaults, CameraFeed
+from sim_drivers.devices.ardusub import ArduSub
+from sim_drivers.devices.device import SimulatedDevice
+from sim_drivers.devices.wires import UdpWire
+from sim_drivers.faults import Faults, faulty
+from sim_drivers.v4l2_kernel import V4l2Kernel
+
+GIVE_UP_S = 60.0
+QUICK = {"stall_s": 1.0, "first_retry_s": 0.02, "last_retry_s": 0.05}
+
+
+class Pictures:
+    """A recording of plain pictures."""
+
+    camera: CameraModel | None = None
+    frame_count: int | None = 40
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+
+    def frames(self, every: int = 1, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        for index in range(start, 40, every):
+            image = np.full((HEIGHT, WIDTH, 3), 5 * index, np.uint8)
+            yield Frame(index, index, index, image, guess_camera(WIDTH, HEIGHT))
+
+    def close(self) -> None: ...
+
+
+def camera(root: Path, faults: CameraFaults) -> V4l2Camera:
+    kernel = V4l2Kernel(root, CameraFeed(Pictures(), 100.0, faults), None)
+    asked = {"kind": "v4l2", "pixels": "YUYV", "width": WIDTH, "height": HEIGHT, **QUICK}
+    return V4l2Camera("front", V4l2Config.model_validate(asked), kernel, root)
+
+
+def until(true: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + GIVE_UP_S
+    while not true():
+        assert time.monotonic() < deadline, "gave up"
+        time.sleep(0.01)
+
+
+def test_an_unplugged_camera_tells_why_and_its_pictures_come_again(tmp_path: Path) -> None:
+    front = camera(tmp_path, CameraFaults(disconnect=frozenset({5}), away_s=0.3))
+    feed = LiveFeed("front", {"front": front}, None, SourceConfig())
+    feed.start()
+    try:
+        until(lambda: feed.newest.take(0.1) is not None and front.counters.reconnects == 1)
+        (device,) = feed.describe().values()
+        assert (device["kind"], device["state"]) == ("camera", "streaming")
+        assert device["reconnects"] == 1
+    finally:
+        feed.close()
+
+
+def test_only_pictures_that_are_asked_for_are_decoded(tmp_path: Path) -> None:
+    front = camera(tmp_path, CameraFaults())
+    feed = LiveFeed("front", {"front": front}, None, SourceConfig())
+    feed.start()
+    try:
+        taken: list[Frame | Dropped] = []
+        until(lambda: (frame := feed.newest.take(1.0)) is None or taken.append(frame) is None)
+        until(lambda: front.counters.received > 20)
+        assert front.counters.delivered <= len(taken) + 2
+    finally:
+        feed.close()
+
+
+def test_a_resumed_dive_counts_a_devices_pictures_on(tmp_path: Path) -> None:
+    feed = LiveFeed("front", {"front": camera(tmp_path, CameraFaults())}, None, SourceConfig())
+    feed.go_on(Continued(first_index=1000, shift_ns=10**15))
+    feed.start()
+    try:
+        frame = feed.newest.take(GIVE_UP_S)
+        assert frame is not None
+        assert 1000 <= frame.index < 1100
+        assert frame.t_ns > 10**15
+    finally:
+        feed.close()
+
+
+class Telemetry:
+    """A depth with every picture."""
+
+    def samples(self) -> Iterator[TelemetrySample]:
+        for index in range(40):
+            yield Depth(index, index, "truth", float(index))
+
+    def close(self) -> None: ...
+
+
+def test_a_resumed_recording_goes_on_at_once_behind_what_was_seen() -> None:
+    slept: list[float] = []
+    playback = Playback(Pictures(), [Telemetry()], 1e-9, lambda: 0, slept.append)
+    feed = PlaybackFeed(playback, SourceConfig(every=3), None, str, [])
+    feed.go_on(Continued(first_index=35))
+    feed.start()
+    until(lambda: not any(thread.name == "recording" for thread in threading.enumerate()))
+    feed.close()
+    assert feed.failure is None
+    assert feed.heard.samples == 4  # those of the pictures 36 to 39
+    assert slept == pytest.approx([1.0, 2.0, 3.0, 3.0])  # samples 37, 38, picture and sample 39
+
+
+def test_a_camera_whose_driver_fails_ends_the_feed_with_a_reason(tmp_path: Path) -> None:
+    front = camera(tmp_path, CameraFaults())
+    front.frames = lambda every=1: iter(_failing())  # type: ignore[method-assign,assignment]
+    feed = LiveFeed("front", {"front": front}, None, SourceConfig())
+    feed.start()
+    feed.newest.take(GIVE_UP_S)
+    until(lambda: feed.newest.ended)
+    feed.close()
+    assert feed.failure is not None
+    assert "told so" in feed.failure
+
+
+def _failing() -> Iterator[Frame]:
+    raise ValueError("told so")
+    yield
+
+
+def test_a_flood_of_garbage_costs_its_bytes_and_no_sample() -> None:
+    pytest.importorskip("pymavlink", reason="pymavlink is not installed")
+    wire = UdpWire()
+    link = {"kind": "udp", "mode": "send", "host": "127.0.0.1", "port": wire.port}
+    config = parse_telemetry({"devices": {"autopilot": {"kind": "mavlink", "link": link}}}, "test")
+    flooded, injected = faulty(
+        opener("autopilot", config.devices["autopilot"].link), Faults(flood=0.5)
+    )
+    telemetry = LinkTelemetry(config, links={"autopilot": flooded})
+    samples = [Depth(i * 20_000_000, i * 20_000_000, "truth", 3.0) for i in range(400)]
+    device = SimulatedDevice(ArduSub(), wire, samples).start()
+    feed = LiveFeed("none", {}, telemetry, SourceConfig())
+    feed.start()
+    try:
+        until(lambda: injected["flood"] > 3 and feed.heard.samples > 10)
+        (described,) = feed.describe().values()
+        assert described["state"] == "connected"
+        assert int(str(described["garbage_bytes"])) > 100_000
+        assert all(abs(s.depth_m - 3.0) < 0.1 for s in feed.heard.latest() if isinstance(s, Depth))
+    finally:
+        device.close()
+        feed.close()

@@ -1,0 +1,164 @@
+"""The live loop under faults: expected state, counter and recovery, in the test's own time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from live_scenes import CALM, Told, frame_of, rows_of, visited
+
+from aquaflow.errors import AquaFlowError
+from aquaflow.messages import Dropped
+from aquaflow.service.health import State
+from aquaflow.service.ladder import Level
+
+
+@pytest.fixture
+def told(tmp_path: Path) -> Iterator[Told]:
+    told = Told(tmp_path / "dive")
+    yield told
+    told.close()
+
+
+def test_a_dive_goes_from_starting_over_initialising_to_tracking(told: Told) -> None:
+    told.frames("llllpp")
+    assert visited(told) == ["starting", "initialising", "tracking"]
+    assert all(change.reason for change in told.loop.health.changes)
+
+
+def test_an_unplugged_camera_is_waited_for_and_the_dive_goes_on(told: Told) -> None:
+    told.feed.devices = {"front": {"kind": "camera", "state": "lost", "reason": "No such device"}}
+    told.frames("pp")
+    told.idle(10.0, turns=40)
+    assert told.loop.health.state is State.WAITING
+    assert "No such device" in told.loop.health.reason
+    told.frames("pp", first=100)
+    assert visited(told)[-3:] == ["tracking", "waiting for camera", "tracking"]
+    assert told.loop.health.visits[State.WAITING] == 1
+
+
+def test_lost_frames_make_it_lost_and_one_alone_does_not(told: Told) -> None:
+    told.frames("pplpp")
+    assert State.LOST not in told.loop.health.visits
+    told.frames("lll", first=10)
+    assert told.loop.health.state is State.LOST
+    told.frames("p", first=20)
+    assert told.loop.health.state is State.TRACKING
+
+
+def test_skipped_frames_say_nothing_about_being_lost(told: Told) -> None:
+    told.frames("p" + "s" * 20)
+    assert told.loop.health.state is State.TRACKING
+
+
+def test_a_silent_link_degrades_with_its_name_and_comes_back(told: Told) -> None:
+    link = {"kind": "link", "state": "no byte for 10 s", "reason": ""}
+    told.feed.devices = {"autopilot": link}
+    told.frames("pp")
+    assert told.loop.health.state is State.DEGRADED
+    assert "autopilot" in told.loop.health.reason
+    link["state"] = "connected"
+    told.frames("p", first=5)
+    assert told.loop.health.state is State.TRACKING
+
+
+def test_memory_pressure_goes_down_the_stated_steps_and_climbs_back(told: Told) -> None:
+    told.frames("p")
+    told.pressure = replace(CALM, free_memory_share=0.02)
+    levels = []
+    for _ in range(5):
+        told.idle(told.config.limits.look_s)
+        levels.append(told.ladder.level)
+    assert levels == [*list(Level)[1:], Level.RECORDING_ONLY]
+    told.frames("p", first=50)
+    assert "2 % of the memory" in told.loop.health.reason
+    assert "recording only" in list(rows_of(told.dive.path))[-1]
+    told.pressure = CALM
+    for _ in range(60):
+        told.idle(told.config.limits.look_s)
+    assert told.ladder.level is Level.FULL
+    assert (told.ladder.steps_down, told.ladder.steps_up) == (4, 4)
+    told.frames("p", first=60)
+    assert told.loop.health.state is State.TRACKING
+
+
+@pytest.mark.parametrize(
+    ("short", "says"),
+    [
+        ({"temperature_c": 95.0}, "95 degC"),
+        ({"gpu_free_share": 0.01}, "GPU"),
+    ],
+)
+def test_heat_and_a_full_gpu_are_pressure_too(
+    told: Told, short: dict[str, float], says: str
+) -> None:
+    told.pressure = replace(CALM, **short)
+    told.idle(told.config.limits.look_s)
+    assert told.ladder.level is Level.FEWER_STEPS
+    assert says in told.ladder.reason
+
+
+def test_a_full_disk_degrades_but_costs_no_step_of_the_ladder(told: Told) -> None:
+    told.frames("pp")
+    told.pressure = replace(CALM, disk_free_mb=3.0)
+    told.idle(told.config.limits.look_s)
+    told.frames("p", first=5)
+    assert told.loop.health.state is State.DEGRADED
+    assert "disk full: 3 MB" in told.loop.health.reason
+    assert told.ladder.level is Level.FULL
+    told.pressure = CALM
+    told.idle(told.config.limits.look_s)
+    told.frames("p", first=6)
+    assert told.loop.health.state is State.TRACKING
+
+
+def test_a_frame_that_raises_costs_itself(told: Told) -> None:
+    told.frames("ppxp")
+    assert told.loop.counters.failures == 1
+    assert told.loop.health.state is State.TRACKING
+    assert [row for row in rows_of(told.dive.path) if "failed: told so" in row]
+
+
+def test_frame_after_frame_that_raises_ends_the_process(told: Told) -> None:
+    with pytest.raises(AquaFlowError, match="10 frames in a row failed"):
+        told.frames("x" * 10)
+
+
+def test_a_source_that_fails_ends_the_loop_with_its_reason(told: Told) -> None:
+    told.feed.failure = "camera 'front' failed: no such luck"
+    told.feed.newest.end()
+    with pytest.raises(AquaFlowError, match="no such luck"):
+        told.loop.run()
+
+
+def test_a_missing_picture_is_a_row_and_no_silence(told: Told) -> None:
+    told.loop.take(Dropped(7, 0, "front#7 is damaged"))
+    assert "front#7 is damaged" in "".join(rows_of(told.dive.path))
+    assert told.loop.health.state is not State.WAITING
+
+
+def test_after_the_end_there_is_no_other_state(told: Told) -> None:
+    told.frames("pp")
+    told.loop.stop("told to stop")
+    told.loop.take(frame_of(9))
+    assert told.loop.health.state is State.STOPPING
+
+
+def test_frames_that_a_newer_one_overtook_are_counted(told: Told) -> None:
+    for index in range(4):
+        told.feed.newest.put(frame_of(index))
+    frame = told.feed.newest.take(0.0)
+    assert frame is not None
+    assert frame.index == 3
+    assert told.loop.status()["overtaken"] == 3
+
+
+def test_the_slowest_stage_is_named(told: Told) -> None:
+    totals = told.run.profiler._totals_ms
+    totals.update({"track": 1000.0, "insert": 400.0, "refine": 9000.0})
+    told.clock.pass_(10.0)
+    told.loop.take(None)
+    assert told.loop.counters.slowest == "track"
+    assert told.loop.counters.shares["track"] == pytest.approx(0.1)

@@ -1,0 +1,132 @@
+"""Mapping beside tracking: order, what is left out when it is behind, what a failure costs."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from live_scenes import HEIGHT, WIDTH, RecordedMaps
+
+from aquaflow.config.service import LiveMappingConfig
+from aquaflow.geometry.camera import guess_camera
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes import Pointmap
+from aquaflow.mapping.views import View
+from aquaflow.maps import Growth, Insertion
+from aquaflow.service.beats import Beats
+from aquaflow.service.ladder import Level
+from aquaflow.service.map_thread import STAGE, MapThread
+
+CAMERA = guess_camera(WIDTH, HEIGHT)
+
+
+class Beside:
+    """A mapping thread that can be held up."""
+
+    def __init__(self) -> None:
+        self.maps, self.beats, self.level = RecordedMaps(), Beats(), Level.FULL
+        self.thread = MapThread(
+            self.maps, LiveMappingConfig(backlog=2, nice=0), self.beats, lambda: self.level
+        )
+
+    def hold(self) -> threading.Event:
+        """Let the thread do nothing until the event is set."""
+        held, going = threading.Event(), threading.Event()
+
+        def wait(maps: object, lacking: object) -> None:
+            going.set()
+            held.wait(20.0)
+
+        self.thread.look("wait", wait)
+        assert going.wait(20.0)
+        return held
+
+
+@pytest.fixture
+def beside() -> Iterator[Beside]:
+    beside = Beside()
+    yield beside
+    beside.thread.close()
+
+
+def growth(index: int, robust: bool = False, retired: tuple[Insertion, ...] = ()) -> Growth:
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    view = View(index, image, CAMERA, Sim3.identity(), 0, robust)
+    return Growth(view, 0, 8, None if robust else Pointmap.unknown(CAMERA), retired)
+
+
+def test_requests_are_done_in_their_order(beside: Beside) -> None:
+    for index in range(2):
+        beside.thread.grow(growth(index))
+    beside.thread.close()
+    assert beside.maps.asked == ["grow 0 64px 8", "grow 1 64px 8"]
+
+
+def test_common_frames_are_left_out_first_and_counted(beside: Beside) -> None:
+    held = beside.hold()
+    for index in range(20):
+        beside.thread.grow(growth(index, robust=index % 2 == 1))
+    held.set()
+    beside.thread.close()
+    left_out = beside.thread.left_out
+    assert left_out["common frame, mapping was behind"] == 9
+    assert left_out["mapping frame, mapping was behind"] == 5
+    assert len(beside.maps.asked) == 6
+
+
+def test_a_keyframe_that_the_map_never_saw_does_not_retire_into_it(beside: Beside) -> None:
+    seen, unseen = growth(0), growth(1)
+    beside.thread.grow(seen)
+    retired = tuple(Insertion(g.view, 0, Pointmap.unknown(CAMERA)) for g in (seen, unseen))
+    beside.thread.grow(growth(2, retired=retired))
+    beside.thread.close()
+    assert beside.maps.asked == ["grow 0 64px 8", "grow 2 64px 8", "insert 0"]
+
+
+@pytest.mark.parametrize(
+    ("level", "asked"),
+    [
+        (Level.FEWER_STEPS, ["grow 0 64px 2"]),
+        (Level.SMALLER_IMAGES, ["grow 0 32px 2"]),
+        (Level.TRACKING_ONLY, []),
+    ],
+)
+def test_each_level_asks_for_less(beside: Beside, level: Level, asked: list[str]) -> None:
+    beside.level = level
+    beside.thread.grow(growth(0))
+    beside.thread.close()
+    assert beside.maps.asked == asked
+
+
+def test_a_lost_gpu_costs_its_requests_and_is_told(beside: Beside) -> None:
+    beside.maps.fail = True
+    beside.thread.grow(growth(0))
+    assert beside.maps.failed.wait(20.0)
+    beside.hold().set()
+    assert beside.thread.failures == 1
+    assert "the GPU is gone" in beside.thread.last_failure
+    beside.maps.fail = False
+    beside.thread.grow(growth(1))
+    beside.thread.close()
+    assert beside.maps.asked == ["grow 1 64px 8"]
+
+
+def test_a_look_is_told_the_corrections_that_still_wait(beside: Beside) -> None:
+    held, told = beside.hold(), []
+    beside.thread.correct({3: Sim3.identity()}, {1: 0})
+    beside.thread.look("look", lambda maps, lacking: told.append(lacking))
+    held.set()
+    beside.thread.close()
+    ((correction,),) = told
+    assert (list(correction.moves), dict(correction.merged)) == ([3], {1: 0})
+
+
+def test_an_idle_thread_shows_that_it_lives_and_a_closed_one_is_not_missed(
+    beside: Beside,
+) -> None:
+    beside.hold().set()
+    assert beside.beats.ages_s()[STAGE] < 20.0
+    beside.thread.close()
+    assert STAGE not in beside.beats.ages_s()

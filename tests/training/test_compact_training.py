@@ -1,0 +1,200 @@
+"""The compact prior learns, a run resumes where it stopped, and what it learns from is fixed."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from aquaflow.errors import InputError
+from aquaflow.prior.compact.network import COARSE, CompactPrior, NetworkSize
+from aquaflow.training.compact import CompactSettings, CompactTask, coarse_loss, compact_losses
+from aquaflow.training.compact_recall import mean_recall
+from aquaflow.training.correspondences import Correspondences
+from aquaflow.training.generator.cameras import TRAINING
+from aquaflow.training.generator.draw import Draw
+from aquaflow.training.generator.drawing import Looks, training_pair
+from aquaflow.training.generator.pool import Pool
+from aquaflow.training.generator.render import render_pairs
+from aquaflow.training.generator.scene import Detail
+from aquaflow.training.pairs import Pair
+from aquaflow.training.schedule import Schedule
+from aquaflow.training.trainer import CHECKPOINT, CURVE, HISTORY, TrainingPlan, train
+
+SMALL = NetworkSize(levels=(8, 8, 12, 16), merged=(16, 12, 8), fine=8, coarse=16, head=4)
+DETAIL = Detail(terrain=64, texture=128)
+LOOKS = Looks(width=64, height=48, roll=0.2)
+SETTINGS = CompactSettings(batch=2, matches=64, first_scenes=8, steps_per_shard=2, scenes=24)
+PLAN = TrainingPlan(Schedule(4, 1, 1e-3, 1e-4), validate_every=2, save_every=2)
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    """No progress bar."""
+
+
+def network() -> CompactPrior:
+    torch.manual_seed(0)
+    return CompactPrior(SMALL)
+
+
+@pytest.fixture(scope="module")
+def pair() -> Pair:
+    draw = Draw(2)
+    clear = render_pairs(draw, 2, 96, 72, TRAINING, DETAIL)
+    return training_pair(draw, clear, LOOKS)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("pool")
+
+
+def task(folder: Path) -> CompactTask:
+    pool = Pool(folder, 1, 48, 36, detail=DETAIL)
+    return CompactTask(network(), pool, [], SETTINGS, replace(LOOKS, width=32, height=32), 1)
+
+
+class Recorded(CompactTask):
+    """A task without held-out pairs, whose figure is known."""
+
+    def validate(self) -> dict[str, float]:
+        return {"figure": 0.5}
+
+
+def recorded(folder: Path) -> Recorded:
+    return Recorded(**vars(task(folder)))
+
+
+def test_one_pair_is_learnt_by_heart(pair: Pair) -> None:
+    prior = network()
+    optimiser = torch.optim.AdamW(prior.parameters(), lr=4e-3)
+
+    def recall() -> float:
+        prior.eval()
+        return mean_recall(prior.encode, prior.comparison, [pair])["fine_4px"]
+
+    before = recall()
+    for step in range(40):
+        prior.train()
+        terms = compact_losses(prior, pair, SETTINGS, Draw(step))
+        optimiser.zero_grad()
+        sum(terms.values(), torch.zeros(())).backward()
+        optimiser.step()
+    assert before < 0.3
+    assert recall() > before + 0.4
+
+
+def test_every_term_reaches_the_weights_it_is_for(pair: Pair) -> None:
+    prior = network()
+    reached = {}
+    for name in ("coarse", "among", "around", "trust", "range"):
+        prior.zero_grad()
+        compact_losses(prior, pair, SETTINGS, Draw(0))[name].backward()
+        reached[name] = {key for key, p in prior.named_parameters() if p.grad is not None}
+    assert any(key.startswith("encoder.down_2") for key in reached["coarse"] & reached["around"])
+    assert reached["trust"] == {"encoder.trust.weight", "encoder.trust.bias"}
+    assert all(key.startswith("comparison.range") for key in reached["range"])
+
+
+def test_coarse_loss_is_chance_for_equal_cells_and_little_for_the_right_ones() -> None:
+    rows, columns = 4, 6
+    centres = torch.meshgrid(
+        torch.arange(rows * COARSE) + 0.5, torch.arange(columns * COARSE) + 0.5, indexing="ij"
+    )
+    pixels = torch.stack([centres[1], centres[0]], -1)[None]
+    found = Correspondences(pixels, torch.ones(1, rows * COARSE, columns * COARSE).bool())
+    size = (rows * COARSE, columns * COARSE)
+    cells = rows * columns
+    chance = coarse_loss(torch.zeros(1, cells, cells), found, size)
+    right = coarse_loss(20.0 * torch.eye(cells)[None], found, size)
+    assert float(chance) == pytest.approx(math.log(cells), rel=1e-4)
+    assert float(right) < 1e-3
+
+
+def test_a_pair_that_shares_nothing_costs_nothing_and_can_be_differentiated(pair: Pair) -> None:
+    T = pair.b.T_wc.clone()
+    T[:, :3, 3] += 1000.0
+    apart = Pair(pair.a, replace(pair.b, T_wc=T))
+    terms = compact_losses(network(), apart, SETTINGS, Draw(0))
+    matching = terms["coarse"] + terms["among"] + terms["around"] + terms["trust"]
+    matching.backward()
+    assert float(matching.detach()) == 0.0
+
+
+def test_early_steps_use_the_first_scenes_only(folder: Path) -> None:
+    learner = task(folder)
+    asked: list[Tensor] = []
+    pairs = learner.pool.pairs
+    learner.pool.pairs = lambda numbers: asked.append(numbers) or pairs(numbers)  # type: ignore
+    for step in (0, 1, 40):
+        learner.loss(step)
+    assert int(torch.stack(asked[:2]).max()) < SETTINGS.first_scenes
+    assert int(torch.stack(asked).max()) < SETTINGS.scenes
+
+
+def test_a_run_that_was_stopped_ends_with_the_same_weights(folder: Path, tmp_path: Path) -> None:
+    whole, parts = recorded(folder), recorded(folder)
+    history = train(whole, PLAN, tmp_path / "whole", silent)
+
+    def stops(stage: str, done: int, total: int) -> None:
+        if done == 3:  # after the checkpoint of step 2
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(parts, PLAN, tmp_path / "parts", stops)
+    resumed = recorded(folder)
+    again = train(resumed, PLAN, tmp_path / "parts", silent)
+    for one, other in zip(
+        whole.network.state_dict().values(), resumed.network.state_dict().values(), strict=True
+    ):
+        assert torch.equal(one, other)
+    assert [row["loss_coarse"] for row in again] == [row["loss_coarse"] for row in history]
+
+
+def test_a_run_leaves_a_curve_and_its_figures(folder: Path, tmp_path: Path) -> None:
+    train(recorded(folder), PLAN, tmp_path, silent)
+    rows = json.loads((tmp_path / HISTORY).read_text())
+    assert [row["step"] for row in rows] == [2.0, 4.0]
+    assert rows[-1]["figure"] == 0.5
+    assert (tmp_path / CURVE).read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_checkpoint_of_another_network_is_refused(folder: Path, tmp_path: Path) -> None:
+    train(recorded(folder), replace(PLAN, schedule=Schedule(1, 1)), tmp_path, silent)
+    other = recorded(folder)
+    other.network = CompactPrior(replace(SMALL, coarse=20))
+    with pytest.raises(InputError, match="another network"):
+        train(other, PLAN, tmp_path, silent)
+    assert (tmp_path / CHECKPOINT).is_file()
+
+
+class Broken:
+    """A task whose loss is no number."""
+
+    def __init__(self) -> None:
+        self.network = nn.Linear(2, 1)
+
+    def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
+        return self.network(torch.full((1, 2), torch.inf)).sum() * 0.0, {"loss": math.nan}
+
+    def validate(self) -> dict[str, float]:
+        return {}
+
+
+def test_a_loss_that_is_no_number_moves_nothing(tmp_path: Path) -> None:
+    broken = Broken()
+    before = broken.network.weight.detach().clone()
+    train(broken, PLAN, tmp_path, silent)
+    assert torch.equal(broken.network.weight, before)
+
+
+def test_a_held_rate_stays_highest_and_then_falls_to_the_lowest() -> None:
+    schedule = Schedule(100, 10, 1.0, 0.1, hold=50)
+    assert [schedule.rate(step) for step in (9, 30, 60)] == [1.0, 1.0, 1.0]
+    assert 0.1 < schedule.rate(80) < 1.0
+    assert schedule.rate(99) == pytest.approx(0.1)

@@ -1,0 +1,110 @@
+"""The window itself: a finished dive, a live one, browsers that hang, and one that is real."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import HEIGHT, WIDTH
+
+from aquaflow.config.viewer import ViewerConfig
+from aquaflow.errors import InputError
+from aquaflow.geometry.camera import guess_camera
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.viewer.finished import read_dive, show_dive
+from aquaflow.viewer.splats import splats
+from aquaflow.viewer.window import Window
+
+pytest.importorskip("viser", reason="viser is not installed")
+
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
+UPGRADE = (
+    b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+)
+
+
+@pytest.fixture
+def window() -> Iterator[Window]:
+    window = Window(ViewerConfig(port=0), "test")
+    yield window
+    window.close()
+
+
+def many(count: int) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    return {
+        "means": rng.normal(size=(count, 3)).astype(np.float32),
+        "quats": rng.normal(size=(count, 4)).astype(np.float32),
+        "scales": np.full((count, 3), 0.05, np.float32),
+        "opacities": np.full(count, 0.9, np.float32),
+    }
+
+
+def test_a_browser_that_never_reads_does_not_hold_up_who_shows(window: Window) -> None:
+    port = int(window.address.rstrip("/").rpartition(":")[2])
+    hung = socket.create_connection(("127.0.0.1", port), timeout=20)
+    hung.sendall(UPGRADE)
+    parts, camera = many(20_000), guess_camera(WIDTH, HEIGHT)
+    picture = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    for turn in range(20):  # 20 x 640 kB: far beyond what a socket's buffers take
+        colours = {"water": np.full((20_000, 3), turn / 20, np.float32)}
+        window.show_splats(splats(**parts, colours=colours, budget=20_000))
+        window.show_camera(Sim3.identity(), camera, picture)
+        window.show_path(parts["means"][: turn + 2], np.ones(turn + 2))
+        window.show_health(f"turn {turn}")
+    assert window.splats_shown == 20_000
+    hung.close()
+
+
+def test_a_finished_dive_is_read_with_its_colours_poses_and_pictures(small_dive: Path) -> None:
+    dive = read_dive(small_dive, budget=500)
+    assert len(dive.splats) == 500
+    assert {"water", "clear"} == set(dive.splats.colours)
+    assert len(dive.poses) == len(dive.quality) == len(dive.pictures)
+    kept = [picture for picture in dive.pictures if picture is not None]
+    assert len(kept) == len(list((small_dive / "heldout").glob("*_real.png")))
+
+
+def test_a_folder_without_a_dive_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"map\.ply is missing"):
+        read_dive(tmp_path, budget=500)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
+def test_a_real_browser_shows_splats(small_dive: Path, tmp_path: Path) -> None:
+    import cv2
+
+    window = show_dive(read_dive(small_dive, budget=20_000), ViewerConfig(port=0))
+    try:
+        picture = screenshot(window.address, tmp_path / "shot.png")
+    finally:
+        window.close()
+    scene = cv2.cvtColor(picture[:, : picture.shape[1] * 2 // 3], cv2.COLOR_BGR2HSV)
+    coloured = (scene[..., 1] > 60).mean()
+    assert coloured > 0.05, f"{100 * coloured:.1f} % of the page is coloured"
+
+
+def screenshot(address: str, file: Path) -> np.ndarray:
+    """[H, W, 3] BGR of the page in a headless Chromium."""
+    import cv2
+
+    assert BROWSER is not None
+    software = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    quiet = ["--headless=new", "--no-sandbox", f"--user-data-dir={file.parent / 'profile'}"]
+    waiting = ["--virtual-time-budget=30000", "--timeout=90000", "--window-size=1280,800"]
+    subprocess.run(
+        [BROWSER, *quiet, *software, *waiting, f"--screenshot={file}", address],
+        capture_output=True,
+        timeout=300,
+        check=True,
+    )
+    picture = cv2.imread(str(file))
+    assert picture is not None
+    return np.asarray(picture)
