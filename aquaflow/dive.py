@@ -8,7 +8,7 @@ import json
 import logging
 import shutil
 from collections.abc import Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from aquaflow.export.map_file import write_map_file
 from aquaflow.export.ply import Splats, write_ply
 from aquaflow.export.report import ReportData, write_report
 from aquaflow.export.tum import write_tum
+from aquaflow.frame_rows import FRAME_COLUMNS, FrameRow, or_lost, read_rows
 from aquaflow.geometry.camera import CameraModel, save_camera
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.gaussians import radiance
@@ -31,7 +32,6 @@ from aquaflow.outcome import HeldOut, WaterSummary, water_of
 
 log = logging.getLogger(__name__)
 
-FRAME_COLUMNS = ("index", "source", "t_s", "class", "sub_map", "keyframe", "quality", "reason")
 MARKER = "frames.csv"
 """The file by which a folder is known to be a dive."""
 
@@ -50,62 +50,6 @@ CHECKPOINT = "checkpoint"
 
 WORK = "work"
 """Folder of what waits for a long dive's memory; gone when the run has ended."""
-
-
-@dataclass(frozen=True)
-class FrameRow:
-    """One line of frames.csv."""
-
-    index: int
-    source: str
-    t_s: float
-    frame_class: str
-    sub_map: int | None = None
-    keyframe: int | None = None
-    quality: float | None = None
-    """Inlier share of the pose's matches."""
-    reason: str = ""
-
-    @staticmethod
-    def of_cells(cells: Sequence[str]) -> FrameRow:
-        """The row that :meth:`cells` wrote."""
-        index, source, t_s, frame_class, sub_map, keyframe, quality, reason = cells
-        return FrameRow(
-            int(index), source, float(t_s), frame_class,
-            int(sub_map) if sub_map else None,
-            int(keyframe) if keyframe else None,
-            float(quality) if quality else None,
-            reason,
-        )  # fmt: skip
-
-    def cells(self) -> list[str]:
-        quality = "" if self.quality is None else f"{self.quality:.3f}"
-        sub_map = "" if self.sub_map is None else str(self.sub_map)
-        keyframe = "" if self.keyframe is None else str(self.keyframe)
-        return [
-            str(self.index), self.source, f"{self.t_s:.9f}", self.frame_class,
-            sub_map, keyframe, quality, self.reason,
-        ]  # fmt: skip
-
-
-def read_rows(path: Path) -> list[FrameRow]:
-    """The rows of frames.csv; a last one that was cut short is left out.
-
-    Raises:
-        InputError: it cannot be read.
-    """
-    try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            whole = [cells for cells in csv.reader(stream) if len(cells) == len(FRAME_COLUMNS)]
-        return [FrameRow.of_cells(cells) for cells in whole[1:]]
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot read {path}: {error}; start with --new") from error
-
-
-def _or_lost(row: FrameRow, known: Container[int]) -> FrameRow:
-    if row.index in known or row.frame_class == "dropped":
-        return row
-    return FrameRow(row.index, row.source, row.t_s, "dropped", reason="lost in a restart")
 
 
 class DiveFolder:
@@ -132,7 +76,7 @@ class DiveFolder:
         if resume is None:
             self._claim(overwrite)
         else:
-            self._rows = [_or_lost(row, resume) for row in read_rows(path / MARKER)]
+            self._rows = [or_lost(row, resume) for row in read_rows(path / MARKER)]
         dump_config(config, path / "config.yaml")
         self._rewrite_frames(self._rows)
         self._frames = (path / MARKER).open("a", newline="", encoding="utf-8")

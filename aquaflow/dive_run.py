@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from aquaflow.config import Config
-from aquaflow.dive import TRACE, DiveFolder, FrameRow
+from aquaflow.dive import TRACE, DiveFolder
 from aquaflow.errors import InputError, NotMappedError
+from aquaflow.frame_rows import FrameRow
 from aquaflow.maps import MIN_VIEWS, Progress
 from aquaflow.messages import CameraModel, Dropped, Frame
 from aquaflow.outcome import (

@@ -14,10 +14,11 @@ import pytest
 from conftest import FRAMES, HEIGHT, WIDTH
 
 from aquaflow.config import Config, load_config
-from aquaflow.dive import DiveFolder, FrameRow
+from aquaflow.dive import DiveFolder
 from aquaflow.errors import InputError
 from aquaflow.evaluation.trajectory import read_tum
 from aquaflow.export.ply import read_ply
+from aquaflow.frame_rows import FrameRow
 from aquaflow.geometry.camera import load_camera
 
 METRICS = {

@@ -21,6 +21,7 @@ FLOORS = (
     {"dive_run"},
     {"reporting"},
     {"dive"},
+    {"frame_rows"},
     {"outcome"},
     {"slam", "export"},
     {"maps"},

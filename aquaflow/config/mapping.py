@@ -99,8 +99,8 @@ class InsertionConfig(Stage):
         1.0,
         gt=0,
         le=1,
-        description="Gaussians per pixel of certain structure; 0.5 is 1 dB and 0.02 SSIM worse "
-        "after as many steps, which it makes a fifth faster",
+        description="Gaussians per pixel of certain structure; 0.5 is 0.2 dB and 0.02 SSIM worse "
+        "on the reef clip after as many steps",
     )
     bare_probability: float = Field(
         0.06, ge=0, le=1, description="least P_a where the map does not cover the picture"
@@ -138,7 +138,7 @@ class OptimiserConfig(Stage):
     """Adam rates and the number of steps."""
 
     betas: tuple[float, float] = Field((0.9, 0.99), description="Adam's decay rates")
-    means: float = Field(8e-4, gt=0, description="map units per step; 4e-4 is 0.2 dB worse")
+    means: float = Field(8e-4, gt=0, description="map units per step; 4e-4 is 0.15 dB worse")
     means_final: float = Field(0.1, gt=0, le=1, description="factor reached at the end of refining")
     quats: float = Field(4e-3, gt=0)
     log_scales: float = Field(

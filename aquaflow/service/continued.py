@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from aquaflow.dive import FrameRow
+from aquaflow.frame_rows import FrameRow
 from aquaflow.messages import Dropped, Frame
 from aquaflow.service.moment import Moment
 

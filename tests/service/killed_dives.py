@@ -10,7 +10,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from aquaflow.dive import read_rows
+from aquaflow.frame_rows import read_rows
 from aquaflow.service.checkpoint import read_state, state_file
 
 CONFIG = """

@@ -17,8 +17,8 @@ from live_scenes import ToldFeed
 from aquaflow.config.service import CheckpointConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.config.viewer import ViewerConfig
-from aquaflow.dive import read_rows
 from aquaflow.errors import InputError
+from aquaflow.frame_rows import read_rows
 from aquaflow.messages import Frame
 from aquaflow.service.checkpoint import read_state, state_file
 from aquaflow.service.choice import choose, is_unfinished, resumed, tidy
@@ -37,10 +37,11 @@ VEHICLE = VehicleConfig.model_validate(
         "service": {
             "health": {"enabled": False, "port": 8230},
             "mapping": {"backlog": 100, "steps_per_view": 0, "nice": 0},
+            "checkpoint": {"every_s": 1e6},
         },
     }
 )
-CUT = 16
+CUT = 12
 """Frames before the cut."""
 
 
@@ -64,7 +65,7 @@ class Cut:
 @pytest.fixture(scope="module")
 def cut(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cut]:
     recording, folder = open_recording(small_recording), tmp_path_factory.mktemp("dives") / "cut"
-    frames = [frame for frame in recording.frames() if isinstance(frame, Frame)]
+    frames = [frame for frame in recording.frames(stop=20) if isinstance(frame, Frame)]
     dive = LiveDive("cut", resumed(folder, new=False), ToldFeed(), VEHICLE)
     for frame in frames[:CUT]:
         dive.parts.loop.take(frame)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from killed_dives import kill_and_resume
 
-from aquaflow.dive import read_rows
+from aquaflow.frame_rows import read_rows
 from aquaflow.synthetic import SyntheticConfig, write_dive
 
 

@@ -64,7 +64,8 @@ def _contender(folder: Path, precision: str, threads: int, device: str) -> Conte
         "threads": threads,
     }  # fmt: skip
     prior = make_prior(PriorConfig.model_validate(config))
-    return Contender(prior.name, precision, threads, prior)
+    name = prior.name if folder == SHIPPED else f"{prior.name} in {folder}"
+    return Contender(name, precision, threads, prior)
 
 
 def _precisions(folder: Path) -> list[str]:

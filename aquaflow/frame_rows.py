@@ -1,0 +1,69 @@
+"""The lines of frames.csv: what became of each frame."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Container, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from aquaflow.errors import InputError
+
+FRAME_COLUMNS = ("index", "source", "t_s", "class", "sub_map", "keyframe", "quality", "reason")
+
+
+@dataclass(frozen=True)
+class FrameRow:
+    """One line of frames.csv."""
+
+    index: int
+    source: str
+    t_s: float
+    frame_class: str
+    sub_map: int | None = None
+    keyframe: int | None = None
+    quality: float | None = None
+    """Inlier share of the pose's matches."""
+    reason: str = ""
+
+    @staticmethod
+    def of_cells(cells: Sequence[str]) -> FrameRow:
+        """The row that :meth:`cells` wrote."""
+        index, source, t_s, frame_class, sub_map, keyframe, quality, reason = cells
+        return FrameRow(
+            int(index), source, float(t_s), frame_class,
+            int(sub_map) if sub_map else None,
+            int(keyframe) if keyframe else None,
+            float(quality) if quality else None,
+            reason,
+        )  # fmt: skip
+
+    def cells(self) -> list[str]:
+        quality = "" if self.quality is None else f"{self.quality:.3f}"
+        sub_map = "" if self.sub_map is None else str(self.sub_map)
+        keyframe = "" if self.keyframe is None else str(self.keyframe)
+        return [
+            str(self.index), self.source, f"{self.t_s:.9f}", self.frame_class,
+            sub_map, keyframe, quality, self.reason,
+        ]  # fmt: skip
+
+
+def read_rows(path: Path) -> list[FrameRow]:
+    """The rows of frames.csv; a last one that was cut short is left out.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as stream:
+            whole = [cells for cells in csv.reader(stream) if len(cells) == len(FRAME_COLUMNS)]
+        return [FrameRow.of_cells(cells) for cells in whole[1:]]
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read {path}: {error}; start with --new") from error
+
+
+def or_lost(row: FrameRow, known: Container[int]) -> FrameRow:
+    """The row, or that the frame was lost in a restart if its index is not ``known``."""
+    if row.index in known or row.frame_class == "dropped":
+        return row
+    return FrameRow(row.index, row.source, row.t_s, "dropped", reason="lost in a restart")
