@@ -11,6 +11,9 @@ LOGGERS = ("aquaflow", "py.warnings")
 """Loggers whose records go to log.jsonl."""
 
 
+_FORMATTER = logging.Formatter()
+
+
 class JsonLog(logging.Handler):
     """One JSON object a line, flushed at once; a record's ``fields`` become keys of their own."""
 
@@ -35,6 +38,8 @@ class JsonLog(logging.Handler):
             "message": record.getMessage(),
             **getattr(record, "fields", {}),
         }
+        if record.exc_info and record.exc_info[0] is not None:
+            entry["exception"] = _FORMATTER.formatException(record.exc_info)
         with contextlib.suppress(OSError):  # a full disk costs log lines, not the dive
             self._stream.write(json.dumps(entry, default=str) + "\n")
             self._stream.flush()

@@ -92,7 +92,7 @@ def shared_data() -> Path:
     return SHARED_DATA
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def one_thread() -> Iterator[None]:
     """torch as the pipeline has it: barriers between threads cost more than small tensors."""
     import torch

@@ -77,6 +77,8 @@ def put_together(facts: Facts, arrays: Mapping[str, Any], renderer: Renderer) ->
     for name, width in gaussians.WIDTHS.items():
         gaussians.parameters[name] = _tensor(arrays[f"gaussians.{name}"]).reshape(-1, width)
     gaussians.keyframes = _tensor(arrays["keyframes"])
+    width = gaussians.local_features.shape[1]  # a decoder, if there is one, brings its own
+    gaussians.local_features = torch.zeros(len(gaussians.keyframes), width)
     if any(len(tensor) != len(gaussians) for tensor in gaussians.parameters.values()):
         raise ValueError("its Gaussians differ in number")
     scene.shading = np.array(arrays["shading"])

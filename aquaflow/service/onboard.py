@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import threading
 from pathlib import Path
 
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive_run import Finished
+from aquaflow.errors import AquaFlowError
 from aquaflow.maps import Progress
-from aquaflow.service.choice import choose, is_unfinished, resumed, tidy
+from aquaflow.service.choice import Choice, choose, is_unfinished, resumed, tidy
 from aquaflow.service.feed import Feed
 from aquaflow.service.http import HealthServer
 from aquaflow.service.moment import Moment
@@ -18,6 +20,8 @@ from aquaflow.service.report import report
 from aquaflow.service.session import LiveDive
 from aquaflow.service.vehicle import VehicleReport
 from aquaflow.service.window import LiveWindow
+
+log = logging.getLogger(__name__)
 
 
 def map_live(
@@ -49,9 +53,7 @@ def map_live(
         choice = resumed(out, new)
         overwrite = overwrite or is_unfinished(out)
     with contextlib.ExitStack() as around:
-        dive = around.enter_context(
-            LiveDive(choice.folder.name, choice, feed, vehicle, overwrite=new or overwrite)
-        )
+        dive = around.enter_context(_begun(choice, feed, vehicle, new or overwrite, out is None))
         if service.health.enabled:
             server = HealthServer(service.health, lambda: report(dive.parts, service.hang_s))
             around.callback(server.close)
@@ -68,6 +70,21 @@ def map_live(
             watchers.append(window.look)
         around.callback(_stop_after(seconds, dive).cancel)
         return dive.run(progress)
+
+
+def _begun(
+    choice: Choice, feed: Feed, vehicle: VehicleConfig, overwrite: bool, unattended: bool
+) -> LiveDive:
+    """The dive; where nobody is there to help, one that cannot be resumed gives way to another."""
+    try:
+        return LiveDive(choice.folder.name, choice, feed, vehicle, overwrite)
+    except AquaFlowError as error:
+        if choice.checkpoint is None or not unattended:
+            raise
+        log.error("%s: %s; a new dive begins", choice.folder, error)
+        service = vehicle.service
+        fresh = choose(service.dives, service.checkpoint, True, Moment.now())
+        return LiveDive(fresh.folder.name, fresh, feed, vehicle, overwrite)
 
 
 def _stop_after(seconds: float | None, dive: LiveDive) -> threading.Timer:

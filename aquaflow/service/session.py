@@ -16,7 +16,7 @@ from aquaflow.config.service import ServiceConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive import CHECKPOINT, DiveFolder
 from aquaflow.dive_run import DiveRun, Finished
-from aquaflow.errors import InputError, NotMappedError
+from aquaflow.errors import AquaFlowError, InputError, NotMappedError
 from aquaflow.maps import Maps, Progress
 from aquaflow.messages import Dropped
 from aquaflow.pipeline import fix_threads
@@ -95,7 +95,12 @@ class LiveDive:
         run = DiveRun(name, self.folder, config, slam, feed.calibration, feed.name_of)
         continued = Continued()
         if choice.checkpoint is not None:
-            restore(choice.checkpoint, slam, run, maps)
+            try:
+                restore(choice.checkpoint, slam, run, maps)
+            except AquaFlowError:
+                slam.close(keep=True)
+                self.folder.close(keep_work=True)
+                raise
             continued = Continued.after(choice.checkpoint.moment, self.folder.rows)
             run.dropped += [
                 Dropped(row.index, round(row.t_s * 1e9), row.reason)

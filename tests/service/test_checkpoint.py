@@ -20,9 +20,11 @@ from aquaflow.config.viewer import ViewerConfig
 from aquaflow.errors import InputError
 from aquaflow.frame_rows import read_rows
 from aquaflow.messages import Frame
-from aquaflow.service.checkpoint import read_state, state_file
+from aquaflow.service import tracking_state
+from aquaflow.service.checkpoint import read_state, state_file, write_state
 from aquaflow.service.choice import choose, is_unfinished, resumed, tidy
 from aquaflow.service.moment import Moment
+from aquaflow.service.onboard import map_live
 from aquaflow.service.prometheus import exposition
 from aquaflow.service.report import report
 from aquaflow.service.session import LiveDive
@@ -89,6 +91,7 @@ def test_the_map_comes_back_bit_for_bit(cut: Cut, back: LiveDive) -> None:
     old, new = cut.dive.parts.maps.mappers[0], back.parts.maps.mappers[0]
     saved = read_state(cut.folder).arrays
     assert len(new.gaussians) > 100
+    assert len(new.gaussians.local_features) == len(new.gaussians)  # or pruning would fail
     for name, tensor in new.gaussians.parameters.items():
         assert np.array_equal(tensor.numpy(), saved[f"mapping.map0.gaussians.{name}"]), name
     assert len(new.views) == len(saved["mapping.map0.views.numbers"])
@@ -191,6 +194,21 @@ def test_only_a_dive_that_was_told_to_stop_can_be_resumed(tmp_path: Path, told: 
         assert dive.run() is None  # not one frame: nothing was mapped
     assert dive.parts.loop.health.reason == told
     assert (tmp_path / "dive" / "checkpoint").exists() == (told == "told to stop")
+
+
+def test_a_vehicle_whose_checkpoint_fits_nothing_begins_a_new_dive(tmp_path: Path) -> None:
+    dives = tmp_path / "dives"
+    (dives / "old").mkdir(parents=True)
+    (dives / "old" / "frames.csv").write_text("index,source,t_s,class,sub_map,keyframe,quality,r\n")
+    frames = {"tracking.frames": np.zeros(0, tracking_state.FRAME)}
+    facts = {"format": 1, "version": "0", "moment": Moment.now().to_json(), "tracking": {}}
+    write_state(dives / "old", facts, frames)
+    service = VEHICLE.service.model_copy(update={"dives": dives})
+    feed = ToldFeed()
+    feed.newest.end()
+    assert map_live(feed, VEHICLE.model_copy(update={"service": service})) is None
+    assert len(list(dives.iterdir())) == 2
+    assert state_file(dives / "old").is_file()
 
 
 def test_finished_dives_keep_no_files_for_a_resumption(tmp_path: Path) -> None:

@@ -21,6 +21,8 @@ from aquaflow.training.correspondences import overlap
 from aquaflow.training.generator.pool import Pool
 from aquaflow.training.generator.scene import Detail
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 SMALL = NetworkSize(levels=(8, 8, 12, 16), merged=(16, 12, 8), fine=8, coarse=16, head=4)
 SMALL_POOL = partial(Pool, width=96, height=64, detail=Detail(terrain=64, texture=128))
 

@@ -26,6 +26,8 @@ from aquaflow.training.pairs import Pair
 from aquaflow.training.schedule import Schedule
 from aquaflow.training.trainer import CHECKPOINT, CURVE, HISTORY, TrainingPlan, train
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 SMALL = NetworkSize(levels=(8, 8, 12, 16), merged=(16, 12, 8), fine=8, coarse=16, head=4)
 DETAIL = Detail(terrain=64, texture=128)
 LOOKS = Looks(width=64, height=48, roll=0.2)

@@ -12,6 +12,8 @@ from plane_pairs import FOCAL_PX, plane_view, shifted_pair
 from aquaflow.training.correspondences import correspondences, overlap
 from aquaflow.training.pairs import Pair, true_pointmaps
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 
 def test_a_plane_moves_by_its_disparity() -> None:
     found = correspondences(shifted_pair(0.5))

@@ -24,6 +24,7 @@ from aquaflow.training.peers import Peers, Together
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
+
 SMALL = FineTuningSettings(width=32, height=32, epochs=2, warm_up_epochs=1, batch=2, accumulate=2)
 
 

@@ -19,6 +19,8 @@ from aquaflow.training.generator.sensor import taken
 from aquaflow.training.generator.water import MOST_ATTENUATION, random_water
 from aquaflow.training.pairs import Pair
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 WIDTH, HEIGHT = 48, 36
 COARSE = Detail(terrain=64, texture=128)
 LOOKS = Looks(width=32, height=24)

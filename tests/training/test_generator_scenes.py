@@ -18,6 +18,8 @@ from aquaflow.training.generator.render import median_depth, render_pairs, rende
 from aquaflow.training.generator.scene import Detail, Scene, random_scenes, rotation
 from aquaflow.training.pairs import Pair, View, seen_from
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 WIDTH, HEIGHT, BATCH = 64, 48, 2
 COARSE = Detail(terrain=64, texture=128)
 

@@ -16,6 +16,8 @@ from aquaflow.training.losses import LossWeights, info_nce, match_loss, pair_los
 from aquaflow.training.pairs import Pair, true_pointmaps
 from aquaflow.training.schedule import Schedule
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 
 class Said(NamedTuple):
     X: Tensor
