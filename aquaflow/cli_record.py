@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-import signal
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from aquaflow.stopping import until_told
 from aquaflow.terminal import Json, progress_bars
 
 if TYPE_CHECKING:
@@ -56,7 +55,7 @@ def record(
     session = Session(Recorder(folder, vehicle.recording))
     try:
         add_sources(session)
-        with _until_told(session), progress_bars(quiet=as_json) as progress:
+        with until_told(session.stopping), progress_bars(quiet=as_json) as progress:
             session.run(seconds, progress)
     finally:
         status = session.recorder.close()
@@ -99,18 +98,6 @@ def _recording(path: Path) -> Callable[[Session], None]:
     camera = open_recording(path) if camera_reader(path) or not telemetry else None
     playback = Playback(camera, telemetry, speed=1.0)
     return lambda session: session.add_playback(SOURCE_CAMERA, playback, telemetry)
-
-
-@contextmanager
-def _until_told(session: Session) -> Iterator[None]:
-    """Ctrl-C and systemd's SIGTERM end the recording instead of breaking it off."""
-    asked = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(each, lambda *_: session.stopping.set()) for each in asked]
-    try:
-        yield
-    finally:
-        for each, handler in zip(asked, before, strict=True):
-            signal.signal(each, handler)
 
 
 def _tell(session: Session, status: RecorderStatus, folder: Path, as_json: bool) -> None:

@@ -6,9 +6,7 @@ import contextlib
 import logging
 import os
 import shutil
-import signal
 import sys
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from aquaflow.config import Config, parse_config
@@ -33,6 +31,7 @@ from aquaflow.service.map_thread import MapThread
 from aquaflow.service.notify import Notifier
 from aquaflow.service.pressure import Machine
 from aquaflow.slam import Slam
+from aquaflow.stopping import until_told
 
 log = logging.getLogger(__name__)
 
@@ -127,7 +126,7 @@ class LiveDive:
             AquaFlowError: the source or the loop failed; the checkpoint stays.
         """
         parts = self.parts
-        with told_to_stop(parts.loop):
+        with until_told(parts.loop.stopping):
             parts.loop.run()
         source_ended = not parts.loop.stopping.is_set()
         parts.loop.stop("the recording ended" if source_ended else "told to stop")
@@ -169,17 +168,3 @@ def plain(vehicle: VehicleConfig) -> Config:
     if optimiser["refine_seconds"] is None:
         optimiser["refine_seconds"] = vehicle.service.mapping.refine_seconds
     return parse_config(settings, "config")
-
-
-@contextlib.contextmanager
-def told_to_stop(loop: LiveLoop) -> Iterator[None]:
-    """Ctrl-C and systemd's SIGTERM end the dive instead of breaking it off."""
-    asked = (signal.SIGINT, signal.SIGTERM)
-    before: list[Callable[..., object] | int | None] = []
-    with contextlib.suppress(ValueError):  # not in the main thread: somebody else listens
-        before = [signal.signal(each, lambda *_: loop.stopping.set()) for each in asked]
-    try:
-        yield
-    finally:
-        for each, handler in zip(asked, before, strict=False):
-            signal.signal(each, handler)
