@@ -64,6 +64,7 @@ def test_the_oldest_samples_give_way_and_are_counted(tmp_path):
     until(lambda: telemetry.links["device"].is_open)
 
     device.start()
+    until(device.finished.is_set)
     until(lambda: telemetry.counters()["device"].messages >= device.said > 100)
     telemetry.close()
     heard = list(telemetry.samples())
