@@ -136,7 +136,8 @@ def map_realtime(
     from aquaflow.service.onboard import map_live
     from aquaflow.service.sources import recording
 
-    alone = {"health": {"enabled": False, "port": 1}, "mapping": {"refine_seconds": None}}
+    alone = VehicleConfig().service.model_dump()
+    alone["health"]["enabled"], alone["mapping"]["refine_seconds"] = False, None
     vehicle = VehicleConfig.model_validate(settings.model_dump() | {"service": alone})
     feed = recording(source, vehicle, calibration=calibration)
     with progress_bars(quiet=quiet) as progress:

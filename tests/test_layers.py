@@ -31,7 +31,7 @@ FLOORS = (
     {"keyframes", "synthetic", "fusion", "sources", "discovery", "preparation"},
     {"image_metrics"},
     {"prior", "messages", "vehicle_words"},
-    {"presets", "access", "stopping"},
+    {"presets", "access", "stopping", "plain_arrays"},
     {"render", "geometry", "config", "profiler", "spill", "dive_log"},
     {"errors"},
     {"aquaflow"},

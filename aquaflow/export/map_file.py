@@ -1,20 +1,17 @@
 """``map.aqf``: the exact map. What comes back renders bit for bit as what was written.
 
-A zip of arrays (``.npz``, uncompressed, without pickle) and ``facts``, a JSON text in it, as
-:mod:`aquaflow.mapping.map_state` takes a map apart. PLY files, beside it, show one choice of range
-or viewpoint; this has the water, the light of every view and the decoder themselves.
+A file of arrays and facts (:mod:`aquaflow.export.facts_file`), as :mod:`aquaflow.mapping.map_state`
+takes a map apart. PLY files, beside it, show one choice of range or viewpoint; this has the water,
+the light of every view and the decoder themselves.
 """
 
 from __future__ import annotations
 
-import json
 import zipfile
 from pathlib import Path
 
-import numpy as np
-
 from aquaflow.errors import AquaFlowError, InputError
-from aquaflow.export.atomic import atomic_write
+from aquaflow.export.facts_file import UNREADABLE, read_facts_file, write_facts_file
 from aquaflow.mapping.map_state import put_together, take_apart
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.contract import Renderer
@@ -22,7 +19,6 @@ from aquaflow.render.contract import Renderer
 SUFFIX = ".aqf"
 KIND = "aquaflow map"
 FORMAT = 1
-FACTS = "facts"
 
 
 def write_map_file(path: Path, mapper: Mapper, optimiser: bool = False) -> None:
@@ -32,9 +28,7 @@ def write_map_file(path: Path, mapper: Mapper, optimiser: bool = False) -> None:
         InputError: the file cannot be written.
     """
     facts, arrays = take_apart(mapper, optimiser)
-    text = json.dumps({"kind": KIND, "format": FORMAT, **facts}).encode("utf-8")
-    with atomic_write(path) as stream:
-        np.savez(stream, **{FACTS: np.frombuffer(text, np.uint8)}, **arrays)  # type: ignore[arg-type]
+    write_facts_file(path, {"kind": KIND, "format": FORMAT, **facts}, arrays)
 
 
 def read_map_file(path: Path, renderer: Renderer) -> Mapper:
@@ -48,12 +42,10 @@ def read_map_file(path: Path, renderer: Renderer) -> Mapper:
             damaged = archive.testzip()
         if damaged is not None:
             raise InputError(f"the map {path} is damaged in {damaged}; copy it or map again")
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        facts = json.loads(arrays.pop(FACTS).tobytes())
+        facts, arrays = read_facts_file(path)
         if facts["kind"] != KIND:
             raise ValueError(f"it says that it is '{facts['kind']}'")
-    except (OSError, zipfile.BadZipFile, ValueError, KeyError, TypeError, EOFError) as error:
+    except UNREADABLE as error:
         raise InputError(_unreadable(path, error)) from error
     if facts["format"] != FORMAT:
         raise InputError(

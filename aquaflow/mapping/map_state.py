@@ -8,7 +8,6 @@ on being optimised as if it had never been away, once its views have their pictu
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -17,15 +16,14 @@ import torch
 from torch import Tensor
 
 from aquaflow.config import MappingConfig
-from aquaflow.geometry.camera import CameraModel, Port
-from aquaflow.geometry.similarity import Sim3
+from aquaflow.geometry.camera import CameraModel
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.neural import NeuralGaussians
 from aquaflow.mapping.views import View
+from aquaflow.plain_arrays import Arrays, of_camera, of_sim3, prefixed, to_camera, to_sim3, under
 from aquaflow.render.adam import SelectiveAdam
 from aquaflow.render.contract import Renderer
 
-Arrays = dict[str, npt.NDArray[Any]]
 Facts = dict[str, Any]
 
 NO_PIXELS = np.zeros((0, 0, 3), np.uint8)
@@ -47,7 +45,7 @@ def take_apart(mapper: Mapper, optimiser: bool = False) -> tuple[Facts, Arrays]:
         "optimiser": optimiser,
         "steps": mapper.steps,
         "undone": mapper.undone,
-        "cameras": [asdict(camera) for camera in cameras],
+        "cameras": [of_camera(camera) for camera in cameras],
     }
     arrays = _prefixed("gaussians", mapper.gaussians.parameters)
     arrays["keyframes"] = mapper.gaussians.keyframes.numpy().copy()
@@ -87,7 +85,7 @@ def put_together(facts: Facts, arrays: Mapping[str, Any], renderer: Renderer) ->
     scene.sunlight.plays = bool(facts["sunlight_plays"])
     scene.water_evidence, scene.beta_a_sigma = facts["water_evidence"], facts["beta_a_sigma"]
     mapper.steps, mapper.undone = int(facts["steps"]), int(facts["undone"])
-    mapper.views = _read_views(arrays, [_camera(values) for values in facts["cameras"]])
+    mapper.views = _read_views(arrays, [to_camera(values) for values in facts["cameras"]])
     mapper._optimiser.extend(len(gaussians))
     mapper._optimiser.bind(gaussians.parameters)
     if not facts["decoder"]:
@@ -108,11 +106,10 @@ def _views(views: Sequence[View], cameras: list[CameraModel]) -> Arrays:
         (v.frame_index, v.keyframe, v.robust, v.looks, v.moments[2], cameras.index(v.camera))
         for v in views
     ]
-    poses = [[*v.T_wc.R.ravel(), *v.T_wc.t, v.T_wc.scale] for v in views]
     moments = [[*v.moments[0], *v.moments[1]] for v in views]
     arrays = {
         "views.numbers": np.array(numbers, np.int64).reshape(-1, 6),
-        "views.poses": np.array(poses, np.float64).reshape(-1, 13),
+        "views.poses": of_sim3([view.T_wc for view in views]),
         "views.log_gains": np.array([v.log_gain for v in views], np.float64).reshape(-1, 3),
         "views.moments": np.array(moments, np.float64).reshape(-1, 12),
     }
@@ -129,8 +126,7 @@ def _read_views(arrays: Mapping[str, Any], cameras: Sequence[CameraModel]) -> li
     rows = (arrays[f"views.{name}"] for name in ("numbers", "poses", "log_gains", "moments"))
     for i, (numbers, pose, log_gain, moments) in enumerate(zip(*rows, strict=True)):
         index, keyframe, robust, looks, count, camera = numbers.tolist()
-        T_wc = Sim3(pose[:9].reshape(3, 3).copy(), pose[9:12].copy(), float(pose[12]))
-        view = View(index, NO_PIXELS, cameras[camera], T_wc, keyframe, bool(robust))
+        view = View(index, NO_PIXELS, cameras[camera], to_sim3(pose), keyframe, bool(robust))
         view.log_gain, view.looks = log_gain.copy(), looks
         view.moments = (moments[:6].copy(), moments[6:].copy(), count)
         for name in ("light", "explained"):
@@ -138,11 +134,6 @@ def _read_views(arrays: Mapping[str, Any], cameras: Sequence[CameraModel]) -> li
                 setattr(view, name, _tensor(arrays[f"views.{name}{i}"]))
         views.append(view)
     return views
-
-
-def _camera(values: Mapping[str, Any]) -> CameraModel:
-    whole = {"distortion": tuple(values["distortion"]), "port": Port(**values["port"])}
-    return CameraModel(**{**values, **whole})
 
 
 # --- decoder --------------------------------------------------------------------------------------
@@ -216,13 +207,13 @@ def _read_optimisers(mapper: Mapper, arrays: Mapping[str, Any], rates: Facts) ->
 
 
 def _prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> Arrays:
-    return {f"{prefix}.{name}": t.detach().numpy().copy() for name, t in tensors.items()}
+    """Copies, as arrays."""
+    return prefixed(prefix, {name: t.detach().numpy().copy() for name, t in tensors.items()})
 
 
 def _under(prefix: str, arrays: Mapping[str, Any]) -> dict[str, Tensor]:
     """What :func:`_prefixed` put there."""
-    start = f"{prefix}."
-    return {name[len(start) :]: _tensor(a) for name, a in arrays.items() if name.startswith(start)}
+    return {name: _tensor(array) for name, array in under(prefix, arrays).items()}
 
 
 def _tensor(array: npt.NDArray[Any]) -> Tensor:

@@ -144,8 +144,6 @@ def _evidence(fits: list[_Fit]) -> float | None:
 def _solve(problem: WaterModel, before: Sequence[_Fit]) -> _Fit:
     """From the best of the problem's own start and of simpler models' fits, which it contains.
 
-    Parameters, mean absolute error, and the noise that gives every point one vote.
-
     Sightings of one point share its errors, so they count together as one; a second fit weighs them
     against the priors by the noise that the first one found.
     """

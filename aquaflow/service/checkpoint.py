@@ -8,26 +8,22 @@ keyframe and view, and are on the disk before a state that names them is.
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import os
 import time
-import zipfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from aquaflow import __version__
 from aquaflow.dive import CHECKPOINT
 from aquaflow.dive_run import DiveRun
 from aquaflow.errors import InputError
-from aquaflow.export.atomic import atomic_write
+from aquaflow.export.facts_file import UNREADABLE, read_facts_file, write_facts_file
 from aquaflow.maps import Maps
+from aquaflow.plain_arrays import Arrays, prefixed, under
 from aquaflow.service import map_state, tracking_state
-from aquaflow.service.arrays import Arrays, prefixed, under
 from aquaflow.service.map_thread import Correction, MapThread
 from aquaflow.service.moment import Moment
 from aquaflow.slam import Slam
@@ -36,7 +32,6 @@ log = logging.getLogger(__name__)
 
 STATE = "state.npz"
 FORMAT = 1
-FACTS = "facts"
 
 
 def state_file(dive: Path) -> Path:
@@ -72,17 +67,15 @@ class Checkpointer:
         slam: Slam,
         maps: MapThread,
         every_s: float,
-        more: Callable[[], dict[str, Any]] = dict,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """``more``: facts of others, for whoever reads the checkpoint (clock mappings)."""
         self.taken = 0
         self.failures = 0
         self.size_bytes = 0
         self.wrote_s = 0.0
         """How long the last writing took."""
         self._dive, self._run, self._slam, self._maps = dive, run, slam, maps
-        self._every_s, self._more, self._now_s = every_s, more, now_s
+        self._every_s, self._now_s = every_s, now_s
         self._table = tracking_state.FrameTable()
         self._due_s = now_s() + every_s
         self._writing = False
@@ -104,7 +97,7 @@ class Checkpointer:
             files = self._slam.keyframes.save()
         self._writing = True
         head = {"format": FORMAT, "version": __version__, "moment": Moment.now().to_json()}
-        head |= {"tracking": facts, "more": self._more()}
+        head |= {"tracking": facts}
         arrays = prefixed("tracking", arrays)
 
         def write(maps: Maps, lacking: list[Correction]) -> None:
@@ -146,9 +139,7 @@ def write_state(dive: Path, facts: dict[str, Any], arrays: Arrays) -> None:
     """
     path = state_file(dive)
     path.parent.mkdir(exist_ok=True)
-    text = json.dumps(facts, allow_nan=False).encode()
-    with atomic_write(path) as stream:
-        np.savez(stream, allow_pickle=False, **{FACTS: np.frombuffer(text, np.uint8)}, **arrays)
+    write_facts_file(path, facts, arrays, allow_nan=False)
     bring_to_disk([path.parent])
 
 
@@ -160,11 +151,9 @@ def read_state(dive: Path) -> Checkpoint:
     """
     path = state_file(dive)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        facts = json.loads(arrays.pop(FACTS).tobytes())
+        facts, arrays = read_facts_file(path)
         known = facts["format"] == FORMAT
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except UNREADABLE as error:
         raise InputError(f"cannot resume from {path}: {error}; start with --new") from error
     if not known:
         raise InputError(f"{path} was written by version {facts.get('version')}; start with --new")

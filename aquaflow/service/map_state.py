@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from aquaflow.mapping import map_state
 from aquaflow.mapping.map_state import NO_PIXELS
 from aquaflow.mapping.views import View
 from aquaflow.maps import Maps
-from aquaflow.service.arrays import Arrays, of_sim3, prefixed, to_camera, to_sim3, under
+from aquaflow.plain_arrays import Arrays, of_camera, of_sim3, prefixed, to_camera, to_sim3, under
 from aquaflow.service.map_thread import Correction
 
 
@@ -76,7 +75,7 @@ def _held_out(views: Sequence[View]) -> tuple[list[dict[str, Any]], Arrays]:
         "numbers": np.array(numbers, np.int64).reshape(-1, 4),
         "poses": of_sim3([view.T_wc for view in views]),
     }
-    return [asdict(camera) for camera in cameras], arrays
+    return [of_camera(camera) for camera in cameras], arrays
 
 
 def _read_held_out(cameras: list[dict[str, Any]], arrays: Arrays) -> list[View]:

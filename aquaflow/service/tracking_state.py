@@ -10,7 +10,7 @@ import numpy as np
 from aquaflow.dive_run import DiveRun
 from aquaflow.errors import InputError
 from aquaflow.messages import Frame
-from aquaflow.service.arrays import (
+from aquaflow.plain_arrays import (
     Array,
     Arrays,
     Cameras,

@@ -24,7 +24,8 @@ from mapping_scenes import (
 )
 
 from aquaflow.errors import InputError
-from aquaflow.export.map_file import FACTS, read_map_file, write_map_file
+from aquaflow.export.facts_file import FACTS
+from aquaflow.export.map_file import read_map_file, write_map_file
 from aquaflow.mapping.mapper import Mapper
 
 PLAIN: dict[str, Any] = {"optimiser": {"refine_steps": 6}}
