@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
-from aquaflow.geometry.similarity import Sim3, hat, so3_exp
+from aquaflow.geometry.similarity import Sim3, so3_exp
 
 Array = npt.NDArray[np.float64]
 
@@ -123,38 +123,45 @@ class _System:
         size = 6 * views + int(self.solve_focal)
         H_cc, H_cp, H_pp = np.zeros((size, size)), np.zeros((size, count)), np.zeros(count)
         g_c, g_p = np.zeros(size), np.zeros(count)
-        for v in range(views):
-            weight = _huber_weight(error[v]) * (self.observed[v] & (Y[v, :, 2] > 1e-3))
+        weights = _huber_weight(error) * (self.observed & (Y[..., 2] > 1e-3))
+        # View by view, for what belongs to one stays in the processor's cache.
+        for v, weight in enumerate(weights):
             Jc, Jp = self._jacobians(bundle, v, Y[v], rays)
+            e = np.ascontiguousarray(error[v].T)  # [2, P]
             # A view touches its own six columns and, at the end, the focal length.
             columns = np.arange(6 * v, 6 * v + 6)
             if self.solve_focal:
                 columns = np.append(columns, size - 1)
-            wJc, wJp = Jc * weight[:, None, None], Jp * weight[:, None]
-            flat, k = Jc.reshape(2 * count, -1), len(columns)
-            H_cc[np.ix_(columns, columns)] += wJc.reshape(2 * count, k).T @ flat
-            H_cp[columns] += np.einsum("pik,pi->kp", wJc, Jp)
-            H_pp += (wJp * Jp).sum(1)
-            g_c[columns] += wJc.reshape(2 * count, k).T @ error[v].reshape(-1)
-            g_p += (wJp * error[v]).sum(1)
+            wJc, wJp, k = Jc * weight, Jp * weight, len(columns)
+            H_cc[np.ix_(columns, columns)] += wJc.reshape(k, -1) @ Jc.reshape(k, -1).T
+            H_cp[columns] += wJc[:, 0] * Jp[0] + wJc[:, 1] * Jp[1]
+            H_pp += wJp[0] * Jp[0] + wJp[1] * Jp[1]
+            g_c[columns] += wJc.reshape(k, -1) @ e.reshape(-1)
+            g_p += wJp[0] * e[0] + wJp[1] * e[1]
         return H_cc, H_cp, H_pp, g_c, g_p
 
     def _jacobians(self, bundle: Bundle, v: int, Y: Array, rays: Array) -> tuple[Array, Array]:
-        """d error / d camera [P, 2, 6 or 7] and d error / d rho [P, 2] of view ``v``."""
+        """d error / d camera [6 or 7, 2, P] and d error / d rho [2, P] of view ``v``, whose points
+        are at Y. The camera moves by the left tangent: translation, then rotation."""
         camera, T = bundle.camera, bundle.T[v]
         iz = 1.0 / np.maximum(Y[:, 2], 1e-3)
-        P = np.zeros((len(Y), 2, 3))
-        P[:, 0, 0], P[:, 1, 1] = camera.fx * iz, camera.fy * iz
-        P[:, 0, 2] = -camera.fx * Y[:, 0] * iz**2
-        P[:, 1, 2] = -camera.fy * Y[:, 1] * iz**2
-        parts = [P * bundle.rho[:, None, None], -P @ hat(Y)]
+        x, y = Y[:, 0] * iz, Y[:, 1] * iz
+        fx, fy = camera.fx, camera.fy
+        P = np.zeros((3, 2, len(Y)))  # d error / d Y
+        P[0, 0], P[2, 0] = fx * iz, -fx * x * iz
+        P[1, 1], P[2, 1] = fy * iz, -fy * y * iz
+        Jc = np.empty((7 if self.solve_focal else 6, 2, len(Y)))
+        Jc[:3] = P * bundle.rho
+        Jc[3], Jc[4], Jc[5] = (
+            (-fx * x * y, -fy * (1.0 + y * y)),
+            (fx * (1.0 + x * x), fy * x * y),
+            (-fx * y, fy * x),
+        )
         if self.solve_focal:
             # f scales the projection, and the reference rays shrink as 1 / f.
-            image = np.stack([camera.fx * Y[:, 0], camera.fy * Y[:, 1]], -1) * iz[:, None]
-            lateral = rays * np.array([1.0, 1.0, 0.0])
-            moved = np.einsum("nij,nj->ni", P, -(lateral @ T.R.T))
-            parts.append((image + moved)[..., None])
-        return np.concatenate(parts, axis=2), P @ T.t
+            shrinks = -(T.R[:, :2] @ rays[:, :2].T)  # [3, P]
+            Jc[6] = (P * shrinks[:, None]).sum(0) + np.stack([fx * x, fy * y])
+        return Jc, np.tensordot(T.t, P, 1)
 
     def step(self, bundle: Bundle, damping: float) -> Bundle:
         H_cc, H_cp, H_pp, g_c, g_p = self._blocks(bundle)
@@ -187,7 +194,7 @@ class _System:
 
 
 def _huber_weight(
-    error: Array,  # [P, 2] px
+    error: Array,  # [..., 2] px
 ) -> Array:
     size = np.linalg.norm(error, axis=-1)
     return np.where(size < HUBER_PX, 1.0, HUBER_PX / np.maximum(size, 1e-12))
