@@ -89,6 +89,12 @@ class DiveRun:
         self._time_frame(begun)
         return decided
 
+    def catch_up(self) -> list[Tracked]:
+        """A pose for a frame of the past, if one waits; for a moment without a new one."""
+        decided = self.slam.catch_up()
+        self.decide(decided)
+        return decided
+
     def _time_frame(self, begun: float) -> None:
         now = time.monotonic()
         self.frame_ms.append(1e3 * (now - begun))

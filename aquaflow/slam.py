@@ -58,7 +58,7 @@ class Slam:
         self.keyframes = KeyframeStore(work, self.prior)
         places = Places(self.keyframes, config.tracking)
         self.gate = FrameGate(config.tracking.gate)
-        self.tracker = Tracker(self.prior, self.keyframes, config.tracking, places)
+        self.tracker = Tracker(self.prior, self.keyframes, config.tracking, places, live)
         self.graph = KeyframeGraph(self.keyframes, places, config.tracking)
         self.renderer = select_renderer(config.mapping.renderer, config.threads or os.cpu_count())
         self.maps: MapWork = maps or Maps(config, self.renderer, self.profiler, work)
@@ -93,6 +93,15 @@ class Slam:
         # Sec. 3.2: loops between keyframes, which start the next optimisation of their graph.
         # Sec. 3.3 and 3.4: grow and optimise the map.
         return self._place_all(decided)
+
+    def catch_up(self) -> list[Tracked]:
+        """In a live run's idle moments: poses of the past, which waited for a map (Sec. 3.2)."""
+        newest = self._latest
+        with self.profiler.stage("back-fill"):
+            decided = self.tracker.back_fill()
+        placed = self._place_all(decided)
+        self._latest = newest
+        return placed
 
     def finish(self, progress: Callable[[int, int], None] | None = None) -> list[Tracked]:
         """After the last frame: what is still undecided, the last keyframes, the refinement."""

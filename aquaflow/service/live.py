@@ -27,6 +27,8 @@ log = logging.getLogger(__name__)
 STAGE = "tracking"
 IDLE_S = 0.25
 """Without a frame for so long, the loop says that it is idle and lives."""
+BUSY_S = 0.01
+"""The same while frames of the past wait for their poses: one of them takes its turn."""
 PATIENCE_S = 2.0
 """So long may a camera be silent before it is said to be waited for."""
 LOST_AFTER = 3
@@ -77,7 +79,7 @@ class LiveLoop:
         """
         self.feed.start()
         while not self.stopping.is_set() and not self.feed.newest.ended:
-            self.take(self.feed.newest.take(IDLE_S))
+            self.take(self.feed.newest.take(IDLE_S if self._past is None else BUSY_S))
         if self.feed.failure is not None:
             raise AquaFlowError(f"{self.feed.failure}; the service ends, to be started anew")
 
@@ -88,6 +90,8 @@ class LiveLoop:
             self._frame_s = self._now_s()
         elif frame is not None:
             self._frame(frame)
+        elif self._past is not None:
+            self._catch_up(self._past)
         self._tend()
 
     def stop(self, reason: str) -> None:
@@ -135,6 +139,19 @@ class LiveLoop:
         self.counters.classes.update(tracked.frame_class.value for tracked in decided)
         own = [tracked for tracked in decided if tracked.frame.index == frame.index]
         self._place(own[0] if own else None)
+
+    @property
+    def _past(self) -> Frame | None:
+        """A frame that waits for its pose until there is time."""
+        return self.run_.slam.tracker.past
+
+    def _catch_up(self, past: Frame) -> None:
+        try:
+            decided = self.run_.catch_up()
+        except Exception as error:  # likewise
+            self._failed(past, error)
+            return
+        self.counters.classes.update(tracked.frame_class.value for tracked in decided)
 
     def _place(self, tracked: Tracked | None) -> None:
         """Remember whether the newest frame has a pose; one that was skipped says nothing."""

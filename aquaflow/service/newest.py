@@ -33,7 +33,7 @@ class Newest(Generic[Thing]):
             self._changed.notify_all()
             self._changed.wait_for(lambda: self._thing is not None or self._ended, timeout_s)
             thing, self._thing = self._thing, None
-            self._asked = False
+            self._asked = thing is None  # whoever got nothing will come again
             return thing
 
     def asked(self, timeout_s: float) -> bool:

@@ -71,7 +71,8 @@ class LiveDive:
             InputError: the folder or the checkpoint cannot be used.
         """
         service = config.service
-        fix_threads(config.threads or os.cpu_count() or 1)
+        cores = config.threads or os.cpu_count() or 1
+        fix_threads(max(1, cores // 2))  # tracking's; the other half is mapping's
         sys.setswitchinterval(SWITCH_S)
         known = None if choice.checkpoint is None else choice.checkpoint.frames
         self._plain = plain(config)

@@ -18,8 +18,9 @@ from aquaflow.errors import InputError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
+from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, Float, Mask, PairGeometry, Prior
-from aquaflow.tracking.frames import FrameClass
+from aquaflow.tracking.frames import FrameClass, Link, Quality, Tracked
 from aquaflow.tracking.fusion import fuse, transfer
 from aquaflow.tracking.matcher import KeyframeMatcher, Matched
 from aquaflow.tracking.neighbours import Neighbours
@@ -50,6 +51,18 @@ class Attachment:
         """A frame was placed."""
         self.motion = T_fk @ self.T_fk.inverse()
         self.T_fk, self.matches = T_fk, matches
+
+    def tracked(
+        self,
+        frame: Frame,
+        frame_class: FrameClass,
+        quality: Quality,
+        pointmap: Pointmap | None = None,
+        link: Link | None = None,
+    ) -> Tracked:
+        """The last frame, as it is told to others."""
+        sub_map, number = self.keyframe.sub_map, self.keyframe.number
+        return Tracked(frame, frame_class, sub_map, number, self.T_wc, quality, pointmap, link=link)
 
 
 class Follower:

@@ -63,6 +63,11 @@ class Tracked:
     link: Link | None = None
     """Of a keyframe that continues a sub-map."""
 
+    @staticmethod
+    def lost(frame: Frame, sub_map: int, reason: str = "no pose found") -> Tracked:
+        """A frame that got no pose."""
+        return Tracked(frame, FrameClass.LOST, sub_map, reason=reason)
+
     def bare(self) -> Tracked:
         """Itself without picture and pointmap: what a long dive can keep of every frame."""
         nothing = np.empty((0, 0, 3), np.uint8)

@@ -12,6 +12,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe
 from aquaflow.prior.contract import Encoding, Mask, PairGeometry
+from aquaflow.tracking.frames import Quality
 from aquaflow.tracking.relocate import pose_from_scratch
 from aquaflow.tracking.solver import PoseEstimate, PoseProblem, solve_pose
 from aquaflow.tracking.verification import pose_problem
@@ -32,6 +33,14 @@ class Matched:
     points: npt.NDArray[np.float64]
     """[M, 3] of the keyframe that the pose was solved from."""
     visibility: Visibility
+
+    @property
+    def quality(self) -> Quality:
+        """How well the pose is known."""
+        estimate = self.estimate
+        return Quality(
+            estimate.inlier_share, estimate.residual_px, self.share, estimate.conditioning
+        )
 
 
 class KeyframeMatcher:

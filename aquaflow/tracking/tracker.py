@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import replace
 
 from aquaflow.config import TrackingConfig
@@ -11,13 +12,16 @@ from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
 from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, PairGeometry, Prior
 from aquaflow.tracking.attachment import Attachment, Follower
-from aquaflow.tracking.frames import FrameClass, Link, Quality, Tracked
+from aquaflow.tracking.back_fill import BackFill
+from aquaflow.tracking.frames import FrameClass, Link, Tracked
 from aquaflow.tracking.initialisation import Initialiser, calibrated, fused_pointmap
-from aquaflow.tracking.matcher import Matched
 from aquaflow.tracking.places import Places
 
 MAX_ORPHANS = 60
 """Frames without a pose that are kept for back-filling; bounds memory while nothing moves."""
+
+MAX_PAST = 120
+"""Frames that a live run keeps until it has time for them; likewise."""
 
 
 class Tracker:
@@ -29,8 +33,13 @@ class Tracker:
         keyframes: KeyframeStore,
         config: TrackingConfig,
         places: Places | None = None,
+        live: bool = False,
     ) -> None:
-        """Without ``places``, what was lost is never found again, only begun anew."""
+        """Without ``places``, what was lost is never found again, only begun anew.
+
+        Once a map has started, or a place was found again, the frames that waited for it get their
+        poses at once, or, in a ``live`` run, whenever there is time: see :meth:`back_fill`.
+        """
         self.sub_map = 0
         self.camera: CameraModel | None = None
         """The camera as refined by initialisation, once known."""
@@ -40,6 +49,9 @@ class Tracker:
         self._sub_maps = 1
         self._initialiser: Initialiser | None = None
         self._orphans: list[Frame] = []
+        """Frames without a pose, which wait for a keyframe that shows their place."""
+        self._live = live
+        self._past: deque[BackFill] = deque()
         self._at: Attachment | None = None
         self._lost: list[Frame] = []
         self._origin = Sim3.identity()
@@ -58,6 +70,17 @@ class Tracker:
         if len(self._lost) >= self._config.lost_after:
             return self._start_sub_map()
         return []
+
+    @property
+    def past(self) -> Frame | None:
+        """The frame whose turn it is at :meth:`back_fill`."""
+        return next((fill.frames[-1] for fill in self._past if fill.frames), None)
+
+    def back_fill(self) -> list[Tracked]:
+        """The pose of :attr:`past`, or that it has none; nothing if no frame waits."""
+        while self._past and not self._past[0].frames:
+            self._past.popleft()
+        return [self._past[0].step()] if self._past else []
 
     @property
     def lost(self) -> bool:
@@ -85,6 +108,8 @@ class Tracker:
         tracked: list[Tracked] = []
         if self._at is None and self._initialiser is not None and self._initialiser.waiting:
             tracked = self._begin(self._initialiser)
+        tracked += [past for fill in self._past for past in fill.all()]
+        self._past.clear()
         left = self._orphans + self._lost
         self._orphans, self._lost = [], []
         if self._at is None and self._initialiser is not None:
@@ -131,8 +156,11 @@ class Tracker:
         first = Tracked(
             reference, FrameClass.KEYFRAME, self.sub_map, number, self._origin, pointmap=shown
         )
+        # A live run goes on from the newest frame.
+        now = len(solution.waiting) - 1 if self._live else 0
+        self._orphans += [waiting.frame for waiting in solution.waiting[:now]]
         tracked = [first, *self._back_fill()]
-        for waiting, T in zip(solution.waiting, solution.T, strict=True):
+        for waiting, T in zip(solution.waiting[now:], solution.T[now:], strict=True):
             on_reference = self._at is start
             if on_reference:
                 start.T_fk = T
@@ -145,19 +173,21 @@ class Tracker:
         """Poses of earlier frames that could not start a map, against the keyframe in use."""
         assert self._at is not None
         assert self.camera is not None
-        (orphans, self._orphans), now = (self._orphans, []), self._at
-        tracked = []
-        self._at = replace(now)
-        for frame in reversed(orphans):
-            encoding = self._prior.encode(frame.image, self.camera)
-            solved = self._follower.place(self._at, encoding, self.camera)
-            if solved is None:
-                tracked.append(self._as_lost(frame))
-                continue
-            self._at.T_fk = solved.estimate.T
-            tracked.append(self._tracked(frame, FrameClass.COMMON, solved, None))
-        self._at = now
-        return tracked[::-1]
+        orphans, self._orphans = self._orphans, []
+        fill = BackFill(orphans, self._at, self.camera, self._prior, self._follower)
+        if not self._live:
+            return fill.all()
+        self._past.append(fill)
+        return self._forget_oldest_past()
+
+    def _forget_oldest_past(self) -> list[Tracked]:
+        surplus = sum(len(fill.frames) for fill in self._past) - MAX_PAST
+        forgotten: list[Frame] = []
+        for fill in self._past:
+            count = max(0, surplus - len(forgotten))
+            forgotten += fill.frames[:count]
+            fill.frames = fill.frames[count:]
+        return [self._as_lost(frame, "no time to look back") for frame in forgotten]
 
     def _waiting_frames(self, initialiser: Initialiser) -> list[Frame]:
         return [*initialiser.thinned, initialiser.frame, *(w.frame for w in initialiser.waiting)]
@@ -218,7 +248,7 @@ class Tracker:
                 self._at, solved = earlier
                 frame_class = FrameClass.COMMON
         if frame_class is FrameClass.COMMON:
-            return self._tracked(frame, frame_class, solved, None)
+            return self._at.tracked(frame, frame_class, solved.quality)
         pointmap = follower.pointmap(at, solved, camera)
         link = None
         if frame_class is FrameClass.KEYFRAME:
@@ -228,7 +258,8 @@ class Tracker:
             self._make_keyframe(frame, encoding, at.T_wc, pointmap)
         else:
             at.mapped_parallax_px = solved.parallax_px
-        return self._tracked(frame, frame_class, solved, pointmap.copy(), link)
+        # A new keyframe is already in use, with the identity as its relative pose.
+        return self._at.tracked(frame, frame_class, solved.quality, pointmap.copy(), link)
 
     # --- bookkeeping --------------------------------------------------------------------------
 
@@ -240,23 +271,6 @@ class Tracker:
         )
         motion = Sim3.identity() if self._at is None else self._at.motion
         self._at = Attachment(keyframe, frame.image, motion=motion)
-
-    def _tracked(
-        self,
-        frame: Frame,
-        frame_class: FrameClass,
-        solved: Matched,
-        pointmap: Pointmap | None,
-        link: Link | None = None,
-    ) -> Tracked:
-        # A new keyframe is already in use, with the identity as its relative pose.
-        assert self._at is not None
-        keyframe, estimate = self._at.keyframe, solved.estimate
-        quality = Quality(
-            estimate.inlier_share, estimate.residual_px, solved.share, estimate.conditioning
-        )
-        sub_map, number, T_wc = keyframe.sub_map, keyframe.number, self._at.T_wc
-        return Tracked(frame, frame_class, sub_map, number, T_wc, quality, pointmap, link=link)
 
     def _start_sub_map(self) -> list[Tracked]:
         """Give the lost frames to a new sub-map that starts where the old one ended."""
@@ -272,4 +286,4 @@ class Tracker:
         return tracked
 
     def _as_lost(self, frame: Frame, reason: str = "no pose found") -> Tracked:
-        return Tracked(frame, FrameClass.LOST, self.sub_map, reason=reason)
+        return Tracked.lost(frame, self.sub_map, reason)

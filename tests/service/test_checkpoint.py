@@ -48,7 +48,9 @@ CUT = 12
 
 
 def caught_up(dive: LiveDive) -> None:
-    """Wait until mapping has done all that was asked for."""
+    """Give the loop time for the past, and wait until mapping has done all that was asked for."""
+    while dive.parts.slam.tracker.past is not None:
+        dive.parts.loop.take(None)
     done = threading.Event()
     dive.parts.maps._post("wait", lambda maps: done.set())
     assert done.wait(60.0)
@@ -111,6 +113,17 @@ def test_the_optimisers_and_the_random_state_come_back(cut: Cut, back: LiveDive)
             assert np.array_equal(tensor.numpy(), saved[f"mapping.map0.adam.{kind}.{name}"])
         assert any(bool(tensor.any()) for tensor in moments.values())
     assert torch.equal(new._random.get_state(), torch.from_numpy(saved["mapping.map0.random"]))
+
+
+def test_idle_moments_give_the_frames_of_the_past_their_poses(cut: Cut) -> None:
+    rows = read_rows(cut.folder / "frames.csv")
+    started = [row.index for row in rows].index(0)
+    order = [row.index for row in rows[started:]]
+    newest = order[1]  # frame 0 is the keyframe, and this one started the map with it
+    past = [index for index in order[1:] if index < newest]
+    assert past == list(range(newest - 1, 0, -1))
+    assert order.index(newest + 1) < order.index(past[0])
+    assert all(row.keyframe is not None for row in rows[started:CUT])
 
 
 def test_keyframes_poses_and_graph_come_back(cut: Cut, back: LiveDive) -> None:

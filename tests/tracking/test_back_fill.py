@@ -1,0 +1,88 @@
+"""A live run goes on from the newest frame, and looks back when there is time."""
+
+from __future__ import annotations
+
+import pytest
+from tracked_clips import error_share
+from tracking_scenes import SeaFloor, black, filmed, lawn_path
+
+from aquaflow.config import TrackingConfig
+from aquaflow.keyframes import KeyframeStore
+from aquaflow.messages import Frame
+from aquaflow.prior.classical import ClassicalPrior
+from aquaflow.tracking import tracker as module
+from aquaflow.tracking.frames import Tracked
+from aquaflow.tracking.tracker import Tracker
+
+POSES = lawn_path(12, step_m=0.12)
+
+
+@pytest.fixture(scope="module")
+def clip() -> list[Frame]:
+    return filmed(SeaFloor(), POSES)
+
+
+def live() -> Tracker:
+    return Tracker(ClassicalPrior(), KeyframeStore(), TrackingConfig(), live=True)
+
+
+def until_started(tracker: Tracker, clip: list[Frame]) -> tuple[list[Tracked], int]:
+    """What the frame that starts the map decides, and that frame's index."""
+    for frame in clip:
+        decided = tracker.track(frame)
+        if decided:
+            return decided, frame.index
+    pytest.fail("no map was started")
+
+
+def test_the_start_decides_the_keyframe_and_the_newest_frame_only(clip: list[Frame]) -> None:
+    tracker = live()
+    decided, newest = until_started(tracker, clip)
+    assert newest > 1
+    assert [tracked.frame.index for tracked in decided] == [0, newest]
+    assert tracker.past is not None
+    assert tracker.past.index == newest - 1
+
+
+def test_the_past_is_placed_frame_by_frame_and_as_well(clip: list[Frame]) -> None:
+    tracker = live()
+    decided, newest = until_started(tracker, clip)
+    for frame in clip[newest + 1 :]:
+        decided += tracker.track(frame)
+    while tracker.past is not None:
+        placed = tracker.back_fill()
+        assert len(placed) == 1
+        decided += placed
+    assert tracker.back_fill() == []
+    assert sorted(tracked.frame.index for tracked in decided) == list(range(len(clip)))
+    assert all(tracked.T_wc is not None for tracked in decided)
+    assert error_share(decided, POSES) < 0.01
+
+
+def test_the_end_of_a_dive_leaves_nobody_waiting(clip: list[Frame]) -> None:
+    tracker = live()
+    decided, newest = until_started(tracker, clip)
+    decided += tracker.finish()
+    assert sorted(tracked.frame.index for tracked in decided) == list(range(newest + 1))
+    assert tracker.past is None
+
+
+def test_a_run_that_never_has_time_forgets_the_oldest_and_says_so(
+    clip: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "MAX_PAST", 1)
+    decided, newest = until_started(live(), clip)
+    forgotten = [tracked.frame.index for tracked in decided if tracked.T_wc is None]
+    assert forgotten == list(range(1, newest - 1))
+    assert {tracked.reason for tracked in decided if tracked.T_wc is None} == {
+        "no time to look back"
+    }
+
+
+def test_a_frame_of_the_past_that_shows_nothing_is_lost(clip: list[Frame]) -> None:
+    tracker = live()
+    _, newest = until_started(tracker, clip)
+    tracker._past[0].frames[-1] = black(newest - 1)
+    (lost,) = tracker.back_fill()
+    assert lost.T_wc is None
+    assert lost.reason == "no pose found"
