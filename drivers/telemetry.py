@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import NamedTuple
 
 from aquaflow.config.telemetry import AnyDevice, TelemetryConfig
-from aquaflow.fusion.clock import ClockReport
+from aquaflow.fusion.clock import ClockReport, Learned
 from aquaflow.messages import TelemetrySample
 from aquaflow.sources import RawTap
 from aquaflow.vehicle_words import Hears, Word
@@ -111,6 +111,17 @@ class LinkTelemetry:
             if decoder.clock is not None
         }
         return {name: report for name, report in reports.items() if report is not None}
+
+    def learned(self) -> dict[str, Learned]:
+        """What :meth:`resume` takes, by device."""
+        clocks = {name: decoder.clock for name, decoder in self.decoders.items()}
+        return {name: clock.mapping.learned() for name, clock in clocks.items() if clock}
+
+    def resume(self, learned: Mapping[str, Learned]) -> None:
+        """Go on with the devices' clocks as an earlier process since the same boot left them."""
+        for name, decoder in self.decoders.items():
+            if decoder.clock is not None:
+                decoder.clock.mapping.resume(learned.get(name, ()))
 
     def tell(self, word: Word) -> bool:
         """Tell every device that understands it; see :class:`aquaflow.vehicle_words.Hears`."""

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -38,6 +39,9 @@ REORDERED_NS = 500_000_000
 
 STEP_NS = 100_000_000
 """A message this much faster than the fastest of the window tells of a clock set forward."""
+
+Learned = Sequence[Sequence[int | None]]
+"""The buckets of a mapping, for whoever keeps them over a restart of the process."""
 
 CONTRADICTIONS = 3
 """So many messages in a row make a new clock; a single one is a damaged time stamp."""
@@ -74,6 +78,19 @@ class _Bucket:
     bound_ns: int | None = None
     """Largest arrival - round trip - device: a lower bound at ``bound_device_ns``."""
 
+    @staticmethod
+    def of(row: Sequence[int | None]) -> _Bucket:
+        """The bucket that was written as a row.
+
+        Raises:
+            TypeError, ValueError: it is none.
+        """
+        number, device_ns, offset_ns, *bound = row
+        if number is None or device_ns is None or offset_ns is None or len(bound) != 2:
+            raise ValueError(f"{row} is no second of a clock")
+        bounded = [None if value is None else int(value) for value in bound]
+        return _Bucket(int(number), int(device_ns), int(offset_ns), *bounded)
+
 
 @dataclass(frozen=True)
 class _Line:
@@ -104,6 +121,7 @@ class ClockMapping:
         self._newest_ns = 0
         self._line: _Line | None = None
         self._contradictions: list[tuple[int, int, int | None]] = []
+        self._earlier: list[_Bucket] = []
 
     def add(self, device_ns: int, arrival_ns: int, round_trip_ns: int | None = None) -> None:
         """Learn from a message.
@@ -113,6 +131,8 @@ class ClockMapping:
             arrival_ns: CLOCK_MONOTONIC when the message reached this process.
             round_trip_ns: where the message answers a request of ours: arrival minus request.
         """
+        if self._earlier:
+            self._take_up()
         if self._contradicts(device_ns, arrival_ns - device_ns):
             self._contradictions.append((device_ns, arrival_ns, round_trip_ns))
             if len(self._contradictions) == CONTRADICTIONS:
@@ -121,6 +141,18 @@ class ClockMapping:
         self.outliers += len(self._contradictions)
         self._contradictions.clear()
         self._learn(device_ns, arrival_ns, round_trip_ns)
+
+    def learned(self) -> Learned:
+        """What :meth:`resume` takes; may be called from another thread than ``add`` is."""
+        return [astuple(bucket) for bucket in tuple(self._buckets)]
+
+    def resume(self, earlier: Learned) -> None:
+        """Go on from what an earlier process learned since the same boot; likewise. If the device
+        began its time anew meanwhile, its messages tell. What is no such thing is not used."""
+        try:
+            self._earlier = [_Bucket.of(row) for row in earlier]
+        except (TypeError, ValueError) as error:
+            log.warning("the clock of %s is learned anew: %s", self.name, error)
 
     def to_monotonic(self, device_ns: int) -> int | None:
         """CLOCK_MONOTONIC of a moment on the device's clock; None before the first message."""
@@ -141,6 +173,16 @@ class ClockMapping:
             resets=self.resets,
             outliers=self.outliers,
         )
+
+    def _take_up(self) -> None:
+        """The earlier process's messages, and then those that came before we knew of them."""
+        earlier, self._earlier = self._earlier, []
+        since = tuple(self._buckets)
+        self._buckets = deque(earlier, maxlen=WINDOW_BUCKETS)
+        self._newest_ns = self._buckets[-1].device_ns
+        self._line = _fit(self._buckets)
+        for bucket in since:
+            self.add(bucket.device_ns, bucket.device_ns + bucket.offset_ns)
 
     def _contradicts(self, device_ns: int, offset_ns: int) -> bool:
         """True if no latency explains the message: its clock is another one, or damaged."""

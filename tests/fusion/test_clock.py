@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -245,3 +247,47 @@ def test_the_watch_reads_the_systems_clocks() -> None:
     reading = watch.look()
     assert reading.offset_ns > 0
     assert watch.look().jump_ns == 0
+
+
+def test_a_restarted_process_goes_on_with_what_the_one_before_knew() -> None:
+    first, second = ClockMapping(), ClockMapping()
+    messages = simulated(90.0)
+    half = len(messages.device_ns) // 2
+    for device_ns, arrival_ns in zip(
+        messages.device_ns[:half], messages.arrival_ns[:half], strict=True
+    ):
+        first.add(int(device_ns), int(arrival_ns))
+    # The device speaks before anybody tells the new process what was known.
+    second.add(int(messages.device_ns[half]), int(messages.arrival_ns[half]))
+    second.resume(json.loads(json.dumps(first.learned())))
+    second.add(int(messages.device_ns[half + 1]), int(messages.arrival_ns[half + 1]))
+    report = second.report()
+    assert report is not None
+    assert report.drift_ppm == pytest.approx(50.0, abs=15.0)
+    mapped = second.to_monotonic(int(messages.device_ns[half + 1]))
+    assert mapped is not None
+    assert abs(mapped - int(messages.true_ns[half + 1])) < MS
+
+
+def test_a_device_that_was_restarted_meanwhile_is_learned_anew() -> None:
+    first, second = ClockMapping(), ClockMapping()
+    errors_ms(first, simulated(40.0))
+    second.resume(first.learned())
+    again = simulated(40.0, seed=1)
+    for device_ns, arrival_ns in zip(again.device_ns, again.arrival_ns, strict=True):
+        second.add(int(device_ns), int(arrival_ns) + 100 * SECOND)
+    assert second.resets == 1
+    mapped = second.to_monotonic(int(again.device_ns[-1]))
+    assert mapped is not None
+    assert abs(mapped - (int(again.true_ns[-1]) + 100 * SECOND)) < MS
+
+
+@pytest.mark.parametrize("damage", [[["x", 1, 2, 3, 4]], [[1, 2]], [[None] * 5], [3]])
+def test_a_damaged_memory_of_a_clock_is_not_used(
+    damage: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    mapping = ClockMapping("DVL")
+    mapping.resume(damage)
+    errors_ms(mapping, simulated(2.0))
+    assert mapping.report() is not None
+    assert "the clock of DVL is learned anew" in caplog.text
