@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import io
+import contextlib
 import json
 import logging
 import shutil
@@ -23,7 +22,7 @@ from aquaflow.export.map_file import write_map_file
 from aquaflow.export.ply import Splats, write_ply
 from aquaflow.export.report import ReportData, write_report
 from aquaflow.export.tum import write_tum
-from aquaflow.frame_rows import FRAME_COLUMNS, FrameRow, or_lost, read_rows
+from aquaflow.frame_rows import FrameRow, header, of_text, or_lost, read_rows, to_text
 from aquaflow.geometry.camera import CameraModel, save_camera
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.gaussians import radiance
@@ -70,16 +69,17 @@ class DiveFolder:
                 ``overwrite`` nor ``resume`` is set.
         """
         self.path = path
-        self._rows: list[FrameRow] = []
+        self._recorded = bytearray()
+        """The rows so far as lines of frames.csv: a tenth of what they take as objects."""
         self.unwritten = 0
         """Rows that the disk did not take when they came."""
         if resume is None:
             self._claim(overwrite)
         else:
-            self._rows = [or_lost(row, resume) for row in read_rows(path / MARKER)]
+            self._add(or_lost(row, resume) for row in read_rows(path / MARKER))
         dump_config(config, path / "config.yaml")
-        self._rewrite_frames(self._rows)
-        self._frames = (path / MARKER).open("a", newline="", encoding="utf-8")
+        self._rewrite_frames(self._recorded)
+        self._frames = (path / MARKER).open("ab")
         self._log = JsonLog(path / "log.jsonl", append=resume is not None)
         self._log.attach()
 
@@ -115,44 +115,47 @@ class DiveFolder:
         if not keep_work:
             shutil.rmtree(self.work, ignore_errors=True)
         self._log.close()
-        self._frames.close()
+        self._close_frames()
 
     @property
     def rows(self) -> Sequence[FrameRow]:
         """What was recorded so far."""
-        return self._rows
+        return of_text(self._recorded.decode("utf-8"))
 
     # --- while the dive runs ------------------------------------------------------------------
 
     def record(self, rows: Iterable[FrameRow]) -> None:
         """Append frames in the order in which their fate was decided."""
         new = list(rows)
-        self._rows += new
         try:
-            self._write_rows(self._frames, [row.cells() for row in new])
+            self._frames.write(self._add(new))
             self._frames.flush()
         except OSError as error:  # a full disk ends no dive; all rows are written at its end
             self.unwritten += len(new)
             log.warning("frames.csv takes no more for now: %s", error.strerror)
 
-    @staticmethod
-    def _write_rows(stream: Any, rows: Iterable[Sequence[str]]) -> None:
-        csv.writer(stream, lineterminator="\n").writerows(rows)
+    def _add(self, rows: Iterable[FrameRow]) -> bytes:
+        lines = to_text(rows).encode("utf-8")
+        self._recorded += lines
+        return lines
 
     # --- at its end ---------------------------------------------------------------------------
 
     def write_frames(self, sub_maps: Mapping[int, int]) -> None:
         """frames.csv once more: in the order of the recording, each posed frame in the sub-map that
         it ended up in (``sub_maps`` by frame index)."""
-        rows = [replace(row, sub_map=sub_maps.get(row.index, row.sub_map)) for row in self._rows]
-        self._frames.close()
-        self._rewrite_frames(sorted(rows, key=lambda row: row.index))
+        rows = [replace(row, sub_map=sub_maps.get(row.index, row.sub_map)) for row in self.rows]
+        self._close_frames()
+        self._rewrite_frames(to_text(sorted(rows, key=lambda row: row.index)).encode("utf-8"))
 
-    def _rewrite_frames(self, rows: Iterable[FrameRow]) -> None:
-        text = io.StringIO(newline="")
-        self._write_rows(text, [FRAME_COLUMNS, *(row.cells() for row in rows)])
+    def _close_frames(self) -> None:
+        with contextlib.suppress(OSError):  # rows that a full disk did not take; nothing is lost
+            self._frames.close()
+
+    def _rewrite_frames(self, lines: bytes | bytearray) -> None:
         with atomic_write(self.path / MARKER) as stream:
-            stream.write(text.getvalue().encode("utf-8"))
+            stream.write(header().encode("utf-8"))
+            stream.write(lines)
 
     def write_trajectory(self, t_s: list[float], poses: list[Sim3]) -> None:
         """trajectory.tum: every frame that has a pose."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,18 +60,22 @@ class DiveRun:
         self.calibration = calibration
         self.preparation = Preparation(config.source, calibration)
         self.profiler = slam.profiler
-        self.results: list[Tracked] = []
         self.dropped: list[Dropped] = []
         self.notes: list[str] = []
         self.live: dict[str, Any] | None = None
         """What a live run says of itself in metrics.json."""
         self.started = time.monotonic()
-        self.frame_ms: list[float] = []
+        self.frame_ms = array("d")
         """Of every frame that was read: preparing, tracking and mapping it."""
         self.first_pose_s: float | None = None
         """Seconds from the start of the run."""
         self._name_of, self._trace = name_of, trace
         self._cpu_before_s = time.process_time()
+
+    @property
+    def results(self) -> list[Tracked]:
+        """All frames whose fate is known, with their poses as they are now; made when asked for."""
+        return self.slam.results()
 
     # --- while frames come --------------------------------------------------------------------
 
@@ -86,7 +91,7 @@ class DiveRun:
             return []
         decided = self.slam.process(prepared)
         self.decide(decided)
-        self._time_frame(begun)
+        self._time_frame(begun, decided)
         return decided
 
     def catch_up(self) -> list[Tracked]:
@@ -95,10 +100,10 @@ class DiveRun:
         self.decide(decided)
         return decided
 
-    def _time_frame(self, begun: float) -> None:
+    def _time_frame(self, begun: float, decided: list[Tracked]) -> None:
         now = time.monotonic()
         self.frame_ms.append(1e3 * (now - begun))
-        if self.first_pose_s is None and any(t.T_wc is not None for t in self.results):
+        if self.first_pose_s is None and any(t.T_wc is not None for t in decided):
             self.first_pose_s = now - self.started
 
     def drop(self, frame: Dropped) -> None:
@@ -116,7 +121,6 @@ class DiveRun:
 
     def decide(self, decided: list[Tracked]) -> None:
         """Frames whose fate is known."""
-        self.results += [tracked.bare() for tracked in decided]
         with self.profiler.stage("record"):
             self.folder.record(self._row(tracked) for tracked in decided)
 
@@ -143,19 +147,19 @@ class DiveRun:
         """
         self.decide(self.slam.finish(progress))
         with self.profiler.stage("write"):
-            self.results = self.slam.settled(self.results)
-            self._note_what_was_left_out(notes)
-            self.folder.write_frames({t.frame.index: t.sub_map for t in self.results if t.T_wc})
-        if sum(tracked.T_wc is not None for tracked in self.results) < MIN_VIEWS:
-            raise NotMappedError(self._why_not())
-        return self._write()
+            results = self.results
+            self._note_what_was_left_out(results, notes)
+            self.folder.write_frames({t.frame.index: t.sub_map for t in results if t.T_wc})
+        if sum(tracked.T_wc is not None for tracked in results) < MIN_VIEWS:
+            raise NotMappedError(self._why_not(len(results)))
+        return self._write(results)
 
-    def _note_what_was_left_out(self, notes: list[str]) -> None:
+    def _note_what_was_left_out(self, results: list[Tracked], notes: list[str]) -> None:
         self.notes += notes
-        lost = sum(tracked.T_wc is None for tracked in self.results)
+        lost = sum(tracked.T_wc is None for tracked in results)
         if lost:
-            self.notes.append(f"{lost} of {len(self.results)} frames got no pose")
-        sub_maps = {tracked.sub_map for tracked in self.results if tracked.T_wc is not None}
+            self.notes.append(f"{lost} of {len(results)} frames got no pose")
+        sub_maps = {tracked.sub_map for tracked in results if tracked.T_wc is not None}
         if len(sub_maps) > 1:
             self.notes.append(
                 f"tracking was lost {len(sub_maps) - 1} times: the dive has {len(sub_maps)} "
@@ -170,8 +174,7 @@ class DiveRun:
         for note in self.notes:
             log.info(note)
 
-    def _why_not(self) -> str:
-        read = len(self.results)
+    def _why_not(self, read: int) -> str:
         if read == 0:
             return f"{self.name}: no frame could be read, see {self.folder.path}/frames.csv"
         if read < MIN_VIEWS:
@@ -181,14 +184,14 @@ class DiveRun:
             "the camera must move sideways, see frames.csv for each frame"
         )
 
-    def _write(self) -> Finished:
-        main = largest_sub_map(self.results)
+    def _write(self, results: list[Tracked]) -> Finished:
+        main = largest_sub_map(results)
         with self.profiler.stage("evaluate"):
             held_out = examine_held_out(self.slam, main)
             waters = {n: summarise_water(mapper) for n, mapper in self.slam.mappers.items()}
             water = waters.get(main)
-            poses = refined_poses(self.slam, self.results)
-        times = {tracked.frame.index: tracked.frame.t_ns * 1e-9 for tracked in self.results}
+            poses = refined_poses(self.slam, results)
+        times = {tracked.frame.index: tracked.frame.t_ns * 1e-9 for tracked in results}
         with self.profiler.stage("write"):
             self.folder.write_trajectory([times[i] for i in poses], list(poses.values()))
             assert self.slam.tracker.camera is not None
@@ -198,25 +201,25 @@ class DiveRun:
                 self.folder.write_map(mapped, waters[sub_map], suffix)
             self.folder.write_held_out(held_out)
         with self.profiler.stage("report"):
-            numbers = self._numbers(held_out)
+            numbers = self._numbers(results, held_out)
             mapper = self.slam.mappers.get(main)
             evidence = None if mapper is None else mapper.scene.water_evidence
             self.folder.write_medium(water, numbers["scale_source"], evidence)
             self.folder.write_report(
                 report_data(
-                    self.name, self.slam, self.results, self.dropped, poses, held_out, water,
+                    self.name, self.slam, results, self.dropped, poses, held_out, water,
                     numbers, self.notes, calibrated=self.calibration is not None,
                 )
             )  # fmt: skip
-        numbers = self._numbers(held_out)  # the report's own time included
+        numbers = self._numbers(results, held_out)  # the report's own time included
         self.folder.write_json("metrics.json", numbers)
         if self._trace:
             self.folder.write_json(TRACE, self.profiler.chrome_trace())
         return Finished(self.folder.path, numbers, self.notes)
 
-    def _numbers(self, held_out: list[HeldOut]) -> dict[str, Any]:
+    def _numbers(self, results: list[Tracked], held_out: list[HeldOut]) -> dict[str, Any]:
         wall_s = time.monotonic() - self.started
-        numbers = metrics(self.slam, self.results, self.dropped, held_out, wall_s)
+        numbers = metrics(self.slam, results, self.dropped, held_out, wall_s)
         numbers["cpu_s"] = round(time.process_time() - self._cpu_before_s, 3)  # of all threads
         if self.live is not None:
             numbers["live"] = self.live

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Container, Sequence
+import io
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,6 +49,32 @@ class FrameRow:
         ]  # fmt: skip
 
 
+def to_text(rows: Iterable[FrameRow]) -> str:
+    """Their lines of frames.csv."""
+    return _csv(row.cells() for row in rows)
+
+
+def header() -> str:
+    """The first line of frames.csv."""
+    return _csv([FRAME_COLUMNS])
+
+
+def _csv(lines: Iterable[Sequence[str]]) -> str:
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n").writerows(lines)
+    return text.getvalue()
+
+
+def of_text(text: str) -> list[FrameRow]:
+    """The rows of :func:`to_text`; a last one that was cut short is left out.
+
+    Raises:
+        ValueError: these are no rows.
+    """
+    lines = csv.reader(io.StringIO(text, newline=""))
+    return [FrameRow.of_cells(cells) for cells in lines if len(cells) == len(FRAME_COLUMNS)]
+
+
 def read_rows(path: Path) -> list[FrameRow]:
     """The rows of frames.csv; a last one that was cut short is left out.
 
@@ -56,8 +83,8 @@ def read_rows(path: Path) -> list[FrameRow]:
     """
     try:
         with path.open(newline="", encoding="utf-8") as stream:
-            whole = [cells for cells in csv.reader(stream) if len(cells) == len(FRAME_COLUMNS)]
-        return [FrameRow.of_cells(cells) for cells in whole[1:]]
+            next(stream, None)
+            return of_text(stream.read())
     except (OSError, ValueError) as error:
         raise InputError(f"cannot read {path}: {error}; start with --new") from error
 

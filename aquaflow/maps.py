@@ -12,6 +12,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
 from aquaflow.mapping.following import move_views
 from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.view_budget import alike, let_surplus_go
 from aquaflow.mapping.views import View, ViewStore
 from aquaflow.profiler import Profiler
 from aquaflow.render import select_renderer
@@ -109,6 +110,8 @@ class Maps:
         with self.profiler.stage("view"):  # now and then a view makes the water be fitted again
             mapper = self.mapper(growth.sub_map)
             mapper.add_view(growth.view)
+            group = alike(growth.view, mapper.views)
+            let_surplus_go(mapper.views, group, self.config.mapping.views_per_keyframe)
 
         # Sec. 3.3.3: medium-guided insertion, from this frame and from the keyframe it retires.
         for retired in growth.retired:
@@ -121,7 +124,9 @@ class Maps:
             mapper.optimise(growth.steps)
 
     def hold_out(self, view: View, sub_map: int) -> None:
-        self.held_out.setdefault(sub_map, []).append(self.views.keep(view))
+        views = self.held_out.setdefault(sub_map, [])
+        views.append(self.views.keep(view))
+        let_surplus_go(views, views, self.config.mapping.held_out_most)
 
     def insert(self, insertion: Insertion) -> None:
         with self.profiler.stage("insert"):
@@ -135,7 +140,9 @@ class Maps:
         for source, target in merged.items():
             if source in self.mappers:
                 self.mapper(target).absorb(self.mappers.pop(source))
-            self.held_out.setdefault(target, []).extend(self.held_out.pop(source, []))
+            views = self.held_out.setdefault(target, [])
+            views.extend(self.held_out.pop(source, []))
+            let_surplus_go(views, views, self.config.mapping.held_out_most)
 
     def refine(self, progress: Progress | None = None) -> None:
         with self.profiler.stage("refine"):

@@ -6,6 +6,7 @@ import threading
 import time
 from array import array
 from collections import defaultdict
+from collections.abc import Sequence
 from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
@@ -129,7 +130,7 @@ class _Stage:
 
 
 def pace(
-    frame_ms: list[float], count: int, first_pose_s: float | None, wall_s: float
+    frame_ms: Sequence[float], count: int, first_pose_s: float | None, wall_s: float
 ) -> dict[str, Any]:
     """Milliseconds per frame and seconds to the first pose.
 

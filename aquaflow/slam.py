@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 from aquaflow.config import Config
 from aquaflow.errors import ConfigError
+from aquaflow.frame_table import FrameTable
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.mapping.mapper import Mapper
@@ -65,10 +66,14 @@ class Slam:
         self.skipped: Counter[str] = Counter()
         """Frames that the gate kept from tracking, by its reason's kind."""
         self._live = live
+        self.frames = FrameTable()
+        """All frames whose fate is known, in the order in which it was decided."""
+        self.used = 0
+        """Frames that passed the gate so far."""
         self._sequence: dict[int, int] = {}
-        self._T_kf: dict[int, Sim3] = {}
-        """By frame index: the pose against the frame's keyframe, which later corrections leave."""
-        self._latest: Tracked | None = None
+        """By frame index, while the frame's fate is open: the frames used before it."""
+        self._latest: tuple[Tracked, Sim3] | None = None
+        """The frame placed last, if it has a pose, and that against its keyframe, T_kf."""
         self._keyframe_views: dict[int, View] = {}
 
     def process(self, frame: Frame) -> list[Tracked]:
@@ -82,7 +87,8 @@ class Slam:
             verdict = self.gate.judge(frame.image, frame.mask)
         if not verdict.passed:
             return [self._skip(frame, verdict)]
-        self._sequence[frame.index] = len(self._sequence)
+        self._sequence[frame.index] = self.used
+        self.used += 1
 
         # Sec. 3.1 and 3.2: two-view prior, Sim(3) pose against the keyframe, frame class.
         with self.profiler.stage("track"):
@@ -113,7 +119,11 @@ class Slam:
         for insertion in self._retired_keyframes():
             self.maps.insert(insertion)
         self.maps.refine(progress)
-        return self.settled(placed)
+        settled = self.results()[len(self.frames) - len(placed) :]
+        return [
+            replace(tracked, T_wc=now.T_wc, sub_map=now.sub_map)
+            for tracked, now in zip(placed, settled, strict=True)
+        ]
 
     def close(self, keep: bool = False) -> None:
         """End the work beside tracking; remove what waits in the work folder, or ``keep`` it."""
@@ -133,33 +143,30 @@ class Slam:
 
     # --- an earlier run -----------------------------------------------------------------------
 
-    def anchor(self, index: int) -> Sim3 | None:
-        """A frame's pose against its keyframe, T_kf; None without one."""
-        return self._T_kf.get(index)
-
-    @property
-    def used(self) -> int:
-        """Frames that passed the gate so far."""
-        return len(self._sequence)
-
-    def resume(self, T_kf: dict[int, Sim3], used: int) -> None:
-        """Take over the anchors of an earlier run's frames; ``used`` of them passed the gate."""
-        self._T_kf = T_kf
-        self._sequence = {-1 - i: i for i in range(used)}
+    def resume(self, frames: FrameTable, used: int) -> None:
+        """Take over the frames of an earlier run; ``used`` of them passed the gate."""
+        self.frames, self.used = frames, used
 
     # --- poses --------------------------------------------------------------------------------
 
     def _place_all(self, decided: list[Tracked]) -> list[Tracked]:
         """Anchor all frames before a loop among them moves the keyframes that they hang on."""
-        for tracked in decided:
-            if tracked.keyframe is not None and tracked.T_wc is not None:
-                T_kw = self.keyframes[tracked.keyframe].T_wc.inverse()
-                self._T_kf[tracked.frame.index] = T_kw @ tracked.T_wc
-        return [self._place(tracked) for tracked in decided]
+        anchors = [self._anchor(tracked) for tracked in decided]
+        placed = [self._place(*each) for each in zip(decided, anchors, strict=True)]
+        for tracked, T_kf in zip(placed, anchors, strict=True):
+            self._sequence.pop(tracked.frame.index, None)
+            self.frames.add(tracked, T_kf)
+        return placed
 
-    def _place(self, tracked: Tracked) -> Tracked:
-        """Let the keyframe graph and the map know of a frame; its pose after that."""
+    def _anchor(self, tracked: Tracked) -> Sim3 | None:
+        """The pose against the frame's keyframe, T_kf, which later corrections leave."""
         if tracked.keyframe is None or tracked.T_wc is None:
+            return None
+        return self.keyframes[tracked.keyframe].T_wc.inverse() @ tracked.T_wc
+
+    def _place(self, tracked: Tracked, T_kf: Sim3 | None) -> Tracked:
+        """Let the keyframe graph and the map know of a frame; its pose after that."""
+        if tracked.keyframe is None or T_kf is None:
             self._latest = None
             return tracked
         if tracked.frame_class is FrameClass.KEYFRAME:
@@ -167,21 +174,26 @@ class Slam:
                 self._correct(wait=True)
             with self.profiler.stage("graph"):
                 self.graph.add(tracked.keyframe, tracked.link)
-        self._latest = self._settled(tracked)
+        settled = self._settled(tracked, T_kf)
+        self._latest = settled, T_kf
         if self.config.mapping.enabled:
-            self._map(self._latest)
-        return self._latest
+            self._map(settled)
+        return settled
 
     def _skip(self, frame: Frame, verdict: Verdict) -> Tracked:
         """A frame that was not looked at; one like the frame before it has that frame's pose."""
         self.skipped[verdict.kind.value] += 1
-        before = self._latest
-        if not verdict.same_place or before is None or before.keyframe is None:
-            sub_map = self.tracker.sub_map
-            return Tracked(frame, FrameClass.SKIPPED, sub_map, reason=verdict.reason)
-        self._T_kf[frame.index] = self._T_kf[before.frame.index]
-        skipped = replace(self._settled(before), frame=frame, frame_class=FrameClass.SKIPPED)
-        return replace(skipped, pointmap=None, reason=verdict.reason, link=None)
+        if not verdict.same_place or self._latest is None:
+            sub_map, T_kf = self.tracker.sub_map, None
+            skipped = Tracked(frame, FrameClass.SKIPPED, sub_map, reason=verdict.reason)
+        else:
+            before, T_kf = self._latest
+            skipped = replace(
+                self._settled(before, T_kf), frame=frame, frame_class=FrameClass.SKIPPED,
+                pointmap=None, reason=verdict.reason, link=None,
+            )  # fmt: skip
+        self.frames.add(skipped, T_kf)
+        return skipped
 
     def _correct(self, wait: bool) -> None:
         """The map follows its keyframes."""
@@ -190,16 +202,16 @@ class Slam:
         if correction.moves:
             self.maps.correct(correction.moves, correction.merged)
 
-    def settled(self, results: Iterable[Tracked]) -> list[Tracked]:
-        """The frames with pose and sub-map as they are now, after all corrections of keyframes."""
-        return [self._settled(tracked) for tracked in results]
+    def results(self) -> list[Tracked]:
+        """All frames whose fate is known, without pictures and reasons, with pose and sub-map as
+        they are now, after all corrections of keyframes."""
+        return [self._settled(tracked, T_kf) for tracked, T_kf in self.frames]
 
-    def _settled(self, tracked: Tracked) -> Tracked:
-        if tracked.keyframe is None:
+    def _settled(self, tracked: Tracked, T_kf: Sim3 | None) -> Tracked:
+        if tracked.keyframe is None or T_kf is None:
             return tracked
         keyframe = self.keyframes[tracked.keyframe]
-        T_wc = keyframe.T_wc @ self._T_kf[tracked.frame.index]
-        return replace(tracked, T_wc=T_wc, sub_map=keyframe.sub_map)
+        return replace(tracked, T_wc=keyframe.T_wc @ T_kf, sub_map=keyframe.sub_map)
 
     # --- the map ------------------------------------------------------------------------------
 

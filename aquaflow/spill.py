@@ -88,6 +88,19 @@ class Spill(Generic[T]):
         self._use(number, thing)
         return thing
 
+    def __delitem__(self, number: int) -> None:
+        """Forget a thing that is not pinned, its file as well."""
+        self._unsaved.discard(number)
+        if number in self._resident:
+            self._let_go(number)
+        if number in self._saved:
+            self._saved.discard(number)
+            with contextlib.suppress(OSError):
+                self._file(number).unlink(missing_ok=True)
+
+    def __contains__(self, number: int) -> bool:
+        return number in self._resident or number in self._saved
+
     def pin(self, number: int) -> None:
         """Keep this one in memory, where it may be changed in place, until another is pinned."""
         thing = self[number]
@@ -116,9 +129,13 @@ class Spill(Generic[T]):
         Raises:
             InputError: its file is not there.
         """
-        if not self._file(number).is_file():
+        if not self.is_saved(number):
             raise InputError(f"{self._file(number)} is gone; start with --new")
         self._saved.add(number)
+
+    def is_saved(self, number: int) -> bool:
+        """True if this run or an earlier one left a file of it."""
+        return self._file(number).is_file()
 
     def close(self, keep: bool = False) -> None:
         """Remove the files; or, to ``keep`` them, write what is only in memory too."""

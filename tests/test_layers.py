@@ -24,7 +24,7 @@ FLOORS = (
     {"frame_rows"},
     {"outcome"},
     {"slam", "export"},
-    {"maps"},
+    {"maps", "frame_table"},
     {"sim_drivers"},
     {"tracking", "mapping", "training", "drivers"},
     {"recording"},

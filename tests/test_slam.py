@@ -276,14 +276,11 @@ def test_a_corrected_keyframe_takes_its_frames_and_their_sub_map_along(
     told: Told, calls: Calls
 ) -> None:
     slam = told("KCMKC", "00011")
-    results = [
-        Tracked(frame_of(i), FrameClass.COMMON, i // 3, i // 3, Sim3.identity()) for i in range(5)
-    ]
-    before = slam.settled(results)
+    before = slam.results()
     S = Sim3(np.eye(3), np.array([5.0, 0.0, 0.0]), 2.0)
     first, second = slam.keyframes[0], slam.keyframes[1]
     second.T_wc, second.sub_map = S @ second.T_wc, first.sub_map
-    after = slam.settled(results)
+    after = slam.results()
     for old, new in zip(before, after, strict=True):
         moved = old.frame.index >= 3
         assert old.T_wc is not None
@@ -293,6 +290,7 @@ def test_a_corrected_keyframe_takes_its_frames_and_their_sub_map_along(
 
 
 def test_a_frame_without_a_pose_settles_as_it_is(told: Told, calls: Calls) -> None:
-    slam = told("KCL")
-    lost = Tracked(frame_of(2), FrameClass.LOST, 0, reason="told so")
-    assert slam.settled([lost]) == [lost]
+    *posed, lost = told("KCL").results()
+    assert all(tracked.T_wc is not None for tracked in posed)
+    assert (lost.frame.index, lost.frame_class) == (2, FrameClass.LOST)
+    assert (lost.keyframe, lost.T_wc) == (None, None)

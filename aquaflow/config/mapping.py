@@ -235,6 +235,18 @@ class MappingConfig(Stage):
     hold_out_every: int = Field(
         8, ge=0, description="i % n == 0 and i != 0 is tracked, never mapped; 0: map every frame"
     )
+    held_out_most: int = Field(
+        256,
+        ge=2,
+        description="held-out views of a sub-map, spread over it, that are kept and judged: one "
+        "takes heldout_steps, 256 some minutes; no reference clip has as many",
+    )
+    views_per_keyframe: int = Field(
+        48,
+        ge=2,
+        description="views that hang on a keyframe, common ones and others each, that are kept, "
+        "spread over its time; the reef clip has 40 common ones at its full 30 fps, 20 at 15",
+    )
     insertion: InsertionConfig = InsertionConfig()
     loss: LossConfig = LossConfig()
     optimiser: OptimiserConfig = OptimiserConfig()

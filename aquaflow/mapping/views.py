@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -73,6 +73,14 @@ class View:
     def lie_in(self, store: Spill[Pixels]) -> None:
         """The pixels lie in ``store`` already, under the frame's index."""
         self._lies_in = store
+
+    def lies_in(self, store: Spill[Pixels]) -> bool:
+        """True while its pixels are in ``store``."""
+        return self._lies_in is store and self.frame_index in store
+
+    def let_go(self) -> None:
+        """Give the pixels up, for good: nobody looks at this view any more."""
+        del self._lies_in[self.frame_index]
 
     @property
     def _pixels(self) -> Pixels:
@@ -157,15 +165,22 @@ class ViewStore:
         """Write what is only in memory; the files that are new."""
         return self._pixels.save()
 
-    def adopt(self, view: View) -> View:
-        """Let a view have the pixels that an earlier run saved of it.
+    def adopt(self, views: Sequence[View]) -> list[View]:
+        """Let views have the pixels that an earlier run saved of them; those that it let go of
+        afterwards are left out.
 
         Raises:
-            InputError: their file is not there.
+            InputError: there is no file of any of them.
         """
-        self._pixels.adopt(view.frame_index)
-        view.lie_in(self._pixels)
-        return view
+        known = [view for view in views if self._pixels.is_saved(view.frame_index)]
+        for view in known or views[:1]:
+            self._pixels.adopt(view.frame_index)
+            view.lie_in(self._pixels)
+        return known
+
+    def holds(self, view: View) -> bool:
+        """True if the view's pixels lie here, and it was not let go of."""
+        return view.lies_in(self._pixels)
 
     @property
     def resident_bytes(self) -> int:

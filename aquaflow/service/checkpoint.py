@@ -11,7 +11,7 @@ import contextlib
 import logging
 import os
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from aquaflow.dive import CHECKPOINT
 from aquaflow.dive_run import DiveRun
 from aquaflow.errors import InputError
 from aquaflow.export.facts_file import UNREADABLE, read_facts_file, write_facts_file
+from aquaflow.fusion.clock import Learned
 from aquaflow.maps import Maps
 from aquaflow.plain_arrays import Arrays, prefixed, under
 from aquaflow.service import map_state, tracking_state
@@ -31,7 +32,7 @@ from aquaflow.slam import Slam
 log = logging.getLogger(__name__)
 
 STATE = "state.npz"
-FORMAT = 1
+FORMAT = 2
 
 
 def state_file(dive: Path) -> Path:
@@ -52,6 +53,12 @@ class Checkpoint:
         return Moment(**self.facts["moment"])
 
     @property
+    def clocks(self) -> dict[str, Learned]:
+        """What was known of the devices' clocks."""
+        known: dict[str, Learned] = self.facts["clocks"]
+        return known
+
+    @property
     def frames(self) -> set[int]:
         """Indices of the frames that it knows."""
         return {int(index) for index in self.arrays["tracking.frames"]["index"]}
@@ -67,6 +74,7 @@ class Checkpointer:
         slam: Slam,
         maps: MapThread,
         every_s: float,
+        clocks: Callable[[], Mapping[str, Learned]],
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self.taken = 0
@@ -75,8 +83,7 @@ class Checkpointer:
         self.wrote_s = 0.0
         """How long the last writing took."""
         self._dive, self._run, self._slam, self._maps = dive, run, slam, maps
-        self._every_s, self._now_s = every_s, now_s
-        self._table = tracking_state.FrameTable()
+        self._every_s, self._clocks, self._now_s = every_s, clocks, now_s
         self._due_s = now_s() + every_s
         self._writing = False
 
@@ -90,14 +97,14 @@ class Checkpointer:
     def take(self) -> None:
         """Take one now; what the map still waits for, but corrections, is not in it."""
         with self._run.profiler.stage("checkpoint"):
-            parts = tracking_state.take_apart(self._slam, self._run, self._table)
+            parts = tracking_state.take_apart(self._slam, self._run)
             if parts is None:
                 return
             facts, arrays = parts
             files = self._slam.keyframes.save()
         self._writing = True
         head = {"format": FORMAT, "version": __version__, "moment": Moment.now().to_json()}
-        head |= {"tracking": facts}
+        head |= {"tracking": facts, "clocks": self._clocks()}
         arrays = prefixed("tracking", arrays)
 
         def write(maps: Maps, lacking: list[Correction]) -> None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 from aquaflow.frame_rows import FrameRow
+from aquaflow.fusion.clock import Learned
 from aquaflow.messages import Dropped, Frame
 from aquaflow.service.moment import Moment
 
@@ -18,12 +19,21 @@ class Continued:
     """Frames before this one were decided, or lost, in the run before."""
     shift_ns: int = 0
     """From this boot's clock to the dive's."""
+    clocks: Mapping[str, Learned] = field(default_factory=dict)
+    """What was known of the devices' clocks, by device."""
 
     @staticmethod
-    def after(moment: Moment, rows: Sequence[FrameRow], now: Moment | None = None) -> Continued:
-        """After the run that took a checkpoint at ``moment`` and left ``rows``."""
+    def after(
+        moment: Moment,
+        rows: Sequence[FrameRow],
+        clocks: Mapping[str, Learned],
+        now: Moment | None = None,
+    ) -> Continued:
+        """After the run that took a checkpoint at ``moment``, knew the devices' ``clocks`` then and
+        left ``rows``. With another boot CLOCK_MONOTONIC is another one: clocks are learned anew."""
         first = 1 + max((row.index for row in rows), default=-1)
-        return Continued(first, moment.shift_ns(now or Moment.now()))
+        shift_ns = moment.shift_ns(now or Moment.now())
+        return Continued(first, shift_ns, clocks if shift_ns == 0 else {})
 
     def counted(self, frame: Frame | Dropped) -> Frame | Dropped:
         """A frame of a device that began to count anew."""

@@ -7,9 +7,10 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from aquaflow.config import SourceConfig
+from aquaflow.fusion.clock import Learned
 from aquaflow.messages import CameraModel, Dropped, Frame, TelemetrySample
 from aquaflow.recording.playback import Playback, arrived
 from aquaflow.recording.recorder import Recorder
@@ -43,6 +44,19 @@ class Heard:
         return list(self._latest.values())
 
 
+@runtime_checkable
+class KnowsClocks(Protocol):
+    """A telemetry source whose devices have clocks of their own."""
+
+    def learned(self) -> Mapping[str, Learned]:
+        """What is known of them, by device."""
+        ...
+
+    def resume(self, learned: Mapping[str, Learned]) -> None:
+        """Go on with what an earlier process knew."""
+        ...
+
+
 class Feed(Protocol):
     """One camera's newest frame, and telemetry beside it."""
 
@@ -65,6 +79,10 @@ class Feed(Protocol):
 
     def go_on(self, continued: Continued) -> None:
         """Count frames and time on from an earlier run; before the start."""
+        ...
+
+    def clocks(self) -> Mapping[str, Learned]:
+        """What is known of the devices' clocks, for the run that continues this one."""
         ...
 
     def tell(self, word: Word) -> bool:
@@ -90,6 +108,9 @@ class _Pumps:
 
     def go_on(self, continued: Continued) -> None:
         self.continued = continued
+
+    def clocks(self) -> Mapping[str, Learned]:
+        return {}
 
     def pump(self, name: str, work: Callable[[], None], last: bool = False) -> None:
         """Run ``work``; with ``last``, no frame comes after its end."""
@@ -150,6 +171,14 @@ class LiveFeed(_Pumps):
             status = self._recorder.status
             devices["recorder"] = {"kind": "recorder", "state": status.stopped or "recording"}
         return devices
+
+    def go_on(self, continued: Continued) -> None:
+        super().go_on(continued)
+        if isinstance(self._telemetry, KnowsClocks):
+            self._telemetry.resume(continued.clocks)
+
+    def clocks(self) -> Mapping[str, Learned]:
+        return self._telemetry.learned() if isinstance(self._telemetry, KnowsClocks) else {}
 
     def tell(self, word: Word) -> bool:
         return isinstance(self._telemetry, Hears) and self._telemetry.tell(word)

@@ -78,6 +78,8 @@ class Facts:
     """Since the last frame, or since the start."""
     patience_s: float
     """So long may a camera be silent."""
+    pictured: bool
+    """A frame came since the start."""
     camera: str
     """What the driver says of a camera that is silent."""
     posed: bool
@@ -92,6 +94,8 @@ def judged(facts: Facts) -> tuple[State, str]:
     if facts.frame_age_s > facts.patience_s:
         said = f": {facts.camera}" if facts.camera else ""
         return State.WAITING, f"no picture for {facts.frame_age_s:.0f} s{said}"
+    if not facts.pictured:
+        return State.STARTING, "no picture yet"
     if not facts.ever_posed:
         return State.INITIALISING, "no pose yet: the camera must move sideways over texture"
     if not facts.posed:

@@ -66,6 +66,7 @@ class LiveLoop:
         """Called after every frame and every idle moment; must not wait."""
         self._read_pressure, self._now_s = pressure, now_s
         self._frame_s = now_s()
+        self._pictured = False
         self._ever_posed = any(tracked.T_wc is not None for tracked in run.results)
         self._unposed = LOST_AFTER
         """Frames in a row without a pose."""
@@ -85,9 +86,10 @@ class LiveLoop:
 
     def take(self, frame: Frame | Dropped | None) -> None:
         """One turn: a frame, the note that one is missing, or an idle moment."""
+        if frame is not None:
+            self._frame_s, self._pictured = self._now_s(), True
         if isinstance(frame, Dropped):
             self.run_.drop(frame)
-            self._frame_s = self._now_s()
         elif frame is not None:
             self._frame(frame)
         elif self._past is not None:
@@ -118,7 +120,6 @@ class LiveLoop:
     # --- one frame ------------------------------------------------------------------------------
 
     def _frame(self, frame: Frame) -> None:
-        self._frame_s = self._now_s()
         self.picture = frame
         if self.ladder.level is Level.RECORDING_ONLY:
             self.run_.drop(
@@ -192,6 +193,7 @@ class LiveLoop:
         return Facts(
             self._now_s() - self._frame_s,
             PATIENCE_S,
+            self._pictured,
             str(cameras[0]["reason"]) if cameras else "",
             self._unposed < LOST_AFTER,
             self._ever_posed,

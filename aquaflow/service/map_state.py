@@ -32,18 +32,17 @@ def put_together(maps: Maps, facts: dict[str, Any], arrays: Arrays) -> None:
     """Let fresh ``maps`` go on where those that were taken apart stood.
 
     Raises:
-        InputError: a view's file is gone.
+        InputError: the views' files are gone.
         KeyError, ValueError, TypeError, RuntimeError: this is no such checkpoint.
     """
     for number, values in facts["maps"].items():
         parts = under(f"map{number}", arrays)
         mapper = map_state.put_together(values, parts, maps.renderer)
-        for view in mapper.views:
-            maps.views.adopt(view)
+        mapper.views = maps.views.adopt(mapper.views)
         maps.mappers[int(number)] = mapper
     for number, values in facts["held_out"].items():
         views = _read_held_out(values, under(f"held_out{number}", arrays))
-        maps.held_out[int(number)] = [maps.views.adopt(view) for view in views]
+        maps.held_out[int(number)] = maps.views.adopt(views)
 
 
 def corrections_apart(lacking: Sequence[Correction]) -> tuple[list[dict[str, Any]], Arrays]:

@@ -11,7 +11,7 @@ import logging
 import os
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -71,8 +71,6 @@ class MapThread:
         """The last request raised."""
         self._maps, self._config, self._beats, self._level = maps, config, beats, level
         self._jobs: deque[tuple[str, Job]] = deque()
-        self._whole: set[int] = set()
-        """Frames whose views may be inserted from once more."""
         self._growing = 0
         """Growths that wait."""
         self._newest: int | None = None
@@ -90,13 +88,11 @@ class MapThread:
             self.left_out[refused] += 1
             return
         level = self._level()
-        growth = replace(growth, retired=tuple(self._owned(growth.retired)))
+        growth = replace(growth, retired=tuple(map(_owned, growth.retired)))
         if level >= Level.FEWER_STEPS:
             growth = replace(growth, steps=growth.steps // FEWER)
         if level >= Level.SMALLER_IMAGES:
             growth = halved(growth)
-        elif growth.pointmap is not None:
-            self._whole.add(growth.view.frame_index)
         with self._changed:
             self._growing += 1
         self._post("grow", partial(self._grow, growth))
@@ -106,8 +102,7 @@ class MapThread:
             self._post("hold out", lambda maps: maps.hold_out(view, sub_map))
 
     def insert(self, insertion: Insertion) -> None:
-        for own in self._owned((insertion,)):
-            self._post("insert", partial(_insert, own))
+        self._post("insert", partial(_insert, _owned(insertion)))
 
     def correct(self, moves: Mapping[int, Sim3], merged: Mapping[int, int]) -> None:
         self._post("correct", Correction(moves, merged))
@@ -144,14 +139,6 @@ class MapThread:
         """Requests that wait."""
         return len(self._jobs)
 
-    def _owned(self, insertions: Iterable[Insertion]) -> Iterator[Insertion]:
-        """Those whose view the map has, at its full size. Their pointmaps are copied: tracking goes
-        on fusing into that of a keyframe which it takes up again."""
-        for each in insertions:
-            if each.view.frame_index in self._whole:
-                self._whole.discard(each.view.frame_index)
-                yield replace(each, pointmap=each.pointmap.copy())
-
     # --- the thread -----------------------------------------------------------------------------
 
     def _refused(self, growth: Growth) -> str | None:
@@ -174,7 +161,8 @@ class MapThread:
     def _grow(self, growth: Growth, maps: Maps) -> None:
         with self._changed:
             self._growing -= 1
-        maps.grow(growth)
+        retired = tuple(each for each in growth.retired if _is_mapped(each, maps))
+        maps.grow(replace(growth, retired=retired))
         self._newest = growth.sub_map
 
     def _run(self) -> None:
@@ -217,7 +205,7 @@ class MapThread:
         if mapper is None or len(mapper.gaussians) == 0:
             return None
         wanted = self._config.steps_per_view * len(mapper.views)
-        return mapper if mapper.steps < wanted else None
+        return mapper if sum(view.looks for view in mapper.views) < wanted else None
 
     def _optimise(self, maps: Maps) -> None:
         mapper = self._wanting()
@@ -242,5 +230,17 @@ class MapThread:
             self._thread.join(JOIN_S)
 
 
+def _owned(insertion: Insertion) -> Insertion:
+    """With a pointmap of its own: tracking goes on fusing into that of a keyframe which it takes up
+    again."""
+    return replace(insertion, pointmap=insertion.pointmap.copy())
+
+
+def _is_mapped(insertion: Insertion, maps: Maps) -> bool:
+    """True if the map has the view, at its full size."""
+    return maps.views.holds(insertion.view)
+
+
 def _insert(insertion: Insertion, maps: Maps) -> None:
-    maps.insert(insertion)
+    if _is_mapped(insertion, maps):
+        maps.insert(insertion)

@@ -101,7 +101,8 @@ class LiveDive:
                 slam.close(keep=True)
                 self.folder.close(keep_work=True)
                 raise
-            continued = Continued.after(choice.checkpoint.moment, self.folder.rows)
+            known = choice.checkpoint
+            continued = Continued.after(known.moment, self.folder.rows, known.clocks)
             run.dropped += [
                 Dropped(row.index, round(row.t_s * 1e9), row.reason)
                 for row in self.folder.rows
@@ -114,7 +115,7 @@ class LiveDive:
             Machine(self.folder.path), self._notifier,
         )  # fmt: skip
         every_s = service.checkpoint.every_s
-        checkpointer = Checkpointer(self.folder.path, run, slam, thread, every_s)
+        checkpointer = Checkpointer(self.folder.path, run, slam, thread, every_s, feed.clocks)
         loop.watchers.append(
             lambda live: checkpointer.look(live.pressure.disk_is_full(service.limits))
         )

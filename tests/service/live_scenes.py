@@ -12,6 +12,7 @@ from aquaflow.config import Config, parse_config
 from aquaflow.config.service import ServiceConfig
 from aquaflow.dive import DiveFolder
 from aquaflow.dive_run import DiveRun
+from aquaflow.fusion.clock import Learned
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.maps import Growth, Insertion, Maps
@@ -63,6 +64,7 @@ class ToldFeed:
         self.devices: dict[str, dict[str, object]] = {}
         self.continued = Continued()
         self.told: list[Word] = []
+        self.learned: dict[str, Learned] = {}
 
     def name_of(self, index: int) -> str:
         return f"told#{index}"
@@ -72,6 +74,9 @@ class ToldFeed:
 
     def go_on(self, continued: Continued) -> None:
         self.continued = continued
+
+    def clocks(self) -> dict[str, Learned]:
+        return self.learned
 
     def tell(self, word: Word) -> bool:
         self.told.append(word)
@@ -150,6 +155,7 @@ class RecordedMaps(Maps):
         if self.fail:
             self.failed.set()
             raise RuntimeError("the GPU is gone")
+        self.views.keep(growth.view)
         size = growth.view.camera.width
         self.asked.append(f"grow {growth.view.frame_index} {size}px {growth.steps}")
         for each in growth.retired:

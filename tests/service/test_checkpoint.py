@@ -19,10 +19,11 @@ from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.errors import InputError
 from aquaflow.frame_rows import read_rows
+from aquaflow.frame_table import FRAME
 from aquaflow.messages import Frame
-from aquaflow.service import tracking_state
 from aquaflow.service.checkpoint import read_state, state_file, write_state
 from aquaflow.service.choice import choose, is_unfinished, resumed, tidy
+from aquaflow.service.continued import Continued
 from aquaflow.service.moment import Moment
 from aquaflow.service.onboard import map_live
 from aquaflow.service.prometheus import exposition
@@ -43,6 +44,7 @@ VEHICLE = VehicleConfig.model_validate(
         },
     }
 )
+CLOCKS = {"autopilot": [[12, 12_000_000_000, 345, None, None]]}
 CUT = 12
 """Frames before the cut."""
 
@@ -74,6 +76,7 @@ def cut(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Iter
     for frame in frames[:CUT]:
         dive.parts.loop.take(frame)
     caught_up(dive)
+    dive.feed.learned = CLOCKS  # type: ignore[attr-defined]
     dive.parts.checkpointer.take()
     caught_up(dive)
     rows = len(read_rows(folder / "frames.csv"))
@@ -213,7 +216,7 @@ def test_a_vehicle_whose_checkpoint_fits_nothing_begins_a_new_dive(tmp_path: Pat
     dives = tmp_path / "dives"
     (dives / "old").mkdir(parents=True)
     (dives / "old" / "frames.csv").write_text("index,source,t_s,class,sub_map,keyframe,quality,r\n")
-    frames = {"tracking.frames": np.zeros(0, tracking_state.FRAME)}
+    frames = {"tracking.frames": np.zeros(0, FRAME)}
     facts = {"format": 1, "version": "0", "moment": Moment.now().to_json(), "tracking": {}}
     write_state(dives / "old", facts, frames)
     service = VEHICLE.service.model_copy(update={"dives": dives})
@@ -256,6 +259,14 @@ def test_the_dives_clock_goes_on_over_restarts_and_jumps(
     before = Moment(1_000_000, 10**18, "a")
     now = Moment(1_000_000 + later_ns, 10**18 + wall_ns, boot)
     assert before.shift_ns(now) == shift_ns
+
+
+def test_a_devices_clock_is_known_after_a_restart_but_not_after_another_boot(
+    cut: Cut, back: LiveDive
+) -> None:
+    assert back.feed.continued.clocks == CLOCKS  # type: ignore[attr-defined]
+    before, rebooted = Moment(1_000_000, 10**18, "a"), Moment(900, 10**18, "b")
+    assert Continued.after(before, [], CLOCKS, rebooted).clocks == {}
 
 
 # --- whoever looks on -----------------------------------------------------------------------------

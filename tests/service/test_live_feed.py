@@ -142,6 +142,23 @@ def _failing() -> Iterator[Frame]:
     yield
 
 
+def test_the_clocks_of_the_devices_are_told_and_taken_up_again() -> None:
+    pytest.importorskip("pymavlink", reason="pymavlink is not installed")
+    known = {"autopilot": [(12, 12 * 10**9, 345, None, None)]}
+    told = {**known, "sonar": [(1, 2, 3, None, None)]}  # one device is no longer there
+    link = {"kind": "udp", "mode": "listen", "host": "127.0.0.1", "port": UdpWire().port}
+    config = parse_telemetry({"devices": {"autopilot": {"kind": "mavlink", "link": link}}}, "test")
+    feed = LiveFeed("none", {}, LinkTelemetry(config), SourceConfig())
+    try:
+        assert feed.clocks() == {"autopilot": []}
+        feed.go_on(Continued(clocks=told))
+        decoder = feed._telemetry.decoders["autopilot"]  # type: ignore[union-attr]
+        decoder.clock.mapping.add(13 * 10**9, 13 * 10**9 + 400)
+        assert feed.clocks()["autopilot"][:1] == known["autopilot"]
+    finally:
+        feed.close()
+
+
 def test_a_flood_of_garbage_costs_its_bytes_and_no_sample() -> None:
     pytest.importorskip("pymavlink", reason="pymavlink is not installed")
     wire = UdpWire()

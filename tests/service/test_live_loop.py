@@ -28,6 +28,13 @@ def test_a_dive_goes_from_starting_over_initialising_to_tracking(told: Told) -> 
     assert all(change.reason for change in told.loop.health.changes)
 
 
+def test_systemd_hears_nothing_of_ready_until_the_camera_answers_or_is_missed(told: Told) -> None:
+    told.idle(1.0, turns=4)
+    assert told.loop.health.state is State.STARTING
+    told.idle(2.0, turns=8)
+    assert visited(told) == ["starting", "waiting for camera"]
+
+
 def test_an_unplugged_camera_is_waited_for_and_the_dive_goes_on(told: Told) -> None:
     told.feed.devices = {"front": {"kind": "camera", "state": "lost", "reason": "No such device"}}
     told.frames("pp")

@@ -1,0 +1,31 @@
+"""How many views a long dive keeps: where it stays or comes again, only some of each place's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from aquaflow.mapping.views import View, in_time
+
+
+def alike(view: View, views: Sequence[View]) -> list[View]:
+    """Those of ``views`` that hang on the same keyframe and are as robust."""
+    return [v for v in views if v.keyframe == view.keyframe and v.robust == view.robust]
+
+
+def let_surplus_go(
+    views: list[View],
+    group: Sequence[View],  # those of ``views`` that have a budget together
+    most: int,
+) -> None:
+    """Drop views, and their pixels, until the ``group`` has at most ``most``.
+
+    Always the one whose neighbours are nearest to each other in time, the earliest of equals, so
+    that those that stay are spread over the whole time. First and last stay.
+    """
+    kept = in_time(group)
+    while len(kept) > max(most, 2):
+        index = [view.frame_index for view in kept]
+        gaps = [after - before for before, after in zip(index, index[2:])]  # noqa: B905
+        dropped = kept.pop(1 + gaps.index(min(gaps)))
+        views.remove(dropped)
+        dropped.let_go()

@@ -1,0 +1,204 @@
+"""A dive on simulated devices to which everything happens: it goes on, and says what happened.
+
+The devices speak their real protocols (V4L2 calls, MAVLink over a pseudo terminal); the service is
+the whole of ``aquaflow run`` but its sockets.
+"""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from aquaflow.config import SourceConfig
+from aquaflow.config.cameras import V4l2Config
+from aquaflow.config.telemetry import parse_telemetry
+from aquaflow.config.vehicle import VehicleConfig
+from aquaflow.frame_rows import read_rows
+from aquaflow.messages import CameraModel, Depth, Frame
+from aquaflow.service.choice import resumed
+from aquaflow.service.feed import LiveFeed
+from aquaflow.service.health import State
+from aquaflow.service.session import LiveDive
+from aquaflow.sources import open_recording
+from drivers.telemetry import LinkTelemetry
+from drivers.v4l2 import V4l2Camera
+from sim_drivers.camera_feed import CameraFaults, CameraFeed
+from sim_drivers.devices.ardusub import ArduSub
+from sim_drivers.devices.device import SimulatedDevice
+from sim_drivers.devices.wires import PtyWire
+from sim_drivers.v4l2_kernel import V4l2Kernel
+
+FPS = 10.0
+GIVE_UP_S = 90.0
+AWAY_S = 3.0
+"""Longer than the service's patience with a camera."""
+CLOCK_SET = 50
+"""The picture from which on the camera's clock is an hour ahead."""
+UNPLUGGED = 80
+"""The picture at which the camera is."""
+GARBAGE_BYTES = 300_000
+FEW = {"steps_keyframe": 2, "steps_mapping": 2, "steps_common": 1, "refine_steps": 4}
+VEHICLE = VehicleConfig.model_validate(
+    {
+        "threads": 1,
+        "mapping": {"optimiser": FEW, "medium": {"fit": False}},
+        "service": {
+            "health": {"enabled": False, "port": 8230},
+            "mapping": {"steps_per_view": 0},
+            "checkpoint": {"every_s": 1e6},
+        },
+    }
+)
+
+
+class ThereAndBack:
+    """A recording forwards and backwards, for ever: no place changes at once."""
+
+    camera: CameraModel | None = None
+    frame_count: int | None = None
+
+    def __init__(self, recording: Path) -> None:
+        source = open_recording(recording)
+        self._seen = [frame for frame in source.frames() if isinstance(frame, Frame)]
+        self.notes: list[str] = []
+
+    def frames(self, every: int = 1, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        yield from self._seen
+        yield from self._seen[-2:0:-1]
+
+    def close(self) -> None: ...
+
+
+@dataclass
+class Told:
+    """What the service said when something had happened to it."""
+
+    reason: dict[str, str] = field(default_factory=dict)
+    problem: str = ""
+    garbage_bytes: int = 0
+    dive: LiveDive | None = None
+
+
+class Fate(threading.Thread):
+    """Does to the devices what happens at sea, and waits for the service to notice."""
+
+    def __init__(self, dive: LiveDive, wire: PtyWire, told: Told) -> None:
+        super().__init__(name="fate", daemon=True)
+        self._loop, self._feed, self._wire, self._told = dive.parts.loop, dive.feed, wire, told
+
+    def run(self) -> None:
+        try:
+            self._until(State.TRACKING)
+            self._wire.unplug()
+            self._told.reason["link away"] = self._until(State.DEGRADED)
+            self._wire.plug()
+            self._told.reason["link back"] = self._until(State.TRACKING)
+            self._flood()
+            self._told.reason["camera away"] = self._until(State.WAITING)
+            self._told.reason["camera back"] = self._until(State.TRACKING)
+        except AssertionError as error:
+            self._told.problem = str(error)
+        finally:
+            self._loop.stopping.set()
+
+    def _until(self, state: State) -> str:
+        self._wait(lambda: self._loop.health.state is state, f"'{state.value}'")
+        return self._loop.health.reason
+
+    def _flood(self) -> None:
+        noise = random.Random(0)
+        for _ in range(GARBAGE_BYTES // 1000):
+            self._wire.send(noise.randbytes(1000))
+        self._wait(lambda: self._garbage() > GARBAGE_BYTES // 2, "garbage to be counted")
+        self._told.garbage_bytes = self._garbage()
+        self._told.reason["flooded"] = self._until(State.TRACKING)
+
+    def _garbage(self) -> int:
+        return int(str(self._feed.describe()["autopilot"]["garbage_bytes"]))
+
+    def _wait(self, true: Callable[[], bool], what: str) -> None:
+        deadline = time.monotonic() + GIVE_UP_S
+        while not true():
+            now = f"{self._loop.health.state.value}: {self._loop.health.reason}"
+            assert time.monotonic() < deadline, f"no {what} but {now}"
+            time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def told(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Told:
+    pytest.importorskip("pymavlink", reason="pymavlink is not installed")
+    root = tmp_path_factory.mktemp("at_sea")
+    faults = CameraFaults(
+        disconnect=frozenset({UNPLUGGED}), away_s=AWAY_S, clock_jump_s={CLOCK_SET: 3600.0}
+    )
+    kernel = V4l2Kernel(root, CameraFeed(ThereAndBack(small_recording), FPS, faults), None)
+    asked = {"kind": "v4l2", "pixels": "YUYV", "width": 160, "height": 120}
+    asked |= {"stall_s": 1.0, "first_retry_s": 0.05, "last_retry_s": 0.1}
+    camera = V4l2Camera("front", V4l2Config.model_validate(asked), kernel, root)
+    wire = PtyWire(root / "autopilot")
+    link = {"kind": "serial", "port": str(wire.path), "baud": 115200}
+    device = {"kind": "mavlink", "link": link, "silence_s": 1.0}
+    links = LinkTelemetry(parse_telemetry({"devices": {"autopilot": device}}, "test"))
+    samples = [Depth(i * 50_000_000, i * 50_000_000, "truth", 3.0) for i in range(4000)]
+    autopilot = SimulatedDevice(ArduSub(), wire, samples).start()
+    feed = LiveFeed("front", {"front": camera}, links, SourceConfig())
+    told = Told()
+    with LiveDive("sea", resumed(root / "dive", new=False), feed, VEHICLE) as dive:
+        told.dive = dive
+        fate = Fate(dive, wire, told)
+        fate.start()
+        dive.run()
+        fate.join()
+    autopilot.close()
+    return told
+
+
+def test_nothing_ended_the_dive(told: Told) -> None:
+    assert told.problem == ""
+
+
+def test_a_silent_link_is_named_and_comes_back(told: Told) -> None:
+    assert told.reason["link away"].startswith("link 'autopilot': ")
+    assert told.reason["link back"] == "every frame has a pose"
+
+
+def test_garbage_is_counted_and_degrades_nothing(told: Told) -> None:
+    assert told.garbage_bytes > GARBAGE_BYTES // 2
+    assert told.reason["flooded"] == "every frame has a pose"
+
+
+def test_an_unplugged_camera_is_waited_for_with_its_reason(told: Told) -> None:
+    assert told.reason["camera away"].startswith("no picture for 2 s: ")
+    assert told.reason["camera back"] == "every frame has a pose"
+
+
+def test_frames_go_on_in_one_map_where_the_camera_comes_back(told: Told) -> None:
+    assert told.dive is not None
+    rows = read_rows(told.dive.folder.path / "frames.csv")
+    after = [row for row in rows if row.index >= UNPLUGGED and row.keyframe is not None]
+    assert after
+    assert {row.sub_map for row in rows if row.keyframe is not None} == {0}
+    assert max(later - t_s for t_s, later in pairwise(row.t_s for row in rows)) > 0.8 * AWAY_S
+
+
+def test_a_camera_whose_clock_is_set_an_hour_on_changes_no_time(told: Told) -> None:
+    assert told.dive is not None
+    rows = read_rows(told.dive.folder.path / "frames.csv")
+    assert max(row.index for row in rows) > CLOCK_SET
+    assert max(abs(later - t_s) for t_s, later in pairwise(row.t_s for row in rows)) < 2.0 * AWAY_S
+
+
+def test_the_counts_of_all_this_are_kept_with_the_dive(told: Told) -> None:
+    assert told.dive is not None
+    live = told.dive.parts.run.live
+    assert live is not None
+    assert live["visits"]["waiting for camera"] == 1
+    assert live["visits"]["degraded"] == 1
+    assert live["failures"] == 0
