@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from aquaflow.config import Config
     from aquaflow.dive_run import Finished
     from aquaflow.geometry.camera import CameraModel
+    from aquaflow.service.feed import Feed
 
 
 def register(app: typer.Typer) -> None:
@@ -32,6 +33,9 @@ def run(
     source: Annotated[
         Path | None, typer.Option(help="Map this recording as if it happened now.")
     ] = None,
+    calib: Annotated[
+        Path | None, typer.Option(help="Of --source: camera.yaml; else a guess, refined.")
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Dive folder; else one in service.dives, named by time.")
     ] = None,
@@ -43,15 +47,25 @@ def run(
     """Map live: cameras and telemetry in, dive folder out; resumes what was interrupted."""
     from aquaflow.config.vehicle import VehicleConfig, load_vehicle
     from aquaflow.errors import InputError
+    from aquaflow.geometry.camera import load_camera
     from aquaflow.service.sources import devices, recording
 
     vehicle = VehicleConfig() if config is None else load_vehicle(config)
     if source is None and not vehicle.cameras:
         raise InputError("nothing to map: give --config with cameras, or --source")
+    if source is None and calib is not None:
+        raise InputError(
+            f"--calib {calib} is for --source; a camera's calibration stands in --config, under "
+            "cameras"
+        )
 
     from aquaflow.service.onboard import map_live  # loads torch
 
-    feed = devices(vehicle) if source is None else recording(source, vehicle, speed)
+    if source is None:
+        feed: Feed = devices(vehicle)
+    else:
+        calibration = None if calib is None else load_camera(calib)
+        feed = recording(source, vehicle, speed, calibration)
     with progress_bars(quiet=as_json) as progress:
         finished = map_live(
             feed, vehicle, out, new, seconds, lambda done, total: progress("refine", done, total)

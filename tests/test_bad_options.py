@@ -40,6 +40,13 @@ def test_a_calibration_of_another_shape_is_refused(
     refused(ran, "320 x 120", "160 x 120")
 
 
+def test_a_calibration_for_no_recording_is_refused(aquaflow: Cli, tmp_path: Path) -> None:
+    vehicle = tmp_path / "vehicle.yaml"
+    vehicle.write_text("cameras: {front: {kind: v4l2}}")
+    ran = aquaflow("run", "--config", vehicle, "--calib", "camera.yaml")
+    refused(ran, "camera.yaml", "--source")
+
+
 def test_a_missing_calibration_is_refused(
     aquaflow: Cli, small_recording: Path, tmp_path: Path
 ) -> None:
