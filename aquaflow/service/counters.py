@@ -38,11 +38,13 @@ class Counters:
         self._profiler, self._now_s = profiler, now_s
         self._window = (now_s(), 0, profiler.totals_ms())
 
-    def frame(self, arrival_ns: int, now_ns: int | None = None) -> None:
-        """A frame was dealt with that had come at ``arrival_ns``."""
+    def frame(self, arrival_ns: int, now_ns: int | None = None) -> float:
+        """A frame was dealt with that had come at ``arrival_ns``; how long ago that is, in ms."""
         self.frames += 1
         now = time.monotonic_ns() if now_ns is None else now_ns
-        self._lags_ms.append((now - arrival_ns) * 1e-6)
+        lag_ms = (now - arrival_ns) * 1e-6
+        self._lags_ms.append(lag_ms)
+        return lag_ms
 
     def look(self) -> None:
         """Work out rates and shares, now and then."""

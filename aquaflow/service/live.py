@@ -27,6 +27,9 @@ log = logging.getLogger(__name__)
 STAGE = "tracking"
 IDLE_S = 0.25
 """Without a frame for so long, the loop says that it is idle and lives."""
+LATE_MS = 150.0
+"""A frame that took longer from its arrival on is late, and mapping gives way; at 10 frames/s one
+that found tracking idle is ready in 60 to 100 ms."""
 BUSY_S = 0.01
 """The same while frames of the past wait for their poses: one of them takes its turn."""
 PATIENCE_S = 2.0
@@ -115,6 +118,7 @@ class LiveLoop:
             "left_out_of_the_map": dict(self.maps.left_out),
             "mapping_failures": self.maps.failures,
             "mapping_waits": self.maps.waiting,
+            "mapping_rests": self.maps.rests,
         }
 
     # --- one frame ------------------------------------------------------------------------------
@@ -127,7 +131,7 @@ class LiveLoop:
             )
         else:
             self._track(frame)
-        self.counters.frame(frame.arrival_ns)
+        self.maps.late = self.counters.frame(frame.arrival_ns) > LATE_MS
 
     def _track(self, frame: Frame) -> None:
         try:

@@ -10,6 +10,7 @@ import contextlib
 import logging
 import os
 import threading
+import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -33,6 +34,8 @@ STEPS_AT_ONCE = 4
 """Of idle time: a new request waits for no more, about 0.1 s at 480 px."""
 FEWER = 4
 """At the level of fewer steps, one step of so many is done."""
+LONGEST_REST_S = 1.0
+"""A fit of the water takes longer, and is rare."""
 JOIN_S = 30.0
 """Longest wait for the thread at the end of a dive."""
 MAPPING_AT, KEYFRAME_AT = 3, 8
@@ -61,7 +64,9 @@ class MapThread:
         config: LiveMappingConfig,
         beats: Beats,
         level: Callable[[], Level] = lambda: Level.FULL,
+        rest: Callable[[float], object] | None = None,
     ) -> None:
+        """``rest`` for some seconds, from which ``refine`` and ``close`` wake the thread."""
         self.left_out: Counter[str] = Counter()
         """Frames that the map never saw, by reason."""
         self.failures = 0
@@ -69,6 +74,10 @@ class MapThread:
         self.last_failure = ""
         self.failing = False
         """The last request raised."""
+        self.late = False
+        """Set by tracking that is late: the thread then rests as long as it worked."""
+        self.rests = 0
+        """Requests after which it did."""
         self._maps, self._config, self._beats, self._level = maps, config, beats, level
         self._jobs: deque[tuple[str, Job]] = deque()
         self._growing = 0
@@ -76,7 +85,8 @@ class MapThread:
         self._newest: int | None = None
         """The sub-map that grew last."""
         self._changed = threading.Condition()
-        self._ending = False
+        self._ending = threading.Event()
+        self._rest = rest or self._ending.wait
         self._thread = threading.Thread(target=self._run, name=STAGE, daemon=True)
         self._thread.start()
 
@@ -171,18 +181,24 @@ class MapThread:
         while True:
             self._beats.beat(STAGE)
             job = self._next()
-            if job is not None:
-                self._do(*job)
-            elif self._ending:
+            if job is None and self._ending.is_set():
                 return
-            else:
-                self._do("optimise", self._optimise)
+            began_s = time.monotonic()
+            self._do(*job or ("optimise", self._optimise))
+            self._give_way(time.monotonic() - began_s)
+
+    def _give_way(self, worked_s: float) -> None:
+        """With few cores, mapping takes from tracking what tracking needs to keep up: Python's
+        lock, the memory, and on a busy machine the core itself."""
+        if self.late and not self._ending.is_set():
+            self.rests += 1
+            self._rest(min(worked_s, LONGEST_REST_S))
 
     def _next(self) -> tuple[str, Job] | None:
         """The next request; none if there is something better to do than to wait for it."""
         with self._changed:
             idle = self.failing or not self._wanting()
-            if not self._jobs and not self._ending and idle:
+            if not self._jobs and not self._ending.is_set() and idle:
                 self._changed.wait(IDLE_S)
             return self._jobs.popleft() if self._jobs else None
 
@@ -224,7 +240,7 @@ class MapThread:
     def _end(self) -> None:
         """Do what was asked for and end; nobody else may touch the maps before."""
         with self._changed:
-            self._ending = True
+            self._ending.set()
             self._changed.notify()
         while self._thread.is_alive():  # the guard ends the process if the thread hangs
             self._thread.join(JOIN_S)

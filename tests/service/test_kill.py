@@ -23,7 +23,7 @@ def tracked_to_the_end(dive: Path, frames: int) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("kills", [4, 50])
 def test_a_dive_that_is_killed_goes_on_each_time(tmp_path: Path, kills: int) -> None:
-    source, frames = tmp_path / "recording", 25 * kills
+    source, frames = tmp_path / "recording", 40 * kills
     write_dive(source, SyntheticConfig(frames=frames, width=160, height=120))
     killed = kill_and_resume(source, tmp_path, kills, longest_s=4.0, speed=1.0)
     assert killed.kills == kills

@@ -17,7 +17,7 @@ from aquaflow.mapping.views import View
 from aquaflow.maps import Growth, Insertion
 from aquaflow.service.beats import Beats
 from aquaflow.service.ladder import Level
-from aquaflow.service.map_thread import STAGE, MapThread
+from aquaflow.service.map_thread import LONGEST_REST_S, STAGE, MapThread
 
 CAMERA = guess_camera(WIDTH, HEIGHT)
 
@@ -27,8 +27,10 @@ class Beside:
 
     def __init__(self) -> None:
         self.maps, self.beats, self.level = RecordedMaps(), Beats(), Level.FULL
+        self.rested_s: list[float] = []
+        config = LiveMappingConfig(backlog=2, nice=0)
         self.thread = MapThread(
-            self.maps, LiveMappingConfig(backlog=2, nice=0), self.beats, lambda: self.level
+            self.maps, config, self.beats, lambda: self.level, self.rested_s.append
         )
 
     def hold(self) -> threading.Event:
@@ -111,6 +113,43 @@ def test_a_lost_gpu_costs_its_requests_and_is_told(beside: Beside) -> None:
     beside.thread.grow(growth(1))
     beside.thread.close()
     assert beside.maps.asked == ["grow 1 64px 8"]
+
+
+class StubMapper:
+    """Has had steps enough, but of views that were let go of since."""
+
+    def __init__(self, views: list[View]) -> None:
+        self.gaussians, self.steps, self.views = [0], 1_000_000, views
+        self.done = threading.Event()
+
+    def optimise(self, steps: int) -> None:
+        self.views[-1].looks += steps
+        if self.views[-1].looks >= len(self.views) * LiveMappingConfig().steps_per_view:
+            self.done.set()
+
+
+def test_idle_steps_go_on_until_the_views_that_are_kept_have_had_theirs(beside: Beside) -> None:
+    mapper = StubMapper([growth(index).view for index in range(3)])
+    beside.maps.mappers[0] = mapper  # type: ignore[assignment]
+    beside.thread.grow(growth(9))
+    assert mapper.done.wait(20.0)
+    beside.thread.close()
+    assert mapper.views[-1].looks == 3 * LiveMappingConfig().steps_per_view
+
+
+def test_mapping_rests_as_long_as_it_worked_while_tracking_is_late(beside: Beside) -> None:
+    beside.hold().set()
+    done = threading.Event()
+    beside.thread.look("see", lambda maps, lacking: done.set())
+    assert done.wait(20.0)
+    assert beside.rested_s == []
+    beside.thread.late = True
+    held = beside.hold()
+    assert not held.wait(0.05)  # what it works
+    held.set()
+    beside.hold().set()  # behind the rest
+    assert 0.04 < max(beside.rested_s) <= LONGEST_REST_S
+    assert beside.thread.rests >= 1
 
 
 def test_a_look_is_told_the_corrections_that_still_wait(beside: Beside) -> None:
