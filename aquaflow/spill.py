@@ -115,12 +115,19 @@ class Spill(Generic[T]):
         return sum(array.nbytes for thing in things for array in self._pack(thing).values())
 
     def save(self) -> list[Path]:
-        """Write what is only in memory, where it stays too; the files that are new."""
+        """Write what is only in memory, where it stays too; the files that are new.
+
+        Raises:
+            OSError: something could not be written.
+        """
         if self._folder is None:
             return []
+        self._full = False  # there may be room again
         saved = [number for number in sorted(self._unsaved) if self._save(number, self._folder)]
         if self._pinned is not None:
             self._unsaved.add(self._pinned)  # it may be changed in place from here on
+        if self._full:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._folder))
         return [self._file(number) for number in saved]
 
     def adopt(self, number: int) -> None:
@@ -142,6 +149,7 @@ class Spill(Generic[T]):
         if self._folder is None:
             return
         if keep:
+            self._full = False
             for number in sorted(self._unsaved):
                 self._save(number, self._folder)
             return
@@ -175,7 +183,8 @@ class Spill(Generic[T]):
             release_memory(0)
 
     def _save(self, number: int, folder: Path) -> bool:
-        """True once it is in its file; the first failure is told, and there is no second try."""
+        """True once it is in its file; after a failure, which is told, there is no other try until
+        all is to be saved."""
         if self._full:
             return False
         try:

@@ -191,7 +191,7 @@ class Step(NamedTuple):
 
 STEPS = st.builds(
     Step,
-    st.sampled_from(["set", "get", "pin", "mutate"]),
+    st.sampled_from(["set", "get", "pin", "mutate", "forget"]),
     st.integers(0, 5),
     st.integers(0, 1 << 60),
 )
@@ -224,9 +224,22 @@ def test_it_holds_what_a_dictionary_holds_whenever_the_disk_fills(
             elif number in wanted and kind == "pin":
                 things.pin(number)
                 pinned = number
+            elif number in wanted and kind == "forget" and number != pinned:
+                del things[number], wanted[number]
             elif number in wanted and kind == "get":
                 assert things[number][0] == wanted[number]
         assert {number: int(things[number][0]) for number in wanted} == wanted
+        assert [number for number in range(6) if number in things] == sorted(wanted)
+
+
+def test_what_is_forgotten_leaves_no_file(tmp_path: Path) -> None:
+    things = filled(tmp_path / "work")
+    for number in range(4):
+        del things[number]
+    things.save()
+    assert files(tmp_path / "work") == ["000004.arrays"]
+    with pytest.raises(KeyError):
+        _ = things[0]
 
 
 def test_the_pinned_one_may_be_changed_in_place_for_as_long_as_it_is_pinned(

@@ -101,7 +101,11 @@ class Checkpointer:
             if parts is None:
                 return
             facts, arrays = parts
-            files = self._slam.keyframes.save()
+            try:
+                files = self._slam.keyframes.save()
+            except OSError as error:  # what it would name is not there
+                self._failed(error)
+                return
         self._writing = True
         head = {"format": FORMAT, "version": __version__, "moment": Moment.now().to_json()}
         head |= {"tracking": facts, "clocks": self._clocks()}
@@ -131,11 +135,15 @@ class Checkpointer:
             self.taken += 1
             self.size_bytes = state_file(self._dive).stat().st_size
         except (InputError, OSError) as error:
-            self.failures += 1
-            log.warning("no checkpoint: %s", error)
+            self._failed(error)
         finally:
             self.wrote_s = time.monotonic() - began
             self._writing = False
+
+    def _failed(self, error: Exception) -> None:
+        """The checkpoint before stays, and can be resumed from."""
+        self.failures += 1
+        log.warning("no checkpoint: %s", error)
 
 
 def write_state(dive: Path, facts: dict[str, Any], arrays: Arrays) -> None:

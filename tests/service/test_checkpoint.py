@@ -14,6 +14,7 @@ import pytest
 import torch
 from live_scenes import ToldFeed
 
+from aquaflow import spill
 from aquaflow.config.service import CheckpointConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.config.viewer import ViewerConfig
@@ -243,6 +244,26 @@ def test_a_full_disk_writes_no_checkpoint(cut: Cut) -> None:
     checkpointer.look(disk_is_full=True)
     caught_up(cut.dive)
     assert checkpointer.taken == taken
+
+
+def test_no_checkpoint_names_files_that_the_disk_did_not_take(
+    cut: Cut, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checkpointer, before = cut.dive.parts.checkpointer, state_file(cut.folder).read_bytes()
+    taken, failures = checkpointer.taken, checkpointer.failures
+    monkeypatch.setattr(spill, "RESERVE_BYTES", 1 << 60)
+    checkpointer.take()
+    caught_up(cut.dive)
+    assert (checkpointer.taken, checkpointer.failures) == (taken, failures + 1)
+    assert state_file(cut.folder).read_bytes() == before
+    monkeypatch.undo()
+    checkpointer.take()  # there is room again
+    caught_up(cut.dive)
+    assert checkpointer.taken == taken + 1
+    assert all(
+        cut.dive.parts.slam.keyframes._contents.is_saved(keyframe.number)
+        for keyframe in cut.dive.parts.slam.keyframes.keyframes
+    )
 
 
 @pytest.mark.parametrize(
