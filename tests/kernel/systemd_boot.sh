@@ -27,15 +27,22 @@ for module in overlay vivid; do
   \$B umount /newroot/sys; \$B umount /newroot/proc; \$B umount /newroot/dev
 done
 \$B mkdir -p /memory /merged
-\$B mount -t tmpfs -o size=900m memory /memory
+# More than there is memory: on a disk that looks full the service would keep no checkpoint.
+\$B mount -t tmpfs -o size=8g memory /memory
 \$B mkdir /memory/upper /memory/work
 \$B mount -t overlay -o lowerdir=/newroot,upperdir=/memory/upper,workdir=/memory/work root /merged
+# This machine may be a container; the guest is none, and systemd would hold it for one.
+\$B rm -f /merged/.dockerenv
 units=/merged/etc/systemd/system
 \$B rm -rf \$units/*.wants
 # What would walk this machine's whole disk over 9p, or wait for devices that are not there.
 for unit in tmpfiles-setup tmpfiles-setup-dev udev-trigger random-seed journal-flush sysusers \
-  update-utmp machine-id-commit remount-fs fsck-root hwdb-update; do
+  update-utmp machine-id-commit remount-fs fsck-root hwdb-update udevd modules-load sysctl; do
   \$B ln -sf /dev/null \$units/systemd-\$unit.service
+done
+for unit in dev-hugepages.mount dev-mqueue.mount sys-kernel-debug.mount sys-kernel-tracing.mount \
+  sys-kernel-config.mount sys-fs-fuse-connections.mount modprobe@.service; do
+  \$B ln -sf /dev/null \$units/\$unit
 done
 for place in /merged/tmp /merged/var/tmp; do \$B mount -t tmpfs -o mode=1777 place \$place; done
 \$B printf '%s\n' '[Unit]' 'DefaultDependencies=no' 'Wants=systemd-journald.service' \
@@ -56,5 +63,5 @@ GUEST
 
 timeout "${TIMEOUT_S:-560}" qemu-system-x86_64 -accel tcg -cpu max -m 2560 -smp 1 -nographic \
   -no-reboot -net none -kernel "$folder/kernel/boot/vmlinuz-$version" -initrd "$work/initramfs.gz" \
-  -append "console=ttyS0 panic=-1 quiet no_timer_check systemd.show_status=false systemd.log_level=warning systemd.journald.forward_to_console=0" \
+  -append "console=ttyS0 panic=-1 quiet no_timer_check mitigations=off no5lvl systemd.show_status=false systemd.log_level=warning systemd.journald.forward_to_console=0" \
   -virtfs "local,path=/,mount_tag=root,security_model=none,readonly=on,multidevs=remap" </dev/null
