@@ -34,7 +34,7 @@ def so3_exp(
     w: Array,  # [3] rad
 ) -> Array:
     """Rotation matrix [3, 3] of the rotation vector ``w``."""
-    return np.asarray(Rotation.from_rotvec(w).as_matrix())
+    return np.array(Rotation.from_rotvec(w).as_matrix())
 
 
 def so3_log(
@@ -47,8 +47,11 @@ def so3_log(
 def on_so3(
     R: Array,  # [3, 3] nearly a rotation
 ) -> Array:
-    """The rotation [3, 3] next to ``R``: by way of a unit quaternion."""
-    return np.asarray(Rotation.from_matrix(R).as_matrix())
+    """The rotation [3, 3] next to ``R``: by way of a unit quaternion.
+
+    A copy: SciPy's array is a view of what takes 1.2 kB, and a long dive keeps many poses.
+    """
+    return np.array(Rotation.from_matrix(R).as_matrix())
 
 
 def quaternion_from_rotation(

@@ -68,9 +68,11 @@ def log_gain_at(
 def set_log_gains(
     views: Sequence[View],
     fitted: Sequence[View],  # some of them, in the order of their frames
-    log_gains: Array,  # [len(fitted), 3]
+    log_gains: Array,  # [up to len(fitted), 3]
 ) -> None:
-    """Give the fitted views their gains, and all others what changes between them."""
+    """Give the fitted views their gains, and all others what changes between them; so too the last
+    of those fitted where nothing was sighted in them."""
+    fitted = fitted[: len(log_gains)]
     change = [new - view.log_gain for new, view in zip(log_gains, fitted, strict=True)]
     moved = [view.log_gain + _between(view.frame_index, fitted, change) for view in views]
     for view, log_gain in zip(views, moved, strict=True):

@@ -175,3 +175,8 @@ def test_quaternions_put_the_scalar_first() -> None:
 def test_a_broken_similarity_says_so(broken: Sim3) -> None:
     assert not broken.is_finite()
     assert Sim3.identity().is_finite()
+
+
+def test_a_product_holds_no_more_than_its_own_numbers() -> None:
+    product = Sim3.identity() @ Sim3(so3_exp(np.array([0.1, 0.2, 0.3])), np.zeros(3), 2.0)
+    assert product.R.base is None

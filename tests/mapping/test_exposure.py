@@ -99,3 +99,9 @@ def test_views_between_fitted_ones_take_the_change_between_them() -> None:
     views = along(0.0, 0.5, 0.0)
     set_log_gains(views, [views[0], views[2]], np.array([[0.2] * 3, [0.4] * 3]))
     np.testing.assert_allclose([view.log_gain[0] for view in views], [0.2, 0.8, 0.4])
+
+
+def test_a_last_view_in_which_nothing_was_sighted_changes_as_the_one_before() -> None:
+    views = along(0.0, 0.0, 0.0)
+    set_log_gains(views, views, np.array([[0.2] * 3, [0.4] * 3]))
+    np.testing.assert_allclose([view.log_gain[0] for view in views], [0.2, 0.4, 0.4])
