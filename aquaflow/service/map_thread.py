@@ -127,8 +127,8 @@ class MapThread:
 
     def refine(self, progress: Progress | None = None) -> None:
         self._end()
-        if self._level() is Level.FULL:
-            self._maps.refine(self._beating(progress))
+        if self._level() is Level.FULL:  # what fails here must not cost the map as it is
+            self._do("refine", lambda maps: maps.refine(self._beating(progress)))
         self._beats.retire(STAGE)
 
     def close(self, keep: bool = False) -> None:

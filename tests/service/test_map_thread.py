@@ -152,6 +152,18 @@ def test_mapping_rests_as_long_as_it_worked_while_tracking_is_late(beside: Besid
     assert beside.thread.rests >= 1
 
 
+def test_a_refinement_that_fails_leaves_the_map_as_it_is(
+    beside: Beside, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refine(progress: object = None) -> None:
+        raise RuntimeError("told so")
+
+    monkeypatch.setattr(beside.maps, "refine", refine)
+    beside.thread.refine()
+    assert beside.thread.failures == 1
+    assert beside.thread.last_failure == "refine: told so"
+
+
 def test_a_look_is_told_the_corrections_that_still_wait(beside: Beside) -> None:
     held, told = beside.hold(), []
     beside.thread.correct({3: Sim3.identity()}, {1: 0})
