@@ -10,6 +10,7 @@ import numpy as np
 
 from aquaflow.config import Config, parse_config
 from aquaflow.config.service import ServiceConfig
+from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive import DiveFolder
 from aquaflow.dive_run import DiveRun
 from aquaflow.fusion.clock import Learned
@@ -33,6 +34,21 @@ from aquaflow.vehicle_words import Word
 WIDTH, HEIGHT = 64, 48
 CALM = Pressure(free_memory_share=0.5, disk_free_mb=50_000.0, temperature_c=40.0)
 SETTINGS = parse_config({"threads": 1, "mapping": {"medium": {"enabled": False}}}, "test")
+
+
+FEW = {"steps_keyframe": 2, "steps_mapping": 2, "steps_common": 1, "refine_steps": 4}
+VEHICLE = VehicleConfig.model_validate(
+    {
+        "threads": 1,
+        "mapping": {"optimiser": FEW, "medium": {"fit": False}},
+        "service": {
+            "health": {"enabled": False, "port": 8230},
+            "mapping": {"backlog": 100, "steps_per_view": 0, "nice": 0},
+            "checkpoint": {"every_s": 1e6},
+        },
+    }
+)
+"""One that maps quickly, and takes checkpoints when it is told to."""
 
 
 class Clock:

@@ -12,39 +12,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from live_scenes import ToldFeed
+from live_scenes import VEHICLE, ToldFeed
 
 from aquaflow import spill
 from aquaflow.config.service import CheckpointConfig
-from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.config.viewer import ViewerConfig
-from aquaflow.errors import InputError
 from aquaflow.frame_rows import read_rows
-from aquaflow.frame_table import FRAME
 from aquaflow.messages import Frame
-from aquaflow.service.checkpoint import read_state, state_file, write_state
-from aquaflow.service.choice import choose, is_unfinished, resumed, tidy
+from aquaflow.service.checkpoint import read_state, state_file
+from aquaflow.service.choice import choose, is_unfinished, resumed
 from aquaflow.service.continued import Continued
 from aquaflow.service.moment import Moment
-from aquaflow.service.onboard import map_live
 from aquaflow.service.prometheus import exposition
 from aquaflow.service.report import report
 from aquaflow.service.session import LiveDive
 from aquaflow.service.window import LiveWindow, in_words
 from aquaflow.sources import open_recording
 
-FEW = {"steps_keyframe": 2, "steps_mapping": 2, "steps_common": 1, "refine_steps": 4}
-VEHICLE = VehicleConfig.model_validate(
-    {
-        "threads": 1,
-        "mapping": {"optimiser": FEW, "medium": {"fit": False}},
-        "service": {
-            "health": {"enabled": False, "port": 8230},
-            "mapping": {"backlog": 100, "steps_per_view": 0, "nice": 0},
-            "checkpoint": {"every_s": 1e6},
-        },
-    }
-)
 CLOCKS = {"autopilot": [[12, 12_000_000_000, 345, None, None]]}
 CUT = 12
 """Frames before the cut."""
@@ -163,20 +147,6 @@ def test_the_dive_goes_on_at_its_old_place_and_ends_as_one(cut: Cut, back: LiveD
     assert (cut.folder / "map.ply").is_file()
 
 
-@pytest.mark.parametrize("damage", [b"", b"PK\x03\x04 cut short", b"\x80\x04pickle"])
-def test_a_damaged_checkpoint_is_refused_and_the_next_dive_is_new(
-    tmp_path: Path, damage: bytes
-) -> None:
-    file = state_file(tmp_path / "old")
-    file.parent.mkdir(parents=True)
-    file.write_bytes(damage)
-    with pytest.raises(InputError, match="--new"):
-        resumed(tmp_path / "old", new=False)
-    choice = choose(tmp_path, CheckpointConfig(), new=False, now=Moment.now())
-    assert choice.checkpoint is None
-    assert choice.folder != tmp_path / "old"
-
-
 def test_the_newest_unfinished_dive_is_chosen_unless_it_is_old_or_new_is_asked_for(
     cut: Cut,
 ) -> None:
@@ -196,46 +166,6 @@ def test_a_dive_that_was_cut_off_before_its_first_checkpoint_may_begin_anew(
     assert is_unfinished(tmp_path)
     (tmp_path / "metrics.json").touch()
     assert not is_unfinished(tmp_path)
-
-
-@pytest.mark.parametrize("told", ["the recording ended", "told to stop"])
-def test_only_a_dive_that_was_told_to_stop_can_be_resumed(tmp_path: Path, told: str) -> None:
-    feed = ToldFeed()
-    dive = LiveDive("dive", resumed(tmp_path / "dive", new=False), feed, VEHICLE)
-    for name in ("work", "checkpoint"):
-        (tmp_path / "dive" / name).mkdir()
-    if told == "told to stop":
-        dive.parts.loop.stopping.set()
-    feed.newest.end()
-    with dive:
-        assert dive.run() is None  # not one frame: nothing was mapped
-    assert dive.parts.loop.health.reason == told
-    assert (tmp_path / "dive" / "checkpoint").exists() == (told == "told to stop")
-
-
-def test_a_vehicle_whose_checkpoint_fits_nothing_begins_a_new_dive(tmp_path: Path) -> None:
-    dives = tmp_path / "dives"
-    (dives / "old").mkdir(parents=True)
-    (dives / "old" / "frames.csv").write_text("index,source,t_s,class,sub_map,keyframe,quality,r\n")
-    frames = {"tracking.frames": np.zeros(0, FRAME)}
-    facts = {"format": 1, "version": "0", "moment": Moment.now().to_json(), "tracking": {}}
-    write_state(dives / "old", facts, frames)
-    service = VEHICLE.service.model_copy(update={"dives": dives})
-    feed = ToldFeed()
-    feed.newest.end()
-    assert map_live(feed, VEHICLE.model_copy(update={"service": service})) is None
-    assert len(list(dives.iterdir())) == 2
-    assert state_file(dives / "old").is_file()
-
-
-def test_finished_dives_keep_no_files_for_a_resumption(tmp_path: Path) -> None:
-    for name in ("old", "current"):
-        (tmp_path / name / "work").mkdir(parents=True)
-        (tmp_path / name / "checkpoint").mkdir()
-        (tmp_path / name / "report.html").touch()
-    tidy(tmp_path, tmp_path / "current")
-    assert sorted(path.name for path in (tmp_path / "old").iterdir()) == ["report.html"]
-    assert (tmp_path / "current" / "checkpoint").is_dir()
 
 
 def test_a_full_disk_writes_no_checkpoint(cut: Cut) -> None:

@@ -15,11 +15,11 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from live_scenes import VEHICLE
 
 from aquaflow.config import SourceConfig
 from aquaflow.config.cameras import V4l2Config
 from aquaflow.config.telemetry import parse_telemetry
-from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.frame_rows import read_rows
 from aquaflow.messages import CameraModel, Depth, Frame
 from aquaflow.service.choice import resumed
@@ -44,18 +44,6 @@ CLOCK_SET = 50
 UNPLUGGED = 80
 """The picture at which the camera is."""
 GARBAGE_BYTES = 300_000
-FEW = {"steps_keyframe": 2, "steps_mapping": 2, "steps_common": 1, "refine_steps": 4}
-VEHICLE = VehicleConfig.model_validate(
-    {
-        "threads": 1,
-        "mapping": {"optimiser": FEW, "medium": {"fit": False}},
-        "service": {
-            "health": {"enabled": False, "port": 8230},
-            "mapping": {"steps_per_view": 0},
-            "checkpoint": {"every_s": 1e6},
-        },
-    }
-)
 
 
 class ThereAndBack:
