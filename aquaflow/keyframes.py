@@ -33,6 +33,8 @@ class Pointmap:
     """[H, W] 1 / z; 0 where unknown."""
     variance: Array
     """[H, W] variance of ``rho``."""
+    fused: int = 0
+    """Frames whose depths were fused into it."""
 
     @staticmethod
     def unknown(camera: CameraModel) -> Pointmap:
@@ -59,7 +61,7 @@ class Pointmap:
             return np.where(self.rho[..., None] > 1e-6, rays / self.rho[..., None], np.nan)
 
     def copy(self) -> Pointmap:
-        return Pointmap(self.camera, self.rho.copy(), self.variance.copy())
+        return Pointmap(self.camera, self.rho.copy(), self.variance.copy(), self.fused)
 
 
 @dataclass(frozen=True)
@@ -211,14 +213,17 @@ class KeyframeStore:
 
     def _pack(self, content: _Content) -> Arrays:
         assert self._prior is not None
-        pointmap = {"rho": content.pointmap.rho, "variance": content.pointmap.variance}
+        pointmap = content.pointmap
+        arrays = {"rho": pointmap.rho, "variance": pointmap.variance}
+        arrays["fused"] = np.array([pointmap.fused])
         packed = self._prior.pack(content.encoding)
-        return pointmap | {f"encoding.{name}": array for name, array in packed.items()}
+        return arrays | {f"encoding.{name}": array for name, array in packed.items()}
 
     def _unpack(self, number: int, arrays: Arrays) -> _Content:
         assert self._prior is not None
         encoding_camera, pointmap_camera = self._cameras[number]
-        pointmap = Pointmap(pointmap_camera, arrays.pop("rho"), arrays.pop("variance"))
+        rho, variance, fused = (arrays.pop(name) for name in ("rho", "variance", "fused"))
+        pointmap = Pointmap(pointmap_camera, rho, variance, int(fused[0]))
         _set_writable(pointmap, False)
         packed = {name.removeprefix("encoding."): array for name, array in arrays.items()}
         return _Content(self._prior.unpack(packed, encoding_camera), pointmap)

@@ -18,6 +18,10 @@ MEASUREMENT_FLOOR = 0.01
 from frame to frame."""
 FUSED_FLOOR = 0.003
 """Relative sigma that no fused depth is trusted beyond (same reason)."""
+MOST_FUSED = 300
+"""Frames after which a pointmap is as good as it gets, half a minute at 10 a second. A frame's pose
+takes its scale from the pointmap and hands its errors back with its depths: over 72,000 frames of
+hovering, the depths of a keyframe drifted by 22 % while its links to others stayed as they were."""
 GATE_SIGMAS = 3.0
 """A measurement further off than this disagrees: it does not move the depth, it lowers trust."""
 DISAGREEMENT_INFLATION = 1.3
@@ -38,8 +42,12 @@ def fuse(
 ) -> float:
     """Inverse-variance fusion of the pair's triangulated depths into ``pointmap`` (in place).
 
-    Returns the share of the picture that got a usable measurement.
+    Returns the share of the picture that got a usable measurement; 0 for a pointmap that has had
+    enough of them.
     """
+    if pointmap.fused >= MOST_FUSED:
+        return 0.0
+    pointmap.fused += 1
     rows, columns = np.nonzero(pair.valid)
     if len(rows) == 0:
         return 0.0

@@ -15,6 +15,7 @@ from aquaflow.tracking.fusion import (
     DISAGREEMENT_INFLATION,
     FUSED_FLOOR,
     MEASUREMENT_FLOOR,
+    MOST_FUSED,
     TRANSFER_INFLATION,
     fuse,
     transfer,
@@ -273,3 +274,14 @@ def test_the_store_numbers_keyframes_in_order() -> None:
     assert len(store) == 3
     assert [keyframe.number for keyframe in store.keyframes] == [0, 1, 2]
     assert (store[1].frame_index, store[1].t_ns, store[1].sub_map) == (7, 70, 2)
+
+
+def test_a_pointmap_that_has_had_enough_frames_changes_no_more() -> None:
+    pointmap, pair = Pointmap.unknown(SMALL), two_views()
+    for _ in range(MOST_FUSED):
+        assert fuse(pointmap, pair, T_BA, SMALL, SIGMA_PX) > 0.0
+    rho, variance = pointmap.rho.copy(), pointmap.variance.copy()
+    assert fuse(pointmap, two_views(noise_px=2.0), T_BA, SMALL, SIGMA_PX) == 0.0
+    np.testing.assert_array_equal(pointmap.rho, rho)
+    np.testing.assert_array_equal(pointmap.variance, variance)
+    assert pointmap.fused == pointmap.copy().fused == MOST_FUSED
