@@ -20,8 +20,9 @@ FUSED_FLOOR = 0.003
 """Relative sigma that no fused depth is trusted beyond (same reason)."""
 MOST_FUSED = 300
 """Frames after which a pointmap is as good as it gets, half a minute at 10 a second. A frame's pose
-takes its scale from the pointmap and hands its errors back with its depths: over 72,000 frames of
-hovering, the depths of a keyframe drifted by 22 % while its links to others stayed as they were."""
+takes its scale from the pointmap and hands its errors back with its depths, so that endless fusion
+may drift: where tracking had diverged, after 65,000 frames at one place, a keyframe's depths were
+22 % from what they had been, while its links to others were not."""
 GATE_SIGMAS = 3.0
 """A measurement further off than this disagrees: it does not move the depth, it lowers trust."""
 DISAGREEMENT_INFLATION = 1.3
