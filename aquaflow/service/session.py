@@ -72,7 +72,7 @@ class LiveDive:
         """
         service = config.service
         cores = config.threads or os.cpu_count() or 1
-        fix_threads(max(1, cores // 2))  # tracking's; the other half is mapping's
+        fix_threads(max(1, cores // 2))  # tracking's; the renderer's are counted below
         sys.setswitchinterval(SWITCH_S)
         known = None if choice.checkpoint is None else choice.checkpoint.frames
         self._plain = plain(config)
