@@ -40,8 +40,10 @@ def run(
         Path | None, typer.Option(help="Dive folder; else one in service.dives, named by time.")
     ] = None,
     new: Annotated[bool, typer.Option("--new", help="Begin a new dive; resume nothing.")] = False,
-    speed: Annotated[float, typer.Option(help="Of --source: 1 as it was, 2 twice as fast.")] = 1.0,
-    seconds: Annotated[float | None, typer.Option(help="Stop after this long.")] = None,
+    speed: Annotated[
+        float, typer.Option(min=0.001, help="Of --source: 1 as it was, 2 twice as fast.")
+    ] = 1.0,
+    seconds: Annotated[float | None, typer.Option(min=0.0, help="Stop after this long.")] = None,
     as_json: Json = False,
 ) -> None:
     """Map live: cameras and telemetry in, dive folder out; resumes what was interrupted."""

@@ -47,6 +47,15 @@ def test_a_calibration_for_no_recording_is_refused(aquaflow: Cli, tmp_path: Path
     refused(ran, "camera.yaml", "--source")
 
 
+@pytest.mark.parametrize("option", ["--speed=0", "--seconds=-3"])
+def test_a_time_that_cannot_pass_is_refused(
+    aquaflow: Cli, small_recording: Path, tmp_path: Path, option: str
+) -> None:
+    ran = aquaflow("run", "--source", small_recording, option, "--out", tmp_path / "out")
+    assert ran.code == USAGE
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_missing_calibration_is_refused(
     aquaflow: Cli, small_recording: Path, tmp_path: Path
 ) -> None:
