@@ -75,8 +75,12 @@ class FrameTable:
         return self._count
 
     def __iter__(self) -> Iterator[tuple[Tracked, Sim3 | None]]:
-        """The frames, without pictures and reasons, and their poses against their keyframes."""
-        for i in range(self._count):
+        return self.since(0)
+
+    def since(self, first: int) -> Iterator[tuple[Tracked, Sim3 | None]]:
+        """The frames from row ``first`` on, without pictures and reasons, and their poses against
+        their keyframes."""
+        for i in range(first, self._count):
             yield self._frame(self._chunks[i // CHUNK][i % CHUNK])
 
     def _frame(self, row: Array) -> tuple[Tracked, Sim3 | None]:

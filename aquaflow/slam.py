@@ -119,7 +119,7 @@ class Slam:
         for insertion in self._retired_keyframes():
             self.maps.insert(insertion)
         self.maps.refine(progress)
-        settled = self.results()[len(self.frames) - len(placed) :]
+        settled = self.results(len(self.frames) - len(placed))
         return [
             replace(tracked, T_wc=now.T_wc, sub_map=now.sub_map)
             for tracked, now in zip(placed, settled, strict=True)
@@ -202,10 +202,10 @@ class Slam:
         if correction.moves:
             self.maps.correct(correction.moves, correction.merged)
 
-    def results(self) -> list[Tracked]:
-        """All frames whose fate is known, without pictures and reasons, with pose and sub-map as
-        they are now, after all corrections of keyframes."""
-        return [self._settled(tracked, T_kf) for tracked, T_kf in self.frames]
+    def results(self, first: int = 0) -> list[Tracked]:
+        """All frames whose fate is known, from the ``first`` decided on, without pictures and
+        reasons, with pose and sub-map as they are now, after all corrections of keyframes."""
+        return [self._settled(tracked, T_kf) for tracked, T_kf in self.frames.since(first)]
 
     def _settled(self, tracked: Tracked, T_kf: Sim3 | None) -> Tracked:
         if tracked.keyframe is None or T_kf is None:

@@ -40,11 +40,11 @@ REORDERED_NS = 500_000_000
 STEP_NS = 100_000_000
 """A message this much faster than the fastest of the window tells of a clock set forward."""
 
-Learned = Sequence[Sequence[int | None]]
-"""The buckets of a mapping, for whoever keeps them over a restart of the process."""
-
 CONTRADICTIONS = 3
 """So many messages in a row make a new clock; a single one is a damaged time stamp."""
+
+Learned = Sequence[Sequence[int | None]]
+"""The buckets of a mapping, for whoever keeps them over a restart of the process."""
 
 
 @dataclass(frozen=True)

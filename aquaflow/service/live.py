@@ -27,11 +27,11 @@ log = logging.getLogger(__name__)
 STAGE = "tracking"
 IDLE_S = 0.25
 """Without a frame for so long, the loop says that it is idle and lives."""
+BUSY_S = 0.01
+"""The same while frames of the past wait for their poses: one of them takes its turn."""
 LATE_MS = 150.0
 """A frame that took longer from its arrival on is late, and mapping gives way; at 10 frames/s one
 that found tracking idle is ready in 60 to 100 ms."""
-BUSY_S = 0.01
-"""The same while frames of the past wait for their poses: one of them takes its turn."""
 PATIENCE_S = 2.0
 """So long may a camera be silent before it is said to be waited for."""
 LOST_AFTER = 3
@@ -153,7 +153,7 @@ class LiveLoop:
     def _catch_up(self, past: Frame) -> None:
         try:
             decided = self.run_.catch_up()
-        except Exception as error:  # likewise
+        except Exception as error:  # costs that frame
             self._failed(past, error)
             return
         self.counters.classes.update(tracked.frame_class.value for tracked in decided)

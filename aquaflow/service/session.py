@@ -101,11 +101,11 @@ class LiveDive:
                 slam.close(keep=True)
                 self.folder.close(keep_work=True)
                 raise
-            known = choice.checkpoint
-            continued = Continued.after(known.moment, self.folder.rows, known.clocks)
+            known, rows = choice.checkpoint, self.folder.rows
+            continued = Continued.after(known.moment, rows, known.clocks)
             run.dropped += [
                 Dropped(row.index, round(row.t_s * 1e9), row.reason)
-                for row in self.folder.rows
+                for row in rows
                 if row.frame_class == "dropped"
             ]
             log.info("resumed %s with %d keyframes", self.folder.path, len(slam.keyframes))
