@@ -19,7 +19,7 @@ from aquaflow.cli_devices import register as register_devices
 from aquaflow.cli_export import register as register_export
 from aquaflow.cli_prior import register as register_prior
 from aquaflow.cli_record import register as register_record
-from aquaflow.cli_service import map_realtime, tell_finished
+from aquaflow.cli_service import exit_code, map_realtime, tell_finished
 from aquaflow.cli_service import register as register_service
 from aquaflow.cli_stress import register as register_stress
 from aquaflow.errors import AquaFlowError
@@ -27,6 +27,7 @@ from aquaflow.terminal import Json, progress_bars
 
 if TYPE_CHECKING:
     from aquaflow.config import Config
+    from aquaflow.dive_run import Finished
 
 app = typer.Typer(
     help="Onboard mapping for underwater robots: trajectory, Gaussian map, and the water itself.",
@@ -114,10 +115,11 @@ def map_command(
         )
     if as_json:
         typer.echo(json.dumps({"dive": str(replayed.dive), **replayed.metrics}))
-        return
-    _print_summary(replayed.metrics, replayed.notes)
+        raise typer.Exit(exit_code(replayed))
+    _print_summary(replayed)
     shown = [name for name in ("report.html", "map.ply") if (replayed.dive / name).exists()]
     typer.echo(f"Look at {' and '.join(str(replayed.dive / name) for name in shown)}.")
+    raise typer.Exit(exit_code(replayed))
 
 
 @app.command()
@@ -223,7 +225,10 @@ def _configured(path: Path | None, preset: str | None, overrides: dict[str, Any]
     return parse_config(presets.merged(base, overrides), "command line")
 
 
-def _print_summary(metrics: dict[str, Any], notes: list[str]) -> None:
+def _print_summary(finished: Finished) -> None:
+    metrics = finished.metrics
+    for warning in finished.warnings:
+        typer.echo(f"Warning: {warning}.")
     quality = (
         "no held-out frames"
         if metrics["psnr"] is None
@@ -233,7 +238,7 @@ def _print_summary(metrics: dict[str, Any], notes: list[str]) -> None:
         f"{metrics['tracked']} of {metrics['frames']} frames posed, {metrics['keyframes']} "
         f"keyframes, {metrics['gaussians']} Gaussians, {quality}, {metrics['wall_s']:.0f} s."
     )
-    for note in notes:
+    for note in finished.notes:
         typer.echo(f"Note: {note}.")
 
 

@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from aquaflow.service.feed import Feed
 
 
+POOR_RESULT = 3
+"""Exit code of a dive that was written but has warnings: hardly any poses, or an empty map."""
+
+
 def register(app: typer.Typer) -> None:
     """Add the commands to ``app``."""
     app.command()(run)
@@ -139,6 +143,11 @@ def _in_words(value: Any) -> str:
     return "-" if value is None else str(value)
 
 
+def exit_code(finished: Finished) -> int:
+    """0 for a dive as it was asked for, ``POOR_RESULT`` for one with warnings."""
+    return POOR_RESULT if finished.warnings else 0
+
+
 def map_realtime(
     source: Path,
     settings: Config,
@@ -164,16 +173,20 @@ def map_realtime(
 
 
 def tell_finished(finished: Finished | None, as_json: bool) -> None:
+    """Print the summary of a live dive, and end the command with its exit code."""
     if finished is None:
         typer.echo("{}" if as_json else "Nothing was mapped; frames.csv says why.")
         return
     numbers = finished.metrics
     if as_json:
         typer.echo(json.dumps({"dive": str(finished.dive), **numbers}))
-        return
+        raise typer.Exit(exit_code(finished))
+    for warning in finished.warnings:
+        typer.echo(f"Warning: {warning}.")
     typer.echo(
         f"{numbers['tracked']} of {numbers['frames']} frames posed, {numbers['keyframes']} "
         f"keyframes, {numbers['gaussians']} Gaussians in {finished.dive}."
     )
     for note in finished.notes:
         typer.echo(f"Note: {note}.")
+    raise typer.Exit(exit_code(finished))

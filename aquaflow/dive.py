@@ -176,11 +176,13 @@ class DiveFolder:
         if calibration is not None:
             save_camera(calibration, self.path / "calibration.yaml")
 
-    def write_map(self, mapper: Mapper, water: WaterSummary | None, suffix: str = "") -> None:
-        """map.aqf, the exact map; map.ply as seen through water at the median range, map_clear.ply
-        without water, where there is a decoder each Gaussian as the mapped view nearest to it
-        sees it."""
+    def write_map(self, mapper: Mapper, suffix: str = "") -> None:
+        """map.aqf: the exact map."""
         write_map_file(self.path / f"map{suffix}.aqf", mapper)
+
+    def write_splats(self, mapper: Mapper, water: WaterSummary | None, suffix: str = "") -> None:
+        """map.ply as seen through water at the median range, map_clear.ply without water; where
+        there is a decoder, each Gaussian as the mapped view nearest to it sees it."""
         with torch.no_grad():
             plain = mapper.scene.baked(mapper.views)
             clear = radiance(plain["raw_colours"])

@@ -11,22 +11,16 @@ from pathlib import Path
 from typing import Any
 
 from aquaflow.config import Config
+from aquaflow.deliverables import Deliverables
 from aquaflow.dive import TRACE, DiveFolder
 from aquaflow.errors import InputError, NotMappedError
 from aquaflow.frame_rows import FrameRow
 from aquaflow.maps import MIN_VIEWS, Progress
 from aquaflow.messages import CameraModel, Dropped, Frame
-from aquaflow.outcome import (
-    HeldOut,
-    examine_held_out,
-    largest_sub_map,
-    metrics,
-    refined_poses,
-    summarise_water,
-)
+from aquaflow.outcome import SCALE_SOURCE, HeldOut, metrics
 from aquaflow.preparation import Preparation
 from aquaflow.profiler import pace
-from aquaflow.reporting import report_data
+from aquaflow.shortcomings import shortcomings
 from aquaflow.slam import Slam
 from aquaflow.tracking.frames import Tracked
 
@@ -40,6 +34,8 @@ class Finished:
     dive: Path
     metrics: dict[str, Any]
     notes: list[str]
+    warnings: list[str]
+    """Why the result is poor, and what to do; empty for a good one."""
 
 
 class DiveRun:
@@ -62,6 +58,8 @@ class DiveRun:
         self.profiler = slam.profiler
         self.dropped: list[Dropped] = []
         self.notes: list[str] = []
+        self.warnings: list[str] = []
+        self.config = config
         self.live: dict[str, Any] | None = None
         """What a live run says of itself in metrics.json."""
         self.started = time.monotonic()
@@ -83,16 +81,25 @@ class DiveRun:
         """One frame's way, and whose fate it decided; a picture that cannot be prepared costs
         itself, not the dive."""
         begun = time.monotonic()
-        try:
-            with self.profiler.stage("prepare"):
-                prepared = self.preparation(frame)
-        except InputError as error:
-            self.drop(Dropped(frame.index, frame.t_ns, str(error)))
+        prepared = self._prepared(frame)
+        if prepared is None:
             return []
         decided = self.slam.process(prepared)
         self.decide(decided)
         self._time_frame(begun, decided)
         return decided
+
+    def _prepared(self, frame: Frame) -> Frame | None:
+        """None for a picture that cannot be prepared, which is dropped."""
+        reason = "preparation failed, see log.jsonl"
+        contain = self.slam.failures.contain("preparation", frame.index)
+        with self.profiler.stage("prepare"), contain:
+            try:
+                return self.preparation(frame)
+            except InputError as error:
+                reason = str(error)
+        self.drop(Dropped(frame.index, frame.t_ns, reason))
+        return None
 
     def catch_up(self) -> list[Tracked]:
         """A pose for a frame of the past, if one waits; for a moment without a new one."""
@@ -149,7 +156,8 @@ class DiveRun:
         with self.profiler.stage("write"):
             results = self.results
             self._note_what_was_left_out(results, notes)
-            self.folder.write_frames({t.frame.index: t.sub_map for t in results if t.T_wc})
+            with self.slam.failures.contain("writing frames.csv"):
+                self.folder.write_frames({t.frame.index: t.sub_map for t in results if t.T_wc})
         if sum(tracked.T_wc is not None for tracked in results) < MIN_VIEWS:
             raise NotMappedError(self._why_not(len(results)))
         return self._write(results)
@@ -185,41 +193,30 @@ class DiveRun:
         )
 
     def _write(self, results: list[Tracked]) -> Finished:
-        main = largest_sub_map(results)
+        made = Deliverables(self.name, self.folder, self.slam, results, self.calibration)
         with self.profiler.stage("evaluate"):
-            held_out = examine_held_out(self.slam, main)
-            waters = {n: summarise_water(mapper) for n, mapper in self.slam.mappers.items()}
-            water = waters.get(main)
-            poses = refined_poses(self.slam, results)
-        times = {tracked.frame.index: tracked.frame.t_ns * 1e-9 for tracked in results}
+            made.evaluate()
         with self.profiler.stage("write"):
-            self.folder.write_trajectory([times[i] for i in poses], list(poses.values()))
-            assert self.slam.tracker.camera is not None
-            self.folder.write_cameras(self.slam.tracker.camera, self.calibration)
-            for sub_map, mapped in self.slam.mappers.items():
-                suffix = "" if sub_map == main else f"_{sub_map}"
-                self.folder.write_map(mapped, waters[sub_map], suffix)
-            self.folder.write_held_out(held_out)
+            made.write(SCALE_SOURCE)
         with self.profiler.stage("report"):
-            numbers = self._numbers(results, held_out)
-            mapper = self.slam.mappers.get(main)
-            evidence = None if mapper is None else mapper.scene.water_evidence
-            self.folder.write_medium(water, numbers["scale_source"], evidence)
-            self.folder.write_report(
-                report_data(
-                    self.name, self.slam, results, self.dropped, poses, held_out, water,
-                    numbers, self.notes, calibrated=self.calibration is not None,
-                )
-            )  # fmt: skip
-        numbers = self._numbers(results, held_out)  # the report's own time included
-        self.folder.write_json("metrics.json", numbers)
+            numbers = self._numbers(results, made.held_out)
+            notes = self.notes + self.slam.failures.notes()
+            made.write_report(self.dropped, numbers, notes)
+        numbers = self._numbers(results, made.held_out)  # the report's own time included
+        with self.slam.failures.contain("writing metrics.json"):
+            self.folder.write_json("metrics.json", numbers)
         if self._trace:
-            self.folder.write_json(TRACE, self.profiler.chrome_trace())
-        return Finished(self.folder.path, numbers, self.notes)
+            with self.slam.failures.contain(f"writing {TRACE}"):
+                self.folder.write_json(TRACE, self.profiler.chrome_trace())
+        notes = self.notes + self.slam.failures.notes()
+        return Finished(self.folder.path, numbers, notes, self.warnings)
 
     def _numbers(self, results: list[Tracked], held_out: list[HeldOut]) -> dict[str, Any]:
         wall_s = time.monotonic() - self.started
+        gaussians = sum(len(mapper.gaussians) for mapper in self.slam.mappers.values())
+        self.warnings = shortcomings(self.config, self.folder.rows, gaussians)
         numbers = metrics(self.slam, results, self.dropped, held_out, wall_s)
+        numbers["warnings"], numbers["failures"] = self.warnings, self.slam.failures.to_json()
         numbers["cpu_s"] = round(time.process_time() - self._cpu_before_s, 3)  # of all threads
         if self.live is not None:
             numbers["live"] = self.live

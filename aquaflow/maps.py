@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from aquaflow.config import Config
+from aquaflow.failures import Failures
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
 from aquaflow.mapping.following import move_views
@@ -94,30 +95,33 @@ class Maps:
         renderer: Renderer | None = None,
         profiler: Profiler | None = None,
         work: Path | None = None,
+        failures: Failures | None = None,
     ) -> None:
         """What does not fit into memory waits in the folder ``work``, if there is one.
 
-        The renderer is selected by the config if none is given.
+        The renderer is selected by the config if none is given. What a stage raises is counted in
+        ``failures``; the map goes on without it.
         """
         self.config, self.profiler = config, profiler or Profiler()
+        self.failures = failures or Failures()
         self.renderer = renderer or select_renderer(config.mapping.renderer, config.threads)
         self.mappers: dict[int, Mapper] = {}
         self.held_out: dict[int, list[View]] = {}
         self.views = ViewStore(work)
 
     def grow(self, growth: Growth) -> None:
-        self.views.keep(growth.view)
-        with self.profiler.stage("view"):  # now and then a view makes the water be fitted again
-            mapper = self.mapper(growth.sub_map)
-            mapper.add_view(growth.view)
-            group = alike(growth.view, mapper.views)
+        view, mapper = growth.view, self.mapper(growth.sub_map)
+        with self.profiler.stage("view"), self.failures.contain("view", view.frame_index):
+            self.views.keep(view)
+            mapper.add_view(view)  # now and then a view makes the water be fitted again
+            group = alike(view, mapper.views)
             let_surplus_go(mapper.views, group, self.config.mapping.views_per_keyframe)
 
         # Sec. 3.3.3: medium-guided insertion, from this frame and from the keyframe it retires.
         for retired in growth.retired:
             self.insert(retired)
         if growth.pointmap is not None:
-            self.insert(Insertion(growth.view, growth.sub_map, growth.pointmap))
+            self.insert(Insertion(view, growth.sub_map, growth.pointmap))
 
         # Sec. 3.4: joint optimisation of Gaussians and water.
         with self.profiler.stage("optimise"):
@@ -129,8 +133,11 @@ class Maps:
         let_surplus_go(views, views, self.config.mapping.held_out_most)
 
     def insert(self, insertion: Insertion) -> None:
-        with self.profiler.stage("insert"):
-            self.mapper(insertion.sub_map).insert(insertion.view, insertion.pointmap)
+        mapper, frame = self.mapper(insertion.sub_map), insertion.view.frame_index
+        with self.profiler.stage("insert"), self.failures.contain("insertion", frame) as insert:
+            mapper.insert(insertion.view, insertion.pointmap)
+        if insert.failed:
+            mapper.make_whole()
 
     def correct(self, moves: Mapping[int, Sim3], merged: Mapping[int, int]) -> None:
         for mapper in self.mappers.values():
@@ -154,7 +161,7 @@ class Maps:
         """The map of a sub-map, made when first asked for."""
         if sub_map not in self.mappers:
             seed = self.config.seed + sub_map
-            self.mappers[sub_map] = Mapper(self.config.mapping, self.renderer, seed)
+            self.mappers[sub_map] = Mapper(self.config.mapping, self.renderer, seed, self.failures)
         return self.mappers[sub_map]
 
     def close(self, keep: bool = False) -> None:

@@ -31,6 +31,8 @@ PROTOCOL = {
     "ate": "see `aquaflow evaluate`, which knows the truth",
 }
 
+SCALE_SOURCE = "none: the median depth of the first keyframe is 1 map unit"
+
 RANGE_PERCENTILES = (5.0, 95.0)
 
 
@@ -75,11 +77,17 @@ def largest_sub_map(results: list[Tracked]) -> int:
     return max(sorted(set(posed)), key=posed.count, default=0)
 
 
+def tracked_poses(results: list[Tracked]) -> dict[int, Sim3]:
+    """T_wc by frame index, of the frames that have one."""
+    return {tracked.frame.index: tracked.T_wc for tracked in results if tracked.T_wc is not None}
+
+
 def refined_poses(slam: Slam, results: list[Tracked]) -> dict[int, Sim3]:
     """Pose by frame index: as the map refined it where it did, else as it was tracked."""
-    poses = {tracked.frame.index: tracked.T_wc for tracked in results if tracked.T_wc is not None}
+    poses = tracked_poses(results)
     for mapper in slam.mappers.values():
-        poses.update({view.frame_index: view.T_wc for view in mapper.views})
+        refined = {view.frame_index: view.T_wc for view in mapper.views}
+        poses |= {index: T_wc for index, T_wc in refined.items() if T_wc.is_finite()}
     return poses
 
 
@@ -89,12 +97,19 @@ def examine_held_out(slam: Slam, sub_map: int) -> list[HeldOut]:
     if mapper is None or len(mapper.gaussians) == 0:
         return []
     views = sorted(slam.held_out.get(sub_map, []), key=lambda view: view.frame_index)
+    contain, exposure = slam.failures.contain, 1.0
     for view in views:
-        mapper.register(view)
-    exposure = common_exposure(
-        restored_picture(mapper.scene, view, mapper.show(view)) for view in views
-    )
-    return [_examine(mapper, view, exposure) for view in views]
+        with contain("held-out pose", view.frame_index):
+            mapper.register(view)
+    with contain("restored exposure"):
+        exposure = common_exposure(
+            restored_picture(mapper.scene, view, mapper.show(view)) for view in views
+        )
+    examined = []
+    for view in views:
+        with contain("evaluation", view.frame_index):
+            examined.append(_examine(mapper, view, exposure))
+    return examined
 
 
 def _examine(mapper: Mapper, view: View, exposure: float) -> HeldOut:
@@ -194,7 +209,7 @@ def metrics(
         "ate_rmse_m_se3": None,
         "ate_rmse_m_sim3": None,
         "rpe": None,
-        "scale_source": "none: the median depth of the first keyframe is 1 map unit",
+        "scale_source": SCALE_SOURCE,
         "renderer": f"{slam.renderer.name} ({slam.renderer.isa}, {slam.renderer.threads} threads)",
         "prior": slam.prior.name,
         "device": "cpu",

@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
 
-from aquaflow.config import Config
+from aquaflow.config import Config, SourceConfig
 from aquaflow.dive import DiveFolder
 from aquaflow.dive_run import DiveRun, Finished
 from aquaflow.errors import NotMappedError
-from aquaflow.messages import CameraModel, Dropped
+from aquaflow.messages import CameraModel, Dropped, Frame
 from aquaflow.profiler import Profiler
 from aquaflow.slam import Slam
 from aquaflow.sources import RecordedCamera
 
 Progress = Callable[[str, int, int | None], None]
 """Called with the stage, the steps done and, where known, the steps there are."""
+
+
+MOST_UNREADABLE = 5
+"""Frames in a row that a recording fails on until the rest is given up."""
 
 
 def map_recording(
@@ -47,7 +51,8 @@ def map_recording(
         try:
             return _replay(run, recording, config, progress or (lambda stage, done, total: None))
         finally:
-            slam.close()
+            with slam.failures.contain("closing"):
+                slam.close()
     finally:
         folder.close()
         recording.close()
@@ -60,19 +65,14 @@ def _replay(
     stop = count if source.stop is None else min(source.stop, count or source.stop)
     total = None if stop is None else len(range(source.start, stop, source.every))
     done = 0
-    profile = run.profiler.stage
-    frames = recording.frames(source.every, source.start, source.stop)
-    while True:
-        with profile("read"):
-            frame = next(frames, None)
-        if frame is None:
-            break
+    contain = run.slam.failures.contain
+    for frame in _frames(run, recording, source):
         done += 1
         if isinstance(frame, Dropped):
             run.drop(frame)
         else:
             run.frame(frame)
-        with profile("progress"):
+        with run.profiler.stage("progress"), contain("progress"):
             progress("map", done, total)
     if done == 0:
         end = "the end" if source.stop is None else f"--stop {source.stop}"
@@ -81,6 +81,35 @@ def _replay(
             f"{run.name}: none{known} lies between --start {source.start} and {end}"
         )
     return run.finish(recording.notes, lambda done, total: progress("refine", done, total))
+
+
+def _frames(
+    run: DiveRun, recording: RecordedCamera, source: SourceConfig
+) -> Iterator[Frame | Dropped]:
+    """The frames to map; after one that the recording fails on, reading goes on with the next.
+
+    Raises:
+        Exception: the recording fails before its first frame; whatever its reader raised.
+    """
+    start, t_ns, failed_in_a_row, any_read = source.start, 0, 0, False
+    frames = recording.frames(source.every, start, source.stop)
+    while failed_in_a_row < MOST_UNREADABLE:
+        with run.profiler.stage("read"), run.slam.failures.contain("reading", start) as reading:
+            frame = next(frames, None)
+        if reading.error is not None:
+            if not any_read:
+                raise reading.error
+            failed_in_a_row += 1
+            yield Dropped(start, t_ns, "reading failed, see log.jsonl")
+            start += source.every
+            frames = recording.frames(source.every, start, source.stop)
+            continue
+        if frame is None:
+            return
+        any_read, failed_in_a_row = True, 0
+        start, t_ns = frame.index + source.every, frame.t_ns
+        yield frame
+    run.notes.append(f"{run.name} could not be read after frame {start}; the dive ends there")
 
 
 def fix_threads(threads: int) -> None:

@@ -45,6 +45,7 @@ def report_data(
         examples=_examples(held_out),
         medium=_curves(water),
         stages=metrics["stage_ms"],
+        warnings=metrics["warnings"],
         notes=notes,
     )
 

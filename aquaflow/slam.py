@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from aquaflow.config import Config
 from aquaflow.errors import ConfigError
+from aquaflow.failures import Failures
 from aquaflow.frame_table import FrameTable
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
@@ -20,11 +21,21 @@ from aquaflow.messages import Frame
 from aquaflow.prior.choice import make_prior
 from aquaflow.profiler import Profiler
 from aquaflow.render import select_renderer
-from aquaflow.tracking.frames import FrameClass, Tracked
-from aquaflow.tracking.gate import FrameGate, Verdict
+from aquaflow.tracking.frames import FrameClass, Tracked, without_pictures
+from aquaflow.tracking.gate import FrameGate, GateKind, Verdict
 from aquaflow.tracking.keyframe_graph import KeyframeGraph
 from aquaflow.tracking.places import Places
 from aquaflow.tracking.tracker import Tracker
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """A frame that passed the gate and is not finished."""
+
+    used_before: int
+    """Frames that passed the gate before it."""
+    frame: Frame
+    """Without its pictures."""
 
 
 class Slam:
@@ -37,11 +48,13 @@ class Slam:
         work: Path | None = None,
         live: bool = False,
         maps: MapWork | None = None,
+        failures: Failures | None = None,
     ) -> None:
         """What does not fit into memory waits in the folder ``work``, if there is one.
 
         A ``live`` run takes over an optimised keyframe graph as soon as it is there; a replay waits
-        for it at the next keyframe, and so repeats bit for bit. ``maps`` may do their work beside.
+        for it at the next keyframe, and so repeats bit for bit. ``maps`` may do their work in
+        another thread. What a stage raises is counted in ``failures`` and costs that stage.
 
         Raises:
             ConfigError: the prior cannot give what the config asks tracking for.
@@ -53,16 +66,19 @@ class Slam:
             )
         self.config = config
         self.profiler = profiler or Profiler()
+        self.failures = failures or Failures()
         self.prior = make_prior(config.prior)
         if live:
             self.prior.warm_up()
         self.keyframes = KeyframeStore(work, self.prior)
         places = Places(self.keyframes, config.tracking)
         self.gate = FrameGate(config.tracking.gate)
-        self.tracker = Tracker(self.prior, self.keyframes, config.tracking, places, live)
-        self.graph = KeyframeGraph(self.keyframes, places, config.tracking)
+        self.tracker = Tracker(
+            self.prior, self.keyframes, config.tracking, places, live, self.failures
+        )
+        self.graph = KeyframeGraph(self.keyframes, places, config.tracking, self.failures)
         self.renderer = select_renderer(config.mapping.renderer, config.threads or os.cpu_count())
-        self.maps: MapWork = maps or Maps(config, self.renderer, self.profiler, work)
+        self.maps: MapWork = maps or Maps(config, self.renderer, self.profiler, work, self.failures)
         self.skipped: Counter[str] = Counter()
         """Frames that the gate kept from tracking, by its reason's kind."""
         self._live = live
@@ -70,8 +86,8 @@ class Slam:
         """All frames whose fate is known, in the order in which it was decided."""
         self.used = 0
         """Frames that passed the gate so far."""
-        self._sequence: dict[int, int] = {}
-        """By frame index, while the frame's fate is open: the frames used before it."""
+        self._waiting: dict[int, Waiting] = {}
+        """By index, the frames that passed the gate and are not finished."""
         self._latest: tuple[Tracked, Sim3] | None = None
         """The frame placed last, if it has a pose, and that against its keyframe, T_kf."""
         self._keyframe_views: dict[int, View] = {}
@@ -83,16 +99,19 @@ class Slam:
             self._correct(wait=False)
 
         # Not in the paper: is the frame worth looking at (DESIGN section 6)?
-        with self.profiler.stage("gate"):
+        verdict = Verdict(GateKind.PASS)
+        with self.profiler.stage("gate"), self.failures.contain("frame gate", frame.index):
             verdict = self.gate.judge(frame.image, frame.mask)
         if not verdict.passed:
             return [self._skip(frame, verdict)]
-        self._sequence[frame.index] = self.used
+        self._waiting[frame.index] = Waiting(self.used, without_pictures(frame))
         self.used += 1
 
         # Sec. 3.1 and 3.2: two-view prior, Sim(3) pose against the keyframe, frame class.
-        with self.profiler.stage("track"):
+        with self.profiler.stage("track"), self.failures.contain("tracking", frame.index) as run:
             decided = self.tracker.track(frame)
+        if run.failed:
+            decided = [self._as_lost(frame)]
         if self.tracker.lost:
             self.gate.forget()
 
@@ -102,8 +121,8 @@ class Slam:
 
     def catch_up(self) -> list[Tracked]:
         """In a live run's idle moments: poses of the past, which waited for a map (Sec. 3.2)."""
-        newest = self._latest
-        with self.profiler.stage("back-fill"):
+        newest, decided = self._latest, []
+        with self.profiler.stage("back-fill"), self.failures.contain("back-filling"):
             decided = self.tracker.back_fill()
         placed = self._place_all(decided)
         self._latest = newest
@@ -111,14 +130,17 @@ class Slam:
 
     def finish(self, progress: Callable[[int, int], None] | None = None) -> list[Tracked]:
         """After the last frame: what is still undecided, the last keyframes, the refinement."""
-        with self.profiler.stage("track"):
+        decided: list[Tracked] = []
+        with self.profiler.stage("track"), self.failures.contain("tracking"):
             decided = self.tracker.finish()
         placed = self._place_all(decided)
+        placed += self._place_all([self._as_lost(left.frame) for left in self._left()])
         while self.graph.optimising:
             self._correct(wait=True)
         for insertion in self._retired_keyframes():
             self.maps.insert(insertion)
-        self.maps.refine(progress)
+        with self.failures.contain("refinement"):
+            self.maps.refine(progress)
         settled = self.results(len(self.frames) - len(placed))
         return [
             replace(tracked, T_wc=now.T_wc, sub_map=now.sub_map)
@@ -151,12 +173,22 @@ class Slam:
 
     def _place_all(self, decided: list[Tracked]) -> list[Tracked]:
         """Anchor all frames before a loop among them moves the keyframes that they hang on."""
+        # A frame on which a stage failed may be known already.
+        decided = [tracked for tracked in decided if tracked.frame.index in self._waiting]
         anchors = [self._anchor(tracked) for tracked in decided]
         placed = [self._place(*each) for each in zip(decided, anchors, strict=True)]
         for tracked, T_kf in zip(placed, anchors, strict=True):
-            self._sequence.pop(tracked.frame.index, None)
+            self._waiting.pop(tracked.frame.index, None)
             self.frames.add(tracked, T_kf)
         return placed
+
+    def _left(self) -> list[Waiting]:
+        """Frames that tracking no longer has: a stage failed that held them."""
+        return list(self._waiting.values())
+
+    def _as_lost(self, frame: Frame) -> Tracked:
+        reason = self.failures.reason(frame.index) or "tracking failed"
+        return Tracked.lost(frame, self.tracker.sub_map, reason)
 
     def _anchor(self, tracked: Tracked) -> Sim3 | None:
         """The pose against the frame's keyframe, T_kf, which later corrections leave."""
@@ -172,12 +204,14 @@ class Slam:
         if tracked.frame_class is FrameClass.KEYFRAME:
             if not self._live:
                 self._correct(wait=True)
-            with self.profiler.stage("graph"):
+            index = tracked.frame.index
+            with self.profiler.stage("graph"), self.failures.contain("keyframe graph", index):
                 self.graph.add(tracked.keyframe, tracked.link)
         settled = self._settled(tracked, T_kf)
         self._latest = settled, T_kf
         if self.config.mapping.enabled:
-            self._map(settled)
+            with self.failures.contain("mapping", settled.frame.index):
+                self._map(settled)
         return settled
 
     def _skip(self, frame: Frame, verdict: Verdict) -> Tracked:
@@ -200,7 +234,8 @@ class Slam:
         with self.profiler.stage("correct"):
             correction = self.graph.correction(wait)
         if correction.moves:
-            self.maps.correct(correction.moves, correction.merged)
+            with self.failures.contain("correction of the map"):
+                self.maps.correct(correction.moves, correction.merged)
 
     def results(self, first: int = 0) -> list[Tracked]:
         """All frames whose fate is known, from the ``first`` decided on, without pictures and
@@ -229,7 +264,7 @@ class Slam:
 
     def is_held_out(self, frame: Frame) -> bool:
         """i % n == 0 and i != 0, i counting the frames that were used (DESIGN section 4)."""
-        every, i = self.config.mapping.hold_out_every, self._sequence[frame.index]
+        every, i = self.config.mapping.hold_out_every, self._waiting[frame.index].used_before
         return every > 0 and i != 0 and i % every == 0
 
     def _retired_keyframes(self) -> list[Insertion]:

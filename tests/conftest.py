@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -10,6 +11,9 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+# What a stage raises ends a test: a contained defect would stay hidden (aquaflow/failures.py).
+os.environ["AQUAFLOW_STRICT"] = "1"
 
 # A machine that does other work meanwhile is slow, not wrong.
 settings.register_profile("aquaflow", deadline=None)
@@ -57,6 +61,12 @@ def refused(ran: Ran, *named: object) -> None:
     assert line.startswith("aquaflow: ")
     for name in named:
         assert str(name) in line
+
+
+@pytest.fixture
+def contained(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Failures are contained, as in the field."""
+    monkeypatch.setenv("AQUAFLOW_STRICT", "0")
 
 
 @pytest.fixture(scope="session")

@@ -19,6 +19,7 @@ FLOORS = (
     {"evaluation", "service", "doctor"},
     {"pipeline", "viewer"},
     {"dive_run"},
+    {"deliverables", "shortcomings"},
     {"reporting"},
     {"dive"},
     {"frame_rows"},
@@ -33,6 +34,7 @@ FLOORS = (
     {"prior", "messages", "vehicle_words"},
     {"presets", "access", "stopping", "plain_arrays"},
     {"render", "geometry", "config", "profiler", "spill", "dive_log"},
+    {"failures"},
     {"errors"},
     {"aquaflow"},
 )

@@ -61,34 +61,43 @@ class GaussianMap:
 
     def extend(self, new: Mapping[str, Tensor], keyframe: int) -> None:
         """Append Gaussians (tensors by the names above) that ``keyframe`` saw."""
-        count = len(new["means"])
-        for name in self.NAMES:
-            self.parameters[name] = torch.cat([self.parameters[name], new[name]]).contiguous()
-        owner = torch.full((count,), keyframe, dtype=torch.int64)
-        self.keyframes = torch.cat([self.keyframes, owner])
-        self._extend_features(count)
+        self._grow(new, torch.full((len(new["means"]),), keyframe, dtype=torch.int64))
 
     def append(self, other: GaussianMap) -> None:
         """Append all Gaussians of ``other``, which keep their keyframes but not their features."""
-        for name in self.NAMES:
-            both = [self.parameters[name], other.parameters[name]]
-            self.parameters[name] = torch.cat(both).contiguous()
-        self.keyframes = torch.cat([self.keyframes, other.keyframes])
-        self._extend_features(len(other))
+        self._grow(other.parameters, other.keyframes)
 
     def keep(
         self,
         mask: Tensor,  # [N] bool
     ) -> None:
         """Drop the Gaussians where ``mask`` is False."""
-        for name in self.NAMES:
-            self.parameters[name] = self.parameters[name][mask].contiguous()
-        self.keyframes = self.keyframes[mask]
-        self.local_features = self.local_features[mask].contiguous()
+        self._replace(
+            {name: self.parameters[name][mask].contiguous() for name in self.NAMES},
+            self.keyframes[mask],
+            self.local_features[mask].contiguous(),
+        )
 
-    def _extend_features(self, count: int) -> None:
-        new = self.local_features.new_zeros(count, self.local_features.shape[1])
-        self.local_features = torch.cat([self.local_features, new]).contiguous()
+    def _grow(
+        self,
+        new: Mapping[str, Tensor],  # each [M, ...]
+        keyframes: Tensor,  # [M] int64
+    ) -> None:
+        features = self.local_features.new_zeros(len(keyframes), self.local_features.shape[1])
+        self._replace(
+            {n: torch.cat([self.parameters[n], new[n]]).contiguous() for n in self.NAMES},
+            torch.cat([self.keyframes, keyframes]),
+            torch.cat([self.local_features, features]).contiguous(),
+        )
+
+    def _replace(
+        self,
+        parameters: dict[str, Tensor],
+        keyframes: Tensor,  # [N] int64
+        features: Tensor,  # [N, F]
+    ) -> None:
+        """All tables at once, when all are made: a failure leaves them as they were."""
+        self.parameters, self.keyframes, self.local_features = parameters, keyframes, features
 
 
 def radiance(

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from aquaflow.config import MappingConfig
+from aquaflow.failures import Failures
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
 from aquaflow.mapping.attention import look, tiles_to_draw
@@ -40,6 +41,10 @@ from aquaflow.render.contract import Renderer
 log = logging.getLogger(__name__)
 
 
+MOST_FAILED_STEPS = 10
+"""Steps in a row that raise until the final refinement gives up: the next would, too."""
+
+
 def is_number(value: Tensor) -> bool:
     """True if a loss or a norm may be acted on."""
     return bool(torch.isfinite(value))
@@ -48,20 +53,26 @@ def is_number(value: Tensor) -> bool:
 class Mapper:
     """Owns the Gaussians, the medium, their optimisers and the views of one sub-map."""
 
-    def __init__(self, config: MappingConfig, renderer: Renderer, seed: int) -> None:
+    def __init__(
+        self,
+        config: MappingConfig,
+        renderer: Renderer,
+        seed: int,
+        failures: Failures | None = None,
+    ) -> None:
+        """What a fit or a step raises is counted in ``failures`` and skipped."""
         self.config, self.renderer = config, renderer
+        self.failures = failures or Failures()
         self._random = torch.Generator().manual_seed(seed)
         self.scene = Scene(config.medium, renderer, self._random, config.sunlight)
         self.views: list[View] = []
         self.steps = 0
+        self._failed_in_a_row = 0
+        """Steps that raised, since the last one that did not."""
         self.undone = 0
         """Steps that were undone because their loss or gradient was not finite."""
         rates = config.optimiser
-        self._optimiser = SelectiveAdam(
-            {name: (tensor, getattr(rates, name)) for name, tensor in self._parameters.items()},
-            rates.betas,
-            threads=renderer.threads,
-        )
+        self._optimiser = self._new_optimiser()
         if config.decoder.enabled:
             drawn = torch.Generator().manual_seed(seed)  # its own: insertion is as without it
             self.scene.neural = NeuralGaussians(
@@ -71,6 +82,11 @@ class Mapper:
         self._next_water_fit = config.medium.first_fit_views
         self._objective = Objective(config.loss, renderer.threads)
 
+    def _new_optimiser(self) -> SelectiveAdam:
+        rates = self.config.optimiser
+        groups = {name: (tensor, getattr(rates, name)) for name, tensor in self._parameters.items()}
+        return SelectiveAdam(groups, rates.betas, threads=self.renderer.threads)
+
     # --- growing ------------------------------------------------------------------------------
 
     def add_view(self, view: View) -> None:
@@ -79,9 +95,9 @@ class Mapper:
             view.log_gain, view.light = self.views[-1].log_gain, self.views[-1].light
         self.views.append(view)
         if len(self.views) >= self._next_water_fit:
+            self._next_water_fit *= 2
             self.fit_water()
             self.scene.sunlight.judge(in_time(self.views))
-            self._next_water_fit *= 2
 
     @torch.no_grad()
     def insert(self, view: View, pointmap: Pointmap) -> int:
@@ -133,7 +149,9 @@ class Mapper:
         """Estimate the water from views spread over the dive so far."""
         count, views = self.config.medium.fit_views, in_time(self.views)
         chosen = np.linspace(0, len(views) - 1, min(count, len(views))).astype(int)
-        estimate = self.scene.fit_water([views[i] for i in chosen], self._random, views)
+        estimate = None
+        with self.failures.contain("water fit"):
+            estimate = self.scene.fit_water([views[i] for i in chosen], self._random, views)
         if estimate is not None:
             log.info(
                 "water fitted: %s, beta_a %s per map unit (relative sigma %s)",
@@ -178,7 +196,7 @@ class Mapper:
         chosen = sampled_views(self.views, steps, share, self._random)
         with self.scene.learning_from(chosen):
             for view in chosen:
-                self._step(view, refine_poses=False)
+                self._contained_step("optimisation", view, refine_poses=False)
 
     def refine(self, progress: Callable[[int, int], None] | None = None) -> None:
         """The final refinement: all views in random order, rates falling, poses included."""
@@ -196,9 +214,18 @@ class Mapper:
                 self._optimiser.learning_rates["means"] = self.config.optimiser.means * factor
                 if self.neural is not None:
                     self.neural.slow_down(factor)
-                self._step(view, refine_poses=self.config.optimiser.poses > 0.0)
+                self._contained_step("refinement", view, self.config.optimiser.poses > 0.0)
+                if self._failed_in_a_row == MOST_FAILED_STEPS:
+                    break
                 if progress is not None:
                     progress(step + 1, steps)
+
+    def _contained_step(self, stage: str, view: View, refine_poses: bool) -> None:
+        with self.failures.contain(stage, view.frame_index) as step:
+            self._step(view, refine_poses)
+        self._failed_in_a_row = self._failed_in_a_row + 1 if step.failed else 0
+        if step.failed:
+            self.make_whole()
 
     def _step(self, view: View, refine_poses: bool) -> None:
         """Render, compare, differentiate, move; undone when anything is not finite."""
@@ -265,6 +292,13 @@ class Mapper:
         for tensor in self._parameters.values():
             sound &= torch.isfinite(tensor).all(dim=-1)
         self._keep(sound)
+
+    def make_whole(self) -> None:
+        """After a failure: every row of the optimiser belongs to a Gaussian, and all are finite."""
+        if len(self._optimiser.steps) != len(self.gaussians):
+            self._optimiser = self._new_optimiser()
+        self._optimiser.bind(self._parameters)
+        self._drop_unsound()
 
     def _keep(self, keep: Tensor) -> None:
         """Drop the Gaussians where ``keep`` [N] is False, their optimiser state with them."""

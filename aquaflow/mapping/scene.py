@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -207,8 +208,23 @@ class Scene:
             self.config.priors,
         )
         if estimate is not None:
-            self._adopt(estimate, views, views if dive is None else dive)
+            with self._unchanged_by_failure():
+                self._adopt(estimate, views, views if dive is None else dive)
         return estimate
+
+    @contextmanager
+    def _unchanged_by_failure(self) -> Iterator[None]:
+        """The water as it was, if the block raises: half of a new one fits no picture."""
+        medium, active = copy.deepcopy(self.medium.state_dict()), self.medium.active
+        before = (self.shading, self.exposes, self.beta_a_sigma, self.water_evidence)
+        try:
+            yield
+        except Exception:
+            self.medium.load_state_dict(medium)
+            self.medium.active = active
+            self.shading, self.exposes, self.beta_a_sigma, self.water_evidence = before
+            self._gains.clear()
+            raise
 
     @torch.no_grad()
     def _adopt(self, estimate: WaterEstimate, fitted: Sequence[View], dive: Sequence[View]) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
@@ -87,20 +87,20 @@ class SelectiveAdam:
 
     def extend(self, n_new: int) -> None:
         """Add state for ``n_new`` rows at the end, at step 0; then ``bind`` the grown tensors."""
-        self.steps = torch.cat([self.steps, self.steps.new_zeros(n_new)])
-        for moments in (self.first_moments, self.second_moments):
-            for name, moment in moments.items():
-                moments[name] = torch.cat([moment, moment.new_zeros(n_new, *moment.shape[1:])])
+        self._replace(lambda state: torch.cat([state, state.new_zeros(n_new, *state.shape[1:])]))
 
     def keep(
         self,
         mask: Tensor,  # [N] bool
     ) -> None:
         """Drop the state of rows where ``mask`` is False; then ``bind`` the pruned tensors."""
-        self.steps = self.steps[mask]
-        for moments in (self.first_moments, self.second_moments):
-            for name, moment in moments.items():
-                moments[name] = moment[mask]
+        self._replace(lambda state: state[mask])
+
+    def _replace(self, change: Callable[[Tensor], Tensor]) -> None:
+        """All state at once, when all of it is made: a failure leaves it as it was."""
+        first = {name: change(moment) for name, moment in self.first_moments.items()}
+        second = {name: change(moment) for name, moment in self.second_moments.items()}
+        self.steps, self.first_moments, self.second_moments = change(self.steps), first, second
 
     def bind(self, params: Mapping[str, Tensor]) -> None:
         """Replace the tensors named in ``params``; raises AquaFlowError if they do not fit."""

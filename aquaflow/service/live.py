@@ -119,6 +119,7 @@ class LiveLoop:
             "mapping_failures": self.maps.failures,
             "mapping_waits": self.maps.waiting,
             "mapping_rests": self.maps.rests,
+            "stage_failures": self.run_.slam.failures.to_json(),
         }
 
     # --- one frame ------------------------------------------------------------------------------
@@ -180,12 +181,17 @@ class LiveLoop:
 
     def _tend(self) -> None:
         self.beats.beat(STAGE)
-        self.ladder.look(self._need)
-        self.counters.look()
-        self.health.set(*judged(self._facts()))
+        contain = self.run_.slam.failures.contain
+        with contain("resource check"):
+            self.ladder.look(self._need)
+            self.counters.look()
+        with contain("health state"):
+            self.health.set(*judged(self._facts()))
         for watch in self.watchers:
-            watch(self)
-        self._tell()
+            with contain(f"service: {getattr(watch, '__qualname__', type(watch).__name__)}"):
+                watch(self)
+        with contain("notification of systemd"):
+            self._tell()
 
     def _need(self) -> str | None:
         self.pressure = self._read_pressure()
@@ -212,6 +218,7 @@ class LiveLoop:
             troubles.append(f"disk full: {self.pressure.disk_free_mb:.0f} MB left")
         if self.maps.failing:
             troubles.append(f"mapping fails: {self.maps.last_failure}")
+        troubles += self.run_.slam.failures.repeated()
         for name, device in devices.items():
             if device["kind"] == "link" and device["state"] != "connected":
                 troubles.append(f"link '{name}': {device['state']}")

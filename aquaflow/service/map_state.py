@@ -38,6 +38,7 @@ def put_together(maps: Maps, facts: dict[str, Any], arrays: Arrays) -> None:
     for number, values in facts["maps"].items():
         parts = under(f"map{number}", arrays)
         mapper = map_state.put_together(values, parts, maps.renderer)
+        mapper.failures = maps.failures
         mapper.views = maps.views.adopt(mapper.views)
         maps.mappers[int(number)] = mapper
     for number, values in facts["held_out"].items():

@@ -203,14 +203,14 @@ class MapThread:
             return self._jobs.popleft() if self._jobs else None
 
     def _do(self, name: str, job: Job) -> None:
+        # A request that fails (a GPU that is gone, a file that cannot be read) is skipped; so is
+        # one for which the memory or the disk is full: this thread has nobody to hand it to.
         try:
             job(self._maps)
             self.failing = False
-        # A request that fails (a GPU that is gone, a file that cannot be read) costs itself.
         except Exception as error:
-            said, self.last_failure = self.last_failure, f"{name}: {error}"
-            if not self.failing or self.last_failure != said:  # what goes on failing is said once
-                log.exception("mapping failed to %s", name)
+            self._maps.failures.record(f"map: {name}", error)
+            self.last_failure = f"{name}: {error}"
             self.failures, self.failing = self.failures + 1, True
 
     def _wanting(self) -> Mapper | None:

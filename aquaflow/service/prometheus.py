@@ -53,6 +53,11 @@ def _lines(report: Mapping[str, Any]) -> Iterator[str]:
         "left_out_total", "reason", report["left_out_of_the_map"], "Frames that the map never saw."
     )
     yield from _labelled("state_visits_total", "state", report["visits"], "Times in each state.")
+    yield from _head("stage_failures_total", "counter", "Failures of a stage, by exception.")
+    for kind in report["stage_failures"]:
+        labels = f'stage="{_escaped(kind["stage"])}",error="{_escaped(kind["error"])}"'
+        labels += f',place="{_escaped(kind["place"])}"'
+        yield f"aquaflow_stage_failures_total{{{labels}}} {kind['count']}"
     yield from _labelled(
         "stage_share", "stage", report["stage_shares"], "Seconds per second in a stage.", "gauge"
     )
@@ -63,8 +68,11 @@ def _labelled(
 ) -> Iterator[str]:
     yield from _head(name, kind, help_text)
     for value, number in values.items():
-        escaped = value.replace("\\", r"\\").replace('"', r"\"").replace("\n", " ")
-        yield f'aquaflow_{name}{{{label}="{escaped}"}} {number}'
+        yield f'aquaflow_{name}{{{label}="{_escaped(value)}"}} {number}'
+
+
+def _escaped(value: str) -> str:
+    return value.replace("\\", r"\\").replace('"', r"\"").replace("\n", " ")
 
 
 def _head(name: str, kind: str, help_text: str) -> Iterator[str]:

@@ -15,6 +15,7 @@ from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive import CHECKPOINT, DiveFolder
 from aquaflow.dive_run import DiveRun, Finished
 from aquaflow.errors import AquaFlowError, InputError, NotMappedError
+from aquaflow.failures import Failures
 from aquaflow.maps import Maps, Progress
 from aquaflow.messages import Dropped
 from aquaflow.pipeline import fix_threads
@@ -89,9 +90,10 @@ class LiveDive:
         # A core is left for tracking, where there is more than one.
         threads = config.threads or max(1, (os.cpu_count() or 1) - 1)
         renderer = select_renderer(config.mapping.renderer, threads)
-        maps = Maps(config, renderer, profiler, self.folder.work)
+        failures = Failures()
+        maps = Maps(config, renderer, profiler, self.folder.work, failures)
         thread = MapThread(maps, service.mapping, self._beats, lambda: self._ladder.level)
-        slam = Slam(config, profiler, self.folder.work, live=True, maps=thread)
+        slam = Slam(config, profiler, self.folder.work, True, thread, failures)
         run = DiveRun(name, self.folder, config, slam, feed.calibration, feed.name_of)
         continued = Continued()
         if choice.checkpoint is not None:
@@ -133,10 +135,14 @@ class LiveDive:
         source_ended = not parts.loop.stopping.is_set()
         parts.loop.stop("the recording ended" if source_ended else "told to stop")
         self._notifier.more_time(FINISHING_S)
+        contain = parts.slam.failures.contain
         if not source_ended:
-            parts.checkpointer.take()
-        self.feed.close()
-        parts.run.live = parts.loop.status()
+            with contain("checkpoint"):
+                parts.checkpointer.take()
+        with contain("closing of the source"):
+            self.feed.close()
+        with contain("service counters"):
+            parts.run.live = parts.loop.status()
         try:
             finished = parts.run.finish(self.feed.notes, progress)
         except NotMappedError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from aquaflow.failures import Failures
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.messages import Frame
 from aquaflow.prior.contract import Prior
@@ -21,18 +22,21 @@ class BackFill:
         camera: CameraModel,
         prior: Prior,
         follower: Follower,
+        failures: Failures,
     ) -> None:
         """``at``: where the newest of the frames, which come oldest first, is looked for."""
         self.frames = frames
         """What is left."""
         self._at, self._camera = replace(at), camera
-        self._prior, self._follower = prior, follower
+        self._prior, self._follower, self._failures = prior, follower, failures
 
     def step(self) -> Tracked:
         """The newest frame that is left, with its pose if it has one."""
         frame, at = self.frames.pop(), self._at
-        encoding = self._prior.encode(frame.image, self._camera)
-        solved = self._follower.place(at, encoding, self._camera)
+        solved = None
+        with self._failures.contain("pose", frame.index):
+            encoding = self._prior.encode(frame.image, self._camera)
+            solved = self._follower.place(at, encoding, self._camera)
         if solved is None:
             return Tracked.lost(frame, at.keyframe.sub_map)
         at.T_fk = solved.estimate.T

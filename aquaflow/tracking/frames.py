@@ -70,5 +70,10 @@ class Tracked:
 
     def bare(self) -> Tracked:
         """Itself without picture and pointmap: what a long dive can keep of every frame."""
-        nothing = np.empty((0, 0, 3), np.uint8)
-        return replace(self, frame=replace(self.frame, image=nothing, mask=None), pointmap=None)
+        return replace(self, frame=without_pictures(self.frame), pointmap=None)
+
+
+def without_pictures(frame: Frame) -> Frame:
+    """A frame's index, times and camera: its picture and mask are empty."""
+    nothing = np.empty((0, 0, 3), np.uint8)
+    return replace(frame, image=nothing, mask=None, encoded=None)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from aquaflow.config import TrackingConfig
+from aquaflow.failures import Failures
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.keyframes import Keyframe, KeyframeStore
@@ -40,8 +41,15 @@ class KeyframeGraph:
     To be used from one thread: nothing changes but in ``add`` and ``correction``.
     """
 
-    def __init__(self, keyframes: KeyframeStore, places: Places, config: TrackingConfig) -> None:
+    def __init__(
+        self,
+        keyframes: KeyframeStore,
+        places: Places,
+        config: TrackingConfig,
+        failures: Failures | None = None,
+    ) -> None:
         self.graph = PoseGraph(config.graph)
+        self._failures = failures or Failures()
         self._keyframes, self._places, self._config = keyframes, places, config.graph
         self.loops = 0
         """Loop edges found."""
@@ -73,8 +81,10 @@ class KeyframeGraph:
             information = edge_information(link.covariance, sigma, link.T_fk)
             self.graph.add_edge(Edge(number, link.keyframe, link.T_fk, information))
         if self._config.enabled:
-            self._close_loops(keyframe)
-        self._places.add(keyframe)
+            with self._failures.contain("loop search", keyframe.frame_index):
+                self._close_loops(keyframe)
+        with self._failures.contain("place index", keyframe.frame_index):
+            self._places.add(keyframe)
         self._optimise()
 
     def resume(self, graph: PoseGraph, loops: int) -> None:
@@ -87,14 +97,16 @@ class KeyframeGraph:
     def correction(self, wait: bool) -> Correction:
         """What the optimisation found, once; nothing if there is none, or it is still at work.
 
-        With ``wait`` its end is waited for. What was raised in its thread is raised here.
+        With ``wait`` its end is waited for. What was raised in its thread counts as a failure here.
         """
         if self._optimisation is None or not (wait or self._optimisation.done()):
             return Correction()
         finished, self._optimisation = self._optimisation, None
-        result = self.graph.apply(finished.result())
-        assert result is not None  # nobody else applies
-        correction = self._taken_over(result)
+        correction = Correction()
+        with self._failures.contain("graph optimisation"):
+            result = self.graph.apply(finished.result())
+            assert result is not None  # nobody else applies
+            correction = self._taken_over(result)
         self._optimise()
         return correction
 

@@ -6,6 +6,7 @@ from collections import deque
 from dataclasses import replace
 
 from aquaflow.config import TrackingConfig
+from aquaflow.failures import Failures
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
@@ -34,11 +35,13 @@ class Tracker:
         config: TrackingConfig,
         places: Places | None = None,
         live: bool = False,
+        failures: Failures | None = None,
     ) -> None:
         """Without ``places``, what was lost is never found again, only begun anew.
 
         Once a map has started, or a place was found again, the frames that waited for it get their
         poses at once, or, in a ``live`` run, whenever there is time: see :meth:`back_fill`.
+        What raises is counted in ``failures``, and the frame is one that could not be placed.
         """
         self.sub_map = 0
         self.camera: CameraModel | None = None
@@ -46,6 +49,7 @@ class Tracker:
         self.focal_sigma = 0.0
         self._prior, self._keyframes, self._config = prior, keyframes, config
         self._places, self._follower = places, Follower(prior, keyframes, config)
+        self._failures = failures or Failures()
         self._sub_maps = 1
         self._initialiser: Initialiser | None = None
         self._orphans: list[Frame] = []
@@ -58,7 +62,9 @@ class Tracker:
 
     def track(self, frame: Frame) -> list[Tracked]:
         """Poses that this frame makes known: none while waiting, several when waiting ends."""
-        encoding = self._prior.encode(frame.image, self.camera or frame.camera)
+        encoding = self._encode(frame)
+        if encoding is None:
+            return [self._as_lost(frame)]
         if self._at is None:
             return self._find_again(frame, encoding) or self._initialise(frame, encoding)
         tracked = self._follow(frame, encoding)
@@ -81,6 +87,11 @@ class Tracker:
         while self._past and not self._past[0].frames:
             self._past.popleft()
         return [self._past[0].step()] if self._past else []
+
+    def _encode(self, frame: Frame) -> Encoding | None:
+        with self._failures.contain("encoding", frame.index):
+            return self._prior.encode(frame.image, self.camera or frame.camera)
+        return None
 
     @property
     def lost(self) -> bool:
@@ -122,7 +133,9 @@ class Tracker:
         if self._initialiser is None:
             self._restart(frame, encoding)
             return []
-        matched = self._initialiser.add(frame, encoding)
+        matched = False  # so are frames that cannot be: the next reference is another one
+        with self._failures.contain("initialisation", frame.index):
+            matched = self._initialiser.add(frame, encoding)
         if matched and not self._initialiser.ready:
             return self._forget_oldest_orphans()
         tracked = self._begin(self._initialiser) if self._initialiser.waiting else []
@@ -138,7 +151,9 @@ class Tracker:
 
     def _begin(self, initialiser: Initialiser) -> list[Tracked]:
         """Turn a decided geometry into the first keyframe, and pose every frame that waited."""
-        solution = initialiser.solve()
+        solution = None
+        with self._failures.contain("initialisation", initialiser.frame.index):
+            solution = initialiser.solve()
         if solution is None:
             return []
         camera = calibrated(solution.camera)
@@ -164,8 +179,10 @@ class Tracker:
             on_reference = self._at is start
             if on_reference:
                 start.T_fk = T
-            encoded = self._prior.encode(waiting.frame.image, camera)
-            result = self._follow(waiting.frame, encoded, waiting.pair if on_reference else None)
+            encoded, result = self._encode(waiting.frame), None
+            if encoded is not None:
+                pair = waiting.pair if on_reference else None
+                result = self._follow(waiting.frame, encoded, pair)
             tracked.append(result or self._as_lost(waiting.frame))
         return tracked
 
@@ -174,7 +191,7 @@ class Tracker:
         assert self._at is not None
         assert self.camera is not None
         orphans, self._orphans = self._orphans, []
-        fill = BackFill(orphans, self._at, self.camera, self._prior, self._follower)
+        fill = BackFill(orphans, self._at, self.camera, self._prior, self._follower, self._failures)
         if not self._live:
             return fill.all()
         self._past.append(fill)
@@ -206,11 +223,15 @@ class Tracker:
         """
         if self._places is None or self.camera is None:
             return []
-        found = self._places.of_frame(encoding, self.camera)
-        if found is None:
+        before, there = self._at, None
+        with self._failures.contain("relocalisation", frame.index):
+            found = self._places.of_frame(encoding, self.camera)
+            if found is not None:
+                keyframe = self._keyframes.hold(found.keyframe.number)
+                there = Attachment(keyframe, T_fk=found.estimate.T)
+        if there is None:
             return []
-        before = self._at
-        self._at = Attachment(self._keyframes.hold(found.keyframe.number), T_fk=found.estimate.T)
+        self._at = there
         tracked = self._follow(frame, encoding)
         if tracked is None:
             self._at = before
@@ -230,6 +251,13 @@ class Tracker:
         self, frame: Frame, encoding: Encoding, pair: PairGeometry | None = None
     ) -> Tracked | None:
         """Pose, fusion and class of one frame; None when it cannot be placed."""
+        with self._failures.contain("pose", frame.index):
+            return self._placed(frame, encoding, pair)
+        return None
+
+    def _placed(
+        self, frame: Frame, encoding: Encoding, pair: PairGeometry | None
+    ) -> Tracked | None:
         assert self._at is not None
         assert self.camera is not None
         at, camera, follower = self._at, self.camera, self._follower
@@ -286,4 +314,4 @@ class Tracker:
         return tracked
 
     def _as_lost(self, frame: Frame, reason: str = "no pose found") -> Tracked:
-        return Tracked.lost(frame, self.sub_map, reason)
+        return Tracked.lost(frame, self.sub_map, self._failures.reason(frame.index) or reason)

@@ -45,6 +45,20 @@ def test_matches_that_are_no_numbers_give_no_pose() -> None:
     assert pose_from_scratch(problem) is None
 
 
+@pytest.mark.parametrize("scale", [1.0, 1e-12])
+def test_points_on_a_line_on_which_sqpnp_raises_give_no_pose(scale: float) -> None:
+    line = np.linspace(-0.5, 0.5, 100)[:, None] * [[1.0, 0.5, 0.2]] + [[0.0, 0.0, 5.0]]
+    assert pose_from_scratch(problem_of(scale * line, FAR)) is None
+
+
+def test_a_pose_is_found_although_samples_on_which_sqpnp_raises_are_drawn() -> None:
+    points = np.concatenate([np.repeat(cloud(7, 1), 150, axis=0), cloud(8, 60)])
+    assert pose_from_scratch(problem_of(np.repeat(points[:1], 100, axis=0), FAR)) is None
+    found = pose_from_scratch(problem_of(points, FAR))
+    assert found is not None
+    assert np.linalg.norm(found.t - FAR.t) < 0.02
+
+
 def test_one_point_repeated_raises_nothing() -> None:
     problem = problem_of(np.repeat(cloud(6, 1), 100, axis=0), FAR)
     found = pose_from_scratch(problem)

@@ -91,6 +91,8 @@ class ReportData:
     """None if the medium is off."""
     stages: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Stage -> ``count``, ``total``, ``p50``, ``p95``; times in ms."""
+    warnings: list[str] = field(default_factory=list)
+    """Why the result is poor, and what to do: shown first."""
     notes: list[str] = field(default_factory=list)
     """Sentences about what went wrong or was left out."""
     written: str = ""

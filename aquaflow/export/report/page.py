@@ -25,6 +25,7 @@ def write_report(path: Path, data: ReportData) -> None:
 def render_report(data: ReportData) -> str:
     """The whole page; it loads nothing, and the same data give the same text."""
     body = [
+        sections.warnings(data),
         sections.tiles(data.metrics),
         sections.path(data),
         sections.examples(data),

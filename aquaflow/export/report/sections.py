@@ -41,6 +41,14 @@ FOCAL_WORDS = {
 }
 
 
+def warnings(data: ReportData) -> str:
+    """What makes the dive's result poor, before anything else."""
+    if not data.warnings:
+        return ""
+    items = "".join(f"<li>{html.escape(warning)}</li>" for warning in data.warnings)
+    return _section("Look at this first", "This dive did not come out well.", f"<ul>{items}</ul>")
+
+
 def tiles(metrics: Mapping[str, Any]) -> str:
     """The numbers that a pilot asks for first; what was not measured is left out."""
     wanted = (

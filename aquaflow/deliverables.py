@@ -1,0 +1,100 @@
+"""What a dive delivers at its end: each part is made and written on its own.
+
+A part that fails is counted, named in the notes, and left out; it never costs another.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+from aquaflow.dive import DiveFolder
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.messages import CameraModel, Dropped
+from aquaflow.outcome import (
+    HeldOut,
+    WaterSummary,
+    examine_held_out,
+    largest_sub_map,
+    refined_poses,
+    summarise_water,
+    tracked_poses,
+)
+from aquaflow.reporting import report_data
+from aquaflow.slam import Slam
+from aquaflow.tracking.frames import Tracked
+
+
+class Deliverables:
+    """Evaluates a finished dive and writes its files into the dive folder."""
+
+    def __init__(
+        self,
+        name: str,
+        folder: DiveFolder,
+        slam: Slam,
+        results: list[Tracked],
+        calibration: CameraModel | None,
+    ) -> None:
+        """``results``: all frames with their final poses; ``calibration``: as given, if any."""
+        self.name, self.folder, self.slam = name, folder, slam
+        self.results, self.calibration = results, calibration
+        self.held_out: list[HeldOut] = []
+        self.poses: dict[int, Sim3] = tracked_poses(results)
+        """By frame index."""
+        self._contain = slam.failures.contain
+        self._main = largest_sub_map(results)
+        self._waters: dict[int, WaterSummary | None] = {}
+        """By sub-map; a sub-map whose summary failed is missing."""
+
+    def evaluate(self) -> None:
+        """Poses as the map refined them, held-out views, and the water of each sub-map."""
+        with self._contain("refined poses"):
+            self.poses = refined_poses(self.slam, self.results)
+        with self._contain("evaluation"):
+            self.held_out = examine_held_out(self.slam, self._main)
+        for sub_map, mapper in self.slam.mappers.items():
+            with self._contain("water summary"):
+                self._waters[sub_map] = summarise_water(mapper)
+
+    def write(self, scale_source: str) -> None:
+        """Everything but the report and metrics.json."""
+        times = {tracked.frame.index: tracked.frame.t_ns * 1e-9 for tracked in self.results}
+        with self._contain("writing trajectory.tum"):
+            self.folder.write_trajectory([times[i] for i in self.poses], list(self.poses.values()))
+        camera = self.slam.tracker.camera
+        if camera is not None:
+            with self._contain("writing camera.yaml"):
+                self.folder.write_cameras(camera, self.calibration)
+        for sub_map in self.slam.mappers:
+            self._write_map(sub_map)
+        with self._contain("writing held-out views"):
+            self.folder.write_held_out(self.held_out)
+        if self._main in self._waters or not self.slam.mappers:
+            with self._contain("writing medium.json"):
+                mapper = self.slam.mappers.get(self._main)
+                evidence = None if mapper is None else mapper.scene.water_evidence
+                self.folder.write_medium(self._waters.get(self._main), scale_source, evidence)
+
+    def _write_map(self, sub_map: int) -> None:
+        suffix = "" if sub_map == self._main else f"_{sub_map}"
+        mapper, water = self.slam.mappers[sub_map], self._waters.get(sub_map)
+        for file, write in (
+            (f"map{suffix}.aqf", partial(self.folder.write_map, mapper, suffix)),
+            (f"map{suffix}.ply", partial(self.folder.write_splats, mapper, water, suffix)),
+        ):
+            with self._contain(f"writing {file}"):
+                write()
+
+    def write_report(
+        self, dropped: list[Dropped], numbers: dict[str, Any], notes: list[str]
+    ) -> None:
+        """report.html, with the ``numbers`` of metrics.json."""
+        with self._contain("report"):
+            water = self._waters.get(self._main)
+            self.folder.write_report(
+                report_data(
+                    self.name, self.slam, self.results, dropped, self.poses, self.held_out, water,
+                    numbers, notes, calibrated=self.calibration is not None,
+                )
+            )  # fmt: skip
