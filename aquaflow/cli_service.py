@@ -176,7 +176,7 @@ def tell_finished(finished: Finished | None, as_json: bool) -> None:
     """Print the summary of a live dive, and end the command with its exit code."""
     if finished is None:
         typer.echo("{}" if as_json else "Nothing was mapped; frames.csv says why.")
-        return
+        raise typer.Exit(POOR_RESULT)
     numbers = finished.metrics
     if as_json:
         typer.echo(json.dumps({"dive": str(finished.dive), **numbers}))
