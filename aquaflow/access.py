@@ -10,7 +10,7 @@ from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 from aquaflow.config.service import ListenConfig, is_loopback
-from aquaflow.errors import ConfigError, InputError
+from aquaflow.errors import ConfigError, InputError, reason_of
 
 COOKIE = "aquaflow_token"
 SHORTEST_TOKEN = 16
@@ -28,7 +28,7 @@ def read_token(path: Path) -> str:
         token = path.read_text(encoding="ascii").strip()
         mode = path.stat().st_mode
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read the token file {path}: {error}") from error
+        raise InputError(f"cannot read the token file {path}: {reason_of(error)}") from error
     if mode & (stat.S_IRWXO | stat.S_IWGRP):
         raise ConfigError(f"others may read or change {path}; run: chmod 640 {path}")
     if len(token) < SHORTEST_TOKEN:
@@ -55,7 +55,7 @@ class Access:
 
     def by_query(self, target: str) -> bool:
         """True if the address itself carries the token: it belongs into a cookie then."""
-        given = parse_qs(urlsplit(target).query).get("token", [])
+        given = _asked(target)
         return self.token is not None and any(
             hmac.compare_digest(each.encode(), self.token.encode()) for each in given
         )
@@ -72,7 +72,7 @@ def _name_of(host: str) -> str:
 
 def _tokens(target: str, headers: Mapping[str, str]) -> list[str]:
     """What the request shows as token: header, cookie or query, as ASCII."""
-    given = parse_qs(urlsplit(target).query).get("token", [])
+    given = _asked(target)
     scheme, _, value = headers.get("authorization", "").partition(" ")
     if scheme.lower() == "bearer":
         given.append(value.strip())
@@ -83,3 +83,19 @@ def _tokens(target: str, headers: Mapping[str, str]) -> list[str]:
     if cookie is not None:
         given.append(cookie.value)
     return [each for each in given if each.isascii()]
+
+
+def path_of(target: str) -> str | None:
+    """The path of a request's target; None if it is no address at all."""
+    try:
+        return urlsplit(target).path
+    except ValueError:
+        return None
+
+
+def _asked(target: str) -> list[str]:
+    """Tokens in the query of a request's target."""
+    try:
+        return parse_qs(urlsplit(target).query).get("token", [])
+    except ValueError:
+        return []

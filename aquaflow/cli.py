@@ -22,7 +22,7 @@ from aquaflow.cli_record import register as register_record
 from aquaflow.cli_service import exit_code, map_realtime, tell_finished
 from aquaflow.cli_service import register as register_service
 from aquaflow.cli_stress import register as register_stress
-from aquaflow.errors import AquaFlowError
+from aquaflow.crash_report import one_sentence, print_anything, refuse_unreadable
 from aquaflow.terminal import Json, progress_bars
 
 if TYPE_CHECKING:
@@ -38,17 +38,13 @@ app = typer.Typer(
 
 
 def main() -> None:
-    """Entry point: an AquaFlowError becomes one sentence and exit code 1."""
+    """Entry point: whatever a command raises becomes one sentence and an exit code."""
     # What Python warns of is for the log of the dive, not for who flies it.
     logging.captureWarnings(True)
-    try:
+    print_anything((sys.stdout, sys.stderr))
+    with one_sentence():
+        refuse_unreadable(sys.argv[1:])
         app()
-    except AquaFlowError as error:
-        typer.echo(f"aquaflow: {error}", err=True)
-        sys.exit(1)
-    except KeyboardInterrupt:
-        typer.echo("aquaflow: stopped; what was written so far stays where it is", err=True)
-        sys.exit(130)
 
 
 @app.callback(invoke_without_command=True)

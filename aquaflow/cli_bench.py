@@ -60,6 +60,7 @@ def dives(
     `aquaflow bench` alone does this too; `aquaflow bench render` times the renderer.
     """
     from aquaflow.evaluation.bench import benchmark as bm
+    from aquaflow.evaluation.bench.readme import around_section
     from aquaflow.presets import PRESETS
 
     if data is not None and suite is None and not scene:
@@ -68,6 +69,8 @@ def dives(
             "give render, --suite real DATA_DIR, or --scene PATH"
         )
 
+    if readme is not None:
+        around_section(readme)
     contenders = bm.contenders_of(preset or list(PRESETS), peers)
     with progress_bars(as_json) as progress:
         scenes = bm.scenes_of(suite, data, scene or [], out, progress)

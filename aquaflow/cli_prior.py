@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from aquaflow.cores import usable_threads
 from aquaflow.errors import AquaFlowError
 from aquaflow.terminal import Json, progress_bars, table_console
 
@@ -112,7 +113,8 @@ def bench(
     from aquaflow.evaluation.prior_bench.table import print_result
 
     with progress_bars(as_json) as advance:
-        result = bench_prior(folder or [], threads or [1], device, pictures, repeats, advance)
+        counts = list(dict.fromkeys(map(usable_threads, threads or [1])))
+        result = bench_prior(folder or [], counts, device, pictures, repeats, advance)
     if as_json:
         typer.echo(json.dumps(result))
     else:
@@ -174,7 +176,7 @@ def train_compact(
     from aquaflow.training.compact_run import PRIOR, CompactRun
     from aquaflow.training.compact_run import train_compact as run_training
 
-    torch.set_num_threads(threads)
+    torch.set_num_threads(usable_threads(threads))
     settings = CompactSettings(batch=batch, scenes=scenes, first_scenes=min(160, scenes))
     run = CompactRun(seed=seed, steps=steps, settings=settings)
     with progress_bars(as_json) as advance:

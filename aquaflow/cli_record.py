@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from aquaflow.stopping import until_told
-from aquaflow.terminal import Json, progress_bars
+from aquaflow.terminal import Json, Seconds, progress_bars
 
 if TYPE_CHECKING:
     from aquaflow.config.vehicle import VehicleConfig
@@ -35,7 +35,7 @@ def record(
         Path | None, typer.Option(help="Record this recording as if it happened now.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder to write; else named by time.")] = None,
-    seconds: Annotated[float | None, typer.Option(help="Stop after this long.")] = None,
+    seconds: Seconds = None,
     picture: Annotated[str | None, typer.Option(help="jpeg | png | raw")] = None,
     as_json: Json = False,
 ) -> None:

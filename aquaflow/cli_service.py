@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from aquaflow.terminal import Json, progress_bars, table_console
+from aquaflow.terminal import Json, Seconds, progress_bars, table_console
 
 if TYPE_CHECKING:
     from aquaflow.config import Config
@@ -45,9 +45,10 @@ def run(
     ] = None,
     new: Annotated[bool, typer.Option("--new", help="Begin a new dive; resume nothing.")] = False,
     speed: Annotated[
-        float, typer.Option(min=0.001, help="Of --source: 1 as it was, 2 twice as fast.")
+        float,
+        typer.Option(min=0.001, max=1000.0, help="Of --source: 1 as it was, 2 twice as fast."),
     ] = 1.0,
-    seconds: Annotated[float | None, typer.Option(min=0.0, help="Stop after this long.")] = None,
+    seconds: Seconds = None,
     as_json: Json = False,
 ) -> None:
     """Map live: cameras and telemetry in, dive folder out; resumes what was interrupted."""

@@ -1,5 +1,10 @@
 """The errors a user can meet: one sentence each that says what, which input, what to do."""
 
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+
 
 class AquaFlowError(Exception):
     """Base of every error that the command line prints as one sentence."""
@@ -22,5 +27,62 @@ MAX_QUOTED = 160
 
 
 def first_line(error: BaseException) -> str:
-    """What another library said, short enough for a sentence; its kind if it said nothing."""
+    """What another library said while it computed, short enough for a sentence; its kind if it
+    said nothing. Of an error in reading a file, :func:`reason_of` is to be passed on instead."""
     return (str(error).splitlines() or [type(error).__name__])[0][:MAX_QUOTED]
+
+
+class DamagedError(ValueError):
+    """What a reader of ours found wrong with a file, in words that hold nothing of its content."""
+
+
+_KINDS = {
+    UnicodeError: "it is not text",
+    RecursionError: "it is nested too deeply",
+    MemoryError: "it needs more memory than there is",
+}
+_NAME = re.compile(r"[A-Za-z_][\w-]{0,40}|\d{1,6}", re.ASCII)
+_POSITION = re.compile(r"\bline:? (\d+)(?:[ ,(]*col(?:umn)?:? (\d+))?", re.IGNORECASE)
+
+
+def reason_of(error: BaseException) -> str:
+    """Why another library could not use a file, without a word of what the file holds.
+
+    Parsers quote what they could not read, and AquaFlow may have been pointed at any file, by a
+    user with more rights than the reader of the message: so only what the system said, the kind
+    of the error and its position are passed on.
+    """
+    if isinstance(error, (AquaFlowError, DamagedError)):
+        return str(error)
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    for kind, words in _KINDS.items():
+        if isinstance(error, kind):
+            return words
+    found = _POSITION.search(str(error))
+    if found is None:
+        return _words(type(error).__name__)
+    column = "" if found[2] is None else f", column {found[2]}"
+    return f"{_words(type(error).__name__)} in line {found[1]}{column}"
+
+
+def _words(name: str) -> str:
+    """``BadZipFile`` as "bad zip file"."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", name).lower()
+
+
+def printable(name: str) -> str:
+    r"""A file name to show: bytes that are not UTF-8 as ``\xe9``, a line break as ``\n``."""
+    raw = name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in raw)
+
+
+def words_of(message: str) -> str:
+    """pydantic's message on a key, as words that follow the key's name."""
+    return message.removeprefix("Value error, ").lower()
+
+
+def path_of_key(parts: Iterable[object]) -> str:
+    """Where a setting stands, as ``mapping.medium.enabled``; what is no name is left out, for a
+    file that is no config may have anything before a colon."""
+    return ".".join(str(part) if _NAME.fullmatch(str(part)) else "..." for part in parts)

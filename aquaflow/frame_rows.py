@@ -8,7 +8,7 @@ from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from aquaflow.errors import InputError
+from aquaflow.errors import InputError, reason_of
 
 FRAME_COLUMNS = ("index", "source", "t_s", "class", "sub_map", "keyframe", "quality", "reason")
 
@@ -86,7 +86,7 @@ def read_rows(path: Path) -> list[FrameRow]:
             next(stream, None)
             return of_text(stream.read())
     except (OSError, ValueError) as error:
-        raise InputError(f"cannot read {path}: {error}; start with --new") from error
+        raise InputError(f"cannot read {path}: {reason_of(error)}; start with --new") from error
 
 
 def or_lost(row: FrameRow, known: Container[int]) -> FrameRow:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
 
 from aquaflow.config import Config, SourceConfig
+from aquaflow.cores import usable_threads
 from aquaflow.dive import DiveFolder
 from aquaflow.dive_run import DiveRun, Finished
 from aquaflow.errors import NotMappedError
@@ -42,7 +42,7 @@ def map_recording(
         ConfigError: crop or calibration do not fit the pictures.
         NotMappedError: the frames were read but gave no map; the folder says why.
     """
-    fix_threads(config.threads or os.cpu_count() or 1)
+    fix_threads(usable_threads(config.threads))
     folder = DiveFolder(out, config, overwrite)
     try:
         slam = Slam(config, Profiler(trace), folder.work)

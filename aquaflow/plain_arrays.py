@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.geometry.camera import CameraModel, Port
+from aquaflow.geometry.camera import CameraFile, CameraModel, Port
 from aquaflow.geometry.similarity import Sim3
 
 Array = npt.NDArray[Any]
@@ -36,7 +36,10 @@ def of_camera(camera: CameraModel) -> dict[str, Any]:
 
 def to_camera(values: dict[str, Any]) -> CameraModel:
     """Raises TypeError, ValueError where the values are no camera."""
-    tuples = {"distortion": tuple(values["distortion"]), "port": Port(**values["port"])}
+    port = Port(**values["port"])
+    plain = {name: each for name, each in values.items() if name != "calibrated"}
+    CameraFile.model_validate({**plain, "port": port.kind}, strict=True)
+    tuples = {"distortion": tuple(values["distortion"]), "port": port}
     return CameraModel(**{**values, **tuples})
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,6 +13,20 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 Json = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON.")]
+
+
+def duration(value: float | None) -> float | None:
+    """An option in seconds that a clock can wait for.
+
+    Raises:
+        typer.BadParameter: it is negative, not finite, or longer than any timer runs.
+    """
+    if value is not None and not 0.0 <= value <= threading.TIMEOUT_MAX:
+        raise typer.BadParameter(f"give seconds from 0 to {threading.TIMEOUT_MAX:.0f}")
+    return value
+
+
+Seconds = Annotated[float | None, typer.Option(callback=duration, help="Stop after this long.")]
 
 LOG_WIDTH = 200
 """Columns of a table where nobody looks on a terminal: a log must neither cut nor fold numbers."""

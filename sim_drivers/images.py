@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from aquaflow.errors import InputError
+from aquaflow.errors import InputError, printable
 from aquaflow.geometry.camera import guess_camera, load_camera
 from aquaflow.messages import CameraModel, Dropped, Frame
 from sim_drivers.picture import (
@@ -71,7 +71,7 @@ class ImageFolder:
 
     def name_of(self, index: int) -> str:
         """File name of the picture at ``index``."""
-        return self.files[index].name
+        return printable(self.files[index].name)
 
     def frames(
         self, every: int = 1, start: int = 0, stop: int | None = None
@@ -123,11 +123,11 @@ class ImageFolder:
             try:
                 sizes[index] = probe_size(file)
             except UnreadablePictureError as error:
-                self._reasons[index] = f"{file.name} {error}"
+                self._reasons[index] = f"{self.name_of(index)} {error}"
         if not sizes:
             raise InputError(
                 f"none of the {len(self.files)} pictures in {self.folder} can be read; the first "
-                f"is {self.files[0].name}"
+                f"is {self.name_of(0)}"
             )
         (width, height), _ = Counter(sizes.values()).most_common(1)[0]
         for index, (w, h) in sizes.items():
@@ -208,12 +208,10 @@ def _read_stamps(path: Path) -> list[float]:
         try:
             second = float(text)
         except ValueError as error:
-            raise InputError(
-                f"{path} line {number}: '{text[:40]}' is not a time in seconds"
-            ) from error
+            raise InputError(f"{path} line {number}: this is not a time in seconds") from error
         if not np.isfinite(second) or (seconds and second <= seconds[-1]):
             raise InputError(
-                f"{path} line {number}: time {text} does not come after the one before it"
+                f"{path} line {number}: the time does not come after the one before it"
             )
         seconds.append(second)
     return seconds

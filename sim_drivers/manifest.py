@@ -14,14 +14,14 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-import yaml
+from pydantic import Field
 
 from aquaflow.config.stage import Stage, validated
 from aquaflow.config.telemetry import AnyDevice
 from aquaflow.errors import ConfigError, InputError
 from aquaflow.messages import TelemetrySample
+from aquaflow.plain_yaml import read_mapping
 from aquaflow.sources import (
     RawTap,
     RecordedCamera,
@@ -32,13 +32,15 @@ from aquaflow.sources import (
 from sim_drivers.telemetry_log import ByteLog
 
 MANIFEST = "replay.yaml"
+MOST_S = 1e9
+"""30 years between a log's beginning and the first picture: clocks that were never set."""
 
 
 class LogEntry(Stage):
     """One telemetry log."""
 
     file: str
-    starts_s: float = 0.0
+    starts_s: float = Field(0.0, ge=-MOST_S, le=MOST_S)
     device: AnyDevice | None = None
     """What speaks in a log of bytes; None: the usual for its kind."""
 
@@ -58,12 +60,7 @@ def read_manifest(folder: Path) -> Manifest:
         ConfigError: a key is unknown or a value out of range.
     """
     path = folder / MANIFEST
-    try:
-        data: Any = yaml.safe_load(path.read_text()) or {}
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f"cannot read {path}; write `camera:` and `telemetry:` lines") from error
-    if not isinstance(data, dict):
-        raise ConfigError(f"{path} holds no key: value pairs")
+    data = read_mapping(path, "list of logs", "write `camera:` and `telemetry:` lines")
     return validated(Manifest, data, str(path))
 
 
@@ -82,7 +79,7 @@ class ManifestCamera:
         manifest = read_manifest(path)
         if manifest.camera is None:
             raise InputError(f"{path / MANIFEST} names no camera")
-        return open_recording(path / manifest.camera, fps)
+        return open_recording(_named(path, manifest.camera), fps)
 
 
 class ManifestTelemetry:
@@ -122,8 +119,20 @@ class ManifestTelemetry:
             log.close()
 
 
+def _named(folder: Path, name: str) -> Path:
+    """What the folder's manifest names.
+
+    Raises:
+        InputError: that has a manifest too, perhaps this one: following them might never end.
+    """
+    path = folder / name
+    if ManifestCamera.recognises(path):
+        raise InputError(f"{folder / MANIFEST} names {path}, which has a {MANIFEST} of its own")
+    return path
+
+
 def _log(folder: Path, entry: LogEntry, starts_s: float) -> RecordedTelemetry:
-    path = folder / entry.file
+    path = _named(folder, entry.file)
     log = open_recorded_telemetry(path, entry.starts_s + starts_s)
     if entry.device is None:
         return log

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from aquaflow.errors import InputError
+from aquaflow.errors import InputError, reason_of
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -52,7 +52,9 @@ def opened(path: Path) -> Iterator[AnyReader]:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
     except (AnyReaderError, Ros1Error, Ros2Error, OSError) as error:
-        raise InputError(f"cannot read the bag {path}: {error}") from error
+        raise InputError(
+            f"cannot read the bag {path}: {reason_of(error)}; copy or record it again"
+        ) from error
     try:
         yield reader
     finally:

@@ -8,7 +8,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import Field
 
 from aquaflow.config.mapping import (
@@ -33,7 +32,7 @@ from aquaflow.config.tracking import (
     TrackingConfig,
     VerificationConfig,
 )
-from aquaflow.errors import ConfigError, InputError
+from aquaflow.plain_yaml import read_mapping, write_mapping
 
 __all__ = [
     "Config",
@@ -98,18 +97,9 @@ def read_yaml(path: Path) -> dict[str, Any]:
         InputError: the file cannot be read, or is not YAML.
         ConfigError: it holds something else.
     """
-    try:
-        data = yaml.safe_load(path.read_text()) or {}
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not text"
-        raise InputError(f"cannot read the config {path}: {reason}; give a YAML file") from error
-    except yaml.YAMLError as error:
-        raise InputError(f"{path} is not YAML; write `key: value` lines") from error
-    if not isinstance(data, dict):
-        raise ConfigError(f"{path} holds no key: value pairs; see `aquaflow config`")
-    return data
+    return read_mapping(path, "config", "write `key: value` lines; see `aquaflow config`")
 
 
 def dump_config(config: Config, path: Path) -> None:
     """Write the effective configuration."""
-    path.write_text(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
+    write_mapping(path, config.model_dump(mode="json"))

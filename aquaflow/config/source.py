@@ -14,7 +14,10 @@ class SourceConfig(Stage):
     start: int = Field(0, ge=0, description="first frame index")
     stop: int | None = Field(None, ge=1, description="first frame index not used")
     width: int | None = Field(
-        None, ge=64, description="px; frames are made this wide (None: 480, or less if smaller)"
+        None,
+        ge=64,
+        le=8192,
+        description="px; frames are made this wide (None: 480, or less if smaller)",
     )
     crop: str | None = Field(None, description="left | right | x,y,width,height, before resizing")
     fps: float | None = Field(None, gt=0, description="frames/s of a folder without timestamps")

@@ -6,13 +6,13 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from aquaflow.errors import ConfigError
+from aquaflow.errors import ConfigError, path_of_key, words_of
 
 
 class Stage(BaseModel):
     """A stage's settings: immutable, and a misspelt key is an error."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 AnyStage = TypeVar("AnyStage", bound=Stage)
@@ -28,6 +28,7 @@ def validated(model: type[AnyStage], data: dict[str, Any], origin: str) -> AnySt
         return model.model_validate(data)
     except ValidationError as error:
         first = error.errors()[0]
-        path = ".".join(str(part) for part in first["loc"])
-        problem = "is not a known key" if first["type"] == "extra_forbidden" else first["msg"]
-        raise ConfigError(f"{origin}: '{path}' {problem.lower()}; see `aquaflow config`") from error
+        path = path_of_key(first["loc"])
+        unknown = first["type"] == "extra_forbidden"
+        problem = "is not a known key" if unknown else words_of(first["msg"])
+        raise ConfigError(f"{origin}: '{path}' {problem}; see `aquaflow config`") from error

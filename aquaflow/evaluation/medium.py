@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from aquaflow.errors import InputError
+from aquaflow.errors import DamagedError, InputError, reason_of
 from aquaflow.synthetic.water import WATER_TYPES, Medium
 
 BACKSCATTER_SPAN_M = (0.5, 8.0)
@@ -89,7 +89,7 @@ def read_recovered(path: Path, metres_per_unit: float) -> tuple[Medium, bool]:
             d=_rgb(scatter["d"], per_metre),
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
-        what = f"key {error} is missing" if isinstance(error, KeyError) else error
+        what = f"key {error} is missing" if isinstance(error, KeyError) else reason_of(error)
         raise InputError(f"cannot read the medium {path}: {what}; map the dive again") from error
     return medium, True
 
@@ -98,6 +98,6 @@ def _rgb(value: object, factor: float = 1.0) -> tuple[float, float, float]:
     """Three finite, non-negative numbers times ``factor``."""
     channels = np.asarray(value, dtype=np.float64)
     if channels.shape != (3,) or not np.isfinite(channels).all() or (channels < 0.0).any():
-        raise ValueError(f"{value!r} is not three numbers of at least 0")
+        raise DamagedError("a colour is not three numbers of at least 0")
     red, green, blue = (channels * factor).tolist()
     return red, green, blue

@@ -101,7 +101,7 @@ def _parse(text: str, path: Path, number: int) -> list[float]:
         row = [float(field) for field in fields]
     except ValueError as error:
         raise InputError(
-            f"{path} line {number}: '{text[:60]}' is not 8 numbers; expected '{TUM_FIELDS}'"
+            f"{path} line {number}: these are not 8 numbers; expected '{TUM_FIELDS}'"
         ) from error
     if not np.isfinite(row).all():
         raise InputError(f"{path} line {number}: a number is not finite; remove this pose")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.errors import InputError
+from aquaflow.errors import InputError, reason_of
 from aquaflow.evaluation.trajectory import Trajectory, read_tum
 
 SYNTHETIC_POSES = "poses.tum"
@@ -92,7 +92,9 @@ def read_positions(path: Path) -> PositionTable:
                 files.append(Path(row["file"]).name)
                 rows.append(_metres(row, path, reader.line_num))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"cannot read the positions {path}: {error}; give a CSV file") from error
+        raise InputError(
+            f"cannot read the positions {path}: {reason_of(error)}; give a CSV file"
+        ) from error
     if not rows:
         raise InputError(f"{path} holds no position; expected one row for each picture")
     plane = np.array(rows) - np.array(rows[0])

@@ -7,10 +7,9 @@ the light of every view and the decoder themselves.
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
-from aquaflow.errors import AquaFlowError, InputError
+from aquaflow.errors import AquaFlowError, DamagedError, InputError, reason_of
 from aquaflow.export.facts_file import UNREADABLE, read_facts_file, write_facts_file
 from aquaflow.mapping.map_state import put_together, take_apart
 from aquaflow.mapping.mapper import Mapper
@@ -38,13 +37,9 @@ def read_map_file(path: Path, renderer: Renderer) -> Mapper:
         InputError: the file is not there, damaged, none of ours, or of a newer AquaFlow.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            damaged = archive.testzip()
-        if damaged is not None:
-            raise InputError(f"the map {path} is damaged in {damaged}; copy it or map again")
         facts, arrays = read_facts_file(path)
         if facts["kind"] != KIND:
-            raise ValueError(f"it says that it is '{facts['kind']}'")
+            raise DamagedError("it says that it is something else")
     except UNREADABLE as error:
         raise InputError(_unreadable(path, error)) from error
     if facts["format"] != FORMAT:
@@ -60,6 +55,5 @@ def read_map_file(path: Path, renderer: Renderer) -> Mapper:
 
 def _unreadable(path: Path, error: Exception) -> str:
     if isinstance(error, OSError):
-        return f"cannot read the map {path}: {error.strerror or error}; give a map{SUFFIX}"
-    said = str(error).strip().splitlines()
-    return f"{path} is no whole AquaFlow map ({said[0] if said else 'empty'}); copy or map it again"
+        return f"cannot read the map {path}: {reason_of(error)}; give a map{SUFFIX}"
+    return f"{path} is no whole AquaFlow map ({reason_of(error)}); copy or map it again"

@@ -144,7 +144,7 @@ def _read_header(stream: BinaryIO, path: Path) -> tuple[int, np.dtype[np.void]]:
             count = int(words[2])
         elif words[:1] == ["property"]:
             if len(words) != 3 or words[1] not in PLY_TYPES:
-                raise InputError(f"{path} has the property '{line}', which no Gaussian map has")
+                raise InputError(f"{path} has a property that no Gaussian map has")
             fields.append((words[2], PLY_TYPES[words[1]]))
     needed = set(PROPERTIES) - {"nx", "ny", "nz"}
     missing = sorted(needed - {name for name, _ in fields})

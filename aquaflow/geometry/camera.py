@@ -12,10 +12,10 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from aquaflow.errors import ConfigError, InputError
+from aquaflow.errors import ConfigError, path_of_key, words_of
+from aquaflow.plain_yaml import read_mapping, write_mapping
 
 DistortionModel = Literal["none", "radtan", "fisheye"]
 
@@ -119,13 +119,24 @@ def guess_camera(width: int, height: int) -> CameraModel:
     return CameraModel(width, height, focal, focal, width / 2.0, height / 2.0, calibrated=False)
 
 
+MOST_SIDE_PX = 1 << 16
+"""Of a picture; the largest sensors have a fifth of that."""
+
+FOCAL_SIDES = (0.01, 100.0)
+"""Focal lengths over the picture's longer side that a lens may have: a fisheye has 0.2, a telephoto
+lens 20."""
+
+COEFFICIENTS = {"radtan": (4, 5, 8, 12, 14), "fisheye": (4,)}
+"""Numbers of distortion coefficients that OpenCV takes; none at all means no distortion."""
+
+
 class CameraFile(BaseModel):
     """The ``camera.yaml`` format."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-    width: int = Field(gt=0)
-    height: int = Field(gt=0)
+    width: int = Field(gt=0, le=MOST_SIDE_PX)
+    height: int = Field(gt=0, le=MOST_SIDE_PX)
     model: Literal["pinhole"] = "pinhole"
     fx: float = Field(gt=0)
     fy: float = Field(gt=0)
@@ -135,6 +146,31 @@ class CameraFile(BaseModel):
     distortion: list[float] = Field(default_factory=list, max_length=14)
     port: Literal["none", "flat", "dome"] = "none"
 
+    @property
+    def kind(self) -> DistortionModel:
+        """The distortion model by the name that we use for it."""
+        if self.distortion_model in ("none", "fisheye"):
+            return self.distortion_model  # type: ignore[return-value]
+        return "radtan"
+
+    @model_validator(mode="after")
+    def _is_a_camera(self) -> CameraFile:
+        """What no single key shows."""
+        least, most = (share * max(self.width, self.height) for share in FOCAL_SIDES)
+        for key in ("fx", "fy"):
+            if not least <= getattr(self, key) <= most:
+                raise ValueError(f"{key} is no focal length, in pixels, of such a picture")
+        for key, side in (("cx", self.width), ("cy", self.height)):
+            if abs(getattr(self, key)) > FOCAL_SIDES[1] * side:
+                raise ValueError(f"{key} lies far outside the picture")
+        counts = COEFFICIENTS.get(self.kind)
+        if counts and self.distortion and len(self.distortion) not in counts:
+            known = " or ".join(map(str, counts))
+            raise ValueError(
+                f"distortion has {len(self.distortion)} numbers, {self.kind} takes {known}"
+            )
+        return self
+
 
 def load_camera(path: Path) -> CameraModel:
     """Read a calibration.
@@ -143,30 +179,19 @@ def load_camera(path: Path) -> CameraModel:
         InputError: the file is not there or is not YAML.
         ConfigError: a key is unknown, missing, or its value is out of range.
     """
-    try:
-        data = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"cannot read the calibration {path}: {_reason(error)}; give a camera.yaml file"
-        ) from error
-    except yaml.YAMLError as error:
-        raise InputError(f"{path} is not YAML; compare it with the README's camera.yaml") from error
-    if not isinstance(data, dict):
-        raise ConfigError(f"{path} holds no key: value pairs; compare it with the README")
+    data = read_mapping(path, "calibration", "compare it with the README's camera.yaml")
     try:
         file = CameraFile.model_validate(data)
     except ValidationError as error:
         # A misspelt key is also a missing one; the one that was written says more.
         found = sorted(error.errors(), key=lambda each: each["type"] != "extra_forbidden")
         first = found[0]
-        key = ".".join(str(part) for part in first["loc"])
+        key = path_of_key(first["loc"])
+        named = f"key '{key}': " if key else ""
         raise ConfigError(
-            f"{path}: key '{key}': {first['msg'].lower()}; known keys are "
+            f"{path}: {named}{words_of(first['msg'])}; known keys are "
             f"{', '.join(CameraFile.model_fields)}"
         ) from error
-    kind: DistortionModel = {"none": "none", "fisheye": "fisheye"}.get(  # type: ignore[assignment]
-        file.distortion_model, "radtan"
-    )
     return CameraModel(
         file.width,
         file.height,
@@ -174,14 +199,10 @@ def load_camera(path: Path) -> CameraModel:
         file.fy,
         file.cx,
         file.cy,
-        distortion_model=kind,
+        distortion_model=file.kind,
         distortion=tuple(file.distortion),
         port=Port(kind=file.port),
     )
-
-
-def _reason(error: OSError | UnicodeDecodeError) -> str:
-    return (error.strerror or "unreadable") if isinstance(error, OSError) else "it is not text"
 
 
 def save_camera(camera: CameraModel, path: Path) -> None:
@@ -198,4 +219,4 @@ def save_camera(camera: CameraModel, path: Path) -> None:
         "distortion": list(camera.distortion),
         "port": camera.port.kind,
     }
-    path.write_text(yaml.safe_dump(data, sort_keys=False))
+    write_mapping(path, data)

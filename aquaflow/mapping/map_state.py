@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from aquaflow.config import MappingConfig
+from aquaflow.errors import DamagedError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.neural import NeuralGaussians
@@ -78,13 +79,15 @@ def put_together(facts: Facts, arrays: Mapping[str, Any], renderer: Renderer) ->
     width = gaussians.local_features.shape[1]  # a decoder, if there is one, brings its own
     gaussians.local_features = torch.zeros(len(gaussians.keyframes), width)
     if any(len(tensor) != len(gaussians) for tensor in gaussians.parameters.values()):
-        raise ValueError("its Gaussians differ in number")
+        raise DamagedError("its Gaussians differ in number")
     scene.shading = np.array(arrays["shading"])
     mapper.medium.load_state_dict(_under("medium", arrays))
     mapper.medium.active, scene.exposes = bool(facts["medium_active"]), bool(facts["exposes"])
     scene.sunlight.plays = bool(facts["sunlight_plays"])
     scene.water_evidence, scene.beta_a_sigma = facts["water_evidence"], facts["beta_a_sigma"]
     mapper.steps, mapper.undone = int(facts["steps"]), int(facts["undone"])
+    if len(facts["cameras"]) > len(arrays["views.numbers"]):
+        raise DamagedError("it has more cameras than views")
     mapper.views = _read_views(arrays, [to_camera(values) for values in facts["cameras"]])
     mapper._optimiser.extend(len(gaussians))
     mapper._optimiser.bind(gaussians.parameters)

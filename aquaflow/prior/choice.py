@@ -7,6 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from aquaflow.config.prior import PriorConfig
+from aquaflow.cores import core_count
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.contract import Prior
 from aquaflow.prior.folder import CARD
@@ -35,7 +36,9 @@ def make_prior(config: PriorConfig) -> Prior:
     from aquaflow.prior.describers import describer_in
     from aquaflow.prior.hybrid import HybridPrior
 
-    settings = RuntimeSettings(config.device, config.precision, config.threads, config.engine_cache)
+    settings = RuntimeSettings(
+        config.device, config.precision, min(config.threads, core_count()), config.engine_cache
+    )
     return HybridPrior(describer_in(folder, settings))
 
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from pydantic import ValidationError
 
 from aquaflow.config.stage import Stage
-from aquaflow.errors import InputError
+from aquaflow.errors import InputError, path_of_key
 
 CARD = "prior.json"
 ENCODER, DECODER = "encoder.onnx", "decoder.onnx"
@@ -56,7 +56,7 @@ def read_card(folder: Path) -> PriorCard:
         card = PriorCard.model_validate_json(path.read_bytes())
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "the file"
+        where = path_of_key(first["loc"]) or "the file"
         raise InputError(
             f"{path}: {where} {first['msg'].lower()}; export the prior again"
         ) from error

@@ -17,7 +17,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.errors import AquaFlowError, InputError, first_line
+from aquaflow.errors import AquaFlowError, InputError, reason_of
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ class Session:
             )
         except Exception as error:  # onnxruntime's errors share no base of their own
             raise InputError(
-                f"{path} cannot be run ({first_line(error)}); export it again"
+                f"{path} cannot be run ({reason_of(error)}); export it again"
             ) from error
         self.device = _obtained(self._session, device, settings.device, path.name)
         self.inputs = {value.name: tuple(value.shape) for value in self._session.get_inputs()}

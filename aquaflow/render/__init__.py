@@ -8,6 +8,8 @@ from __future__ import annotations
 import warnings
 from typing import TYPE_CHECKING, Literal
 
+from aquaflow.cores import core_count
+
 if TYPE_CHECKING:
     from aquaflow.render.contract import Renderer
 
@@ -17,10 +19,12 @@ RendererName = Literal["auto", "cpu", "tiles", "gsplat"]
 def select_renderer(name: RendererName = "auto", threads: int | None = None) -> Renderer:
     """The renderer called ``name``; ``auto`` takes gsplat on CUDA machines, else the CPU kernels.
 
-    ``threads`` defaults to torch's number. Where ``auto`` finds no compiled library and no compiler
-    it warns once, in one sentence, and returns the torch tile renderer. Raises AquaFlowError when a
-    renderer asked for by name is not to be had.
+    ``threads`` defaults to torch's number; more than the machine has cores are not used. Where
+    ``auto`` finds no compiled library and no compiler it warns once, in one sentence, and returns
+    the torch tile renderer. Raises AquaFlowError when a renderer asked for by name is not to be
+    had.
     """
+    threads = None if threads is None else min(threads, core_count())
     from aquaflow.render import gsplat
     from aquaflow.render.tiles import TileRenderer
 

@@ -8,10 +8,9 @@ import threading
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
-from urllib.parse import urlsplit
 
 from aquaflow import __version__
-from aquaflow.access import Access
+from aquaflow.access import Access, path_of
 from aquaflow.config.service import ListenConfig
 from aquaflow.errors import InputError
 from aquaflow.service.page import PAGE
@@ -102,9 +101,11 @@ def _handler(access: Access, report: Callable[[], dict[str, Any]]) -> type[BaseH
 
         def do_GET(self) -> None:
             headers = {name.lower(): value for name, value in self.headers.items()}
-            path = urlsplit(self.path).path
+            path = path_of(self.path)
             # BlueOS asks without a token, and hears nothing that is not on the package's page.
-            if path == "/register_service":
+            if path is None:
+                self._answer(400, JSON, json.dumps({"error": "this is no address"}))
+            elif path == "/register_service":
                 self._answer(200, JSON, json.dumps(REGISTRATION))
             elif not access.allows(self.path, headers):
                 self._answer(403, JSON, json.dumps(NOT_ALLOWED))

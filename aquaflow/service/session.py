@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import shutil
 import sys
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from dataclasses import dataclass
 from aquaflow.config import Config, parse_config
 from aquaflow.config.service import ServiceConfig
 from aquaflow.config.vehicle import VehicleConfig
+from aquaflow.cores import core_count, usable_threads
 from aquaflow.dive import CHECKPOINT, DiveFolder
 from aquaflow.dive_run import DiveRun, Finished
 from aquaflow.errors import AquaFlowError, InputError, NotMappedError
@@ -31,6 +31,7 @@ from aquaflow.service.live import LiveLoop
 from aquaflow.service.map_thread import MapThread
 from aquaflow.service.notify import Notifier
 from aquaflow.service.pressure import Machine
+from aquaflow.service.same_pictures import check_same_pictures
 from aquaflow.slam import Slam
 from aquaflow.stopping import until_told
 
@@ -72,11 +73,13 @@ class LiveDive:
             InputError: the folder or the checkpoint cannot be used.
         """
         service = config.service
-        cores = config.threads or os.cpu_count() or 1
+        cores = usable_threads(config.threads)
         fix_threads(max(1, cores // 2))  # tracking's; the renderer's are counted below
         sys.setswitchinterval(SWITCH_S)
         known = None if choice.checkpoint is None else choice.checkpoint.frames
         self._plain = plain(config)
+        if choice.checkpoint is not None:
+            check_same_pictures(choice.folder, self._plain)
         self.folder = DiveFolder(choice.folder, self._plain, overwrite, known)
         self.feed, self._service = feed, service
         self._beats, self._ladder = Beats(), Ladder(service.limits)
@@ -88,7 +91,7 @@ class LiveDive:
     def _assembled(self, name: str, choice: Choice, service: ServiceConfig) -> Parts:
         config, feed, profiler = self._plain, self.feed, Profiler()
         # A core is left for tracking, where there is more than one.
-        threads = config.threads or max(1, (os.cpu_count() or 1) - 1)
+        threads = config.threads or max(1, core_count() - 1)
         renderer = select_renderer(config.mapping.renderer, threads)
         failures = Failures()
         maps = Maps(config, renderer, profiler, self.folder.work, failures)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 import yaml
 from scipy.spatial.transform import Rotation
 
-from aquaflow.errors import InputError
+from aquaflow.errors import InputError, reason_of
 from aquaflow.geometry.camera import CameraModel, save_camera
 from aquaflow.synthetic import objects, radiance, render
 from aquaflow.synthetic import path as paths
@@ -128,7 +128,7 @@ def write_dive(
         _write_pictures(out, config, scene, path, progress)
     except OSError as error:
         raise InputError(
-            f"cannot write the dive to {out}: {error}; choose another folder"
+            f"cannot write the dive to {out}: {reason_of(error)}; choose another folder"
         ) from error
 
 

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from aquaflow.errors import InputError
+from aquaflow.errors import InputError, reason_of
 from aquaflow.messages import AngularRate, Attitude, Depth, TelemetrySample, Velocity
 from aquaflow.synthetic.config import SyntheticConfig
 from aquaflow.synthetic.path import Path as VehiclePath
@@ -95,10 +95,10 @@ def read_telemetry(path: Path) -> Iterator[TelemetrySample]:
             for line in csv.DictReader(file):
                 yield _sample(line)
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read the telemetry {path}: {error}") from error
+        raise InputError(f"cannot read the telemetry {path}: {reason_of(error)}") from error
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
-            f"{path} holds a line that is no telemetry sample ({error}); its columns must be "
+            f"{path} holds a line that is no telemetry sample; its columns must be "
             f"{', '.join(HEADER)}"
         ) from error
 

@@ -19,12 +19,11 @@ from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-import yaml
-from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from aquaflow.errors import InputError
+from aquaflow.errors import AquaFlowError, InputError, reason_of
 from aquaflow.geometry.camera import CameraModel, load_camera
+from aquaflow.plain_yaml import read_mapping
 from aquaflow.synthetic.config import SyntheticConfig
 from aquaflow.synthetic.water import Medium, load_medium
 
@@ -59,7 +58,7 @@ class Truth:
                 return np.where(data["hit"], data["range_m"], np.float32(np.inf))
         except (OSError, KeyError, ValueError) as error:
             raise InputError(
-                f"cannot read the ranges {path}: {error}; write the dive again"
+                f"cannot read the ranges {path}: {reason_of(error)}; write the dive again"
             ) from error
 
     def clean(self, index: int) -> npt.NDArray[np.float32]:
@@ -95,14 +94,15 @@ def read_truth(out: Path) -> Truth:
         InputError: a file of it is missing or damaged.
     """
     try:
-        stated = yaml.safe_load((out / "synth.yaml").read_text())
+        stated = read_mapping(out / "synth.yaml", "facts of the dive", "write the dive again")
         config = SyntheticConfig.model_validate(stated["config"])
         R_bc = np.array(stated["mounting"]["R_body_camera"], np.float64).reshape(3, 3)
         rows = np.loadtxt(out / "poses.tum", ndmin=2).reshape(-1, 8)
         times = np.loadtxt(out / "timestamps.txt", ndmin=1)
-    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, ValidationError) as error:
+    except (AquaFlowError, OSError, KeyError, TypeError, ValueError) as error:
         raise InputError(
-            f"{out} is not a complete synthetic dive ({error}); write it again with aquaflow synth"
+            f"{out} is not a complete synthetic dive ({reason_of(error)}); write it again with "
+            "aquaflow synth"
         ) from error
     T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
     T_wc[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()

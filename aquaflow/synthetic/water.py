@@ -21,7 +21,8 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
-from aquaflow.errors import InputError
+from aquaflow.errors import InputError, reason_of
+from aquaflow.plain_yaml import read_mapping
 from aquaflow.synthetic.config import WaterType
 
 __all__ = ["WATER_TYPES", "Medium", "load_medium", "save_medium"]
@@ -122,12 +123,13 @@ def load_medium(path: Path) -> Medium:
         InputError: the file is missing or is no medium file.
     """
     try:
-        data = yaml.safe_load(path.read_text())
+        data = read_mapping(path, "water", "write the dive again")
         rows = {name: tuple(map(float, data[name])) for name in Medium.__dataclass_fields__}
         return Medium(**{name: _rgb_of(row) for name, row in rows.items()})
-    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise InputError(
-            f"{path} does not hold the water's parameters ({error}); write the dive again"
+            f"{path} does not hold the water's parameters ({reason_of(error)}); write the dive "
+            "again"
         ) from error
 
 

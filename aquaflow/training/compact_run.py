@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from aquaflow.errors import InputError
 from aquaflow.prior.compact.export import export, folded
 from aquaflow.prior.compact.network import CompactPrior
 from aquaflow.prior.compact.quantise import INT8_ENCODER
@@ -62,10 +63,11 @@ def train_compact(run: CompactRun, out: Path, progress: Progress, device: str = 
     """Train on ``device`` in ``out``, going on from what is there, and export to ``out``/prior.
 
     Raises:
-        InputError: ``out`` holds the checkpoint of another network.
+        InputError: ``out`` holds the checkpoint of another network, or there is no such device.
     """
+    place = device_called(device)
     torch.manual_seed(run.seed)
-    network = CompactPrior().to(device)
+    network = CompactPrior().to(place)
     pool = Pool(out / POOL, run.seed)
     first = -(-min(run.settings.first_scenes, run.settings.scenes) // SHARD)
     for shard in range(first):
@@ -79,6 +81,23 @@ def train_compact(run: CompactRun, out: Path, progress: Progress, device: str = 
     card = export(network, out / PRIOR, record, calibration(pool), progress)
     wider = held_out_pairs(out / HELD_OUT_WIDER, WIDER)
     return with_figures(out / PRIOR, card, network, {"wide": held_out, "wider": wider})
+
+
+def device_called(name: str) -> torch.device:
+    """cpu, cuda or cuda:N.
+
+    Raises:
+        InputError: torch knows no such device, or it is not here.
+    """
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise InputError(f"there is no device '{name}'; give cpu or cuda") from error
+    if device.type not in ("cpu", "cuda"):
+        raise InputError(f"training on '{name}' is not supported; give cpu or cuda")
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise InputError(f"torch finds no GPU for device '{name}'; give cpu")
+    return device
 
 
 def training_record(

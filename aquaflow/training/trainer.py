@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
-from aquaflow.errors import InputError
+from aquaflow.errors import InputError, reason_of
 from aquaflow.training.curve import draw_curve
 from aquaflow.training.peers import Peers
 from aquaflow.training.schedule import Schedule
@@ -158,7 +158,12 @@ def _save(network: nn.Module, optimiser: torch.optim.Optimizer, run: _Run, path:
 def _resumed(network: nn.Module, optimiser: torch.optim.Optimizer, path: Path) -> _Run:
     if not path.is_file():
         return _Run(0, 0.0, [])
-    state = torch.load(path, weights_only=True, map_location="cpu")
+    try:
+        state = torch.load(path, weights_only=True, map_location="cpu")
+    except Exception as error:  # the unpickler lets through whatever damaged bytes make it do
+        raise InputError(
+            f"{path} cannot be read as a checkpoint ({reason_of(error)}); give another --out"
+        ) from error
     try:
         network.load_state_dict(state["network"])
         optimiser.load_state_dict(state["optimiser"])

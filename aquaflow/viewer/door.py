@@ -10,9 +10,8 @@ import contextlib
 import logging
 import socket
 import threading
-from urllib.parse import urlsplit
 
-from aquaflow.access import Access
+from aquaflow.access import Access, path_of
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.errors import InputError
 
@@ -124,7 +123,7 @@ def _parsed(request: bytes) -> tuple[str, dict[str, str]]:
 
 def _path(target: str) -> str:
     """Where a browser is sent back to: on this server, and without what ends a header."""
-    path = urlsplit(target).path
+    path = path_of(target) or "/"
     safe = path.startswith("/") and not path.startswith("//") and path.isprintable()
     return path if safe else "/"
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.viewer import ViewerConfig
-from aquaflow.errors import InputError
+from aquaflow.errors import InputError, reason_of
 from aquaflow.export.ply import read_ply
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.geometry.similarity import Sim3, rotation_from_quaternion
@@ -95,7 +95,7 @@ def _poses(path: Path) -> tuple[list[Sim3], npt.NDArray[np.float64]]:
     try:
         rows = np.loadtxt(path, ndmin=2)
     except (OSError, ValueError) as error:
-        raise InputError(f"cannot read {path}: {error}") from error
+        raise InputError(f"cannot read {path}: {reason_of(error)}; map the dive again") from error
     rows = rows.reshape(-1, 8)
     poses = [Sim3(rotation_from_quaternion(np.roll(row[4:8], 1)), row[1:4]) for row in rows]
     return poses, rows[:, 0]

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from aquaflow.config.telemetry import DbcConfig, DbcSignal
-from aquaflow.errors import ConfigError
+from aquaflow.errors import ConfigError, reason_of
 from aquaflow.messages import (
     Acceleration,
     Altitude,
@@ -72,8 +72,9 @@ class DbcDecoder(PacketDecoder):
         try:
             return self._cantools.database.load_file(path, database_format="dbc")
         except (OSError, ValueError, self._cantools.Error) as error:
-            reason = " ".join(str(error).split())
-            raise ConfigError(f"cannot read the DBC file {path}: {reason}") from error
+            raise ConfigError(
+                f"cannot read the DBC file {path}: {reason_of(error)}; give the bus's .dbc"
+            ) from error
 
 
 def _message(database: Any, mapping: DbcSignal, path: str) -> Any:

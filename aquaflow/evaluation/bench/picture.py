@@ -29,6 +29,8 @@ FEW_DIGITS = 10.0
 """Ratio of an axis' ends above which not every digit is labelled: 1, 2 and 5 are."""
 LONE_DIGITS = 1000.0
 """Ratio above which 1 alone is: the labels of four decades would run into each other."""
+EMPTY = (1.0, 1000.0)
+"""Ends of the axes where every run failed."""
 MARGIN = 0.025
 """Height at which failed runs are marked, as a share of the axes."""
 
@@ -83,6 +85,9 @@ def _axes(
             x, y, MARKER_SIZE, marker=shape_of(row), color=colours[row["scene"]],
             edgecolors="white", linewidths=0.7, zorder=3,
         )  # fmt: skip
+    if not shown:  # a logarithmic axis has no limits of its own
+        axes.set_xlim(*EMPTY)
+        axes.set_ylim(*EMPTY)
     _fronts(axes, shown, colours, better_is_lower)
     _plain_numbers(axes.xaxis)
     _mark_failed(axes, [row for row in rows if row["failed"]], colours)

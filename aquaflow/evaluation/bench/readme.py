@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from aquaflow.errors import InputError
+from aquaflow.errors import InputError, reason_of
 from aquaflow.evaluation.bench.summary import NOTES
 from aquaflow.evaluation.bench.table import failures, markdown
+from aquaflow.export.atomic import atomic_write
 
 BEGIN, END = "<!-- bench: begin -->", "<!-- bench: end -->"
 
@@ -21,19 +22,32 @@ def write_readme(
     Raises:
         InputError: the file or its markers are not there.
     """
-    try:
-        text = readme.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"cannot read {readme}: {error.strerror}; give a Markdown file") from error
-    if text.count(BEGIN) != 1 or text.count(END) != 1:
-        raise InputError(f"{readme} needs the lines '{BEGIN}' and '{END}' once each, in this order")
-    before, rest = text.split(BEGIN)
-    after = rest.split(END)[-1]
+    before, after = around_section(readme)
     where = picture.resolve()
     folder = readme.resolve().parent
     shown = where.relative_to(folder) if where.is_relative_to(folder) else where
     middle = section(str(shown), machine, rows)
-    readme.write_text(f"{before}{BEGIN}\n{middle}\n{END}{after}", encoding="utf-8")
+    with atomic_write(readme) as stream:
+        stream.write(f"{before}{BEGIN}\n{middle}\n{END}{after}".encode())
+
+
+def around_section(readme: Path) -> tuple[str, str]:
+    """What stands before and after the section; to be asked before hours of measuring.
+
+    Raises:
+        InputError: the file or its markers are not there.
+    """
+    try:
+        text = readme.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"cannot read {readme}: {reason_of(error)}; give a Markdown file"
+        ) from error
+    before, begun, rest = text.partition(BEGIN)
+    _, ended, after = rest.partition(END)
+    if not begun or not ended or text.count(BEGIN) != 1 or text.count(END) != 1:
+        raise InputError(f"{readme} needs the lines '{BEGIN}' and '{END}' once each, in this order")
+    return before, after
 
 
 def section(picture: str, machine: dict[str, Any], rows: Sequence[dict[str, Any]]) -> str:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from aquaflow.config import PriorConfig
+from aquaflow.config.stage import validated
 from aquaflow.errors import InputError
 from aquaflow.evaluation.bench import machine
 from aquaflow.evaluation.matching import LEVELS, Picture, homography_recall, matcher_of
@@ -63,7 +64,7 @@ def _contender(folder: Path, precision: str, threads: int, device: str) -> Conte
         "kind": "folder", "folder": folder, "device": device, "precision": precision,
         "threads": threads,
     }  # fmt: skip
-    prior = make_prior(PriorConfig.model_validate(config))
+    prior = make_prior(validated(PriorConfig, config, "command line"))
     name = prior.name if folder == SHIPPED else f"{prior.name} in {folder}"
     return Contender(name, precision, threads, prior)
 

@@ -10,7 +10,6 @@ import copy
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from aquaflow.errors import InputError
+from aquaflow.errors import InputError, reason_of
 from aquaflow.prior.compact.network import COARSE, STRIDE, CompactPrior, Compared, Encoded
 from aquaflow.prior.compact.quantise import INT8_ENCODER, quantise
 from aquaflow.prior.folder import CARD, DECODER, ENCODER, PriorCard, sha256_of, write_card
@@ -125,8 +124,10 @@ def load_checkpoint(path: Path) -> CompactPrior:
     network = CompactPrior()
     try:
         network.load_state_dict(torch.load(path, weights_only=True, map_location="cpu")["network"])
-    except (OSError, KeyError, TypeError, RuntimeError, UnpicklingError) as error:
-        raise InputError(f"{path} is no checkpoint of `prior train compact`") from error
+    except Exception as error:  # the unpickler lets through whatever damaged bytes make it do
+        raise InputError(
+            f"{path} is no checkpoint of `prior train compact` ({reason_of(error)}); give another"
+        ) from error
     return network.eval()
 
 

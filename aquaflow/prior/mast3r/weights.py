@@ -7,14 +7,13 @@ The file is read without running any code in it (``weights_only``): its ``args``
 from __future__ import annotations
 
 import argparse
-import pickle
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from aquaflow.errors import InputError, first_line
+from aquaflow.errors import InputError, reason_of
 from aquaflow.prior.mast3r.network import Mast3r
 from aquaflow.prior.mast3r.settings import FULL, NetworkSize
 
@@ -61,9 +60,9 @@ def _tensors_of(path: Path) -> dict[str, Tensor]:
     try:
         with torch.serialization.safe_globals([argparse.Namespace]):
             content: Any = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError) as error:
+    except Exception as error:  # the unpickler lets through whatever damaged bytes make it do
         raise InputError(
-            f"{path} cannot be read as a checkpoint of tensors ({first_line(error)}); "
+            f"{path} cannot be read as a checkpoint of tensors ({reason_of(error)}); "
             "download it again"
         ) from error
     state = content.get("model", content) if isinstance(content, dict) else None

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import yaml
 
 from aquaflow.errors import InputError
+from aquaflow.plain_yaml import read_mapping
 from aquaflow.training.datasets.openexr import read_exr
 from aquaflow.training.datasets.posed import (
     NED_TO_OPTICAL,
@@ -73,9 +72,9 @@ def _moment(image: Path) -> int:
 def _calibration(path: Path) -> tuple[Array, Array]:
     """K and T_bc of the camera's optical axes."""
     try:
-        sensor: dict[str, Any] = yaml.safe_load(path.read_text())
+        sensor = read_mapping(path, "calibration", "unpack it again")
         K = np.array(sensor["intrinsics"], dtype=np.float64).reshape(3, 3)
         T_bs = np.array(sensor["T_BS"], dtype=np.float64).reshape(4, 4)
-    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is no calibration of a camera; unpack it again") from error
     return K, T_bs @ NED_TO_OPTICAL

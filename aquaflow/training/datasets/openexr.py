@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.errors import InputError
+from aquaflow.errors import DamagedError, InputError, reason_of
 
 MAGIC = 20000630
 LINES = {0: 1, 2: 1, 3: 16}
@@ -43,11 +43,12 @@ def read_exr(path: Path) -> npt.NDArray[np.float32]:
     try:
         data = path.read_bytes()
         if struct.unpack_from("<I", data)[0] != MAGIC:
-            raise ValueError("it is no OpenEXR file")
+            raise DamagedError("it is no OpenEXR file")
         header, at = _header(data)
         return _pixels(data, header, at)
     except (OSError, ValueError, LookupError, struct.error, zlib.error) as error:
-        raise InputError(f"cannot read {path} ({error}); convert it to 32-bit zip") from error
+        said = reason_of(error)
+        raise InputError(f"cannot read {path} ({said}); convert it to 32-bit zip") from error
 
 
 def _header(data: bytes) -> tuple[_Header, int]:
@@ -64,7 +65,7 @@ def _header(data: bytes) -> tuple[_Header, int]:
         _channels(found["channels"]), found["compression"][0], y1 - y0 + 1, x1 - x0 + 1, y0
     )
     if header.compression not in LINES:
-        raise ValueError(f"its compression is number {header.compression}")
+        raise DamagedError(f"its compression is number {header.compression}")
     return header, at + 1
 
 

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
 from pydantic import ValidationError
 
 from aquaflow.config.stage import Stage
-from aquaflow.errors import InputError
+from aquaflow.errors import ConfigError, InputError
+from aquaflow.plain_yaml import read_mapping
 from aquaflow.training.datasets.posed import (
     Depth,
     Frames,
@@ -120,8 +120,8 @@ def read_pfm(path: Path) -> Depth:
 
 def _rig(path: Path) -> StereoRig:
     try:
-        return StereoRig.model_validate(yaml.safe_load(path.read_text()))
-    except (OSError, yaml.YAMLError, ValidationError) as error:
+        return StereoRig.model_validate(read_mapping(path, "cameras", "write them"))
+    except (InputError, ConfigError, ValidationError) as error:
         raise InputError(
             f"UWStereo does not carry its cameras: write fx, fy, cx, cy in px and baseline_m to "
             f"{path}"
