@@ -6,8 +6,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+# Tests of one file run in one process: they share what the file's fixtures made.
+TESTS := $(BIN)/pytest -n $(WORKERS) --dist loadfile
 KERNELS := $(wildcard aquaflow/render/native/*.cpp aquaflow/render/native/*.h)
 
+WORKERS ?= 2
 OUT ?= out/dive
 SYNTHETIC := out/synthetic
 
@@ -41,7 +44,7 @@ run: setup
 endif
 
 test: setup ## Run the tests that take seconds.
-	$(BIN)/pytest -m 'not slow and not kernel'
+	$(TESTS) -m 'not slow and not kernel'
 
 test-all: setup ## Run all tests, also those on whole recordings.
 	$(BIN)/pytest

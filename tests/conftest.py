@@ -1,19 +1,39 @@
-"""What several tests share: the command line in a process of its own, and one small mapped dive."""
+"""What several tests share: the command line in a process of its own, and one small mapped dive.
+
+What a new test has to respect, so that `make test` stays quick and passes on a busy machine:
+
+- It runs in one of two processes, one thread each (below). A file's tests run in one process, one
+  after the other: what several tests of a file need is a fixture of that module, made once.
+- Start from `small_recording` (24 pictures) and `small_dive` (its map); both are made once for all
+  processes and are only read: copy one before changing it. No test maps a whole dive of its own
+  where a part shows it (`--stop 10`, `--tracking-only`), or draws larger pictures than it needs.
+- `aquaflow(...)` costs 0.1 s of CPU; a new interpreter that imports torch costs 3 s.
+- Nothing may depend on how fast the machine is. Wait for a state or an event, never for a time;
+  give code that looks at a clock a simulated one; a give-up limit is GIVE_UP_S, since it only ends
+  a test that fails. A live dive takes every picture with `tests/service/paced.py`.
+- Two CPU seconds are much. What needs minutes is marked `slow` and has a quick relative here.
+"""
 
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from command_line import Cli, Ran, refused, run_aquaflow
+from filelock import FileLock
 from hypothesis import settings
+
+__all__ = ["Cli", "Ran", "refused", "run_aquaflow"]
 
 # What a stage raises ends a test: a contained defect would stay hidden (aquaflow/failures.py).
 os.environ["AQUAFLOW_STRICT"] = "1"
+
+# Before torch, OpenCV and BLAS are loaded, here and in the processes that tests start: tests run
+# side by side, and threads of several processes that share cores only wait for each other.
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
+    os.environ.setdefault(_variable, "1")
 
 # A machine that does other work meanwhile is slow, not wrong.
 settings.register_profile("aquaflow", deadline=None)
@@ -21,46 +41,26 @@ settings.load_profile("aquaflow")
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
+GIVE_UP_S = 300.0
+"""Longest wait for what takes milliseconds on an idle machine; only a failing test waits for it."""
+
 FRAMES = 24
 WIDTH, HEIGHT = 160, 120
 QUICK = ("--refine-steps", "60")
 """A map good enough to look at the files; its quality is the bars' business."""
 
 
-@dataclass(frozen=True)
-class Ran:
-    """A finished command."""
-
-    code: int
-    out: str
-    err: str
-
-
-Cli = Callable[..., Ran]
-
-
-def run_aquaflow(*arguments: object, timeout_s: float = 400.0) -> Ran:
-    """Run ``aquaflow`` as a user does."""
-    script = Path(sys.executable).with_name("aquaflow")
-    done = subprocess.run(
-        [str(script), *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=timeout_s,
-        check=False,
-    )
-    return Ran(done.returncode, done.stdout, done.stderr)
-
-
-def refused(ran: Ran, *named: object) -> None:
-    """The command failed with one sentence that names the input."""
-    assert ran.code == 1
-    assert ran.out == ""
-    assert "Traceback" not in ran.err
-    (line,) = ran.err.splitlines()
-    assert line.startswith("aquaflow: ")
-    for name in named:
-        assert str(name) in line
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """A folder that ``make`` writes in the first process that needs it; the others wait."""
+    root = factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        root = root.parent  # each worker has a folder of its own in it
+    folder, finished = root / name, root / f"{name}.finished"
+    with FileLock(root / f"{name}.lock"):
+        if not finished.exists():
+            make(folder)
+            finished.touch()
+    return folder
 
 
 @pytest.fixture
@@ -118,20 +118,24 @@ def pictures(tmp_path: Path) -> Path:
 @pytest.fixture(scope="session")
 def small_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A synthetic dive of 24 small pictures, made once."""
-    from aquaflow.synthetic import SyntheticConfig, write_dive
 
-    folder = tmp_path_factory.mktemp("recording") / "small"
-    write_dive(folder, SyntheticConfig(frames=FRAMES, width=WIDTH, height=HEIGHT))
-    return folder
+    def make(folder: Path) -> None:
+        from aquaflow.synthetic import SyntheticConfig, write_dive
+
+        write_dive(folder, SyntheticConfig(frames=FRAMES, width=WIDTH, height=HEIGHT))
+
+    return made_once(tmp_path_factory, "small_recording", make)
 
 
 @pytest.fixture(scope="session")
 def small_dive(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The dive folder of the small recording, mapped once."""
-    dive = tmp_path_factory.mktemp("dive") / "small"
-    ran = run_aquaflow("map", small_recording, "--out", dive, *QUICK)
-    assert ran.code == 0, ran.err
-    return dive
+
+    def make(folder: Path) -> None:
+        ran = run_aquaflow("map", small_recording, "--out", folder, *QUICK)
+        assert ran.code == 0, ran.err
+
+    return made_once(tmp_path_factory, "small_dive", make)
 
 
 @pytest.fixture(scope="session")
