@@ -90,6 +90,14 @@ class CameraFeed:
     def plugged_in(self) -> bool:
         return self._now_ns() >= self.away_until_ns
 
+    def come_back(self) -> None:
+        """The device was away until now: what it did not show meanwhile never comes."""
+        self.away_until_ns = self._now_ns()
+
+    def set_clock_on(self, seconds: float) -> None:
+        """From the next picture on, the claimed times are off by so much more."""
+        self._jump_ns += round(seconds * NS_PER_S)
+
     def peek(self) -> Shot:
         """The next shot, which may not be due yet."""
         if self._next is None:

@@ -68,6 +68,21 @@ class V4l2Kernel:
         self._buffers = Buffers()
         self._plug_in()
 
+    def unplug(self) -> None:
+        """Take the camera away, until it is plugged in. Its nodes go; the number stays taken while
+        a descriptor is open, so the next is new."""
+        self._present = False
+        for node in self._nodes():
+            (self.root / "dev" / node).unlink()
+            shutil.rmtree(self.root / "sys/class/video4linux" / node)
+        for link in (self.root / "dev/v4l/by-id").glob(f"usb-{self.spec.serial}-*"):
+            link.unlink()
+
+    def plug_in(self) -> None:
+        """Bring a camera back that was unplugged."""
+        self.feed.come_back()
+        self._plug_in()
+
     def open(self, path: str) -> int:
         if not Path(path).exists():
             raise OSError(errno.ENOENT, os.strerror(errno.ENOENT), path)
@@ -159,7 +174,10 @@ class V4l2Kernel:
             raise refused(errno.EAGAIN)
         shot = self.feed.take()
         if shot.unplugged:
-            self._unplug()
+            self.unplug()
+            again = threading.Timer(self.feed.faults.away_s, self._plug_in)
+            again.daemon = True
+            again.start()
             raise refused(errno.ENODEV)
         payload, damaged = encoded(shot.image, self._format, shot.corrupt)
         index = self._buffers.fill(payload)
@@ -210,18 +228,6 @@ class V4l2Kernel:
             (device / "device").mkdir(parents=True, exist_ok=True)
             (device / "serial").write_text(f"{self.spec.serial}\n")
         self._present = True
-
-    def _unplug(self) -> None:
-        """The nodes go; the number stays taken while a descriptor is open, so the next is new."""
-        self._present = False
-        for node in self._nodes():
-            (self.root / "dev" / node).unlink()
-            shutil.rmtree(self.root / "sys/class/video4linux" / node)
-        for link in (self.root / "dev/v4l/by-id").glob(f"usb-{self.spec.serial}-*"):
-            link.unlink()
-        again = threading.Timer(self.feed.faults.away_s, self._plug_in)
-        again.daemon = True
-        again.start()
 
 
 def _index(data: memoryview) -> int:
