@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from conftest import GIVE_UP_S
 
 from aquaflow.config.cameras import OakConfig, StreamConfig, V4l2Config
 from aquaflow.geometry.camera import guess_camera
@@ -23,9 +24,8 @@ from sim_drivers.v4l2_kernel import CameraSpec, V4l2Kernel
 
 WIDTH, HEIGHT, COUNT = 64, 48, 40
 
-QUICK = {"stall_s": 1.0, "first_retry_s": 0.02, "last_retry_s": 0.05}
-GIVE_UP_S = 30.0
-"""A test that hangs fails after this."""
+QUICK = {"stall_s": 60.0, "first_retry_s": 0.02, "last_retry_s": 0.05}
+"""A machine that is slow has no silent camera: what is silent says so by its own ``stall_s``."""
 
 KINDS = ("v4l2-YUYV", "v4l2-MJPG", "v4l2-GREY", "oak", "stream")
 

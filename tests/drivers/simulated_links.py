@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from conftest import GIVE_UP_S
 from scipy.spatial.transform import Rotation
 
 from aquaflow.config.link import CanConfig
@@ -40,8 +41,6 @@ from sim_drivers.devices.waterlinked import WaterLinkedJson, WaterLinkedSerial
 from sim_drivers.devices.wires import CanWire, PtyWire, TcpWire, UdpWire
 from sim_drivers.faults import Faults, faulty
 
-PATIENCE_S = 30.0
-"""For what takes milliseconds on a machine that has nothing else to do."""
 SPEED = 4.0
 STEPS = 20
 RATE_HZ = 20.0
@@ -234,7 +233,7 @@ class Running:
         """Let the device say all its samples to the open link."""
         self.wait_open()
         self.device.start()
-        assert self.device.finished.wait(PATIENCE_S)
+        assert self.device.finished.wait(GIVE_UP_S)
 
     def fetched(self) -> list[TelemetrySample]:
         """Stop, and everything that came."""
@@ -260,7 +259,7 @@ def running(
 
 def until(condition: Callable[[], bool]) -> None:
     """Wait for what other threads do."""
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + GIVE_UP_S
     while not condition():
         assert time.monotonic() < deadline, "nothing happened"
         time.sleep(0.005)

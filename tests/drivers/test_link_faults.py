@@ -7,7 +7,8 @@ import threading
 
 import numpy as np
 import pytest
-from simulated_links import PATIENCE_S, RIGS, endless, motion, running, until, values
+from conftest import GIVE_UP_S
+from simulated_links import RIGS, endless, motion, running, until, values
 
 from drivers.link import MAX_READ_BYTES
 from sim_drivers.faults import Faults
@@ -46,7 +47,7 @@ def test_a_driver_lives_through_a_fault(name, fault, tmp_path):
         before = session.counters.samples
         until(lambda: session.counters.samples > before)
         enough.set()
-        assert session.device.finished.wait(PATIENCE_S)
+        assert session.device.finished.wait(GIVE_UP_S)
         heard = session.fetched()
 
     counters = session.counters

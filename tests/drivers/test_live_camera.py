@@ -49,7 +49,32 @@ def picture(sequence: int | None = None, size: tuple[int, int] = SIZE) -> RawPic
     return RawPicture(time.monotonic_ns(), lambda: image, sequence=sequence)
 
 
-def camera(*openings: Capture | Exception, **settings: object) -> LiveCamera:
+class Silent(Scripted):
+    """After its pictures it is silent, for so long each time that it is read."""
+
+    def __init__(self, clock: SimulatedClock, seconds: float, *script: RawPicture):
+        super().__init__(*script)
+        self._clock, self._seconds = clock, seconds
+
+    def read(self, timeout_s: float) -> RawPicture | None:
+        if not self._script:
+            self._clock.now_ns += round(self._seconds * 1e9)
+        return super().read(timeout_s)
+
+
+class SimulatedClock:
+    """Time that passes when a device lets it."""
+
+    def __init__(self) -> None:
+        self.now_ns = time.monotonic_ns()
+
+    def __call__(self) -> int:
+        return self.now_ns
+
+
+def camera(
+    *openings: Capture | Exception, clock: SimulatedClock | None = None, **settings: object
+) -> LiveCamera:
     """One opening after the other; the last is repeated."""
     queue = list(openings)
 
@@ -60,7 +85,7 @@ def camera(*openings: Capture | Exception, **settings: object) -> LiveCamera:
         return opening
 
     config = LiveCameraConfig.model_validate({**QUICK, **settings})
-    return LiveCamera("front", config, open_next)
+    return LiveCamera("front", config, open_next, clock or time.monotonic_ns)
 
 
 def paced(count: int, make: Callable[[int], RawPicture]) -> Scripted:
@@ -130,8 +155,9 @@ def test_closing_from_another_thread_ends_iteration() -> None:
 
 
 def test_a_silent_device_is_opened_anew() -> None:
-    silent, good = Scripted(picture()), Scripted(picture())
-    with closing(camera(silent, good, stall_s=0.05)) as stalled:
+    clock = SimulatedClock()
+    silent, good = Silent(clock, 0.3, picture()), Scripted(picture())
+    with closing(camera(silent, good, clock=clock, stall_s=1.0)) as stalled:
         frames = stalled.frames()
         assert [next(frames).index, next(frames).index] == [0, 1]
         assert silent.closed == 1

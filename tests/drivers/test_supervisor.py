@@ -128,17 +128,44 @@ def test_pauses_grow_while_nothing_is_heard_and_start_small_after(monkeypatch):
     assert pauses[5] == 0.002
 
 
-def test_a_silent_link_is_opened_anew_and_said_once(caplog):
-    silent = ScriptedLink(), ScriptedLink(), ScriptedLink()
+class SimulatedTime:
+    """The supervisor's module ``time``; it passes while a silent link is read."""
+
+    def __init__(self):
+        self.now_s = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def monotonic_ns(self) -> int:
+        return round(self.now_s * 1e9)
+
+
+class SilentLink(ScriptedLink):
+    """Every read of it takes a second."""
+
+    def __init__(self, time: SimulatedTime):
+        super().__init__()
+        self._time = time
+
+    def read(self, timeout_s: float) -> bytes:
+        self._time.now_s += 1.0
+        return super().read(timeout_s)
+
+
+def test_a_silent_link_is_opened_anew_and_said_once(caplog, monkeypatch):
+    time = SimulatedTime()
+    monkeypatch.setattr(supervisor, "time", time)
+    silent = SilentLink(time), SilentLink(time), SilentLink(time)
     with (
         caplog.at_level(logging.INFO),
-        supervised(*silent, ScriptedLink(DEPTH), silence_s=0.02) as (link, heard),
+        supervised(*silent, ScriptedLink(DEPTH), silence_s=10.0) as (link, heard),
     ):
         until(lambda: len(heard) == 1)
         assert link.counters.reconnects == 0
 
     said = [record.getMessage() for record in caplog.records]
-    assert said == ["box: no byte for 0.02 s", "box: connected"]
+    assert said == ["box: no byte for 10 s", "box: connected"]
 
 
 def test_a_link_may_be_silent_where_the_config_says_so():

@@ -9,6 +9,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from conftest import GIVE_UP_S
+
 from aquaflow.messages import Dropped
 from sim_drivers.mcap_camera import McapCamera
 from sim_drivers.mcap_messages import McapMessages, mcap_files
@@ -16,7 +18,7 @@ from sim_drivers.mcap_telemetry import McapTelemetry
 
 FPS = 30
 
-BEGUN_S = 60.0
+BEGUN_S = GIVE_UP_S
 """Longest wait for the first pictures; importing takes a second, on a busy machine more."""
 
 FIRST_BYTES = 20_000
@@ -71,14 +73,16 @@ def sentence(degrees: float) -> str:
     return f"${body}*{checksum:02X}"
 
 
-def record_and_kill(source: Path, out: Path, after_s: float, *options: str) -> Killed:
-    """Record ``source``, kill -9 ``after_s`` seconds after the first pictures are there."""
+def record_and_kill(
+    source: Path, out: Path, after_s: float, begun_bytes: int = FIRST_BYTES
+) -> Killed:
+    """Record ``source``, kill -9 ``after_s`` seconds after so many bytes are there."""
     script = Path(sys.executable).with_name("aquaflow")
-    arguments = [str(script), "record", "--source", str(source), "--out", str(out), *options]
+    arguments = [str(script), "record", "--source", str(source), "--out", str(out)]
     process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         deadline = time.monotonic() + BEGUN_S
-        while not under_way(out):
+        while not under_way(out, begun_bytes):
             assert process.poll() is None, "the recorder ended by itself"
             assert time.monotonic() < deadline, "the recorder never began"
             time.sleep(0.02)
@@ -101,12 +105,13 @@ def examined(out: Path, ran_s: float, ended: float, used_s: float) -> Killed:
     unreadable = sum(isinstance(frame, Dropped) for frame in frames)
     samples = sum(1 for _ in McapTelemetry(out).samples())
     lost_s = ended - last_ns * 1e-9
-    return Killed(ran_s, lost_s, used_s / ran_s, len(frames) - unreadable, samples, unreadable)
+    share = used_s / ran_s if ran_s > 0.0 else 0.0
+    return Killed(ran_s, lost_s, share, len(frames) - unreadable, samples, unreadable)
 
 
-def under_way(out: Path) -> bool:
+def under_way(out: Path, begun_bytes: int = FIRST_BYTES) -> bool:
     """True once pictures are on the disk."""
-    return out.is_dir() and any(file.stat().st_size > FIRST_BYTES for file in mcap_files(out))
+    return out.is_dir() and any(file.stat().st_size > begun_bytes for file in mcap_files(out))
 
 
 def cpu_s(pid: int) -> float:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import random
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from killed import FPS, Killed, record_and_kill, write_source
+from simulated_time import simulated, written
 
 from aquaflow.config.recording import RecordingConfig
 from aquaflow.geometry.camera import guess_camera
@@ -80,18 +82,34 @@ def small_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def assert_only_the_last_second_is_lost(left: Killed) -> None:
-    assert left.lost_s < 1.0
+def assert_all_that_is_there_replays(left: Killed) -> None:
     assert left.unreadable == 0
     assert left.pictures > 0
     assert left.samples > 0
 
 
-def test_a_killed_recorder_loses_at_most_the_last_second(
-    small_source: Path, tmp_path: Path
+def test_all_that_a_killed_recorder_wrote_replays(small_source: Path, tmp_path: Path) -> None:
+    left = record_and_kill(small_source, tmp_path / "killed", after_s=0.0, begun_bytes=200_000)
+    assert_all_that_is_there_replays(left)
+
+
+def test_whenever_the_power_goes_at_most_the_last_second_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    left = record_and_kill(small_source, tmp_path / "killed", after_s=2.0)
-    assert_only_the_last_second_is_lost(left)
+    """What the disk has at a moment is what a kill at that moment leaves."""
+    clock, live = simulated(monkeypatch), tmp_path / "live"
+    recorder = Recorder(live, RecordingConfig(picture="raw", reserve_mb=0))
+    for k in range(3 * FPS):
+        image = np.full((48, 64, 3), k, np.uint8)
+        recorder.frame("c", Frame(k, k * 10**7, k * 10**7, image, guess_camera(64, 48)))
+        written(recorder, k + 1)
+        if k >= FPS and k % 7 == 0:
+            left = tmp_path / f"left after {k}"
+            shutil.copytree(live, left)
+            newest = max(frame.index for frame in McapCamera(left).frames())
+            assert k - FPS < newest <= k
+        clock.now_s += 1.0 / FPS
+    recorder.close()
 
 
 @pytest.mark.slow
@@ -103,7 +121,8 @@ def test_twenty_killed_recordings_of_a_minute_all_replay(tmp_path: Path) -> None
     shares = []
     for k in range(20):
         left = record_and_kill(source, tmp_path / f"out{k}", rng.uniform(2.0, 60.0))
-        assert_only_the_last_second_is_lost(left)
+        assert_all_that_is_there_replays(left)
+        assert left.lost_s < 1.0
         shares.append(left.cpu_share)
         assert left.pictures < 66 * FPS
     assert np.median(shares) < 0.3

@@ -9,13 +9,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import Cli, refused
-from killed import sentence, under_way, write_source
+from conftest import GIVE_UP_S, Cli, refused
+from killed import FPS, sentence, under_way, write_source
 
 from aquaflow.config.recording import RecordingConfig
 from aquaflow.config.telemetry import TelemetryConfig
@@ -23,11 +23,14 @@ from aquaflow.errors import InputError
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.messages import Depth, Dropped, Frame, TelemetrySample
 from aquaflow.recording import Recorder
+from aquaflow.recording import session as session_module
 from aquaflow.recording.session import Session
 from aquaflow.sources import open_links
 from sim_drivers.mcap_camera import McapCamera
 from sim_drivers.mcap_messages import McapMessages, mcap_files
 from sim_drivers.mcap_telemetry import McapTelemetry
+
+HOUR_S = 3600.0
 
 
 @pytest.fixture(scope="module")
@@ -38,16 +41,17 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_recording_is_recorded_with_its_telemetry_and_its_bytes(
-    aquaflow: Cli, source: Path, tmp_path: Path
+    aquaflow: Cli, tmp_path: Path
 ) -> None:
-    out = tmp_path / "out"
-    ran = aquaflow("record", "--source", source, "--out", out, "--seconds", 1.5, "--json")
+    out, source = tmp_path / "out", tmp_path / "source"
+    write_source(source, 2.0, 64, 48)
+    ran = aquaflow("record", "--source", source, "--out", out, "--json")
     assert ran.code == 0, ran.err
     told = json.loads(ran.out)
     assert told["stopped"] is None
     assert told["dropped"] == {}
     telemetry = McapTelemetry(out)
-    assert len(list(McapCamera(out).frames())) == told["frames"] > 0
+    assert len(list(McapCamera(out).frames())) == told["frames"] == 2 * FPS
     assert len(list(telemetry.samples())) == told["samples"] > 0
     assert sum(len(read.data) for read in telemetry.link_bytes()) == told["link_bytes"] > 0
     assert told["files"] == [str(file) for file in mcap_files(out)]
@@ -61,11 +65,11 @@ def test_systemds_sigterm_ends_it_cleanly_with_one_line(source: Path, tmp_path: 
         stdout=subprocess.PIPE,
         text=True,
     )
-    deadline = time.monotonic() + 60.0
+    deadline = time.monotonic() + GIVE_UP_S
     while not under_way(out) and time.monotonic() < deadline:
         time.sleep(0.05)
     process.send_signal(signal.SIGTERM)
-    printed, _ = process.communicate(timeout=60.0)
+    printed, _ = process.communicate(timeout=GIVE_UP_S)
     assert process.returncode == 0
     (line,) = printed.splitlines()
     assert line.startswith("Recorded ")
@@ -108,6 +112,7 @@ class LiveCamera:
 
     def __init__(self, fails_at: int = 10**9) -> None:
         self.closed = threading.Event()
+        self.delivered = 0
         self._fails_at = fails_at
 
     def frames(
@@ -121,6 +126,7 @@ class LiveCamera:
             image = np.zeros((4, 4, 3), np.uint8)
             yield Frame(index, now, now, image, guess_camera(4, 4))
             index += 1
+            self.delivered = index
 
     def close(self) -> None:
         self.closed.set()
@@ -136,11 +142,32 @@ def session_of(out: Path) -> Session:
     return Session(Recorder(out, RecordingConfig(picture="raw", reserve_mb=0)))
 
 
-def test_live_sources_are_recorded_until_time_is_up_and_then_closed(tmp_path: Path) -> None:
+def hours_pass_when(so_far: Callable[[], bool], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The session's clock stands still until ``so_far``, and is then hours later."""
+    began_s = time.monotonic()
+
+    class SimulatedTime:
+        monotonic_ns = time.monotonic_ns
+
+        @staticmethod
+        def monotonic() -> float:
+            return began_s + 2.0 * HOUR_S * so_far()
+
+    monkeypatch.setattr(session_module, "time", SimulatedTime)
+
+
+def test_live_sources_are_recorded_until_time_is_up_and_then_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     cameras = {"front": LiveCamera(), "down": CameraWithImu()}
     session = session_of(tmp_path)
     session.add_live(cameras, [])
-    session.run(seconds=0.5)
+
+    def all_recorded() -> bool:
+        return session.recorder.status.samples > 0 and all(c.delivered for c in cameras.values())
+
+    hours_pass_when(all_recorded, monkeypatch)
+    session.run(seconds=HOUR_S)
     assert all(camera.closed.is_set() for camera in cameras.values())
     assert session.recorder.status.samples > 0
     for name in cameras:
@@ -159,7 +186,7 @@ def test_live_links_are_recorded_with_their_bytes(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as talker:
 
         def talk() -> None:
-            deadline = time.monotonic() + 30.0
+            deadline = time.monotonic() + GIVE_UP_S
             while session.recorder.status.samples < 3 and time.monotonic() < deadline:
                 talker.sendto(f"{sentence(10.0)}\r\n".encode(), ("127.0.0.1", port))
                 time.sleep(0.02)
@@ -175,10 +202,20 @@ def test_live_links_are_recorded_with_their_bytes(tmp_path: Path) -> None:
     assert [s.source for s in again[:3]] == [s.source for s in telemetry.samples()][:3]
 
 
-def test_a_camera_that_fails_does_not_end_the_others(tmp_path: Path) -> None:
-    session = session_of(tmp_path)
-    session.add_live({"bad": LiveCamera(fails_at=3), "good": LiveCamera()}, [])
-    session.run(seconds=0.8)
+def test_a_camera_that_fails_does_not_end_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session, good_one = session_of(tmp_path), LiveCamera()
+    session.add_live({"bad": LiveCamera(fails_at=3), "good": good_one}, [])
+    at_failure: list[int] = []
+
+    def more_came() -> bool:
+        if session.notes and not at_failure:
+            at_failure.append(good_one.delivered)
+        return bool(at_failure) and good_one.delivered > at_failure[0] + 3
+
+    hours_pass_when(more_came, monkeypatch)
+    session.run(seconds=HOUR_S)
     assert session.notes == ["camera 'bad' failed: the lens fell off"]
     good = len(list(McapCamera(tmp_path, camera="good").frames()))
     assert good > len(list(McapCamera(tmp_path, camera="bad").frames())) == 3

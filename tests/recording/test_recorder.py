@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import GIVE_UP_S
+from simulated_time import SimulatedTime, simulated, written
 
 from aquaflow.config.recording import RecordingConfig
 from aquaflow.errors import InputError
@@ -40,6 +42,11 @@ CAMERA = CameraModel(
 )
 LOSSLESS = RecordingConfig(picture="png", reserve_mb=0)
 BIG_MB = 10**9
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> SimulatedTime:
+    return simulated(monkeypatch)
 
 
 def picture(index: int, **more: object) -> Frame:
@@ -155,13 +162,14 @@ def test_the_wall_clock_is_a_series_beside_the_monotonic_one(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("limits", [{"file_mb": 1}, {"file_s": 0.1}])
 def test_every_file_of_a_long_recording_stands_alone(
-    tmp_path: Path, limits: dict[str, float]
+    tmp_path: Path, limits: dict[str, float], clock: SimulatedTime
 ) -> None:
     settings = RecordingConfig(picture="raw", reserve_mb=0, chunk_kb=16, flush_s=0.05, **limits)
     recorder = Recorder(tmp_path, settings)
     for index in range(150):
         recorder.frame("c", picture(index))
-        time.sleep(0.001)
+        written(recorder, index + 1)
+        clock.now_s += 0.001
     status = recorder.close()
     assert len(status.files) > 1
     alone = [McapCamera(file) for file in status.files if "image" in str(topics(file))]
@@ -175,13 +183,16 @@ def topics(file: Path) -> set[str]:
     return {message.topic for message in McapMessages([file])}
 
 
-def test_a_video_goes_on_in_a_new_file_only_with_a_key_frame(tmp_path: Path) -> None:
+def test_a_video_goes_on_in_a_new_file_only_with_a_key_frame(
+    tmp_path: Path, clock: SimulatedTime
+) -> None:
     settings = RecordingConfig(reserve_mb=0, file_s=0.02, flush_s=0.01)
     recorder = Recorder(tmp_path, settings)
     for index in range(60):
         unit = Encoded("h264", bytes([index]), key=index % 10 == 0)
         recorder.frame("c", picture(index, encoded=unit))
-        time.sleep(0.004)
+        written(recorder, index + 1)
+        clock.now_s += 0.004
     files = recorder.close().files
     assert len(files) > 2
     firsts = [
@@ -198,11 +209,11 @@ def test_a_slow_disk_costs_messages_that_are_counted_and_never_a_drivers_time(
 
     def slow_flush(self: DiveFile) -> None:
         stuck.set()
-        release.wait(30.0)
+        release.wait(GIVE_UP_S)
 
     monkeypatch.setattr(dive_file.DiveFile, "flush", slow_flush)
     recorder = Recorder(tmp_path, RecordingConfig(queue_mb=1, reserve_mb=0))
-    assert stuck.wait(30.0)
+    assert stuck.wait(GIVE_UP_S)
     for index in range(200):
         recorder.frame("c", picture(index))  # 9 kB each; would hang here if it waited
     waiting = recorder.status.frames
@@ -220,7 +231,7 @@ def test_recording_stops_before_the_disk_is_full_and_says_so(tmp_path: Path) -> 
         return next(left) * 1_000_000
 
     recorder = Recorder(tmp_path, RecordingConfig(reserve_mb=1000, flush_s=0.02), free)
-    deadline = time.monotonic() + 30.0
+    deadline = time.monotonic() + GIVE_UP_S
     index = 0
     while recorder.status.stopped is None and time.monotonic() < deadline:
         recorder.frame("c", picture(index))

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import GIVE_UP_S
 from live_scenes import HEIGHT, WIDTH
 
 from aquaflow.config import SourceConfig
@@ -29,8 +30,7 @@ from sim_drivers.devices.wires import UdpWire
 from sim_drivers.faults import Faults, faulty
 from sim_drivers.v4l2_kernel import V4l2Kernel
 
-GIVE_UP_S = 60.0
-QUICK = {"stall_s": 1.0, "first_retry_s": 0.02, "last_retry_s": 0.05}
+QUICK = {"stall_s": 60.0, "first_retry_s": 0.02, "last_retry_s": 0.05}
 
 
 class Pictures:
