@@ -102,8 +102,13 @@ def clip() -> list[Frame]:
     return filmed(SeaFloor(), POSES)
 
 
-def test_a_loop_is_closed_and_the_path_stays_right(clip: list[Frame]) -> None:
-    swim = Swim().run(clip)
+@pytest.fixture(scope="module")
+def swim(clip: list[Frame]) -> Swim:
+    """Once round, which nothing disturbs; only read."""
+    return Swim().run(clip)
+
+
+def test_a_loop_is_closed_and_the_path_stays_right(swim: Swim, clip: list[Frame]) -> None:
     assert swim.loops > 0
     assert len(swim.anchors) == len(clip)
     assert share(swim.errors(POSES), POSES) < 0.003
@@ -114,9 +119,8 @@ def test_without_the_graph_no_loop_is_looked_for(clip: list[Frame]) -> None:
     assert Swim(settings).run(clip).loops == 0
 
 
-def test_drift_at_the_seam_falls_fivefold_when_the_loop_closes(clip: list[Frame]) -> None:
+def test_drift_at_the_seam_falls_fivefold_when_the_loop_closes(swim: Swim) -> None:
     """A path that drifts by planted errors of its links, and one true loop."""
-    swim = Swim().run(clip)
     drifting = Swim()
     store, graph = drifting.store, drifting.graph.graph
     for keyframe in swim.store.keyframes:
