@@ -6,7 +6,8 @@ What a new test has to respect, so that `make test` stays quick and passes on a 
   after the other: what several tests of a file need is a fixture of that module, made once.
 - Start from `small_recording` (24 pictures) and `small_dive` (its map); both are made once for all
   processes and are only read: copy one before changing it. No test maps a whole dive of its own
-  where a part shows it (`--stop 10`, `--tracking-only`), or draws larger pictures than it needs.
+  where a part shows it (`--stop 10`, `--tracking-only`, HASTY), or draws larger pictures than it
+  needs.
 - `aquaflow(...)` costs 0.1 s of CPU; a new interpreter that imports torch costs 3 s.
 - Nothing may depend on how fast the machine is. Wait for a state or an event, never for a time;
   give code that looks at a clock a simulated one; a give-up limit is GIVE_UP_S, since it only ends
@@ -48,6 +49,8 @@ FRAMES = 24
 WIDTH, HEIGHT = 160, 120
 QUICK = ("--refine-steps", "60")
 """A map good enough to look at the files; its quality is the bars' business."""
+HASTY = ("--config", str(Path(__file__).with_name("hasty.yaml")))
+"""A map that is there, for half the time."""
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:

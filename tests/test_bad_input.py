@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import QUICK, Cli, refused
+from conftest import HASTY, Cli, refused
 
 
 def rows(dive: Path) -> list[dict[str, str]]:
@@ -88,7 +88,7 @@ def test_a_video_that_ends_early_is_mapped_as_far_as_it_goes(
     write_video(source, "MJPG", small_recording)
     cut(source, 0.7)
     calibration = small_recording / "camera.yaml"
-    ran = aquaflow("map", source, "--calib", calibration, "--out", dive, *QUICK)
+    ran = aquaflow("map", source, "--calib", calibration, "--out", dive, *HASTY)
     assert ran.code == 0
     assert "ends after" in ran.out
     assert "ends after" in (dive / "report.html").read_text()
@@ -106,7 +106,7 @@ def test_pictures_of_another_size_are_left_out_and_named(
     shutil.copy(small_recording / "camera.yaml", source)
     odd = pictures(small_recording)[5].name
     cv2.imwrite(str(source / odd), np.zeros((60, 80, 3), np.uint8))
-    ran = aquaflow("map", source, "--out", dive, *QUICK)
+    ran = aquaflow("map", source, "--out", dive, *HASTY)
     assert ran.code == 0
     assert "1 of 24 pictures were left out" in ran.out
     (left_out,) = [row for row in rows(dive) if row["class"] == "dropped"]
@@ -131,7 +131,7 @@ def test_a_clip_of_three_frames_is_mapped_or_refused_with_its_name(
     source.mkdir()
     for file in pictures(small_recording)[:3]:
         shutil.copy(file, source)
-    ran = aquaflow("map", source, "--out", out, *QUICK)
+    ran = aquaflow("map", source, "--out", out, *HASTY)
     if ran.code == 0:
         assert json.loads((out / "metrics.json").read_text())["tracked"] == 3
     else:
@@ -142,7 +142,7 @@ def test_a_clip_of_three_frames_is_mapped_or_refused_with_its_name(
 def test_a_clip_of_two_frames_is_too_short(
     aquaflow: Cli, small_recording: Path, tmp_path: Path
 ) -> None:
-    ran = aquaflow("map", small_recording, "--stop", 2, *QUICK, "--out", tmp_path / "out")
+    ran = aquaflow("map", small_recording, "--stop", 2, *HASTY, "--out", tmp_path / "out")
     refused(ran, small_recording.name, "at least 3")
 
 

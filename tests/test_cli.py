@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from conftest import FRAMES, QUICK, Cli
+from conftest import FRAMES, HASTY, Cli
 
 from aquaflow import __version__
 from aquaflow.config import Config, load_config
@@ -63,7 +63,7 @@ def test_map_as_json_prints_one_object_and_nothing_else(
     aquaflow: Cli, small_recording: Path, tmp_path: Path
 ) -> None:
     dive = tmp_path / "dive"
-    ran = aquaflow("map", small_recording, "--out", dive, "--stop", 10, *QUICK, "--json")
+    ran = aquaflow("map", small_recording, "--out", dive, "--stop", 10, *HASTY, "--json")
     printed = json.loads(ran.out)
     assert ran.err == ""
     assert printed.pop("dive") == str(dive)
@@ -82,7 +82,7 @@ def test_map_says_what_came_out_and_where_to_look(
     aquaflow: Cli, small_recording: Path, tmp_path: Path
 ) -> None:
     dive = tmp_path / "dive"
-    ran = aquaflow("map", small_recording, "--out", dive, "--stop", 10, *QUICK)
+    ran = aquaflow("map", small_recording, "--out", dive, "--stop", 10, *HASTY)
     assert "10 of 10 frames posed" in ran.out
     assert str(dive / "report.html") in ran.out
 
@@ -102,7 +102,7 @@ def test_overwrite_leaves_nothing_of_the_dive_before(
     aquaflow: Cli, small_recording: Path, tmp_path: Path
 ) -> None:
     dive = tmp_path / "dive"
-    aquaflow("map", small_recording, "--out", dive, *QUICK)
+    aquaflow("map", small_recording, "--out", dive, *HASTY)
     assert (dive / "heldout" / "000016_real.png").is_file()
     ran = aquaflow(
         "map", small_recording, "--out", dive, "--stop", 12, "--tracking-only", "--overwrite"

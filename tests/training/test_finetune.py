@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import torch
+from conftest import GIVE_UP_S
 from data_trees import write_colmap, write_tartanair
 from typer.testing import CliRunner
 
@@ -170,13 +172,20 @@ def test_two_processes_train_one_network(data: Path, tmp_path: Path) -> None:
     """Each sees pairs of its own, and both end with the same weights."""
     script, out = tmp_path / "worker.py", tmp_path / "out"
     script.write_text(WORKER)
-    done = subprocess.run(
-        [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2",
-         str(script), str(data), str(out)],
-        capture_output=True, text=True, timeout=300, check=False,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-2000:]
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    workers = []
+    for rank in ("0", "1"):  # as torchrun sets it, whose own process would import torch once more
+        told = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2"}
+        told |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+        command = [sys.executable, str(script), str(data), str(out)]
+        workers.append(
+            subprocess.Popen(command, env={**os.environ, **told}, stderr=subprocess.PIPE, text=True)
+        )
+    for worker in workers:
+        _, said = worker.communicate(timeout=GIVE_UP_S)
+        assert worker.returncode == 0, said[-2000:]
     first, second = (torch.load(out / f"rank{rank}.pt") for rank in (0, 1))
     assert all(torch.equal(first[name], second[name]) for name in first)
     start = tiny().state_dict()
