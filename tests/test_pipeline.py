@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import FRAMES, HEIGHT, QUICK, WIDTH, Cli
+from conftest import FRAMES, HASTY, HEIGHT, QUICK, WIDTH, Cli
 
 from aquaflow.config import Config
 from aquaflow.errors import NotMappedError
@@ -51,7 +51,7 @@ def test_holding_out_counts_the_frames_that_are_used(
 ) -> None:
     dive = tmp_path / "dive"
     chosen = ("--every", 2, "--start", 4)
-    assert aquaflow("map", small_recording, *chosen, "--out", dive, *QUICK).code == 0
+    assert aquaflow("map", small_recording, *chosen, "--out", dive, *HASTY).code == 0
     assert [row["index"] for row in rows(dive)] == [str(i) for i in range(4, FRAMES, 2)]
     # The ninth used frame, and its time still counts from the recording's first frame.
     assert [path.name for path in (dive / "heldout").glob("*_real.png")] == ["000020_real.png"]
@@ -83,7 +83,7 @@ def test_black_frames_in_the_middle_cost_those_frames_and_are_noted(
     blind = range(9, 15)
     for i in blind:
         cv2.imwrite(str(source / "images" / f"{i:06d}.png"), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
-    ran = aquaflow("map", source, "--out", dive, *QUICK)
+    ran = aquaflow("map", source, "--out", dive, *HASTY)
     assert ran.code == 0
     table = rows(dive)
     assert [int(row["index"]) for row in table] == list(range(FRAMES))
