@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TextIO
 
 from aquaflow import __version__
-from aquaflow.errors import AquaFlowError, InputError, printable
+from aquaflow.errors import AquaFlowError, InputError, is_out_of_memory, printable
 
 DEBUG = "AQUAFLOW_DEBUG"
 """Environment variable: set to anything, tracebacks go to stderr."""
@@ -26,9 +26,6 @@ OUR_MISTAKE = 70
 """EX_SOFTWARE of sysexits.h."""
 INTERRUPTED = 130
 """As a shell reports an end by Ctrl-C."""
-
-NO_MEMORY = ("can't allocate memory", "not enough memory", "failed to allocate", "insufficient mem")
-"""How torch, OpenCV and onnxruntime word what is no MemoryError of theirs, in lower case."""
 
 
 @contextmanager
@@ -58,7 +55,7 @@ def said_of(error: Exception) -> tuple[str, int]:
             "and that there is room on the disk",
             FAILED,
         )
-    if isinstance(error, MemoryError) or any(each in str(error).lower() for each in NO_MEMORY):
+    if is_out_of_memory(error):
         return "out of memory; give smaller pictures with --width, or fewer of them", FAILED
     return _ours(error), OUR_MISTAKE
 

@@ -42,7 +42,7 @@ class Deliverables:
         self.held_out: list[HeldOut] = []
         self.poses: dict[int, Sim3] = tracked_poses(results)
         """By frame index."""
-        self._contain = slam.failures.contain
+        self._contain = partial(slam.failures.contain, full_disk=True)
         self._main = largest_sub_map(results)
         self._waters: dict[int, WaterSummary | None] = {}
         """By sub-map; a sub-map whose summary failed is missing."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import shutil
 from collections.abc import Container, Iterable, Mapping, Sequence
@@ -17,9 +16,10 @@ import torch
 from aquaflow.config import Config, dump_config
 from aquaflow.dive_log import JsonLog
 from aquaflow.errors import InputError
-from aquaflow.export.atomic import atomic_write
+from aquaflow.export.atomic import atomic_write, write_json
 from aquaflow.export.map_file import write_map_file
 from aquaflow.export.ply import Splats, write_ply
+from aquaflow.export.png import write_png
 from aquaflow.export.report import ReportData, write_report
 from aquaflow.export.tum import write_tum
 from aquaflow.frame_rows import FrameRow, header, of_text, or_lost, read_rows, to_text
@@ -228,24 +228,21 @@ class DiveFolder:
 
     def write_held_out(self, examples: list[HeldOut]) -> None:
         """heldout/: what the camera saw, also without its water, what the map shows, its range."""
-        import cv2
-
         folder = self.path / "heldout"
         folder.mkdir(exist_ok=True)
         for example in examples:
             if example.z is not None:
-                np.savez_compressed(folder / f"{example.frame_index:06d}_range.npz", z=example.z)
+                with atomic_write(folder / f"{example.frame_index:06d}_range.npz") as stream:
+                    np.savez_compressed(stream, z=example.z)
             pictures = {"real": example.real, "rendered": example.rendered}
             if example.restored is not None:
                 pictures["restored"] = example.restored
             for name, picture in pictures.items():
-                file = folder / f"{example.frame_index:06d}_{name}.png"
-                cv2.imwrite(str(file), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+                write_png(folder / f"{example.frame_index:06d}_{name}.png", picture)
 
     def write_json(self, name: str, data: dict[str, Any]) -> None:
         """A JSON file of the dive; a number that is not finite is a mistake, not a result."""
-        with atomic_write(self.path / name) as stream:
-            stream.write((json.dumps(data, indent=2, allow_nan=False) + "\n").encode("utf-8"))
+        write_json(self.path / name, data)
 
     def write_report(self, data: ReportData) -> None:
         """report.html."""

@@ -151,12 +151,13 @@ class DiveRun:
 
         Raises:
             NotMappedError: too few frames could be placed; the folder says why.
+        InputError: the disk was too full for all files; those with room were written.
         """
         self.decide(self.slam.finish(progress))
         with self.profiler.stage("write"):
             results = self.results
             self._note_what_was_left_out(results, notes)
-            with self.slam.failures.contain("writing frames.csv"):
+            with self.slam.failures.contain("writing frames.csv", full_disk=True):
                 self.folder.write_frames({t.frame.index: t.sub_map for t in results if t.T_wc})
         if sum(tracked.T_wc is not None for tracked in results) < MIN_VIEWS:
             raise NotMappedError(self._why_not(len(results)))
@@ -203,11 +204,16 @@ class DiveRun:
             notes = self.notes + self.slam.failures.notes()
             made.write_report(self.dropped, numbers, notes)
         numbers = self._numbers(results, made.held_out)  # the report's own time included
-        with self.slam.failures.contain("writing metrics.json"):
+        with self.slam.failures.contain("writing metrics.json", full_disk=True):
             self.folder.write_json("metrics.json", numbers)
         if self._trace:
             with self.slam.failures.contain(f"writing {TRACE}"):
                 self.folder.write_json(TRACE, self.profiler.chrome_trace())
+        if self.slam.failures.disk_was_full:
+            raise InputError(
+                f"the disk is full: {self.folder.path} lacks some of its files, log.jsonl says "
+                "which; make room and map again"
+            )
         notes = self.notes + self.slam.failures.notes()
         return Finished(self.folder.path, numbers, notes, self.warnings)
 

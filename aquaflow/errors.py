@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import re
 from collections.abc import Iterable
 
@@ -34,6 +35,34 @@ def first_line(error: BaseException) -> str:
 
 class DamagedError(ValueError):
     """What a reader of ours found wrong with a file, in words that hold nothing of its content."""
+
+
+FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""No room on the disk, in the user's share of it, or for a file of this size."""
+
+_NO_MEMORY = (
+    "can't allocate memory",
+    "not enough memory",
+    "failed to allocate",
+    "insufficient mem",
+)
+"""How torch, OpenCV and onnxruntime word what is no MemoryError of theirs, in lower case."""
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """True for a MemoryError, and for what libraries raise in its place."""
+    if isinstance(error, MemoryError):
+        return True
+    return isinstance(error, Exception) and any(each in str(error).lower() for each in _NO_MEMORY)
+
+
+def is_full_disk(error: BaseException | None) -> bool:
+    """True if the disk refused to hold more, also where our own sentence says so."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in FULL_DISK:
+            return True
+        error = error.__cause__
+    return False
 
 
 _KINDS = {

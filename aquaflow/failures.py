@@ -7,19 +7,24 @@ the log once, and the dive goes on without the result of that stage.
 
 from __future__ import annotations
 
-import errno
 import logging
 import os
 import threading
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from aquaflow.errors import ConfigError, NotMappedError, first_line
+from aquaflow.errors import (
+    ConfigError,
+    NotMappedError,
+    first_line,
+    is_full_disk,
+    is_out_of_memory,
+)
 
 log = logging.getLogger(__name__)
 
@@ -33,10 +38,6 @@ RECENT_S = 60.0
 """A stage that has not failed for so long works again."""
 REASONS_KEPT = 256
 """Frames whose failure is remembered until their row is written: more than ever wait for a pose."""
-
-FULL_DISK = (errno.ENOSPC, errno.EDQUOT)
-NO_MEMORY = "can't allocate memory"
-"""In the message of the RuntimeError that torch raises when the memory is full."""
 
 DEFECTS = (
     AssertionError, AttributeError, LookupError, NameError, NotImplementedError, TypeError,
@@ -91,19 +92,22 @@ class Failures:
     ) -> None:
         """``strict`` lets every exception through; None: as the environment says."""
         self.strict = os.environ.get(STRICT) == "1" if strict is None else strict
+        self.disk_was_full = False
+        """A file of the dive found no room."""
         self._kinds: dict[tuple[str, str, str], Kind] = {}
         self._recent: deque[tuple[float, str]] = deque(maxlen=100)
         """When which stage failed."""
         self._reasons: OrderedDict[int, str] = OrderedDict()
         self._now_s, self._lock = now_s, threading.Lock()
 
-    def contain(self, stage: str, frame: int | None = None) -> Contained:
+    def contain(self, stage: str, frame: int | None = None, full_disk: bool = False) -> Contained:
         """A ``with`` block whose exceptions are counted here and go no further.
 
         Let through are KeyboardInterrupt and SystemExit, full memory, a full disk, bad settings,
-        and a dive of which nothing can be mapped: each has its own way to the user.
+        and a dive of which nothing can be mapped: each has its own way to the user. With
+        ``full_disk``, one is counted too, and ``disk_was_full`` set: smaller files may find room.
         """
-        return Contained(self, stage, frame)
+        return Contained(self, stage, frame, full_disk)
 
     def record(self, stage: str, error: Exception, frame: int | None = None) -> None:
         """Count ``error``; the first of its kind is logged with its traceback."""
@@ -164,10 +168,11 @@ class Failures:
 class Contained:
     """One run of a stage; ``failed`` tells afterwards whether it raised."""
 
-    __slots__ = ("_failures", "_frame", "_stage", "error")
+    __slots__ = ("_failures", "_frame", "_full_disk", "_stage", "error")
 
-    def __init__(self, failures: Failures, stage: str, frame: int | None) -> None:
+    def __init__(self, failures: Failures, stage: str, frame: int | None, full_disk: bool) -> None:
         self._failures, self._stage, self._frame = failures, stage, frame
+        self._full_disk = full_disk
         self.error: Exception | None = None
 
     @property
@@ -184,7 +189,11 @@ class Contained:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> bool:
-        if not isinstance(error, Exception) or self._failures.strict or has_own_way(error):
+        if not isinstance(error, Exception):
+            return False
+        is_full = self._full_disk and is_full_disk(error)
+        self._failures.disk_was_full |= is_full
+        if not is_full and (self._failures.strict or has_own_way(error)):
             return False
         self.error = error
         self._failures.record(self._stage, error, self._frame)
@@ -193,19 +202,8 @@ class Contained:
 
 def has_own_way(error: BaseException) -> bool:
     """True for full memory, a full disk, bad settings, and a dive that cannot be mapped."""
-    return any(
-        isinstance(each, MemoryError | ConfigError | NotMappedError)
-        or (isinstance(each, OSError) and each.errno in FULL_DISK)
-        or (isinstance(each, RuntimeError) and NO_MEMORY in str(each))
-        for each in _chain(error)
-    )
-
-
-def _chain(error: BaseException | None) -> Iterator[BaseException]:
-    """The exception and those that it was raised from."""
-    while error is not None:
-        yield error
-        error = error.__cause__
+    settled = isinstance(error, ConfigError | NotMappedError)
+    return settled or is_out_of_memory(error) or is_full_disk(error)
 
 
 def _name_of(error: Exception) -> str:

@@ -61,12 +61,17 @@ def write_mapping(path: Path, data: dict[str, Any]) -> None:
     """Write a YAML file that is whole or as it was before.
 
     Raises:
-        OSError: the file cannot be written.
+        InputError: the file cannot be written.
     """
     part = path.with_name(f".{path.name}.part")
     try:
         part.write_text(yaml.safe_dump(data, sort_keys=False))
         part.replace(path)
+    except OSError as error:
+        raise InputError(
+            f"cannot write {path}: {error.strerror or error}; give a folder with room that can be "
+            "written to"
+        ) from error
     finally:
         part.unlink(missing_ok=True)
 

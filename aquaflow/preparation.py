@@ -65,7 +65,14 @@ class Preparation:
         self._box = crop_box(self._config.crop, width, height)
         camera = fit_calibration(self._calibration, (width, height), self._box)
         asked = self._config.width or min(DEFAULT_WIDTH_PX, camera.width)
-        return Rectifier(camera, asked)
+        rectifier = Rectifier(camera, asked)
+        size = (rectifier.camera.width, rectifier.camera.height)
+        if min(size) < MIN_SIDE_PX:
+            raise ConfigError(
+                f"crop and width leave pictures of {size[0]} x {size[1]} pixels; tracking needs at "
+                f"least {MIN_SIDE_PX} x {MIN_SIDE_PX}"
+            )
+        return rectifier
 
 
 def check_picture(frame: Frame) -> None:

@@ -18,6 +18,7 @@ What a new test has to respect, so that `make test` stays quick and passes on a 
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 

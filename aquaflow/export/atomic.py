@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from aquaflow.errors import InputError
 
@@ -32,3 +33,15 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
         ) from error
     finally:
         part.unlink(missing_ok=True)
+
+
+def write_json(path: Path, data: dict[str, Any]) -> None:
+    """A JSON file, whole or not there; a number that is not finite is a mistake, not a result.
+
+    Raises:
+        InputError: the file cannot be written.
+        ValueError: a number is not finite.
+    """
+    text = json.dumps(data, indent=2, allow_nan=False) + "\n"
+    with atomic_write(path) as stream:
+        stream.write(text.encode("utf-8"))

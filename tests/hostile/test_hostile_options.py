@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
-from conftest import Cli, refused
+from conftest import HASTY, Cli, refused
 
 USAGE = 2
 
@@ -41,6 +44,50 @@ def test_a_width_beyond_all_cameras_is_refused(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("threads", ["100000"])
+def test_more_threads_than_cores_are_not_started(
+    aquaflow: Cli, small_recording: Path, tmp_path: Path, threads: str
+) -> None:
+    ran = aquaflow(
+        "map",
+        small_recording,
+        "--stop",
+        12,
+        "--threads",
+        threads,
+        "--out",
+        tmp_path / "out",
+        *HASTY,
+    )
+    assert ran.code == 0, ran.err
+    (note,) = ran.err.splitlines()
+    assert note.startswith("note: ")
+    assert threads in note
+    assert str(os.cpu_count()) in note
+
+
+@pytest.mark.parametrize("size", [(160, 1), (1, 160)])
+def test_pictures_one_pixel_high_or_wide_are_refused(
+    aquaflow: Cli, tmp_path: Path, size: tuple[int, int]
+) -> None:
+    width, height = size
+    folder = tmp_path / "thin"
+    folder.mkdir()
+    for i in range(4):
+        cv2.imwrite(str(folder / f"{i}.png"), np.zeros((height, width, 3), np.uint8))
+    for name in ("map", "run"):
+        given = [folder] if name == "map" else ["--source", folder, "--speed", 100]
+        ran = aquaflow(name, *given, "--out", tmp_path / name)
+        assert ran.code in ((1,) if name == "map" else (1, 3))
+        assert "Traceback" not in ran.err
+        assert "mistake" not in ran.err
+
+
+def test_a_crop_one_pixel_high_is_refused(aquaflow: Cli, pictures: Path, tmp_path: Path) -> None:
+    ran = aquaflow("map", pictures, "--crop", "0,0,160,1", "--out", tmp_path / "out")
+    refused(ran, "16")
+
+
 # --- names ----------------------------------------------------------------------------------------
 
 
@@ -57,3 +104,32 @@ def test_a_name_that_is_not_utf_8_is_refused_readably(
     command: Cli, arguments: tuple[str, ...]
 ) -> None:
     refused(command(*arguments), "\\x", "rename")
+
+
+def test_pictures_whose_names_are_not_utf_8_are_mapped(
+    aquaflow: Cli, small_recording: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for i, file in enumerate(sorted((small_recording / "images").iterdir())[:8]):
+        prefix = b"\xe9\n" if i < 4 else b""
+        target = os.fsencode(folder) + b"/" + prefix + os.fsencode(file.name)
+        Path(os.fsdecode(target)).write_bytes(file.read_bytes())
+    ran = aquaflow("map", folder, "--out", tmp_path / "out", *HASTY)
+    assert ran.code == 0, ran.err
+    table = (tmp_path / "out" / "frames.csv").read_text(encoding="utf-8")
+    assert "\\xe9\\n000003.png" in table
+
+
+# --- folders --------------------------------------------------------------------------------------
+
+
+def test_an_export_to_where_no_folder_can_be_is_refused(
+    command: Cli, small_dive: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "file"
+    file.write_text("thesis")
+    for place in (Path("/proc/aquaflow"), file, file / "below"):
+        ran = command("export", small_dive, "--format", "restored", "--out", place)
+        refused(ran, place)
+    assert file.read_text() == "thesis"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from aquaflow.evaluation.bench.runner import (
     run_all,
 )
 from aquaflow.evaluation.bench.scene import Scene, scene_at
+from aquaflow.export.atomic import write_json
 from aquaflow.presets import preset
 
 JSON_FILE, PICTURE_FILE = "bench.json", "bench.png"
@@ -80,7 +80,7 @@ def benchmark(
     described = machine.describe()
     rows = run_all(jobs_for(scenes, contenders, repeats, out), progress, perform)
     result = {"machine": described, "runs": rows}
-    (out / JSON_FILE).write_text(json.dumps(result, indent=2, allow_nan=False) + "\n")
+    write_json(out / JSON_FILE, result)
     draw(rows, out / PICTURE_FILE, caption(described))
     return result
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -24,6 +23,7 @@ from aquaflow.evaluation.bench.render.picture import draw
 from aquaflow.evaluation.bench.render.rows import Row, row_of
 from aquaflow.evaluation.bench.render.scene import SMALL, Size, SplatScene, height_field
 from aquaflow.evaluation.bench.render.timing import Sample, interleaved
+from aquaflow.export.atomic import write_json
 
 JSON_FILE, PICTURE_FILE = "render_bench.json", "render_bench.png"
 
@@ -60,7 +60,7 @@ def bench_render(
         "gradient_rel_error": errors,
         "notes": notes,
     }
-    (out / JSON_FILE).write_text(json.dumps(result, indent=2, allow_nan=False) + "\n")
+    write_json(out / JSON_FILE, result)
     draw(rows, out / PICTURE_FILE, caption(described))
     return result
 
