@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.array_file import Arrays
+from aquaflow.errors import InputError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.prior.contract import Encoding, Prior
-from aquaflow.spill import Arrays, Spill
+from aquaflow.spill import Spill
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -121,6 +123,8 @@ class KeyframeStore:
         folder = None if work is None else work / "keyframes"
         self._contents = Spill(folder, resident, self._pack, self._unpack)
         self._held: int | None = None
+        self.lost: set[int] = set()
+        """Numbers of the keyframes whose file was lost: they have a pose, and no content."""
 
     def add(
         self,
@@ -159,8 +163,10 @@ class KeyframeStore:
         """Encoding and pointmap.
 
         Raises:
-            InputError: they cannot be read back.
+            InputError: they cannot be read back, or were lost.
         """
+        if number in self.lost:
+            raise InputError(f"what keyframe {number} showed was lost")
         return self._contents[number]
 
     def replace_pointmap(self, number: int, pointmap: Pointmap) -> None:
@@ -194,11 +200,12 @@ class KeyframeStore:
     ) -> Keyframe:
         """Append a keyframe that an earlier run saved; ``cameras`` of encoding and pointmap.
 
-        Raises:
-            InputError: its file is not there.
+        Without its file it is one of the ``lost``: the frames that hang on it keep their poses,
+        which follow it as before; nothing is tracked against it any more.
         """
         number = len(self.keyframes)
-        self._contents.adopt(number)
+        if not self._contents.adopt(number):
+            self.lost.add(number)
         self._cameras.append(cameras)
         self.keyframes.append(Keyframe(number, frame_index, t_ns, T_wc, sub_map, self))
         return self.keyframes[number]

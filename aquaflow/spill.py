@@ -1,8 +1,6 @@
 """What a long dive cannot keep in memory: the last used stay, the others wait in files.
 
-A file is one line of JSON, ``{name: [dtype, shape]}``, and the arrays' bytes in that order. What
-comes back is what was written, bit for bit, so a map does not depend on what lay where; a ``.npz``
-of the same picture takes several times as long to read.
+What comes back is what was written, bit for bit, so a map does not depend on what lay where.
 """
 
 from __future__ import annotations
@@ -10,24 +8,18 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
-import json
 import logging
-import math
 import os
 import shutil
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
-import numpy as np
-import numpy.typing as npt
-
-from aquaflow.errors import InputError
+from aquaflow.array_file import Arrays, read_arrays, write_arrays
 
 log = logging.getLogger(__name__)
 
-Arrays = dict[str, npt.NDArray[Any]]
 T = TypeVar("T")
 
 RESERVE_BYTES = 1 << 30
@@ -37,6 +29,12 @@ RELEASE_EVERY = 32
 """Things let go of until the C library is told to give their memory back (about 4 ms). Left alone,
 glibc keeps the holes between what stays: measured at 480 x 270 px, beside 281 MB of pixels in use
 157 MB of holes after 200 keyframes and 390 MB after 500; so, under 10 MB."""
+
+SUFFIX = ".arrays"
+"""Of the things' files."""
+
+LET_GO = "let_go.txt"
+"""File beside the things' files: a line for every number whose file was removed on purpose."""
 
 release_memory = getattr(ctypes.CDLL(None), "malloc_trim", lambda pad: 0)
 """``malloc_trim``, which only glibc has and only glibc needs."""
@@ -84,7 +82,7 @@ class Spill(Generic[T]):
             return self._resident[number]
         if number not in self._saved:
             raise KeyError(number)
-        thing = self._unpack(number, read_arrays(self._file(number)))
+        thing = self._unpack(number, read_thing(self._file(number)))
         self._use(number, thing)
         return thing
 
@@ -95,8 +93,14 @@ class Spill(Generic[T]):
             self._let_go(number)
         if number in self._saved:
             self._saved.discard(number)
+            self._note_let_go(number)
             with contextlib.suppress(OSError):
                 self._file(number).unlink(missing_ok=True)
+
+    def _note_let_go(self, number: int) -> None:
+        assert self._folder is not None
+        with contextlib.suppress(OSError), (self._folder / LET_GO).open("a") as stream:
+            stream.write(f"{number}\n")
 
     def __contains__(self, number: int) -> bool:
         return number in self._resident or number in self._saved
@@ -130,19 +134,24 @@ class Spill(Generic[T]):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._folder))
         return [self._file(number) for number in saved]
 
-    def adopt(self, number: int) -> None:
-        """A thing that an earlier run saved in the same folder; read back when it is asked for.
+    def adopt(self, number: int) -> bool:
+        """Take over a thing that an earlier run saved in the same folder; it is read back when it
+        is asked for. False if there is no file of it."""
+        found = self._folder is not None and self._file(number).is_file()
+        if found:
+            self._saved.add(number)
+        return found
 
-        Raises:
-            InputError: its file is not there.
-        """
-        if not self.is_saved(number):
-            raise InputError(f"{self._file(number)} is gone; start with --new")
-        self._saved.add(number)
-
-    def is_saved(self, number: int) -> bool:
-        """True if this run or an earlier one left a file of it."""
-        return self._file(number).is_file()
+    def let_go(self) -> set[int]:
+        """Numbers whose files this run or an earlier one removed; without a file, any other one
+        was lost."""
+        if self._folder is None:
+            return set()
+        try:
+            lines = (self._folder / LET_GO).read_bytes().split()
+        except OSError:
+            return set()
+        return {int(line) for line in lines if line.isdigit()}
 
     def close(self, keep: bool = False) -> None:
         """Remove the files; or, to ``keep`` them, write what is only in memory too."""
@@ -156,6 +165,7 @@ class Spill(Generic[T]):
         with contextlib.suppress(OSError):
             for number in self._saved:
                 self._file(number).unlink(missing_ok=True)
+            (self._folder / LET_GO).unlink(missing_ok=True)
             self._folder.rmdir()
 
     def _use(self, number: int, thing: T) -> None:
@@ -191,7 +201,8 @@ class Spill(Generic[T]):
             folder.mkdir(parents=True, exist_ok=True)
             if shutil.disk_usage(folder).free < RESERVE_BYTES:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            write_arrays(self._file(number), self._pack(self._resident[number]))
+            path = self._file(number)
+            write_arrays(path, self._pack(self._resident[number]), _owner(path))
         except OSError as error:
             self._full = True
             log.warning(
@@ -207,42 +218,18 @@ class Spill(Generic[T]):
 
     def _file(self, number: int) -> Path:
         assert self._folder is not None
-        return self._folder / f"{number:06d}.arrays"
+        return self._folder / f"{number:06d}{SUFFIX}"
 
 
-def write_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
-    """Write a file that is whole or not there, unless power fails: then it may be cut short.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    part = path.with_name(f".{path.name}.part")
-    header = {name: [array.dtype.str, array.shape] for name, array in arrays.items()}
-    try:
-        with part.open("wb") as stream:
-            stream.write(json.dumps(header).encode("ascii") + b"\n")
-            for array in arrays.values():
-                array.tofile(stream)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
-
-
-def read_arrays(path: Path) -> Arrays:
-    """The arrays of ``write_arrays``, in memory of their own.
+def read_thing(path: Path) -> Arrays:
+    """The arrays of a file in a spill's folder, if it is whole and the one that its name says.
 
     Raises:
-        InputError: the file is gone, cut short or none of ours.
+        InputError: it is not.
     """
-    arrays: Arrays = {}
-    try:
-        with path.open("rb") as stream:
-            for name, (dtype, shape) in json.loads(stream.readline()).items():
-                flat = np.fromfile(stream, np.dtype(dtype), math.prod(shape))
-                arrays[name] = flat.reshape(shape)
-    except (OSError, ValueError, TypeError, AttributeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is damaged"
-        raise InputError(
-            f"cannot read back {path}: {reason}; leave the dive's work folder alone until the end"
-        ) from error
-    return arrays
+    return read_arrays(path, _owner(path))
+
+
+def _owner(path: Path) -> str:
+    """Folder and number: what a file says that it belongs to."""
+    return f"{path.parent.name}/{path.stem}"

@@ -34,7 +34,7 @@ FLOORS = (
     {"prior", "messages", "vehicle_words"},
     {"presets", "access", "stopping", "plain_arrays"},
     {"render", "geometry", "config", "profiler", "spill", "dive_log"},
-    {"failures", "plain_yaml", "cores", "crash_report"},
+    {"array_file", "failures", "plain_yaml", "cores", "crash_report"},
     {"errors"},
     {"aquaflow"},
 )

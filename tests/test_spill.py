@@ -16,8 +16,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 
 from aquaflow import spill
+from aquaflow.array_file import Arrays, read_arrays, write_arrays
 from aquaflow.errors import InputError
-from aquaflow.spill import Arrays, Spill, read_arrays, write_arrays
+from aquaflow.spill import Spill, read_thing
 
 Thing = npt.NDArray[np.int64]
 
@@ -53,9 +54,9 @@ def writes(monkeypatch: pytest.MonkeyPatch) -> Writes:
     """Names of the files written, in order."""
     names: Writes = []
 
-    def write(path: Path, arrays: Arrays) -> None:
+    def write(path: Path, arrays: Arrays, of: str) -> None:
         names.append(path.name)
-        write_arrays(path, arrays)
+        write_arrays(path, arrays, of)
 
     monkeypatch.setattr(spill, "write_arrays", write)
     return names
@@ -99,7 +100,7 @@ def test_a_transposed_array_comes_back_in_its_own_order(tmp_path: Path) -> None:
 def test_a_file_that_cannot_be_finished_leaves_the_one_before(tmp_path: Path) -> None:
     path = tmp_path / "x"
     write_arrays(path, {"a": np.arange(3)})
-    with pytest.raises(OSError, match="object"):
+    with pytest.raises(TypeError, match="references"):
         write_arrays(path, {"a": np.arange(4), "b": np.array([None])})
     assert files(tmp_path) == ["x"]
     assert len(read_arrays(path)["a"]) == 3
@@ -206,12 +207,12 @@ def test_it_holds_what_a_dictionary_holds_whenever_the_disk_fills(
     pinned: int | None = None
     written = 0
 
-    def write(path: Path, arrays: Arrays) -> None:
+    def write(path: Path, arrays: Arrays, of: str) -> None:
         nonlocal written
         written += 1
         if written > room:
             raise OSError(28, "No space left on device")
-        write_arrays(path, arrays)
+        write_arrays(path, arrays, of)
 
     with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         patch.setattr(spill, "write_arrays", write)
@@ -232,12 +233,13 @@ def test_it_holds_what_a_dictionary_holds_whenever_the_disk_fills(
         assert [number for number in range(6) if number in things] == sorted(wanted)
 
 
-def test_what_is_forgotten_leaves_no_file(tmp_path: Path) -> None:
+def test_what_is_forgotten_leaves_its_number_and_no_file(tmp_path: Path) -> None:
     things = filled(tmp_path / "work")
     for number in range(4):
         del things[number]
     things.save()
-    assert files(tmp_path / "work") == ["000004.arrays"]
+    assert files(tmp_path / "work") == ["000004.arrays", "let_go.txt"]
+    assert spill_of(tmp_path / "work").let_go() == {0, 1, 2}  # 3 was in memory alone
     with pytest.raises(KeyError):
         _ = things[0]
 
@@ -326,7 +328,9 @@ def test_closing_removes_its_files_and_no_others(tmp_path: Path) -> None:
 
 
 def test_closing_removes_a_folder_of_its_own(tmp_path: Path) -> None:
-    filled(tmp_path / "work").close()
+    things = filled(tmp_path / "work")
+    del things[0]
+    things.close()
     assert files(tmp_path) == []
 
 
@@ -334,6 +338,6 @@ def test_on_request_everything_is_kept_in_files(tmp_path: Path) -> None:
     things = filled(tmp_path)
     things.close(keep=True)
     assert files(tmp_path) == [f"{number:06d}.arrays" for number in range(5)]
-    assert [int(read_arrays(tmp_path / name)["thing"][0]) for name in files(tmp_path)] == [
+    assert [int(read_thing(tmp_path / name)["thing"][0]) for name in files(tmp_path)] == [
         0, 1, 2, 3, 4,
     ]  # fmt: skip

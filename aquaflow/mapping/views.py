@@ -12,9 +12,10 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from aquaflow.array_file import Arrays
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.spill import Arrays, Spill
+from aquaflow.spill import Spill
 
 RESIDENT_VIEWS = 128
 """Views in memory while the others wait in files; at most 1.4 MB each at 480 x 270 px. Any view may
@@ -155,6 +156,8 @@ class ViewStore:
     def __init__(self, work: Path | None = None, resident: int = RESIDENT_VIEWS) -> None:
         folder = None if work is None else work / "views"
         self._pixels = Spill(folder, resident, _pack, _unpack)
+        self.lost: set[int] = set()
+        """Frame indices of the views that :meth:`adopt` found no file of."""
 
     def keep(self, view: View) -> View:
         """Take over the view's pixels; no other view of the dive may have its frame index."""
@@ -166,16 +169,14 @@ class ViewStore:
         return self._pixels.save()
 
     def adopt(self, views: Sequence[View]) -> list[View]:
-        """Let views have the pixels that an earlier run saved of them; those that it let go of
-        afterwards are left out.
-
-        Raises:
-            InputError: there is no file of any of them.
-        """
-        known = [view for view in views if self._pixels.is_saved(view.frame_index)]
-        for view in known or views[:1]:
-            self._pixels.adopt(view.frame_index)
+        """Let views have the pixels that an earlier run saved of them, and say which have them:
+        not those that it let go of afterwards, and not those whose file was lost."""
+        known = [view for view in views if self._pixels.adopt(view.frame_index)]
+        for view in known:
             view.lie_in(self._pixels)
+        let_go = self._pixels.let_go()
+        there = {view.frame_index for view in known}
+        self.lost |= {view.frame_index for view in views} - there - let_go
         return known
 
     def holds(self, view: View) -> bool:

@@ -88,11 +88,15 @@ class KeyframeGraph:
         self._optimise()
 
     def resume(self, graph: PoseGraph, loops: int) -> None:
-        """Go on with an earlier run's graph; the store holds its keyframes again."""
+        """Go on with an earlier run's graph; the store holds its keyframes again.
+
+        One whose content was lost moves with the others, and is no place to be found again.
+        """
         self.graph, self.loops = graph, loops
         self._known = [known for known in self._keyframes.keyframes if known.number in graph]
         for keyframe in self._known:
-            self._places.add(keyframe)
+            if keyframe.number not in self._keyframes.lost:
+                self._places.add(keyframe)
 
     def correction(self, wait: bool) -> Correction:
         """What the optimisation found, once; nothing if there is none, or it is still at work.

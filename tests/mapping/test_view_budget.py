@@ -9,7 +9,6 @@ import pytest
 from mapping_scenes import CAMERA, view_of
 
 from aquaflow.config import parse_config
-from aquaflow.errors import InputError
 from aquaflow.mapping.view_budget import alike, let_surplus_go
 from aquaflow.mapping.views import View, ViewStore
 from aquaflow.maps import Growth, Maps
@@ -81,7 +80,7 @@ def test_a_place_that_is_seen_for_long_keeps_few_views_and_their_files(tmp_path:
     assert len(mapped) == 2 * MOST
     assert [int(each.image[0, 0, 0]) for each in mapped] == indices(mapped)
     maps.views.save()
-    assert len(list((tmp_path / "views").iterdir())) == 2 * MOST
+    assert len(list((tmp_path / "views").glob("*.arrays"))) == 2 * MOST
 
 
 def test_held_out_views_have_a_budget_of_their_own_over_merged_maps_too() -> None:
@@ -111,6 +110,12 @@ def test_a_restart_does_without_the_views_that_were_let_go_of_since(tmp_path: Pa
     before.save()
     views[1].let_go()
     again = [view(i) for i in range(3)]
-    assert indices(ViewStore(tmp_path).adopt(again)) == [0, 2]
-    with pytest.raises(InputError, match="gone"):
-        ViewStore(tmp_path).adopt([view(7), view(8)])
+    after = ViewStore(tmp_path)
+    assert indices(after.adopt(again)) == [0, 2]
+    assert after.lost == set()
+
+
+def test_views_whose_files_are_gone_are_left_out_and_known_as_lost(tmp_path: Path) -> None:
+    store = ViewStore(tmp_path)
+    assert store.adopt([view(7), view(8)]) == []
+    assert store.lost == {7, 8}
