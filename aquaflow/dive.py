@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import shutil
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from aquaflow.export.ply import Splats, write_ply
 from aquaflow.export.png import write_png
 from aquaflow.export.report import ReportData, write_report
 from aquaflow.export.tum import write_tum
-from aquaflow.frame_rows import FrameRow, header, of_text, or_lost, read_rows, to_text
+from aquaflow.frame_rows import FrameRow, header, of_text, to_text
 from aquaflow.geometry.camera import CameraModel, save_camera
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.gaussians import radiance
@@ -59,10 +59,9 @@ class DiveFolder:
         path: Path,
         config: Config,
         overwrite: bool = False,
-        resume: Container[int] | None = None,
+        resume: Iterable[FrameRow] | None = None,
     ) -> None:
-        """Make the folder; or go on with the dive in it, of which these frames are known to
-        ``resume`` from: the later ones were lost.
+        """Make the folder; or ``resume`` the dive in it, which has these rows so far.
 
         Raises:
             InputError: it cannot be made, holds something else, or holds a dive and neither
@@ -76,7 +75,7 @@ class DiveFolder:
         if resume is None:
             self._claim(overwrite)
         else:
-            self._add(or_lost(row, resume) for row in read_rows(path / MARKER))
+            self._add(resume)
         dump_config(config, path / "config.yaml")
         self._rewrite_frames(self._recorded)
         self._frames = (path / MARKER).open("ab")

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from aquaflow.errors import InputError, reason_of
+
+MOST_LINES = 20
+"""Lines of one reason; a library's message has a few."""
 
 FRAME_COLUMNS = ("index", "source", "t_s", "class", "sub_map", "keyframe", "quality", "reason")
 
@@ -87,6 +90,50 @@ def read_rows(path: Path) -> list[FrameRow]:
             return of_text(stream.read())
     except (OSError, ValueError) as error:
         raise InputError(f"cannot read {path}: {reason_of(error)}; start with --new") from error
+
+
+def readable_rows(path: Path) -> tuple[list[FrameRow], int]:
+    """The rows of a frames.csv that may be damaged, and the number of lines that are none.
+
+    Raises:
+        FileNotFoundError, OSError: there is no such file, or it cannot be read at all.
+    """
+    lines = path.read_bytes().splitlines(keepends=True)
+    damaged = 0 if lines[:1] == [header().encode("utf-8")] else 1
+    rows = []
+    for line in _joined(lines[1:]):
+        row = _row_of(line)
+        if row is None:
+            damaged += 1
+        else:
+            rows.append(row)
+    return rows, damaged
+
+
+def _joined(lines: Sequence[bytes]) -> Iterator[bytes]:
+    """Lines of the file as lines of the table: a reason in quotation marks may have several."""
+    waiting: list[bytes] = []
+    for line in lines:
+        whole = b"".join([*waiting, line])
+        if whole.count(b'"') % 2 and _row_of(line) is None and len(waiting) < MOST_LINES:
+            waiting.append(line)
+            continue
+        if waiting and _row_of(whole) is None:  # the mark was damage, and what follows is not
+            yield from [*waiting, line]
+        else:
+            yield whole
+        waiting = []
+    yield from waiting
+
+
+def _row_of(line: bytes) -> FrameRow | None:
+    """The row that was written as just this line."""
+    try:
+        text = line.decode("utf-8")
+        [row] = of_text(text)
+        return row if to_text([row]) == text else None
+    except (ValueError, csv.Error):
+        return None
 
 
 def or_lost(row: FrameRow, known: Container[int]) -> FrameRow:

@@ -133,6 +133,27 @@ def test_a_damaged_file_is_named_in_one_sentence(
         read_arrays(path)
 
 
+@given(st.integers(0, 10_000), st.integers(0, 7))
+def test_no_flipped_bit_goes_unnoticed(at: int, bit: int) -> None:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "x"
+        write_arrays(path, {"a": np.arange(30.0).reshape(5, 6), "b": np.zeros(3, bool)})
+        data = bytearray(path.read_bytes())
+        data[at % len(data)] ^= 1 << bit
+        path.write_bytes(data)
+        with pytest.raises(InputError, match="it is damaged"):
+            read_arrays(path)
+
+
+def test_files_that_were_swapped_are_noticed(tmp_path: Path) -> None:
+    filled(tmp_path).save()
+    one, other = tmp_path / "000000.arrays", tmp_path / "000001.arrays"
+    one.replace(tmp_path / "spare")
+    other.replace(one)
+    with pytest.raises(InputError, match="it is damaged"):
+        read_thing(one)
+
+
 # --- memory and files -----------------------------------------------------------------------------
 
 

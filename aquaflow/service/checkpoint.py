@@ -1,67 +1,41 @@
 """Checkpoints: what a kill or a power cut leaves, and how the next start goes on from there.
 
-``checkpoint/state.npz`` replaces its predecessor as a whole and holds no pickle; its size is that
-of the map and a row for every frame. Pictures and depths lie in ``work/``, one file for each
-keyframe and view, and are on the disk before a state that names them is.
+A checkpoint's size is that of the map and a row for every frame; the last two are kept (see
+generations.py). Pictures and depths lie in ``work/``, one file for each keyframe and view, and are
+on the disk before a checkpoint that names them is.
 """
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
 import time
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from aquaflow import __version__
-from aquaflow.dive import CHECKPOINT
 from aquaflow.dive_run import DiveRun
 from aquaflow.errors import InputError
-from aquaflow.export.facts_file import UNREADABLE, read_facts_file, write_facts_file
 from aquaflow.fusion.clock import Learned
 from aquaflow.maps import Maps
 from aquaflow.plain_arrays import Arrays, prefixed, under
 from aquaflow.service import map_state, tracking_state
+from aquaflow.service.generations import (
+    FORMAT,
+    Checkpoint,
+    bring_to_disk,
+    state_file,
+    write_state,
+)
 from aquaflow.service.map_thread import Correction, MapThread
 from aquaflow.service.moment import Moment
 from aquaflow.slam import Slam
 
 log = logging.getLogger(__name__)
 
-STATE = "state.npz"
-FORMAT = 2
 
-
-def state_file(dive: Path) -> Path:
-    """Where a dive's checkpoint lies."""
-    return dive / CHECKPOINT / STATE
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """A checkpoint as it was read."""
-
-    facts: dict[str, Any]
-    arrays: Arrays
-
-    @property
-    def moment(self) -> Moment:
-        """When it was taken."""
-        return Moment(**self.facts["moment"])
-
-    @property
-    def clocks(self) -> dict[str, Learned]:
-        """What was known of the devices' clocks."""
-        known: dict[str, Learned] = self.facts["clocks"]
-        return known
-
-    @property
-    def frames(self) -> set[int]:
-        """Indices of the frames that it knows."""
-        return {int(index) for index in self.arrays["tracking.frames"]["index"]}
+class UnusableStateError(InputError):
+    """A checkpoint that was read, and that this program cannot go on from."""
 
 
 class Checkpointer:
@@ -146,56 +120,17 @@ class Checkpointer:
         log.warning("no checkpoint: %s", error)
 
 
-def write_state(dive: Path, facts: dict[str, Any], arrays: Arrays) -> None:
-    """Replace the checkpoint of ``dive``.
-
-    Raises:
-        InputError, OSError: it cannot be written; the one before stays.
-    """
-    path = state_file(dive)
-    path.parent.mkdir(exist_ok=True)
-    write_facts_file(path, facts, arrays, allow_nan=False)
-    bring_to_disk([path.parent])
-
-
-def read_state(dive: Path) -> Checkpoint:
-    """The checkpoint of ``dive``.
-
-    Raises:
-        InputError: there is none, or it cannot be used.
-    """
-    path = state_file(dive)
-    try:
-        facts, arrays = read_facts_file(path)
-        known = facts["format"] == FORMAT
-    except UNREADABLE as error:
-        raise InputError(f"cannot resume from {path}: {error}; start with --new") from error
-    if not known:
-        raise InputError(f"{path} was written by version {facts.get('version')}; start with --new")
-    return Checkpoint(facts, arrays)
-
-
 def restore(checkpoint: Checkpoint, slam: Slam, run: DiveRun, maps: Maps) -> None:
     """Let fresh ``slam``, ``run`` and ``maps`` go on from ``checkpoint``.
 
     Raises:
-        InputError: it does not fit, or a file of ``work/`` is gone.
+        ConfigError: the config asks for pictures of another size.
+        UnusableStateError: it does not fit.
     """
     facts, arrays = checkpoint.facts, checkpoint.arrays
     try:
         tracking_state.put_together(slam, run, facts["tracking"], under("tracking", arrays))
         map_state.put_together(maps, facts["mapping"], under("mapping", arrays))
         map_state.catch_up(maps, facts["mapping"]["lacking"], under("mapping", arrays))
-    except (KeyError, ValueError, TypeError, IndexError, RuntimeError) as error:
-        raise InputError(f"the checkpoint cannot be used: {error}; start with --new") from error
-
-
-def bring_to_disk(paths: Iterable[Path]) -> None:
-    """What a power cut must not take (fsync); a file that is gone by now is none of it."""
-    for path in paths:
-        with contextlib.suppress(FileNotFoundError):
-            descriptor = os.open(path, os.O_RDONLY)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
+    except (KeyError, ValueError, TypeError, IndexError, RuntimeError, InputError) as error:
+        raise UnusableStateError(f"{checkpoint.file} cannot be used: {error}") from error

@@ -1,17 +1,23 @@
-"""Which folder a dive goes into: the unfinished one of before, or a new one."""
+"""Which folder a dive goes into: the unfinished one of before, or a new one.
+
+A new dive never goes into a folder that holds another's rows, but into one beside it.
+"""
 
 from __future__ import annotations
 
+import itertools
 import logging
 import shutil
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from aquaflow.config.service import CheckpointConfig
 from aquaflow.dive import CHECKPOINT, MARKER, WORK
 from aquaflow.errors import InputError
-from aquaflow.service.checkpoint import Checkpoint, read_state, state_file
+from aquaflow.frame_rows import header
+from aquaflow.service.generations import Checkpoint, generations, read_state
 from aquaflow.service.moment import Moment
 
 log = logging.getLogger(__name__)
@@ -23,16 +29,18 @@ class Choice:
 
     folder: Path
     checkpoint: Checkpoint | None = None
+    notes: tuple[str, ...] = ()
+    """Why it is not the folder that was asked for."""
 
 
 def choose(dives: Path, config: CheckpointConfig, new: bool, now: Moment) -> Choice:
     """The newest dive in ``dives`` that can be resumed, unless ``new``; else a new folder.
 
-    A checkpoint that cannot be used costs itself: the dive begins anew beside it.
+    A dive none of whose checkpoints can be used is left as it is: another begins beside it.
     """
     for folder in [] if new else _unfinished(dives):
-        checkpoint = _usable(folder, config, now)
-        if checkpoint is not None:
+        checkpoint = newest_usable(folder)
+        if checkpoint is not None and _is_recent(folder, checkpoint, config, now):
             return Choice(folder, checkpoint)
         break  # an older one was left for this one
     return Choice(_fresh(dives))
@@ -41,52 +49,89 @@ def choose(dives: Path, config: CheckpointConfig, new: bool, now: Moment) -> Cho
 def resumed(folder: Path, new: bool) -> Choice:
     """A folder that was asked for by name: resumed if it can be.
 
-    Raises:
-        InputError: it holds a checkpoint that cannot be used.
+    If not, and with ``new``, the dive goes into the first of ``folder``, ``folder-2``, ... that
+    holds no rows of another; on the way, without ``new``, one that can be resumed is.
     """
-    if new or not state_file(folder).is_file():
-        return Choice(folder)
-    return Choice(folder, read_state(folder))
+    taken = holds_rows if new else _was_cut_off
+    for place in _numbered(folder):
+        checkpoint = None if new else newest_usable(place)
+        if checkpoint is not None or not taken(place):
+            break
+    if place == folder:
+        return Choice(place, checkpoint)
+    why = "another dive" if new else "a dive without a usable checkpoint"
+    note = f"{folder} holds {why} and is left as it is: this dive is in {place}"
+    log.warning("%s", note)
+    return Choice(place, checkpoint, (note,))
 
 
-def is_unfinished(folder: Path) -> bool:
-    """True for a dive that was cut off before its first checkpoint: it may be begun anew."""
-    begun = (folder / MARKER).is_file()
-    return begun and not (folder / "metrics.json").is_file() and not state_file(folder).is_file()
+def is_begun(folder: Path) -> bool:
+    """True for a dive that was cut off before its first row: it may be begun anew."""
+    return (folder / MARKER).is_file() and not holds_rows(folder)
+
+
+def holds_rows(folder: Path) -> bool:
+    """True if something was recorded there, be it damaged."""
+    frames = folder / MARKER
+    recorded = frames.is_file() and frames.stat().st_size > len(header())
+    return recorded or (folder / "metrics.json").is_file() or bool(_kept(folder))
+
+
+def newest_usable(folder: Path) -> Checkpoint | None:
+    """The newest checkpoint of a dive that can be read."""
+    for path in generations(folder):
+        try:
+            return read_state(path)
+        except InputError as error:
+            log.warning("%s", error)
+    return None
 
 
 def tidy(dives: Path, keep: Path) -> None:
-    """Remove what finished dives, other than ``keep``, kept for a resumption."""
+    """Remove what finished dives, other than ``keep``, kept for a resumption; not from a dive whose
+    checkpoints are damaged, which is left as it is."""
     for report in dives.glob("*/report.html"):
-        if report.parent != keep:
+        dive = report.parent
+        if dive != keep and (not generations(dive) or newest_usable(dive) is not None):
             for name in (CHECKPOINT, WORK):
-                shutil.rmtree(report.parent / name, ignore_errors=True)
+                shutil.rmtree(dive / name, ignore_errors=True)
+
+
+def _was_cut_off(folder: Path) -> bool:
+    """True if rows were recorded there, and it is no dive that was ended."""
+    ended = (folder / "metrics.json").is_file() and not _kept(folder)
+    return holds_rows(folder) and not ended
+
+
+def _kept(folder: Path) -> list[Path]:
+    """What a run kept for a resumption."""
+    return [path for name in (CHECKPOINT, WORK) for path in (folder / name).glob("**/*.*")]
+
+
+def _numbered(folder: Path) -> Iterator[Path]:
+    yield folder
+    for count in itertools.count(2):
+        yield folder.with_name(f"{folder.name}-{count}")
 
 
 def _unfinished(dives: Path) -> list[Path]:
     """Folders with a checkpoint, the newest first."""
-    files = sorted(dives.glob(f"*/{CHECKPOINT}/state.npz"), key=lambda file: file.stat().st_mtime)
-    return [file.parent.parent for file in reversed(files)]
+    newest: dict[Path, float] = {}
+    for file in dives.glob(f"*/{CHECKPOINT}/*.npz"):
+        dive = file.parent.parent
+        newest[dive] = max(newest.get(dive, 0.0), file.stat().st_mtime)
+    return sorted(newest, key=newest.__getitem__, reverse=True)
 
 
-def _usable(folder: Path, config: CheckpointConfig, now: Moment) -> Checkpoint | None:
-    try:
-        checkpoint = read_state(folder)
-    except InputError as error:
-        log.warning("%s", error)
-        return None
+def _is_recent(folder: Path, checkpoint: Checkpoint, config: CheckpointConfig, now: Moment) -> bool:
     age_h = checkpoint.moment.age_h(now)
-    if config.resume_h and age_h > config.resume_h:
+    recent = not config.resume_h or age_h <= config.resume_h
+    if not recent:
         log.info("the dive in %s is %.0f h old: a new one begins", folder, age_h)
-        return None
-    return checkpoint
+    return recent
 
 
 def _fresh(dives: Path) -> Path:
     """Named by the wall clock, which may stand still over a restart."""
-    name = time.strftime("dive-%Y%m%d-%H%M%S")
-    folder, count = dives / name, 1
-    while folder.exists():
-        count += 1
-        folder = dives / f"{name}-{count}"
-    return folder
+    named = dives / time.strftime("dive-%Y%m%d-%H%M%S")
+    return next(folder for folder in _numbered(named) if not folder.exists())

@@ -31,8 +31,9 @@ def take_apart(maps: Maps) -> tuple[dict[str, Any], Arrays]:
 def put_together(maps: Maps, facts: dict[str, Any], arrays: Arrays) -> None:
     """Let fresh ``maps`` go on where those that were taken apart stood.
 
+    A view whose file was lost is left out; the Gaussians that it brought stay.
+
     Raises:
-        InputError: the views' files are gone.
         KeyError, ValueError, TypeError, RuntimeError: this is no such checkpoint.
     """
     for number, values in facts["maps"].items():

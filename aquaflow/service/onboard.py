@@ -11,13 +11,15 @@ from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive_run import Finished
 from aquaflow.errors import AquaFlowError
 from aquaflow.maps import Progress
-from aquaflow.service.choice import Choice, choose, is_unfinished, resumed, tidy
+from aquaflow.service.checkpoint import UnusableStateError
+from aquaflow.service.choice import Choice, choose, is_begun, resumed, tidy
 from aquaflow.service.feed import Feed
 from aquaflow.service.http import HealthServer
 from aquaflow.service.moment import Moment
 from aquaflow.service.pose_out import PoseOut, metric_scale
 from aquaflow.service.report import report
 from aquaflow.service.session import LiveDive
+from aquaflow.service.set_aside import SetAside
 from aquaflow.service.vehicle import VehicleReport
 from aquaflow.service.window import LiveWindow
 
@@ -36,9 +38,10 @@ def map_live(
     """Map what ``feed`` brings until it ends, ``seconds`` have passed, or somebody says stop.
 
     Args:
-        out: the dive's folder; None: the unfinished dive in ``service.dives``, or a new one there.
+        out: the dive's folder, or one beside it if it holds another dive; None: the unfinished dive
+            in ``service.dives``, or a new one there.
         new: begin anew, whatever could be resumed.
-        overwrite: a dive that is in ``out`` already.
+        overwrite: a dive that is in ``out`` already, instead of going on with it.
 
     Returns None where nothing could be mapped.
 
@@ -46,14 +49,8 @@ def map_live(
         AquaFlowError: the folder, the config, the source or the loop; the checkpoint stays.
     """
     service = vehicle.service
-    if out is None:
-        choice = choose(service.dives, service.checkpoint, new, Moment.now())
-        tidy(service.dives, choice.folder)
-    else:
-        choice = resumed(out, new)
-        overwrite = overwrite or is_unfinished(out)
     with contextlib.ExitStack() as around:
-        dive = around.enter_context(_begun(choice, feed, vehicle, new or overwrite, out is None))
+        dive = around.enter_context(begun(feed, vehicle, out, new, overwrite))
         if service.health.enabled:
             server = HealthServer(service.health, lambda: report(dive.parts, service.hang_s))
             around.callback(server.close)
@@ -72,19 +69,39 @@ def map_live(
         return dive.run(progress)
 
 
-def _begun(
-    choice: Choice, feed: Feed, vehicle: VehicleConfig, overwrite: bool, unattended: bool
+def begun(
+    feed: Feed, vehicle: VehicleConfig, out: Path | None, new: bool, overwrite: bool
 ) -> LiveDive:
-    """The dive; where nobody is there to help, one that cannot be resumed gives way to another."""
-    try:
-        return LiveDive(choice.folder.name, choice, feed, vehicle, overwrite)
-    except AquaFlowError as error:
-        if choice.checkpoint is None or not unattended:
-            raise
-        log.error("%s: %s; a new dive begins", choice.folder, error)
-        service = vehicle.service
-        fresh = choose(service.dives, service.checkpoint, True, Moment.now())
-        return LiveDive(fresh.folder.name, fresh, feed, vehicle, overwrite)
+    """The dive of :func:`map_live`, before its first frame. A checkpoint that cannot be gone on
+    from gives way to the one before, and that to a new dive; so does, where nobody is there to
+    help, one that the config does not fit.
+
+    Raises:
+        AquaFlowError: the folder, or the config.
+    """
+    while True:
+        choice = _chosen(vehicle, out, new, overwrite)
+        replaces = overwrite or is_begun(choice.folder)
+        try:
+            return LiveDive(choice.folder.name, choice, feed, vehicle, replaces)
+        except UnusableStateError as error:
+            assert choice.checkpoint is not None
+            log.error("%s", error)
+            SetAside(choice.folder).move(choice.checkpoint.file, str(error))
+        except AquaFlowError as error:
+            if choice.checkpoint is None or out is not None:
+                raise
+            log.error("%s: %s; a new dive begins", choice.folder, error)
+            new = True
+
+
+def _chosen(vehicle: VehicleConfig, out: Path | None, new: bool, overwrite: bool) -> Choice:
+    if out is not None:
+        return Choice(out) if overwrite else resumed(out, new)
+    service = vehicle.service
+    choice = choose(service.dives, service.checkpoint, new, Moment.now())
+    tidy(service.dives, choice.folder)
+    return choice
 
 
 def _stop_after(seconds: float | None, dive: LiveDive) -> threading.Timer:

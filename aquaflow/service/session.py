@@ -31,7 +31,8 @@ from aquaflow.service.live import LiveLoop
 from aquaflow.service.map_thread import MapThread
 from aquaflow.service.notify import Notifier
 from aquaflow.service.pressure import Machine
-from aquaflow.service.same_pictures import check_same_pictures
+from aquaflow.service.salvage import Salvaged, lost_with_their_files, salvaged
+from aquaflow.service.tracking_state import refuse_another_size
 from aquaflow.slam import Slam
 from aquaflow.stopping import until_told
 
@@ -70,17 +71,18 @@ class LiveDive:
         """Make everything.
 
         Raises:
-            InputError: the folder or the checkpoint cannot be used.
+            ConfigError: the checkpoint is of pictures of another size.
+            UnusableStateError: the checkpoint cannot be gone on from.
+            InputError: the folder cannot be used.
         """
         service = config.service
         cores = usable_threads(config.threads)
         fix_threads(max(1, cores // 2))  # tracking's; the renderer's are counted below
         sys.setswitchinterval(SWITCH_S)
-        known = None if choice.checkpoint is None else choice.checkpoint.frames
         self._plain = plain(config)
-        if choice.checkpoint is not None:
-            check_same_pictures(choice.folder, self._plain)
-        self.folder = DiveFolder(choice.folder, self._plain, overwrite, known)
+        self._salvaged = _salvaged(choice, self._plain, feed)
+        rows = None if self._salvaged is None else self._salvaged.rows
+        self.folder = DiveFolder(choice.folder, self._plain, overwrite, rows)
         self.feed, self._service = feed, service
         self._beats, self._ladder = Beats(), Ladder(service.limits)
         self._notifier = Notifier()
@@ -108,12 +110,16 @@ class LiveDive:
                 raise
             known, rows = choice.checkpoint, self.folder.rows
             continued = Continued.after(known.moment, rows, known.clocks)
+            run.notes += lost_with_their_files(known, slam, maps)
             run.dropped += [
                 Dropped(row.index, round(row.t_s * 1e9), row.reason)
                 for row in rows
                 if row.frame_class == "dropped"
             ]
             log.info("resumed %s with %d keyframes", self.folder.path, len(slam.keyframes))
+        run.notes += [*choice.notes, *(self._salvaged.losses if self._salvaged else ())]
+        for note in run.notes:
+            log.warning("%s", note)
         feed.go_on(continued)
         loop = LiveLoop(
             run, feed, thread, service, self._beats, self._ladder,
@@ -141,6 +147,8 @@ class LiveDive:
         contain = parts.slam.failures.contain
         if not source_ended:
             with contain("checkpoint"):
+                while parts.slam.tracker.past is not None:  # or none would have these poses
+                    parts.loop.take(None)
                 parts.checkpointer.take()
         with contain("closing of the source"):
             self.feed.close()
@@ -170,6 +178,14 @@ class LiveDive:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _salvaged(choice: Choice, config: Config, feed: Feed) -> Salvaged | None:
+    """What there is to go on with, if the dive is gone on with."""
+    if choice.checkpoint is None:
+        return None
+    refuse_another_size(choice.folder, choice.checkpoint.facts["tracking"], config)
+    return salvaged(choice.checkpoint, choice.folder, feed.name_of)
 
 
 def plain(vehicle: VehicleConfig) -> Config:

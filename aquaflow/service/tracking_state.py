@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from aquaflow.config import Config
 from aquaflow.dive_run import DiveRun
-from aquaflow.errors import InputError
+from aquaflow.errors import ConfigError, InputError
 from aquaflow.frame_table import FrameTable
 from aquaflow.plain_arrays import (
     Arrays,
@@ -46,6 +48,9 @@ def take_apart(slam: Slam, run: DiveRun) -> tuple[dict[str, Any], Arrays] | None
         "skipped": dict(slam.skipped),
         "cameras": cameras.to_json(),
         "first_pose_s": run.first_pose_s,
+        "source": _asked(slam.config),
+        "notes": list(run.notes),
+        "lost_keyframes": sorted(slam.keyframes.lost),
     }
     arrays = {
         "frames": slam.frames.rows(),
@@ -60,7 +65,7 @@ def put_together(slam: Slam, run: DiveRun, facts: dict[str, Any], arrays: Arrays
     """Let a fresh ``slam`` and ``run`` go on where those that were taken apart stood.
 
     Raises:
-        InputError: a keyframe's file is gone.
+        InputError: it holds no pose.
         KeyError, ValueError, TypeError: this is no such checkpoint.
     """
     cameras = [to_camera(values) for values in facts["cameras"]]
@@ -77,9 +82,37 @@ def put_together(slam: Slam, run: DiveRun, facts: dict[str, Any], arrays: Arrays
     run.first_pose_s = facts["first_pose_s"]
     posed = [tracked for tracked in slam.results() if tracked.T_wc is not None]
     if not posed:
-        raise InputError("the checkpoint holds no pose; start with --new")
+        raise InputError("it holds no pose")
     last = posed[-1].T_wc
     assert last is not None
     slam.tracker.resume(camera, float(facts["focal_sigma"]), int(facts["sub_maps"]), last)
+    run.notes += facts["notes"]
     for keyframe in slam.keyframes.keyframes:
-        slam.tracker.recall(keyframe)
+        if keyframe.number not in slam.keyframes.lost:
+            slam.tracker.recall(keyframe)
+
+
+def lost_since(slam: Slam, facts: dict[str, Any]) -> set[int]:
+    """Keyframes that were whole when the checkpoint was taken, and are no more."""
+    return slam.keyframes.lost - set(facts["lost_keyframes"])
+
+
+def refuse_another_size(dive: Path, facts: dict[str, Any], config: Config) -> None:
+    """Poses and maps are in pixels of one size.
+
+    Raises:
+        ConfigError: ``config`` asks for pictures of another width, or cropped in another way.
+    """
+    asked = _asked(config)
+    for name, before in facts["source"].items():
+        if asked[name] != before:
+            was, now = (value or "the default" for value in (before, asked[name]))
+            raise ConfigError(
+                f"{dive} was begun with source.{name} {was} and cannot be gone on with at {now}; "
+                f"give the same {name}, or begin another dive"
+            )
+
+
+def _asked(config: Config) -> dict[str, Any]:
+    """What decides the size of the mapped pictures."""
+    return {"width": config.source.width, "crop": config.source.crop}

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from aquaflow.frame_rows import read_rows
-from aquaflow.service.checkpoint import read_state, state_file
+from aquaflow.service.generations import read_state, state_file
 
 CONFIG = """
 threads: 1
@@ -85,7 +85,7 @@ def _wrote(dive: Path, process: subprocess.Popen[bytes]) -> bool:
 
 def _examine(dive: Path, killed: Killed) -> None:
     """Everything that is on the disk can be read."""
-    checkpoint = read_state(dive)
+    checkpoint = read_state(state_file(dive))
     killed.known.append(len(checkpoint.frames))
     killed.lost_s.append(time.time() - checkpoint.moment.wall_ns * 1e-9)
     assert read_rows(dive / "frames.csv")

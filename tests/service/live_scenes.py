@@ -27,6 +27,7 @@ from aquaflow.service.map_thread import MapThread
 from aquaflow.service.newest import Newest
 from aquaflow.service.notify import Notifier
 from aquaflow.service.pressure import Pressure
+from aquaflow.service.session import LiveDive
 from aquaflow.slam import Slam
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.vehicle_words import Word
@@ -179,6 +180,15 @@ class RecordedMaps(Maps):
 
     def insert(self, insertion: Insertion) -> None:
         self.asked.append(f"insert {insertion.view.frame_index}")
+
+
+def caught_up(dive: LiveDive) -> None:
+    """Give the loop time for the past, and wait until mapping has done all that was asked for."""
+    while dive.parts.slam.tracker.past is not None:
+        dive.parts.loop.take(None)
+    done = threading.Event()
+    dive.parts.maps._post("wait", lambda maps: done.set())
+    assert done.wait(60.0)
 
 
 def visited(told: Told) -> list[str]:

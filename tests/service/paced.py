@@ -20,7 +20,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from aquaflow.messages import Dropped, Frame
-from aquaflow.service.checkpoint import state_file
+from aquaflow.service.generations import state_file
 from aquaflow.service.newest import Newest
 
 ROOM_BYTES = 64

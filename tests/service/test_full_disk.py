@@ -11,7 +11,7 @@ from killed_dives import CONFIG
 from paced import paced_run
 
 from aquaflow.frame_rows import read_rows
-from aquaflow.service.checkpoint import read_state
+from aquaflow.service.generations import read_state, state_file
 
 FULL_AT = 12
 """The picture at which the disk is full, once there is a checkpoint of those before it."""
@@ -44,7 +44,7 @@ def test_the_user_hears_of_a_full_disk_in_one_sentence(full: tuple[int, str]) ->
 
 
 def test_what_was_written_before_stays_whole(full: tuple[int, str], folder: Path) -> None:
-    known = read_state(folder / "dive").frames
+    known = read_state(state_file(folder / "dive")).frames
     written = {row.index for row in read_rows(folder / "dive" / "frames.csv")}
     assert known
     assert known <= written
@@ -53,7 +53,7 @@ def test_what_was_written_before_stays_whole(full: tuple[int, str], folder: Path
 def test_with_room_again_the_dive_is_taken_up_and_finished(
     full: tuple[int, str], small_recording: Path, folder: Path
 ) -> None:
-    known = len(read_state(folder / "dive").frames)
+    known = len(read_state(state_file(folder / "dive")).frames)
     done = paced_run(small_recording, folder / "vehicle.yaml", folder / "dive")
     assert done.returncode == 0, done.stderr
     assert "resumed" in logged(folder)

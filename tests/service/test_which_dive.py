@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import random
+import time
 from pathlib import Path
 
 import numpy as np
@@ -11,22 +14,100 @@ from live_scenes import VEHICLE, ToldFeed
 from aquaflow.config.service import CheckpointConfig
 from aquaflow.errors import InputError
 from aquaflow.frame_table import FRAME
-from aquaflow.service.checkpoint import FORMAT, state_file, write_state
+from aquaflow.geometry.camera import guess_camera
+from aquaflow.plain_arrays import of_camera
 from aquaflow.service.choice import choose, resumed, tidy
+from aquaflow.service.generations import (
+    FORMAT,
+    OtherFormatError,
+    previous_file,
+    read_state,
+    state_file,
+    write_state,
+)
 from aquaflow.service.moment import Moment
 from aquaflow.service.onboard import map_live
 from aquaflow.service.session import LiveDive
 
 
+def write_numbered(dive: Path, number: int) -> None:
+    """A checkpoint of nothing, by whose clock it can be known again."""
+    frames = {"tracking.frames": np.zeros(0, FRAME), "tracking.keyframes": np.zeros((0, 5))}
+    camera = of_camera(guess_camera(64, 48))
+    tracking = {"camera": camera, "source": {"width": None, "crop": None}}
+    facts = {"format": FORMAT, "version": "0", "tracking": tracking, "clocks": {}}
+    moment = Moment(number, time.time_ns(), "boot").to_json()
+    write_state(dive, facts | {"moment": moment}, frames)
+
+
+def numbers(dive: Path) -> list[int]:
+    files = (state_file(dive), previous_file(dive))
+    return [read_state(file).moment.monotonic_ns for file in files if file.is_file()]
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_the_last_two_checkpoints_are_kept(
+    tmp_path: Path, links: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: object) -> None:
+        raise OSError("no links on this file system")
+
+    if not links:
+        monkeypatch.setattr(os, "link", refused)
+    seen = []
+    for number in range(4):
+        write_numbered(tmp_path, number)
+        seen.append(numbers(tmp_path))
+    assert seen == [[0], [1, 0], [2, 1], [3, 2]]
+    assert sorted(path.name for path in (tmp_path / "checkpoint").iterdir()) == [
+        "previous.npz",
+        "state.npz",
+    ]
+
+
+def test_after_a_kill_between_two_names_of_a_checkpoint_the_next_one_is_written(
+    tmp_path: Path,
+) -> None:
+    write_numbered(tmp_path, 0)
+    os.link(state_file(tmp_path), previous_file(tmp_path))
+    os.link(state_file(tmp_path), tmp_path / "checkpoint" / "link.npz")
+    write_numbered(tmp_path, 1)
+    assert numbers(tmp_path) == [1, 0]
+
+
+def test_no_flipped_bit_changes_what_a_checkpoint_says(tmp_path: Path) -> None:
+    write_numbered(tmp_path, 7)
+    file, rng = state_file(tmp_path), random.Random(0)
+    whole, said = file.read_bytes(), read_state(file)
+    for _ in range(300):
+        data = bytearray(whole)
+        data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+        file.write_bytes(data)
+        try:
+            again = read_state(file)
+        except InputError:
+            continue
+        assert again.facts == said.facts
+        assert list(again.arrays) == list(said.arrays)
+        assert all(np.array_equal(again.arrays[name], said.arrays[name]) for name in said.arrays)
+
+
+def test_a_checkpoint_of_another_version_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "old").mkdir()
+    write_state(tmp_path / "old", {"format": FORMAT - 1, "version": "0.0.9"}, {})
+    with pytest.raises(OtherFormatError, match=r"version 0\.0\.9"):
+        read_state(state_file(tmp_path / "old"))
+    assert resumed(tmp_path / "old", new=False).folder == tmp_path / "old-2"
+
+
 @pytest.mark.parametrize("damage", [b"", b"PK\x03\x04 cut short", b"\x80\x04pickle"])
-def test_a_damaged_checkpoint_is_refused_and_the_next_dive_is_new(
+def test_a_damaged_checkpoint_is_left_alone_and_the_next_dive_is_beside(
     tmp_path: Path, damage: bytes
 ) -> None:
     file = state_file(tmp_path / "old")
     file.parent.mkdir(parents=True)
     file.write_bytes(damage)
-    with pytest.raises(InputError, match="--new"):
-        resumed(tmp_path / "old", new=False)
+    assert resumed(tmp_path / "old", new=False).folder == tmp_path / "old-2"
     choice = choose(tmp_path, CheckpointConfig(), new=False, now=Moment.now())
     assert choice.checkpoint is None
     assert choice.folder != tmp_path / "old"
@@ -51,21 +132,13 @@ def test_a_vehicle_whose_checkpoint_fits_nothing_begins_a_new_dive(tmp_path: Pat
     dives = tmp_path / "dives"
     (dives / "old").mkdir(parents=True)
     (dives / "old" / "frames.csv").write_text("index,source,t_s,class,sub_map,keyframe,quality,r\n")
-    frames = {"tracking.frames": np.zeros(0, FRAME)}
-    facts = {
-        "format": FORMAT,
-        "version": "0",
-        "moment": Moment.now().to_json(),
-        "tracking": {},
-        "clocks": {},
-    }
-    write_state(dives / "old", facts, frames)
+    write_numbered(dives / "old", 0)
     service = VEHICLE.service.model_copy(update={"dives": dives})
     feed = ToldFeed()
     feed.newest.end()
     assert map_live(feed, VEHICLE.model_copy(update={"service": service})) is None
     assert len(list(dives.iterdir())) == 2
-    assert state_file(dives / "old").is_file()
+    assert list((dives / "old").glob("set-aside-*/checkpoint/state.npz"))
 
 
 def test_finished_dives_keep_no_files_for_a_resumption(tmp_path: Path) -> None:
@@ -73,6 +146,10 @@ def test_finished_dives_keep_no_files_for_a_resumption(tmp_path: Path) -> None:
         (tmp_path / name / "work").mkdir(parents=True)
         (tmp_path / name / "checkpoint").mkdir()
         (tmp_path / name / "report.html").touch()
+    (tmp_path / "damaged" / "checkpoint").mkdir(parents=True)
+    (tmp_path / "damaged" / "report.html").touch()
+    state_file(tmp_path / "damaged").write_bytes(b"PK damaged")
     tidy(tmp_path, tmp_path / "current")
     assert sorted(path.name for path in (tmp_path / "old").iterdir()) == ["report.html"]
+    assert state_file(tmp_path / "damaged").is_file()
     assert (tmp_path / "current" / "checkpoint").is_dir()
