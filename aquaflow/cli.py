@@ -121,12 +121,17 @@ def map_command(
 @app.command()
 def synth(
     out: Annotated[Path, typer.Argument(help="Folder to write.")],
-    scene: Annotated[str, typer.Option(help="reef | flat_sand | wall | pipe")] = "reef",
+    scene: Annotated[
+        str, typer.Option(help="reef | flat_sand | wall | pipe | pool | survey")
+    ] = "reef",
     water: Annotated[str | None, typer.Option(help="Water type, such as coastal_1C.")] = None,
     frames: Annotated[int | None, typer.Option(help="Number of pictures.")] = None,
     width: Annotated[int | None, typer.Option(help="Pixels.")] = None,
     height: Annotated[int | None, typer.Option(help="Pixels.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of every random draw.")] = 0,
+    display: Annotated[
+        str | None, typer.Option(help="Burned into the pictures: clock | clock_and_crosshair")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Write a synthetic dive with its ground truth."""
@@ -137,7 +142,7 @@ def synth(
 
     asked = {
         "scene": scene, "water": water, "frames": frames, "width": width, "height": height,
-        "seed": seed,
+        "seed": seed, "display": display,
     }  # fmt: skip
     try:
         config = SyntheticConfig.model_validate({k: v for k, v in asked.items() if v is not None})

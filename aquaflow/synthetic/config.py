@@ -2,16 +2,34 @@
 
 from __future__ import annotations
 
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-__all__ = ["SceneKind", "SyntheticConfig", "TelemetryNoise", "WaterType"]
+__all__ = ["Display", "SceneKind", "SyntheticConfig", "TelemetryNoise", "WaterType"]
 
-SceneKind: TypeAlias = Literal["reef", "flat_sand", "wall", "pipe"]
+SceneKind: TypeAlias = Literal["reef", "flat_sand", "wall", "pipe", "pool", "survey"]
+Display: TypeAlias = Literal["clock", "clock_and_crosshair"]
 WaterType: TypeAlias = Literal[
     "clear", "oceanic_IB", "oceanic_II", "coastal_1C", "coastal_3C", "coastal_5C"
 ]
+
+SCENE_DEFAULTS: dict[str, dict[str, object]] = {
+    # A small vehicle in a test tank, filmed at 1 picture/s: 0.25 m and 6 degrees from one to the
+    # next. The forward view sees floor, walls and no surface.
+    "pool": {
+        "frames": 60, "fps": 1.0, "speed_m_s": 0.25, "altitude_m": 1.1, "altitude_swing_m": 0.1,
+        "camera_pitch_deg": 10.0, "roll_deg": 2.0, "pitch_deg": 2.0, "yaw_deg": 5.0,
+        "floor_depth_m": 3.2, "water": "oceanic_IB", "snow_per_m3": 2.0,
+    },
+    # An AUV that looks straight down: 2 m up at 1 picture/s, two thirds of each picture in the
+    # next (the shared IMOS surveys: 60 to 75 %).
+    "survey": {
+        "frames": 9, "fps": 1.0, "speed_m_s": 0.5, "altitude_m": 2.0, "altitude_swing_m": 0.1,
+        "camera_pitch_deg": 90.0, "roll_deg": 2.0, "pitch_deg": 2.0, "yaw_deg": 4.0,
+    },
+}  # fmt: skip
+"""What differs from the fields' defaults where nothing else is asked for."""
 
 
 class TelemetryNoise(BaseModel):
@@ -71,7 +89,7 @@ class SyntheticConfig(BaseModel):
     )
     camera_pitch_deg: float = Field(
         42.0,
-        ge=25,
+        ge=5,
         le=90,
         description="degrees below the horizon; oblique, so that ranges span 1:3 in a picture",
     )
@@ -96,11 +114,22 @@ class SyntheticConfig(BaseModel):
     noise_sigma: float = Field(
         0.005, ge=0, le=0.2, description="sensor noise, of full scale; 1.3 grey levels"
     )
+    display: Display | None = Field(
+        None, description="what the recorder burns into the pictures; none by default"
+    )
     telemetry: TelemetryNoise = TelemetryNoise.model_validate({})
+
+    @model_validator(mode="before")
+    @classmethod
+    def _scene_defaults(cls, data: Any) -> Any:
+        scene = data.get("scene") if isinstance(data, dict) else None
+        own = SCENE_DEFAULTS.get(scene) if isinstance(scene, str) else None
+        return data if own is None else {**own, **data}
 
     @property
     def duration_s(self) -> float:
-        """Time to travel the whole loop; the frame after the last would be the first again."""
+        """Time to travel the whole loop; the frame after the last would be the first again (but a
+        survey's line is open)."""
         return self.frames / self.fps
 
     @property

@@ -17,9 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow.errors import InputError, reason_of
 from aquaflow.geometry.camera import CameraModel, save_camera
-from aquaflow.synthetic import objects, radiance, render
+from aquaflow.synthetic import objects, pool, radiance, render
 from aquaflow.synthetic import path as paths
 from aquaflow.synthetic.config import SyntheticConfig
+from aquaflow.synthetic.display import burn_in
 from aquaflow.synthetic.march import HeightField
 from aquaflow.synthetic.placement import place_objects
 from aquaflow.synthetic.sensor import Snow, expose, quantised, vignette
@@ -27,6 +28,7 @@ from aquaflow.synthetic.telemetry import write_telemetry
 from aquaflow.synthetic.terrain import Area, build_relief
 from aquaflow.synthetic.texture import MipAtlas
 from aquaflow.synthetic.water import WATER_TYPES, save_medium
+from aquaflow.synthetic.ways import way_of
 
 __all__ = ["FORMAT_VERSION", "build", "camera_of", "write_dive"]
 
@@ -57,7 +59,7 @@ def build(config: SyntheticConfig) -> tuple[render.Scene, paths.Path]:
     """The scene and the way through it."""
     # One stream each: the scene does not change when the path's or the sensor's draws do.
     terrain_rng, things_rng, colour_rng, sway_rng = _streams(config)[:4]
-    loop, _ = paths.lane_loop(config)
+    loop = way_of(config).points
     flat = paths.plan_path(config, sway_rng)
     low, high = _seen(config, flat)
     texel = max(
@@ -86,6 +88,8 @@ def _streams(config: SyntheticConfig) -> list[np.random.Generator]:
 
 def _seen(config: SyntheticConfig, flat: paths.Path) -> tuple[Array, Array]:
     """Corners [2] (m, survey frame) of the floor that the dive sees."""
+    if config.scene == "pool":
+        return pool.corners(way_of(config).points)
     t = np.linspace(0.0, config.duration_s, 65)
     camera = camera_of(config)
     corners = np.array([[x, y] for x in (0, camera.width) for y in (0, camera.height)], float)
@@ -144,7 +148,7 @@ def _write_tables(out: Path, config: SyntheticConfig, path: paths.Path) -> None:
     write_telemetry(out / "telemetry.csv", config, path, _streams(config)[4])
     stated = {
         "version": FORMAT_VERSION,
-        "config": config.model_dump(),
+        "config": config.model_dump(exclude_none=True),
         "frames": {
             "world": "z down, metres, z = 0 at the surface (NED-like)",
             "camera": "x right, y down, z forward; poses are camera to world",
@@ -178,6 +182,8 @@ def _write_pictures(
             water = view.water.copy()
             snow.draw(water, view.range_m, camera, R_sc[k], centres[k], float(t[k]), medium)
             picture = expose(water, shade, config.noise_sigma, noise_rng)
+            if config.display is not None:
+                burn_in(picture, config.display, float(t[k]))
             if pending is not None:
                 pending.result()
             pending = pool.submit(_save, out, k, picture, replace(view, water=water))

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from aquaflow.synthetic import tiles
 from aquaflow.synthetic.noise import FloatMap, fractal
 from aquaflow.synthetic.radiance import AMBIENT, SUN, SUN_DIRECTION
 from aquaflow.synthetic.terrain import Area, Relief
@@ -26,6 +27,8 @@ Rgb: TypeAlias = tuple[float, float, float]
 
 TEXEL_M = 0.002
 TEXELS = 1024
+GRAIN, GLAZE_GRAIN = 0.16, 0.04
+"""Relative standard deviation of the albedo of paint, and of tiles."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +46,9 @@ class Shape:
     growth: Rgb
     """Albedo of the bare thing, and of what grows on it."""
     covered: float
-    """Share that is overgrown, about."""
+    """How much is overgrown: 0.5 is half of it, 0 an eighth, -0.3 a thirtieth."""
+    tile_m: float = 0.0
+    """Edge of the tiles that cover it; 0: none."""
 
     @property
     def reach(self) -> float:
@@ -124,7 +129,10 @@ def radiance(
     shift = 311.0 * float(shape.centre[0]) % TEXELS
     noise = texture.mirrored(u / TEXEL_M + shift, v / TEXEL_M + 2.0 * shift, footprint)
     grown = torch.sigmoid(5.0 * (noise[1] + 2.4 * (shape.covered - 0.5)))
-    paint = torch.tensor(shape.paint)[:, None] * (1.0 + 0.16 * noise[0])
+    grain = GRAIN if shape.tile_m == 0.0 else GLAZE_GRAIN
+    paint = torch.tensor(shape.paint)[:, None] * (1.0 + grain * noise[0])
+    if shape.tile_m > 0.0:
+        paint = tiles.laid(paint, texture, u, v, t * pixel * facing.rsqrt(), shape.tile_m)
     growth = torch.tensor(shape.growth)[:, None] * (1.0 + 0.28 * noise[0])
     R = torch.tensor(shape.R, dtype=torch.float32)
     up = R[2, 0] * normal[0] + R[2, 1] * normal[1] + R[2, 2] * normal[2]

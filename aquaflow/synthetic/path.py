@@ -1,4 +1,4 @@
-"""The vehicle's path: lanes flown at held heading, closed to a loop, with sway.
+"""The vehicle's path: a way over the floor at an altitude, with sway.
 
 The survey frame has x along the lanes, y to the right and z down, with the mean floor at z = 0.
 World is NED-like (z down, 0 at the surface). For floors the two differ by the depth only; for the
@@ -18,46 +18,15 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from aquaflow.synthetic.config import SyntheticConfig
+from aquaflow.synthetic.ways import DENSE, Way, way_of
 
-__all__ = ["Path", "lane_loop", "mounting", "plan_path", "survey_to_world"]
+__all__ = ["Path", "mounting", "plan_path", "survey_to_world"]
 
 Array: TypeAlias = npt.NDArray[np.float64]
 
 MAX_TURN_RATE_DEG_S = 6.0
 """Sway slows down to this where a short dive would make it faster: flow stays below 6 % of W."""
 MAX_CLIMB_M_S = 0.3
-DENSE = 2048
-"""Samples of the loop from which splines are made."""
-
-
-def lane_loop(config: SyntheticConfig) -> tuple[Array, int]:
-    """The loop [DENSE + 1, 2] (m, survey frame, equal arc lengths) and its number of lanes."""
-    length = config.speed_m_s * config.duration_s
-    spacing = min(config.lane_spacing_m, length / 8.0)
-    lanes = 2
-    while _lane(length, lanes, spacing) > config.lane_length_m:
-        lanes += 2
-    run = _lane(length, lanes, spacing)
-    corners = [(run * ((k + 1) // 2 % 2), (k // 2) * spacing) for k in range(2 * lanes)]
-    points = np.array([*corners, (0.0, 0.0)])
-    for _ in range(4):
-        points = _equal_arcs(points, DENSE)
-        step = length / DENSE
-        smooth = gaussian_filter1d(points[:-1], 0.3 * spacing / step, axis=0, mode="wrap")
-        points = np.vstack([smooth, smooth[:1]])
-        points *= length / np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
-    return points, lanes
-
-
-def _lane(length: float, lanes: int, spacing: float) -> float:
-    return (length - 2.0 * (lanes - 1) * spacing) / lanes
-
-
-def _equal_arcs(points: Array, count: int) -> Array:
-    """The polyline ``points`` [N, 2] at count + 1 equal steps of arc length."""
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    at = np.linspace(0.0, arc[-1], count + 1)
-    return np.stack([np.interp(at, arc, points[:, k]) for k in range(2)], axis=1)
 
 
 def survey_to_world(config: SyntheticConfig) -> tuple[Array, Array]:
@@ -83,6 +52,8 @@ class Path:
 
     position: CubicSpline
     """t -> [3] m, survey frame."""
+    heading: CubicSpline
+    """t -> rad about the survey frame's z, before sway."""
     sway: tuple[tuple[float, float, float], ...]
     """(amplitude rad, angular frequency rad/s, phase) of roll, pitch and yaw."""
     R_ws: Array
@@ -104,6 +75,7 @@ class Path:
     def R_wb(self, t: Array) -> Array:
         """Body in the world [N, 3, 3]."""
         angles = [a * np.sin(w * t + p) - a * math.sin(p) for a, w, p in self.sway]
+        angles[2] = angles[2] + self.heading(t)
         survey = Rotation.from_euler("ZYX", np.stack(angles[::-1], axis=1)).as_matrix()
         return np.asarray(self.R_ws @ survey @ self.R_ws.T)
 
@@ -125,16 +97,16 @@ def plan_path(
     relief: Array | None = None,  # [DENSE + 1] m, height of the floor below the loop
 ) -> Path:
     """The path over a flat floor, or over ``relief`` where the floor is known."""
-    loop, lanes = lane_loop(config)
+    way = way_of(config)
     period = config.duration_s
     at = np.linspace(0.0, period, DENSE + 1)
-    turns = lanes // 2
-    omega = 2.0 * math.pi * turns / period
+    omega = 2.0 * math.pi * way.rounds / period
     swing = min(config.altitude_swing_m, MAX_CLIMB_M_S / omega)
     altitude = config.altitude_m + swing * np.cos(omega * at)
-    ground = np.zeros(DENSE + 1) if relief is None else _followed(relief, config)
-    points = np.column_stack([loop, -(ground + altitude)])
-    points[-1] = points[0]
+    ground = np.zeros(DENSE + 1) if relief is None else _followed(relief, config, way)
+    points = np.column_stack([way.points, -(ground + altitude)])
+    if way.closed:
+        points[-1] = points[0]
     amplitudes = (config.roll_deg, config.pitch_deg, config.yaw_deg)
     sway = []
     for amplitude, period_s in zip(amplitudes, (3.7, 4.6, 9.0), strict=True):
@@ -143,12 +115,14 @@ def plan_path(
         limit = min(amplitude, MAX_TURN_RATE_DEG_S / omega)
         sway.append((math.radians(limit), omega, float(rng.uniform(-0.5, 0.5))))
     R_ws, t_ws = survey_to_world(config)
-    spline = CubicSpline(at, points, bc_type="periodic")
-    return Path(spline, tuple(sway), R_ws, t_ws, mounting(config))
+    spline = CubicSpline(at, points, bc_type="periodic" if way.closed else "not-a-knot")
+    return Path(spline, CubicSpline(at, way.heading), tuple(sway), R_ws, t_ws, mounting(config))
 
 
-def _followed(relief: Array, config: SyntheticConfig) -> Array:
+def _followed(relief: Array, config: SyntheticConfig, way: Way) -> Array:
     """What the vehicle follows of the relief: smoothed over 0.6 m, the altimeter's footprint."""
     step = config.speed_m_s * config.duration_s / DENSE
+    if not way.closed:
+        return np.asarray(gaussian_filter1d(relief, 0.6 / step, mode="nearest"))
     smooth = gaussian_filter1d(relief[:-1], 0.6 / step, mode="wrap")
     return np.append(smooth, smooth[0])

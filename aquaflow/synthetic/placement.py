@@ -9,6 +9,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.synthetic import pool
 from aquaflow.synthetic.config import SceneKind
 from aquaflow.synthetic.objects import Rgb, Shape
 from aquaflow.synthetic.terrain import Relief
@@ -35,6 +36,10 @@ def place_objects(
     if kind == "flat_sand":
         x, y = high[0] + rng.uniform(0.8, 1.2), low[1] - rng.uniform(0.6, 0.9)
         return [_crate(x, y, ground(x, y), 0.16, rng)]
+    if kind == "pool":
+        return [*pool.tiled_basin(*pool.corners(loop), rng), *_in_pool(low, high, rng)]
+    if kind == "survey":
+        return []
     if kind == "wall":
         y = high[1] + 0.9
         return [_rope((low[0] - 1.0, y, 0.35), (high[0] + 4.0, y + 0.2, 0.4))]
@@ -49,6 +54,19 @@ def place_objects(
     x, y = low[0] + 1.2, low[1] - 1.1
     shapes.append(_ball(x, y, ground(x, y) + 0.08, 0.14, rng))
     return shapes
+
+
+def _in_pool(low: Array, high: Array, rng: np.random.Generator) -> list[Shape]:
+    """Crates and a mooring on the tiles, on both sides of the way, and a rope across."""
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    shapes = []
+    for k in range(5):
+        angle, out = rng.uniform(0.0, 0.8) + 1.26 * k, rng.choice([0.45, 1.3])
+        x, y = middle + out * half * (math.cos(angle), math.sin(angle))
+        shapes.append(_crate(x, y, 0.0, float(rng.uniform(0.1, 0.2)), rng))
+    shapes += _mooring(middle[0] + 0.3, middle[1] + rng.uniform(-0.2, 0.2), 0.0, rng)
+    ends = (low[0] - 1.2, low[1] - 0.3, 1.9), (high[0] + 1.2, high[1] + 0.5, 1.6)
+    return [*shapes, _rope(*ends)]
 
 
 def _pipeline(

@@ -133,20 +133,31 @@ class _Plan:
     """What is scattered, and how many per square metre."""
 
 
-_BASES = {"reef": _reef, "flat_sand": _sand, "wall": _wall, "pipe": _sand}
-_PLANS = {
-    "reef": _Plan(
-        1.0,
-        -0.1,
-        (
-            (stamps.boulder, 0.9),
-            (stamps.brain_coral, 0.45),
-            (stamps.table_coral, 0.2),
-            (stamps.branching_coral, 0.6),
-            (stamps.sponge, 0.4),
-            (stamps.pebble, 10.0),
-        ),
+def _bedding(rng: np.random.Generator, area: Area) -> FloatMap:
+    """Flat, just below the tiles of a pool."""
+    return np.full(area.shape, -0.01, np.float32)
+
+
+_BASES = {
+    "reef": _reef, "flat_sand": _sand, "wall": _wall, "pipe": _sand, "pool": _bedding,
+    "survey": _reef,
+}  # fmt: skip
+_REEF = _Plan(
+    1.0,
+    -0.1,
+    (
+        (stamps.boulder, 0.9),
+        (stamps.brain_coral, 0.45),
+        (stamps.table_coral, 0.2),
+        (stamps.branching_coral, 0.6),
+        (stamps.sponge, 0.4),
+        (stamps.pebble, 10.0),
     ),
+)
+_PLANS = {
+    "reef": _REEF,
+    "survey": _REEF,
+    "pool": _Plan(0.0, 0.0, ()),
     "flat_sand": _Plan(0.0, 0.0, ((stamps.boulder, 0.03), (stamps.pebble, 6.0))),
     "wall": _Plan(
         1.0,

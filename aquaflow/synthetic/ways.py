@@ -1,0 +1,95 @@
+"""Ways over the floor: lanes closed to a loop, an oval round a pool, a survey's straight line."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import gaussian_filter1d
+
+from aquaflow.synthetic.config import SyntheticConfig
+
+__all__ = ["DENSE", "Way", "way_of"]
+
+Array: TypeAlias = npt.NDArray[np.float64]
+
+DENSE = 2048
+"""Steps of a way from which splines are made."""
+OVAL = 0.6
+"""Short over long axis of the way round a pool."""
+WANDER_M = 0.08
+"""Amplitude by which a survey leaves its line."""
+
+
+@dataclass(frozen=True)
+class Way:
+    """Where the vehicle goes, seen from above, and where it points."""
+
+    points: Array
+    """[DENSE + 1, 2] m, survey frame, equal arc lengths."""
+    heading: Array
+    """[DENSE + 1] rad from the survey frame's x towards its y."""
+    rounds: int
+    """How often the altitude rises and falls along the way."""
+    closed: bool
+    """True if the last point is the first."""
+
+
+def way_of(config: SyntheticConfig) -> Way:
+    """The way of a dive's scene, as long as its speed and duration make it."""
+    held = np.zeros(DENSE + 1)
+    if config.scene == "pool":
+        points = _oval(config)
+        tangent = np.gradient(np.vstack([points[-2], points, points[1]]), axis=0)[1:-1]
+        return Way(points, np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0])), 1, True)
+    if config.scene == "survey":
+        return Way(_line(config), held, 1, False)
+    points, lanes = _lane_loop(config)
+    return Way(points, held, lanes // 2, True)
+
+
+def _oval(config: SyntheticConfig) -> Array:
+    angle = np.linspace(0.0, 2.0 * math.pi, DENSE + 1)
+    points = _equal_arcs(np.stack([np.sin(angle), -OVAL * np.cos(angle)], axis=1), DENSE)
+    points[-1] = points[0]
+    round_ = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
+    return np.asarray(points * (config.speed_m_s * config.duration_s / round_))
+
+
+def _line(config: SyntheticConfig) -> Array:
+    length = config.speed_m_s * config.duration_s
+    x = np.linspace(0.0, length, DENSE + 1)
+    return np.stack([x, WANDER_M * np.sin(2.0 * math.pi * x / length)], axis=1)
+
+
+def _lane_loop(config: SyntheticConfig) -> tuple[Array, int]:
+    """The loop [DENSE + 1, 2] (m, survey frame, equal arc lengths) and its number of lanes."""
+    length = config.speed_m_s * config.duration_s
+    spacing = min(config.lane_spacing_m, length / 8.0)
+    lanes = 2
+    while _lane(length, lanes, spacing) > config.lane_length_m:
+        lanes += 2
+    run = _lane(length, lanes, spacing)
+    corners = [(run * ((k + 1) // 2 % 2), (k // 2) * spacing) for k in range(2 * lanes)]
+    points = np.array([*corners, (0.0, 0.0)])
+    for _ in range(4):
+        points = _equal_arcs(points, DENSE)
+        step = length / DENSE
+        smooth = gaussian_filter1d(points[:-1], 0.3 * spacing / step, axis=0, mode="wrap")
+        points = np.vstack([smooth, smooth[:1]])
+        points *= length / np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
+    return points, lanes
+
+
+def _lane(length: float, lanes: int, spacing: float) -> float:
+    return (length - 2.0 * (lanes - 1) * spacing) / lanes
+
+
+def _equal_arcs(points: Array, count: int) -> Array:
+    """The polyline ``points`` [N, 2] at count + 1 equal steps of arc length."""
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    at = np.linspace(0.0, arc[-1], count + 1)
+    return np.stack([np.interp(at, arc, points[:, k]) for k in range(2)], axis=1)
