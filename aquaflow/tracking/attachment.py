@@ -80,10 +80,16 @@ class Follower:
         pair: PairGeometry | None = None,
     ) -> Matched | None:
         """The frame's pose at the keyframe in use; None where too little speaks for any."""
+        predicted, seed = at.motion @ at.T_fk, None
         if pair is None:
             seed = at.matches if self._config.seed_matching else None
             pair = self._prior.decode(self._reference(at), encoding, seed)
-        return self._matcher.pose(at.keyframe, camera, pair, at.motion @ at.T_fk, at.T_fk)
+        solved = self._matcher.pose(at.keyframe, camera, pair, predicted, at.T_fk)
+        if solved is None and seed is not None:
+            # After a wide step flow may hold on to a neighbour: on tiles it comes back from there.
+            pair = self._prior.decode(self._reference(at), encoding)
+            solved = self._matcher.pose(at.keyframe, camera, pair, predicted, at.T_fk)
+        return solved
 
     def _reference(self, at: Attachment) -> Encoding:
         if self._config.reuse_encodings or at.image is None:

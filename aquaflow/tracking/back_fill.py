@@ -2,14 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from aquaflow.failures import Failures
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes import KeyframeStore
 from aquaflow.messages import Frame
-from aquaflow.prior.contract import Prior
+from aquaflow.prior.contract import Encoding, Prior
 from aquaflow.tracking.attachment import Attachment, Follower
 from aquaflow.tracking.frames import FrameClass, Tracked
+from aquaflow.tracking.matcher import Matched
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """A frame that got its pose."""
+
+    frame: Frame
+    encoding: Encoding
+    solved: Matched
+    at: Attachment
+    """What it was placed against."""
+    T_ak: Sim3
+    """From the keyframe that all poses hang on to ``at``."""
+
+    def as_keyframe(self, follower: Follower, camera: CameraModel) -> tuple[Attachment, Sim3]:
+        """Itself with the depths that it took along, for others to be placed against; T_fk."""
+        pointmap = follower.pointmap(self.at, self.solved, camera)
+        frame, sub_map = self.frame, self.at.keyframe.sub_map
+        # In a store of its own: the dive's keyframes are others.
+        keyframe = KeyframeStore().add(
+            frame.index, frame.t_ns, self.encoding, Sim3.identity(), pointmap, sub_map
+        )
+        return Attachment(keyframe), self.solved.estimate.T @ self.T_ak
 
 
 class BackFill:
@@ -29,18 +55,31 @@ class BackFill:
         """What is left."""
         self._at, self._camera = replace(at), camera
         self._prior, self._follower, self._failures = prior, follower, failures
+        self._last: _Placed | None = None
 
     def step(self) -> Tracked:
         """The newest frame that is left, with its pose if it has one."""
         frame, at = self.frames.pop(), self._at
-        solved = None
+        placed = None
         with self._failures.contain("pose", frame.index):
-            encoding = self._prior.encode(frame.image, self._camera)
-            solved = self._follower.place(at, encoding, self._camera)
-        if solved is None:
+            placed = self._place(frame)
+        if placed is None:
             return Tracked.lost(frame, at.keyframe.sub_map)
-        at.T_fk = solved.estimate.T
-        return at.tracked(frame, FrameClass.COMMON, solved.quality)
+        self._last = placed
+        at.T_fk = placed.solved.estimate.T @ placed.T_ak
+        return at.tracked(frame, FrameClass.COMMON, placed.solved.quality)
+
+    def _place(self, frame: Frame) -> _Placed | None:
+        """At the keyframe; where the frame no longer shows that, at the frame placed before."""
+        encoding = self._prior.encode(frame.image, self._camera)
+        solved = self._follower.place(self._at, encoding, self._camera)
+        if solved is not None:
+            return _Placed(frame, encoding, solved, self._at, Sim3.identity())
+        if self._last is None:
+            return None
+        at, T_ak = self._last.as_keyframe(self._follower, self._camera)
+        solved = self._follower.place(at, encoding, self._camera)
+        return None if solved is None else _Placed(frame, encoding, solved, at, T_ak)
 
     def all(self) -> list[Tracked]:
         """Every frame that is left, the oldest first."""

@@ -111,7 +111,9 @@ class Initialiser:
         )
 
     def _trustworthy(self, explained: float, result: BundleResult) -> bool:
-        relative = result.rho_sigma / np.maximum(result.bundle.rho, 1e-6)
+        # A point that no waiting frame sees has no depth to judge by; of a wide step, most are so.
+        seen = np.any([frame.observed for frame in self.waiting], axis=0)
+        relative = result.rho_sigma[seen] / np.maximum(result.bundle.rho[seen], 1e-6)
         focal_known = (
             result.focal_sigma <= self._config.max_focal_sigma
             or self.parallax_px > 3.0 * self._config.parallax_widths * result.bundle.camera.width

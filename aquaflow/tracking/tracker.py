@@ -70,8 +70,8 @@ class Tracker:
         tracked = self._follow(frame, encoding)
         found = [tracked] if tracked is not None else self._find_again(frame, encoding)
         if found:
-            lost, self._lost = self._lost, []
-            return [self._as_lost(past) for past in lost] + found
+            self._orphans, self._lost = self._orphans + self._lost, []
+            return [*self._back_fill(), *found]
         self._lost.append(frame)
         if len(self._lost) >= self._config.lost_after:
             return self._start_sub_map()

@@ -224,3 +224,10 @@ def test_waiting_frames_are_thinned_and_none_is_forgotten() -> None:
 
 def test_a_calibrated_camera_differs_from_its_guess_only_in_saying_so() -> None:
     assert calibrated(GUESS) == replace(GUESS, calibrated=True)
+
+
+def test_one_wide_step_that_shows_less_than_half_of_the_reference_decides_a_geometry() -> None:
+    wide = [Sim3.identity(), pose((0.01, 0.03, -0.02), (0.95, 0.1, 0.05))]
+    initialiser = started(prior_of(wide))
+    assert initialiser.waiting[0].observed.mean() < 0.5
+    assert_poses(initialiser, wide, 0.03)
