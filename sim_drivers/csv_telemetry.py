@@ -55,18 +55,27 @@ class CsvTelemetry(TelemetryLog):
         """Every line converted; ``stamps_of`` gives arrival and measurement, ns."""
         clock, bad = LogTime(self.starts_s), 0
         with self.path.open(newline="", encoding="utf-8", errors="replace") as file:
-            for line in csv.DictReader(file):
+            for line in self._as_far_as_it_is_a_table(csv.DictReader(file)):
                 try:
                     arrival_stamp, stamp = stamps_of(line)
                     arrival_ns = clock.at(arrival_stamp)
                     t_ns = arrival_ns + min(stamp - arrival_stamp, 0)
                     found = convert(line, t_ns, arrival_ns, self.path.stem)
-                except (KeyError, TypeError, ValueError):
+                except (KeyError, TypeError, ValueError, OverflowError):
                     bad += 1
                     continue
                 yield from found
         if bad:
             self.notes.append(f"{bad} lines of {self.path.name} were left out")
+
+    def _as_far_as_it_is_a_table(self, reader: csv.DictReader[str]) -> Iterator[Line]:
+        """Lines before the first of more than 131,072 characters in a field, csv's limit."""
+        try:
+            yield from reader
+        except csv.Error:
+            self.notes.append(
+                f"{self.path.name} is damaged after line {reader.line_num}; the rest was left out"
+            )
 
 
 Reader: TypeAlias = Callable[[CsvTelemetry], Samples]

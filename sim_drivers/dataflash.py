@@ -20,6 +20,7 @@ from aquaflow.messages import (
     Depth,
     TelemetrySample,
 )
+from drivers.plausible import plausible
 from drivers.rotation import from_euler
 from sim_drivers.telemetry_log import TelemetryLog
 
@@ -64,8 +65,10 @@ class Dataflash(TelemetryLog):
         while at + 3 <= len(data):
             layout = layouts.get(data[at + 2]) if data.startswith(HEAD, at) else None
             if layout is None or at + 3 + layout.fields.size > len(data):
-                skipped += 1
-                at += 1
+                following = data.find(HEAD, at + 1)
+                following = len(data) if following < 0 else following
+                skipped += following - at
+                at = following
                 continue
             if data[at + 2] == DESCRIPTION:
                 kind, length, name, codes, labels = layout.fields.unpack_from(data, at + 3)
@@ -80,12 +83,22 @@ class Dataflash(TelemetryLog):
 
     def samples(self) -> Iterator[TelemetrySample]:
         first_us: int | None = None
+        bad = 0
         for name, record in self.records():
             if "TimeUS" not in record or name not in CONVERSIONS:
                 continue
-            first_us = record["TimeUS"] if first_us is None else first_us
-            t_ns = round(self.starts_s * 1e9) + 1000 * (record["TimeUS"] - first_us)
-            yield from CONVERSIONS[name](record, t_ns, f"{self.path.stem}/{name}")
+            try:
+                first_us = int(record["TimeUS"]) if first_us is None else first_us
+                t_ns = round(self.starts_s * 1e9) + 1000 * (int(record["TimeUS"]) - first_us)
+                found = CONVERSIONS[name](record, t_ns, f"{self.path.stem}/{name}")
+            except (KeyError, TypeError, ValueError, OverflowError):  # its description is damaged
+                bad += 1
+                continue
+            sound = [sample for sample in found if plausible(sample)]
+            bad += len(sound) < len(found)
+            yield from sound
+        if bad:
+            self.notes.append(f"{bad} records of {self.path.name} hold no sane values")
 
 
 def _described(name: bytes, codes: bytes, labels: bytes, length: int) -> _Layout | None:

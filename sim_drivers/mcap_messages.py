@@ -62,7 +62,10 @@ class McapMessages:
         """Messages whose topic is ``wanted``."""
         self.notes = []
         for file in self.files:
-            yield from self._messages(file, wanted)
+            try:
+                yield from self._messages(file, wanted)
+            except OSError as error:
+                self.notes.append(f"{file.name} cannot be read: {error.strerror}")
 
     def counts(self) -> dict[str, int] | None:
         """Messages by topic from the files' summaries; None if one was cut off before it."""
@@ -71,11 +74,11 @@ class McapMessages:
 
         counts: dict[str, int] = {}
         for path in self.files:
-            with path.open("rb") as file:
-                try:
+            try:
+                with path.open("rb") as file:
                     summary = make_reader(file).get_summary()
-                except (McapError, ValueError, OSError, KeyError, MemoryError):
-                    return None
+            except (McapError, ValueError, OSError, KeyError, MemoryError):
+                return None
             if summary is None or summary.statistics is None:
                 return None
             for number, count in summary.statistics.channel_message_counts.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
 from aquaflow.config.link import SerialConfig
@@ -10,6 +11,7 @@ from sim_drivers.telemetry_log import LONGEST_PAUSE_NS, ByteLog, LogTime, Read
 
 STAMP_BYTES = 8
 MAVLINK_1, MAVLINK_2 = 0xFE, 0xFD
+MARKS = re.compile(rb"[\xfd\xfe]")
 FRAMING_BYTES = {MAVLINK_1: 8, MAVLINK_2: 12}
 """Of a packet without payload: header and checksum."""
 SIGNED_FLAG, SIGNATURE_BYTES = 0x01, 13
@@ -36,8 +38,10 @@ class Tlog(ByteLog):
             length = _packet_bytes(data, at + STAMP_BYTES)
             near = stamp_us is None or abs(found_us - stamp_us) * 1000 <= LONGEST_PAUSE_NS
             if length == 0 or not (near or _leads_on(data, at, length)):
-                at += 1
-                skipped += 1
+                mark = MARKS.search(data, at + 1 + STAMP_BYTES)
+                following = len(data) if mark is None else mark.start() - STAMP_BYTES
+                skipped += following - at
+                at = following
                 continue
             stamp_us = found_us
             packet = data[at + STAMP_BYTES : at + STAMP_BYTES + length]

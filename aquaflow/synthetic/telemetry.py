@@ -96,7 +96,7 @@ def read_telemetry(path: Path) -> Iterator[TelemetrySample]:
                 yield _sample(line)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read the telemetry {path}: {reason_of(error)}") from error
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, csv.Error) as error:
         raise InputError(
             f"{path} holds a line that is no telemetry sample; its columns must be "
             f"{', '.join(HEADER)}"
