@@ -64,6 +64,7 @@ class McapCamera:
         self.topic = first.topic
         self._base = first.topic.rpartition("/")[0]
         self._ours = OURS in self._messages.facts
+        self._damage: list[str] = []
         self._stated = self._calibration()
         """As every frame carried it, be it only a guess."""
         known = self._stated is not None and self._stated.calibrated
@@ -93,7 +94,7 @@ class McapCamera:
                 break
             if is_asked(frame.index, every, start):
                 yield frame
-        self.notes = list(self._messages.notes)
+        self.notes = [*self._damage, *self._messages.notes]
 
     def close(self) -> None:
         """Nothing stays open between passes."""
@@ -116,9 +117,13 @@ class McapCamera:
         facts = self._messages.facts.get(f"camera:{self._base.strip('/')}")
         if facts is None:
             return None
-        fields = json.loads(facts["model"])
-        beside = {"distortion": tuple(fields["distortion"]), "port": Port(**fields["port"])}
-        return CameraModel(**fields | beside)
+        try:
+            fields = json.loads(facts["model"])
+            beside = {"distortion": tuple(fields["distortion"]), "port": Port(**fields["port"])}
+            return CameraModel(**fields | beside)
+        except (KeyError, TypeError, ValueError, RecursionError):
+            self._damage.append(f"the calibration in {self.path.name} is damaged and was left out")
+            return None
 
     def _count(self, counts: dict[str, int] | None) -> int | None:
         if counts is None:
@@ -129,10 +134,9 @@ class McapCamera:
         """Pictures with what belongs to them; a sentence instead of one that is missing."""
         beside: dict[str, Any] = {}
         mask: npt.NDArray[np.bool_] | None = None
-        topics = {
-            self.topic: "picture", f"{self._base}/dropped": "dropped",
-            f"{self._base}/exposure": "exposure", f"{self._base}/mask": "mask",
-        }  # fmt: skip
+        topics = {self.topic: "picture"}
+        if self._ours:  # elsewhere, topics of these names hold what their makers mean by them
+            topics |= {f"{self._base}/{kind}": kind for kind in ("dropped", "exposure", "mask")}
         for count, message in _numbered(self._messages.of(topics.__contains__), self.topic):
             kind = topics[message.topic]
             if kind == "mask":

@@ -61,6 +61,25 @@ def opened(path: Path) -> Iterator[AnyReader]:
         reader.close()
 
 
+def messages_in(
+    reader: AnyReader, connections: list[Connection], notes: list[str]
+) -> Iterator[tuple[Connection, int, bytes]]:
+    """Connection, time of reception and bytes, up to the first place that cannot be read.
+
+    That there was one is added to ``notes``.
+    """
+    messages = reader.messages(connections) if connections else iter(())
+    while True:
+        try:
+            message = next(messages, None)
+        except Exception:  # SQLite, MCAP and each compression have errors of their own
+            notes.append("the bag is damaged; all before the damage is used")
+            return
+        if message is None:
+            return
+        yield message
+
+
 def picture_connections(reader: AnyReader) -> list[Connection]:
     """Those of the first picture topic by name that holds messages."""
     found = [c for c in reader.connections if c.msgtype in PICTURES and c.msgcount > 0]
@@ -90,6 +109,6 @@ def stamp_of(message: Any, received_ns: int) -> int:
 def origin_of(reader: AnyReader) -> int:
     """Time of the first picture; that of the bag's first message where it holds no picture."""
     pictures = picture_connections(reader)
-    for connection, received_ns, data in reader.messages(pictures) if pictures else ():
+    for connection, received_ns, data in messages_in(reader, pictures, []):
         return stamp_of(decoded(reader, connection, data), received_ns)
     return int(reader.start_time)

@@ -20,6 +20,7 @@ from sim_drivers.rosbag import (
     PICTURES,
     decoded,
     is_bag,
+    messages_in,
     opened,
     origin_of,
     picture_connections,
@@ -83,7 +84,7 @@ class RosbagCamera:
         if self._other_topics:
             self.notes.append(f"{self.topic} is used; also there: {', '.join(self._other_topics)}")
         with opened(self.path) as reader:
-            messages = reader.messages(picture_connections(reader))
+            messages = messages_in(reader, picture_connections(reader), self.notes)
             for index, (connection, received_ns, data) in enumerate(messages):
                 if stop is not None and index >= stop:
                     return
@@ -119,7 +120,7 @@ def _calibration(reader: AnyReader, topic: str) -> CameraModel | None:
     base = topic.removesuffix("/compressed").rpartition("/")[0]
     infos = [connection for connection in reader.connections if connection.msgtype == CAMERA_INFO]
     beside = [connection for connection in infos if connection.topic.startswith(base)]
-    for connection, _, data in reader.messages(beside) if beside else ():
+    for connection, _, data in messages_in(reader, beside, []):
         info = decoded(reader, connection, data)
         if info is None:
             return None

@@ -20,7 +20,7 @@ from aquaflow.messages import (
     Velocity,
 )
 from drivers.rotation import Vector, normalised, product
-from sim_drivers.rosbag import decoded, is_bag, opened, origin_of, stamp_of
+from sim_drivers.rosbag import decoded, is_bag, messages_in, opened, origin_of, stamp_of
 
 Convert: TypeAlias = Callable[[Any, int, int, str], list[TelemetrySample]]
 
@@ -60,10 +60,11 @@ class RosbagTelemetry:
             InputError: the bag is damaged.
         """
         bad = 0
+        self.notes = []
         with opened(self.path) as reader:
             base_ns = origin_of(reader) - self._shift_ns
             wanted = [c for c in reader.connections if c.msgtype in CONVERSIONS]
-            for connection, received_ns, data in reader.messages(wanted) if wanted else ():
+            for connection, received_ns, data in messages_in(reader, wanted, self.notes):
                 message = decoded(reader, connection, data)
                 arrival_ns = received_ns - base_ns
                 t_ns = min(stamp_of(message, received_ns) - base_ns, arrival_ns)
@@ -74,7 +75,8 @@ class RosbagTelemetry:
                     bad += 1
                     continue
                 yield from found
-        self.notes = [f"{bad} messages of {self.path.name} make no sense"] if bad else []
+        if bad:
+            self.notes.append(f"{bad} messages of {self.path.name} make no sense")
 
     def close(self) -> None:
         """Nothing stays open between passes."""

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,9 @@ from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.geometry.similarity import Sim3, rotation_from_quaternion
 from aquaflow.viewer.splats import Splats, splats
 from aquaflow.viewer.window import Window
+
+TUM_COLUMNS = 8
+"""t_s tx ty tz qx qy qz qw"""
 
 
 @dataclass(frozen=True)
@@ -93,10 +96,11 @@ def _splats(folder: Path, budget: int) -> Splats:
 
 def _poses(path: Path) -> tuple[list[Sim3], npt.NDArray[np.float64]]:
     try:
-        rows = np.loadtxt(path, ndmin=2)
+        rows = np.loadtxt(path, ndmin=2).reshape(-1, TUM_COLUMNS)
     except (OSError, ValueError) as error:
         raise InputError(f"cannot read {path}: {reason_of(error)}; map the dive again") from error
-    rows = rows.reshape(-1, 8)
+    if not np.isfinite(rows).all() or (np.linalg.norm(rows[:, 4:8], axis=1) == 0.0).any():
+        raise InputError(f"{path} holds what is no pose; map the dive again")
     poses = [Sim3(rotation_from_quaternion(np.roll(row[4:8], 1)), row[1:4]) for row in rows]
     return poses, rows[:, 0]
 
@@ -105,17 +109,32 @@ def _of_frames(
     folder: Path, times: npt.NDArray[np.float64]
 ) -> tuple[npt.NDArray[np.float64], list[Path | None]]:
     """Quality and picture of the frame at each time."""
-    by_time: dict[int, dict[str, Any]] = {}
-    with (folder / "frames.csv").open(newline="", encoding="utf-8") as stream:
-        for row in csv.DictReader(stream):
-            by_time[round(float(row["t_s"]) * 1e6)] = row
+    shown = _shown_by_microsecond(folder / "frames.csv")
     quality, pictures = [], []
     for t_s in times:
-        row = by_time.get(round(float(t_s) * 1e6), {})
-        quality.append(float(row.get("quality") or 1.0))
-        picture = folder / "heldout" / f"{int(row.get('index') or 0):06d}_real.png"
+        inliers, index = shown.get(_microsecond(t_s), (1.0, 0))
+        quality.append(inliers)
+        picture = folder / "heldout" / f"{index:06d}_real.png"
         pictures.append(picture if picture.is_file() else None)
     return np.array(quality), pictures
+
+
+def _shown_by_microsecond(path: Path) -> dict[int, tuple[float, int]]:
+    """Quality and index of the frame at each time; a damaged line costs itself."""
+    shown: dict[int, tuple[float, int]] = {}
+    try:
+        with path.open(newline="", encoding="utf-8", errors="replace") as stream:
+            for row in csv.DictReader(stream):
+                with contextlib.suppress(KeyError, TypeError, ValueError, OverflowError):
+                    found = float(row["quality"] or 1.0), int(row["index"])
+                    shown[_microsecond(float(row["t_s"]))] = found
+    except (OSError, csv.Error) as error:
+        raise InputError(f"cannot read {path}; map the dive again") from error
+    return shown
+
+
+def _microsecond(t_s: float) -> int:
+    return round(float(t_s) * 1e6)
 
 
 def _picture(path: Path) -> npt.NDArray[np.uint8] | None:

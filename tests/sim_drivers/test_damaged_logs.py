@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import struct
 from pathlib import Path
 
+import numpy as np
 import pytest
+from mcap.writer import Writer
 
+from aquaflow.config.recording import RecordingConfig
 from aquaflow.errors import InputError
 from aquaflow.messages import Acceleration, Depth
+from aquaflow.recording.pictures import encode
 from aquaflow.synthetic.telemetry import HEADER
 from sim_drivers.csv_telemetry import CsvTelemetry
 from sim_drivers.dataflash import Dataflash
+from sim_drivers.mcap_camera import OURS, McapCamera
 from sim_drivers.mcap_messages import McapMessages
 from sim_drivers.tlog import Tlog
 
@@ -87,3 +94,45 @@ def test_an_mcap_file_that_cannot_be_opened_costs_itself(tmp_path: Path) -> None
     assert [note.partition(" cannot be read: ")[0] for note in messages.notes] == [
         "0000.mcap", "0001.mcap",
     ]  # fmt: skip
+
+
+def a_recording(path: Path, model: str) -> None:
+    """Two pictures as AquaFlow records them, with ``model`` as what is known of the camera."""
+    picture = encode(np.full((4, 6, 3), 90, np.uint8), RecordingConfig(picture="png")).data
+    message = json.dumps({"format": "png", "data": base64.b64encode(picture).decode()}).encode()
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_metadata(OURS, {})
+        writer.add_metadata("camera:cam", {"model": model})
+        schema = writer.register_schema("foxglove.CompressedImage", "jsonschema", b"{}")
+        channel = writer.register_channel("/cam/image", "json", schema)
+        for number in range(2):
+            writer.add_message(channel, number, message, number, number)
+        writer.finish()
+
+
+@pytest.mark.parametrize(
+    "model", ["{", "[]", '{"width": 6}', '{"distortion": [], "port": {"x": 1}}']
+)
+def test_a_damaged_calibration_in_a_recording_is_left_out(tmp_path: Path, model: str) -> None:
+    a_recording(tmp_path / "a.mcap", model)
+    camera = McapCamera(tmp_path / "a.mcap")
+    assert camera.camera is None
+    assert len(list(camera.frames())) == 2
+    assert "the calibration in a.mcap is damaged and was left out" in camera.notes
+
+
+def test_topics_of_others_that_are_named_as_ours_are_theirs(tmp_path: Path) -> None:
+    a_recording(tmp_path / "a.mcap", "{}")
+    picture = next(iter(McapMessages([tmp_path / "a.mcap"])))
+    with (tmp_path / "b.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("foxglove.CompressedImage", "jsonschema", b"{}")
+        for name, data in (("image", picture.data), ("exposure", b"\x08\x01"), ("mask", b"?")):
+            channel = writer.register_channel(f"/cam/{name}", "json", schema)
+            writer.add_message(channel, 0, data, 0)
+        writer.add_message(channel - 2, 1, picture.data, 1)
+        writer.finish()
+    assert len(list(McapCamera(tmp_path / "b.mcap").frames())) == 2

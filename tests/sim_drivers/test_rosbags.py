@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from aquaflow.messages import (
 )
 from aquaflow.recording.pictures import encode
 from aquaflow.sources import open_recorded_telemetry, open_recording
+from sim_drivers.rosbag import messages_in
 from sim_drivers.rosbag_camera import RosbagCamera
 
 SECOND = 1_000_000_000
@@ -169,3 +171,28 @@ def test_a_bag_without_pictures_is_telemetry_only(tmp_path: Path) -> None:
     assert isinstance(sample, Depth)
     assert not isinstance(sample, Dropped)
     assert sample.arrival_ns == 0
+
+
+def test_a_bag_whose_storage_is_damaged_is_used_up_to_the_damage() -> None:
+    class Damaged:
+        """A reader as rosbags has it, whose second message cannot be read."""
+
+        def messages(self, connections: list[str]) -> Iterator[tuple[str, int, bytes]]:
+            yield connections[0], 1, b"whole"
+            raise RuntimeError("database disk image is malformed")
+
+    notes: list[str] = []
+    reader: Any = Damaged()
+    connections: Any = ["/imu"]
+    assert list(messages_in(reader, connections, notes)) == [("/imu", 1, b"whole")]
+    assert notes == ["the bag is damaged; all before the damage is used"]
+
+
+def test_a_cut_database_is_a_note_or_one_sentence(bag: Path) -> None:
+    whole = bag if bag.is_file() else next(f for f in bag.iterdir() if f.suffix != ".yaml")
+    content = whole.read_bytes()
+    for share in (0.3, 0.6, 0.9, 0.99):
+        whole.write_bytes(content[: int(share * len(content))])
+        with contextlib.suppress(InputError):
+            camera = open_recording(bag)
+            assert len(list(camera.frames())) == 3 or camera.notes

@@ -71,6 +71,30 @@ def test_a_finished_dive_is_read_with_its_colours_poses_and_pictures(small_dive:
     assert len(kept) == len(list((small_dive / "heldout").glob("*_real.png")))
 
 
+def test_a_damaged_line_of_the_frames_costs_itself(small_dive: Path, tmp_path: Path) -> None:
+    dive = tmp_path / "dive"
+    shutil.copytree(small_dive, dive)
+    header, *lines = (dive / "frames.csv").read_text().splitlines()
+    lines[5] = lines[5].replace("0.", "0g.")
+    (dive / "frames.csv").write_text("\n".join([header, "x", ",1e999,,,", *lines]))
+    damaged, whole = read_dive(dive, budget=50), read_dive(small_dive, budget=50)
+    assert len(damaged.poses) == len(whole.poses)
+    assert (damaged.quality != whole.quality).sum() <= 1
+
+
+@pytest.mark.parametrize(
+    "line", ["1 2 3", "0 0 0 0 0 0 0 0", "0 nan 0 0 0 0 0 1", "0 x 0 0 0 0 0 1"]
+)
+def test_a_trajectory_that_holds_no_poses_is_refused(
+    small_dive: Path, tmp_path: Path, line: str
+) -> None:
+    dive = tmp_path / "dive"
+    shutil.copytree(small_dive, dive)
+    (dive / "trajectory.tum").write_text(f"{line}\n")
+    with pytest.raises(InputError, match=r"trajectory\.tum"):
+        read_dive(dive, budget=50)
+
+
 def test_a_folder_without_a_dive_is_refused_in_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"map\.ply is missing"):
         read_dive(tmp_path, budget=500)
