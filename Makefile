@@ -12,6 +12,7 @@ KERNELS := $(wildcard aquaflow/render/native/*.cpp aquaflow/render/native/*.h)
 
 WORKERS ?= 2
 OUT ?= out/dive
+FUZZ_SECONDS ?= 120
 SYNTHETIC := out/synthetic
 
 export PIP_NO_CACHE_DIR := 1
@@ -19,7 +20,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export XDG_CACHE_HOME := $(CURDIR)/$(VENV)/cache
 export MPLCONFIGDIR := $(CURDIR)/$(VENV)/cache/matplotlib
 
-.PHONY: help setup run test test-all test-kernel check clean
+.PHONY: help setup run test test-all test-kernel fuzz check clean
 
 help: ## Show this list.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -52,6 +53,9 @@ test-all: setup ## Run all tests, also those on whole recordings.
 test-kernel: setup ## Run the drivers on a real Linux kernel under qemu: V4L2, CAN.
 	tests/kernel/prepare.sh $(VENV)/cache/kernel
 	$(BIN)/pytest tests/kernel -rs
+
+fuzz: setup ## Feed every command what nothing sane would, for FUZZ_SECONDS=120.
+	$(BIN)/python -m tests.fuzz --seconds $(FUZZ_SECONDS)
 
 check: setup ## Lint, formatting, types.
 	$(BIN)/ruff check
