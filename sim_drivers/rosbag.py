@@ -40,9 +40,7 @@ def opened(path: Path) -> Iterator[AnyReader]:
         InputError: it is damaged, or the extra ``recording`` is missing.
     """
     try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
-        from rosbags.rosbag1 import ReaderError as Ros1Error
-        from rosbags.rosbag2 import ReaderError as Ros2Error
+        from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise InputError(
@@ -51,7 +49,7 @@ def opened(path: Path) -> Iterator[AnyReader]:
     try:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
-    except (AnyReaderError, Ros1Error, Ros2Error, OSError) as error:
+    except Exception as error:  # of rosbags, YAML, SQLite, MCAP, and each compression
         raise InputError(
             f"cannot read the bag {path}: {reason_of(error)}; copy or record it again"
         ) from error

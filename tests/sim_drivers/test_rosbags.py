@@ -173,6 +173,14 @@ def test_a_bag_without_pictures_is_telemetry_only(tmp_path: Path) -> None:
     assert sample.arrival_ns == 0
 
 
+@pytest.mark.parametrize("text", [b"\xff\xfe", b"rosbag2_bagfile_information: 3\n", b"a: *x\n"])
+def test_a_bag_with_damaged_metadata_is_one_sentence(tmp_path: Path, text: bytes) -> None:
+    (tmp_path / "a.db3").write_bytes(b"")
+    (tmp_path / "metadata.yaml").write_bytes(text)
+    with pytest.raises(InputError, match="cannot read the bag"):
+        open_recording(tmp_path)
+
+
 def test_a_bag_whose_storage_is_damaged_is_used_up_to_the_damage() -> None:
     class Damaged:
         """A reader as rosbags has it, whose second message cannot be read."""
