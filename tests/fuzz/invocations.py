@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from .commands import Command, Parameter
 from .damage import KINDS, Damage
 from .text_damage import HOSTILE_NUMBERS
-from .values import ABSURD_PATHS, FITTING, ONLY, QUICK, TEXTS, numbers
+from .values import ABSURD_PATHS, FITTING, ONLY, QUICK, TEXTS, USUAL, numbers
 
 
 @dataclass(frozen=True)
@@ -57,11 +57,15 @@ DAMAGES = st.builds(
 )
 
 
+DAMAGES_OF_A_FILE = (0, 0, 0, 1, 1, 2)
+"""As many are whole as are damaged: most damage ends a run before much of it was seen."""
+
+
 @st.composite
 def invocations(draw: st.DrawFn, command: Command, exemplars: tuple[str, ...]) -> Invocation:
     """Any call of ``command``: mostly whole, with a few options, on files mostly damaged."""
-    parameters = [p for p in command.parameters if p.required and draw(st.integers(0, 30))]
-    optional = [p for p in command.parameters if not p.required]
+    parameters = [p for p in command.parameters if _is_usual(p) and draw(st.integers(0, 30))]
+    optional = [p for p in command.parameters if not _is_usual(p)]
     if optional:
         parameters += draw(st.lists(st.sampled_from(optional), max_size=4, unique=True))
     arguments: list[str] = []
@@ -82,6 +86,11 @@ def invocations(draw: st.DrawFn, command: Command, exemplars: tuple[str, ...]) -
         f"{flag}={text}" if text else flag for flag, text in quick.items() if flag not in given
     ]
     return Invocation(command, tuple(arguments), tuple(planted.values()), frozenset(outputs))
+
+
+def _is_usual(parameter: Parameter) -> bool:
+    """Without it, a command has nothing to do."""
+    return parameter.required or parameter.name in USUAL
 
 
 def _with_flag(parameter: Parameter, text: str) -> list[str]:
@@ -114,5 +123,6 @@ def _path(draw: st.DrawFn, parameter: Parameter, exemplars: tuple[str, ...]) -> 
         return _Value(draw(st.sampled_from(("new", "new/deep", "new é"))))
     fitting = FITTING.get(parameter.name, exemplars)
     exemplar = draw(st.sampled_from(fitting if chance > 2 else exemplars))
-    damages = () if parameter.is_output else tuple(draw(st.lists(DAMAGES, max_size=3)))
+    count = 0 if parameter.is_output else draw(st.sampled_from(DAMAGES_OF_A_FILE))
+    damages = tuple(draw(st.lists(DAMAGES, min_size=count, max_size=count)))
     return _Value(exemplar, (Planted(exemplar, damages),))

@@ -29,6 +29,9 @@ FITTING: dict[str, tuple[str, ...]] = {
 }
 """Exemplars that suit a parameter, by its name; for others any does."""
 
+USUAL = frozenset({"source"})
+"""Options that are nearly always given: without them, `run` and `record` look for devices."""
+
 ABSURD_PATHS = (
     *("", ".", "..", "/", "missing", "missing/deep", "x" * 300, "a" * 5000, "é\udcff", "new\n"),
     *("null", "full", "null/x", "/proc/self/mem", "/proc/1/environ", "/proc/new", "/sys/new"),
