@@ -6,11 +6,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+WORKERS ?= 2
 # Tests of one file run in one process: they share what the file's fixtures made.
 TESTS := $(BIN)/pytest -n $(WORKERS) --dist loadfile
 KERNELS := $(wildcard aquaflow/render/native/*.cpp aquaflow/render/native/*.h)
 
-WORKERS ?= 2
 OUT ?= out/dive
 FUZZ_SECONDS ?= 120
 SYNTHETIC := out/synthetic
