@@ -144,7 +144,8 @@ class FlowMatcher:
         return Flow(forward, backward, error.astype(np.float32), valid)
 
     def _flow(self, a: Grey, b: Grey, start: Float | None) -> Float:
-        if start is None:
+        # Where a start is NaN, OpenCV reads outside of the picture and ends the process.
+        if start is None or not np.isfinite(start).all():
             return refine(a, b, self._unseeded.calc(a, b, None))
         initial = np.ascontiguousarray(start, dtype=np.float32).copy()
         return refine(a, b, self._seeded.calc(a, b, initial))

@@ -120,6 +120,12 @@ def test_the_start_is_not_written_to() -> None:
     assert not start.any()
 
 
+def test_a_start_that_is_no_number_counts_as_none() -> None:
+    pair = moved_pair(shift(6.0, 0.0))
+    start = np.full((HEIGHT, WIDTH, 2), np.nan, np.float32)
+    np.testing.assert_array_equal(flow_between(*pair, start).forward, flow_between(*pair).forward)
+
+
 def test_a_flow_without_a_start_does_not_remember_an_earlier_one() -> None:
     a, b = (normalised_grey(picture) for picture in moved_pair(shift(3.0, 1.0)))
     textures = (texture_of(a), texture_of(b))
