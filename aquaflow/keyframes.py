@@ -135,9 +135,13 @@ class KeyframeStore:
         pointmap: Pointmap,
         sub_map: int,
     ) -> Keyframe:
-        """Append a keyframe and hold it; the pointmap is the store's own from here on."""
+        """Append a keyframe and hold it; the pointmap is the store's own from here on.
+
+        Raises:
+            ArithmeticError: its pose is not finite.
+        """
         number = len(self.keyframes)
-        keyframe = Keyframe(number, frame_index, t_ns, T_wc, sub_map, self)
+        keyframe = Keyframe(number, frame_index, t_ns, T_wc.if_finite(), sub_map, self)
         self.keyframes.append(keyframe)
         self._cameras.append((encoding.camera, pointmap.camera))
         self._contents[number] = _Content(encoding, pointmap)

@@ -155,7 +155,9 @@ class Maps:
         with self.profiler.stage("refine"):
             for mapper in self.mappers.values():
                 if len(mapper.views) >= MIN_VIEWS:
-                    mapper.refine(progress)
+                    with self.failures.contain("refinement"):
+                        mapper.refine(progress)
+                mapper.make_whole()
 
     def mapper(self, sub_map: int) -> Mapper:
         """The map of a sub-map, made when first asked for."""

@@ -137,8 +137,9 @@ class Slam:
         placed += self._place_all([self._as_lost(left.frame) for left in self._left()])
         while self.graph.optimising:
             self._correct(wait=True)
-        for insertion in self._retired_keyframes():
-            self.maps.insert(insertion)
+        with self.failures.contain("insertion"):
+            for insertion in self._retired_keyframes():
+                self.maps.insert(insertion)
         with self.failures.contain("refinement"):
             self.maps.refine(progress)
         settled = self.results(len(self.frames) - len(placed))
@@ -175,11 +176,11 @@ class Slam:
         """Anchor all frames before a loop among them moves the keyframes that they hang on."""
         # A frame on which a stage failed may be known already.
         decided = [tracked for tracked in decided if tracked.frame.index in self._waiting]
-        anchors = [self._anchor(tracked) for tracked in decided]
-        placed = [self._place(*each) for each in zip(decided, anchors, strict=True)]
-        for tracked, T_kf in zip(placed, anchors, strict=True):
+        anchored = [self._anchored(tracked) for tracked in decided]
+        placed = [self._place(*each) for each in anchored]
+        for tracked, (_, T_kf) in zip(placed, anchored, strict=True):
             self._waiting.pop(tracked.frame.index, None)
-            self.frames.add(tracked, T_kf)
+            self.frames.add(tracked, None if tracked.T_wc is None else T_kf)
         return placed
 
     def _left(self) -> list[Waiting]:
@@ -190,11 +191,14 @@ class Slam:
         reason = self.failures.reason(frame.index) or "tracking failed"
         return Tracked.lost(frame, self.tracker.sub_map, reason)
 
-    def _anchor(self, tracked: Tracked) -> Sim3 | None:
-        """The pose against the frame's keyframe, T_kf, which later corrections leave."""
+    def _anchored(self, tracked: Tracked) -> tuple[Tracked, Sim3 | None]:
+        """With the pose against the frame's keyframe, T_kf, which later corrections leave."""
         if tracked.keyframe is None or tracked.T_wc is None:
-            return None
-        return self.keyframes[tracked.keyframe].T_wc.inverse() @ tracked.T_wc
+            return tracked, None
+        with self.failures.contain("pose", tracked.frame.index):
+            T_kf = self.keyframes[tracked.keyframe].T_wc.inverse() @ tracked.T_wc
+            return tracked, T_kf.if_finite()
+        return self._as_lost(tracked.frame), None
 
     def _place(self, tracked: Tracked, T_kf: Sim3 | None) -> Tracked:
         """Let the keyframe graph and the map know of a frame; its pose after that."""
@@ -208,8 +212,8 @@ class Slam:
             with self.profiler.stage("graph"), self.failures.contain("keyframe graph", index):
                 self.graph.add(tracked.keyframe, tracked.link)
         settled = self._settled(tracked, T_kf)
-        self._latest = settled, T_kf
-        if self.config.mapping.enabled:
+        self._latest = None if settled.T_wc is None else (settled, T_kf)
+        if self.config.mapping.enabled and settled.T_wc is not None:
             with self.failures.contain("mapping", settled.frame.index):
                 self._map(settled)
         return settled
@@ -226,7 +230,7 @@ class Slam:
                 self._settled(before, T_kf), frame=frame, frame_class=FrameClass.SKIPPED,
                 pointmap=None, reason=verdict.reason, link=None,
             )  # fmt: skip
-        self.frames.add(skipped, T_kf)
+        self.frames.add(skipped, None if skipped.T_wc is None else T_kf)
         return skipped
 
     def _correct(self, wait: bool) -> None:
@@ -243,10 +247,14 @@ class Slam:
         return [self._settled(tracked, T_kf) for tracked, T_kf in self.frames.since(first)]
 
     def _settled(self, tracked: Tracked, T_kf: Sim3 | None) -> Tracked:
+        """Where the frame is now; one whose pose cannot be computed has none."""
         if tracked.keyframe is None or T_kf is None:
             return tracked
         keyframe = self.keyframes[tracked.keyframe]
-        return replace(tracked, T_wc=keyframe.T_wc @ T_kf, sub_map=keyframe.sub_map)
+        with self.failures.contain("pose", tracked.frame.index):
+            T_wc = (keyframe.T_wc @ T_kf).if_finite()
+            return replace(tracked, T_wc=T_wc, sub_map=keyframe.sub_map)
+        return self._as_lost(tracked.frame)
 
     # --- the map ------------------------------------------------------------------------------
 

@@ -51,12 +51,12 @@ class VideoFile:
                     f"{path} cannot be read as a video; check that it plays, or give a folder of "
                     "images"
                 )
-            self.width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
-            self.height = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-            count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-            rate = float(capture.get(cv2.CAP_PROP_FPS))
+            self.width = int(_property(capture, cv2.CAP_PROP_FRAME_WIDTH))
+            self.height = int(_property(capture, cv2.CAP_PROP_FRAME_HEIGHT))
+            count = int(_property(capture, cv2.CAP_PROP_FRAME_COUNT))
+            rate = _property(capture, cv2.CAP_PROP_FPS)
         self.frame_count: int | None = count if count > 0 else None
-        known = rate if np.isfinite(rate) and rate > 0.0 else DEFAULT_FPS
+        known = rate if rate > 0.0 else DEFAULT_FPS
         self._period_ns = NS_PER_S / (known if fps is None else fps)
         self.camera = self._calibration_beside()
 
@@ -173,8 +173,13 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def _position_ms(capture: Any) -> float:
-    """The grabbed frame's time in its container; not finite counts as unknown, zero."""
+    """The grabbed frame's time in its container."""
     import cv2
 
-    position = float(capture.get(cv2.CAP_PROP_POS_MSEC))
-    return position if np.isfinite(position) else 0.0
+    return _property(capture, cv2.CAP_PROP_POS_MSEC)
+
+
+def _property(capture: Any, number: int) -> float:
+    """What a container says of itself; zero, as unknown, where that is not finite."""
+    value = float(capture.get(number))
+    return value if np.isfinite(value) else 0.0

@@ -179,3 +179,11 @@ def test_closing_removes_the_files_unless_they_are_to_be_kept(tmp_path: Path) ->
 def test_files_without_the_prior_that_packs_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="prior"):
         KeyframeStore(tmp_path)
+
+
+def test_a_keyframe_needs_a_pose_that_is_finite() -> None:
+    store = KeyframeStore()
+    nowhere = Sim3(np.eye(3), np.full(3, np.nan))
+    with pytest.raises(ArithmeticError):
+        store.add(0, 0, PRIOR.encode(picture(0), GUESS), nowhere, pointmap_of(0), 0)
+    assert len(store) == 0

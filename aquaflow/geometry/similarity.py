@@ -129,6 +129,16 @@ class Sim3:
         finite = np.isfinite(self.R).all() and np.isfinite(self.t).all()
         return bool(finite and np.isfinite(self.scale) and self.scale > 0.0)
 
+    def if_finite(self) -> Sim3:
+        """Itself, before it is kept for good.
+
+        Raises:
+            ArithmeticError: an entry is not a number, or the scale is not positive.
+        """
+        if not self.is_finite():
+            raise ArithmeticError("a pose is not finite")
+        return self
+
 
 def _left_jacobian(w: Array, sigma: float) -> Array:
     """V with ``exp([u, w, sigma]).t == V @ u``: the integral of e^(sigma t) exp(t hat(w)) dt."""

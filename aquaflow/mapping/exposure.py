@@ -53,7 +53,7 @@ def learn_gain(
     ratio = theirs.clamp_min(DARKEST) / ours.clamp_min(DARKEST)
     median = torch.where(good, ratio.log(), torch.nan).nanmedian(dim=0).values
     found = (1.0 - TOWARDS_ONE) * median.double().numpy()
-    enough = good.sum(dim=0).numpy() >= FEWEST
+    enough = (good.sum(dim=0).numpy() >= FEWEST) & np.isfinite(found)
     view.log_gain = np.where(enough, found.clip(-MAX_LOG_GAIN, MAX_LOG_GAIN), view.log_gain)
 
 
@@ -75,6 +75,8 @@ def set_log_gains(
     fitted = fitted[: len(log_gains)]
     change = [new - view.log_gain for new, view in zip(log_gains, fitted, strict=True)]
     moved = [view.log_gain + _between(view.frame_index, fitted, change) for view in views]
+    if not np.isfinite(moved).all():
+        raise ArithmeticError("an exposure is not finite")
     for view, log_gain in zip(views, moved, strict=True):
         view.log_gain = log_gain
 

@@ -18,6 +18,9 @@ def move_gaussians(gaussians: GaussianMap, moves: Mapping[int, Sim3]) -> torch.T
 
     ``moves`` holds for a keyframe's number the similarity that maps its old world to its new one.
     Returns the rows [M] that were moved; the cost grows with M.
+
+    Raises:
+        ArithmeticError: where they go is not finite; nothing has moved then.
     """
     if not moves or len(gaussians) == 0:
         return torch.zeros(0, dtype=torch.int64)
@@ -31,17 +34,29 @@ def move_gaussians(gaussians: GaussianMap, moves: Mapping[int, Sim3]) -> torch.T
     turn = torch.from_numpy(np.stack([S.quaternion for S in ordered]))[which]
     means, quats = (gaussians.parameters[name] for name in ("means", "quats"))
     turned = torch.einsum("nij,nj->ni", R, means[rows].double())
-    means[rows] = (scale * turned + t).float()
-    quats[rows] = quaternion_product(turn, quats[rows].double()).float()
-    gaussians.parameters["log_scales"][rows] += torch.log(scale).float()
+    moved = (scale * turned + t).float()
+    facing = quaternion_product(turn, quats[rows].double()).float()
+    growth = torch.log(scale).float()
+    if not all(bool(torch.isfinite(each).all()) for each in (moved, facing, growth)):
+        raise ArithmeticError("a correction of the map is not finite")
+    means[rows], quats[rows] = moved, facing
+    gaussians.parameters["log_scales"][rows] += growth
     return rows
 
 
 def move_views(views: Iterable[View], moves: Mapping[int, Sim3]) -> None:
-    """Re-anchor the views that hang on the keyframes in ``moves``."""
-    for view in views:
-        if view.keyframe in moves:
-            view.T_wc = moves[view.keyframe] @ view.T_wc
+    """Re-anchor the views that hang on the keyframes in ``moves``.
+
+    Raises:
+        ArithmeticError: where they go is not finite; no view has moved then.
+    """
+    moved = [
+        (view, (moves[view.keyframe] @ view.T_wc).if_finite())
+        for view in views
+        if view.keyframe in moves
+    ]
+    for view, T_wc in moved:
+        view.T_wc = T_wc
 
 
 def quaternion_product(

@@ -96,7 +96,13 @@ class GaussianMap:
         keyframes: Tensor,  # [N] int64
         features: Tensor,  # [N, F]
     ) -> None:
-        """All tables at once, when all are made: a failure leaves them as they were."""
+        """All tables at once, when all are made: a failure leaves them as they were.
+
+        Raises:
+            ArithmeticError: a Gaussian is not finite; one alone would spoil every later step.
+        """
+        if not all(bool(torch.isfinite(tensor).all()) for tensor in parameters.values()):
+            raise ArithmeticError("a Gaussian is not finite")
         self.parameters, self.keyframes, self.local_features = parameters, keyframes, features
 
 

@@ -95,7 +95,10 @@ def new_gaussians(
     probability: Tensor,  # [H, W] P_a
     config: InsertionConfig,
 ) -> dict[str, Tensor]:
-    """Start values: on the pixel's ray, as wide as the expected spacing, coloured by J-hat."""
+    """Start values: on the pixel's ray, as wide as the expected spacing, coloured by J-hat.
+
+    Pixels for which one of them is not finite get no Gaussian.
+    """
     pixels = torch.stack([columns, rows], dim=-1).numpy() + 0.5
     rays = view.camera.unproject(pixels)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -108,13 +111,15 @@ def new_gaussians(
     opacity = (config.opacity * confidence[rows, columns]).clamp(0.05, 0.95)
     quats = torch.zeros(len(rows), 4)
     quats[:, 0] = 1.0
-    return {
+    new = {
         "means": torch.from_numpy(means).to(torch.float32),
         "quats": quats,
         "log_scales": torch.log(scale)[:, None].repeat(1, 3),
         "opacity_logits": torch.logit(opacity)[:, None],
         "raw_colours": raw_colour(colour[rows, columns]),
     }
+    sound = torch.stack([torch.isfinite(values).all(dim=-1) for values in new.values()]).all(0)
+    return new if bool(sound.all()) else {name: values[sound] for name, values in new.items()}
 
 
 def range_of(pointmap: Pointmap, known_sigma: float) -> tuple[Tensor, Tensor]:

@@ -130,11 +130,12 @@ class Mapper:
             return 0
         new = new_gaussians(view, rows, columns, z, restored, confidence, P, self.config.insertion)
         self.gaussians.extend(new, view.keyframe)
-        self._optimiser.extend(len(rows))
+        count = len(new["means"])
+        self._optimiser.extend(count)
         if self.neural is not None:
-            self.neural.insert(torch.from_numpy(view.T_wc.t).to(torch.float32), len(rows))
+            self.neural.insert(torch.from_numpy(view.T_wc.t).to(torch.float32), count)
         self._optimiser.bind(self._parameters)
-        return len(rows)
+        return count
 
     def _room_for(self, wanted: int) -> int:
         """How many Gaussians may come: at the hard cap, those least worth make room for them."""

@@ -100,7 +100,7 @@ def learn_light(
     ratio = ((theirs + DARK * share) / (ours + DARK * share).clamp_min(1e-6)).clamp_min(1e-6)
     found = (1.0 - TOWARDS_ONE) * ratio.log().clamp(-MAX_LOG_GAIN, MAX_LOG_GAIN)
     before = torch.zeros_like(found) if view.light is None else view.light
-    view.light = torch.where(share > LEAST_SHARE, found, before)
+    view.light = torch.where((share > LEAST_SHARE) & torch.isfinite(found), found, before)
 
 
 def light_over(view: View) -> Tensor | None:

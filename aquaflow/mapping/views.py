@@ -243,9 +243,9 @@ def refine_pose(
     step = (
         -rate * (m / (1.0 - BETAS[0] ** count)) / (np.sqrt(v / (1.0 - BETAS[1] ** count)) + 1e-15)
     )
-    view.moments = (m, v, count)
     R_cw = so3_exp(step[3:]) @ V[:3, :3]
     t_cw = so3_exp(step[3:]) @ V[:3, 3] + step[:3]
     # so3_exp(log(R)) puts the product back on the group.
     pose = Sim3(R_cw.T, -R_cw.T @ t_cw, view.T_wc.scale)
-    view.T_wc = pose @ Sim3.identity()
+    view.T_wc = (pose @ Sim3.identity()).if_finite()
+    view.moments = (m, v, count)

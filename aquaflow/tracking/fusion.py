@@ -73,8 +73,9 @@ def fuse(
     merged_variance = np.where(fresh, variance, merged_variance)
     merged_variance = np.maximum(merged_variance, (FUSED_FLOOR * merged) ** 2)
 
-    use = new.good & agrees
-    distrust = new.good & ~agrees
+    sound = new.good & np.isfinite(merged) & np.isfinite(merged_variance)
+    use = sound & agrees
+    distrust = sound & ~agrees
     pointmap.rho[rows, columns] = np.where(use, merged, old_rho)
     kept = np.where(distrust, old_variance * DISAGREEMENT_INFLATION, old_variance)
     pointmap.variance[rows, columns] = np.where(use, merged_variance, kept)

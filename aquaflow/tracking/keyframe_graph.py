@@ -72,7 +72,7 @@ class KeyframeGraph:
         keyframe = self._keyframes[number]
         if link is not None:  # the earlier one may have been moved since they were linked
             earlier = self._keyframes[link.keyframe]
-            keyframe.T_wc = earlier.T_wc @ link.T_fk.inverse()
+            keyframe.T_wc = (earlier.T_wc @ link.T_fk.inverse()).if_finite()
             keyframe.sub_map = earlier.sub_map
         self.graph.add_keyframe(number, keyframe.T_wc)
         self._known.append(keyframe)

@@ -194,6 +194,9 @@ class PoseGraph:
 
         Keyframes added meanwhile go along with the keyframe before them, as one body. The answer's
         ``poses`` holds these too, and those that a join of components moved.
+
+        Raises:
+            ArithmeticError: a pose of the result is not finite; nothing is taken over then.
         """
         if result.snapshot.version != self._version:
             return None
@@ -205,6 +208,8 @@ class PoseGraph:
             nodes = self._nodes.rows.copy()
             nodes[result.rows] = solved
             numbers |= self._carry(nodes, result)
+            if not all(np.isfinite(nodes[name]).all() for name in ("R", "t", "scale")):
+                raise ArithmeticError("an optimised pose is not finite")
             self._nodes.replace(nodes)
         trust = self._trust.rows.copy()
         trust[: len(result.edge_trust)] = result.edge_trust

@@ -172,3 +172,11 @@ def test_real_clip_has_the_times_of_its_truth():
     assert source.frame_count == 211
     np.testing.assert_allclose([frame.t_ns / 1e9 for frame in frames], truth, atol=2e-3)
     assert frames[0].image.shape == (1080, 1920, 3)
+
+
+def test_what_a_container_does_not_know_counts_as_unknown():
+    class Unsure:
+        def get(self, number):
+            return float("nan")
+
+    assert video._property(Unsure(), 7) == 0.0

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
-from aquaflow.tracking.pose_graph import Edge, PoseGraph, edge_information
+from aquaflow.tracking.pose_graph import Edge, PoseGraph, edge_information, solve
 from aquaflow.tracking.pose_graph_equations import Equations, Misfit
 
 Array = npt.NDArray[np.float64]
@@ -230,3 +230,14 @@ def test_edge_information_is_that_of_the_samples_it_stands_for() -> None:
     np.testing.assert_allclose(
         found / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=0.05
     )
+
+
+def test_a_result_that_is_not_finite_is_not_taken_over() -> None:
+    dive = Dive(12, bias=1.0)
+    dive.close((0, 11))
+    before = dive.poses()
+    result = solve(dive.graph.snapshot())
+    result.solved["t"][0] = np.nan
+    with pytest.raises(ArithmeticError):
+        dive.graph.apply(result)
+    np.testing.assert_array_equal(dive.poses().t, before.t)
