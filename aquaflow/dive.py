@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -240,12 +241,21 @@ class DiveFolder:
                 write_png(folder / f"{example.frame_index:06d}_{name}.png", picture)
 
     def write_json(self, name: str, data: dict[str, Any]) -> None:
-        """A JSON file of the dive; a number that is not finite is a mistake, not a result."""
-        write_json(self.path / name, data)
+        """A JSON file of the dive; a number that is not finite is unknown, null."""
+        write_json(self.path / name, _finite(data))
 
     def write_report(self, data: ReportData) -> None:
         """report.html."""
         write_report(self.path / "report.html", data)
+
+
+def _finite(value: Any) -> Any:
+    """``value`` for JSON, with None for every number in it that is not finite."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _finite(each) for key, each in value.items()}
+    return [_finite(each) for each in value] if isinstance(value, (list, tuple)) else value
 
 
 def _splats(

@@ -7,6 +7,7 @@ import time
 from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -153,12 +154,13 @@ class DiveRun:
             NotMappedError: too few frames could be placed; the folder says why.
         InputError: the disk was too full for all files; those with room were written.
         """
+        attempt = self.slam.failures.attempt
         self.decide(self.slam.finish(progress))
         with self.profiler.stage("write"):
             results = self.results
             self._note_what_was_left_out(results, notes)
-            with self.slam.failures.contain("writing frames.csv", full_disk=True):
-                self.folder.write_frames({t.frame.index: t.sub_map for t in results if t.T_wc})
+            sub_maps = {t.frame.index: t.sub_map for t in results if t.T_wc}
+            attempt("writing frames.csv", partial(self.folder.write_frames, sub_maps))
         if sum(tracked.T_wc is not None for tracked in results) < MIN_VIEWS:
             raise NotMappedError(self._why_not(len(results)))
         return self._write(results)
@@ -204,11 +206,10 @@ class DiveRun:
             notes = self.notes + self.slam.failures.notes()
             made.write_report(self.dropped, numbers, notes)
         numbers = self._numbers(results, made.held_out)  # the report's own time included
-        with self.slam.failures.contain("writing metrics.json", full_disk=True):
-            self.folder.write_json("metrics.json", numbers)
+        attempt, write = self.slam.failures.attempt, self.folder.write_json
+        attempt("writing metrics.json", partial(write, "metrics.json", numbers))
         if self._trace:
-            with self.slam.failures.contain(f"writing {TRACE}"):
-                self.folder.write_json(TRACE, self.profiler.chrome_trace())
+            attempt(f"writing {TRACE}", lambda: write(TRACE, self.profiler.chrome_trace()))
         if self.slam.failures.disk_was_full:
             raise InputError(
                 f"the disk is full: {self.folder.path} lacks some of its files, log.jsonl says "

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 from aquaflow.errors import (
     ConfigError,
@@ -44,8 +44,14 @@ DEFECTS = (
 )  # fmt: skip
 """Raised by our own code, these are programming errors of ours, whatever the picture shows."""
 
+ATTEMPTS = 2
+"""Of a step at a dive's end: what made it fail may have passed, and nothing waits for it."""
+
 OWN_PACKAGES = ("aquaflow", "drivers", "sim_drivers")
 ROOT = Path(__file__).resolve().parents[1]
+
+
+T = TypeVar("T")
 
 
 @dataclass
@@ -108,6 +114,18 @@ class Failures:
         ``full_disk``, one is counted too, and ``disk_was_full`` set: smaller files may find room.
         """
         return Contained(self, stage, frame, full_disk)
+
+    def attempt(self, stage: str, work: Callable[[], T]) -> T | None:
+        """Contain ``work``, and do it once more if it failed; None if it failed again.
+
+        A full disk is counted, and has no second attempt.
+        """
+        for _ in range(ATTEMPTS):
+            with self.contain(stage, full_disk=True) as run:
+                return work()
+            if run.error is not None and is_full_disk(run.error):
+                break
+        return None
 
     def record(self, stage: str, error: Exception, frame: int | None = None) -> None:
         """Count ``error``; the first of its kind is logged with its traceback."""

@@ -135,11 +135,12 @@ def test_a_frame_stands_in_the_sub_map_that_it_ended_up_in(tmp_path: Path) -> No
         assert [row["sub_map"] for row in table(folder.path)] == ["0", "0"]
 
 
-def test_a_number_that_is_not_finite_is_never_written(tmp_path: Path) -> None:
+def test_a_number_that_is_not_finite_is_null_and_costs_no_other(tmp_path: Path) -> None:
+    nan, inf = float("nan"), float("inf")
     with opened(tmp_path / "dive") as folder:
-        with pytest.raises(ValueError, match="JSON compliant"):
-            folder.write_json("metrics.json", {"psnr": float("nan")})
-        assert not (folder.path / "metrics.json").exists()
+        folder.write_json("metrics.json", {"psnr": nan, "stages": {"a": [1.5, inf]}, "n": 3})
+        written = json.loads((folder.path / "metrics.json").read_text())
+    assert written == {"psnr": None, "stages": {"a": [1.5, None]}, "n": 3}
 
 
 def test_overwriting_removes_results_and_keeps_what_is_not_a_runs(tmp_path: Path) -> None:

@@ -166,3 +166,22 @@ def test_threads_may_fail_at_the_same_time() -> None:
     for thread in threads:
         thread.join()
     assert failures.total == 800
+
+
+def test_a_step_that_fails_is_done_once_more() -> None:
+    failures, tries = Failures(strict=False), [0]
+
+    def work() -> str:
+        tries[0] += 1
+        if tries[0] == 1:
+            raise OSError(errno.EIO, "Input/output error")
+        return "written"
+
+    assert failures.attempt("writing", work) == "written"
+    assert failures.total == 1
+
+
+def test_a_step_that_fails_again_is_left() -> None:
+    failures = Failures(strict=False)
+    assert failures.attempt("writing", lambda: raise_in(OWN, "raise ValueError")) is None
+    assert failures.total == 2

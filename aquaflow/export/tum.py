@@ -26,12 +26,15 @@ def write_tum(
 
     Raises:
         InputError: the file cannot be written.
+        ArithmeticError: a pose is not finite.
     """
     unit = wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)
     unit = np.where(unit[:, :1] < 0.0, -unit, unit)
     table = np.column_stack([t_s, positions, unit[:, [1, 2, 3, 0]]]).astype(np.float64)
     # Rounding before adding zero turns -0.0 and what rounds to it into 0.0.
     table = np.round(table, DECIMALS) + 0.0
+    if not np.isfinite(table).all():
+        raise ArithmeticError("a pose is not finite")
     lines = [f"# {line}" for line in comment.splitlines()]
     lines.append("# t_s tx ty tz qx qy qz qw, camera to world")
     lines += [" ".join(f"{value:.{DECIMALS}f}" for value in row) for row in table]

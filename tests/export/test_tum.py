@@ -51,3 +51,10 @@ def test_folder_that_is_not_there_is_one_sentence(tmp_path):
         InputError, match=r"cannot write .* No such file or directory; give a folder"
     ):
         write_tum(tmp_path / "none" / "t.tum", *ONE)
+
+
+def test_a_pose_that_is_not_finite_is_not_written(tmp_path):
+    t_s, positions, wxyz = ONE
+    with pytest.raises(ArithmeticError):
+        write_tum(tmp_path / "t.tum", t_s, positions * np.nan, wxyz)
+    assert list(tmp_path.iterdir()) == []
