@@ -12,6 +12,7 @@ from aquaflow.cores import usable_threads
 from aquaflow.dive import DiveFolder
 from aquaflow.dive_run import DiveRun, Finished
 from aquaflow.errors import NotMappedError
+from aquaflow.failures import Failures
 from aquaflow.messages import CameraModel, Dropped, Frame
 from aquaflow.profiler import Profiler
 from aquaflow.slam import Slam
@@ -43,19 +44,20 @@ def map_recording(
         NotMappedError: the frames were read but gave no map; the folder says why.
     """
     fix_threads(usable_threads(config.threads))
-    folder = DiveFolder(out, config, overwrite)
+    folder, failures = DiveFolder(out, config, overwrite), Failures()
     try:
-        slam = Slam(config, Profiler(trace), folder.work)
+        slam = Slam(config, Profiler(trace), folder.work, failures=failures)
         calibration = calibration or recording.camera
         run = DiveRun(name, folder, config, slam, calibration, recording.name_of, trace)
         try:
             return _replay(run, recording, config, progress or (lambda stage, done, total: None))
         finally:
-            with slam.failures.contain("closing"):
+            with failures.contain("closing"):
                 slam.close()
     finally:
-        folder.close()
-        recording.close()
+        for close in (folder.close, recording.close):
+            with failures.contain("closing"):
+                close()
 
 
 def _replay(

@@ -9,6 +9,7 @@ from dataclasses import replace
 from itertools import chain, dropwhile
 from typing import TypeAlias
 
+from aquaflow.failures import Failures
 from aquaflow.messages import Dropped, Frame, TelemetrySample
 from aquaflow.sources import CameraSource, TelemetrySource
 
@@ -28,8 +29,13 @@ class Playback:
         speed: float | None = None,
         now_ns: Callable[[], int] = time.monotonic_ns,
         sleep_s: Callable[[float], None] = time.sleep,
+        failures: Failures | None = None,
     ) -> None:
-        """``speed`` 1 plays in real time, 4 four times faster, None without waiting."""
+        """``speed`` 1 plays in real time, 4 four times faster, None without waiting.
+
+        Telemetry that fails is counted in ``failures``, and ends; the pictures go on.
+        """
+        self._failures = failures or Failures()
         self._camera, self._telemetry, self._speed = camera, telemetry, speed
         self._now_ns, self._sleep_s = now_ns, sleep_s
 
@@ -42,7 +48,7 @@ class Playback:
         since_ns = None
         if start > 0 and (first := next(pictures, None)) is not None:
             since_ns, pictures = arrival_of(first), chain([first], pictures)
-        samples = (_since(since_ns, source.samples()) for source in self._telemetry)
+        samples = (_since(since_ns, self._samples(source)) for source in self._telemetry)
         streams: list[Iterator[Event]] = [pictures, *samples]
         began: tuple[int, int] | None = None
         for event in heapq.merge(*streams, key=arrival_of):
@@ -54,6 +60,10 @@ class Playback:
                 if wait_s > 0:
                     self._sleep_s(wait_s)
             yield event
+
+    def _samples(self, source: TelemetrySource) -> Iterator[TelemetrySample]:
+        with self._failures.contain("telemetry"):
+            yield from source.samples()
 
     def close(self) -> None:
         """Close every source."""

@@ -10,8 +10,10 @@ from functools import partial
 from typing import Protocol, runtime_checkable
 
 from aquaflow.config import SourceConfig
+from aquaflow.failures import Failures
 from aquaflow.fusion.clock import Learned
 from aquaflow.messages import CameraModel, Dropped, Frame, TelemetrySample
+from aquaflow.pipeline import MOST_UNREADABLE
 from aquaflow.recording.playback import Playback, arrived
 from aquaflow.recording.recorder import Recorder
 from aquaflow.recording.session import HasSamples
@@ -65,6 +67,8 @@ class Feed(Protocol):
     notes: list[str]
     failure: str | None
     """Why no more frames will come, if that was not their end."""
+    failures: Failures
+    """What reading raised; the dive goes on counting in it."""
 
     @property
     def calibration(self) -> CameraModel | None: ...
@@ -97,7 +101,8 @@ class Feed(Protocol):
 class _Pumps:
     """Threads that end when the feed is closed."""
 
-    def __init__(self) -> None:
+    def __init__(self, failures: Failures | None = None) -> None:
+        self.failures = failures or Failures()
         self.newest: Newest[Frame | Dropped] = Newest()
         self.heard = Heard()
         self.notes: list[str] = []
@@ -119,7 +124,7 @@ class _Pumps:
             try:
                 work()
             except Exception as error:
-                log.exception("%s failed", name)
+                self.failures.record(name, error)
                 self.failure = f"{name} failed: {error}" if last else self.failure
                 self.notes.append(f"{name} failed: {error}")
             finally:
@@ -237,11 +242,17 @@ class PlaybackFeed(_Pumps):
         calibration: CameraModel | None,
         name_of: Callable[[int], str],
         notes: list[str],
+        failures: Failures | None = None,
     ) -> None:
         """Goes on with the first frame that an earlier run did not see."""
-        super().__init__()
+        super().__init__(failures)
         self.calibration, self.name_of, self._notes = calibration, name_of, notes
         self._playback, self._source = playback, source
+        self._next = source.start
+        """The frame to read."""
+        self._read: Frame | Dropped | None = None
+        """The last one that was."""
+        self._failed_in_a_row = 0
 
     def describe(self) -> dict[str, dict[str, object]]:
         return {}
@@ -257,20 +268,38 @@ class PlaybackFeed(_Pumps):
         self._playback.close()
 
     def _events(self) -> None:
+        """After a frame on which reading failed, it goes on with the next."""
+        self._next = self._source.start
+        while self._next < self.continued.first_index:
+            self._next += self._source.every
+        while self._failed_in_a_row < MOST_UNREADABLE:
+            with self.failures.contain("reading", self._next) as reading:
+                self._play()
+            if reading.error is None:
+                break
+            if self._read is None:
+                raise reading.error
+            self._failed_in_a_row += 1
+            reason = "reading failed, see log.jsonl"
+            self.newest.put(Dropped(self._next, self._read.t_ns, reason))
+            self._next += self._source.every
+        else:
+            self.notes.append(f"the recording could not be read after frame {self._next}")
+        self.notes += self._notes
+
+    def _play(self) -> None:
         source = self._source
-        start = source.start
-        while start < self.continued.first_index:
-            start += source.every
-        for event in self._playback.events(source.every, start, source.stop):
+        for event in self._playback.events(source.every, self._next, source.stop):
             if self.closing.is_set():
                 return
             # Moments stay as recorded, so that frames.csv can be compared with a replay's.
             now = arrived(event, 0, time.monotonic_ns())
             if isinstance(now, (Frame, Dropped)):
+                self._read, self._next = now, now.index + source.every
+                self._failed_in_a_row = 0
                 self.newest.put(now)
             else:
                 self.heard.take(now)
-        self.notes += self._notes
 
 
 def _state_of(device: object) -> dict[str, object]:

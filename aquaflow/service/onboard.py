@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from aquaflow.config.vehicle import VehicleConfig
@@ -53,7 +55,7 @@ def map_live(
         dive = around.enter_context(begun(feed, vehicle, out, new, overwrite))
         if service.health.enabled:
             server = HealthServer(service.health, lambda: report(dive.parts, service.hang_s))
-            around.callback(server.close)
+            around.callback(partial(_closed, dive, server.close))
         watchers = dive.parts.loop.watchers
         watchers.append(VehicleReport(service.report, feed).look)
         if service.pose.enabled:
@@ -63,7 +65,7 @@ def map_live(
             window = LiveWindow(
                 vehicle.viewer, dive.parts.maps, lambda: report(dive.parts, service.hang_s)
             )
-            around.callback(window.close)
+            around.callback(partial(_closed, dive, window.close))
             watchers.append(window.look)
         around.callback(_stop_after(seconds, dive).cancel)
         return dive.run(progress)
@@ -102,6 +104,11 @@ def _chosen(vehicle: VehicleConfig, out: Path | None, new: bool, overwrite: bool
     choice = choose(service.dives, service.checkpoint, new, Moment.now())
     tidy(service.dives, choice.folder)
     return choice
+
+
+def _closed(dive: LiveDive, close: Callable[[], None]) -> None:
+    with dive.parts.slam.failures.contain("closing"):
+        close()
 
 
 def _stop_after(seconds: float | None, dive: LiveDive) -> threading.Timer:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import shutil
 import sys
 from dataclasses import dataclass
+from functools import partial
 
 from aquaflow.config import Config, parse_config
 from aquaflow.config.service import ServiceConfig
@@ -14,8 +14,7 @@ from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.cores import core_count, usable_threads
 from aquaflow.dive import CHECKPOINT, DiveFolder
 from aquaflow.dive_run import DiveRun, Finished
-from aquaflow.errors import AquaFlowError, InputError, NotMappedError
-from aquaflow.failures import Failures
+from aquaflow.errors import AquaFlowError, NotMappedError
 from aquaflow.maps import Maps, Progress
 from aquaflow.messages import Dropped
 from aquaflow.pipeline import fix_threads
@@ -95,7 +94,7 @@ class LiveDive:
         # A core is left for tracking, where there is more than one.
         threads = config.threads or max(1, core_count() - 1)
         renderer = select_renderer(config.mapping.renderer, threads)
-        failures = Failures()
+        failures = feed.failures
         maps = Maps(config, renderer, profiler, self.folder.work, failures)
         thread = MapThread(maps, service.mapping, self._beats, lambda: self._ladder.level)
         slam = Slam(config, profiler, self.folder.work, True, thread, failures)
@@ -164,14 +163,22 @@ class LiveDive:
 
     def close(self) -> None:
         """Give everything back; an unfinished dive keeps what it can be resumed from."""
-        self._guard.close()
-        with contextlib.suppress(InputError):
-            self.feed.close()
-        self.parts.slam.close(keep=not self._finished)
-        self.folder.close(keep_work=not self._finished)
-        if self._finished:  # a recording came to its end: there is nothing to go on with
+        keep = not self._finished
+        for close in (
+            self._guard.close,
+            self.feed.close,
+            partial(self.parts.slam.close, keep),
+            partial(self.folder.close, keep),
+            self._remove_checkpoint,
+            self._notifier.close,
+        ):
+            with self.parts.slam.failures.contain("closing"):
+                close()
+
+    def _remove_checkpoint(self) -> None:
+        """Where a recording came to its end, there is nothing to go on with."""
+        if self._finished:
             shutil.rmtree(self.folder.path / CHECKPOINT, ignore_errors=True)
-        self._notifier.close()
 
     def __enter__(self) -> LiveDive:
         return self

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.errors import ConfigError
+from aquaflow.failures import Failures
 from aquaflow.messages import CameraModel
 from aquaflow.recording.playback import Playback
 from aquaflow.recording.recorder import Recorder
@@ -53,6 +54,7 @@ def recording(
     camera = open_recording(path, fps=vehicle.source.fps)
     reader = telemetry_reader(path)
     telemetry = [] if reader is None else [reader.open(path)]
-    playback = Playback(camera, telemetry, speed)
+    failures = Failures()
+    playback = Playback(camera, telemetry, speed, failures=failures)
     known = calibration or camera.camera
-    return PlaybackFeed(playback, vehicle.source, known, camera.name_of, camera.notes)
+    return PlaybackFeed(playback, vehicle.source, known, camera.name_of, camera.notes, failures)

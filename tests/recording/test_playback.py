@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from aquaflow.failures import Failures
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.messages import Depth, Dropped, Frame, TelemetrySample
 from aquaflow.recording.playback import Event, Playback, arrival_of
@@ -114,3 +115,19 @@ def test_closing_closes_the_sources() -> None:
     pictures = Pictures()
     Playback(pictures, [Depths()]).close()
     assert pictures.read == -1
+
+
+class Broken(Depths):
+    """Telemetry that fails after its first sample."""
+
+    def samples(self) -> Iterator[TelemetrySample]:
+        yield Depth(40 * MS, 100 * MS, "d", 0.0)
+        raise ValueError("the log is damaged")
+
+
+def test_telemetry_that_fails_ends_alone_and_is_counted() -> None:
+    failures = Failures(strict=False)
+    playback = Playback(Pictures(), [Broken()], failures=failures)
+    events = list(playback.events())
+    assert sum(isinstance(event, (Frame, Dropped)) for event in events) == 10
+    assert [kind.stage for kind in failures.kinds] == ["telemetry"]

@@ -13,6 +13,7 @@ from aquaflow.config.service import ServiceConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive import DiveFolder
 from aquaflow.dive_run import DiveRun
+from aquaflow.failures import Failures
 from aquaflow.fusion.clock import Learned
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
@@ -77,6 +78,7 @@ class ToldFeed:
         self.newest: Newest[Frame | Dropped] = Newest()
         self.heard, self.notes = Heard(), []
         self.failure: str | None = None
+        self.failures = Failures()
         self.calibration: CameraModel | None = None
         self.devices: dict[str, dict[str, object]] = {}
         self.continued = Continued()

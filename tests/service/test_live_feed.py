@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -15,6 +16,7 @@ from live_scenes import HEIGHT, WIDTH
 from aquaflow.config import SourceConfig
 from aquaflow.config.cameras import V4l2Config
 from aquaflow.config.telemetry import parse_telemetry
+from aquaflow.failures import Failures
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.messages import CameraModel, Depth, Dropped, Frame, TelemetrySample
 from aquaflow.recording.playback import Playback
@@ -181,3 +183,30 @@ def test_a_flood_of_garbage_costs_its_bytes_and_no_sample() -> None:
     finally:
         device.close()
         feed.close()
+
+
+class FailsOnce(Pictures):
+    """A recording that cannot be read once, at picture 5."""
+
+    failed = False
+
+    def frames(self, every: int = 1, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        for frame in super().frames(every, start, stop):
+            if frame.index == 5 and not self.failed:
+                self.failed = True
+                raise OSError(errno.EIO, "Input/output error")
+            yield frame
+
+
+def test_a_picture_that_cannot_be_read_costs_itself() -> None:
+    failures, taken = Failures(strict=False), list[Frame | Dropped]()
+    playback = Playback(FailsOnce(), [], failures=failures)
+    feed = PlaybackFeed(playback, SourceConfig(), None, str, [], failures)
+    feed.newest.put = taken.append  # type: ignore[method-assign]
+    feed.start()
+    until(lambda: feed.newest.ended)
+    feed.close()
+    assert [frame.index for frame in taken] == list(range(40))
+    assert [frame.index for frame in taken if isinstance(frame, Dropped)] == [5]
+    assert feed.failure is None
+    assert failures.total == 1
