@@ -26,6 +26,7 @@ OUR_MISTAKE = 70
 """EX_SOFTWARE of sysexits.h."""
 INTERRUPTED = 130
 """As a shell reports an end by Ctrl-C."""
+STOPPED = "stopped; what was written so far stays where it is"
 
 
 @contextmanager
@@ -39,7 +40,11 @@ def one_sentence() -> Iterator[None]:
         sentence, code = said_of(error)
         _end(sentence, code)
     except KeyboardInterrupt:
-        _end("stopped; what was written so far stays where it is", INTERRUPTED)
+        _end(STOPPED, INTERRUPTED)
+    except SystemExit as ended:
+        if ended.code == INTERRUPTED:  # Typer exits so on Ctrl-C, and says nothing
+            _end(STOPPED, INTERRUPTED)
+        raise
 
 
 def said_of(error: Exception) -> tuple[str, int]:

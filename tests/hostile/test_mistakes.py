@@ -77,6 +77,7 @@ def test_the_machines_limits_are_not_called_mistakes(
     refused(failing(error), words)
 
 
-def test_an_interrupt_keeps_its_exit_code(failing: Cli) -> None:
+def test_an_interrupt_keeps_its_exit_code_and_says_what_stays(failing: Cli) -> None:
     ran = failing(KeyboardInterrupt())
     assert ran.code == 130
+    assert ran.err == "aquaflow: stopped; what was written so far stays where it is\n"
