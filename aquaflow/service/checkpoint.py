@@ -80,7 +80,6 @@ class Checkpointer:
             except OSError as error:  # what it would name is not there
                 self._failed(error)
                 return
-        self._writing = True
         head = {"format": FORMAT, "version": __version__, "moment": Moment.now().to_json()}
         head |= {"tracking": facts, "clocks": self._clocks()}
         arrays = prefixed("tracking", arrays)
@@ -88,6 +87,7 @@ class Checkpointer:
         def write(maps: Maps, lacking: list[Correction]) -> None:
             self._write(maps, lacking, head, arrays, files)
 
+        self._writing = True
         self._maps.look("write a checkpoint", write)
 
     def _write(
