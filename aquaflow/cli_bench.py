@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -51,7 +50,7 @@ def dives(
     peers: Annotated[bool, typer.Option(help="Run COLMAP and two-view odometry too.")] = True,
     out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("out/bench"),
     readme: Annotated[
-        Path | None, typer.Option(help="Write table and picture into this file's section.")
+        Path | None, typer.Option(help="Write table and picture into this Markdown file.")
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -76,7 +75,9 @@ def dives(
         scenes = bm.scenes_of(suite, data, scene or [], out, progress)
         result = bm.benchmark(scenes, contenders, repeats, out, progress)
     if readme is not None:
-        _into_readme(readme, out / bm.PICTURE_FILE, result)
+        from aquaflow.evaluation.bench.readme import write_readme
+
+        write_readme(readme, out / bm.PICTURE_FILE, result["machine"], result["runs"])
     if as_json:
         typer.echo(json.dumps(result))
         return
@@ -90,7 +91,7 @@ def render(
     quick: Annotated[bool, typer.Option("--quick", help="Only the bars' two sizes.")] = False,
     repeats: Annotated[int, typer.Option(min=1, help="Runs of each, interleaved.")] = 7,
     opensplat: Annotated[
-        str | None, typer.Option(help="Program that times your OpenSplat build; see README.")
+        str | None, typer.Option(help="Times your OpenSplat build; see docs/performance.md.")
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("out/bench_render"),
     as_json: Json = False,
@@ -132,13 +133,3 @@ def ablate(
         typer.echo(json.dumps(result))
     else:
         ablation.print_ablation(result["rows"], table_console())
-
-
-def _into_readme(readme: Path, picture: Path, result: dict[str, Any]) -> None:
-    """The picture goes to docs/ beside the file, where a page can show it."""
-    from aquaflow.evaluation.bench.readme import write_readme
-
-    kept = readme.parent / "docs" / picture.name
-    kept.parent.mkdir(exist_ok=True)
-    shutil.copyfile(picture, kept)
-    write_readme(readme, kept, result["machine"], result["runs"])

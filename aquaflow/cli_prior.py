@@ -123,7 +123,9 @@ def bench(
 
 def train_mast3r(
     checkpoint: Annotated[Path, typer.Option(help="Weights to start from, which you bring.")],
-    data: Annotated[list[str], typer.Option(help="KIND=FOLDER; may be repeated. See README.")],
+    data: Annotated[
+        list[str], typer.Option(help="KIND=FOLDER; may be repeated; see docs/prior.md.")
+    ],
     out: Annotated[Path, typer.Option(help="Folder of pairs, checkpoint, curve and weights.")],
     width: Annotated[int, typer.Option(help="px of the pictures, a multiple of 16.")] = 512,
     height: Annotated[int, typer.Option(help="px, a multiple of 16.")] = 384,

@@ -179,7 +179,7 @@ def load_camera(path: Path) -> CameraModel:
         InputError: the file is not there or is not YAML.
         ConfigError: a key is unknown, missing, or its value is out of range.
     """
-    data = read_mapping(path, "calibration", "compare it with the README's camera.yaml")
+    data = read_mapping(path, "calibration", "compare it with docs/formats.md")
     try:
         file = CameraFile.model_validate(data)
     except ValidationError as error:

@@ -1,4 +1,4 @@
-"""The benchmark: order, rows, failures, table, picture, README section; ablation rows."""
+"""The benchmark: order, rows, failures, table, picture, section of a page; ablation rows."""
 
 from __future__ import annotations
 
@@ -100,22 +100,25 @@ def test_a_benchmark_writes_all_its_results_and_marks_failures(tmp_path: Path) -
     assert markdown(result["runs"]).count("failed") == 3
 
 
-def test_the_readme_gets_the_section_between_its_markers(tmp_path: Path) -> None:
-    result = benchmark([REEF], [Contender("fast")], 1, tmp_path / "docs", quiet, pretended)
-    readme = tmp_path / "README.md"
+@pytest.mark.parametrize("name", ["README.md", "docs/benchmarks.md", "out/page.md"])
+def test_a_page_gets_the_section_between_its_markers(tmp_path: Path, name: str) -> None:
+    result = benchmark([REEF], [Contender("fast")], 1, tmp_path / "out", quiet, pretended)
+    readme, picture = tmp_path / name, tmp_path / "out" / "bench.png"
+    readme.parent.mkdir(exist_ok=True)
     readme.write_text(f"before\n{BEGIN}\nold numbers\n{END}\nafter\n")
     for _ in range(2):
-        write_readme(readme, tmp_path / "docs/bench.png", result["machine"], result["runs"])
+        write_readme(readme, picture, result["machine"], result["runs"])
+    assert (readme.parent / "bench.png").read_bytes() == picture.read_bytes()
     text = readme.read_text()
     assert text.startswith(f"before\n{BEGIN}\n")
     assert text.endswith(f"{END}\nafter\n")
     assert "old numbers" not in text
-    assert "(docs/bench.png)" in text
+    assert "(bench.png)" in text
     assert re.search(r"\| reef \| fast \| 100 \| 100 ", text)
     assert result["machine"]["date"] in text
     readme.write_text("no markers")
     with pytest.raises(InputError, match="needs the lines"):
-        write_readme(readme, tmp_path / "docs/bench.png", result["machine"], result["runs"])
+        write_readme(readme, picture, result["machine"], result["runs"])
 
 
 def test_a_worker_that_fails_or_crashes_is_a_row(tmp_path: Path) -> None:

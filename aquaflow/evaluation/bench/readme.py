@@ -1,7 +1,8 @@
-"""The README's section on speed and accuracy: its numbers are written here, not typed."""
+"""A page's section on speed and accuracy: its numbers are written here, not typed."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,16 +18,16 @@ BEGIN, END = "<!-- bench: begin -->", "<!-- bench: end -->"
 def write_readme(
     readme: Path, picture: Path, machine: dict[str, Any], rows: Sequence[dict[str, Any]]
 ) -> None:
-    """Replace what stands between the markers.
+    """Replace what stands between the markers; the picture is copied next to the file.
 
     Raises:
         InputError: the file or its markers are not there.
     """
     before, after = around_section(readme)
-    where = picture.resolve()
-    folder = readme.resolve().parent
-    shown = where.relative_to(folder) if where.is_relative_to(folder) else where
-    middle = section(str(shown), machine, rows)
+    kept = readme.resolve().parent / picture.name
+    if kept != picture.resolve():
+        shutil.copyfile(picture, kept)
+    middle = section(kept.name, machine, rows)
     with atomic_write(readme) as stream:
         stream.write(f"{before}{BEGIN}\n{middle}\n{END}{after}".encode())
 

@@ -62,7 +62,7 @@ def failures(rows: Sequence[Row]) -> list[str]:
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """The same table for a README."""
+    """The same table for a page."""
     columns = measured_columns(rows)
     titles = ["scene", "run", *(column.title for column in columns)]
     ruler = ["---", "---", *("---:" for _ in columns)]
