@@ -20,7 +20,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export XDG_CACHE_HOME := $(CURDIR)/$(VENV)/cache
 export MPLCONFIGDIR := $(CURDIR)/$(VENV)/cache/matplotlib
 
-.PHONY: help setup run test test-all test-kernel fuzz check docs clean
+.PHONY: help setup run test test-all test-kernel fuzz coverage check docs clean
 
 help: ## Show this list.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -56,6 +56,9 @@ test-kernel: setup ## Run the drivers on a real Linux kernel under qemu: V4L2, C
 
 fuzz: setup ## Feed every command what nothing sane would, for FUZZ_SECONDS=120.
 	$(BIN)/python -m tests.fuzz --seconds $(FUZZ_SECONDS)
+
+coverage: setup ## Run the tests of `make test` and show how much of each file they reach.
+	$(TESTS) -m 'not slow and not kernel' --cov --cov-report=term --cov-report=html:out/coverage
 
 check: setup ## Lint, formatting, types.
 	$(BIN)/ruff check
