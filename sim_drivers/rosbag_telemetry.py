@@ -1,4 +1,4 @@
-"""Telemetry of a ROS bag: standard messages, from ROS's axes (REP 103) to DESIGN's.
+"""Telemetry of a ROS bag: standard messages, from ROS's axes (REP 103) to ours.
 
 ROS has forward-left-up bodies in an east-north-up world; we forward-right-down in north-east-down.
 """

@@ -1,1 +1,1 @@
-"""Decoders: one protocol per file, bytes in, samples in DESIGN's units and frames out."""
+"""Decoders: one protocol per file, bytes in, samples in our units out (docs/conventions.md)."""

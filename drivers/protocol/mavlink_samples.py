@@ -1,4 +1,4 @@
-"""What each MAVLink message tells, in DESIGN's units and frames.
+"""What each MAVLink message tells, in our units (docs/conventions.md).
 
 MAVLink's body frame is forward-right-down and its world NED, so only units change; layouts are in
 mavlink.io/en/messages/common.html.
