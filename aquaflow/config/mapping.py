@@ -93,7 +93,7 @@ class InsertionConfig(Stage):
         ge=0,
         le=1,
         description="P_a above which a pixel may get a Gaussian; the paper's 1.0 "
-        "never fires (DESIGN section 4)",
+        "never fires (docs/paper.md#deviations-mapping)",
     )
     density: float = Field(
         1.0,

@@ -13,7 +13,7 @@ PoseResidual = Literal["point", "ray", "pixel"]
 
 
 class InitialisationConfig(Stage):
-    """Two-view initialisation (prior_notes.md section 2)."""
+    """Two-view initialisation (docs/measurements.md#initialisation)."""
 
     points: int = Field(800, ge=100, description="sample points; 800 solve in 0.1 s")
     min_share: float = Field(
@@ -50,7 +50,10 @@ class InitialisationConfig(Stage):
 
 
 class GateConfig(Stage):
-    """The frame gate (DESIGN section 6): what is skipped before anything costly looks at it."""
+    """The frame gate: what is skipped before anything costly looks at it.
+
+    See docs/architecture.md#skips.
+    """
 
     skip_duplicates: bool = Field(True, description="skip: nothing moved since the last frame used")
     skip_dark: bool = Field(True, description="skip: too little light for texture above the noise")
@@ -153,7 +156,7 @@ class GraphConfig(Stage):
         30.0,
         ge=1,
         description="the same for loop edges that say the same thing; drift of monocular scale has "
-        "always the same sign, so it outgrows its covariance (prior_notes 4)",
+        "always the same sign, so it outgrows its covariance (docs/measurements.md)",
     )
     corroboration: int = Field(2, ge=1, description="others that must agree with a loop edge")
     corroboration_window: int = Field(
@@ -247,9 +250,11 @@ class TrackingConfig(Stage):
         30.0 / 512.0, gt=0, description="tau_mapframe over width; paper: 30 px at 512 px"
     )
     matches: int = Field(
-        5000, ge=200, description="matches in the pose solver; more gain nothing (prior_notes 4)"
+        5000,
+        ge=200,
+        description="matches in the pose solver; more gain nothing (docs/measurements.md)",
     )
-    min_matches: int = Field(40, ge=10, description="fewer decide no pose (prior_notes 4)")
+    min_matches: int = Field(40, ge=10, description="fewer decide no pose (docs/measurements.md)")
     min_inlier_share: float = Field(
         0.35, gt=0, lt=1, description="inliers below which the frame is lost"
     )
