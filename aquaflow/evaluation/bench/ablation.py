@@ -1,4 +1,4 @@
-"""``aquaflow ablate``: what each part, and each skip of DESIGN section 6, costs and brings."""
+"""``aquaflow ablate``: what parts and skips (docs/architecture.md#skips) cost and bring."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def ablate(
     parts: Sequence[Part] = PARTS,
     perform: Perform = in_process,
 ) -> dict[str, Any]:
-    """Run every part's scenes, interleaved; means over the scenes (DESIGN section 5)."""
+    """Run every part's scenes, interleaved; means over the scenes (docs/formats.md#json-output)."""
     built = [part for part in parts if part.built]
     found: dict[str, list[Row]] = {part.name: [] for part in parts}
     total, done = len(built) * len(scenes), 0

@@ -82,7 +82,7 @@ def run_all(jobs: Sequence[Job], progress: Progress, perform: Perform | None = N
 
 
 def row_of(job: Job, load: float | None, result: Row) -> Row:
-    """The stable keys of a row (DESIGN section 5), then whatever else the run measured."""
+    """The stable keys of a row (docs/formats.md#json-output), then all else that it measured."""
     return {
         "scene": job.scene.name,
         "preset": None if job.peer else job.preset,

@@ -41,7 +41,7 @@ class Result:
         return f"aquaflow stress --case {self.case.name} --seed {self.seed}{long}"
 
     def to_json(self) -> dict[str, Any]:
-        """The stable keys of DESIGN section 5; ``worst`` is null where it is no number."""
+        """The stable keys of docs/formats.md#json-output; ``worst`` may be null."""
         worst = self.outcome.worst
         return {
             "name": self.case.name,
