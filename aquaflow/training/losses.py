@@ -1,4 +1,4 @@
-"""L_total = L_conf + beta L_match (paper, Sec. 3.1): where the points are, and which pixels match.
+"""L_total = L_conf + beta L_match (paper, Eq. 2): where the points are, and which pixels match.
 
 Both terms let the network say how far it trusts itself: an error counts by its confidence, and the
 logarithm of the confidence is rewarded.
@@ -19,10 +19,10 @@ from aquaflow.training.pairs import Pair, true_pointmaps
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weights of the terms; defaults of fine-tuning (paper, and MASt3R's: field_notes.md 2.1)."""
+    """Weights of the terms; defaults of fine-tuning (docs/paper.md#published-values)."""
 
     beta: float = 0.075
-    """Of the matching term; training from scratch wants it dominant (prior_notes.md section 3)."""
+    """Of the matching term; from scratch it must dominate (docs/measurements.md#compact-prior)."""
     points_alpha: float = 0.2
     """Reward of the logarithm of the points' confidence."""
     match_alpha: float = 10.0

@@ -1,5 +1,6 @@
 """Procedural pairs of underwater pictures with exact depths and cameras, on a CPU or a GPU.
 
 Geometry costs most and is kept in a pool on disk; water, light, the camera's behaviour and the
-window that is looked at are drawn anew each time a pair is used (prior_notes.md section 3).
+window that is looked at are drawn anew each time a pair is used
+(docs/measurements.md#compact-prior).
 """

@@ -29,7 +29,7 @@ class Motion:
 
 TRAINING = Motion()
 WIDE = Motion(baseline=0.45, power=1.5, tilt=0.07, roll=0.12)
-"""Of the held-out pairs: the motion that the prototypes were measured with (prior_notes.md)."""
+"""Of the held-out pairs: the motion of the prototypes' measurements (docs/measurements.md)."""
 WIDER = Motion(baseline=0.45, power=1.0, tilt=0.1, roll=0.2)
 """Of a second held-out set: every baseline as likely as another, and more roll."""
 
