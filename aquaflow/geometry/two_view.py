@@ -20,7 +20,7 @@ Array = npt.NDArray[np.float64]
 INLIER_PX = 1.0
 RANSAC_CONFIDENCE = 0.999
 MIN_MATCHES = 40
-"""Fewer matches than this decide nothing (prior_notes.md section 4)."""
+"""Fewer matches than this decide nothing (docs/measurements.md#pose-solver)."""
 
 
 @dataclass(frozen=True)
