@@ -1,4 +1,4 @@
-"""The Local Gaussian Parameter Decoder, LGPD (paper, Sec. 3.3.1).
+"""The Local Gaussian Parameter Decoder, LGPD (paper, Eq. 8 to 11).
 
 A token is made of a Gaussian's own feature and its group's; tokens of a group attend to each
 other; a geometry head and a colour head, told how the camera observes the Gaussian, give what is

@@ -1,4 +1,4 @@
-"""The sinusoidal encoding gamma of the paper (Eq. obs_encoding)."""
+"""The sinusoidal encoding gamma of the paper (Eq. 7)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The map follows its keyframes: Gaussians and views move by the full similarity (DESIGN 4)."""
+"""The map follows its keyframes: Gaussians and views move by the full similarity."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Underwater image formation (paper, Eq. underwater_formation and backscatter_model).
+"""Underwater image formation (paper, Eq. 12, 15 and 16).
 
     I = J exp(-beta_a z) + B(z),   B(z) = B_inf (1 - exp(-b z)) + B_res exp(-d z)
 
@@ -16,7 +16,7 @@ from torch import Tensor
 from aquaflow.render.water import MAX_OPTICAL_DEPTH
 
 MIN_TRANSMISSION = 0.05
-"""Where less light than this arrives, the scene's colour cannot be recovered (DESIGN section 4)."""
+"""Where less light arrives, the scene's colour cannot be recovered (docs/paper.md#deviations)."""
 MAX_RESTORED = 2.0
 """Radiance that restoration may return: twice the brightest white that the camera can store."""
 

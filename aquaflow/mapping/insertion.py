@@ -1,4 +1,4 @@
-"""Medium-guided insertion: where new Gaussians go, and how they start (paper, Sec. 3.3.3)."""
+"""Medium-guided insertion: where new Gaussians go, and how they start (paper, Eq. 16 and 17)."""
 
 from __future__ import annotations
 

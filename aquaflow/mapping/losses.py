@@ -1,4 +1,4 @@
-"""The paper's loss terms beside L1 and SSIM (Sec. 3.4), which live with the renderer."""
+"""The paper's loss terms beside L1 and SSIM (Eq. 18, 21 and 23), which live with the renderer."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 RADIAL_VARIANCE = 5.0
-"""sigma^2 of K_rad in units of the half picture: corner weight 0.82 (ARTDECO, field_notes 2.5)."""
+"""sigma^2 of K_rad in units of the half picture: corner weight 0.82 (ARTDECO; docs/paper.md)."""
 MIN_RANGE = 1e-2
 """Map units; guards 1 / range."""
 

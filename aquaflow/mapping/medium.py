@@ -1,7 +1,7 @@
 """The learnable medium: attenuation from the camera's orientation, and RGB backscatter.
 
-Colour against medium is not identifiable without constraints (DESIGN section 4): rates are positive
-by softplus, colours lie in [0, 1] by sigmoid.
+Colour against medium is not identifiable without constraints (docs/paper.md#deviations): rates are
+positive by softplus, colours lie in [0, 1] by sigmoid.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ B_INF_RANGE = (0.01, 0.99)
 
 
 class Medium(nn.Module):
-    """beta_a = MLP_a(gamma(vec R)); B_inf, b, B_res, d learnable RGB (paper, Sec. 3.3.2)."""
+    """beta_a = MLP_a(gamma(vec R)); B_inf, b, B_res, d learnable RGB (paper, Eq. 13 to 15)."""
 
     def __init__(self, config: MediumConfig, generator: torch.Generator) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""L_total (paper, Eq. total_loss): what one view says about the map."""
+"""L_total (paper, Eq. 19): what one view says about the map."""
 
 from __future__ import annotations
 

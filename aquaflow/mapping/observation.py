@@ -1,6 +1,6 @@
 """The observation condition o = [v, d]: from where, and how far, a Gaussian is seen.
 
-Paper, Sec. 3.3.1. Gradients stop here: through the highest octave a step of the optimiser would
+Paper, Eq. 5 and 6. Gradients stop here: through the highest octave a step of the optimiser would
 push places and cameras towards what the decoder would like to be told.
 """
 

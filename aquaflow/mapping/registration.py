@@ -24,7 +24,7 @@ def register(
     """Refine the pose of ``view`` photometrically.
 
     Its exposure and its light are those of its neighbours in time: nothing of them is learned from
-    its own picture (the peers do so for exposure, field_notes.md 2.7).
+    its own picture (the peers do so for exposure).
     """
     if mapped:
         view.log_gain = log_gain_at(view.frame_index, mapped)

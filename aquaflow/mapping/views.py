@@ -209,7 +209,7 @@ def _unpack(number: int, arrays: Arrays) -> Pixels:
 
 
 BETAS = (0.8, 0.99)
-"""Adam's decay rates for poses (ARTDECO, field_notes.md section 2.5)."""
+"""Adam's decay rates for poses (docs/paper.md#published-values)."""
 
 
 def is_usable(
