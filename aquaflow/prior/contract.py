@@ -1,4 +1,4 @@
-"""The contract between a two-view prior and the rest of AquaFlow (paper, Sec. 3.1).
+"""The contract between a two-view prior and the rest of AquaFlow (paper, Eq. 1).
 
 A prior encodes each picture once and decodes pairs of encodings. Later priors replace the classical
 one behind these two protocols; nothing above them knows which is running.

@@ -86,7 +86,7 @@ class CompactDescriber:
     def range_of(
         self, a: Half, b: Half, camera_a: CameraModel, camera_b: CameraModel
     ) -> LearnedRange:
-        """By comparing rays: nearly monocular, and up to a factor (prior_notes.md section 3)."""
+        """By comparing rays: nearly monocular, and up to a factor (docs/measurements.md)."""
         found = self._decoder(
             {
                 "Dc_a": _channels_first(a.astype(np.float32)),

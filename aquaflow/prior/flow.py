@@ -16,7 +16,7 @@ Grey = npt.NDArray[np.uint8]
 
 CLAHE_CLIP = 2.0
 CLAHE_TILES = (8, 8)
-"""Local contrast normalisation: water takes contrast away unevenly (prior_notes.md section 2)."""
+"""Local contrast normalisation: water takes contrast unevenly (docs/measurements.md)."""
 
 FORWARD_BACKWARD_PX = 1.0
 """A match that does not come back to within a pixel is occluded, out of view or wrong."""

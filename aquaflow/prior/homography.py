@@ -11,7 +11,7 @@ from aquaflow.prior.flow import Float, Grey, pixel_grid
 
 SIFT_FEATURES = 2000
 SIFT_CONTRAST = 0.015
-"""Below OpenCV's 0.04: water lowers contrast (prior_notes.md section 2)."""
+"""Below OpenCV's 0.04: water lowers contrast (docs/measurements.md#initialisation)."""
 LOWE_RATIO = 0.8
 RANSAC_PX = 4.0
 """Loose on purpose: relief does not follow a homography, the flow takes care of the rest."""

@@ -2,7 +2,8 @@
 
 A network tells every cell of a picture from every other, whatever the water, the light and the
 distance did to it; but cells are coarse. Dense flow is exact to a fifth of a pixel, but only finds
-what is near where it starts. So flow starts where the descriptors say (prior_notes.md section 3).
+what is near where it starts. So flow starts where the descriptors say
+(docs/measurements.md#compact-prior).
 """
 
 from __future__ import annotations

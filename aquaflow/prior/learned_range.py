@@ -1,7 +1,7 @@
 """Points where parallax sees nothing: the network's range, with its own, large variance.
 
-Triangulated points are some twenty times as exact (prior_notes.md section 3), so the network only
-fills what they leave, and gives them its unit where that is the metre.
+Triangulated points are some twenty times as exact (docs/measurements.md#compact-prior), so the
+network only fills what they leave, and gives them its unit where that is the metre.
 """
 
 from __future__ import annotations
