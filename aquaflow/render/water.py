@@ -1,4 +1,4 @@
-"""The picture through the water, fused with its gradient (paper, Eq. underwater_formation).
+"""The picture through the water, fused with its gradient (paper, Eq. 12 and 15).
 
     I = J exp(-beta z) + a (B_inf (1 - exp(-b z)) + B_res exp(-d z)) + (1 - a) B_inf
 

@@ -1,4 +1,4 @@
-// Underwater image formation (paper, Eq. underwater_formation and backscatter_model) and its gradient:
+// Underwater image formation (paper, Eq. 12 and 15) and its gradient:
 //
 //   I = J exp(-beta z) + a (B_inf (1 - exp(-b z)) + B_res exp(-d z)) + (1 - a) B_inf
 //
