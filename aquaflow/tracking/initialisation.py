@@ -1,4 +1,4 @@
-"""Two-view initialisation that waits for parallax (prior_notes.md section 2: what fails first).
+"""Two-view initialisation that waits for parallax (docs/measurements.md#initialisation).
 
 Frames are matched to one reference until the parallax decides the geometry. Essential-matrix and
 homography poses then compete; the waiting frames get their poses from the winner.

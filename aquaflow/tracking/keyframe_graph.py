@@ -1,4 +1,4 @@
-"""The keyframe graph: links along the path, loops across it, and what they correct (Sec. 3.2).
+"""The keyframe graph: links along the path, loops across it, and what they correct (Eq. 4).
 
 A loop starts an optimisation in a thread beside tracking, on a snapshot of the graph; its result is
 taken over by ``correction``. A replay waits for it at the next keyframe, so that the same frames

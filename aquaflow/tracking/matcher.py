@@ -44,7 +44,7 @@ class Matched:
 
 
 class KeyframeMatcher:
-    """Poses from a prior's matches and a keyframe's pointmap (paper, Eq. pose_opt)."""
+    """Poses from a prior's matches and a keyframe's pointmap (paper, Eq. 3)."""
 
     def __init__(self, config: TrackingConfig) -> None:
         self._config = config
@@ -98,7 +98,7 @@ class KeyframeMatcher:
 
 
 def matched_share(encoding: Encoding, pair: PairGeometry) -> float:
-    """min(valid matches, distinct matched pixels) over the pixels looked at (DESIGN section 4)."""
+    """min(valid matches, distinct matched pixels) over the pixels looked at (docs/paper.md)."""
     looked_at = encoding.interesting
     matched = looked_at & pair.valid
     targets = np.floor(pair.matches[matched]).astype(np.int64)

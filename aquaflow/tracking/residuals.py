@@ -1,4 +1,4 @@
-"""The three residuals of a pose against a keyframe's pointmap (paper, Eq. pose_opt).
+"""The three residuals of a pose against a keyframe's pointmap (paper, Eq. 3).
 
 All are whitened: one unit is one standard deviation. Derivatives are of the left tangent
 ``[translation, rotation]``, with ``log-scale`` as seventh where the scale is free. Arrays are
