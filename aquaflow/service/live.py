@@ -137,7 +137,7 @@ class LiveLoop:
     def _track(self, frame: Frame) -> None:
         try:
             decided = self.run_.frame(frame)
-        # A bad frame can cost that frame, never the dive (DESIGN section 7).
+        # A bad frame never ends the dive (docs/architecture.md#numbers-stay-finite).
         except Exception as error:
             self._failed(frame, error)
             return
