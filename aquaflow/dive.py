@@ -1,4 +1,4 @@
-"""The dive folder: what a run writes, while it runs and at its end (DESIGN section 5)."""
+"""The dive folder: what a run writes, during it and at its end (docs/formats.md#dive-folder)."""
 
 from __future__ import annotations
 

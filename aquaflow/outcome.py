@@ -177,7 +177,7 @@ def metrics(
     held_out: list[HeldOut],
     wall_s: float,
 ) -> dict[str, Any]:
-    """The stable keys of metrics.json (DESIGN section 5)."""
+    """The stable keys of metrics.json (docs/formats.md#metrics-json)."""
     classes = [tracked.frame_class for tracked in results]
     posed = sum(tracked.T_wc is not None for tracked in results)
     _, lpips_reason = lpips_network()

@@ -98,7 +98,7 @@ class Slam:
         if self._live:
             self._correct(wait=False)
 
-        # Not in the paper: is the frame worth looking at (DESIGN section 6)?
+        # Not in the paper: is the frame worth looking at (docs/architecture.md#skips)?
         verdict = Verdict(GateKind.PASS)
         with self.profiler.stage("gate"), self.failures.contain("frame gate", frame.index):
             verdict = self.gate.judge(frame.image, frame.mask)
@@ -271,7 +271,7 @@ class Slam:
         self.maps.grow(Growth(view, tracked.sub_map, steps, tracked.pointmap, tuple(retired)))
 
     def is_held_out(self, frame: Frame) -> bool:
-        """i % n == 0 and i != 0, i counting the frames that were used (DESIGN section 4)."""
+        """i % n == 0 and i != 0, i counts used frames (docs/paper.md#deviations-evaluation)."""
         every, i = self.config.mapping.hold_out_every, self._waiting[frame.index].used_before
         return every > 0 and i != 0 and i % every == 0
 
