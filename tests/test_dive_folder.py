@@ -1,4 +1,4 @@
-"""The dive folder: every file of DESIGN section 5, readable by what reads it."""
+"""The dive folder: every file of docs/formats.md#dive-folder, readable by what reads it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ METRICS = {
     *("lpips_reason", "heldout_frames", "ate_rmse_m_se3", "ate_rmse_m_sim3", "rpe"),
     *("scale_source", "renderer", "prior", "device", "seed", "version", "protocol"),
 }
-"""The keys that DESIGN section 5 promises."""
+"""The keys that docs/formats.md#metrics-json promises."""
 
 HELD_OUT = (8, 16)
 DEFAULT = Config.model_validate({})

@@ -1,4 +1,4 @@
-"""Who may import whom (DESIGN section 1): a file imports only from floors below its own."""
+"""Who may import whom (docs/architecture.md#levels): imports lead only to lower floors."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def violations(source: str, path: Path) -> list[str]:
     """Sentences about every import of ``source`` that this building does not allow."""
     mine = family(dotted(path))
     if mine not in HEIGHT:
-        return [f"{mine} has no floor; add it to DESIGN section 1 and to FLOORS in this test"]
+        return [f"{mine} has no floor; add it to FLOORS in this test and to docs/architecture.md"]
     problems = []
     for module in sorted(imported(source, path)):
         theirs = family(module)

@@ -100,7 +100,7 @@ def test_garbage_in_a_dataflash_log_costs_the_record_hit(shared_data: Path, tmp_
 
 
 def test_a_candump_log_is_decoded_as_the_bus_is(tmp_path: Path) -> None:
-    """Water depth 12.34 m (PGN 128267), the frame that hardware_notes.md ran."""
+    """Water depth 12.34 m (PGN 128267), the frame that was decoded by another library."""
     log = tmp_path / "bus.log"
     log.write_text(
         "(1436509053.249713) can0 0DF50B23#01D20400000000FF\n"

@@ -1,4 +1,4 @@
-"""Skips of the tracker (DESIGN section 6): each saves what it says, and changes no pose."""
+"""Skips of the tracker (docs/architecture.md#skips): each saves work and changes no pose."""
 
 from __future__ import annotations
 
