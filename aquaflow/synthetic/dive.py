@@ -23,9 +23,10 @@ from aquaflow.synthetic.config import SyntheticConfig
 from aquaflow.synthetic.display import burn_in
 from aquaflow.synthetic.march import HeightField
 from aquaflow.synthetic.placement import place_objects
+from aquaflow.synthetic.relief import Area
 from aquaflow.synthetic.sensor import Snow, expose, quantised, vignette
 from aquaflow.synthetic.telemetry import write_telemetry
-from aquaflow.synthetic.terrain import Area, build_relief
+from aquaflow.synthetic.terrain import build_relief
 from aquaflow.synthetic.texture import MipAtlas
 from aquaflow.synthetic.water import WATER_TYPES, save_medium
 from aquaflow.synthetic.ways import way_of

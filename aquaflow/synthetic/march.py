@@ -17,7 +17,7 @@ import torch
 from torch.nn import functional
 
 from aquaflow.synthetic.noise import FloatMap
-from aquaflow.synthetic.terrain import Area
+from aquaflow.synthetic.relief import Area
 
 __all__ = ["HeightField"]
 

@@ -17,7 +17,7 @@ import torch
 from aquaflow.synthetic import tiles
 from aquaflow.synthetic.noise import FloatMap, fractal
 from aquaflow.synthetic.radiance import AMBIENT, SUN, SUN_DIRECTION
-from aquaflow.synthetic.terrain import Area, Relief
+from aquaflow.synthetic.relief import Area, Relief
 from aquaflow.synthetic.texture import MipAtlas
 
 __all__ = ["TEXEL_M", "Rgb", "Shape", "casters", "hit", "object_texture", "radiance"]

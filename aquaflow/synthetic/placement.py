@@ -12,7 +12,7 @@ import numpy.typing as npt
 from aquaflow.synthetic import pool
 from aquaflow.synthetic.config import SceneKind
 from aquaflow.synthetic.objects import Rgb, Shape
-from aquaflow.synthetic.terrain import Relief
+from aquaflow.synthetic.relief import Relief
 
 __all__ = ["place_objects"]
 

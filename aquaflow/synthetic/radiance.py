@@ -11,7 +11,7 @@ import numpy as np
 
 from aquaflow.synthetic.config import SceneKind
 from aquaflow.synthetic.noise import FloatMap, blur, fractal, resized, smoothstep
-from aquaflow.synthetic.terrain import Relief
+from aquaflow.synthetic.relief import Relief
 
 __all__ = ["AMBIENT", "SUN", "SUN_DIRECTION", "TEXELS_PER_CELL", "bake"]
 

@@ -16,7 +16,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.synthetic import objects
 from aquaflow.synthetic.march import HeightField
 from aquaflow.synthetic.radiance import TEXELS_PER_CELL
-from aquaflow.synthetic.terrain import Area
+from aquaflow.synthetic.relief import Area
 from aquaflow.synthetic.texture import MipAtlas
 from aquaflow.synthetic.water import Medium
 

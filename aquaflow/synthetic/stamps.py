@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from aquaflow.synthetic.noise import FloatMap
-
-if TYPE_CHECKING:
-    from aquaflow.synthetic.terrain import Relief
+from aquaflow.synthetic.relief import Relief
 
 __all__ = [
     "Maker",
