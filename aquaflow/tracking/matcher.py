@@ -13,9 +13,9 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe
 from aquaflow.prior.contract import Encoding, Mask, PairGeometry
 from aquaflow.tracking.frames import Quality
+from aquaflow.tracking.problem import pose_problem
 from aquaflow.tracking.relocate import pose_from_scratch
 from aquaflow.tracking.solver import PoseEstimate, PoseProblem, solve_pose
-from aquaflow.tracking.verification import pose_problem
 from aquaflow.tracking.visibility import Visibility, visibility
 
 

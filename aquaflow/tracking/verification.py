@@ -8,10 +8,8 @@ their pixels agree on no pose.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from aquaflow.config import VerificationConfig
 from aquaflow.geometry.camera import CameraModel
@@ -19,11 +17,9 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, Pointmap
 from aquaflow.prior.contract import Encoding
 from aquaflow.tracking.keypoints import match_keypoints
+from aquaflow.tracking.problem import Array, at_pixels, pose_problem
 from aquaflow.tracking.relocate import pose_from_scratch
-from aquaflow.tracking.solver import PoseEstimate, PoseProblem, solve_pose
-
-Array = npt.NDArray[np.float64]
-Scalar = TypeVar("Scalar", bound=np.generic)
+from aquaflow.tracking.solver import PoseEstimate, solve_pose
 
 GRID = (8, 6)
 """Cells of the picture, across and down, in which inliers are counted as spread."""
@@ -59,7 +55,7 @@ def verify(
     mine, theirs = match_keypoints(keyframe.encoding.keypoints, encoding.keypoints)
     pixels_k = keyframe.encoding.keypoints.pixels[mine].astype(np.float64)
     pixels = encoding.keypoints.pixels[theirs].astype(np.float64)
-    known = _at(keyframe.pointmap.known(config.known_sigma), pixels_k)
+    known = at_pixels(keyframe.pointmap.known(config.known_sigma), pixels_k)
     pixels_k, pixels = pixels_k[known], pixels[known]
     if len(pixels) < config.min_inliers:
         return None
@@ -82,26 +78,6 @@ def verify(
     return Verified(estimate, int(inlier.sum()), len(pixels), cells)
 
 
-def pose_problem(
-    pointmap: Pointmap,
-    pixels_k: Array,  # [M, 2] px, in the keyframe, where its depth is known
-    pixels: Array,  # [M, 2] px, in the frame
-    camera: CameraModel,
-    sigma_px: float,
-    weights: Array | None = None,  # [M]; None: all 1
-) -> PoseProblem:
-    """Matches of a frame seen by ``camera`` with the points of a keyframe's ``pointmap``."""
-    rho = _at(pointmap.rho, pixels_k)
-    return PoseProblem(
-        pointmap.camera.unproject(pixels_k) / rho[:, None],
-        _at(pointmap.variance, pixels_k),
-        pixels,
-        np.ones(len(pixels)) if weights is None else weights,
-        camera,
-        sigma_px,
-    )
-
-
 def _with_scale(
     pointmap_k: Pointmap,
     pointmap: Pointmap,
@@ -111,14 +87,14 @@ def _with_scale(
 ) -> PoseEstimate | None:
     """The similarity between the two pointmaps; None where its scale stays unknown."""
     pixels_k, pixels = inliers
-    known = _at(pointmap.known(config.known_sigma), pixels)
+    known = at_pixels(pointmap.known(config.known_sigma), pixels)
     if known.sum() < config.min_inliers:
         return None
     camera = pointmap.camera
     plain = pose_problem(pointmap_k, pixels_k, pixels, camera, config.sigma_px)
-    rho = np.where(known, _at(pointmap.rho, pixels), np.nan)
+    rho = np.where(known, at_pixels(pointmap.rho, pixels), np.nan)
     own = camera.unproject(pixels) / rho[:, None]
-    variance = np.where(known, _at(pointmap.variance, pixels), np.nan)
+    variance = np.where(known, at_pixels(pointmap.variance, pixels), np.nan)
     problem = replace(plain, frame_points=own, frame_rho_variance=variance)
     # Where the frame's pointmap has another unit, the pose found so far is that far off in depth.
     ratio = own[known][:, 2] / estimate.T.apply(plain.points[known])[:, 2]
@@ -128,17 +104,6 @@ def _with_scale(
     if similar is None or similar.covariance[6, 6] > config.max_scale_sigma**2:
         return None
     return similar
-
-
-def _at(
-    field: npt.NDArray[Scalar],  # [H, W]
-    pixels: Array,  # [M, 2] px
-) -> npt.NDArray[Scalar]:
-    """[M] values of the pixels' own cells."""
-    height, width = field.shape
-    column = np.clip(np.floor(pixels[:, 0]).astype(np.int64), 0, width - 1)
-    row = np.clip(np.floor(pixels[:, 1]).astype(np.int64), 0, height - 1)
-    return field[row, column]
 
 
 def _occupied_cells(
