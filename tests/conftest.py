@@ -26,6 +26,7 @@ import pytest
 from command_line import Cli, Ran, refused, run_aquaflow
 from filelock import FileLock
 from hypothesis import settings
+from small_recording import FRAMES, HEIGHT, QUICK, WIDTH
 
 __all__ = ["Cli", "Ran", "refused", "run_aquaflow"]
 
@@ -42,16 +43,6 @@ settings.register_profile("aquaflow", deadline=None)
 settings.load_profile("aquaflow")
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
-
-GIVE_UP_S = 300.0
-"""Longest wait for what takes milliseconds on an idle machine; only a failing test waits for it."""
-
-FRAMES = 24
-WIDTH, HEIGHT = 160, 120
-QUICK = ("--refine-steps", "60")
-"""A map good enough to look at the files; its quality is the bars' business."""
-HASTY = ("--config", str(Path(__file__).with_name("hasty.yaml")))
-"""A map that is there, for half the time."""
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:

@@ -11,7 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import HASTY, Cli, refused
+from command_line import Cli, refused
+from small_recording import HASTY
 
 
 def rows(dive: Path) -> list[dict[str, str]]:

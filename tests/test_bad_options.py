@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from conftest import Cli, refused
+from command_line import Cli, refused
 
 USAGE = 2
 """Exit code of an option that does not exist."""

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-from conftest import FRAMES, HASTY, Cli
+from command_line import Cli
+from small_recording import FRAMES, HASTY
 
 from aquaflow import __version__
 from aquaflow.config import Config, load_config

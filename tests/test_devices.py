@@ -7,7 +7,7 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
-from conftest import Cli
+from command_line import Cli
 
 from aquaflow import cli_devices, discovery
 from aquaflow.config.cameras import OakConfig, V4l2Config

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import FRAMES, HEIGHT, WIDTH
+from small_recording import FRAMES, HEIGHT, WIDTH
 
 from aquaflow.config import Config, load_config
 from aquaflow.dive import DiveFolder

@@ -10,7 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import FRAMES, HASTY, HEIGHT, QUICK, WIDTH, Cli
+from command_line import Cli
+from small_recording import FRAMES, HASTY, HEIGHT, QUICK, WIDTH
 
 from aquaflow.config import Config
 from aquaflow.errors import NotMappedError

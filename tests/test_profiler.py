@@ -7,7 +7,8 @@ import threading
 from pathlib import Path
 
 import pytest
-from conftest import QUICK, Cli
+from command_line import Cli
+from small_recording import QUICK
 
 from aquaflow import profiler
 from aquaflow.profiler import Profiler

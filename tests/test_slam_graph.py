@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from test_slam import OPEN_GATE, ToldTracker, config, frame_of
+from slam_scenes import OPEN_GATE, ToldTracker, config, frame_of
 
 from aquaflow.slam import Slam
 from aquaflow.tracking.frames import Link

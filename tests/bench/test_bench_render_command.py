@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import refused, run_aquaflow
+from command_line import refused, run_aquaflow
 from pretended_renderer import PEAK, TINY, Pretended, SlowedClock
 from rich.console import Console
 from typer.testing import CliRunner

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import run_aquaflow
+from command_line import run_aquaflow
 
 from aquaflow.errors import ConfigError, InputError
 from aquaflow.evaluation.bench import ablation

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from conftest import GIVE_UP_S
+from small_recording import GIVE_UP_S
 
 from aquaflow.config.cameras import OakConfig, StreamConfig, V4l2Config
 from aquaflow.geometry.camera import guess_camera

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from conftest import GIVE_UP_S
 from scipy.spatial.transform import Rotation
+from small_recording import GIVE_UP_S
 
 from aquaflow.config.link import CanConfig
 from aquaflow.config.telemetry import DbcSignal, TelemetryConfig, parse_telemetry

@@ -7,8 +7,8 @@ import threading
 
 import numpy as np
 import pytest
-from conftest import GIVE_UP_S
 from simulated_links import RIGS, endless, motion, running, until, values
+from small_recording import GIVE_UP_S
 
 from drivers.link import MAX_READ_BYTES
 from sim_drivers.faults import Faults

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import pytest
-from conftest import Cli, refused
+from command_line import Cli, refused
 
 from aquaflow.config.service import ListenConfig
 from aquaflow.service.http import HealthServer

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import Cli, refused
+from command_line import Cli, refused
 
 from aquaflow.evaluation.bench.picture import draw
 from aquaflow.evaluation.bench.readme import BEGIN, END

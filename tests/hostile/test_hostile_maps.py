@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import Cli, refused
+from command_line import Cli, refused
 
 GIB = 1 << 30
 ROOM_BYTES = 6 * GIB

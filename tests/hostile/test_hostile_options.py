@@ -8,7 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import HASTY, Cli, refused
+from command_line import Cli, refused
+from small_recording import HASTY
 
 USAGE = 2
 

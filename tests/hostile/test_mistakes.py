@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from conftest import Cli, refused
+from command_line import Cli, refused
 
 import aquaflow.config
 from aquaflow import crash_report

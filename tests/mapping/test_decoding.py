@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 import torch
+from decoder_scene import ROWS, Scene
 from mapping_scenes import CAMERA, path, view_of
 from numpy import uint8, zeros
-from test_decoder import ROWS, Scene
 from torch import Tensor
 
 from aquaflow.mapping.decoder import Decoder, Trunk

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from mapping_scenes import flat_pointmap, floor, grown, path, picture, renderer, settings, view_of
-from test_water_estimation import B_RES, LAMP, D, sighted
+from water_observations import B_RES, LAMP, D, sighted
 
 from aquaflow.config import MediumConfig
 from aquaflow.mapping.mapper import Mapper

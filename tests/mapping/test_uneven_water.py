@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-from test_water_estimation import B_INF, BETA, LAMP, B, fitted, sighted
+from water_observations import B_INF, BETA, LAMP, B, fitted, sighted
 
 from aquaflow.config import MediumConfig
 from aquaflow.mapping.shading import TERMS, shading_basis

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_water_estimation import B_INF, B_RES, D, sighted
+from water_observations import B_INF, B_RES, D, sighted
 
 from aquaflow.config import WaterPriorsConfig
 from aquaflow.mapping.sighted_points import informative

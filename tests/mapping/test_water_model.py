@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_water_estimation import B_RES, D
+from water_observations import B_RES, D
 
 from aquaflow.mapping.shading import TERMS
 from aquaflow.mapping.sighted_points import MIN_RANGE_RATIO, Observations, informative, mean_by

@@ -9,7 +9,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from conftest import GIVE_UP_S
+from small_recording import GIVE_UP_S
 
 from aquaflow.messages import Dropped
 from sim_drivers.mcap_camera import McapCamera

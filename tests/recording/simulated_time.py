@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 import pytest
-from conftest import GIVE_UP_S
+from small_recording import GIVE_UP_S
 
 from aquaflow.recording import Recorder, writing
 from aquaflow.recording import recorder as recorder_module

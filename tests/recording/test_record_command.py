@@ -14,8 +14,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import GIVE_UP_S, Cli, refused
+from command_line import Cli, refused
 from killed import FPS, sentence, under_way, write_source
+from small_recording import GIVE_UP_S
 
 from aquaflow.config.recording import RecordingConfig
 from aquaflow.config.telemetry import TelemetryConfig

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import GIVE_UP_S
 from simulated_time import SimulatedTime, simulated, written
+from small_recording import GIVE_UP_S
 
 from aquaflow.config.recording import RecordingConfig
 from aquaflow.errors import InputError

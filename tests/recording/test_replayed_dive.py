@@ -6,7 +6,8 @@ import csv
 from pathlib import Path
 
 import pytest
-from conftest import QUICK, Cli
+from command_line import Cli
+from small_recording import QUICK
 
 from aquaflow.config.recording import RecordingConfig
 from aquaflow.recording import Recorder

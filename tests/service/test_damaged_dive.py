@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from conftest import Cli, refused
+from command_line import Cli, refused
 from damaged_dives import Outcome, gone_on_with, killed_dive, many, readable
 from live_scenes import VEHICLE, ToldFeed
 

@@ -16,8 +16,8 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from conftest import GIVE_UP_S
 from live_scenes import VEHICLE, Clock
+from small_recording import GIVE_UP_S
 
 from aquaflow.config import SourceConfig
 from aquaflow.config.cameras import V4l2Config

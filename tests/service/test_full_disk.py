@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 
 import pytest
-from conftest import FRAMES
 from killed_dives import CONFIG
 from paced import paced_run
+from small_recording import FRAMES
 
 from aquaflow.frame_rows import read_rows
 from aquaflow.service.generations import read_state, state_file

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import Cli
+from command_line import Cli
 
 from aquaflow.access import Access, read_token
 from aquaflow.config.service import ListenConfig, ServiceConfig

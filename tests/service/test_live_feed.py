@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import GIVE_UP_S
 from live_scenes import HEIGHT, WIDTH
+from small_recording import GIVE_UP_S
 
 from aquaflow.config import SourceConfig
 from aquaflow.config.cameras import V4l2Config

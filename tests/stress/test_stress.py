@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 import torch
-from conftest import Cli, refused
+from command_line import Cli, refused
 
 from aquaflow import preparation
 from aquaflow.config import TrackingConfig

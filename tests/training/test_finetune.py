@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import GIVE_UP_S
 from data_trees import write_colmap, write_tartanair
+from small_recording import GIVE_UP_S
 from typer.testing import CliRunner
 
 from aquaflow import cli

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import HEIGHT, WIDTH
+from small_recording import HEIGHT, WIDTH
 
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.errors import InputError

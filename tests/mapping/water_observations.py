@@ -1,0 +1,56 @@
+"""Observations of surface points through known water, and the fit to them."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.mapping.shading import shading_basis
+from aquaflow.mapping.sighted_points import Observations
+from aquaflow.mapping.water_estimation import (
+    WaterEstimate,
+    estimate_water,
+)
+
+Array = npt.NDArray[np.float64]
+BETA = np.array([0.6, 0.3, 0.2])
+B_INF = np.array([0.1, 0.3, 0.4])
+B = np.array([0.7, 0.35, 0.25])
+B_RES, D = np.full(3, 0.01), np.ones(3)
+LAMP = np.array([0.0, 0.1, -0.35, 0.0, -0.4])
+
+
+def sighted(
+    seed: int = 0,
+    points: int = 300,
+    sightings: int = 4,
+    noise: float = 0.005,
+    shading: Array | None = None,
+    water: bool = True,
+    log_gains: Array | None = None,  # [sightings, 3], view k holds the k-th sighting of each point
+) -> Observations:
+    """Sightings of points whose colours span black to bright, through known water or none."""
+    rng = np.random.default_rng(seed)
+    J = rng.uniform(0.0, 0.9, (points, 1)) * rng.uniform(0.7, 1.0, (points, 3))
+    point = np.repeat(np.arange(points), sightings)
+    z = rng.uniform(0.5, 3.0, len(point))
+    xy = rng.uniform(-0.95, 0.95, (len(point), 2))
+    # Near ground is seen near the lower edge: the case in which a lamp looks like water.
+    xy[:, 1] = np.clip(0.95 - 0.5 * z + 0.4 * xy[:, 1], -0.95, 0.95)
+    path, seen = z[:, None], J[point]
+    view = np.tile(np.arange(sightings), points)
+    if water:
+        veil = B_INF * -np.expm1(-B * path) + B_RES * np.exp(-D * path)
+        seen = seen * np.exp(-BETA * path) + veil
+    if log_gains is not None:
+        seen = seen * np.exp(log_gains)[view]
+    if shading is not None:
+        seen = seen * np.exp(shading_basis(xy) @ shading)[:, None]
+    noisy = seen + noise * rng.normal(size=seen.shape)
+    return Observations(point, view, noisy, z, xy, np.zeros_like(noisy))
+
+
+def fitted(seen: Observations) -> WaterEstimate:
+    estimate = estimate_water(seen, B_RES, D, start_beta=0.1)
+    assert estimate is not None
+    return estimate
