@@ -23,10 +23,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from command_line import Cli, Ran, refused, run_aquaflow
 from filelock import FileLock
 from hypothesis import settings
-from small_recording import FRAMES, HEIGHT, QUICK, WIDTH
+
+from tests.command_line import Cli, Ran, refused, run_aquaflow
+from tests.small_recording import FRAMES, HEIGHT, QUICK, WIDTH
 
 __all__ = ["Cli", "Ran", "refused", "run_aquaflow"]
 

@@ -11,8 +11,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command_line import Cli, refused
-from small_recording import HASTY
+
+from tests.command_line import Cli, refused
+from tests.small_recording import HASTY
 
 
 def rows(dive: Path) -> list[dict[str, str]]:

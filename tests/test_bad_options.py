@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from command_line import Cli, refused
+
+from tests.command_line import Cli, refused
 
 USAGE = 2
 """Exit code of an option that does not exist."""

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_line import Cli
+
+from tests.command_line import Cli
 
 pytestmark = pytest.mark.slow
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 import yaml
-from command_line import Cli
-from small_recording import FRAMES, HASTY
 
 from aquaflow import __version__
 from aquaflow.config import Config, load_config
+from tests.command_line import Cli
+from tests.small_recording import FRAMES, HASTY
 
 
 def contents(folder: Path) -> dict[str, bytes]:

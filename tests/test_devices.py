@@ -7,7 +7,6 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
-from command_line import Cli
 
 from aquaflow import cli_devices, discovery
 from aquaflow.config.cameras import OakConfig, V4l2Config
@@ -17,6 +16,7 @@ from drivers import discovery as drivers
 from sim_drivers.camera_feed import CameraFeed
 from sim_drivers.images import ImageFolder
 from sim_drivers.v4l2_kernel import V4l2Kernel
+from tests.command_line import Cli
 
 
 def put(root: Path, path: str, content: str = "") -> Path:

@@ -11,7 +11,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from small_recording import FRAMES, HEIGHT, WIDTH
 
 from aquaflow.config import Config, load_config
 from aquaflow.dive import DiveFolder
@@ -20,6 +19,7 @@ from aquaflow.evaluation.trajectory import read_tum
 from aquaflow.export.ply import read_ply
 from aquaflow.frame_rows import FrameRow
 from aquaflow.geometry.camera import load_camera
+from tests.small_recording import FRAMES, HEIGHT, WIDTH
 
 METRICS = {
     *("frames", "tracked", "lost", "skipped", "keyframes", "mapping_frames", "common_frames"),

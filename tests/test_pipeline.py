@@ -10,8 +10,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command_line import Cli
-from small_recording import FRAMES, HASTY, HEIGHT, QUICK, WIDTH
 
 from aquaflow.config import Config
 from aquaflow.errors import NotMappedError
@@ -20,6 +18,8 @@ from aquaflow.pipeline import map_recording
 from aquaflow.preparation import Preparation
 from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
+from tests.command_line import Cli
+from tests.small_recording import FRAMES, HASTY, HEIGHT, QUICK, WIDTH
 
 TRACKING_ONLY = Config.model_validate({"mapping": {"enabled": False}})
 

@@ -7,11 +7,11 @@ import threading
 from pathlib import Path
 
 import pytest
-from command_line import Cli
-from small_recording import QUICK
 
 from aquaflow import profiler
 from aquaflow.profiler import Profiler
+from tests.command_line import Cli
+from tests.small_recording import QUICK
 
 
 class Clock:

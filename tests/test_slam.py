@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from slam_scenes import OPEN_GATE, STEPS, ToldTracker, config, frame_of
 
 from aquaflow.config import Config
 from aquaflow.geometry.similarity import Sim3
@@ -20,6 +19,7 @@ from aquaflow.preparation import Preparation
 from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
 from aquaflow.tracking.frames import FrameClass, Tracked
+from tests.slam_scenes import OPEN_GATE, STEPS, ToldTracker, config, frame_of
 
 DRY = {"medium": {"enabled": False}}
 """Fitting water takes longer than all the rest; tests/mapping does it."""

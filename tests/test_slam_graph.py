@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from slam_scenes import OPEN_GATE, ToldTracker, config, frame_of
 
 from aquaflow.slam import Slam
 from aquaflow.tracking.frames import Link
 from aquaflow.tracking.keyframe_graph import Correction
+from tests.slam_scenes import OPEN_GATE, ToldTracker, config, frame_of
 
 
 class ToldGraph:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-from pretended_renderer import PEAK, TINY, Pretended, SlowedClock
 
 from aquaflow.evaluation.bench.render import peak as peaks
 from aquaflow.evaluation.bench.render.contenders import Timed
@@ -15,6 +14,7 @@ from aquaflow.evaluation.bench.render.scene import Size, height_field
 from aquaflow.evaluation.bench.render.timing import Sample, interleaved, time_renderer
 from aquaflow.render.contract import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from aquaflow.render.reference import ReferenceRenderer, project
+from tests.bench.pretended_renderer import PEAK, TINY, Pretended, SlowedClock
 
 
 def brute_force_interactions(size: Size) -> int:

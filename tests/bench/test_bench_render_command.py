@@ -8,8 +8,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from command_line import refused, run_aquaflow
-from pretended_renderer import PEAK, TINY, Pretended, SlowedClock
 from rich.console import Console
 from typer.testing import CliRunner
 
@@ -24,6 +22,8 @@ from aquaflow.evaluation.bench.render.parts import parts_of
 from aquaflow.evaluation.bench.render.scene import NAMES, SIZES, SMALL, Size, height_field
 from aquaflow.evaluation.bench.render.table import print_result
 from aquaflow.render.native.build import supported_isas
+from tests.bench.pretended_renderer import PEAK, TINY, Pretended, SlowedClock
+from tests.command_line import refused, run_aquaflow
 
 
 def quiet(stage: str, done: int, total: int | None) -> None:

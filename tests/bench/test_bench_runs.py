@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_line import run_aquaflow
 
 from aquaflow.errors import ConfigError, InputError
 from aquaflow.evaluation.bench import ablation
@@ -21,6 +20,7 @@ from aquaflow.evaluation.bench.runner import KEYS, Contender, in_process, jobs_f
 from aquaflow.evaluation.bench.scene import Scene, scene_at
 from aquaflow.evaluation.bench.summary import ATE_PCT, PSNR, lines_of
 from aquaflow.evaluation.bench.table import failures, markdown
+from tests.command_line import run_aquaflow
 
 REEF, WALL = Scene("reef", "/reef", refine_share=0.1), Scene("wall", "/wall")
 GOOD = {

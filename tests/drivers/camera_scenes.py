@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from small_recording import GIVE_UP_S
 
 from aquaflow.config.cameras import OakConfig, StreamConfig, V4l2Config
 from aquaflow.geometry.camera import guess_camera
@@ -21,6 +20,7 @@ from sim_drivers.camera_feed import CameraFaults, CameraFeed
 from sim_drivers.mjpeg_server import MjpegServer
 from sim_drivers.oak import ReplayOak
 from sim_drivers.v4l2_kernel import CameraSpec, V4l2Kernel
+from tests.small_recording import GIVE_UP_S
 
 WIDTH, HEIGHT, COUNT = 64, 48, 40
 

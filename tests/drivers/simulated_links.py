@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from small_recording import GIVE_UP_S
 
 from aquaflow.config.link import CanConfig
 from aquaflow.config.telemetry import DbcSignal, TelemetryConfig, parse_telemetry
@@ -40,6 +39,7 @@ from sim_drivers.devices.pd0 import Pd0Dvl
 from sim_drivers.devices.waterlinked import WaterLinkedJson, WaterLinkedSerial
 from sim_drivers.devices.wires import CanWire, PtyWire, TcpWire, UdpWire
 from sim_drivers.faults import Faults, faulty
+from tests.small_recording import GIVE_UP_S
 
 SPEED = 4.0
 STEPS = 20

@@ -8,7 +8,6 @@ import struct
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from simulated_links import DBC, DBC_SIGNALS
 
 from aquaflow.config.telemetry import DbcConfig, Nmea2000Config
 from aquaflow.errors import ConfigError
@@ -16,6 +15,7 @@ from aquaflow.messages import Altitude, Attitude, Depth, Velocity
 from drivers.protocol.dbc import DbcDecoder
 from drivers.protocol.nmea2000 import Nmea2000Decoder, group_of
 from drivers.transport.can import EXTENDED, RECORD
+from tests.drivers.simulated_links import DBC, DBC_SIGNALS
 
 NOW = 9_000_000_000
 LINK = {"kind": "can", "channel": "can0"}

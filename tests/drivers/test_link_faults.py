@@ -7,11 +7,11 @@ import threading
 
 import numpy as np
 import pytest
-from simulated_links import RIGS, endless, motion, running, until, values
-from small_recording import GIVE_UP_S
 
 from drivers.link import MAX_READ_BYTES
 from sim_drivers.faults import Faults
+from tests.drivers.simulated_links import RIGS, endless, motion, running, until, values
+from tests.small_recording import GIVE_UP_S
 
 CHECKED = ("mavlink_pty", "mavlink_udp", "nmea_pty", "waterlinked_pty", "pd0_pty")
 """Protocols with a checksum of their own."""

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from camera_scenes import QUICK, closing, settled
 
 from aquaflow.config.cameras import LiveCameraConfig
 from aquaflow.errors import InputError
@@ -17,6 +16,7 @@ from aquaflow.geometry.camera import guess_camera, save_camera
 from aquaflow.messages import CameraModel, Dropped, Frame
 from drivers.capture import Capture, RawPicture
 from drivers.live import CameraState, LiveCamera
+from tests.drivers.camera_scenes import QUICK, closing, settled
 
 SIZE = (32, 24)
 

@@ -6,7 +6,6 @@ import itertools
 
 import numpy as np
 import pytest
-from camera_scenes import HEIGHT, WIDTH, Pictures, closing, feed, oak, until
 
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import guess_camera
@@ -14,6 +13,7 @@ from aquaflow.messages import Acceleration, AngularRate, Frame
 from drivers.oak.camera import MAX_SAMPLES
 from sim_drivers.camera_feed import CameraFaults, CameraFeed
 from sim_drivers.oak import EXPOSURE_S, GRAVITY_M_S2, ISO, ReplayImuReading
+from tests.drivers.camera_scenes import HEIGHT, WIDTH, Pictures, closing, feed, oak, until
 
 GRAVITY = (0.0, 0.0, -GRAVITY_M_S2)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-from simulated_links import RIGS, motion, telemetry_config
 
 from drivers.link import LinkCounters
 from drivers.protocol.nmea_sentence import framing
@@ -11,6 +10,7 @@ from drivers.protocol.packets import PacketReader
 from drivers.telemetry import decoder_of
 from drivers.transport.can import packed
 from sim_drivers.devices.nmea_talker import sentence
+from tests.drivers.simulated_links import RIGS, motion, telemetry_config
 
 A, B = sentence("IIHDT,271.3,T"), sentence("SDDBT,9.8,f,3.0,M,1.6,F")
 PROTOCOLS = [name for name in RIGS if name not in ("mavlink_udp", "nmea2000_multicast")]

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import can
 import pytest
-from simulated_links import RIGS, motion, telemetry_config
 
 from drivers.link import LinkCounters
 from drivers.plausible import plausible
@@ -20,6 +19,7 @@ from drivers.transport.can import EXTENDED, RECORD, packed
 from sim_drivers.devices.nmea_talker import sentence
 from sim_drivers.devices.pd0 import ensemble
 from sim_drivers.devices.waterlinked import line
+from tests.drivers.simulated_links import RIGS, motion, telemetry_config
 
 DIALECT = import_module("pymavlink.dialects.v20.ardupilotmega")
 PROTOCOLS = [name for name in RIGS if name not in ("mavlink_udp", "nmea2000_multicast")]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from simulated_links import RIGS, motion, running, until, values
 
 from aquaflow.messages import (
     Acceleration,
@@ -15,6 +14,7 @@ from aquaflow.messages import (
     Lights,
     Velocity,
 )
+from tests.drivers.simulated_links import RIGS, motion, running, until, values
 
 TOLERANCE = {
     Acceleration: 0.006,  # RAW_IMU has milli-g

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from camera_scenes import COUNT, HEIGHT, WIDTH, Pictures, closing, feed, settled, stream, until
 
 from aquaflow.errors import InputError
 from aquaflow.messages import Frame
@@ -19,6 +18,17 @@ from drivers.stream import without_password
 from sim_drivers.camera_feed import CameraFeed, first_images
 from sim_drivers.mjpeg_server import MjpegServer
 from sim_drivers.transport_stream import RtspCamera, UdpCamera
+from tests.drivers.camera_scenes import (
+    COUNT,
+    HEIGHT,
+    WIDTH,
+    Pictures,
+    closing,
+    feed,
+    settled,
+    stream,
+    until,
+)
 
 
 def free_port(kind: socket.SocketKind) -> int:

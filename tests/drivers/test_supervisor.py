@@ -7,7 +7,6 @@ import threading
 from contextlib import contextmanager
 
 import pytest
-from simulated_links import until
 
 from aquaflow.config.telemetry import NmeaConfig
 from drivers import supervisor
@@ -15,6 +14,7 @@ from drivers.link import LinkLostError
 from drivers.protocol.nmea import NmeaDecoder
 from drivers.supervisor import Supervisor
 from sim_drivers.devices.nmea_talker import sentence
+from tests.drivers.simulated_links import until
 
 DEPTH = sentence("SDDPT,4.25,0.5")
 

@@ -7,14 +7,6 @@ import threading
 from importlib.metadata import entry_points
 
 import pytest
-from simulated_links import (
-    RIGS,
-    endless,
-    motion,
-    running,
-    telemetry_config,
-    until,
-)
 
 import drivers.telemetry
 from aquaflow.config.telemetry import parse_telemetry
@@ -25,6 +17,14 @@ from drivers.latest import LatestQueue
 from drivers.telemetry import LinkTelemetry
 from sim_drivers.devices.device import SimulatedDevice, boot_clock
 from sim_drivers.faults import jumping_clock
+from tests.drivers.simulated_links import (
+    RIGS,
+    endless,
+    motion,
+    running,
+    telemetry_config,
+    until,
+)
 
 
 def test_the_source_is_registered():

@@ -10,7 +10,6 @@ import sys
 
 import can
 import pytest
-from simulated_links import free_port, until
 
 from aquaflow.config.link import CanConfig, SerialConfig, TcpConfig, UdpConfig
 from aquaflow.errors import InputError
@@ -21,6 +20,7 @@ from drivers.transport.can import EXTENDED, RECORD, open_can
 from drivers.transport.serial import open_serial
 from drivers.transport.socket import open_tcp, open_udp
 from sim_drivers.devices.wires import CanWire, PtyWire, TcpWire, UdpWire
+from tests.drivers.simulated_links import free_port, until
 
 WAIT_S = 10.0
 

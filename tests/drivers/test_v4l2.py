@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from camera_scenes import HEIGHT, WIDTH, closing, feed, until, v4l2
 
 from aquaflow.config.cameras import V4l2Config
 from aquaflow.errors import InputError
@@ -24,6 +23,7 @@ from drivers.v4l2.discovery import camera_nodes, find_camera, modes
 from drivers.v4l2.pixels import to_rgb
 from sim_drivers.camera_feed import CameraFaults
 from sim_drivers.v4l2_kernel import EXPOSURE_ABSOLUTE, WHITE_BALANCE, CameraSpec, V4l2Kernel
+from tests.drivers.camera_scenes import HEIGHT, WIDTH, closing, feed, until, v4l2
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import cv2
@@ -13,9 +12,6 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "mapping"))
-from mapping_scenes import floor, renderer, view_of
-
 from aquaflow.cli import app
 from aquaflow.config import Config, MappingConfig, dump_config
 from aquaflow.errors import InputError
@@ -23,6 +19,7 @@ from aquaflow.export.map_file import write_map_file
 from aquaflow.export.restored import export_restored
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import to_bytes
+from tests.mapping.mapping_scenes import floor, renderer, view_of
 
 Dive = tuple[Path, Path, npt.NDArray[np.uint8]]
 

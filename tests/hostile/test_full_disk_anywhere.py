@@ -11,7 +11,8 @@ from pathlib import Path
 import cv2
 import pytest
 import yaml
-from small_recording import HASTY
+
+from tests.small_recording import HASTY
 
 
 def run_with_room(room_bytes: int, *arguments: object) -> subprocess.CompletedProcess[str]:

@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import pytest
-from command_line import Cli, refused
 
 from aquaflow.config.service import ListenConfig
 from aquaflow.service.http import HealthServer
+from tests.command_line import Cli, refused
 
 
 @pytest.mark.parametrize(

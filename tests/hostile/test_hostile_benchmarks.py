@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from command_line import Cli, refused
 
 from aquaflow.evaluation.bench.picture import draw
 from aquaflow.evaluation.bench.readme import BEGIN, END
+from tests.command_line import Cli, refused
 
 FAILED_ROW = {"scene": "reef", "preset": "fast", "peer": None, "repeat": 0, "failed": "no map"}
 

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import Cli, refused
+
+from tests.command_line import Cli, refused
 
 GIB = 1 << 30
 ROOM_BYTES = 6 * GIB

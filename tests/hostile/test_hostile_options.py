@@ -8,8 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command_line import Cli, refused
-from small_recording import HASTY
+
+from tests.command_line import Cli, refused
+from tests.small_recording import HASTY
 
 USAGE = 2
 

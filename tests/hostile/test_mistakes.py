@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from command_line import Cli, refused
 
 import aquaflow.config
 from aquaflow import crash_report
+from tests.command_line import Cli, refused
 
 OUR_MISTAKE = 70
 

@@ -6,9 +6,9 @@ import shutil
 from pathlib import Path
 
 import pytest
-from command_line import Cli
 
 from aquaflow.errors import reason_of
+from tests.command_line import Cli
 
 SECRET = "$6$saltsalt$hashhashhash"
 SHADOW = f"root:{SECRET}:19000:0:99999:7:::\ndaemon:*:19000:0:99999:7:::\n"

@@ -9,7 +9,8 @@ import shutil
 import subprocess
 
 import pytest
-from virtual_machine import GUEST, HERE, MACHINE, ROOT
+
+from tests.kernel.virtual_machine import GUEST, HERE, MACHINE, ROOT
 
 DIVE = {"frames": 160, "width": 64, "height": 48}
 """As small as can be tracked, and long enough to be killed, resumed and stopped on the way."""

@@ -11,13 +11,13 @@ from contextlib import contextmanager
 from itertools import islice
 
 import pytest
-from virtual_machine import in_guest
 
 from aquaflow.config.link import CanConfig
 from aquaflow.config.telemetry import parse_telemetry
 from aquaflow.messages import Altitude, TelemetrySample
 from drivers.telemetry import LinkTelemetry
 from drivers.transport import opener
+from tests.kernel.virtual_machine import in_guest
 
 pytest.importorskip("can", reason="python-can is not installed")
 

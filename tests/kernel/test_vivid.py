@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from virtual_machine import in_guest
 
 from aquaflow.config.cameras import V4l2Config
 from aquaflow.errors import InputError
@@ -19,6 +18,7 @@ from drivers.live import CameraState
 from drivers.v4l2 import V4l2Camera
 from drivers.v4l2.discovery import camera_nodes, modes
 from drivers.v4l2.system import Kernel
+from tests.kernel.virtual_machine import in_guest
 
 BUS = "platform:vivid-000"
 DRIVER = Path("/sys/bus/platform/drivers/vivid")

@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from mapping_scenes import (
+
+from aquaflow.config import OptimiserConfig
+from aquaflow.mapping.attention import look, tiles_to_draw
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.views import View
+from tests.mapping.mapping_scenes import (
     copied,
     flat_pointmap,
     floor,
@@ -16,11 +21,6 @@ from mapping_scenes import (
     settings,
     view_of,
 )
-
-from aquaflow.config import OptimiserConfig
-from aquaflow.mapping.attention import look, tiles_to_draw
-from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.views import View
 
 CONFIG = OptimiserConfig(noise_floor=0.01, full_look_every=3)
 

@@ -7,7 +7,6 @@ import math
 
 import pytest
 import torch
-from decoder_scene import CENTRE, ROWS, Scene
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
@@ -18,6 +17,7 @@ from aquaflow.mapping.encoding import sinusoidal_encoding
 from aquaflow.mapping.observation import FURTHEST, encoded_observation, observation
 from aquaflow.mapping.tokens import BUCKET, Tokens, visible_tokens
 from aquaflow.mapping.voxel_groups import EMPTY
+from tests.mapping.decoder_scene import CENTRE, ROWS, Scene
 
 VARIANTS = ("lgpd", "mlp")
 

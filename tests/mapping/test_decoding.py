@@ -8,8 +8,6 @@ from typing import Any
 
 import pytest
 import torch
-from decoder_scene import ROWS, Scene
-from mapping_scenes import CAMERA, path, view_of
 from numpy import uint8, zeros
 from torch import Tensor
 
@@ -24,6 +22,8 @@ from aquaflow.mapping.decoding import (
 from aquaflow.mapping.observation import observation
 from aquaflow.mapping.tokens import visible_tokens
 from aquaflow.render.library import library_or_none
+from tests.mapping.decoder_scene import ROWS, Scene
+from tests.mapping.mapping_scenes import CAMERA, path, view_of
 
 CENTRE = torch.tensor([0.1, -0.2, -1.0])
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from mapping_scenes import view_of
 
 from aquaflow.mapping.exposure import (
     FEWEST,
@@ -17,6 +16,7 @@ from aquaflow.mapping.exposure import (
     set_log_gains,
 )
 from aquaflow.mapping.views import View
+from tests.mapping.mapping_scenes import view_of
 
 SOLID = torch.ones(48, 64)
 GAIN = np.array([0.6, 0.8, 1.2])

@@ -7,7 +7,12 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from mapping_scenes import (
+
+from aquaflow.geometry.similarity import Sim3, rotation_from_quaternion
+from aquaflow.mapping.following import move_gaussians, move_views, quaternion_product
+from aquaflow.mapping.gaussians import GaussianMap
+from aquaflow.mapping.mapper import Mapper
+from tests.mapping.mapping_scenes import (
     cloud,
     flat_pointmap,
     floor,
@@ -18,11 +23,6 @@ from mapping_scenes import (
     settings,
     view_of,
 )
-
-from aquaflow.geometry.similarity import Sim3, rotation_from_quaternion
-from aquaflow.mapping.following import move_gaussians, move_views, quaternion_product
-from aquaflow.mapping.gaussians import GaussianMap
-from aquaflow.mapping.mapper import Mapper
 
 S = Sim3(pose((0, 0, 0), (0.2, -0.4, 0.9)).R, np.array([0.7, -0.3, 1.1]), 1.7)
 angles = st.floats(-3.0, 3.0)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from mapping_scenes import water
 
 from aquaflow.mapping.image_formation import MAX_RESTORED, MIN_TRANSMISSION, Water
 from aquaflow.render.water import compose_water
+from tests.mapping.mapping_scenes import water
 
 
 def scene(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:

@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from mapping_scenes import CAMERA, pose, view_of
 
 from aquaflow.config import InsertionConfig
 from aquaflow.mapping.gaussians import radiance
@@ -18,6 +17,7 @@ from aquaflow.mapping.insertion import (
     structure,
     thin,
 )
+from tests.mapping.mapping_scenes import CAMERA, pose, view_of
 
 SIZE = (CAMERA.height, CAMERA.width)
 CONFIG = InsertionConfig()

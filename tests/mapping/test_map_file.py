@@ -11,7 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from mapping_scenes import (
+
+from aquaflow.errors import InputError
+from aquaflow.export.facts_file import FACTS
+from aquaflow.export.map_file import read_map_file, write_map_file
+from aquaflow.mapping.mapper import Mapper
+from tests.mapping.mapping_scenes import (
     copied,
     filmed,
     flat_pointmap,
@@ -22,11 +27,6 @@ from mapping_scenes import (
     same,
     settings,
 )
-
-from aquaflow.errors import InputError
-from aquaflow.export.facts_file import FACTS
-from aquaflow.export.map_file import read_map_file, write_map_file
-from aquaflow.mapping.mapper import Mapper
 
 PLAIN: dict[str, Any] = {"optimiser": {"refine_steps": 6}}
 KINDS = {

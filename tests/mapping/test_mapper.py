@@ -7,7 +7,11 @@ import math
 import numpy as np
 import pytest
 import torch
-from mapping_scenes import (
+
+from aquaflow.config import MappingConfig
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.mapping.mapper import Mapper
+from tests.mapping.mapping_scenes import (
     copied,
     error,
     filmed,
@@ -20,10 +24,6 @@ from mapping_scenes import (
     settings,
     view_of,
 )
-
-from aquaflow.config import MappingConfig
-from aquaflow.geometry.camera import CameraModel
-from aquaflow.mapping.mapper import Mapper
 
 SHORT = {"refine_steps": 12}
 DRY = settings(optimiser=SHORT)

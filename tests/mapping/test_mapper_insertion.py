@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from mapping_scenes import (
+
+from aquaflow.config import MappingConfig
+from aquaflow.mapping.mapper import Mapper
+from tests.mapping.mapping_scenes import (
     CAMERA,
     flat_pointmap,
     floor,
@@ -15,9 +18,6 @@ from mapping_scenes import (
     settings,
     view_of,
 )
-
-from aquaflow.config import MappingConfig
-from aquaflow.mapping.mapper import Mapper
 
 
 def dense(**keys: object) -> MappingConfig:

@@ -6,7 +6,10 @@ import itertools
 
 import numpy as np
 import pytest
-from mapping_scenes import (
+
+from aquaflow.mapping import mapper as module
+from aquaflow.mapping.mapper import Mapper
+from tests.mapping.mapping_scenes import (
     cloud,
     copied,
     error,
@@ -22,9 +25,6 @@ from mapping_scenes import (
     view_of,
     water,
 )
-
-from aquaflow.mapping import mapper as module
-from aquaflow.mapping.mapper import Mapper
 
 SHORT = {"refine_steps": 12}
 DRY = settings(optimiser=SHORT)

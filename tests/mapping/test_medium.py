@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from mapping_scenes import pose
 
 from aquaflow.config import MediumConfig
 from aquaflow.mapping.medium import Medium, inverse_softplus
+from tests.mapping.mapping_scenes import pose
 
 AHEAD, DOWN = torch.eye(3), torch.from_numpy(pose((0, 0, 0), (1.3, 0, 0)).R).float()
 

@@ -8,7 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from mapping_scenes import (
+
+from aquaflow.config import MappingConfig
+from aquaflow.geometry.similarity import Sim3, so3_exp
+from aquaflow.mapping.decoding import DECODED
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.neural import NeuralGaussians
+from aquaflow.mapping.voxel_groups import EMPTY
+from tests.mapping.mapping_scenes import (
     copied,
     error,
     filmed,
@@ -20,13 +27,6 @@ from mapping_scenes import (
     same,
     settings,
 )
-
-from aquaflow.config import MappingConfig
-from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.mapping.decoding import DECODED
-from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.neural import NeuralGaussians
-from aquaflow.mapping.voxel_groups import EMPTY
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

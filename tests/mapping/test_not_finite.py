@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from mapping_scenes import cloud, view_of
 
 from aquaflow.config import InsertionConfig
 from aquaflow.geometry.similarity import Sim3
@@ -15,6 +14,7 @@ from aquaflow.mapping.gaussians import GaussianMap
 from aquaflow.mapping.insertion import new_gaussians
 from aquaflow.mapping.sunlight import learn_light
 from aquaflow.mapping.views import View, refine_pose
+from tests.mapping.mapping_scenes import cloud, view_of
 
 NOWHERE = Sim3(np.eye(3), np.array([np.nan, 0.0, 0.0]))
 SOLID = torch.ones(48, 64)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from mapping_scenes import floor, renderer, view_of
 
 from aquaflow.config import MediumConfig
 from aquaflow.mapping.restoration import common_exposure, restored_picture, to_bytes
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.views import View
+from tests.mapping.mapping_scenes import floor, renderer, view_of
 
 BRIGHTER_ABOVE = torch.tensor([0.1, -0.6, -0.1, 0.0, 0.2])
 

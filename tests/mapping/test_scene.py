@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from mapping_scenes import filmed, floor, gaussians_at, pose, renderer, view_of, water
 
 from aquaflow.config import MediumConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.views import View
+from tests.mapping.mapping_scenes import filmed, floor, gaussians_at, pose, renderer, view_of, water
 
 NEAR_AND_FAR = [pose((0.02 * i, 0.0, -0.35 * i)) for i in range(5)]
 BLANK = view_of(np.zeros((48, 64, 3), np.uint8))

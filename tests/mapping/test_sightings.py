@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from mapping_scenes import CAMERA, gaussians_at, pose, renderer, view_of
 
 from aquaflow.mapping import sightings
 from aquaflow.mapping.gaussians import GaussianMap
 from aquaflow.mapping.sighted_points import Observations
 from aquaflow.mapping.sightings import MIN_VIEWS, sight
 from aquaflow.mapping.views import View
+from tests.mapping.mapping_scenes import CAMERA, gaussians_at, pose, renderer, view_of
 
 STEPS = [pose((0.0, 0.0, -0.15 * i)) for i in range(MIN_VIEWS)]
 """Cameras that back away from the points."""

@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from mapping_scenes import filmed, floor, path, renderer, settings, view_of
 
 from aquaflow.config import SunlightConfig
 from aquaflow.mapping.mapper import Mapper
@@ -22,6 +21,7 @@ from aquaflow.mapping.sunlight import (
     light_over,
 )
 from aquaflow.mapping.views import View
+from tests.mapping.mapping_scenes import filmed, floor, path, renderer, settings, view_of
 
 SOLID = torch.ones(48, 64)
 COLUMNS = 8

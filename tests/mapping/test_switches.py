@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from mapping_scenes import flat_pointmap, floor, grown, path, picture, renderer, settings, view_of
-from water_observations import B_RES, LAMP, D, sighted
 
 from aquaflow.config import MediumConfig
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.water_estimation import estimate_water, models_for
+from tests.mapping.mapping_scenes import (
+    flat_pointmap,
+    floor,
+    grown,
+    path,
+    picture,
+    renderer,
+    settings,
+    view_of,
+)
+from tests.mapping.water_observations import B_RES, LAMP, D, sighted
 
 
 def test_without_shading_the_fit_knows_no_lamp() -> None:

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mapping_scenes import CAMERA, view_of
 
 from aquaflow.config import parse_config
 from aquaflow.mapping.view_budget import alike, let_surplus_go
 from aquaflow.mapping.views import View, ViewStore
 from aquaflow.maps import Growth, Maps
+from tests.mapping.mapping_scenes import CAMERA, view_of
 
 MOST = 4
 SETTINGS = parse_config(

@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 import torch
-from mapping_scenes import CAMERA, cloud, picture, pose, renderer, view_of
 
 from aquaflow.geometry.similarity import Sim3, so3_exp, so3_log
 from aquaflow.mapping.rendering import show
 from aquaflow.mapping.views import BETAS, View, refine_pose
 from aquaflow.render.contract import Renderer
 from aquaflow.render.reference import ReferenceRenderer
+from tests.mapping.mapping_scenes import CAMERA, cloud, picture, pose, renderer, view_of
 
 TRUE = pose((0.1, -0.05, 0.02), (0.02, -0.03, 0.05))
 BLANK = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)

@@ -8,7 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from mapping_scenes import (
+
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.views import View, ViewStore
+from tests.mapping.mapping_scenes import (
     CAMERA,
     copied,
     filmed,
@@ -20,10 +24,6 @@ from mapping_scenes import (
     settings,
     view_of,
 )
-
-from aquaflow.geometry.camera import CameraModel
-from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.views import View, ViewStore
 
 STEPS = {"refine_steps": 12}
 

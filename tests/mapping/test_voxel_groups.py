@@ -9,12 +9,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mapping_scenes import pose
 from torch import Tensor
 
 from aquaflow.config import VoxelConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.voxel_groups import EMPTY, VoxelGroups
+from tests.mapping.mapping_scenes import pose
 
 SIZE = 0.1
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from water_observations import B_INF, B_RES, D, sighted
 
 from aquaflow.config import WaterPriorsConfig
 from aquaflow.mapping.sighted_points import informative
@@ -12,6 +11,7 @@ from aquaflow.mapping.water_beliefs import BRIGHT_LEVEL, DARK_LEVEL, beliefs
 from aquaflow.mapping.water_estimation import _cost, _normal_equations, estimate_water
 from aquaflow.mapping.water_model import WaterModel
 from aquaflow.mapping.water_parameters import Model
+from tests.mapping.water_observations import B_INF, B_RES, D, sighted
 
 NOTHING = {"dark_channel": False, "saturation": False}
 EACH = [

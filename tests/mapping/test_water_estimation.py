@@ -8,7 +8,6 @@ from itertools import product
 
 import numpy as np
 import pytest
-from water_observations import B_INF, B_RES, BETA, LAMP, Array, B, D, fitted, sighted
 
 from aquaflow.config import MediumConfig
 from aquaflow.mapping.shading import TERMS, shading_basis
@@ -26,6 +25,7 @@ from aquaflow.mapping.water_estimation import (
 )
 from aquaflow.mapping.water_model import WaterModel
 from aquaflow.mapping.water_parameters import Model
+from tests.mapping.water_observations import B_INF, B_RES, BETA, LAMP, Array, B, D, fitted, sighted
 
 
 @cache

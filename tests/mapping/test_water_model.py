@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from water_observations import B_RES, D
 
 from aquaflow.mapping.shading import TERMS
 from aquaflow.mapping.sighted_points import MIN_RANGE_RATIO, Observations, informative, mean_by
 from aquaflow.mapping.water_model import WaterModel
 from aquaflow.mapping.water_parameters import MAX_LOG_RATE, Model
+from tests.mapping.water_observations import B_RES, D
 
 POINTS, SIGHTINGS, VIEWS = 40, 6, 5
 

@@ -6,13 +6,13 @@ import logging
 from pathlib import Path
 
 import pytest
-from stub_prior import write_stub
 
 from aquaflow.config import PriorConfig
 from aquaflow.errors import AquaFlowError, InputError
 from aquaflow.prior import choice
 from aquaflow.prior.choice import make_prior
 from aquaflow.prior.folder import ENCODER
+from tests.prior.stub_prior import write_stub
 
 
 def test_classical_needs_nothing() -> None:

@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 import pytest
-from textured_pictures import (
+
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3, so3_exp
+from aquaflow.prior import flow_pair, homography
+from aquaflow.prior.classical import ClassicalPrior
+from aquaflow.prior.flow import CONFIDENCE_SIGMA_PX, sample
+from aquaflow.prior.flow_pair import FlowPair
+from tests.prior.textured_pictures import (
     HEIGHT,
     WIDTH,
     Picture,
@@ -17,13 +24,6 @@ from textured_pictures import (
     shift,
     texture,
 )
-
-from aquaflow.geometry.camera import CameraModel
-from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.prior import flow_pair, homography
-from aquaflow.prior.classical import ClassicalPrior
-from aquaflow.prior.flow import CONFIDENCE_SIGMA_PX, sample
-from aquaflow.prior.flow_pair import FlowPair
 
 CAMERA = CameraModel(WIDTH, HEIGHT, 200.0, 200.0, 120.0, 90.0)
 T_BA = Sim3(so3_exp(np.array([0.01, -0.04, 0.02])), np.array([-0.12, 0.02, 0.03]))

@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import torch
-from textured_pictures import HEIGHT, WIDTH, moved_pair, shift
 from typer.testing import CliRunner
 
 from aquaflow import cli, cli_prior
@@ -26,6 +25,7 @@ from aquaflow.prior.compact.network import COARSE, CompactPrior, NetworkSize
 from aquaflow.prior.compact.quantise import INT8_ENCODER
 from aquaflow.prior.folder import DECODER, ENCODER, read_card
 from aquaflow.prior.runtime import RuntimeSettings, Session
+from tests.prior.textured_pictures import HEIGHT, WIDTH, moved_pair, shift
 
 pytest.importorskip("onnxruntime", reason="pip install 'aquaflow[prior]'")
 

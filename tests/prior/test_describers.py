@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stub_prior import write_stub
 
 from aquaflow.errors import InputError
 from aquaflow.prior import describers
 from aquaflow.prior.describers import CompactDescriber, describer_in
 from aquaflow.prior.runtime import Precision, RuntimeSettings
+from tests.prior.stub_prior import write_stub
 
 pytest.importorskip("onnxruntime", reason="pip install 'aquaflow[prior]'")
 pytest.importorskip("onnx", reason="pip install 'aquaflow[export]'")

@@ -4,7 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from textured_pictures import (
+
+from aquaflow.prior.flow import (
+    BORDER_PX,
+    Flow,
+    FlowMatcher,
+    confidence,
+    normalised_grey,
+    pixel_grid,
+    sample,
+)
+from aquaflow.prior.flow import texture as texture_of
+from tests.prior.textured_pictures import (
     HEIGHT,
     WIDTH,
     Picture,
@@ -17,17 +28,6 @@ from textured_pictures import (
     shift,
     texture,
 )
-
-from aquaflow.prior.flow import (
-    BORDER_PX,
-    Flow,
-    FlowMatcher,
-    confidence,
-    normalised_grey,
-    pixel_grid,
-    sample,
-)
-from aquaflow.prior.flow import texture as texture_of
 
 
 def flow_between(a: Picture, b: Picture, start: np.ndarray | None = None) -> Flow:

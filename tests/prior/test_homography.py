@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from textured_pictures import HEIGHT, WIDTH, inside, mapped, moved_pair, pixel_centres, shift
 
 from aquaflow.prior.flow import normalised_grey
 from aquaflow.prior.homography import (
@@ -13,6 +12,15 @@ from aquaflow.prior.homography import (
     detect,
     flow_of_homography,
     homography,
+)
+from tests.prior.textured_pictures import (
+    HEIGHT,
+    WIDTH,
+    inside,
+    mapped,
+    moved_pair,
+    pixel_centres,
+    shift,
 )
 
 

@@ -7,8 +7,6 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
-from patch_describer import PatchDescriber
-from textured_pictures import HEIGHT, WIDTH, Picture, moved_pair, pixel_centres, shift
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
@@ -16,6 +14,8 @@ from aquaflow.keyframes import KeyframeStore, Pointmap
 from aquaflow.prior import homography
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.hybrid import HybridEncoding, HybridPrior
+from tests.prior.patch_describer import PatchDescriber
+from tests.prior.textured_pictures import HEIGHT, WIDTH, Picture, moved_pair, pixel_centres, shift
 
 CAMERA = CameraModel(WIDTH, HEIGHT, 200.0, 200.0, 120.0, 90.0)
 FAR = (0.4 * WIDTH, -20.0)

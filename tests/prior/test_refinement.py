@@ -5,9 +5,17 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from textured_pictures import HEIGHT, WIDTH, Array, mapped, moved_pair, pixel_centres, shift
 
 from aquaflow.prior.refinement import MAX_STEP_PX, Float, Grey, refine
+from tests.prior.textured_pictures import (
+    HEIGHT,
+    WIDTH,
+    Array,
+    mapped,
+    moved_pair,
+    pixel_centres,
+    shift,
+)
 
 ZOOM = np.array([[1.06, -0.03, -4.0], [0.03, 1.06, -6.0], [0.0, 0.0, 1.0]])
 INNER = np.s_[15:-15, 20:-20]

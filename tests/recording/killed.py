@@ -9,12 +9,11 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from small_recording import GIVE_UP_S
-
 from aquaflow.messages import Dropped
 from sim_drivers.mcap_camera import McapCamera
 from sim_drivers.mcap_messages import McapMessages, mcap_files
 from sim_drivers.mcap_telemetry import McapTelemetry
+from tests.small_recording import GIVE_UP_S
 
 FPS = 30
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 
 import pytest
-from small_recording import GIVE_UP_S
 
 from aquaflow.recording import Recorder, writing
 from aquaflow.recording import recorder as recorder_module
+from tests.small_recording import GIVE_UP_S
 
 
 class SimulatedTime:

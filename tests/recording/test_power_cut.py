@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from killed import FPS, Killed, record_and_kill, write_source
-from simulated_time import simulated, written
 
 from aquaflow.config.recording import RecordingConfig
 from aquaflow.geometry.camera import guess_camera
@@ -17,6 +15,8 @@ from aquaflow.messages import Depth, Dropped, Frame
 from aquaflow.recording import Recorder
 from sim_drivers.mcap_camera import McapCamera
 from sim_drivers.mcap_telemetry import McapTelemetry
+from tests.recording.killed import FPS, Killed, record_and_kill, write_source
+from tests.recording.simulated_time import simulated, written
 
 FRAMES = 40
 

@@ -14,9 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import Cli, refused
-from killed import FPS, sentence, under_way, write_source
-from small_recording import GIVE_UP_S
 
 from aquaflow.config.recording import RecordingConfig
 from aquaflow.config.telemetry import TelemetryConfig
@@ -30,6 +27,9 @@ from aquaflow.sources import open_links
 from sim_drivers.mcap_camera import McapCamera
 from sim_drivers.mcap_messages import McapMessages, mcap_files
 from sim_drivers.mcap_telemetry import McapTelemetry
+from tests.command_line import Cli, refused
+from tests.recording.killed import FPS, sentence, under_way, write_source
+from tests.small_recording import GIVE_UP_S
 
 HOUR_S = 3600.0
 

@@ -10,8 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from simulated_time import SimulatedTime, simulated, written
-from small_recording import GIVE_UP_S
 
 from aquaflow.config.recording import RecordingConfig
 from aquaflow.errors import InputError
@@ -35,6 +33,8 @@ from aquaflow.recording.pictures import encode
 from sim_drivers.mcap_camera import McapCamera
 from sim_drivers.mcap_messages import McapMessages, mcap_files
 from sim_drivers.mcap_telemetry import McapTelemetry
+from tests.recording.simulated_time import SimulatedTime, simulated, written
+from tests.small_recording import GIVE_UP_S
 
 SECOND = 1_000_000_000
 CAMERA = CameraModel(

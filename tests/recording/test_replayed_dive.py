@@ -6,13 +6,13 @@ import csv
 from pathlib import Path
 
 import pytest
-from command_line import Cli
-from small_recording import QUICK
 
 from aquaflow.config.recording import RecordingConfig
 from aquaflow.recording import Recorder
 from aquaflow.sources import open_recorded_telemetry, open_recording
 from sim_drivers.mcap_telemetry import McapTelemetry
+from tests.command_line import Cli
+from tests.small_recording import QUICK
 
 SAME = ("trajectory.tum", "map.ply", "map_clear.ply", "medium.json")
 

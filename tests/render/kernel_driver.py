@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import torch
-from render_scenes import Scene
 
 from aquaflow.render.native import build as native
+from tests.render.render_scenes import Scene
 
 SOURCE = Path(__file__).parent / "native" / "kernel_driver.cpp"
 TIMEOUT_S = 300.0

@@ -8,7 +8,12 @@ from functools import cache
 
 import pytest
 import torch
-from render_scenes import (
+from torch import Tensor
+
+from aquaflow.render.contract import Rendering
+from aquaflow.render.cpu import CpuRenderer
+from aquaflow.render.native import build as native
+from tests.render.render_scenes import (
     NAMES,
     Scene,
     draw_and_differentiate,
@@ -16,11 +21,6 @@ from render_scenes import (
     reference,
     relative_error,
 )
-from torch import Tensor
-
-from aquaflow.render.contract import Rendering
-from aquaflow.render.cpu import CpuRenderer
-from aquaflow.render.native import build as native
 
 SEEDS = range(20)
 IMAGE_ERROR, GRADIENT_ERROR = 1e-4, 5e-5

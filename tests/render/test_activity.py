@@ -4,16 +4,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-from render_scenes import (
-    HEIGHT,
-    NAMES,
-    WIDTH,
-    Scene,
-    draw_and_differentiate,
-    random_scene,
-    reference,
-    relative_error,
-)
 from torch import Tensor
 
 from aquaflow.errors import AquaFlowError
@@ -23,6 +13,16 @@ from aquaflow.render.cpu import CpuRenderer
 from aquaflow.render.native import build as native
 from aquaflow.render.reference import ReferenceRenderer
 from aquaflow.render.tiles import TileRenderer
+from tests.render.render_scenes import (
+    HEIGHT,
+    NAMES,
+    WIDTH,
+    Scene,
+    draw_and_differentiate,
+    random_scene,
+    reference,
+    relative_error,
+)
 
 GRID = tile_grid(WIDTH, HEIGHT)
 CHECKERBOARD = torch.arange(GRID[0])[:, None].add(torch.arange(GRID[1])) % 2 == 0

@@ -8,12 +8,18 @@ from types import ModuleType
 
 import pytest
 import torch
-from render_scenes import NAMES, draw_and_differentiate, random_scene, reference, relative_error
 
 from aquaflow.errors import AquaFlowError
 from aquaflow.render import gsplat, select_renderer
 from aquaflow.render.cpu import CpuRenderer
 from aquaflow.render.native import build as native
+from tests.render.render_scenes import (
+    NAMES,
+    draw_and_differentiate,
+    random_scene,
+    reference,
+    relative_error,
+)
 
 
 class Installed:

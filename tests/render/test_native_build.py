@@ -6,12 +6,12 @@ import shutil
 from pathlib import Path
 
 import pytest
-from render_scenes import HEIGHT, WIDTH, random_scene
 
 from aquaflow.render import library
 from aquaflow.render.cpu import CpuRenderer
 from aquaflow.render.native import build as native
 from aquaflow.render.reference import ReferenceRenderer
+from tests.render.render_scenes import HEIGHT, WIDTH, random_scene
 
 needs_compiler = pytest.mark.skipif(native.find_compiler() is None, reason="no C++ compiler")
 

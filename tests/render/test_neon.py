@@ -10,13 +10,13 @@ import shutil
 
 import pytest
 import torch
-from kernel_driver import Task, compile_driver, run_driver
-from render_scenes import HEIGHT, NAMES, WIDTH, Scene, random_scene, relative_error
 
 from aquaflow.render.native import build as native
 from aquaflow.render.photometric import photometric_loss_torch
 from aquaflow.render.reference import ReferenceRenderer
 from aquaflow.render.water import compose_water_torch
+from tests.render.kernel_driver import Task, compile_driver, run_driver
+from tests.render.render_scenes import HEIGHT, NAMES, WIDTH, Scene, random_scene, relative_error
 
 CROSS_COMPILER = "aarch64-linux-gnu-g++"
 EMULATORS = ("qemu-aarch64", "qemu-aarch64-static")

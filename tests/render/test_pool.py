@@ -6,11 +6,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
-from render_scenes import draw_and_differentiate, random_scene
 from torch import Tensor
 
 from aquaflow.render.cpu import CpuRenderer
 from aquaflow.render.native import build as native
+from tests.render.render_scenes import draw_and_differentiate, random_scene
 
 pytestmark = pytest.mark.skipif(native.find_compiler() is None, reason="no C++ compiler")
 

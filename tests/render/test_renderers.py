@@ -8,16 +8,6 @@ from functools import cache
 
 import pytest
 import torch
-from render_scenes import (
-    HEIGHT,
-    NAMES,
-    WIDTH,
-    Scene,
-    draw_and_differentiate,
-    random_scene,
-    reference,
-    relative_error,
-)
 
 from aquaflow.errors import AquaFlowError
 from aquaflow.render import contract
@@ -27,6 +17,16 @@ from aquaflow.render.library import STAGES, load_library
 from aquaflow.render.native import build as native
 from aquaflow.render.reference import ReferenceRenderer
 from aquaflow.render.tiles import TileRenderer
+from tests.render.render_scenes import (
+    HEIGHT,
+    NAMES,
+    WIDTH,
+    Scene,
+    draw_and_differentiate,
+    random_scene,
+    reference,
+    relative_error,
+)
 
 has_compiler = native.find_compiler() is not None
 needs_compiler = pytest.mark.skipif(not has_compiler, reason="no C++ compiler")

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from kernel_driver import Task, compile_driver, run_driver
-from render_scenes import Scene, random_scene
 
 from aquaflow.render.native import build as native
+from tests.render.kernel_driver import Task, compile_driver, run_driver
+from tests.render.render_scenes import Scene, random_scene
 
 CHECKS = "address,undefined,float-cast-overflow"
 SANITIZE = ("-O1", "-g1", f"-fsanitize={CHECKS}", "-fno-sanitize-recover=all")

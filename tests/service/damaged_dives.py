@@ -14,7 +14,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from live_scenes import VEHICLE, ToldFeed, caught_up
 
 from aquaflow.dive_run import Finished
 from aquaflow.errors import InputError
@@ -29,6 +28,7 @@ from aquaflow.service.session import LiveDive
 from aquaflow.sources import open_recording
 from aquaflow.spill import read_thing
 from aquaflow.synthetic import SyntheticConfig, write_dive
+from tests.service.live_scenes import VEHICLE, ToldFeed, caught_up
 
 PICTURES = SyntheticConfig(frames=26, width=96, height=72)
 STOPPED, FIRST, SECOND, KILLED = 11, 16, 20, 23

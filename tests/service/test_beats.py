@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from live_scenes import Clock, Told
 
 from aquaflow.service.beats import Beats, Guard
 from aquaflow.service.notify import Notifier
+from tests.service.live_scenes import Clock, Told
 
 
 @pytest.fixture

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from live_scenes import VEHICLE, ToldFeed, caught_up
 
 from aquaflow import spill
 from aquaflow.config.service import CheckpointConfig
@@ -27,6 +26,7 @@ from aquaflow.service.report import report
 from aquaflow.service.session import LiveDive
 from aquaflow.service.window import LiveWindow, in_words
 from aquaflow.sources import open_recording
+from tests.service.live_scenes import VEHICLE, ToldFeed, caught_up
 
 CLOCKS = {"autopilot": [[12, 12_000_000_000, 345, None, None]]}
 CUT = 12

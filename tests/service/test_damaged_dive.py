@@ -7,9 +7,6 @@ import shutil
 from pathlib import Path
 
 import pytest
-from command_line import Cli, refused
-from damaged_dives import Outcome, gone_on_with, killed_dive, many, readable
-from live_scenes import VEHICLE, ToldFeed
 
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.errors import ConfigError
@@ -18,6 +15,9 @@ from aquaflow.frame_rows import read_rows
 from aquaflow.messages import Frame
 from aquaflow.service.generations import previous_file, read_state, state_file
 from aquaflow.service.onboard import begun
+from tests.command_line import Cli, refused
+from tests.service.damaged_dives import Outcome, gone_on_with, killed_dive, many, readable
+from tests.service.live_scenes import VEHICLE, ToldFeed
 
 SAMPLED = 6
 

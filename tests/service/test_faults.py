@@ -16,8 +16,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from live_scenes import VEHICLE, Clock
-from small_recording import GIVE_UP_S
 
 from aquaflow.config import SourceConfig
 from aquaflow.config.cameras import V4l2Config
@@ -38,6 +36,8 @@ from sim_drivers.devices.ardusub import ArduSub
 from sim_drivers.devices.device import SimulatedDevice
 from sim_drivers.devices.wires import PtyWire
 from sim_drivers.v4l2_kernel import V4l2Kernel
+from tests.service.live_scenes import VEHICLE, Clock
+from tests.small_recording import GIVE_UP_S
 
 FPS = 10.0
 PLACE = 8

@@ -6,12 +6,12 @@ import json
 from pathlib import Path
 
 import pytest
-from killed_dives import CONFIG
-from paced import paced_run
-from small_recording import FRAMES
 
 from aquaflow.frame_rows import read_rows
 from aquaflow.service.generations import read_state, state_file
+from tests.service.killed_dives import CONFIG
+from tests.service.paced import paced_run
+from tests.small_recording import FRAMES
 
 FULL_AT = 12
 """The picture at which the disk is full, once there is a checkpoint of those before it."""

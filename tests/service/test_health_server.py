@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_line import Cli
 
 from aquaflow.access import Access, read_token
 from aquaflow.config.service import ListenConfig, ServiceConfig
@@ -21,6 +20,7 @@ from aquaflow.errors import ConfigError
 from aquaflow.service.health import State
 from aquaflow.service.http import MOST_CLIENTS, HealthServer
 from aquaflow.service.prometheus import exposition
+from tests.command_line import Cli
 
 TOKEN = "correct-horse-battery"
 REPORT: dict[str, Any] = {

@@ -6,10 +6,10 @@ import json
 from pathlib import Path
 
 import pytest
-from killed_dives import kill_and_resume
 
 from aquaflow.frame_rows import read_rows
 from aquaflow.synthetic import SyntheticConfig, write_dive
+from tests.service.killed_dives import kill_and_resume
 
 
 def tracked_to_the_end(dive: Path, frames: int) -> None:

@@ -10,8 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from live_scenes import HEIGHT, WIDTH
-from small_recording import GIVE_UP_S
 
 from aquaflow.config import SourceConfig
 from aquaflow.config.cameras import V4l2Config
@@ -31,6 +29,8 @@ from sim_drivers.devices.device import SimulatedDevice
 from sim_drivers.devices.wires import UdpWire
 from sim_drivers.faults import Faults, faulty
 from sim_drivers.v4l2_kernel import V4l2Kernel
+from tests.service.live_scenes import HEIGHT, WIDTH
+from tests.small_recording import GIVE_UP_S
 
 QUICK = {"stall_s": 60.0, "first_retry_s": 0.02, "last_retry_s": 0.05}
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from live_scenes import CALM, Told, frame_of, rows_of, visited
 
 from aquaflow.errors import AquaFlowError
 from aquaflow.messages import Dropped
 from aquaflow.service.health import State
 from aquaflow.service.ladder import Level
+from tests.service.live_scenes import CALM, Told, frame_of, rows_of, visited
 
 
 @pytest.fixture

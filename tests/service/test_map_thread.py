@@ -7,7 +7,6 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from live_scenes import HEIGHT, WIDTH, RecordedMaps
 
 from aquaflow.config.service import LiveMappingConfig
 from aquaflow.geometry.camera import guess_camera
@@ -18,6 +17,7 @@ from aquaflow.maps import Growth, Insertion
 from aquaflow.service.beats import Beats
 from aquaflow.service.ladder import Level
 from aquaflow.service.map_thread import LONGEST_REST_S, STAGE, MapThread
+from tests.service.live_scenes import HEIGHT, WIDTH, RecordedMaps
 
 CAMERA = guess_camera(WIDTH, HEIGHT)
 

@@ -7,12 +7,12 @@ import threading
 from pathlib import Path
 
 import pytest
-from live_scenes import ToldFeed
-from soak import Rounds, Sample, Sampler, descriptors, soak, summary
 
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.service.choice import resumed
 from aquaflow.service.session import LiveDive
+from tests.service.live_scenes import ToldFeed
+from tests.service.soak import Rounds, Sample, Sampler, descriptors, soak, summary
 
 MOST_VIEWS, MOST_HELD_OUT, ROUNDS = 2, 3, 2
 FEW = {"steps_keyframe": 1, "steps_mapping": 1, "steps_common": 0, "refine_steps": 2}

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from live_scenes import Told, frame_of
 
 from aquaflow.config.service import PoseConfig
 from aquaflow.config.telemetry import parse_telemetry
@@ -20,6 +19,7 @@ from aquaflow.service.vehicle import VehicleReport
 from aquaflow.tracking.frames import FrameClass, Quality, Tracked
 from aquaflow.vehicle_words import BodyMotion, BodyPose, Number, Sentence, Word
 from drivers.protocol.mavlink import MavlinkDecoder
+from tests.service.live_scenes import Told, frame_of
 
 pytest.importorskip("pymavlink", reason="pymavlink is not installed")
 

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from live_scenes import VEHICLE, ToldFeed
 
 from aquaflow.config.service import CheckpointConfig
 from aquaflow.errors import InputError
@@ -28,6 +27,7 @@ from aquaflow.service.generations import (
 from aquaflow.service.moment import Moment
 from aquaflow.service.onboard import map_live
 from aquaflow.service.session import LiveDive
+from tests.service.live_scenes import VEHICLE, ToldFeed
 
 
 def write_numbered(dive: Path, number: int) -> None:

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 import torch
-from command_line import Cli, refused
 
 from aquaflow import preparation
 from aquaflow.config import TrackingConfig
@@ -20,6 +19,7 @@ from aquaflow.mapping import gaussians, image_formation, losses, mapper, medium,
 from aquaflow.prior import flow, homography
 from aquaflow.render import adam, reference, water
 from aquaflow.tracking import attachment, bundle, initialisation, solver
+from tests.command_line import Cli, refused
 
 INFINITY = float("inf")
 

@@ -6,14 +6,23 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from tracked_clips import PLACED, QUICK, SMALL, error_share, path, plane_depth, run, told
-from tracking_scenes import KnownPair, KnownPrior, KnownView, pose
 
 from aquaflow.errors import InputError
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.tracking.frames import FrameClass
 from aquaflow.tracking.tracker import Tracker
+from tests.tracking.tracked_clips import (
+    PLACED,
+    QUICK,
+    SMALL,
+    error_share,
+    path,
+    plane_depth,
+    run,
+    told,
+)
+from tests.tracking.tracking_scenes import KnownPair, KnownPrior, KnownView, pose
 
 SNOWED = range(6, 12)
 HIDDEN = 0.55

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import pytest
-from tracked_clips import error_share
-from tracking_scenes import SeaFloor, black, filmed, lawn_path
 
 from aquaflow.config import TrackingConfig
 from aquaflow.keyframes import KeyframeStore
@@ -13,6 +11,8 @@ from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.tracking import tracker as module
 from aquaflow.tracking.frames import Tracked
 from aquaflow.tracking.tracker import Tracker
+from tests.tracking.tracked_clips import error_share
+from tests.tracking.tracking_scenes import SeaFloor, black, filmed, lawn_path
 
 POSES = lawn_path(12, step_m=0.12)
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tracking_scenes import CAMERA, cloud, pose
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp, so3_log
 from aquaflow.tracking import bundle as module
 from aquaflow.tracking.bundle import Bundle, BundleResult, adjust
+from tests.tracking.tracking_scenes import CAMERA, cloud, pose
 
 Array = npt.NDArray[np.float64]
 

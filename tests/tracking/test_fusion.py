@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tracking_scenes import KnownPair, KnownView, depth_map, pose
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
@@ -20,6 +19,7 @@ from aquaflow.tracking.fusion import (
     fuse,
     transfer,
 )
+from tests.tracking.tracking_scenes import KnownPair, KnownView, depth_map, pose
 
 Array = npt.NDArray[np.float64]
 

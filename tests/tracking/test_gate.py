@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tracking_scenes import CAMERA, SeaFloor, lawn_path, pose
 
 from aquaflow.config import GateConfig
 from aquaflow.tracking.gate import FrameGate, GateKind, Verdict
+from tests.tracking.tracking_scenes import CAMERA, SeaFloor, lawn_path, pose
 
 Picture = npt.NDArray[np.uint8]
 

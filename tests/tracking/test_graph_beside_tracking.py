@@ -11,7 +11,6 @@ from typing import cast
 
 import numpy as np
 import pytest
-from graph_scenes import LOOP_SIGMA, SIGMA, circle
 
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry.camera import CameraModel
@@ -24,6 +23,7 @@ from aquaflow.tracking.keyframe_graph import Correction, KeyframeGraph
 from aquaflow.tracking.places import Found, Places
 from aquaflow.tracking.pose_graph_table import GraphResult, Snapshot
 from aquaflow.tracking.solver import Degeneracy, PoseEstimate
+from tests.tracking.graph_scenes import LOOP_SIGMA, SIGMA, circle
 
 COUNT = 24
 TRUTH = circle(COUNT)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
-from tracking_scenes import SeaFloor, black, filmed, pose
 
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry.alignment import align
@@ -19,6 +18,7 @@ from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.tracking.keyframe_graph import Correction, KeyframeGraph
 from aquaflow.tracking.places import Places
 from aquaflow.tracking.tracker import Tracker
+from tests.tracking.tracking_scenes import SeaFloor, black, filmed, pose
 
 COUNT, RADIUS_M = 24, 0.9
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tracked_clips import PLACED, run
 
 from aquaflow.config import PriorConfig, SourceConfig
 from aquaflow.evaluation.trajectory import read_tum
@@ -16,6 +15,7 @@ from aquaflow.preparation import Preparation
 from aquaflow.prior.choice import SHIPPED, make_prior
 from aquaflow.prior.folder import CARD
 from aquaflow.sources import open_recording
+from tests.tracking.tracked_clips import PLACED, run
 
 EVERY = 3
 """Frames from one to the next: nine tenths of a second at walking pace."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 import pytest
-from graph_scenes import EXACT, INFORMATION, LOOP_SIGMA, Dive, largest_gap, moved
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -13,6 +12,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.tracking.pose_graph import Edge, PoseGraph, edge_information, solve
 from aquaflow.tracking.pose_graph_equations import Equations, Misfit
+from tests.tracking.graph_scenes import EXACT, INFORMATION, LOOP_SIGMA, Dive, largest_gap, moved
 
 Array = npt.NDArray[np.float64]
 

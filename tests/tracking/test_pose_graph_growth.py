@@ -4,10 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from graph_scenes import EXACT, INFORMATION, LOOP_SIGMA, SIGMA, STEP_M, Dive, largest_gap, moved
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.tracking.pose_graph import Edge, solve
+from tests.tracking.graph_scenes import (
+    EXACT,
+    INFORMATION,
+    LOOP_SIGMA,
+    SIGMA,
+    STEP_M,
+    Dive,
+    largest_gap,
+    moved,
+)
 
 # Components
 

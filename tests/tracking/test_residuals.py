@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tracking_scenes import cloud, pose, problem_of
 
 from aquaflow.config.tracking import PoseResidual
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.tracking.residuals import ROWS, Matches, PoseProblem
 from aquaflow.tracking.solver import solve_pose
+from tests.tracking.tracking_scenes import cloud, pose, problem_of
 
 Array = npt.NDArray[np.float64]
 

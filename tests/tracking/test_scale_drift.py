@@ -5,13 +5,13 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from tracking_scenes import Array, SeaFloor, filmed, pose
 
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.tracking.tracker import Tracker
+from tests.tracking.tracking_scenes import Array, SeaFloor, filmed, pose
 
 STEP_M = 0.12
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tracking_scenes import SeaFloor, filmed, lawn_path
 
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry.camera import CameraModel
@@ -14,6 +13,7 @@ from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.contract import Encoding
 from aquaflow.prior.flow_pair import FlowEncoding, FlowPair
 from aquaflow.tracking.tracker import Tracker
+from tests.tracking.tracking_scenes import SeaFloor, filmed, lawn_path
 
 
 class Counting(ClassicalPrior):

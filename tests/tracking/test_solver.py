@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tracking_scenes import CAMERA, cloud, pose, problem_of
 
 from aquaflow.geometry.similarity import Sim3, so3_exp, so3_log
 from aquaflow.tracking import solver
 from aquaflow.tracking.certainty import UNKNOWN_SIGMA, certainty
 from aquaflow.tracking.residuals import Matches, Rows
 from aquaflow.tracking.solver import PoseProblem, solve_pose
+from tests.tracking.tracking_scenes import CAMERA, cloud, pose, problem_of
 
 Array = npt.NDArray[np.float64]
 

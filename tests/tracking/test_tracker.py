@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tracked_clips import PLACED, Run, error_share, run
-from tracking_scenes import CAMERA, SeaFloor, black, filmed, lawn_path
 
 from aquaflow.config import TrackingConfig
 from aquaflow.messages import Frame
 from aquaflow.tracking.frames import FrameClass
+from tests.tracking.tracked_clips import PLACED, Run, error_share, run
+from tests.tracking.tracking_scenes import CAMERA, SeaFloor, black, filmed, lawn_path
 
 FRAMES = 18
 POSES = lawn_path(FRAMES, step_m=0.12)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tracked_clips import PLACED, QUICK, SMALL, error_share, path, plane_depth, run, told
-from tracking_scenes import KnownPrior, KnownView, depth_map, pose
 
 from aquaflow.config import InitialisationConfig, TrackingConfig
 from aquaflow.geometry.camera import CameraModel
@@ -14,6 +12,17 @@ from aquaflow.keyframes import KeyframeStore
 from aquaflow.tracking import tracker as module
 from aquaflow.tracking.frames import FrameClass
 from aquaflow.tracking.tracker import Tracker
+from tests.tracking.tracked_clips import (
+    PLACED,
+    QUICK,
+    SMALL,
+    error_share,
+    path,
+    plane_depth,
+    run,
+    told,
+)
+from tests.tracking.tracking_scenes import KnownPrior, KnownView, depth_map, pose
 
 
 def test_the_plane_of_these_tests_is_the_plane_of_the_scenes() -> None:

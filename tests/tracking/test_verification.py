@@ -5,7 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from tracking_scenes import CAMERA, SeaFloor, pose
 
 from aquaflow.config import VerificationConfig
 from aquaflow.geometry.similarity import Sim3, so3_log
@@ -15,6 +14,7 @@ from aquaflow.prior.contract import Keypoints
 from aquaflow.prior.flow_pair import FlowEncoding
 from aquaflow.tracking.keypoints import match_keypoints
 from aquaflow.tracking.verification import verify
+from tests.tracking.tracking_scenes import CAMERA, SeaFloor, pose
 
 FLOOR = SeaFloor()
 PRIOR = ClassicalPrior()

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tracking_scenes import CAMERA, pose
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
 from aquaflow.tracking.visibility import agreeing, expected, predicted_matches, visibility
+from tests.tracking.tracking_scenes import CAMERA, pose
 
 DEPTH = 2.0
 SHAPE = (CAMERA.height, CAMERA.width)

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from tracking_scenes import KnownPrior, KnownView, pose
 
 from aquaflow.config import InitialisationConfig, TrackingConfig
 from aquaflow.geometry.alignment import align
@@ -18,6 +17,7 @@ from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.contract import Prior
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.tracking.tracker import Tracker
+from tests.tracking.tracking_scenes import KnownPrior, KnownView, pose
 
 PLACED = {FrameClass.KEYFRAME, FrameClass.MAPPING, FrameClass.COMMON}
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from plane_pairs import FOCAL_PX, plane_view, shifted_pair
 
 from aquaflow.training.correspondences import correspondences, overlap
 from aquaflow.training.pairs import Pair, true_pointmaps
+from tests.training.plane_pairs import FOCAL_PX, plane_view, shifted_pair
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -8,7 +8,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from data_trees import (
+
+from aquaflow.errors import InputError
+from aquaflow.training.datasets.colmap import colmap
+from aquaflow.training.datasets.flsea import flsea
+from aquaflow.training.datasets.mimir import mimir
+from aquaflow.training.datasets.openexr import read_exr
+from aquaflow.training.datasets.posed import Frames
+from aquaflow.training.datasets.tartanair import tartanair
+from aquaflow.training.datasets.uwstereo import uwstereo
+from tests.training.data_trees import (
     HEIGHT,
     LARGE,
     STEP_M,
@@ -23,15 +32,6 @@ from data_trees import (
     write_tartanair,
     write_uwstereo,
 )
-
-from aquaflow.errors import InputError
-from aquaflow.training.datasets.colmap import colmap
-from aquaflow.training.datasets.flsea import flsea
-from aquaflow.training.datasets.mimir import mimir
-from aquaflow.training.datasets.openexr import read_exr
-from aquaflow.training.datasets.posed import Frames
-from aquaflow.training.datasets.tartanair import tartanair
-from aquaflow.training.datasets.uwstereo import uwstereo
 
 Write, Read = Callable[[Path], None], Callable[[Path], list[Frames]]
 

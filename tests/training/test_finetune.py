@@ -10,8 +10,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from data_trees import write_colmap, write_tartanair
-from small_recording import GIVE_UP_S
 from typer.testing import CliRunner
 
 from aquaflow import cli
@@ -23,6 +21,8 @@ from aquaflow.training import finetune, peers
 from aquaflow.training.finetune import FineTuning, FineTuningSettings, mined, plan_of, read_data
 from aquaflow.training.mining import MinedPairs
 from aquaflow.training.peers import Peers, Together
+from tests.small_recording import GIVE_UP_S
+from tests.training.data_trees import write_colmap, write_tartanair
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

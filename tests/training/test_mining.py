@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from data_trees import FOCAL, STEP_M, WIDTH, depth_at, write_tartanair
 
 from aquaflow.errors import InputError
 from aquaflow.training import mining
@@ -20,6 +19,7 @@ from aquaflow.training.datasets.tartanair import tartanair
 from aquaflow.training.datasets.validity import moved, valid_pixels
 from aquaflow.training.mining import MinedPairs, load_index, mine, save_index
 from aquaflow.training.pairs import true_pointmaps
+from tests.training.data_trees import FOCAL, STEP_M, WIDTH, depth_at, write_tartanair
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 import pytest
 import torch
-from plane_pairs import shifted_pair
 from torch import Tensor
 from torch.nn import functional as F
 
 from aquaflow.training.losses import LossWeights, info_nce, match_loss, pair_loss, points_loss
 from aquaflow.training.pairs import Pair, true_pointmaps
 from aquaflow.training.schedule import Schedule
+from tests.training.plane_pairs import shifted_pair
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

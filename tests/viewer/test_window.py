@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_recording import HEIGHT, WIDTH
 
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.errors import InputError
@@ -19,6 +18,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.viewer.finished import read_dive, show_dive
 from aquaflow.viewer.splats import splats
 from aquaflow.viewer.window import Window
+from tests.small_recording import HEIGHT, WIDTH
 
 pytest.importorskip("viser", reason="viser is not installed")
 
