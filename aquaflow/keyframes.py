@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.array_file import Arrays
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.prior.contract import Encoding, Prior
-from aquaflow.spill import Spill
+from aquaflow.storage.array_file import Arrays
+from aquaflow.storage.spill import Spill
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

@@ -10,21 +10,21 @@ from pathlib import Path
 
 from aquaflow.config import Config
 from aquaflow.errors import ConfigError
-from aquaflow.failures import Failures
-from aquaflow.frame_table import FrameTable
+from aquaflow.errors.failures import Failures
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.maps import Growth, Insertion, Maps, MapWork
 from aquaflow.mapping.views import View
-from aquaflow.maps import Growth, Insertion, Maps, MapWork
 from aquaflow.messages import Frame
-from aquaflow.prior.choice import make_prior
+from aquaflow.prior.factory import make_prior
 from aquaflow.profiler import Profiler
 from aquaflow.render import select_renderer
+from aquaflow.tracking.frame_table import FrameTable
 from aquaflow.tracking.frames import FrameClass, Tracked, without_pictures
-from aquaflow.tracking.gate import FrameGate, GateKind, Verdict
-from aquaflow.tracking.keyframe_graph import KeyframeGraph
-from aquaflow.tracking.places import Places
+from aquaflow.tracking.gate.gate import FrameGate, GateKind, Verdict
+from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph
+from aquaflow.tracking.loops.relocaliser import Places
 from aquaflow.tracking.tracker import Tracker
 
 

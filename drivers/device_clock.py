@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from aquaflow.fusion.clock import ClockMapping
+from aquaflow.clocks.device import ClockMapping
 
 MAX_AGE_NS = 2_000_000_000
 """No link holds a message back longer; an older stamp tells of a clock that was set."""

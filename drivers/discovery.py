@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 from pathlib import Path
 
-from aquaflow.discovery import FoundDevice
+from aquaflow.sources.discovery import FoundDevice
 
 LUXONIS_USB_VENDOR = "03e7"
 ARPHRD_CAN = "280"

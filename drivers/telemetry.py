@@ -8,11 +8,11 @@ from collections.abc import Iterator, Mapping
 from importlib import import_module
 from typing import NamedTuple
 
+from aquaflow.clocks.device import ClockReport, Learned
 from aquaflow.config.telemetry import AnyDevice, TelemetryConfig
-from aquaflow.fusion.clock import ClockReport, Learned
 from aquaflow.messages import TelemetrySample
 from aquaflow.sources import RawTap
-from aquaflow.vehicle_words import Hears, Word
+from aquaflow.sources.outbound import Hears, Word
 from drivers.latest import LatestQueue
 from drivers.link import LinkCounters
 from drivers.mounting import BodyFrame, Mounting
@@ -124,7 +124,7 @@ class LinkTelemetry:
                 decoder.clock.mapping.resume(learned.get(name, ()))
 
     def tell(self, word: Word) -> bool:
-        """Tell every device that understands it; see :class:`aquaflow.vehicle_words.Hears`."""
+        """Tell every device that understands it; see :class:`aquaflow.sources.outbound.Hears`."""
         hearing = [decoder for decoder in self.decoders.values() if isinstance(decoder, Hears)]
         told = [decoder.tell(word) for decoder in hearing]
         return any(told)

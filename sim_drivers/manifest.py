@@ -20,8 +20,8 @@ from pydantic import Field
 from aquaflow.config.stage import Stage, validated
 from aquaflow.config.telemetry import AnyDevice
 from aquaflow.errors import ConfigError, InputError
+from aquaflow.errors.plain_yaml import read_mapping
 from aquaflow.messages import TelemetrySample
-from aquaflow.plain_yaml import read_mapping
 from aquaflow.sources import (
     RawTap,
     RecordedCamera,

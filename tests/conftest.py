@@ -31,7 +31,8 @@ from tests.small_recording import FRAMES, HEIGHT, QUICK, WIDTH
 
 __all__ = ["Cli", "Ran", "refused", "run_aquaflow"]
 
-# What a stage raises ends a test: a contained defect would stay hidden (aquaflow/failures.py).
+# What a stage raises ends a test: a contained defect would stay hidden
+# (aquaflow/errors/failures.py).
 os.environ["AQUAFLOW_STRICT"] = "1"
 
 # Before torch, OpenCV and BLAS are loaded, here and in the processes that tests start: tests run

@@ -11,25 +11,25 @@ from typing import Any
 
 import pytest
 
-from aquaflow import pipeline
 from aquaflow.config import Config
-from aquaflow.deliverables import Deliverables
-from aquaflow.dive import DiveFolder
-from aquaflow.dive_run import Finished
+from aquaflow.dive import replay
+from aquaflow.dive.deliverables import Deliverables
+from aquaflow.dive.folder import DiveFolder
+from aquaflow.dive.run import Finished
 from aquaflow.errors import InputError
-from aquaflow.failures import Failures
+from aquaflow.errors.failures import Failures
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.scene import Scene
 from aquaflow.messages import Dropped, Frame
-from aquaflow.preparation import Preparation
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.slam import Slam
 from aquaflow.sources import RecordedCamera, open_recording
-from aquaflow.tracking.attachment import Follower
-from aquaflow.tracking.gate import FrameGate
-from aquaflow.tracking.initialisation import Initialiser
-from aquaflow.tracking.keyframe_graph import KeyframeGraph
-from aquaflow.tracking.places import Places
+from aquaflow.sources.preprocessing import Preparation
+from aquaflow.tracking.current_keyframe import Follower
+from aquaflow.tracking.gate.gate import FrameGate
+from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph
+from aquaflow.tracking.initialisation.initialiser import Initialiser
+from aquaflow.tracking.loops.relocaliser import Places
 from aquaflow.tracking.tracker import Tracker
 
 pytestmark = pytest.mark.usefixtures("contained")
@@ -85,7 +85,7 @@ def raise_once(monkeypatch: pytest.MonkeyPatch) -> Callable[[type, str, int], No
 
 
 def mapped(recording: RecordedCamera, out: Path, **keywords: Any) -> Finished:
-    return pipeline.map_recording(recording, "planted", out, SETTINGS, **keywords)
+    return replay.map_recording(recording, "planted", out, SETTINGS, **keywords)
 
 
 def rows(dive: Path) -> list[dict[str, str]]:
@@ -231,7 +231,7 @@ def test_a_map_that_stays_empty_and_a_dive_of_few_poses_are_said_first(
     asked = SETTINGS.model_dump()
     asked["mapping"]["insertion"]["tau_a"] = 1.0
     recording, settings = open_recording(small_recording), Config.model_validate(asked)
-    finished = pipeline.map_recording(recording, "empty", tmp_path / "dive", settings)
+    finished = replay.map_recording(recording, "empty", tmp_path / "dive", settings)
     [warning] = finished.warnings
     assert warning.startswith("the map is empty")
     assert "mapping.insertion.tau_a is 1.0, by default" in warning

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from aquaflow.frame_rows import FrameRow, header, read_rows, readable_rows, to_text
+from aquaflow.dive.frames_csv import FrameRow, header, read_rows, readable_rows, to_text
 
 ROWS = [
     FrameRow(0, "film#0", 0.0, "keyframe", 0, 0, 1.0),

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from aquaflow import cli_devices, discovery
+from aquaflow.cli import devices
 from aquaflow.config.cameras import OakConfig, V4l2Config
 from aquaflow.config.link import CanConfig, SerialConfig
-from aquaflow.discovery import Found, FoundDevice, discover
+from aquaflow.sources import discovery
+from aquaflow.sources.discovery import Found, FoundDevice, discover
 from drivers import discovery as drivers
 from sim_drivers.camera_feed import CameraFeed
 from sim_drivers.images import ImageFolder
@@ -92,7 +93,7 @@ def test_the_table_shows_ids_and_lines_for_the_config(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(discovery, "discover", lambda: Found(working(), ["oak: no library"]))
-    cli_devices.devices()
+    devices.devices()
     printed = capsys.readouterr().out
     for part in ("Camera [1]", "abc", "kind: v4l2", "device: abc", "Not looked for: oak: no lib"):
         assert part in printed
@@ -102,7 +103,7 @@ def test_nothing_plugged_in_is_a_sentence(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(discovery, "discover", lambda: Found([], []))
-    cli_devices.devices()
+    devices.devices()
     assert capsys.readouterr().out == "No camera, serial port or CAN interface is plugged in.\n"
 
 

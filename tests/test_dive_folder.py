@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from aquaflow.config import Config, load_config
-from aquaflow.dive import DiveFolder
+from aquaflow.dive.folder import DiveFolder
+from aquaflow.dive.frames_csv import FrameRow
 from aquaflow.errors import InputError
 from aquaflow.evaluation.trajectory import read_tum
 from aquaflow.export.ply import read_ply
-from aquaflow.frame_rows import FrameRow
 from aquaflow.geometry.camera import load_camera
 from tests.small_recording import FRAMES, HEIGHT, WIDTH
 

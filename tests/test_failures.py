@@ -15,11 +15,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aquaflow.dive_log import JsonLog
+from aquaflow.dive.log import JsonLog
 from aquaflow.errors import ConfigError, InputError, NotMappedError
-from aquaflow.failures import RECENT_S, REPEATED, Failures
+from aquaflow.errors.failures import RECENT_S, REPEATED, Failures
 
-OWN = Path(sys.modules["aquaflow.failures"].__file__ or "").parent / "tracking" / "invented.py"
+OWN = (
+    Path(sys.modules["aquaflow.errors.failures"].__file__ or "").parents[1]
+    / "tracking"
+    / "invented.py"
+)
 
 
 def raise_in(path: Path | str, statement: str) -> None:

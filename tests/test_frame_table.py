@@ -6,11 +6,11 @@ import tracemalloc
 
 import numpy as np
 
-from aquaflow.frame_rows import FrameRow, of_text, to_text
-from aquaflow.frame_table import CHUNK, FrameTable
+from aquaflow.dive.frames_csv import FrameRow, of_text, to_text
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.messages import Frame
+from aquaflow.tracking.frame_table import CHUNK, FrameTable
 from aquaflow.tracking.frames import FrameClass, Quality, Tracked
 
 CAMERA = guess_camera(64, 48)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aquaflow import image_metrics as images
+from aquaflow.render import image_metrics as images
 
 
 def picture(seed: int = 0, shape: tuple[int, int, int] = (24, 32, 3)) -> np.ndarray:

@@ -7,10 +7,7 @@ import pytest
 import torch
 
 from aquaflow.config import Config
-from aquaflow.geometry.camera import guess_camera
-from aquaflow.geometry.similarity import Sim3
-from aquaflow.messages import Dropped, Frame
-from aquaflow.outcome import (
+from aquaflow.dive.results import (
     HeldOut,
     WaterSummary,
     examine_held_out,
@@ -19,6 +16,9 @@ from aquaflow.outcome import (
     refined_poses,
     water_of,
 )
+from aquaflow.geometry.camera import guess_camera
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.messages import Dropped, Frame
 from aquaflow.slam import Slam
 from aquaflow.tracking.frames import FrameClass, Tracked
 

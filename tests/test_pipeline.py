@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from aquaflow.config import Config
+from aquaflow.dive.replay import map_recording
 from aquaflow.errors import NotMappedError
 from aquaflow.messages import Frame
-from aquaflow.pipeline import map_recording
-from aquaflow.preparation import Preparation
 from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
+from aquaflow.sources.preprocessing import Preparation
 from tests.command_line import Cli
 from tests.small_recording import FRAMES, HASTY, HEIGHT, QUICK, WIDTH
 

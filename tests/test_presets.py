@@ -8,8 +8,8 @@ import pytest
 
 from aquaflow.cli import _configured
 from aquaflow.config import Config, parse_config
+from aquaflow.config.presets import PRESETS, merged, preset
 from aquaflow.errors import ConfigError
-from aquaflow.presets import PRESETS, merged, preset
 
 
 @pytest.mark.parametrize("name", list(PRESETS))

@@ -15,9 +15,9 @@ from aquaflow.keyframes import Pointmap
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.views import View
 from aquaflow.messages import Frame
-from aquaflow.preparation import Preparation
 from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
+from aquaflow.sources.preprocessing import Preparation
 from aquaflow.tracking.frames import FrameClass, Tracked
 from tests.slam_scenes import OPEN_GATE, STEPS, ToldTracker, config, frame_of
 

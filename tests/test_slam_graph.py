@@ -6,7 +6,7 @@ import pytest
 
 from aquaflow.slam import Slam
 from aquaflow.tracking.frames import Link
-from aquaflow.tracking.keyframe_graph import Correction
+from aquaflow.tracking.graph.keyframe_graph import Correction
 from tests.slam_scenes import OPEN_GATE, ToldTracker, config, frame_of
 
 

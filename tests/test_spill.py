@@ -15,10 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 
-from aquaflow import spill
-from aquaflow.array_file import Arrays, read_arrays, write_arrays
 from aquaflow.errors import InputError
-from aquaflow.spill import Spill, read_thing
+from aquaflow.storage import spill
+from aquaflow.storage.array_file import Arrays, read_arrays, write_arrays
+from aquaflow.storage.spill import Spill, read_thing
 
 Thing = npt.NDArray[np.int64]
 

@@ -33,7 +33,7 @@ from aquaflow.config.tracking import (
     TrackingConfig,
     VerificationConfig,
 )
-from aquaflow.plain_yaml import read_mapping, write_mapping
+from aquaflow.errors.plain_yaml import read_mapping, write_mapping
 
 __all__ = [
     "Config",

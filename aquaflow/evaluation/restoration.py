@@ -19,10 +19,10 @@ import numpy.typing as npt
 from aquaflow.config import load_config
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import CameraModel, load_camera
-from aquaflow.image_metrics import channel_gain, psnr
 from aquaflow.messages import Frame
-from aquaflow.preparation import Preparation
+from aquaflow.render.image_metrics import channel_gain, psnr
 from aquaflow.sources import open_recording
+from aquaflow.sources.preprocessing import Preparation
 
 Pictures = npt.NDArray[np.float32]
 """[N, H, W, 3] in [0, 1]."""

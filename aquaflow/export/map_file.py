@@ -1,6 +1,6 @@
 """``map.aqf``: the exact map. What comes back renders bit for bit as what was written.
 
-A file of arrays and facts (:mod:`aquaflow.export.facts_file`), as :mod:`aquaflow.mapping.map_state`
+A file of arrays and facts (:mod:`aquaflow.storage.facts_file`), as :mod:`aquaflow.mapping.state`
 takes a map apart. PLY files, beside it, show one choice of range or viewpoint; this has the water,
 the light of every view and the decoder themselves.
 """
@@ -10,10 +10,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from aquaflow.errors import AquaFlowError, DamagedError, InputError, reason_of
-from aquaflow.export.facts_file import UNREADABLE, read_facts_file, write_facts_file
-from aquaflow.mapping.map_state import put_together, take_apart
 from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.state import put_together, take_apart
 from aquaflow.render.contract import Renderer
+from aquaflow.storage.facts_file import UNREADABLE, read_facts_file, write_facts_file
 
 SUFFIX = ".aqf"
 KIND = "aquaflow map"

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.errors import InputError
-from aquaflow.export.atomic import atomic_write
+from aquaflow.storage.atomic import atomic_write
 
 Array = npt.NDArray[np.floating]
 

@@ -19,9 +19,9 @@ from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import common_exposure, restored_picture, to_bytes
 from aquaflow.mapping.views import View, in_time
 from aquaflow.messages import Frame
-from aquaflow.preparation import Preparation
 from aquaflow.render import select_renderer
 from aquaflow.sources import open_recording
+from aquaflow.sources.preprocessing import Preparation
 
 LOOKS = 20
 """Frames, spread over the dive, that the common exposure is judged by."""

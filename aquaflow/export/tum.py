@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.export.atomic import atomic_write
+from aquaflow.storage.atomic import atomic_write
 
 DECIMALS = 9
 """Nanoseconds, and nanometres at the scale of metres."""

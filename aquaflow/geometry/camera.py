@@ -15,7 +15,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from aquaflow.errors import ConfigError, path_of_key, words_of
-from aquaflow.plain_yaml import read_mapping, write_mapping
+from aquaflow.errors.plain_yaml import read_mapping, write_mapping
 
 DistortionModel = Literal["none", "radtan", "fisheye"]
 

@@ -11,14 +11,13 @@ import torch
 from torch import Tensor
 
 from aquaflow.config import MappingConfig
-from aquaflow.failures import Failures
+from aquaflow.errors.failures import Failures
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
-from aquaflow.mapping.attention import look, tiles_to_draw
-from aquaflow.mapping.decoding import DECODED
-from aquaflow.mapping.following import move_gaussians, move_views
-from aquaflow.mapping.gaussians import GaussianMap
-from aquaflow.mapping.insertion import (
+from aquaflow.mapping.decoder.decode import DECODED
+from aquaflow.mapping.decoder.neural import NeuralGaussians
+from aquaflow.mapping.gaussians.gaussians import GaussianMap
+from aquaflow.mapping.gaussians.insertion import (
     confidence_of,
     insertion_probability,
     new_gaussians,
@@ -27,14 +26,15 @@ from aquaflow.mapping.insertion import (
     thin,
     worth_keeping,
 )
-from aquaflow.mapping.medium import Medium
-from aquaflow.mapping.neural import NeuralGaussians
-from aquaflow.mapping.objective import Objective
-from aquaflow.mapping.registration import register
+from aquaflow.mapping.gaussians.reanchoring import move_gaussians, move_views
+from aquaflow.mapping.optimisation.active_tiles import look, tiles_to_draw
+from aquaflow.mapping.optimisation.objective import Objective
+from aquaflow.mapping.optimisation.pose_refinement import register
+from aquaflow.mapping.optimisation.schedule import sampled_views, shuffled_views
 from aquaflow.mapping.rendering import Shown
 from aquaflow.mapping.scene import Scene
-from aquaflow.mapping.schedule import sampled_views, shuffled_views
 from aquaflow.mapping.views import View, in_time, refine_pose
+from aquaflow.mapping.water.medium import Medium
 from aquaflow.render.adam import SelectiveAdam
 from aquaflow.render.contract import Renderer
 
@@ -164,7 +164,7 @@ class Mapper:
     # --- following the keyframes --------------------------------------------------------------
 
     def move(self, moves: Mapping[int, Sim3]) -> None:
-        """Let Gaussians and views follow keyframes that were moved (see following.py)."""
+        """Let Gaussians and views follow moved keyframes (see gaussians/reanchoring.py)."""
         moved = move_gaussians(self.gaussians, moves)
         if self.neural is not None:
             self.neural.move(moved)

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from aquaflow.mapping.gaussians import radiance
-from aquaflow.mapping.image_formation import Water
+from aquaflow.mapping.gaussians.gaussians import radiance
 from aquaflow.mapping.views import View
+from aquaflow.mapping.water.image_formation import Water
 from aquaflow.render.contract import Renderer, Rendering
 from aquaflow.render.water import MIN_SOLID, compose_water
 

@@ -13,17 +13,17 @@ import torch
 from torch import Tensor
 
 from aquaflow.config import MediumConfig, SunlightConfig
-from aquaflow.mapping.exposure import gain_of, learn_gain, set_log_gains
-from aquaflow.mapping.gaussians import GaussianMap, radiance, raw_colour
-from aquaflow.mapping.image_formation import Water
-from aquaflow.mapping.medium import Medium
-from aquaflow.mapping.neural import NeuralGaussians
+from aquaflow.mapping.decoder.neural import NeuralGaussians
+from aquaflow.mapping.gaussians.gaussians import GaussianMap, radiance, raw_colour
 from aquaflow.mapping.rendering import Shown, show
-from aquaflow.mapping.shading import TERMS, gain_map
-from aquaflow.mapping.sightings import sight
-from aquaflow.mapping.sunlight import Sunlight
 from aquaflow.mapping.views import View
-from aquaflow.mapping.water_estimation import WaterEstimate, estimate_water, models_for
+from aquaflow.mapping.water.estimation import WaterEstimate, estimate_water, models_for
+from aquaflow.mapping.water.exposure import gain_of, learn_gain, set_log_gains
+from aquaflow.mapping.water.image_formation import Water
+from aquaflow.mapping.water.medium import Medium
+from aquaflow.mapping.water.shading import TERMS, gain_map
+from aquaflow.mapping.water.sightings import sight
+from aquaflow.mapping.water.sunlight import Sunlight
 from aquaflow.render.contract import Renderer
 
 

@@ -12,10 +12,10 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from aquaflow.array_file import Arrays
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.spill import Spill
+from aquaflow.storage.array_file import Arrays
+from aquaflow.storage.spill import Spill
 
 RESIDENT_VIEWS = 128
 """Views in memory while the others wait in files; at most 1.4 MB each at 480 x 270 px. Any view may
@@ -55,9 +55,9 @@ class View:
         self.robust = robust
         """True for common frames, whose outliers are masked (paper, M)."""
         self.log_gain = np.zeros(3)
-        """How much brighter than the mean of the views, RGB (see exposure.py)."""
+        """How much brighter than the mean of the views, RGB (see water/exposure.py)."""
         self.light: Tensor | None = None
-        """[3, rows, columns] log-gain of the sunlight over the picture (see sunlight.py)."""
+        """[3, rows, columns] log-gain of the sunlight over the picture (see water/sunlight.py)."""
         self.looks = 0
         """Steps of the optimiser that looked at this view."""
         self.explained: Tensor | None = None

@@ -9,7 +9,7 @@ from dataclasses import replace
 from itertools import chain, dropwhile
 from typing import TypeAlias
 
-from aquaflow.failures import Failures
+from aquaflow.errors.failures import Failures
 from aquaflow.messages import Dropped, Frame, TelemetrySample
 from aquaflow.sources import CameraSource, TelemetrySource
 

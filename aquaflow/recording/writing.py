@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow import __version__
+from aquaflow.clocks.wall import WallClockWatch
 from aquaflow.config.recording import RecordingConfig
-from aquaflow.fusion.wall_clock import WallClockWatch
 from aquaflow.messages import Dropped, Frame, TelemetrySample
 from aquaflow.recording.dive_file import DiveFile
 from aquaflow.recording.pictures import (

@@ -2,7 +2,7 @@
 
 What a decoder knows before it is told the view comes in as a row of ``trunk`` for each Gaussian;
 out come the attributes as they are seen from one camera. Readable definition, and fallback:
-``Decoder.residuals`` and ``apply_residuals`` of :mod:`aquaflow.mapping.decoder`.
+``Decoder.residuals`` and ``apply_residuals`` of :mod:`aquaflow.mapping.decoder.decoder`.
 """
 
 from __future__ import annotations

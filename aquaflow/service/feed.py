@@ -9,18 +9,18 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Protocol, runtime_checkable
 
+from aquaflow.clocks.device import Learned
 from aquaflow.config import SourceConfig
-from aquaflow.failures import Failures
-from aquaflow.fusion.clock import Learned
+from aquaflow.dive.replay import MOST_UNREADABLE
+from aquaflow.errors.failures import Failures
 from aquaflow.messages import CameraModel, Dropped, Frame, TelemetrySample
-from aquaflow.pipeline import MOST_UNREADABLE
 from aquaflow.recording.playback import Playback, arrived
 from aquaflow.recording.recorder import Recorder
 from aquaflow.recording.session import HasSamples
-from aquaflow.service.continued import Continued
-from aquaflow.service.newest import Newest
+from aquaflow.service.dive_clock import Continued
+from aquaflow.service.latest import Newest
 from aquaflow.sources import CameraSource, TelemetrySource
-from aquaflow.vehicle_words import Hears, Word
+from aquaflow.sources.outbound import Hears, Word
 
 log = logging.getLogger(__name__)
 

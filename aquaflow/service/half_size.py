@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.keyframes import Pointmap
+from aquaflow.mapping.maps import Growth
 from aquaflow.mapping.views import View
-from aquaflow.maps import Growth
 
 
 def halved(growth: Growth) -> Growth:

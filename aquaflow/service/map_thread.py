@@ -19,11 +19,11 @@ from functools import partial
 from aquaflow.config.service import LiveMappingConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.maps import Growth, Insertion, Maps, Progress
 from aquaflow.mapping.views import View
-from aquaflow.maps import Growth, Insertion, Maps, Progress
-from aquaflow.service.beats import Beats
 from aquaflow.service.half_size import halved
-from aquaflow.service.ladder import Level
+from aquaflow.service.health.degradation import Level
+from aquaflow.service.health.heartbeats import Beats
 
 log = logging.getLogger(__name__)
 
@@ -56,7 +56,7 @@ class Correction:
 
 
 class MapThread:
-    """The :class:`aquaflow.maps.MapWork` of a live run."""
+    """The :class:`aquaflow.mapping.maps.MapWork` of a live run."""
 
     def __init__(
         self,

@@ -10,20 +10,20 @@ from functools import partial
 from pathlib import Path
 
 from aquaflow.config.vehicle import VehicleConfig
-from aquaflow.dive_run import Finished
+from aquaflow.dive.run import Finished
 from aquaflow.errors import AquaFlowError
-from aquaflow.maps import Progress
-from aquaflow.service.checkpoint import UnusableStateError
-from aquaflow.service.choice import Choice, choose, is_begun, resumed, tidy
+from aquaflow.mapping.maps import Progress
+from aquaflow.service.checkpoint.checkpoint import UnusableStateError
+from aquaflow.service.checkpoint.resume import Choice, choose, is_begun, resumed, tidy
+from aquaflow.service.checkpoint.set_aside import SetAside
 from aquaflow.service.feed import Feed
-from aquaflow.service.http import HealthServer
+from aquaflow.service.health.http import HealthServer
+from aquaflow.service.live_dive import LiveDive
+from aquaflow.service.live_viewer import LiveWindow
 from aquaflow.service.moment import Moment
-from aquaflow.service.pose_out import PoseOut, metric_scale
 from aquaflow.service.report import report
-from aquaflow.service.session import LiveDive
-from aquaflow.service.set_aside import SetAside
-from aquaflow.service.vehicle import VehicleReport
-from aquaflow.service.window import LiveWindow
+from aquaflow.service.vehicle.pilot_messages import VehicleReport
+from aquaflow.service.vehicle.pose_output import PoseOut, metric_scale
 
 log = logging.getLogger(__name__)
 

@@ -8,8 +8,8 @@ from dataclasses import asdict
 from typing import Any
 
 from aquaflow import __version__
-from aquaflow.service.health import State
-from aquaflow.service.session import Parts
+from aquaflow.service.health.state import State
+from aquaflow.service.live_dive import Parts
 
 GOOD = (State.TRACKING, State.INITIALISING)
 """States in which nothing is to be done about it."""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.errors import ConfigError
-from aquaflow.failures import Failures
+from aquaflow.errors.failures import Failures
 from aquaflow.messages import CameraModel
 from aquaflow.recording.playback import Playback
 from aquaflow.recording.recorder import Recorder

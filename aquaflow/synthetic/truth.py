@@ -22,8 +22,8 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from aquaflow.errors import AquaFlowError, InputError, reason_of
+from aquaflow.errors.plain_yaml import read_mapping
 from aquaflow.geometry.camera import CameraModel, load_camera
-from aquaflow.plain_yaml import read_mapping
 from aquaflow.synthetic.config import SyntheticConfig
 from aquaflow.synthetic.water import Medium, load_medium
 

@@ -22,7 +22,7 @@ import numpy.typing as npt
 import yaml
 
 from aquaflow.errors import InputError, reason_of
-from aquaflow.plain_yaml import read_mapping
+from aquaflow.errors.plain_yaml import read_mapping
 from aquaflow.synthetic.config import WaterType
 
 __all__ = ["WATER_TYPES", "Medium", "load_medium", "save_medium"]

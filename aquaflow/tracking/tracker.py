@@ -6,17 +6,17 @@ from collections import deque
 from dataclasses import replace
 
 from aquaflow.config import TrackingConfig
-from aquaflow.failures import Failures
+from aquaflow.errors.failures import Failures
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
 from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, PairGeometry, Prior
-from aquaflow.tracking.attachment import Attachment, Follower
-from aquaflow.tracking.back_fill import BackFill
+from aquaflow.tracking.current_keyframe import Attachment, Follower
 from aquaflow.tracking.frames import FrameClass, Link, Tracked
-from aquaflow.tracking.initialisation import Initialiser, calibrated, fused_pointmap
-from aquaflow.tracking.places import Places
+from aquaflow.tracking.initialisation.back_fill import BackFill
+from aquaflow.tracking.initialisation.initialiser import Initialiser, calibrated, fused_pointmap
+from aquaflow.tracking.loops.relocaliser import Places
 
 MAX_ORPHANS = 60
 """Frames without a pose that are kept for back-filling; bounds memory while nothing moves."""

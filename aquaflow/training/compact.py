@@ -24,9 +24,9 @@ from aquaflow.prior.compact.network import (
 )
 from aquaflow.training.compact_recall import drawn_matches, mean_recall
 from aquaflow.training.correspondences import Correspondences, correspondences
-from aquaflow.training.generator.draw import Draw
-from aquaflow.training.generator.drawing import Looks, training_pair
-from aquaflow.training.generator.pool import SHARD, STRIDE, Pool
+from aquaflow.training.pair_generator.draw import Draw
+from aquaflow.training.pair_generator.drawing import Looks, training_pair
+from aquaflow.training.pair_generator.pool import SHARD, STRIDE, Pool
 from aquaflow.training.pairs import Pair
 
 

@@ -16,10 +16,10 @@ from aquaflow.prior.compact.matching import coarse_at, descriptors_at, fine_arou
 from aquaflow.prior.compact.network import COARSE, FINE, Compared, Comparison, Encoded, cell_rays
 from aquaflow.prior.runtime import RuntimeSettings, Session
 from aquaflow.training.correspondences import Correspondences, correspondences, overlap
-from aquaflow.training.generator.cameras import WIDE, Motion
-from aquaflow.training.generator.draw import Draw
-from aquaflow.training.generator.drawing import through_water
-from aquaflow.training.generator.pool import SHARD, Pool
+from aquaflow.training.pair_generator.cameras import WIDE, Motion
+from aquaflow.training.pair_generator.draw import Draw
+from aquaflow.training.pair_generator.drawing import through_water
+from aquaflow.training.pair_generator.pool import SHARD, Pool
 from aquaflow.training.pairs import Pair
 
 SEED = 1000

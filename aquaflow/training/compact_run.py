@@ -24,10 +24,10 @@ from aquaflow.training.compact_recall import (
     tracked_recall,
 )
 from aquaflow.training.curve import NOT_FIGURES
-from aquaflow.training.generator.cameras import WIDER
-from aquaflow.training.generator.draw import Draw
-from aquaflow.training.generator.drawing import Looks, through_water
-from aquaflow.training.generator.pool import SHARD, Pool
+from aquaflow.training.pair_generator.cameras import WIDER
+from aquaflow.training.pair_generator.draw import Draw
+from aquaflow.training.pair_generator.drawing import Looks, through_water
+from aquaflow.training.pair_generator.pool import SHARD, Pool
 from aquaflow.training.pairs import Pair
 from aquaflow.training.schedule import Schedule
 from aquaflow.training.trainer import Progress, TrainingPlan, train
@@ -105,7 +105,7 @@ def training_record(
 ) -> dict[str, Any]:
     """What prior.json keeps of a training."""
     return {
-        "data": "generated pictures only (aquaflow.training.generator)",
+        "data": "generated pictures only (aquaflow.training.pair_generator)",
         "seed": run.seed,
         "pool_seed": run.seed,
         "held_out_seed": HELD_OUT_SEED,

@@ -15,7 +15,7 @@ from aquaflow.config.viewer import ViewerConfig
 from aquaflow.errors import InputError
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.messages import CameraModel
-from aquaflow.viewer.door import Door
+from aquaflow.viewer.auth_proxy import Door
 from aquaflow.viewer.splats import Splats, heat
 
 Float = npt.NDArray[np.floating[Any]]

@@ -7,7 +7,7 @@ from typing import Any
 
 from aquaflow.config.telemetry import MavlinkConfig
 from aquaflow.messages import TelemetrySample
-from aquaflow.vehicle_words import Sentence, Word
+from aquaflow.sources.outbound import Sentence, Word
 from drivers.device_clock import DeviceClock
 from drivers.extra import load
 from drivers.protocol.mavlink_frames import MavlinkFraming, header_of

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from aquaflow.vehicle_words import (
+from aquaflow.sources.outbound import (
     LONGEST_NAME,
     LONGEST_SENTENCE,
     BodyMotion,

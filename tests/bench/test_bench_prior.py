@@ -14,7 +14,7 @@ from aquaflow import cli
 from aquaflow.errors import InputError
 from aquaflow.evaluation.prior_bench import benchmark
 from aquaflow.evaluation.prior_bench.latency import sea_floor, timed
-from aquaflow.prior.choice import SHIPPED
+from aquaflow.prior.factory import SHIPPED
 from aquaflow.prior.folder import CARD
 
 ROW = {"prior", "variant", "threads", "width", "height", "work", "ms", "cpu_ms"}

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from aquaflow.errors import InputError
-from aquaflow.export.atomic import atomic_write
 from aquaflow.export.tum import write_tum
+from aquaflow.storage.atomic import atomic_write
 
 ONE = (np.array([0.5]), np.array([[1.0, -0.0, -1e-12]]), np.array([[-2.0, 0.0, 0.0, 0.0]]))
 

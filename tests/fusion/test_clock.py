@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from aquaflow.fusion.clock import BUCKET_NS, WINDOW_BUCKETS, ClockMapping
-from aquaflow.fusion.wall_clock import WallClockWatch
+from aquaflow.clocks.device import BUCKET_NS, WINDOW_BUCKETS, ClockMapping
+from aquaflow.clocks.wall import WallClockWatch
 
 MS = 1_000_000
 SECOND = 1_000_000_000

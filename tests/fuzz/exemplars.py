@@ -82,7 +82,7 @@ def _write_files(root: Path) -> None:
     import torch
 
     from aquaflow.config import Config
-    from aquaflow.prior.choice import SHIPPED
+    from aquaflow.prior.factory import SHIPPED
 
     shutil.copy(root / "recording" / "camera.yaml", root)
     shutil.copy(root / "recording" / "poses.tum", root)

@@ -89,7 +89,7 @@ def injected(dive: Dive, strike: Strike, recordings: Path) -> Injected:
 
 def _run(dive: Dive, recordings: Path, folder: Path) -> None:
     from aquaflow.cli import main
-    from aquaflow.dive_run import DiveRun
+    from aquaflow.dive.run import DiveRun
 
     os.environ["XDG_STATE_HOME"] = str(folder)  # where mistakes of ours are reported
     # A shell starts what runs in the background deaf to it.

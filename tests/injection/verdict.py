@@ -36,7 +36,7 @@ class Before:
 
 def frames_of(dive: Path, whole: bool) -> Before:
     """Of a dive without a fault; ``whole`` if every frame of the recording has a row each time."""
-    from aquaflow.frame_rows import read_rows
+    from aquaflow.dive.frames_csv import read_rows
 
     rows = read_rows(dive / "frames.csv")
     without = frozenset(row.index for row in rows if row.sub_map is None)
@@ -86,7 +86,7 @@ def folder_problems(dive: Path, before: Before) -> list[str]:
 
 def row_problems(dive: Path) -> list[str]:
     """What cannot be read of the rows of a dive that was stopped."""
-    from aquaflow.frame_rows import read_rows
+    from aquaflow.dive.frames_csv import read_rows
 
     problems: list[str] = []
     _try(problems, "frames.csv", lambda: read_rows(dive / "frames.csv"))
@@ -142,7 +142,7 @@ def _read_map_file(path: Path) -> None:
 
 
 def _check_rows(dive: Path, before: Before) -> None:
-    from aquaflow.frame_rows import read_rows
+    from aquaflow.dive.frames_csv import read_rows
 
     rows = {row.index: row for row in read_rows(dive / "frames.csv")}
     if before.rows is not None:

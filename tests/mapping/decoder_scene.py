@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from aquaflow.config import DecoderConfig
-from aquaflow.mapping.decoder import Decoder
-from aquaflow.mapping.observation import observation
-from aquaflow.mapping.tokens import Tokens, visible_tokens
-from aquaflow.mapping.voxel_groups import VoxelGroups
+from aquaflow.mapping.decoder.decoder import Decoder
+from aquaflow.mapping.decoder.observation import observation
+from aquaflow.mapping.decoder.tokens import Tokens, visible_tokens
+from aquaflow.mapping.decoder.voxel_groups import VoxelGroups
 
 ROWS = 23
 CENTRE = torch.tensor([0.1, -0.2, -1.0], dtype=torch.float64)

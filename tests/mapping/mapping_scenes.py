@@ -14,11 +14,11 @@ from aquaflow.config import MappingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.keyframes import Pointmap
-from aquaflow.mapping.gaussians import GaussianMap, raw_colour
-from aquaflow.mapping.image_formation import Water
+from aquaflow.mapping.gaussians.gaussians import GaussianMap, raw_colour
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.rendering import show
 from aquaflow.mapping.views import View
+from aquaflow.mapping.water.image_formation import Water
 from aquaflow.render import select_renderer
 from aquaflow.render.contract import Renderer
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from aquaflow.config import OptimiserConfig
-from aquaflow.mapping.attention import look, tiles_to_draw
 from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.optimisation.active_tiles import look, tiles_to_draw
 from aquaflow.mapping.views import View
 from tests.mapping.mapping_scenes import (
     copied,

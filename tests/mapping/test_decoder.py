@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from aquaflow.geometry.similarity import rotation_from_quaternion
-from aquaflow.mapping.decoder import Attention, apply_residuals
+from aquaflow.mapping.decoder.decoder import Attention, apply_residuals
+from aquaflow.mapping.decoder.observation import FURTHEST, encoded_observation, observation
+from aquaflow.mapping.decoder.tokens import BUCKET, Tokens, visible_tokens
+from aquaflow.mapping.decoder.voxel_groups import EMPTY
 from aquaflow.mapping.encoding import sinusoidal_encoding
-from aquaflow.mapping.observation import FURTHEST, encoded_observation, observation
-from aquaflow.mapping.tokens import BUCKET, Tokens, visible_tokens
-from aquaflow.mapping.voxel_groups import EMPTY
 from tests.mapping.decoder_scene import CENTRE, ROWS, Scene
 
 VARIANTS = ("lgpd", "mlp")

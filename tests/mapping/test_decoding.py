@@ -11,16 +11,16 @@ import torch
 from numpy import uint8, zeros
 from torch import Tensor
 
-from aquaflow.mapping.decoder import Decoder, Trunk
-from aquaflow.mapping.decoding import (
+from aquaflow.mapping.decoder.decode import (
     DECODED,
     decoded,
     decoded_torch,
     in_picture,
     without_residuals,
 )
-from aquaflow.mapping.observation import observation
-from aquaflow.mapping.tokens import visible_tokens
+from aquaflow.mapping.decoder.decoder import Decoder, Trunk
+from aquaflow.mapping.decoder.observation import observation
+from aquaflow.mapping.decoder.tokens import visible_tokens
 from aquaflow.render.library import library_or_none
 from tests.mapping.decoder_scene import ROWS, Scene
 from tests.mapping.mapping_scenes import CAMERA, path, view_of

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from aquaflow.mapping.exposure import (
+from aquaflow.mapping.views import View
+from aquaflow.mapping.water.exposure import (
     FEWEST,
     MAX_LOG_GAIN,
     TOWARDS_ONE,
@@ -15,7 +16,6 @@ from aquaflow.mapping.exposure import (
     log_gain_at,
     set_log_gains,
 )
-from aquaflow.mapping.views import View
 from tests.mapping.mapping_scenes import view_of
 
 SOLID = torch.ones(48, 64)

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aquaflow.mapping.gaussians import GaussianMap, radiance, raw_colour
+from aquaflow.mapping.gaussians.gaussians import GaussianMap, radiance, raw_colour
 
 
 def numbered(start: int, count: int) -> dict[str, torch.Tensor]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from aquaflow.mapping.image_formation import MAX_RESTORED, MIN_TRANSMISSION, Water
+from aquaflow.mapping.water.image_formation import MAX_RESTORED, MIN_TRANSMISSION, Water
 from aquaflow.render.water import compose_water
 from tests.mapping.mapping_scenes import water
 

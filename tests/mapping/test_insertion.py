@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from aquaflow.config import InsertionConfig
-from aquaflow.mapping.gaussians import radiance
-from aquaflow.mapping.insertion import (
+from aquaflow.mapping.gaussians.gaussians import radiance
+from aquaflow.mapping.gaussians.insertion import (
     insertion_probability,
     new_gaussians,
     select,

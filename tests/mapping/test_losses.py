@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from aquaflow.mapping.losses import (
+from aquaflow.mapping.optimisation.losses import (
     MIN_RANGE,
     depth_loss,
     outlier_mask,

@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from aquaflow.errors import InputError
-from aquaflow.export.facts_file import FACTS
 from aquaflow.export.map_file import read_map_file, write_map_file
 from aquaflow.mapping.mapper import Mapper
+from aquaflow.storage.facts_file import FACTS
 from tests.mapping.mapping_scenes import (
     copied,
     filmed,

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from aquaflow.config import MediumConfig
-from aquaflow.mapping.medium import Medium, inverse_softplus
+from aquaflow.mapping.water.medium import Medium, inverse_softplus
 from tests.mapping.mapping_scenes import pose
 
 AHEAD, DOWN = torch.eye(3), torch.from_numpy(pose((0, 0, 0), (1.3, 0, 0)).R).float()

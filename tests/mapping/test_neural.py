@@ -11,10 +11,10 @@ import torch
 
 from aquaflow.config import MappingConfig
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.mapping.decoding import DECODED
+from aquaflow.mapping.decoder.decode import DECODED
+from aquaflow.mapping.decoder.neural import NeuralGaussians
+from aquaflow.mapping.decoder.voxel_groups import EMPTY
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.neural import NeuralGaussians
-from aquaflow.mapping.voxel_groups import EMPTY
 from tests.mapping.mapping_scenes import (
     copied,
     error,

@@ -8,12 +8,12 @@ import torch
 
 from aquaflow.config import InsertionConfig
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.mapping.exposure import learn_gain, set_log_gains
-from aquaflow.mapping.following import move_gaussians, move_views
-from aquaflow.mapping.gaussians import GaussianMap
-from aquaflow.mapping.insertion import new_gaussians
-from aquaflow.mapping.sunlight import learn_light
+from aquaflow.mapping.gaussians.gaussians import GaussianMap
+from aquaflow.mapping.gaussians.insertion import new_gaussians
+from aquaflow.mapping.gaussians.reanchoring import move_gaussians, move_views
 from aquaflow.mapping.views import View, refine_pose
+from aquaflow.mapping.water.exposure import learn_gain, set_log_gains
+from aquaflow.mapping.water.sunlight import learn_light
 from tests.mapping.mapping_scenes import cloud, view_of
 
 NOWHERE = Sim3(np.eye(3), np.array([np.nan, 0.0, 0.0]))

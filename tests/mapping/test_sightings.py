@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from aquaflow.mapping import sightings
-from aquaflow.mapping.gaussians import GaussianMap
-from aquaflow.mapping.sighted_points import Observations
-from aquaflow.mapping.sightings import MIN_VIEWS, sight
+from aquaflow.mapping.gaussians.gaussians import GaussianMap
 from aquaflow.mapping.views import View
+from aquaflow.mapping.water import sightings
+from aquaflow.mapping.water.observations import Observations
+from aquaflow.mapping.water.sightings import MIN_VIEWS, sight
 from tests.mapping.mapping_scenes import CAMERA, gaussians_at, pose, renderer, view_of
 
 STEPS = [pose((0.0, 0.0, -0.15 * i)) for i in range(MIN_VIEWS)]

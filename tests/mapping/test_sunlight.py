@@ -10,7 +10,8 @@ import torch
 
 from aquaflow.config import SunlightConfig
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.sunlight import (
+from aquaflow.mapping.views import View
+from aquaflow.mapping.water.sunlight import (
     FEWEST_VIEWS,
     MAX_LOG_GAIN,
     TOWARDS_ONE,
@@ -20,7 +21,6 @@ from aquaflow.mapping.sunlight import (
     light_at,
     light_over,
 )
-from aquaflow.mapping.views import View
 from tests.mapping.mapping_scenes import filmed, floor, path, renderer, settings, view_of
 
 SOLID = torch.ones(48, 64)

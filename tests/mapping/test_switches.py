@@ -7,7 +7,7 @@ import torch
 
 from aquaflow.config import MediumConfig
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.water_estimation import estimate_water, models_for
+from aquaflow.mapping.water.estimation import estimate_water, models_for
 from tests.mapping.mapping_scenes import (
     flat_pointmap,
     floor,

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from aquaflow.config import parse_config
+from aquaflow.mapping.maps import Growth, Maps
 from aquaflow.mapping.view_budget import alike, let_surplus_go
 from aquaflow.mapping.views import View, ViewStore
-from aquaflow.maps import Growth, Maps
 from tests.mapping.mapping_scenes import CAMERA, view_of
 
 MOST = 4

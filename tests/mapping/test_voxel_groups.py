@@ -13,7 +13,7 @@ from torch import Tensor
 
 from aquaflow.config import VoxelConfig
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.mapping.voxel_groups import EMPTY, VoxelGroups
+from aquaflow.mapping.decoder.voxel_groups import EMPTY, VoxelGroups
 from tests.mapping.mapping_scenes import pose
 
 SIZE = 0.1

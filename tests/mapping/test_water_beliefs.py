@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from aquaflow.config import WaterPriorsConfig
-from aquaflow.mapping.sighted_points import informative
-from aquaflow.mapping.water_beliefs import BRIGHT_LEVEL, DARK_LEVEL, beliefs
-from aquaflow.mapping.water_estimation import _cost, _normal_equations, estimate_water
-from aquaflow.mapping.water_model import WaterModel
-from aquaflow.mapping.water_parameters import Model
+from aquaflow.mapping.water.estimation import _cost, _normal_equations, estimate_water
+from aquaflow.mapping.water.model import WaterModel
+from aquaflow.mapping.water.observations import informative
+from aquaflow.mapping.water.parameters import Model
+from aquaflow.mapping.water.priors import BRIGHT_LEVEL, DARK_LEVEL, beliefs
 from tests.mapping.water_observations import B_INF, B_RES, D, sighted
 
 NOTHING = {"dark_channel": False, "saturation": False}

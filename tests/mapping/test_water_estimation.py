@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from aquaflow.config import MediumConfig
-from aquaflow.mapping.shading import TERMS, shading_basis
-from aquaflow.mapping.sighted_points import Observations, informative, mean_by
-from aquaflow.mapping.water_estimation import (
+from aquaflow.mapping.water.estimation import (
     EVERY_MODEL,
     MIN_POINTS,
     WaterEstimate,
@@ -23,8 +21,10 @@ from aquaflow.mapping.water_estimation import (
     estimate_water,
     models_for,
 )
-from aquaflow.mapping.water_model import WaterModel
-from aquaflow.mapping.water_parameters import Model
+from aquaflow.mapping.water.model import WaterModel
+from aquaflow.mapping.water.observations import Observations, informative, mean_by
+from aquaflow.mapping.water.parameters import Model
+from aquaflow.mapping.water.shading import TERMS, shading_basis
 from tests.mapping.water_observations import B_INF, B_RES, BETA, LAMP, Array, B, D, fitted, sighted
 
 

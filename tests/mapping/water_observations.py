@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.mapping.shading import shading_basis
-from aquaflow.mapping.sighted_points import Observations
-from aquaflow.mapping.water_estimation import (
+from aquaflow.mapping.water.estimation import (
     WaterEstimate,
     estimate_water,
 )
+from aquaflow.mapping.water.observations import Observations
+from aquaflow.mapping.water.shading import shading_basis
 
 Array = npt.NDArray[np.float64]
 BETA = np.array([0.6, 0.3, 0.2])

@@ -9,8 +9,8 @@ import pytest
 
 from aquaflow.config import PriorConfig
 from aquaflow.errors import AquaFlowError, InputError
-from aquaflow.prior import choice
-from aquaflow.prior.choice import make_prior
+from aquaflow.prior import factory
+from aquaflow.prior.factory import make_prior
 from aquaflow.prior.folder import ENCODER
 from tests.prior.stub_prior import write_stub
 
@@ -32,7 +32,7 @@ def test_without_weights_the_safety_net_tracks_and_says_so(
 def test_without_onnxruntime_the_safety_net_tracks_and_names_the_extra(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(choice, "find_spec", lambda name: None)
+    monkeypatch.setattr(factory, "find_spec", lambda name: None)
     with caplog.at_level(logging.WARNING):
         assert make_prior(PriorConfig(kind="compact")).name == "classical"
     assert "aquaflow[prior]" in caplog.text

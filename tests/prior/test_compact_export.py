@@ -11,7 +11,8 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from aquaflow import cli, cli_prior
+from aquaflow import cli
+from aquaflow.cli import prior
 from aquaflow.errors import AquaFlowError, InputError
 from aquaflow.prior.compact.export import (
     INPUTS,
@@ -31,7 +32,7 @@ pytest.importorskip("onnxruntime", reason="pip install 'aquaflow[prior]'")
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-SHIPPED = Path(cli.__file__).parent / "prior" / "weights" / "compact"
+SHIPPED = Path(cli.__file__).parents[1] / "prior" / "weights" / "compact"
 SMALL = NetworkSize(levels=(4, 6, 8, 10), merged=(10, 8, 6), fine=6, coarse=8, head=4)
 CPU = RuntimeSettings(device="cpu")
 MOST_BYTES = 16 << 20
@@ -113,7 +114,7 @@ def test_verify_finds_out_that_what_ships_is_not_of_other_weights(tmp_path: Path
     torch.manual_seed(1)
     torch.save({"network": CompactPrior().state_dict()}, tmp_path / "checkpoint.pt")
     with pytest.raises(AquaFlowError, match="differs from torch"):
-        cli_prior.verify(SHIPPED, tmp_path / "checkpoint.pt")
+        prior.verify(SHIPPED, tmp_path / "checkpoint.pt")
 
 
 def test_what_is_no_checkpoint_is_refused(tmp_path: Path) -> None:

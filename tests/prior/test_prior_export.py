@@ -19,7 +19,7 @@ from aquaflow.config import PriorConfig
 from aquaflow.errors import AquaFlowError, InputError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior import runtime
-from aquaflow.prior.choice import make_prior
+from aquaflow.prior.factory import make_prior
 from aquaflow.prior.folder import CARD, DECODER, ENCODER, read_card
 from aquaflow.prior.hybrid import HybridEncoding
 from aquaflow.prior.mast3r.export import OUTPUTS, export, parity_of, relative_difference

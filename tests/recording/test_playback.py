@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aquaflow.failures import Failures
+from aquaflow.errors.failures import Failures
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.messages import Depth, Dropped, Frame, TelemetrySample
 from aquaflow.recording.playback import Event, Playback, arrival_of

@@ -15,18 +15,18 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from aquaflow.dive_run import Finished
+from aquaflow.dive.frames_csv import FrameRow, readable_rows
+from aquaflow.dive.run import Finished
 from aquaflow.errors import InputError
-from aquaflow.frame_rows import FrameRow, readable_rows
 from aquaflow.messages import Dropped, Frame
-from aquaflow.service.choice import newest_usable
-from aquaflow.service.continued import Continued
-from aquaflow.service.generations import STATE, Checkpoint
-from aquaflow.service.newest import Newest
+from aquaflow.service.checkpoint.generations import STATE, Checkpoint
+from aquaflow.service.checkpoint.resume import newest_usable
+from aquaflow.service.dive_clock import Continued
+from aquaflow.service.latest import Newest
+from aquaflow.service.live_dive import LiveDive
 from aquaflow.service.onboard import begun
-from aquaflow.service.session import LiveDive
 from aquaflow.sources import open_recording
-from aquaflow.spill import read_thing
+from aquaflow.storage.spill import read_thing
 from aquaflow.synthetic import SyntheticConfig, write_dive
 from tests.service.live_scenes import VEHICLE, ToldFeed, caught_up
 

@@ -10,8 +10,8 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from aquaflow.frame_rows import read_rows
-from aquaflow.service.generations import read_state, state_file
+from aquaflow.dive.frames_csv import read_rows
+from aquaflow.service.checkpoint.generations import read_state, state_file
 
 CONFIG = """
 threads: 1

@@ -8,30 +8,30 @@ from pathlib import Path
 
 import numpy as np
 
+from aquaflow.clocks.device import Learned
 from aquaflow.config import Config, parse_config
 from aquaflow.config.service import ServiceConfig
 from aquaflow.config.vehicle import VehicleConfig
-from aquaflow.dive import DiveFolder
-from aquaflow.dive_run import DiveRun
-from aquaflow.failures import Failures
-from aquaflow.fusion.clock import Learned
+from aquaflow.dive.folder import DiveFolder
+from aquaflow.dive.run import DiveRun
+from aquaflow.errors.failures import Failures
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.maps import Growth, Insertion, Maps
+from aquaflow.mapping.maps import Growth, Insertion, Maps
 from aquaflow.messages import CameraModel, Dropped, Frame
-from aquaflow.service.beats import Beats
-from aquaflow.service.continued import Continued
+from aquaflow.service.dive_clock import Continued
 from aquaflow.service.feed import Heard
-from aquaflow.service.ladder import Ladder
-from aquaflow.service.live import LiveLoop
+from aquaflow.service.health.degradation import Ladder
+from aquaflow.service.health.heartbeats import Beats
+from aquaflow.service.health.pressure import Pressure
+from aquaflow.service.health.systemd import Notifier
+from aquaflow.service.latest import Newest
+from aquaflow.service.live_dive import LiveDive
+from aquaflow.service.loop import LiveLoop
 from aquaflow.service.map_thread import MapThread
-from aquaflow.service.newest import Newest
-from aquaflow.service.notify import Notifier
-from aquaflow.service.pressure import Pressure
-from aquaflow.service.session import LiveDive
 from aquaflow.slam import Slam
+from aquaflow.sources.outbound import Word
 from aquaflow.tracking.frames import FrameClass, Tracked
-from aquaflow.vehicle_words import Word
 
 WIDTH, HEIGHT = 64, 48
 CALM = Pressure(free_memory_share=0.5, disk_free_mb=50_000.0, temperature_c=40.0)

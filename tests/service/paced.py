@@ -20,8 +20,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from aquaflow.messages import Dropped, Frame
-from aquaflow.service.generations import state_file
-from aquaflow.service.newest import Newest
+from aquaflow.service.checkpoint.generations import state_file
+from aquaflow.service.latest import Newest
 
 ROOM_BYTES = 64
 """No file can become larger: nothing new can be written, what is there stays."""

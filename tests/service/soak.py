@@ -25,16 +25,16 @@ import numpy as np
 from aquaflow.config.service import ListenConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.messages import CameraModel, Frame
-from aquaflow.service.ask import ask
-from aquaflow.service.choice import resumed
+from aquaflow.service.checkpoint.resume import resumed
 from aquaflow.service.feed import ASK_S, _Pumps
-from aquaflow.service.http import HealthServer
-from aquaflow.service.live import LiveLoop
+from aquaflow.service.health.client import ask
+from aquaflow.service.health.http import HealthServer
+from aquaflow.service.live_dive import LiveDive
+from aquaflow.service.loop import LiveLoop
 from aquaflow.service.report import report
-from aquaflow.service.session import LiveDive
 from aquaflow.sources import open_recording
+from aquaflow.sources.outbound import Word
 from aquaflow.synthetic import SyntheticConfig, write_dive
-from aquaflow.vehicle_words import Word
 
 ROUND = SyntheticConfig(frames=120, width=96, height=72)
 FRAME_NS = 100_000_000

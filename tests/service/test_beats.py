@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from aquaflow.service.beats import Beats, Guard
-from aquaflow.service.notify import Notifier
+from aquaflow.service.health.heartbeats import Beats, Guard
+from aquaflow.service.health.systemd import Notifier
 from tests.service.live_scenes import Clock, Told
 
 

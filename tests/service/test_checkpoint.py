@@ -12,20 +12,20 @@ import numpy as np
 import pytest
 import torch
 
-from aquaflow import spill
 from aquaflow.config.service import CheckpointConfig
 from aquaflow.config.viewer import ViewerConfig
-from aquaflow.frame_rows import read_rows
+from aquaflow.dive.frames_csv import read_rows
 from aquaflow.messages import Frame
-from aquaflow.service.choice import choose, is_begun, resumed
-from aquaflow.service.continued import Continued
-from aquaflow.service.generations import read_state, state_file
+from aquaflow.service.checkpoint.generations import read_state, state_file
+from aquaflow.service.checkpoint.resume import choose, is_begun, resumed
+from aquaflow.service.dive_clock import Continued
+from aquaflow.service.health.prometheus import exposition
+from aquaflow.service.live_dive import LiveDive
+from aquaflow.service.live_viewer import LiveWindow, in_words
 from aquaflow.service.moment import Moment
-from aquaflow.service.prometheus import exposition
 from aquaflow.service.report import report
-from aquaflow.service.session import LiveDive
-from aquaflow.service.window import LiveWindow, in_words
 from aquaflow.sources import open_recording
+from aquaflow.storage import spill
 from tests.service.live_scenes import VEHICLE, ToldFeed, caught_up
 
 CLOCKS = {"autopilot": [[12, 12_000_000_000, 345, None, None]]}

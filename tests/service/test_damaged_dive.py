@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from aquaflow.config.vehicle import VehicleConfig
+from aquaflow.dive.frames_csv import read_rows
 from aquaflow.errors import ConfigError
-from aquaflow.export.facts_file import write_facts_file
-from aquaflow.frame_rows import read_rows
 from aquaflow.messages import Frame
-from aquaflow.service.generations import previous_file, read_state, state_file
+from aquaflow.service.checkpoint.generations import previous_file, read_state, state_file
 from aquaflow.service.onboard import begun
+from aquaflow.storage.facts_file import write_facts_file
 from tests.command_line import Cli, refused
 from tests.service.damaged_dives import Outcome, gone_on_with, killed_dive, many, readable
 from tests.service.live_scenes import VEHICLE, ToldFeed

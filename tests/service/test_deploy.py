@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from aquaflow.config.vehicle import load_vehicle
-from aquaflow.service.http import REGISTRATION
+from aquaflow.service.health.http import REGISTRATION
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 MOST_EXPOSED = 2.0

@@ -20,13 +20,13 @@ import pytest
 from aquaflow.config import SourceConfig
 from aquaflow.config.cameras import V4l2Config
 from aquaflow.config.telemetry import parse_telemetry
-from aquaflow.frame_rows import read_rows
+from aquaflow.dive.frames_csv import read_rows
 from aquaflow.messages import CameraModel, Depth, Frame
-from aquaflow.service.choice import resumed
+from aquaflow.service.checkpoint.resume import resumed
 from aquaflow.service.feed import LiveFeed
-from aquaflow.service.health import State
-from aquaflow.service.live import PATIENCE_S
-from aquaflow.service.session import LiveDive
+from aquaflow.service.health.state import State
+from aquaflow.service.live_dive import LiveDive
+from aquaflow.service.loop import PATIENCE_S
 from aquaflow.sources import open_recording
 from drivers.live import CameraState
 from drivers.telemetry import LinkTelemetry

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from aquaflow.frame_rows import read_rows
-from aquaflow.service.generations import read_state, state_file
+from aquaflow.dive.frames_csv import read_rows
+from aquaflow.service.checkpoint.generations import read_state, state_file
 from tests.service.killed_dives import CONFIG
 from tests.service.paced import paced_run
 from tests.small_recording import FRAMES

@@ -17,9 +17,9 @@ from aquaflow.access import Access, read_token
 from aquaflow.config.service import ListenConfig, ServiceConfig
 from aquaflow.config.stage import validated
 from aquaflow.errors import ConfigError
-from aquaflow.service.health import State
-from aquaflow.service.http import MOST_CLIENTS, HealthServer
-from aquaflow.service.prometheus import exposition
+from aquaflow.service.health.http import MOST_CLIENTS, HealthServer
+from aquaflow.service.health.prometheus import exposition
+from aquaflow.service.health.state import State
 from tests.command_line import Cli
 
 TOKEN = "correct-horse-battery"

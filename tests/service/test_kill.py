@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from aquaflow.frame_rows import read_rows
+from aquaflow.dive.frames_csv import read_rows
 from aquaflow.synthetic import SyntheticConfig, write_dive
 from tests.service.killed_dives import kill_and_resume
 

@@ -14,11 +14,11 @@ import pytest
 from aquaflow.config import SourceConfig
 from aquaflow.config.cameras import V4l2Config
 from aquaflow.config.telemetry import parse_telemetry
-from aquaflow.failures import Failures
+from aquaflow.errors.failures import Failures
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.messages import CameraModel, Depth, Dropped, Frame, TelemetrySample
 from aquaflow.recording.playback import Playback
-from aquaflow.service.continued import Continued
+from aquaflow.service.dive_clock import Continued
 from aquaflow.service.feed import LiveFeed, PlaybackFeed
 from drivers.telemetry import LinkTelemetry
 from drivers.transport import opener

@@ -10,8 +10,8 @@ import pytest
 
 from aquaflow.errors import AquaFlowError
 from aquaflow.messages import Dropped
-from aquaflow.service.health import State
-from aquaflow.service.ladder import Level
+from aquaflow.service.health.degradation import Level
+from aquaflow.service.health.state import State
 from tests.service.live_scenes import CALM, Told, frame_of, rows_of, visited
 
 

@@ -12,10 +12,10 @@ from aquaflow.config.service import LiveMappingConfig
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
+from aquaflow.mapping.maps import Growth, Insertion
 from aquaflow.mapping.views import View
-from aquaflow.maps import Growth, Insertion
-from aquaflow.service.beats import Beats
-from aquaflow.service.ladder import Level
+from aquaflow.service.health.degradation import Level
+from aquaflow.service.health.heartbeats import Beats
 from aquaflow.service.map_thread import LONGEST_REST_S, STAGE, MapThread
 from tests.service.live_scenes import HEIGHT, WIDTH, RecordedMaps
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from aquaflow.config.service import LimitsConfig
-from aquaflow.service.pressure import Machine, Pressure
+from aquaflow.service.health.pressure import Machine, Pressure
 
 LIMITS = LimitsConfig()
 

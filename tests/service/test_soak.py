@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from aquaflow.config.vehicle import VehicleConfig
-from aquaflow.service.choice import resumed
-from aquaflow.service.session import LiveDive
+from aquaflow.service.checkpoint.resume import resumed
+from aquaflow.service.live_dive import LiveDive
 from tests.service.live_scenes import ToldFeed
 from tests.service.soak import Rounds, Sample, Sampler, descriptors, soak, summary
 

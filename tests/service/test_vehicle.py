@@ -14,10 +14,10 @@ from aquaflow.config.service import PoseConfig
 from aquaflow.config.telemetry import parse_telemetry
 from aquaflow.errors import ConfigError
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.service.pose_out import MetricScale, PoseOut
-from aquaflow.service.vehicle import VehicleReport
+from aquaflow.service.vehicle.pilot_messages import VehicleReport
+from aquaflow.service.vehicle.pose_output import MetricScale, PoseOut
+from aquaflow.sources.outbound import BodyMotion, BodyPose, Number, Sentence, Word
 from aquaflow.tracking.frames import FrameClass, Quality, Tracked
-from aquaflow.vehicle_words import BodyMotion, BodyPose, Number, Sentence, Word
 from drivers.protocol.mavlink import MavlinkDecoder
 from tests.service.live_scenes import Told, frame_of
 

@@ -12,11 +12,8 @@ import pytest
 
 from aquaflow.config.service import CheckpointConfig
 from aquaflow.errors import InputError
-from aquaflow.frame_table import FRAME
 from aquaflow.geometry.camera import guess_camera
-from aquaflow.plain_arrays import of_camera
-from aquaflow.service.choice import choose, resumed, tidy
-from aquaflow.service.generations import (
+from aquaflow.service.checkpoint.generations import (
     FORMAT,
     OtherFormatError,
     previous_file,
@@ -24,9 +21,12 @@ from aquaflow.service.generations import (
     state_file,
     write_state,
 )
+from aquaflow.service.checkpoint.resume import choose, resumed, tidy
+from aquaflow.service.live_dive import LiveDive
 from aquaflow.service.moment import Moment
 from aquaflow.service.onboard import map_live
-from aquaflow.service.session import LiveDive
+from aquaflow.storage.arrays import of_camera
+from aquaflow.tracking.frame_table import FRAME
 from tests.service.live_scenes import VEHICLE, ToldFeed
 
 

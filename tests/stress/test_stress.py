@@ -9,16 +9,21 @@ import numpy as np
 import pytest
 import torch
 
-from aquaflow import preparation
 from aquaflow.config import TrackingConfig
 from aquaflow.evaluation.stress import suite, swim
 from aquaflow.evaluation.stress.case import REGISTRY, Check
 from aquaflow.geometry import camera, similarity, triangulation
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.mapping import gaussians, image_formation, losses, mapper, medium, views
+from aquaflow.mapping import mapper, views
+from aquaflow.mapping.gaussians import gaussians
+from aquaflow.mapping.optimisation import losses
+from aquaflow.mapping.water import image_formation, medium
 from aquaflow.prior import flow, homography
 from aquaflow.render import adam, reference, water
-from aquaflow.tracking import attachment, bundle, initialisation, solver
+from aquaflow.sources import preprocessing
+from aquaflow.tracking import current_keyframe
+from aquaflow.tracking.initialisation import bundle, initialiser
+from aquaflow.tracking.pose import solver
 from tests.command_line import Cli, refused
 
 INFINITY = float("inf")
@@ -102,18 +107,18 @@ GUARDS: list[tuple[str, list[tuple[object, str, object]]]] = [
         "gradients_that_are_not_finite",
         [(adam, "sound_rows", all_rows), (adam, "library_or_none", no_library)],
     ),
-    ("nan_in_float_picture", [(preparation, "check_picture", always)]),
-    ("one_by_one", [(preparation, "check_picture", always)]),
+    ("nan_in_float_picture", [(preprocessing, "check_picture", always)]),
+    ("one_by_one", [(preprocessing, "check_picture", always)]),
     ("black", [(flow, "MIN_TEXTURE", -1.0)]),
     ("white", [(flow, "MIN_TEXTURE", -1.0)]),
     (
         "pure_rotation",
         [
-            (initialisation.Initialiser, "_trustworthy", always),
+            (initialiser.Initialiser, "_trustworthy", always),
             (triangulation, "MIN_PARALLAX_RAD", -1.0),
         ],
     ),
-    ("snow", [(attachment.Follower, "hidden", lambda *_: False)]),
+    ("snow", [(current_keyframe.Follower, "hidden", lambda *_: False)]),
 ]
 
 

@@ -10,8 +10,8 @@ import pytest
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp, so3_log
-from aquaflow.tracking import bundle as module
-from aquaflow.tracking.bundle import Bundle, BundleResult, adjust
+from aquaflow.tracking.initialisation import bundle as module
+from aquaflow.tracking.initialisation.bundle import Bundle, BundleResult, adjust
 from tests.tracking.tracking_scenes import CAMERA, cloud, pose
 
 Array = npt.NDArray[np.float64]

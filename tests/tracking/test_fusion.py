@@ -10,7 +10,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.triangulation import triangulate
 from aquaflow.keyframes import UNKNOWN_VARIANCE, KeyframeStore, Pointmap
-from aquaflow.tracking.fusion import (
+from aquaflow.tracking.pose.depth_fusion import (
     DISAGREEMENT_INFLATION,
     FUSED_FLOOR,
     MEASUREMENT_FLOOR,

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from aquaflow.config import GateConfig
-from aquaflow.tracking.gate import FrameGate, GateKind, Verdict
+from aquaflow.tracking.gate.gate import FrameGate, GateKind, Verdict
 from tests.tracking.tracking_scenes import CAMERA, SeaFloor, lawn_path, pose
 
 Picture = npt.NDArray[np.uint8]

@@ -17,12 +17,12 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
 from aquaflow.prior.contract import Encoding
-from aquaflow.tracking import keyframe_graph
 from aquaflow.tracking.frames import Link
-from aquaflow.tracking.keyframe_graph import Correction, KeyframeGraph
-from aquaflow.tracking.places import Found, Places
-from aquaflow.tracking.pose_graph_table import GraphResult, Snapshot
-from aquaflow.tracking.solver import Degeneracy, PoseEstimate
+from aquaflow.tracking.graph import keyframe_graph
+from aquaflow.tracking.graph.keyframe_graph import Correction, KeyframeGraph
+from aquaflow.tracking.graph.table import GraphResult, Snapshot
+from aquaflow.tracking.loops.relocaliser import Found, Places
+from aquaflow.tracking.pose.solver import Degeneracy, PoseEstimate
 from tests.tracking.graph_scenes import LOOP_SIGMA, SIGMA, circle
 
 COUNT = 24

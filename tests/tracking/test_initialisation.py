@@ -10,7 +10,7 @@ import pytest
 from aquaflow.config import InitialisationConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_log
-from aquaflow.tracking.initialisation import Initialiser, calibrated
+from aquaflow.tracking.initialisation.initialiser import Initialiser, calibrated
 from tests.tracking.tracking_scenes import KnownPrior, KnownView, depth_map, pose
 
 CAMERA = CameraModel(96, 72, 80.0, 80.0, 48.0, 36.0)

@@ -15,8 +15,8 @@ from aquaflow.keyframes import KeyframeStore
 from aquaflow.messages import Frame
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.tracking.frames import FrameClass, Tracked
-from aquaflow.tracking.keyframe_graph import Correction, KeyframeGraph
-from aquaflow.tracking.places import Places
+from aquaflow.tracking.graph.keyframe_graph import Correction, KeyframeGraph
+from aquaflow.tracking.loops.relocaliser import Places
 from aquaflow.tracking.tracker import Tracker
 from tests.tracking.tracking_scenes import SeaFloor, black, filmed, pose
 

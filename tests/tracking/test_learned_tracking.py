@@ -11,10 +11,10 @@ from aquaflow.config import PriorConfig, SourceConfig
 from aquaflow.evaluation.trajectory import read_tum
 from aquaflow.geometry.alignment import align
 from aquaflow.messages import Frame
-from aquaflow.preparation import Preparation
-from aquaflow.prior.choice import SHIPPED, make_prior
+from aquaflow.prior.factory import SHIPPED, make_prior
 from aquaflow.prior.folder import CARD
 from aquaflow.sources import open_recording
+from aquaflow.sources.preprocessing import Preparation
 from tests.tracking.tracked_clips import PLACED, run
 
 EVERY = 3

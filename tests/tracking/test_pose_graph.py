@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
-from aquaflow.tracking.pose_graph import Edge, PoseGraph, edge_information, solve
-from aquaflow.tracking.pose_graph_equations import Equations, Misfit
+from aquaflow.tracking.graph.equations import Equations, Misfit
+from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph, edge_information, solve
 from tests.tracking.graph_scenes import EXACT, INFORMATION, LOOP_SIGMA, Dive, largest_gap, moved
 
 Array = npt.NDArray[np.float64]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.tracking.pose_graph import Edge, solve
+from aquaflow.tracking.graph.pose_graph import Edge, solve
 from tests.tracking.graph_scenes import (
     EXACT,
     INFORMATION,

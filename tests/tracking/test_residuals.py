@@ -10,8 +10,8 @@ import pytest
 
 from aquaflow.config.tracking import PoseResidual
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.tracking.residuals import ROWS, Matches, PoseProblem
-from aquaflow.tracking.solver import solve_pose
+from aquaflow.tracking.pose.residuals import ROWS, Matches, PoseProblem
+from aquaflow.tracking.pose.solver import solve_pose
 from tests.tracking.tracking_scenes import cloud, pose, problem_of
 
 Array = npt.NDArray[np.float64]

@@ -9,10 +9,10 @@ import numpy.typing as npt
 import pytest
 
 from aquaflow.geometry.similarity import Sim3, so3_exp, so3_log
-from aquaflow.tracking import solver
-from aquaflow.tracking.certainty import UNKNOWN_SIGMA, certainty
-from aquaflow.tracking.residuals import Matches, Rows
-from aquaflow.tracking.solver import PoseProblem, solve_pose
+from aquaflow.tracking.pose import solver
+from aquaflow.tracking.pose.covariance import UNKNOWN_SIGMA, certainty
+from aquaflow.tracking.pose.residuals import Matches, Rows
+from aquaflow.tracking.pose.solver import PoseProblem, solve_pose
 from tests.tracking.tracking_scenes import CAMERA, cloud, pose, problem_of
 
 Array = npt.NDArray[np.float64]

@@ -7,7 +7,7 @@ import numpy as np
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import UNKNOWN_VARIANCE, Pointmap
-from aquaflow.tracking.fusion import transfer
+from aquaflow.tracking.pose.depth_fusion import transfer
 
 SMALL = CameraModel(60, 45, 50.0, 50.0, 30.0, 22.5)
 SHAPE = (45, 60)

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.messages import Frame
-from aquaflow.tracking.solver import PoseProblem
+from aquaflow.tracking.pose.solver import PoseProblem
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

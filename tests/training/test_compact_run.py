@@ -18,8 +18,8 @@ from aquaflow.training import compact_recall, compact_run
 from aquaflow.training.compact_recall import held_out_pairs, tracked_recall
 from aquaflow.training.compact_run import CompactRun, calibration, hardware_of, training_record
 from aquaflow.training.correspondences import overlap
-from aquaflow.training.generator.pool import Pool
-from aquaflow.training.generator.scene import Detail
+from aquaflow.training.pair_generator.pool import Pool
+from aquaflow.training.pair_generator.scene import Detail
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

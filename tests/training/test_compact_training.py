@@ -16,12 +16,12 @@ from aquaflow.prior.compact.network import COARSE, CompactPrior, NetworkSize
 from aquaflow.training.compact import CompactSettings, CompactTask, coarse_loss, compact_losses
 from aquaflow.training.compact_recall import mean_recall
 from aquaflow.training.correspondences import Correspondences
-from aquaflow.training.generator.cameras import TRAINING
-from aquaflow.training.generator.draw import Draw
-from aquaflow.training.generator.drawing import Looks, training_pair
-from aquaflow.training.generator.pool import Pool
-from aquaflow.training.generator.render import render_pairs
-from aquaflow.training.generator.scene import Detail
+from aquaflow.training.pair_generator.cameras import TRAINING
+from aquaflow.training.pair_generator.draw import Draw
+from aquaflow.training.pair_generator.drawing import Looks, training_pair
+from aquaflow.training.pair_generator.pool import Pool
+from aquaflow.training.pair_generator.render import render_pairs
+from aquaflow.training.pair_generator.scene import Detail
 from aquaflow.training.pairs import Pair
 from aquaflow.training.schedule import Schedule
 from aquaflow.training.trainer import CHECKPOINT, CURVE, HISTORY, TrainingPlan, train

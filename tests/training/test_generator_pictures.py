@@ -9,14 +9,14 @@ import pytest
 import torch
 
 from aquaflow.training.correspondences import overlap
-from aquaflow.training.generator.cameras import TRAINING
-from aquaflow.training.generator.draw import Draw
-from aquaflow.training.generator.drawing import Looks, through_water, training_pair
-from aquaflow.training.generator.pool import SHARD, STRIDE, Pool
-from aquaflow.training.generator.render import BRIGHTEST, median_depth, render_pairs
-from aquaflow.training.generator.scene import Detail
-from aquaflow.training.generator.sensor import taken
-from aquaflow.training.generator.water import MOST_ATTENUATION, random_water
+from aquaflow.training.pair_generator.cameras import TRAINING
+from aquaflow.training.pair_generator.draw import Draw
+from aquaflow.training.pair_generator.drawing import Looks, through_water, training_pair
+from aquaflow.training.pair_generator.pool import SHARD, STRIDE, Pool
+from aquaflow.training.pair_generator.render import BRIGHTEST, median_depth, render_pairs
+from aquaflow.training.pair_generator.scene import Detail
+from aquaflow.training.pair_generator.sensor import taken
+from aquaflow.training.pair_generator.water import MOST_ATTENUATION, random_water
 from aquaflow.training.pairs import Pair
 
 pytestmark = pytest.mark.usefixtures("one_thread")

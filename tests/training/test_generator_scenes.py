@@ -10,12 +10,17 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from aquaflow.training.correspondences import correspondences
-from aquaflow.training.generator.cameras import TRAINING, first_camera, intrinsics, second_camera
-from aquaflow.training.generator.draw import Draw
-from aquaflow.training.generator.look import look_again
-from aquaflow.training.generator.march import first_hits
-from aquaflow.training.generator.render import median_depth, render_pairs, render_view
-from aquaflow.training.generator.scene import Detail, Scene, random_scenes, rotation
+from aquaflow.training.pair_generator.cameras import (
+    TRAINING,
+    first_camera,
+    intrinsics,
+    second_camera,
+)
+from aquaflow.training.pair_generator.draw import Draw
+from aquaflow.training.pair_generator.look import look_again
+from aquaflow.training.pair_generator.march import first_hits
+from aquaflow.training.pair_generator.render import median_depth, render_pairs, render_view
+from aquaflow.training.pair_generator.scene import Detail, Scene, random_scenes, rotation
 from aquaflow.training.pairs import Pair, View, seen_from
 
 pytestmark = pytest.mark.usefixtures("one_thread")

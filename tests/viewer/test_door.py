@@ -13,7 +13,7 @@ import pytest
 
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.errors import ConfigError, InputError
-from aquaflow.viewer.door import LONGEST_HEAD, Door
+from aquaflow.viewer.auth_proxy import LONGEST_HEAD, Door
 
 TOKEN = "correct-horse-battery"
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from aquaflow.config.presets import preset
 from aquaflow.errors import InputError
 from aquaflow.evaluation.bench import machine
 from aquaflow.evaluation.bench.ci_suite import ci_scenes
@@ -20,8 +21,7 @@ from aquaflow.evaluation.bench.runner import (
     run_all,
 )
 from aquaflow.evaluation.bench.scene import Scene, scene_at
-from aquaflow.export.atomic import write_json
-from aquaflow.presets import preset
+from aquaflow.storage.atomic import write_json
 
 JSON_FILE, PICTURE_FILE = "bench.json", "bench.png"
 PEERS = ("two-view", "colmap")

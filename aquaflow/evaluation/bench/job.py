@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from aquaflow.config import Config, parse_config
+from aquaflow.config.presets import merged, preset
 from aquaflow.evaluation.bench.scene import Scene
-from aquaflow.presets import merged, preset
 
 
 @dataclass(frozen=True)

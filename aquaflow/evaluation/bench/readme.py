@@ -10,7 +10,7 @@ from typing import Any
 from aquaflow.errors import InputError, reason_of
 from aquaflow.evaluation.bench.summary import NOTES
 from aquaflow.evaluation.bench.table import failures, markdown
-from aquaflow.export.atomic import atomic_write
+from aquaflow.storage.atomic import atomic_write
 
 BEGIN, END = "<!-- bench: begin -->", "<!-- bench: end -->"
 

@@ -30,7 +30,7 @@ def perform(job: Job) -> dict[str, Any]:
     if job.peer is not None:
         metrics = run_peer(job.peer, scene, job.config(), out)
     else:
-        from aquaflow.pipeline import map_recording  # torch: two seconds that no peer needs
+        from aquaflow.dive.replay import map_recording  # torch: two seconds that no peer needs
 
         calibration = None if scene.calibration is None else load_camera(Path(scene.calibration))
         recording = open_recording(Path(scene.recording), fps=job.config().source.fps)

@@ -15,8 +15,8 @@ from aquaflow.errors import InputError
 from aquaflow.evaluation.bench import machine
 from aquaflow.evaluation.matching import LEVELS, Picture, homography_recall, matcher_of
 from aquaflow.evaluation.prior_bench.latency import Contender, latency_rows, sea_floor
-from aquaflow.prior.choice import SHIPPED, make_prior
 from aquaflow.prior.compact.quantise import INT8_ENCODER
+from aquaflow.prior.factory import SHIPPED, make_prior
 from aquaflow.prior.folder import CARD, read_card
 
 SIZES = ((320, 240), (640, 480))

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from aquaflow.config import Config
-from aquaflow.dive import DiveFolder
+from aquaflow.dive.folder import DiveFolder
 from aquaflow.evaluation.stress.case import Check, case
 from aquaflow.evaluation.stress.swim import Tracking, clear_swim, clear_tracking, sound, track
 

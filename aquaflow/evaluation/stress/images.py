@@ -28,8 +28,8 @@ from aquaflow.evaluation.stress.swim import (
 )
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.messages import Frame
-from aquaflow.preparation import Preparation
 from aquaflow.prior.classical import ClassicalPrior
+from aquaflow.sources.preprocessing import Preparation
 
 HURT = 2
 """Frames in a row that show nothing: fewer than what starts a new sub-map."""

@@ -20,8 +20,8 @@ from aquaflow.evaluation.stress.swim import (
     track,
 )
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.tracking.bundle import Bundle, adjust
-from aquaflow.tracking.solver import PoseProblem, solve_pose
+from aquaflow.tracking.initialisation.bundle import Bundle, adjust
+from aquaflow.tracking.pose.solver import PoseProblem, solve_pose
 
 POINTS = 200
 

@@ -17,7 +17,7 @@ from aquaflow.render import select_renderer
 from aquaflow.render.photometric import photometric_loss, photometric_loss_torch
 from aquaflow.render.reference import ReferenceRenderer
 from aquaflow.render.water import compose_water, compose_water_torch
-from aquaflow.tracking.solver import PoseProblem, solve_pose
+from aquaflow.tracking.pose.solver import PoseProblem, solve_pose
 
 HEIGHT, WIDTH = 24, 32
 

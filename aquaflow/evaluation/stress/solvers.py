@@ -13,9 +13,9 @@ from aquaflow.geometry.similarity import Sim3, so3_exp, so3_log
 from aquaflow.geometry.triangulation import triangulate
 from aquaflow.geometry.two_view import relative_pose
 from aquaflow.prior.homography import flow_of_homography
-from aquaflow.tracking.bundle import Bundle, adjust
-from aquaflow.tracking.relocate import pose_from_scratch
-from aquaflow.tracking.solver import PoseProblem, solve_pose
+from aquaflow.tracking.initialisation.bundle import Bundle, adjust
+from aquaflow.tracking.pose.pnp import pose_from_scratch
+from aquaflow.tracking.pose.solver import PoseProblem, solve_pose
 
 Array = npt.NDArray[np.float64]
 

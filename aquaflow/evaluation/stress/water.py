@@ -9,10 +9,10 @@ from torch import Tensor
 
 from aquaflow.config import MediumConfig
 from aquaflow.evaluation.stress.case import Check, case
-from aquaflow.mapping.gaussians import radiance, raw_colour
-from aquaflow.mapping.image_formation import Water
-from aquaflow.mapping.losses import depth_loss
-from aquaflow.mapping.medium import Medium
+from aquaflow.mapping.gaussians.gaussians import radiance, raw_colour
+from aquaflow.mapping.optimisation.losses import depth_loss
+from aquaflow.mapping.water.image_formation import Water
+from aquaflow.mapping.water.medium import Medium
 from aquaflow.render.water import compose_water, compose_water_torch
 
 RATES = (0.0, 1e-8, 0.01, 0.5, 5.0, 50.0)

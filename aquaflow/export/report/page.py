@@ -5,10 +5,10 @@ from __future__ import annotations
 import html
 from pathlib import Path
 
-from aquaflow.export.atomic import atomic_write
 from aquaflow.export.report import sections
 from aquaflow.export.report.data import ReportData
 from aquaflow.export.report.style import STYLE_SHEET
+from aquaflow.storage.atomic import atomic_write
 
 
 def write_report(path: Path, data: ReportData) -> None:

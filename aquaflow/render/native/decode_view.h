@@ -3,7 +3,7 @@
 //   o = [v, d],  h = relu(trunk + W gamma(o)),  r = tanh(heads h + bias) limits,  attributes = initial + r
 //
 // Gaussians are taken in blocks, one lane each, so that every line of the arithmetic is a vector of them.
-// The definition is Decoder.residuals and apply_residuals in aquaflow/mapping/decoder.py.
+// The definition is Decoder.residuals and apply_residuals in aquaflow/mapping/decoder/decoder.py.
 #pragma once
 
 namespace aq {

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from aquaflow.errors import InputError
-from aquaflow.plain_yaml import read_mapping
+from aquaflow.errors.plain_yaml import read_mapping
 from aquaflow.training.datasets.openexr import read_exr
 from aquaflow.training.datasets.posed import (
     NED_TO_OPTICAL,

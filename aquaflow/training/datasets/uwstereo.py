@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from aquaflow.config.stage import Stage
 from aquaflow.errors import ConfigError, InputError
-from aquaflow.plain_yaml import read_mapping
+from aquaflow.errors.plain_yaml import read_mapping
 from aquaflow.training.datasets.posed import (
     Depth,
     Frames,

@@ -18,9 +18,9 @@ from aquaflow.export.tum import write_tum
 from aquaflow.geometry.camera import load_camera
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.messages import Frame
-from aquaflow.preparation import Preparation
 from aquaflow.profiler import pace
 from aquaflow.sources import open_recording
+from aquaflow.sources.preprocessing import Preparation
 
 FEWEST_POSES = 3
 

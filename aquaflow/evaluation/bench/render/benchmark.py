@@ -23,7 +23,7 @@ from aquaflow.evaluation.bench.render.picture import draw
 from aquaflow.evaluation.bench.render.rows import Row, row_of
 from aquaflow.evaluation.bench.render.scene import SMALL, Size, SplatScene, height_field
 from aquaflow.evaluation.bench.render.timing import Sample, interleaved
-from aquaflow.export.atomic import write_json
+from aquaflow.storage.atomic import write_json
 
 JSON_FILE, PICTURE_FILE = "render_bench.json", "render_bench.png"
 

@@ -1,0 +1,253 @@
+"""The command line. Thin: every command reads its arguments and calls one function.
+
+Heavy modules load inside the commands, so that ``aquaflow --help`` costs no torch.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from aquaflow import __version__
+from aquaflow.cli.bench import register as register_bench
+from aquaflow.cli.console import Json, progress_bars
+from aquaflow.cli.devices import register as register_devices
+from aquaflow.cli.export import register as register_export
+from aquaflow.cli.prior import register as register_prior
+from aquaflow.cli.record import register as register_record
+from aquaflow.cli.service import exit_code, map_realtime, tell_finished
+from aquaflow.cli.service import register as register_service
+from aquaflow.cli.stress import register as register_stress
+from aquaflow.errors.crash_report import one_sentence, print_anything, refuse_unreadable
+
+if TYPE_CHECKING:
+    from aquaflow.config import Config
+    from aquaflow.dive.run import Finished
+
+app = typer.Typer(
+    help="Onboard mapping for underwater robots: trajectory, Gaussian map, and the water itself.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+def main() -> None:
+    """Entry point: whatever a command raises becomes one sentence and an exit code."""
+    # What Python warns of is for the log of the dive, not for who flies it.
+    logging.captureWarnings(True)
+    print_anything((sys.stdout, sys.stderr))
+    with one_sentence():
+        refuse_unreadable(sys.argv[1:])
+        app()
+
+
+@app.callback(invoke_without_command=True)
+def options(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    if version:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.command("map")
+def map_command(
+    source: Annotated[Path, typer.Argument(help="Folder of images, video, or synthetic dive.")],
+    out: Annotated[Path, typer.Option(help="Dive folder to write.")] = Path("out/dive"),
+    calib: Annotated[Path | None, typer.Option(help="camera.yaml; else a guess, refined.")] = None,
+    config: Annotated[Path | None, typer.Option(help="YAML config; see `aquaflow config`.")] = None,
+    every: Annotated[int | None, typer.Option(help="Use every n-th frame.")] = None,
+    start: Annotated[int | None, typer.Option(help="First frame.")] = None,
+    stop: Annotated[int | None, typer.Option(help="First frame not used.")] = None,
+    width: Annotated[int | None, typer.Option(help="Width in pixels to map at.")] = None,
+    crop: Annotated[str | None, typer.Option(help="left | right | x,y,width,height")] = None,
+    fps: Annotated[float | None, typer.Option(help="Frames/s of a folder.")] = None,
+    preset: Annotated[str | None, typer.Option(help="fast | balanced | accurate")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of every random draw.")] = None,
+    threads: Annotated[int | None, typer.Option(help="Default: every core.")] = None,
+    refine_steps: Annotated[int | None, typer.Option(help="Steps after the last frame.")] = None,
+    refine_seconds: Annotated[
+        float | None, typer.Option(help="Time limit of refining; runs then differ.")
+    ] = None,
+    tracking_only: Annotated[bool, typer.Option(help="Trajectory without a map.")] = False,
+    overwrite: Annotated[bool, typer.Option(help="Replace the dive in --out.")] = False,
+    realtime: Annotated[
+        bool, typer.Option(help="As the live loop would: newest frame, mapping beside.")
+    ] = False,
+    profile: Annotated[bool, typer.Option(help="Write trace.json for Chrome's tracing.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Turn a recording into a dive folder: trajectory, map, water, report."""
+    source_settings = {
+        "every": every, "start": start, "stop": stop, "width": width, "crop": crop, "fps": fps,
+    }  # fmt: skip
+    optimiser = {"refine_steps": refine_steps, "refine_seconds": refine_seconds}
+    mapping = {"optimiser": optimiser, "enabled": False if tracking_only else None}
+    settings = _configured(
+        config,
+        preset,
+        {"seed": seed, "threads": threads, "source": source_settings, "mapping": mapping},
+    )
+    from aquaflow.geometry.camera import load_camera
+    from aquaflow.sources import open_recording
+
+    calibration = None if calib is None else load_camera(calib)
+    if realtime:
+        tell_finished(map_realtime(source, settings, calibration, out, overwrite, as_json), as_json)
+        return
+    recording = open_recording(source, fps=settings.source.fps)
+
+    from aquaflow.dive.replay import (
+        map_recording,  # loads torch: after what can be refused without it
+    )
+
+    with progress_bars(quiet=as_json) as progress:
+        replayed = map_recording(
+            recording, source.name, out, settings, calibration, overwrite, progress, trace=profile
+        )
+    if as_json:
+        typer.echo(json.dumps({"dive": str(replayed.dive), **replayed.metrics}))
+        raise typer.Exit(exit_code(replayed))
+    _print_summary(replayed)
+    shown = [name for name in ("report.html", "map.ply") if (replayed.dive / name).exists()]
+    typer.echo(f"Look at {' and '.join(str(replayed.dive / name) for name in shown)}.")
+    raise typer.Exit(exit_code(replayed))
+
+
+@app.command()
+def synth(
+    out: Annotated[Path, typer.Argument(help="Folder to write.")],
+    scene: Annotated[
+        str, typer.Option(help="reef | flat_sand | wall | pipe | pool | survey")
+    ] = "reef",
+    water: Annotated[str | None, typer.Option(help="Water type, such as coastal_1C.")] = None,
+    frames: Annotated[int | None, typer.Option(help="Number of pictures.")] = None,
+    width: Annotated[int | None, typer.Option(help="Pixels.")] = None,
+    height: Annotated[int | None, typer.Option(help="Pixels.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of every random draw.")] = 0,
+    display: Annotated[
+        str | None, typer.Option(help="Burned into the pictures: clock | clock_and_crosshair")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write a synthetic dive with its ground truth."""
+    from pydantic import ValidationError
+
+    from aquaflow.errors import ConfigError
+    from aquaflow.synthetic import SyntheticConfig, write_dive
+
+    asked = {
+        "scene": scene, "water": water, "frames": frames, "width": width, "height": height,
+        "seed": seed, "display": display,
+    }  # fmt: skip
+    try:
+        config = SyntheticConfig.model_validate({k: v for k, v in asked.items() if v is not None})
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ConfigError(f"--{first['loc'][0]}: {first['msg'].lower()}") from error
+    with progress_bars(quiet=as_json) as progress:
+        write_dive(out, config, lambda done, total: progress("render", done, total))
+    if as_json:
+        typer.echo(json.dumps({"out": str(out), "frames": config.frames}))
+    else:
+        typer.echo(f"Wrote {config.frames} pictures with their truth to {out}.")
+
+
+@app.command()
+def evaluate(
+    dive: Annotated[Path, typer.Argument(help="Dive folder.")],
+    truth: Annotated[
+        Path | None, typer.Option(help="poses.tum, a synthetic dive, or a table of positions.")
+    ] = None,
+    clean: Annotated[
+        Path | None, typer.Option(help="The same recording without water, for restored views.")
+    ] = None,
+    clean_crop: Annotated[str | None, typer.Option(help="Crop of --clean, such as right.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Measure a dive against the truth: trajectory, water, restored views."""
+    from aquaflow.errors import InputError
+    from aquaflow.evaluation.protocol import evaluate_dive
+    from aquaflow.evaluation.restoration import evaluate_restoration
+    from aquaflow.evaluation.summary import in_words
+
+    if truth is None and clean is None:
+        raise InputError("nothing to compare with: give --truth, --clean, or both")
+    result: dict[str, Any] = {}
+    if truth is not None:
+        result |= evaluate_dive(dive, truth).to_json()
+    if clean is not None:
+        result["restoration"] = evaluate_restoration(dive, clean, clean_crop).to_json()
+    if as_json:
+        typer.echo(json.dumps(result))
+    else:
+        typer.echo("\n".join(in_words(result)))
+
+
+@app.command()
+def doctor(as_json: Json = False) -> None:
+    """Say what this machine has, what AquaFlow will use, and what is missing for what."""
+    from rich.console import Console
+
+    from aquaflow.doctor import examine, print_findings, to_json
+
+    findings = examine()
+    if as_json:
+        typer.echo(json.dumps(to_json(findings)))
+    else:
+        print_findings(findings, Console())
+
+
+@app.command("config")
+def config_command(
+    file: Annotated[Path | None, typer.Argument(help="A config to check and complete.")] = None,
+) -> None:
+    """Print the effective configuration as YAML: every key and its value."""
+    import yaml
+
+    from aquaflow.config import Config, load_config
+
+    settings = Config() if file is None else load_config(file)
+    typer.echo(yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
+
+
+def _configured(path: Path | None, preset: str | None, overrides: dict[str, Any]) -> Config:
+    """The config file with the preset, and then the command line's options, on top."""
+    from aquaflow.config import Config, load_config, parse_config, presets
+
+    base = (Config() if path is None else load_config(path)).model_dump()
+    if preset is not None:
+        base = presets.merged(base, presets.preset(preset))
+    return parse_config(presets.merged(base, overrides), "command line")
+
+
+def _print_summary(finished: Finished) -> None:
+    metrics = finished.metrics
+    for warning in finished.warnings:
+        typer.echo(f"Warning: {warning}.")
+    quality = (
+        "no held-out frames"
+        if metrics["psnr"] is None
+        else f"held-out PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.3f}"
+    )
+    typer.echo(
+        f"{metrics['tracked']} of {metrics['frames']} frames posed, {metrics['keyframes']} "
+        f"keyframes, {metrics['gaussians']} Gaussians, {quality}, {metrics['wall_s']:.0f} s."
+    )
+    for note in finished.notes:
+        typer.echo(f"Note: {note}.")
+
+
+register_bench(app)
+register_devices(app)
+register_export(app)
+register_prior(app)
+register_record(app)
+register_service(app)
+register_stress(app)

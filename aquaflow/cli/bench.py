@@ -1,0 +1,135 @@
+"""The commands that measure AquaFlow itself: ``bench`` and ``ablate``. Thin, like all of cli/."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from aquaflow.cli.console import Json, progress_bars, table_console
+from aquaflow.errors import InputError
+
+Suite = Annotated[str | None, typer.Option(help="ci (synthetic) | real DATA_DIR")]
+Data = Annotated[Path | None, typer.Argument(help="Of --suite real: a folder for each clip.")]
+Scenes = Annotated[list[Path] | None, typer.Option("--scene", help="Recording; may be repeated.")]
+
+DIVES = "dives"
+
+
+class _DivesUnlessNamed(TyperGroup):
+    """``aquaflow bench [OPTIONS] [DATA]`` is ``aquaflow bench dives [OPTIONS] [DATA]``.
+
+    A DATA argument of the group itself would swallow the names of its commands.
+    """
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        named = bool(args) and args[0] in self.commands
+        return super().parse_args(ctx, args if named else [DIVES, *args])
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to ``app``."""
+    bench = typer.Typer(
+        cls=_DivesUnlessNamed, help="Run time against error; `bench render`: of the renderer."
+    )
+    bench.command(DIVES)(dives)
+    bench.command()(render)
+    app.add_typer(bench, name="bench")
+    app.command()(ablate)
+
+
+def dives(
+    data: Data = None,
+    suite: Suite = None,
+    scene: Scenes = None,
+    preset: Annotated[list[str] | None, typer.Option(help="May be repeated.")] = None,
+    repeats: Annotated[int, typer.Option(min=1, help="Runs of each, interleaved.")] = 1,
+    peers: Annotated[bool, typer.Option(help="Run COLMAP and two-view odometry too.")] = True,
+    out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("out/bench"),
+    readme: Annotated[
+        Path | None, typer.Option(help="Write table and picture into this Markdown file.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Run time against error: scenes x presets as a table, a picture and bench.json.
+
+    `aquaflow bench` alone does this too; `aquaflow bench render` times the renderer.
+    """
+    from aquaflow.config.presets import PRESETS
+    from aquaflow.evaluation.bench import benchmark as bm
+    from aquaflow.evaluation.bench.readme import around_section
+
+    if data is not None and suite is None and not scene:
+        raise InputError(
+            f"bench knows neither a command nor a suite '{data}'; "
+            "give render, --suite real DATA_DIR, or --scene PATH"
+        )
+
+    if readme is not None:
+        around_section(readme)
+    contenders = bm.contenders_of(preset or list(PRESETS), peers)
+    with progress_bars(as_json) as progress:
+        scenes = bm.scenes_of(suite, data, scene or [], out, progress)
+        result = bm.benchmark(scenes, contenders, repeats, out, progress)
+    if readme is not None:
+        from aquaflow.evaluation.bench.readme import write_readme
+
+        write_readme(readme, out / bm.PICTURE_FILE, result["machine"], result["runs"])
+    if as_json:
+        typer.echo(json.dumps(result))
+        return
+    from aquaflow.evaluation.bench.table import print_table
+
+    print_table(result["runs"], table_console())
+    typer.echo(f"Look at {out / bm.PICTURE_FILE}; all numbers are in {out / bm.JSON_FILE}.")
+
+
+def render(
+    quick: Annotated[bool, typer.Option("--quick", help="Only the bars' two sizes.")] = False,
+    repeats: Annotated[int, typer.Option(min=1, help="Runs of each, interleaved.")] = 7,
+    opensplat: Annotated[
+        str | None, typer.Option(help="Times your OpenSplat build; see docs/performance.md.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("out/bench_render"),
+    as_json: Json = False,
+) -> None:
+    """Forward and backward ms of every renderer here: table, picture, render_bench.json."""
+    from aquaflow.evaluation.bench.render import benchmark as bm
+    from aquaflow.evaluation.bench.render.scene import QUICK_SIZES, SIZES
+
+    sizes = QUICK_SIZES if quick else SIZES
+    with progress_bars(as_json) as progress:
+        result = bm.bench_render(sizes, repeats, out, opensplat, progress)
+    if as_json:
+        typer.echo(json.dumps(result))
+        return
+    from aquaflow.evaluation.bench.render.table import print_result
+
+    print_result(result, table_console())
+    typer.echo(f"Look at {out / bm.PICTURE_FILE}; all numbers are in {out / bm.JSON_FILE}.")
+
+
+def ablate(
+    data: Data = None,
+    suite: Suite = None,
+    scene: Scenes = None,
+    out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("out/ablation"),
+    as_json: Json = False,
+) -> None:
+    """What each part is worth: everything once without it, error and time against full."""
+    from aquaflow.evaluation.bench import ablation
+    from aquaflow.evaluation.bench.benchmark import scenes_of
+
+    with progress_bars(as_json) as progress:
+        scenes = scenes_of(suite, data, scene or [], out, progress)
+        if suite == "ci":
+            scenes = [s for s in scenes if s.name in ablation.CI_SCENES] or scenes
+        result = ablation.ablate(scenes, out, progress)
+    (out / "ablate.json").write_text(json.dumps(result, indent=2) + "\n")
+    if as_json:
+        typer.echo(json.dumps(result))
+    else:
+        ablation.print_ablation(result["rows"], table_console())

@@ -1,0 +1,59 @@
+"""The command that looks for hardware: ``devices``. Thin, like all of cli/."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+import typer
+
+from aquaflow.cli.console import Json, table_console
+
+if TYPE_CHECKING:
+    from aquaflow.sources.discovery import Found
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to ``app``."""
+    app.command()(devices)
+
+
+def devices(as_json: Json = False) -> None:
+    """List cameras and links that are plugged in, with the lines for the config."""
+    from aquaflow.sources.discovery import discover
+
+    found = discover()
+    if as_json:
+        typer.echo(json.dumps(asdict(found)))
+    else:
+        _print(found)
+
+
+def _print(found: Found) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = table_console()
+    if found.devices:
+        table = Table(box=None, pad_edge=False, padding=(0, 2, 1, 0))
+        for heading in ("kind", "found", "what it gives", "for the config"):
+            table.add_column(heading, overflow="fold")
+        for device in found.devices:
+            table.add_row(
+                device.kind,
+                escape(f"{device.name}\n{device.id}"),
+                escape(device.detail),
+                escape(_as_yaml(device.config)),
+            )
+        console.print(table)
+    else:
+        typer.echo("No camera, serial port or CAN interface is plugged in.")
+    for problem in found.problems:
+        typer.echo(f"Not looked for: {problem}.")
+
+
+def _as_yaml(config: dict[str, str]) -> str:
+    import yaml
+
+    return str(yaml.safe_dump(config, sort_keys=False)).rstrip()

@@ -1,0 +1,214 @@
+"""The commands of the two-view prior: export, verify, bench, train. Thin, like all of cli/."""
+
+from __future__ import annotations
+
+import json
+from enum import Enum
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from aquaflow.cli.console import Json, progress_bars, table_console
+from aquaflow.cores import usable_threads
+from aquaflow.errors import AquaFlowError
+
+if TYPE_CHECKING:
+    from aquaflow.prior.folder import PriorCard
+
+MOST_RELATIVE = 1e-4
+"""Difference between ONNX and torch, relative to an output's largest value, that is parity."""
+
+Folder = Annotated[
+    Path | None, typer.Argument(help="Exported prior; default: a tiny one, exported on the spot.")
+]
+
+
+Checkpoint = Annotated[
+    Path | None,
+    typer.Option(help="Weights to compare with; without, what was measured at export is shown."),
+]
+
+
+class Exported(str, Enum):
+    """Networks that can be exported."""
+
+    mast3r = "mast3r"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to ``app``."""
+    prior = typer.Typer(
+        help="The two-view prior: export, verify, bench, train.", no_args_is_help=True
+    )
+    prior.command()(export)
+    prior.command()(verify)
+    prior.command()(bench)
+    train = typer.Typer(help="Train a network.", no_args_is_help=True)
+    train.command("mast3r")(train_mast3r)
+    train.command("compact")(train_compact)
+    prior.add_typer(train, name="train")
+    app.add_typer(prior, name="prior")
+
+
+def export(
+    network: Annotated[Exported, typer.Argument(help="Which network.")],
+    checkpoint: Annotated[Path, typer.Option(help="The public .pth file, which you bring.")],
+    out: Annotated[Path, typer.Option(help="New folder to write.")] = Path("out/prior"),
+    width: Annotated[int, typer.Option(help="px of the pictures, a multiple of 16.")] = 512,
+    height: Annotated[int, typer.Option(help="px, a multiple of 16.")] = 384,
+    as_json: Json = False,
+) -> None:
+    """Write encoder.onnx, decoder.onnx and prior.json for pictures of one size."""
+    from aquaflow.prior.mast3r.export import export as export_mast3r
+    from aquaflow.prior.mast3r.weights import LICENCE_NOTICE, load_checkpoint
+
+    del network  # there is one so far
+    typer.echo(LICENCE_NOTICE, err=True)
+    with progress_bars(as_json) as advance:
+        model = load_checkpoint(checkpoint)
+        card = export_mast3r(model, out, width, height, LICENCE_NOTICE, advance)
+    _report(card.name, card.parity, as_json)
+    if not as_json:
+        typer.echo(f"written to {out}")
+
+
+def verify(folder: Folder = None, checkpoint: Checkpoint = None, as_json: Json = False) -> None:
+    """Compare every output of the ONNX files with torch's; exit code 1 beyond 1e-4."""
+    from aquaflow.prior.folder import read_card
+    from aquaflow.prior.mast3r.export import verify_tiny
+
+    if folder is None:
+        with TemporaryDirectory() as scratch, progress_bars(as_json) as advance:
+            name, parity = "mast3r (tiny)", verify_tiny(Path(scratch) / "prior", advance)
+    else:
+        card = read_card(folder)
+        name, parity = card.name, card.parity
+        if checkpoint is not None:
+            parity = _parity_with(checkpoint, folder, card)
+    _report(name, parity, as_json)
+    worst = max(parity.values())
+    if not worst <= MOST_RELATIVE:
+        raise AquaFlowError(
+            f"prior {name} differs from torch by {worst:.1e}, more than {MOST_RELATIVE:.0e}; "
+            "export it again"
+        )
+
+
+def bench(
+    folder: Annotated[
+        list[Path] | None, typer.Option(help="Exported prior to time too; may be repeated.")
+    ] = None,
+    threads: Annotated[list[int] | None, typer.Option(min=1, help="May be repeated.")] = None,
+    device: Annotated[str, typer.Option(help="auto | cpu | cuda | tensorrt")] = "auto",
+    pictures: Annotated[
+        Path | None, typer.Option(help="Folder of pictures to match; default: a generated one.")
+    ] = None,
+    repeats: Annotated[int, typer.Option(min=1, help="Frames of each kind.")] = 15,
+    as_json: Json = False,
+) -> None:
+    """Milliseconds a frame, matching included, and matches found, of every prior that is here."""
+    from aquaflow.evaluation.prior_bench.benchmark import bench_prior
+    from aquaflow.evaluation.prior_bench.table import print_result
+
+    with progress_bars(as_json) as advance:
+        counts = list(dict.fromkeys(map(usable_threads, threads or [1])))
+        result = bench_prior(folder or [], counts, device, pictures, repeats, advance)
+    if as_json:
+        typer.echo(json.dumps(result))
+    else:
+        print_result(result, table_console())
+
+
+def train_mast3r(
+    checkpoint: Annotated[Path, typer.Option(help="Weights to start from, which you bring.")],
+    data: Annotated[
+        list[str], typer.Option(help="KIND=FOLDER; may be repeated; see docs/prior.md.")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder of pairs, checkpoint, curve and weights.")],
+    width: Annotated[int, typer.Option(help="px of the pictures, a multiple of 16.")] = 512,
+    height: Annotated[int, typer.Option(help="px, a multiple of 16.")] = 384,
+    epochs: Annotated[int, typer.Option(min=1, help="The first 2 of 15 are warm-up.")] = 30,
+    batch: Annotated[int, typer.Option(min=1, help="Pairs of a batch, on each GPU.")] = 2,
+    accumulate: Annotated[int, typer.Option(min=1, help="Batches of a step.")] = 4,
+    seed: Annotated[int, typer.Option(help="Of order and draws.")] = 0,
+) -> None:
+    """Fine-tune as in the paper; resumes from --out.
+
+    Several GPUs: torchrun --nproc-per-node 4 --no-python aquaflow prior train mast3r ...
+    """
+    from aquaflow.prior.mast3r.weights import LICENCE_NOTICE, load_checkpoint
+    from aquaflow.training import finetune
+    from aquaflow.training.peers import joined
+
+    settings = finetune.FineTuningSettings(
+        width, height, epochs, max(1, epochs * 2 // 15), batch, accumulate, seed
+    )
+    sequences = finetune.read_data(data)
+    with joined() as peers, progress_bars(quiet=not peers.leads) as advance:
+        if peers.leads:
+            typer.echo(LICENCE_NOTICE, err=True)
+        network = load_checkpoint(checkpoint).requires_grad_(True)
+        pairs = finetune.mined(sequences, out, settings, peers, advance)
+        finetune.fine_tune(network, pairs, out, settings, peers, advance)
+    typer.echo(f"Export {out / finetune.WEIGHTS} with `aquaflow prior export mast3r`.")
+
+
+def train_compact(
+    out: Annotated[Path, typer.Option(help="Folder of scenes, checkpoint, curve and prior.")] = (
+        Path("out/compact")
+    ),
+    steps: Annotated[int, typer.Option(min=1, help="Of the whole training.")] = 20_000,
+    scenes: Annotated[int, typer.Option(min=8, help="Generated pairs; 3 a second.")] = 1600,
+    batch: Annotated[int, typer.Option(min=2, help="Pairs of a step.")] = 8,
+    seed: Annotated[int, typer.Option(help="Of scenes, water and order.")] = 1,
+    threads: Annotated[int, typer.Option(min=1, help="Of torch.")] = 1,
+    device: Annotated[str, typer.Option(help="cpu | cuda")] = "cpu",
+    as_json: Json = False,
+) -> None:
+    """Train the compact prior on generated pictures, from scratch; resumes from --out.
+
+    30 pairs a second on one core; set MALLOC_MMAP_THRESHOLD_ and MALLOC_TRIM_THRESHOLD_ to
+    2000000000, or the pages of every step are given back and asked for again.
+    """
+    import torch
+
+    from aquaflow.training.compact import CompactSettings
+    from aquaflow.training.compact_run import PRIOR, CompactRun
+    from aquaflow.training.compact_run import train_compact as run_training
+
+    torch.set_num_threads(usable_threads(threads))
+    settings = CompactSettings(batch=batch, scenes=scenes, first_scenes=min(160, scenes))
+    run = CompactRun(seed=seed, steps=steps, settings=settings)
+    with progress_bars(as_json) as advance:
+        card = run_training(run, out, advance, device)
+    if as_json:
+        typer.echo(json.dumps(card.training))
+    else:
+        typer.echo(f"written to {out / PRIOR}: {json.dumps((card.training or {})['held_out'])}")
+
+
+def _parity_with(checkpoint: Path, folder: Path, card: PriorCard) -> dict[str, float]:
+    from aquaflow.prior.compact import export as compact
+    from aquaflow.prior.mast3r import export as mast3r
+    from aquaflow.prior.mast3r.weights import load_checkpoint
+
+    if card.name == "compact":
+        return compact.parity_of(compact.load_checkpoint(checkpoint), folder)
+    return mast3r.parity_of(load_checkpoint(checkpoint), folder, card.width, card.height)
+
+
+def _report(name: str, parity: dict[str, float], as_json: bool) -> None:
+    if as_json:
+        outputs = [{"prior": name, "name": output, "max_rel": x} for output, x in parity.items()]
+        typer.echo(json.dumps({"outputs": outputs}))
+        return
+    from rich.table import Table
+
+    table = Table(title=f"{name}: ONNX against torch")
+    table.add_column("output")
+    table.add_column("largest relative difference", justify="right")
+    for output, difference in parity.items():
+        table.add_row(output, f"{difference:.1e}")
+    table_console().print(table)

@@ -1,0 +1,193 @@
+"""The commands of the onboard service: ``run``, ``status`` and ``view``. Thin, like all of cli/."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from aquaflow.cli.console import Json, Seconds, progress_bars, table_console
+
+if TYPE_CHECKING:
+    from aquaflow.config import Config
+    from aquaflow.dive.run import Finished
+    from aquaflow.geometry.camera import CameraModel
+    from aquaflow.service.feed import Feed
+
+
+POOR_RESULT = 3
+"""Exit code of a dive that was written but has warnings: hardly any poses, or an empty map."""
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to ``app``."""
+    app.command()(run)
+    app.command()(status)
+    app.command()(view)
+
+
+def run(
+    config: Annotated[
+        Path | None, typer.Option(help="The vehicle's YAML: cameras, telemetry, service.")
+    ] = None,
+    source: Annotated[
+        Path | None, typer.Option(help="Map this recording as if it happened now.")
+    ] = None,
+    calib: Annotated[
+        Path | None, typer.Option(help="Of --source: camera.yaml; else a guess, refined.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Dive folder; else one in service.dives, named by time.")
+    ] = None,
+    new: Annotated[bool, typer.Option("--new", help="Begin a new dive; resume nothing.")] = False,
+    speed: Annotated[
+        float,
+        typer.Option(min=0.001, max=1000.0, help="Of --source: 1 as it was, 2 twice as fast."),
+    ] = 1.0,
+    seconds: Seconds = None,
+    as_json: Json = False,
+) -> None:
+    """Map live: cameras and telemetry in, dive folder out; resumes what was interrupted."""
+    from aquaflow.config.vehicle import VehicleConfig, load_vehicle
+    from aquaflow.errors import InputError
+    from aquaflow.geometry.camera import load_camera
+    from aquaflow.service.sources import devices, recording
+
+    vehicle = VehicleConfig() if config is None else load_vehicle(config)
+    if source is None and not vehicle.cameras:
+        raise InputError("nothing to map: give --config with cameras, or --source")
+    if source is None and calib is not None:
+        raise InputError(
+            f"--calib {calib} is for --source; a camera's calibration stands in --config, under "
+            "cameras"
+        )
+
+    from aquaflow.service.onboard import map_live  # loads torch
+
+    if source is None:
+        feed: Feed = devices(vehicle)
+    else:
+        calibration = None if calib is None else load_camera(calib)
+        feed = recording(source, vehicle, speed, calibration)
+    with progress_bars(quiet=as_json) as progress:
+        finished = map_live(
+            feed, vehicle, out, new, seconds, lambda done, total: progress("refine", done, total)
+        )
+    tell_finished(finished, as_json)
+
+
+def status(
+    url: Annotated[str, typer.Option(help="Where the service answers.")] = "http://127.0.0.1:8230",
+    token_file: Annotated[Path | None, typer.Option(help="File that holds the token.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Ask the running service how it is; exit code 0 only if nothing is to be done about it."""
+    from aquaflow.access import read_token
+    from aquaflow.service.health.client import ask
+
+    report = ask(url, None if token_file is None else read_token(token_file))
+    if as_json:
+        typer.echo(json.dumps(report))
+    else:
+        _print_status(report)
+    raise typer.Exit(0 if report.get("ok") else 1)
+
+
+def view(
+    dive: Annotated[Path, typer.Argument(help="Dive folder.")],
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="0: any that is free.")] = 8231,
+    token_file: Annotated[
+        Path | None, typer.Option(help="File that holds the token; needed beyond this machine.")
+    ] = None,
+    splats: Annotated[int | None, typer.Option(help="Gaussians to show at most.")] = None,
+) -> None:
+    """Show a finished dive in a browser: splats, path, camera; until Ctrl-C."""
+    from aquaflow.config.stage import validated
+    from aquaflow.config.viewer import ViewerConfig
+    from aquaflow.viewer.finished import read_dive, show_dive
+
+    asked = {"enabled": True, "host": host, "port": port, "token_file": token_file}
+    asked |= {} if splats is None else {"splats": splats}
+    config = validated(ViewerConfig, asked, "command line")
+    window = show_dive(read_dive(dive, config.splats), config)
+    typer.echo(f"Open {window.address} in a browser; Ctrl-C ends it.")
+    with contextlib.suppress(KeyboardInterrupt):
+        threading.Event().wait()
+    window.close()
+
+
+def _print_status(report: dict[str, Any]) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = table_console()
+    colour = "green" if report.get("ok") else "red"
+    console.print(f"[bold {colour}]{escape(report['state'])}[/]: {escape(report['reason'])}")
+    table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+    for key, value in report.items():
+        if key not in ("state", "reason", "ok", "changes"):
+            table.add_row(key.replace("_", " "), escape(_in_words(value)))
+    console.print(table)
+    for change in report.get("changes", []):
+        words = f"{change['before']} -> {change['after']}: {change['reason']}"
+        console.print(f"{change['ago_s']:>8.0f} s ago  {escape(words)}")
+
+
+def _in_words(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_in_words(each)}" for key, each in value.items()) or "none"
+    return "-" if value is None else str(value)
+
+
+def exit_code(finished: Finished) -> int:
+    """0 for a dive as it was asked for, ``POOR_RESULT`` for one with warnings."""
+    return POOR_RESULT if finished.warnings else 0
+
+
+def map_realtime(
+    source: Path,
+    settings: Config,
+    calibration: CameraModel | None,
+    out: Path,
+    overwrite: bool,
+    quiet: bool,
+) -> Finished | None:
+    """``map --realtime``: a recording through the live loop, refined as a replay is."""
+    from aquaflow.config.vehicle import VehicleConfig
+    from aquaflow.service.onboard import map_live
+    from aquaflow.service.sources import recording
+
+    alone = VehicleConfig().service.model_dump()
+    alone["health"]["enabled"], alone["mapping"]["refine_seconds"] = False, None
+    vehicle = VehicleConfig.model_validate(settings.model_dump() | {"service": alone})
+    feed = recording(source, vehicle, calibration=calibration)
+    with progress_bars(quiet=quiet) as progress:
+        return map_live(
+            feed, vehicle, out, progress=lambda done, total: progress("refine", done, total),
+            overwrite=overwrite,
+        )  # fmt: skip
+
+
+def tell_finished(finished: Finished | None, as_json: bool) -> None:
+    """Print the summary of a live dive, and end the command with its exit code."""
+    if finished is None:
+        typer.echo("{}" if as_json else "Nothing was mapped; frames.csv says why.")
+        raise typer.Exit(POOR_RESULT)
+    numbers = finished.metrics
+    if as_json:
+        typer.echo(json.dumps({"dive": str(finished.dive), **numbers}))
+        raise typer.Exit(exit_code(finished))
+    for warning in finished.warnings:
+        typer.echo(f"Warning: {warning}.")
+    typer.echo(
+        f"{numbers['tracked']} of {numbers['frames']} frames posed, {numbers['keyframes']} "
+        f"keyframes, {numbers['gaussians']} Gaussians in {finished.dive}."
+    )
+    for note in finished.notes:
+        typer.echo(f"Note: {note}.")
+    raise typer.Exit(exit_code(finished))

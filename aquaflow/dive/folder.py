@@ -1,0 +1,271 @@
+"""The dive folder: what a run writes, during it and at its end (docs/formats.md#dive-folder)."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from aquaflow.config import Config, dump_config
+from aquaflow.dive.frames_csv import FrameRow, header, of_text, to_text
+from aquaflow.dive.log import JsonLog
+from aquaflow.dive.results import HeldOut, WaterSummary, water_of
+from aquaflow.errors import InputError
+from aquaflow.export.map_file import write_map_file
+from aquaflow.export.ply import Splats, write_ply
+from aquaflow.export.png import write_png
+from aquaflow.export.report import ReportData, write_report
+from aquaflow.export.tum import write_tum
+from aquaflow.geometry.camera import CameraModel, save_camera
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.mapping.gaussians.gaussians import radiance
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.storage.atomic import atomic_write, write_json
+
+log = logging.getLogger(__name__)
+
+MARKER = "frames.csv"
+"""The file by which a folder is known to be a dive."""
+
+TRACE = "trace.json"
+"""Every run of every stage, in Chrome's trace event format; written when asked for."""
+
+RESULTS = (
+    *("trajectory.tum", "camera.yaml", "calibration.yaml", "map*.ply", "map*.aqf", "medium.json"),
+    *("metrics.json", "report.html", "heldout/*.png", "heldout/*.npz", TRACE),
+    "restored/*.png",
+)
+"""What a run writes at its end; of an earlier run in the same folder nothing must remain."""
+
+CHECKPOINT = "checkpoint"
+"""Folder of what a live run can be resumed from."""
+
+WORK = "work"
+"""Folder of what waits for a long dive's memory; gone when the run has ended."""
+
+
+class DiveFolder:
+    """Writes one dive; everything decided is on disk at once, final files are atomic."""
+
+    def __init__(
+        self,
+        path: Path,
+        config: Config,
+        overwrite: bool = False,
+        resume: Iterable[FrameRow] | None = None,
+    ) -> None:
+        """Make the folder; or ``resume`` the dive in it, which has these rows so far.
+
+        Raises:
+            InputError: it cannot be made, holds something else, or holds a dive and neither
+                ``overwrite`` nor ``resume`` is set.
+        """
+        self.path = path
+        self._recorded = bytearray()
+        """The rows so far as lines of frames.csv: a tenth of what they take as objects."""
+        self.unwritten = 0
+        """Rows that the disk did not take when they came."""
+        if resume is None:
+            self._claim(overwrite)
+        else:
+            self._add(resume)
+        dump_config(config, path / "config.yaml")
+        self._rewrite_frames(self._recorded)
+        self._frames = (path / MARKER).open("ab")
+        self._log = JsonLog(path / "log.jsonl", append=resume is not None)
+        self._log.attach()
+
+    def _claim(self, overwrite: bool) -> None:
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            occupied = any(self.path.iterdir())
+        except OSError as error:
+            raise InputError(
+                f"cannot make the dive folder {self.path}: {error.strerror}; choose another --out"
+            ) from error
+        if occupied and not (self.path / MARKER).exists():
+            raise InputError(
+                f"{self.path} holds files that are not a dive; choose an empty folder as --out"
+            )
+        if occupied and not overwrite:
+            raise InputError(
+                f"{self.path} already holds a dive; choose another --out or add --overwrite"
+            )
+        for pattern in RESULTS:
+            for old in self.path.glob(pattern):
+                old.unlink()
+        for folder in (WORK, CHECKPOINT):  # of a run that was stopped
+            shutil.rmtree(self.path / folder, ignore_errors=True)
+
+    @property
+    def work(self) -> Path:
+        """Where a run may put what does not fit into memory."""
+        return self.path / WORK
+
+    def close(self, keep_work: bool = False) -> None:
+        """Release the open files; what was written stays, with ``keep_work`` for a resumption."""
+        if not keep_work:
+            shutil.rmtree(self.work, ignore_errors=True)
+        self._log.close()
+        self._close_frames()
+
+    @property
+    def rows(self) -> Sequence[FrameRow]:
+        """What was recorded so far."""
+        return of_text(self._recorded.decode("utf-8"))
+
+    # --- while the dive runs ------------------------------------------------------------------
+
+    def record(self, rows: Iterable[FrameRow]) -> None:
+        """Append frames in the order in which their fate was decided."""
+        new = list(rows)
+        try:
+            self._frames.write(self._add(new))
+            self._frames.flush()
+        except OSError as error:  # a full disk ends no dive; all rows are written at its end
+            self.unwritten += len(new)
+            log.warning("frames.csv takes no more for now: %s", error.strerror)
+
+    def _add(self, rows: Iterable[FrameRow]) -> bytes:
+        lines = to_text(rows).encode("utf-8")
+        self._recorded += lines
+        return lines
+
+    # --- at its end ---------------------------------------------------------------------------
+
+    def write_frames(self, sub_maps: Mapping[int, int]) -> None:
+        """frames.csv once more: in the order of the recording, each posed frame in the sub-map that
+        it ended up in (``sub_maps`` by frame index)."""
+        rows = [replace(row, sub_map=sub_maps.get(row.index, row.sub_map)) for row in self.rows]
+        self._close_frames()
+        self._rewrite_frames(to_text(sorted(rows, key=lambda row: row.index)).encode("utf-8"))
+
+    def _close_frames(self) -> None:
+        with contextlib.suppress(OSError):  # rows that a full disk did not take; nothing is lost
+            self._frames.close()
+
+    def _rewrite_frames(self, lines: bytes | bytearray) -> None:
+        with atomic_write(self.path / MARKER) as stream:
+            stream.write(header().encode("utf-8"))
+            stream.write(lines)
+
+    def write_trajectory(self, t_s: list[float], poses: list[Sim3]) -> None:
+        """trajectory.tum: every frame that has a pose."""
+        order = np.argsort(t_s, kind="stable")
+        write_tum(
+            self.path / "trajectory.tum",
+            np.array([t_s[i] for i in order]),
+            np.array([poses[i].t for i in order]).reshape(-1, 3),
+            np.array([poses[i].quaternion for i in order]).reshape(-1, 4),
+            comment="camera to world; world is the first keyframe's camera (x right, y down, "
+            "z forward); scale: see scale_source in metrics.json",
+        )
+
+    def write_cameras(self, mapped: CameraModel, calibration: CameraModel | None) -> None:
+        """camera.yaml: the pinhole camera of the mapped pictures; calibration.yaml: the one that
+        they were undistorted with, where there is one."""
+        save_camera(mapped, self.path / "camera.yaml")
+        if calibration is not None:
+            save_camera(calibration, self.path / "calibration.yaml")
+
+    def write_map(self, mapper: Mapper, suffix: str = "") -> None:
+        """map.aqf: the exact map."""
+        write_map_file(self.path / f"map{suffix}.aqf", mapper)
+
+    def write_splats(self, mapper: Mapper, water: WaterSummary | None, suffix: str = "") -> None:
+        """map.ply as seen through water at the median range, map_clear.ply without water; where
+        there is a decoder, each Gaussian as the mapped view nearest to it sees it."""
+        with torch.no_grad():
+            plain = mapper.scene.baked(mapper.views)
+            clear = radiance(plain["raw_colours"])
+            seen = clear
+            if water is not None:
+                medium = water_of(water)
+                z = torch.full((len(clear),), water.range_median)
+                seen = clear * medium.transmission(z) + medium.backscatter(z)
+            for name, colours in (("map", seen), ("map_clear", clear)):
+                write_ply(self.path / f"{name}{suffix}.ply", _splats(plain, colours))
+
+    def write_medium(
+        self, water: WaterSummary | None, scale_source: str, evidence: float | None = None
+    ) -> None:
+        """medium.json: parameters, their units, and the range at which map.ply is shown.
+
+        ``evidence``: for water against none, units of the log likelihood; below -10 it is off.
+        """
+        data: dict[str, Any] = {"active": water is not None, "scale_source": scale_source}
+        data["evidence"] = evidence
+        if water is not None:
+            data |= {
+                "attenuation_per_unit": water.beta_a,
+                "attenuation_unit": "1/map unit",
+                "backscatter": {
+                    "B_inf": water.B_inf, "b": water.b, "B_res": water.B_res, "d": water.d,
+                },
+                "attenuation_relative_sigma": water.beta_a_sigma,
+                "identifiable": water.beta_a_sigma is not None,
+                "shading_log_gain": water.shading,
+                "backscatter_log_gain": water.unevenness,
+                "log_gain_terms": ["x", "y", "x^2", "x y", "y^2"],
+                "units": {
+                    "attenuation, b, d": "1/map unit",
+                    "B_inf, B_res": "share of the camera's full scale",
+                    "log gains": "natural logarithm; x and y run from -1 to 1 over the picture",
+                },
+                "range_p5": water.range_p5,
+                "range_p95": water.range_p95,
+                "map_ply_reference_range": water.range_median,
+            }  # fmt: skip
+        self.write_json("medium.json", data)
+
+    def write_held_out(self, examples: list[HeldOut]) -> None:
+        """heldout/: what the camera saw, also without its water, what the map shows, its range."""
+        folder = self.path / "heldout"
+        folder.mkdir(exist_ok=True)
+        for example in examples:
+            if example.z is not None:
+                with atomic_write(folder / f"{example.frame_index:06d}_range.npz") as stream:
+                    np.savez_compressed(stream, z=example.z)
+            pictures = {"real": example.real, "rendered": example.rendered}
+            if example.restored is not None:
+                pictures["restored"] = example.restored
+            for name, picture in pictures.items():
+                write_png(folder / f"{example.frame_index:06d}_{name}.png", picture)
+
+    def write_json(self, name: str, data: dict[str, Any]) -> None:
+        """A JSON file of the dive; a number that is not finite is unknown, null."""
+        write_json(self.path / name, _finite(data))
+
+    def write_report(self, data: ReportData) -> None:
+        """report.html."""
+        write_report(self.path / "report.html", data)
+
+
+def _finite(value: Any) -> Any:
+    """``value`` for JSON, with None for every number in it that is not finite."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _finite(each) for key, each in value.items()}
+    return [_finite(each) for each in value] if isinstance(value, (list, tuple)) else value
+
+
+def _splats(
+    parameters: Mapping[str, torch.Tensor],  # of a GaussianMap
+    colours: torch.Tensor,  # [N, 3]
+) -> Splats:
+    return Splats(
+        parameters["means"].numpy(),
+        torch.nn.functional.normalize(parameters["quats"], dim=-1).numpy(),
+        torch.exp(parameters["log_scales"]).numpy(),
+        torch.sigmoid(parameters["opacity_logits"][:, 0]).numpy(),
+        colours.numpy(),
+    )

@@ -1,0 +1,129 @@
+"""Replay: every frame of a recording, in order, as fast as the machine goes, into a dive folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import torch
+
+from aquaflow.config import Config, SourceConfig
+from aquaflow.cores import usable_threads
+from aquaflow.dive.folder import DiveFolder
+from aquaflow.dive.run import DiveRun, Finished
+from aquaflow.errors import NotMappedError
+from aquaflow.errors.failures import Failures
+from aquaflow.messages import CameraModel, Dropped, Frame
+from aquaflow.profiler import Profiler
+from aquaflow.slam import Slam
+from aquaflow.sources import RecordedCamera
+
+Progress = Callable[[str, int, int | None], None]
+"""Called with the stage, the steps done and, where known, the steps there are."""
+
+
+MOST_UNREADABLE = 5
+"""Frames in a row that a recording fails on until the rest is given up."""
+
+
+def map_recording(
+    recording: RecordedCamera,
+    name: str,
+    out: Path,
+    config: Config,
+    calibration: CameraModel | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    trace: bool = False,
+) -> Finished:
+    """Map a recording into the dive folder ``out``; with ``trace`` it gets a ``trace.json`` too.
+
+    Raises:
+        InputError: the folder cannot be written.
+        ConfigError: crop or calibration do not fit the pictures.
+        NotMappedError: the frames were read but gave no map; the folder says why.
+    """
+    fix_threads(usable_threads(config.threads))
+    folder, failures = DiveFolder(out, config, overwrite), Failures()
+    try:
+        slam = Slam(config, Profiler(trace), folder.work, failures=failures)
+        calibration = calibration or recording.camera
+        run = DiveRun(name, folder, config, slam, calibration, recording.name_of, trace)
+        try:
+            return _replay(run, recording, config, progress or (lambda stage, done, total: None))
+        finally:
+            with failures.contain("closing"):
+                slam.close()
+    finally:
+        for close in (folder.close, recording.close):
+            with failures.contain("closing"):
+                close()
+
+
+def _replay(
+    run: DiveRun, recording: RecordedCamera, config: Config, progress: Progress
+) -> Finished:
+    source, count = config.source, recording.frame_count
+    stop = count if source.stop is None else min(source.stop, count or source.stop)
+    total = None if stop is None else len(range(source.start, stop, source.every))
+    done = 0
+    contain = run.slam.failures.contain
+    for frame in _frames(run, recording, source):
+        done += 1
+        if isinstance(frame, Dropped):
+            run.drop(frame)
+        else:
+            run.frame(frame)
+        with run.profiler.stage("progress"), contain("progress"):
+            progress("map", done, total)
+    if done == 0:
+        end = "the end" if source.stop is None else f"--stop {source.stop}"
+        known = "" if count is None else f" of its {count} frames"
+        raise NotMappedError(
+            f"{run.name}: none{known} lies between --start {source.start} and {end}"
+        )
+    return run.finish(recording.notes, lambda done, total: progress("refine", done, total))
+
+
+def _frames(
+    run: DiveRun, recording: RecordedCamera, source: SourceConfig
+) -> Iterator[Frame | Dropped]:
+    """The frames to map; after one that the recording fails on, reading goes on with the next.
+
+    Raises:
+        Exception: the recording fails before its first frame; whatever its reader raised.
+    """
+    start, t_ns, failed_in_a_row, any_read = source.start, 0, 0, False
+    frames = recording.frames(source.every, start, source.stop)
+    while failed_in_a_row < MOST_UNREADABLE:
+        with run.profiler.stage("read"), run.slam.failures.contain("reading", start) as reading:
+            frame = next(frames, None)
+        if reading.error is not None:
+            if not any_read:
+                raise reading.error
+            failed_in_a_row += 1
+            yield Dropped(start, t_ns, "reading failed, see log.jsonl")
+            start += source.every
+            frames = recording.frames(source.every, start, source.stop)
+            continue
+        if frame is None:
+            return
+        any_read, failed_in_a_row = True, 0
+        start, t_ns = frame.index + source.every, frame.t_ns
+        yield frame
+    run.notes.append(f"{run.name} could not be read after frame {start}; the dive ends there")
+
+
+def fix_threads(threads: int) -> None:
+    """Results repeat bit for bit at a given number of threads, so it is set once and everywhere.
+
+    torch and BLAS get one: their barriers cost whole scheduler quanta on a busy machine
+    (docs/measurements.md#threads), and the heavy work runs in our own pool and in OpenCV's.
+    """
+    import cv2
+    from threadpoolctl import threadpool_limits
+
+    torch.set_num_threads(1)
+    threadpool_limits(1, user_api="blas")  # small matrices: threads only wait for each other
+    cv2.setNumThreads(threads)
+    cv2.setRNGSeed(0)

@@ -1,0 +1,112 @@
+"""From a finished run to the values that report.html shows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from aquaflow.dive.results import HeldOut, WaterSummary
+from aquaflow.export.report import (
+    CameraSummary,
+    HeldOutExample,
+    MediumCurves,
+    PathPlot,
+    ReportData,
+)
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.messages import Dropped
+from aquaflow.slam import Slam
+from aquaflow.tracking.frames import FrameClass, Tracked
+
+MAX_EXAMPLES = 6
+"""Held-out frames shown, spread evenly over the dive."""
+
+
+def report_data(
+    name: str,
+    slam: Slam,
+    results: list[Tracked],
+    dropped: list[Dropped],
+    poses: dict[int, Sim3],
+    held_out: list[HeldOut],
+    water: WaterSummary | None,
+    metrics: dict[str, Any],
+    notes: list[str],
+    calibrated: bool,
+) -> ReportData:
+    """Everything the report shows."""
+    return ReportData(
+        name=name,
+        camera=_camera(slam, calibrated),
+        metrics=metrics,
+        path=_path(results, poses),
+        timeline=_timeline(results, dropped),
+        examples=_examples(held_out),
+        medium=_curves(water),
+        stages=metrics["stage_ms"],
+        warnings=metrics["warnings"],
+        notes=notes,
+    )
+
+
+def _camera(slam: Slam, calibrated: bool) -> CameraSummary:
+    camera = slam.tracker.camera
+    assert camera is not None
+    source = "calibrated" if calibrated else "refined"
+    return CameraSummary(camera.width, camera.height, camera.fx, source)  # type: ignore[arg-type]
+
+
+def _path(results: list[Tracked], poses: dict[int, Sim3]) -> PathPlot:
+    posed = sorted(
+        (tracked for tracked in results if tracked.T_wc is not None),
+        key=lambda tracked: tracked.frame.index,
+    )
+    return PathPlot(
+        np.array([poses[tracked.frame.index].t for tracked in posed]),
+        [tracked.frame_class.value for tracked in posed],
+        [tracked.sub_map for tracked in posed],
+    )
+
+
+def _timeline(results: list[Tracked], dropped: list[Dropped]) -> list[str]:
+    classes = {tracked.frame.index: tracked.frame_class.value for tracked in results}
+    classes |= {frame.index: FrameClass.DROPPED.value for frame in dropped}
+    return [classes[index] for index in sorted(classes)]
+
+
+def _examples(held_out: list[HeldOut]) -> list[HeldOutExample]:
+    if not held_out:
+        return []
+    count = min(MAX_EXAMPLES, len(held_out))
+    chosen = np.linspace(0, len(held_out) - 1, count).round().astype(int)
+    return [
+        HeldOutExample(
+            f"frame {held_out[i].frame_index}",
+            held_out[i].real,
+            held_out[i].rendered,
+            held_out[i].restored,
+            held_out[i].psnr,
+            held_out[i].ssim,
+        )
+        for i in chosen
+    ]
+
+
+def _curves(water: WaterSummary | None) -> MediumCurves | None:
+    if water is None:
+        return None
+    return MediumCurves(
+        beta=_rgb(water.beta_a),
+        b=_rgb(water.b),
+        B_inf=_rgb(water.B_inf),
+        B_res=_rgb(water.B_res),
+        d=_rgb(water.d),
+        range_p5=water.range_p5,
+        range_p95=water.range_p95,
+    )
+
+
+def _rgb(values: list[float]) -> tuple[float, float, float]:
+    red, green, blue = values
+    return red, green, blue

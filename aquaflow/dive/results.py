@@ -1,0 +1,223 @@
+"""What a finished run amounts to: held-out quality, poses, water and metrics.json's numbers."""
+
+from __future__ import annotations
+
+import resource
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from aquaflow import __version__
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.restoration import common_exposure, restored_picture, to_bytes
+from aquaflow.mapping.views import View
+from aquaflow.mapping.water.image_formation import Water
+from aquaflow.messages import Dropped
+from aquaflow.render.image_metrics import lpips, lpips_network, psnr, ssim
+from aquaflow.slam import Slam
+from aquaflow.tracking.frames import FrameClass, Tracked
+
+PROTOCOL = {
+    "held_out": "i % n == 0 and i != 0 of the used frames: tracked, never mapped; pose refined "
+    "photometrically against the frozen map; exposure and sunlight, where views differ in them, "
+    "those between the mapped frames before and after",
+    "resolution": "the width that was mapped, undistorted",
+    "ssim": "11x11 Gaussian window, sigma 1.5 px, zero-padded, mean over channels",
+    "psnr": "mean over held-out frames of the PSNR of each",
+    "ate": "see `aquaflow evaluate`, which knows the truth",
+}
+
+SCALE_SOURCE = "none: the median depth of the first keyframe is 1 map unit"
+
+RANGE_PERCENTILES = (5.0, 95.0)
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """One held-out frame after its pose was refined."""
+
+    frame_index: int
+    real: npt.NDArray[np.uint8]
+    rendered: npt.NDArray[np.uint8]
+    restored: npt.NDArray[np.uint8] | None
+    psnr: float
+    ssim: float
+    lpips: float | None
+    z: npt.NDArray[np.float32] | None = None
+    """[H, W] rendered range, map units; 0 where the map is not solid."""
+
+
+@dataclass(frozen=True)
+class WaterSummary:
+    """The medium of one sub-map, mean over its views; rates per map unit."""
+
+    beta_a: list[float]
+    b: list[float]
+    B_inf: list[float]
+    B_res: list[float]
+    d: list[float]
+    range_p5: float
+    range_median: float
+    range_p95: float
+    beta_a_sigma: list[float] | None
+    """Relative standard deviation of beta_a; None if the ranges seen never allowed a fit."""
+    shading: list[float]
+    """Log-gain of the camera over the picture: x, y, x^2, x y, y^2 with x, y from -1 to 1."""
+    unevenness: list[float]
+    """Log-gain of the backscatter over the picture, in the same terms."""
+
+
+def largest_sub_map(results: list[Tracked]) -> int:
+    """The sub-map with the most posed frames; the earliest of equals."""
+    posed = [tracked.sub_map for tracked in results if tracked.T_wc is not None]
+    return max(sorted(set(posed)), key=posed.count, default=0)
+
+
+def tracked_poses(results: list[Tracked]) -> dict[int, Sim3]:
+    """T_wc by frame index, of the frames that have one."""
+    return {tracked.frame.index: tracked.T_wc for tracked in results if tracked.T_wc is not None}
+
+
+def refined_poses(slam: Slam, results: list[Tracked]) -> dict[int, Sim3]:
+    """Pose by frame index: as the map refined it where it did, else as it was tracked."""
+    poses = tracked_poses(results)
+    for mapper in slam.mappers.values():
+        refined = {view.frame_index: view.T_wc for view in mapper.views}
+        poses |= {index: T_wc for index, T_wc in refined.items() if T_wc.is_finite()}
+    return poses
+
+
+def examine_held_out(slam: Slam, sub_map: int) -> list[HeldOut]:
+    """Render every held-out frame of a sub-map from its refined pose and compare."""
+    mapper = slam.mappers.get(sub_map)
+    if mapper is None or len(mapper.gaussians) == 0:
+        return []
+    views = sorted(slam.held_out.get(sub_map, []), key=lambda view: view.frame_index)
+    contain, exposure = slam.failures.contain, 1.0
+    for view in views:
+        with contain("held-out pose", view.frame_index):
+            mapper.register(view)
+    with contain("restored exposure"):
+        exposure = common_exposure(
+            restored_picture(mapper.scene, view, mapper.show(view)) for view in views
+        )
+    examined = []
+    for view in views:
+        with contain("evaluation", view.frame_index):
+            examined.append(_examine(mapper, view, exposure))
+    return examined
+
+
+def _examine(mapper: Mapper, view: View, exposure: float) -> HeldOut:
+    shown = mapper.show(view)
+    real = view.target().numpy()
+    rendered = shown.image.clamp(0.0, 1.0).numpy()
+    restored = None
+    if mapper.medium.active:
+        restored = to_bytes(exposure * restored_picture(mapper.scene, view, shown).numpy())
+    perceptual, _ = lpips(rendered, real)
+    return HeldOut(
+        view.frame_index,
+        view.image,
+        to_bytes(rendered),
+        restored,
+        psnr(rendered, real),
+        ssim(rendered, real),
+        perceptual,
+        torch.where(shown.alpha > 0.5, shown.z, 0.0).to(torch.float32).numpy(),
+    )
+
+
+@torch.no_grad()
+def summarise_water(mapper: Mapper) -> WaterSummary | None:
+    """Mean medium over the views and the ranges they span; None while the medium is off."""
+    if not mapper.medium.active or not mapper.views or len(mapper.gaussians) == 0:
+        return None
+    waters = [water for view in mapper.views if (water := mapper.scene.water(view)) is not None]
+    # Every tenth view is enough for the span of ranges.
+    z = torch.cat([_solid_ranges(mapper, view) for view in mapper.views[::10]])
+    if len(z) == 0:
+        return None
+    low, high = np.percentile(z.numpy(), RANGE_PERCENTILES)
+    first = waters[0]
+    return WaterSummary(
+        torch.stack([water.beta_a for water in waters]).mean(0).tolist(),
+        first.b.tolist(),
+        first.B_inf.tolist(),
+        first.B_res.tolist(),
+        first.d.tolist(),
+        float(low),
+        float(z.median()),
+        float(high),
+        mapper.scene.beta_a_sigma,
+        mapper.scene.shading.tolist(),
+        mapper.medium.unevenness.tolist(),
+    )
+
+
+def _solid_ranges(mapper: Mapper, view: View) -> torch.Tensor:
+    shown = mapper.show(view)
+    return shown.z[shown.alpha > 0.5]
+
+
+def water_of(summary: WaterSummary) -> Water:
+    """The summary as tensors."""
+    fields = (summary.beta_a, summary.B_inf, summary.b, summary.B_res, summary.d)
+    return Water(*(torch.tensor(values) for values in fields))
+
+
+def metrics(
+    slam: Slam,
+    results: list[Tracked],
+    dropped: list[Dropped],
+    held_out: list[HeldOut],
+    wall_s: float,
+) -> dict[str, Any]:
+    """The stable keys of metrics.json (docs/formats.md#metrics-json)."""
+    classes = [tracked.frame_class for tracked in results]
+    posed = sum(tracked.T_wc is not None for tracked in results)
+    _, lpips_reason = lpips_network()
+    counts = {"frames": len(results) + len(dropped), "tracked": posed}
+    counts |= {
+        "lost": classes.count(FrameClass.LOST),
+        "skipped": classes.count(FrameClass.SKIPPED) + len(dropped),
+        "keyframes": classes.count(FrameClass.KEYFRAME),
+        "mapping_frames": classes.count(FrameClass.MAPPING),
+        "common_frames": classes.count(FrameClass.COMMON),
+    }
+    perceptual = [example.lpips for example in held_out if example.lpips is not None]
+    return counts | {
+        "sub_maps": len({t.sub_map for t in results if t.T_wc is not None}),
+        "skipped_by": dict(slam.skipped) | ({"dropped": len(dropped)} if dropped else {}),
+        "loops": slam.graph.loops,
+        "gaussians": sum(len(mapper.gaussians) for mapper in slam.mappers.values()),
+        "steps": sum(mapper.steps for mapper in slam.mappers.values()),
+        "steps_undone": sum(mapper.undone for mapper in slam.mappers.values()),
+        "wall_s": round(wall_s, 3),
+        "fps": round((len(results) + len(dropped)) / max(wall_s, 1e-9), 3),
+        "stage_ms": slam.profiler.summary(),
+        "peak_rss_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0, 1),
+        "psnr": _mean([example.psnr for example in held_out]),
+        "ssim": _mean([example.ssim for example in held_out]),
+        "lpips": _mean(perceptual),
+        "lpips_reason": lpips_reason,
+        "heldout_frames": len(held_out),
+        "ate_rmse_m_se3": None,
+        "ate_rmse_m_sim3": None,
+        "rpe": None,
+        "scale_source": SCALE_SOURCE,
+        "renderer": f"{slam.renderer.name} ({slam.renderer.isa}, {slam.renderer.threads} threads)",
+        "prior": slam.prior.name,
+        "device": "cpu",
+        "seed": slam.config.seed,
+        "version": __version__,
+        "protocol": PROTOCOL,
+    }
+
+
+def _mean(values: list[float]) -> float | None:
+    return round(float(np.mean(values)), 4) if values else None

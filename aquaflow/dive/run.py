@@ -1,0 +1,230 @@
+"""One run into a dive folder, live or replayed: the fate of each frame, the results at the end."""
+
+from __future__ import annotations
+
+import logging
+import time
+from array import array
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from aquaflow.config import Config
+from aquaflow.dive.deliverables import Deliverables
+from aquaflow.dive.folder import TRACE, DiveFolder
+from aquaflow.dive.frames_csv import FrameRow
+from aquaflow.dive.results import SCALE_SOURCE, HeldOut, metrics
+from aquaflow.dive.shortcomings import shortcomings
+from aquaflow.errors import InputError, NotMappedError
+from aquaflow.mapping.maps import MIN_VIEWS, Progress
+from aquaflow.messages import CameraModel, Dropped, Frame
+from aquaflow.profiler import pace
+from aquaflow.slam import Slam
+from aquaflow.sources.preprocessing import Preparation
+from aquaflow.tracking.frames import Tracked
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A finished run."""
+
+    dive: Path
+    metrics: dict[str, Any]
+    notes: list[str]
+    warnings: list[str]
+    """Why the result is poor, and what to do; empty for a good one."""
+
+
+class DiveRun:
+    """Frames go through ``slam`` and into ``folder``; ``finish`` writes what came of them."""
+
+    def __init__(
+        self,
+        name: str,
+        folder: DiveFolder,
+        config: Config,
+        slam: Slam,
+        calibration: CameraModel | None,
+        name_of: Callable[[int], str],
+        trace: bool = False,
+    ) -> None:
+        """``name_of`` a frame's index: its file, or where it is in the film."""
+        self.name, self.folder, self.slam = name, folder, slam
+        self.calibration = calibration
+        self.preparation = Preparation(config.source, calibration)
+        self.profiler = slam.profiler
+        self.dropped: list[Dropped] = []
+        self.notes: list[str] = []
+        self.warnings: list[str] = []
+        self.config = config
+        self.live: dict[str, Any] | None = None
+        """What a live run says of itself in metrics.json."""
+        self.started = time.monotonic()
+        self.frame_ms = array("d")
+        """Of every frame that was read: preparing, tracking and mapping it."""
+        self.first_pose_s: float | None = None
+        """Seconds from the start of the run."""
+        self._name_of, self._trace = name_of, trace
+        self._cpu_before_s = time.process_time()
+
+    @property
+    def results(self) -> list[Tracked]:
+        """All frames whose fate is known, with their poses as they are now; made when asked for."""
+        return self.slam.results()
+
+    # --- while frames come --------------------------------------------------------------------
+
+    def frame(self, frame: Frame) -> list[Tracked]:
+        """One frame's way, and whose fate it decided; a picture that cannot be prepared costs
+        itself, not the dive."""
+        begun = time.monotonic()
+        prepared = self._prepared(frame)
+        if prepared is None:
+            return []
+        decided = self.slam.process(prepared)
+        self.decide(decided)
+        self._time_frame(begun, decided)
+        return decided
+
+    def _prepared(self, frame: Frame) -> Frame | None:
+        """None for a picture that cannot be prepared, which is dropped."""
+        reason = "preparation failed, see log.jsonl"
+        contain = self.slam.failures.contain("preparation", frame.index)
+        with self.profiler.stage("prepare"), contain:
+            try:
+                return self.preparation(frame)
+            except InputError as error:
+                reason = str(error)
+        self.drop(Dropped(frame.index, frame.t_ns, reason))
+        return None
+
+    def catch_up(self) -> list[Tracked]:
+        """A pose for a frame of the past, if one waits; for a moment without a new one."""
+        decided = self.slam.catch_up()
+        self.decide(decided)
+        return decided
+
+    def _time_frame(self, begun: float, decided: list[Tracked]) -> None:
+        now = time.monotonic()
+        self.frame_ms.append(1e3 * (now - begun))
+        if self.first_pose_s is None and any(t.T_wc is not None for t in decided):
+            self.first_pose_s = now - self.started
+
+    def drop(self, frame: Dropped) -> None:
+        """A frame that reached nobody."""
+        self.dropped.append(frame)
+        log.warning("frame %d left out: %s", frame.index, frame.reason)
+        row = FrameRow(
+            frame.index,
+            self._name_of(frame.index),
+            frame.t_ns * 1e-9,
+            "dropped",
+            reason=frame.reason,
+        )
+        self.folder.record([row])
+
+    def decide(self, decided: list[Tracked]) -> None:
+        """Frames whose fate is known."""
+        with self.profiler.stage("record"):
+            self.folder.record(self._row(tracked) for tracked in decided)
+
+    def _row(self, tracked: Tracked) -> FrameRow:
+        posed = tracked.T_wc is not None
+        return FrameRow(
+            tracked.frame.index,
+            self._name_of(tracked.frame.index),
+            tracked.frame.t_ns * 1e-9,
+            tracked.frame_class.value,
+            tracked.sub_map if posed else None,
+            tracked.keyframe,
+            tracked.quality.inlier_share if posed else None,
+            tracked.reason,
+        )
+
+    # --- the end ------------------------------------------------------------------------------
+
+    def finish(self, notes: list[str], progress: Progress | None = None) -> Finished:
+        """Refine and write; ``notes`` of the source go to the user with the run's own.
+
+        Raises:
+            NotMappedError: too few frames could be placed; the folder says why.
+        InputError: the disk was too full for all files; those with room were written.
+        """
+        attempt = self.slam.failures.attempt
+        self.decide(self.slam.finish(progress))
+        with self.profiler.stage("write"):
+            results = self.results
+            self._note_what_was_left_out(results, notes)
+            sub_maps = {t.frame.index: t.sub_map for t in results if t.T_wc}
+            attempt("writing frames.csv", partial(self.folder.write_frames, sub_maps))
+        if sum(tracked.T_wc is not None for tracked in results) < MIN_VIEWS:
+            raise NotMappedError(self._why_not(len(results)))
+        return self._write(results)
+
+    def _note_what_was_left_out(self, results: list[Tracked], notes: list[str]) -> None:
+        self.notes += notes
+        lost = sum(tracked.T_wc is None for tracked in results)
+        if lost:
+            self.notes.append(f"{lost} of {len(results)} frames got no pose")
+        sub_maps = {tracked.sub_map for tracked in results if tracked.T_wc is not None}
+        if len(sub_maps) > 1:
+            self.notes.append(
+                f"tracking was lost {len(sub_maps) - 1} times: the dive has {len(sub_maps)} "
+                "sub-maps without a common scale"
+            )
+        if self.calibration is None and self.slam.tracker.camera is not None:
+            focal, sigma = self.slam.tracker.camera.fx, self.slam.tracker.focal_sigma
+            self.notes.append(
+                "no calibration was given: the focal length was guessed and refined to "
+                f"{focal:.0f} px ({100.0 * sigma:.0f} % formal uncertainty), distortion ignored"
+            )
+        for note in self.notes:
+            log.info(note)
+
+    def _why_not(self, read: int) -> str:
+        if read == 0:
+            return f"{self.name}: no frame could be read, see {self.folder.path}/frames.csv"
+        if read < MIN_VIEWS:
+            return f"{self.name} has {read} usable frames; a map needs at least {MIN_VIEWS}"
+        return (
+            f"{self.name}: none of {read} frames could be placed; the pictures need texture and "
+            "the camera must move sideways, see frames.csv for each frame"
+        )
+
+    def _write(self, results: list[Tracked]) -> Finished:
+        made = Deliverables(self.name, self.folder, self.slam, results, self.calibration)
+        with self.profiler.stage("evaluate"):
+            made.evaluate()
+        with self.profiler.stage("write"):
+            made.write(SCALE_SOURCE)
+        with self.profiler.stage("report"):
+            numbers = self._numbers(results, made.held_out)
+            notes = self.notes + self.slam.failures.notes()
+            made.write_report(self.dropped, numbers, notes)
+        numbers = self._numbers(results, made.held_out)  # the report's own time included
+        attempt, write = self.slam.failures.attempt, self.folder.write_json
+        attempt("writing metrics.json", partial(write, "metrics.json", numbers))
+        if self._trace:
+            attempt(f"writing {TRACE}", lambda: write(TRACE, self.profiler.chrome_trace()))
+        if self.slam.failures.disk_was_full:
+            raise InputError(
+                f"the disk is full: {self.folder.path} lacks some of its files, log.jsonl says "
+                "which; make room and map again"
+            )
+        notes = self.notes + self.slam.failures.notes()
+        return Finished(self.folder.path, numbers, notes, self.warnings)
+
+    def _numbers(self, results: list[Tracked], held_out: list[HeldOut]) -> dict[str, Any]:
+        wall_s = time.monotonic() - self.started
+        gaussians = sum(len(mapper.gaussians) for mapper in self.slam.mappers.values())
+        self.warnings = shortcomings(self.config, self.folder.rows, gaussians)
+        numbers = metrics(self.slam, results, self.dropped, held_out, wall_s)
+        numbers["warnings"], numbers["failures"] = self.warnings, self.slam.failures.to_json()
+        numbers["cpu_s"] = round(time.process_time() - self._cpu_before_s, 3)  # of all threads
+        if self.live is not None:
+            numbers["live"] = self.live
+        return numbers | pace(self.frame_ms, len(self.frame_ms), self.first_pose_s, wall_s)

@@ -1,0 +1,1 @@
+"""The Local Gaussian Parameter Decoder and its voxel groups (Sec. 3.3.1)."""

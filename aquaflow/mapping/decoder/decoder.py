@@ -1,0 +1,218 @@
+"""The Local Gaussian Parameter Decoder, LGPD (paper, Eq. 8 to 11).
+
+A token is made of a Gaussian's own feature and its group's; tokens of a group attend to each
+other; a geometry head and a colour head, told how the camera observes the Gaussian, give what is
+added to its initial rotation, log-scale and colour. Place and opacity are not decoded.
+
+The paper tells the tokens gamma(o) before they attend, which costs the attention anew for every
+view. The first layer of the heads is linear in [z, gamma(o)], so here they are told: what does not
+depend on the view, :class:`Trunk`, is computed once for all views of a step, and is exact for each.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from aquaflow.config.mapping import DecoderConfig
+from aquaflow.mapping.decoder.observation import encoded_observation, encoded_width, is_sound
+from aquaflow.mapping.decoder.tokens import Tokens
+from aquaflow.mapping.gaussians.reanchoring import quaternion_product
+
+LARGEST_FEATURE = 1e4
+"""A feature beyond this, or no number, is unsound: its group is decoded to no residual."""
+
+MASKED = -1e9
+"""Added to the score of padding: its weight is exactly zero."""
+
+TURN, LOG_SCALE, COLOUR = 3, 3, 3
+"""Widths of the residuals, in this order."""
+
+
+@dataclass(frozen=True)
+class Trunk:
+    """What the decoder knows before it is told the view."""
+
+    tokens: Tokens
+    hidden: Tensor
+    """[P, d] first layer of both heads, the view's part not yet added."""
+    sound: Tensor | None
+    """[P] bool: all features of the token's group are sensible numbers; None: of every group."""
+
+
+class Decoder(nn.Module):
+    """LGPD, or an MLP of as many weights that sees no neighbours (the paper's "w/o LGPD").
+
+    The last layers start at zero, so that a new Gaussian starts exactly at its initial state.
+    """
+
+    limits: Tensor
+
+    def __init__(self, config: DecoderConfig, generator: torch.Generator) -> None:
+        super().__init__()
+        self.config, d = config, config.width
+        self.local = _linear(config.local_width, d, generator)
+        self.shared = _linear(config.global_width, d, generator, bias=False)
+        self.mixer = Attention(d, generator) if config.variant == "lgpd" else Mlp(d, generator)
+        self.first = _linear(d, d, generator)
+        self.view = _linear(encoded_width(config.distance), d, generator, bias=False)
+        self.geometry = _zero_linear(d // 2, TURN + LOG_SCALE)
+        self.colour = _zero_linear(d // 2, COLOUR)
+        largest = [config.max_turn, config.max_log_scale, config.max_colour]
+        limits = torch.tensor(largest).repeat_interleave(torch.tensor([TURN, LOG_SCALE, COLOUR]))
+        self.register_buffer("limits", limits, persistent=False)
+
+    def trunk(
+        self,
+        tokens: Tokens,
+        local: Tensor,  # [N, F_l] feature of each Gaussian
+        shared: Tensor,  # [G, F_g] feature of each group
+    ) -> Trunk:
+        """The part that all views share."""
+        local = local.index_select(0, tokens.rows)
+        shared = shared.index_select(0, tokens.groups)
+        sizes, counts = tokens.sizes, [count for count, _ in tokens.buckets]
+        sound = None
+        if not (_all_sound(local) and _all_sound(shared)):
+            per_group = _sound_groups(tokens, local, shared)
+            sound = per_group.repeat_interleave(tokens.places_of_groups)
+            local = torch.where(sound[:, None], local, 0.0)
+            shared = torch.where(per_group[:, None], shared, 0.0)
+        own, common = self.local(local), self.shared(shared)
+        mixed = []
+        for (count, width), e, g, valid in zip(
+            tokens.buckets,
+            own.split_with_sizes(sizes),
+            common.split_with_sizes(counts),
+            tokens.valid.split_with_sizes(sizes),
+            strict=True,
+        ):
+            together = e.view(count, width, -1) + g[:, None]
+            mixed.append(self.mixer(together, valid.view(count, width)).reshape(e.shape))
+        z = torch.cat(mixed) if mixed else own
+        return Trunk(tokens, self.first(z), sound)
+
+    def residuals(
+        self,
+        trunk: Trunk,
+        places: Tensor,  # [V] int64 places of trunk.tokens
+        o: Tensor,  # [V, 4] observation of the Gaussian in each
+    ) -> Tensor:
+        """[V, 9]: quaternion vector, log-scales, raw colour; each within its stated limit.
+
+        Zeros for a group with a feature that is no number, and for such an observation.
+        """
+        told = self.view(encoded_observation(o, self.config.distance))
+        hidden = torch.relu(trunk.hidden.index_select(0, places) + told)
+        half = self.config.width // 2  # one product for both heads, each sees its own half
+        heads = torch.cat(
+            [F.pad(self.geometry.weight, (0, half)), F.pad(self.colour.weight, (half, 0))]
+        )
+        raw = F.linear(hidden, heads, torch.cat([self.geometry.bias, self.colour.bias]))
+        residuals = torch.tanh(raw) * self.limits
+        seen = is_sound(o)
+        sound = seen if trunk.sound is None else seen & trunk.sound[places]
+        return residuals if bool(sound.all()) else residuals * sound[:, None]
+
+
+class Attention(nn.Module):
+    """Masked self-attention within each group, one head, added to the tokens.
+
+    The tokens are their own keys, and values are already projected for the output: with one head
+    of full width, W_k and W_o would only multiply W_q and W_v.
+    """
+
+    def __init__(self, width: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.query = _linear(width, width, generator, bias=False)
+        self.value = _linear(width, width, generator, bias=False)
+
+    def forward(
+        self,
+        e: Tensor,  # [B, T, d]
+        valid: Tensor,  # [B, T] bool
+    ) -> Tensor:
+        """[B, T, d]"""
+        mask = torch.where(valid, 0.0, MASKED).to(e.dtype)[:, None]
+        # Two products and a softmax: the backward of torch's fused attention is slower on a CPU.
+        scores = torch.baddbmm(mask, self.query(e), e.mT, alpha=1.0 / math.sqrt(e.shape[-1]))
+        return torch.baddbmm(e, torch.softmax(scores, dim=-1), self.value(e))
+
+
+class Mlp(nn.Module):
+    """What stands in for attention in the ablation: as many weights, each token on its own."""
+
+    def __init__(self, width: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.inner = _linear(width, width, generator, bias=False)
+        self.outer = _linear(width, width, generator, bias=False)
+
+    def forward(
+        self,
+        e: Tensor,  # [B, T, d]
+        valid: Tensor,  # [B, T] bool
+    ) -> Tensor:
+        """[B, T, d]"""
+        del valid  # no token looks at another
+        return e + self.outer(torch.relu(self.inner(e)))  # type: ignore[no-any-return]
+
+
+def apply_residuals(
+    parameters: Mapping[str, Tensor],  # of a GaussianMap
+    rows: Tensor,  # [V] int64, each once
+    residuals: Tensor,  # [V, 9]
+) -> dict[str, Tensor]:
+    """The parameters with the residuals on top; other rows are as they were. Differentiable.
+
+    The residual rotation is a unit quaternion in the Gaussian's own axes, q = q0 (1, u) / |(1, u)|:
+    a similarity that moves q0 (loop closure) carries it along, and |q| = |q0|.
+    """
+    u, log_scales, colours = residuals.split_with_sizes([TURN, LOG_SCALE, COLOUR], dim=1)
+    turn = F.normalize(F.pad(u, (1, 0), value=1.0), dim=1)
+    changed = {
+        "quats": quaternion_product(parameters["quats"].index_select(0, rows), turn),
+        "log_scales": parameters["log_scales"].index_select(0, rows) + log_scales,
+        "raw_colours": parameters["raw_colours"].index_select(0, rows) + colours,
+    }
+    whole = {name: parameters[name].index_copy(0, rows, new) for name, new in changed.items()}
+    return {**parameters, **whole}
+
+
+def _all_sound(features: Tensor) -> bool:
+    """Every feature is a number of sensible size."""
+    if features.numel() == 0:
+        return True
+    low, high = torch.aminmax(features.detach())  # NaN if any is
+    return bool(torch.maximum(-low, high) < LARGEST_FEATURE)
+
+
+def _sound_groups(
+    tokens: Tokens,
+    local: Tensor,  # [P, F_l]
+    shared: Tensor,  # [B, F_g]
+) -> Tensor:
+    """[B] bool: all features of the group are numbers of sensible size."""
+    bad = (~(local.detach().abs() < LARGEST_FEATURE)).any(1).long()
+    group = torch.arange(len(shared)).repeat_interleave(tokens.places_of_groups)
+    count = torch.zeros(len(shared), dtype=torch.int64).index_add_(0, group, bad)
+    return (count == 0) & (shared.detach().abs() < LARGEST_FEATURE).all(1)
+
+
+def _linear(inputs: int, outputs: int, generator: torch.Generator, bias: bool = True) -> nn.Linear:
+    """Weights uniform within 1 / sqrt(inputs), as torch draws them, but from ``generator``."""
+    layer = nn.Linear(inputs, outputs, bias)
+    for weight in layer.parameters():
+        nn.init.uniform_(weight, -1 / math.sqrt(inputs), 1 / math.sqrt(inputs), generator=generator)
+    return layer
+
+
+def _zero_linear(inputs: int, outputs: int) -> nn.Linear:
+    layer = nn.Linear(inputs, outputs)
+    for weight in layer.parameters():
+        nn.init.zeros_(weight)
+    return layer

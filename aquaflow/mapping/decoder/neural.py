@@ -1,0 +1,271 @@
+"""Neural Gaussians: what a decoder adds to explicit ones, and how it learns (paper, Sec. 3.3.1).
+
+One pass over the voxel groups, the trunk, serves a window of several steps, each on its own view.
+The window's gradients meet in the trunk's output; when it ends they go through the trunk at once,
+and features and weights take their step. Places and opacities, and the initial attributes if they
+are not frozen, take theirs at every view.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from aquaflow.config.mapping import DecoderConfig
+from aquaflow.mapping.decoder.decode import (
+    DECODED,
+    decoded,
+    decoded_torch,
+    in_picture,
+    without_residuals,
+)
+from aquaflow.mapping.decoder.decoder import Decoder, Trunk
+from aquaflow.mapping.decoder.observation import observation
+from aquaflow.mapping.decoder.tokens import visible_tokens
+from aquaflow.mapping.decoder.voxel_groups import VoxelGroups
+from aquaflow.mapping.gaussians.gaussians import GaussianMap
+from aquaflow.mapping.views import View
+from aquaflow.render.adam import SelectiveAdam
+
+
+@dataclass
+class Window:
+    """A trunk, and the views that are yet to be decoded from it."""
+
+    trunk: Trunk
+    hidden: Tensor
+    """[P, d] the trunk's output as a leaf; gathers the gradient of the window's views."""
+    local: Tensor
+    """[N, F_l] leaf."""
+    shared: Tensor
+    """[G, F_g] leaf."""
+    views: list[tuple[View, Tensor]]
+    """Each with the Gaussians [N] bool that it shows."""
+
+
+class NeuralGaussians:
+    """Groups, features and decoder of one sub-map, with their optimisers."""
+
+    def __init__(
+        self,
+        config: DecoderConfig,
+        gaussians: GaussianMap,
+        betas: tuple[float, float],
+        generator: torch.Generator,
+        threads: int,
+    ) -> None:
+        self.config, self.gaussians, self.threads = config, gaussians, threads
+        gaussians.local_features = torch.zeros(len(gaussians), config.local_width)
+        self.groups = VoxelGroups(config.voxels, config.global_width)
+        self.decoder = Decoder(config, generator)
+        rate = config.feature_rate
+        self._local = SelectiveAdam(
+            {"local": (gaussians.local_features, rate)}, betas, threads=threads
+        )
+        self._shared = SelectiveAdam(
+            {"shared": (self.groups.features, rate)}, betas, threads=threads
+        )
+        self._weights = torch.optim.Adam(self.decoder.parameters(), lr=config.rate, betas=betas)
+        self._expected: list[View] = []
+        self._window: Window | None = None
+        self._looked: tuple[View, Trunk] | None = None
+        """The trunk that ``seen_from`` used last, while nothing has changed."""
+        self.skipped = 0
+        """Windows whose weights were not stepped, as a gradient was not finite."""
+
+    # --- learning -----------------------------------------------------------------------------
+
+    def expect(self, views: Sequence[View]) -> None:
+        """The views of the next steps, in their order."""
+        self.settle()
+        self._expected = list(views)
+
+    def decode(
+        self,
+        view: View,
+        parameters: Mapping[str, Tensor],  # of the GaussianMap
+        viewmat: Tensor,  # [4, 4]
+    ) -> dict[str, Tensor]:
+        """The parameters as seen from ``view``, for a step of the optimiser; differentiable."""
+        window = self._window
+        if window is None or all(each is not view for each, _ in window.views):
+            self.settle()
+            window = self._window = self._open(view)
+        while window.views[0][0] is not view:  # a step that was left out
+            window.views.pop(0)
+        _, seen = window.views.pop(0)
+        trunk = Trunk(window.trunk.tokens, window.hidden, window.trunk.sound)
+        return self._decoded(trunk, seen, parameters, viewmat)
+
+    def settle(self) -> None:
+        """End the window: features and weights take the step that its views ask for."""
+        self._looked, window, self._window = None, self._window, None
+        if window is None:
+            return
+        self._expected = [view for view, _ in window.views] + self._expected
+        if window.hidden.grad is None:
+            return
+        torch.autograd.backward(window.trunk.hidden, window.hidden.grad)
+        assert window.local.grad is not None
+        assert window.shared.grad is not None
+        tokens = window.trunk.tokens
+        rows = torch.zeros(len(window.local), dtype=torch.bool)
+        rows[tokens.rows] = True
+        groups = torch.zeros(len(window.shared), dtype=torch.bool)
+        groups[tokens.groups] = True
+        self._local.step(rows, {"local": window.local.grad})
+        self._shared.step(groups, {"shared": window.shared.grad})
+        gradients = [w.grad for w in self.decoder.parameters() if w.grad is not None]
+        if all(bool(torch.isfinite(gradient).all()) for gradient in gradients):
+            self._weights.step()
+        else:
+            self.skipped += 1
+        self._weights.zero_grad(set_to_none=True)
+
+    def slow_down(self, factor: float) -> None:
+        """Let the rates be this share of the configured ones."""
+        self._local.learning_rates["local"] = factor * self.config.feature_rate
+        self._shared.learning_rates["shared"] = factor * self.config.feature_rate
+        self._weights.param_groups[0]["lr"] = factor * self.config.rate
+
+    def _open(self, view: View) -> Window:
+        views = [view]
+        if view in self._expected:
+            begin = self._expected.index(view)  # what is before it was left out
+            views = self._expected[begin : begin + self.config.views_per_trunk]
+            del self._expected[: begin + len(views)]
+        means = self.gaussians.means
+        seen = [in_picture(means, each, each.viewmat()) for each in views]
+        local = self.gaussians.local_features.detach().requires_grad_()
+        shared = self.groups.features.detach().requires_grad_()
+        tokens = visible_tokens(self.groups, self._context(seen))
+        trunk = self.decoder.trunk(tokens, local, shared)
+        hidden = trunk.hidden.detach().requires_grad_()
+        return Window(trunk, hidden, local, shared, list(zip(views, seen, strict=True)))
+
+    def _context(self, seen: Sequence[Tensor]) -> Tensor:
+        """[N] bool: what a trunk is made of, for views that show ``seen`` (each [N] bool)."""
+        if not self.config.visible_groups:
+            return torch.ones(len(self.gaussians), dtype=torch.bool)
+        return torch.stack(list(seen)).any(dim=0)
+
+    def _decoded(
+        self,
+        trunk: Trunk,
+        seen: Tensor,  # [N] bool
+        parameters: Mapping[str, Tensor],
+        viewmat: Tensor,  # [4, 4]
+    ) -> dict[str, Tensor]:
+        viewmat = viewmat.detach()
+        centre = -viewmat[:3, :3].T @ viewmat[:3, 3]
+        places = trunk.tokens.places(seen)
+        return decoded(self.decoder, trunk, parameters, places, centre, self.threads)
+
+    # --- looking ------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def seen_from(
+        self,
+        view: View,
+        viewmat: Tensor,  # [4, 4]
+    ) -> dict[str, Tensor]:
+        """The parameters as seen from ``view``; no gradient.
+
+        The trunk is kept for further looks from the same view, until something changes.
+        """
+        parameters = self.gaussians.parameters
+        seen = in_picture(parameters["means"], view, viewmat)
+        if self._window is not None or self._looked is None or self._looked[0] is not view:
+            self._looked = (view, self._trunk(self._context([seen])))
+        return self._decoded(self._looked[1], seen, parameters, viewmat)
+
+    @torch.no_grad()
+    def baked(
+        self,
+        centres: Tensor,  # [N, 3] of the camera that each Gaussian is seen from
+    ) -> dict[str, Tensor]:
+        """All parameters as plain Gaussians, each as its own camera sees it."""
+        everyone = torch.ones(len(self.gaussians), dtype=torch.bool)
+        trunk = self._trunk(everyone)
+        places = trunk.tokens.places(everyone)
+        rows = trunk.tokens.rows[places]
+        return decoded_torch(self.decoder, trunk, self.gaussians.parameters, places, centres[rows])
+
+    def _trunk(
+        self,
+        seen: Tensor,  # [N] bool
+    ) -> Trunk:
+        """Of the groups in which a Gaussian is seen, as everything is now."""
+        self.settle()
+        tokens = visible_tokens(self.groups, seen)
+        return self.decoder.trunk(tokens, self.gaussians.local_features, self.groups.features)
+
+    # --- growing and following ----------------------------------------------------------------
+
+    @torch.no_grad()
+    def insert(
+        self,
+        centres: Tensor,  # [3] or [M, 3] of the camera that the new Gaussians are seen from
+        count: int,  # M
+    ) -> None:
+        """Place the map's last ``count`` Gaussians; from there they look as they were given."""
+        if count == 0:
+            return
+        self.settle()
+        self.groups.insert(self.gaussians.means[-count:])
+        self._local.extend(count)
+        self._bind()
+        rows = torch.zeros(len(self.gaussians), dtype=torch.bool)
+        rows[-count:] = True
+        trunk = self._trunk(rows)
+        places = trunk.tokens.places(rows)
+        new, first = trunk.tokens.rows[places], len(rows) - count
+        parameters = self.gaussians.parameters
+        centre = centres if centres.dim() == 1 else centres[new - first]
+        residuals = self.decoder.residuals(
+            trunk, places, observation(parameters["means"][new], centre)
+        )
+        initial = without_residuals({name: parameters[name][new] for name in DECODED}, residuals)
+        for name, values in initial.items():
+            parameters[name][new] = values
+
+    @torch.no_grad()
+    def keep(
+        self,
+        mask: Tensor,  # [N] bool
+    ) -> None:
+        """Drop the Gaussians where ``mask`` is False, from the map too."""
+        self.settle()
+        self.gaussians.keep(mask)
+        self.groups.keep(mask)
+        self._local.keep(mask)
+        self._shared.keep(self.groups.compact())
+        self._bind()
+
+    @torch.no_grad()
+    def move(
+        self,
+        rows: Tensor,  # [M] int64 of the Gaussians that were moved
+    ) -> None:
+        """Follow a loop closure."""
+        self.settle()
+        if len(rows):
+            self.groups.move(rows, self.gaussians.means)
+            self._bind()
+
+    def adopt(
+        self,
+        local: Tensor,  # [N, F_l]
+    ) -> None:
+        """Take over local features, and groups that were restored, with optimisers at step 0."""
+        self.gaussians.local_features = local
+        self._local.extend(len(local) - len(self._local.steps))
+        self._bind()
+
+    def _bind(self) -> None:
+        self._shared.extend(len(self.groups) - len(self._shared.steps))
+        self._shared.bind({"shared": self.groups.features})
+        self._local.bind({"local": self.gaussians.local_features})

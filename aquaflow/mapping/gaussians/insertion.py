@@ -1,0 +1,138 @@
+"""Medium-guided insertion: where new Gaussians go, and how they start (paper, Eq. 16 and 17)."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from aquaflow.config import InsertionConfig
+from aquaflow.keyframes import Pointmap
+from aquaflow.mapping.gaussians.gaussians import GaussianMap, raw_colour
+from aquaflow.mapping.views import View
+
+LOG_GAIN = 3.0
+"""A Laplacian-of-Gaussian response, L1 over RGB, of 1 / LOG_GAIN counts as certain structure."""
+
+
+def structure(
+    image: Tensor,  # [H, W, 3]
+    sigma_px: float,
+) -> Tensor:
+    """min(|LoG * image|, 1) [H, W]: how much fine structure a pixel belongs to.
+
+    The operator is scale-normalised by sigma^2; its response is averaged over the kernel's own
+    width, so that both sides of an edge count and not the zero crossing on it.
+    """
+    array = image.numpy()
+    smooth = cv2.GaussianBlur(array, (0, 0), sigma_px)
+    response = np.abs(cv2.Laplacian(smooth, cv2.CV_32F)).sum(axis=-1) * sigma_px**2
+    response = cv2.GaussianBlur(response, (0, 0), 2.0 * sigma_px)
+    return torch.from_numpy(np.clip(LOG_GAIN * response, 0.0, 1.0))
+
+
+def insertion_probability(
+    restored: Tensor,  # [H, W, 3] J-hat, medium-reduced observation
+    rendered: Tensor,  # [H, W, 3] J-tilde, medium-free rendering
+    alpha: Tensor,  # [H, W] of the rendering
+    config: InsertionConfig,
+) -> Tensor:
+    """P_a [H, W] of the paper; bare pixels get at least ``bare_probability``.
+
+    Smooth sand has no Laplacian, but it needs a few large Gaussians all the same.
+    """
+    P = structure(restored, config.sigma_px) - structure(rendered, config.sigma_px)
+    bare = torch.where(alpha < config.covered_alpha, config.bare_probability, 0.0)
+    return torch.maximum(P.clamp_min(0.0), bare)
+
+
+def select(
+    probability: Tensor,  # [H, W] P_a
+    allowed: Tensor,  # [H, W] bool
+    config: InsertionConfig,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor]:
+    """Rows and columns drawn with probability ``P_a * density``, at least ``tau_a``."""
+    chance = torch.where(probability > config.tau_a, probability * config.density, 0.0)
+    drawn = torch.rand(chance.shape, generator=generator) < chance
+    rows, columns = torch.nonzero(drawn & allowed, as_tuple=True)
+    return rows, columns
+
+
+def thin(
+    rows: Tensor,  # [M]
+    columns: Tensor,  # [M]
+    room: int,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor]:
+    """At most ``room`` of the pixels, drawn from the whole picture."""
+    if len(rows) <= room:
+        return rows, columns
+    chosen = torch.randperm(len(rows), generator=generator)[: max(room, 0)].sort().values
+    return rows[chosen], columns[chosen]
+
+
+def worth_keeping(gaussians: GaussianMap, count: int) -> Tensor:
+    """[N] bool: the ``count`` Gaussians without which most of the pictures would be missing.
+
+    That is opacity times cross-section, of the two longer axes and in units of the map.
+    """
+    scales = gaussians.scales
+    worth = gaussians.opacities * scales.prod(dim=-1) / scales.amin(dim=-1)
+    keep = torch.ones(len(worth), dtype=torch.bool)
+    keep[torch.argsort(worth, stable=True)[: len(worth) - count]] = False
+    return keep
+
+
+def new_gaussians(
+    view: View,
+    rows: Tensor,  # [M]
+    columns: Tensor,  # [M]
+    z: Tensor,  # [H, W] range
+    colour: Tensor,  # [H, W, 3] J-hat
+    confidence: Tensor,  # [H, W] in [0, 1]
+    probability: Tensor,  # [H, W] P_a
+    config: InsertionConfig,
+) -> dict[str, Tensor]:
+    """Start values: on the pixel's ray, as wide as the expected spacing, coloured by J-hat.
+
+    Pixels for which one of them is not finite get no Gaussian.
+    """
+    pixels = torch.stack([columns, rows], dim=-1).numpy() + 0.5
+    rays = view.camera.unproject(pixels)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    distance = z[rows, columns].numpy().astype(np.float64)
+    means = (rays * distance[:, None]) @ view.T_wc.R.T + view.T_wc.t
+    # Expected distance to the nearest neighbour when a share p of the pixels is drawn: 1 / sqrt(p).
+    share = (probability[rows, columns] * config.density).clamp(1e-4, 1.0)
+    spacing = share.rsqrt().clamp(1.0, config.max_spacing_widths * view.camera.width)
+    scale = config.scale_of_spacing * spacing * z[rows, columns] / view.camera.fx
+    opacity = (config.opacity * confidence[rows, columns]).clamp(0.05, 0.95)
+    quats = torch.zeros(len(rows), 4)
+    quats[:, 0] = 1.0
+    new = {
+        "means": torch.from_numpy(means).to(torch.float32),
+        "quats": quats,
+        "log_scales": torch.log(scale)[:, None].repeat(1, 3),
+        "opacity_logits": torch.logit(opacity)[:, None],
+        "raw_colours": raw_colour(colour[rows, columns]),
+    }
+    sound = torch.stack([torch.isfinite(values).all(dim=-1) for values in new.values()]).all(0)
+    return new if bool(sound.all()) else {name: values[sound] for name, values in new.items()}
+
+
+def range_of(pointmap: Pointmap, known_sigma: float) -> tuple[Tensor, Tensor]:
+    """Range along the ray [H, W] and where it is known, of a tracked frame."""
+    camera = pointmap.camera
+    known = pointmap.known(known_sigma)
+    length = torch.from_numpy(camera.unproject(camera.pixel_centres())).norm(dim=-1)
+    depth = torch.from_numpy(1.0 / pointmap.rho.clip(1e-6))
+    mask = torch.from_numpy(known)
+    return torch.where(mask, length * depth, 0.0).to(torch.float32), mask
+
+
+def confidence_of(pointmap: Pointmap) -> Tensor:
+    """[H, W] in [0, 1]: Q of the paper, saturating at a relative range sigma of 3 %."""
+    Q = torch.from_numpy(pointmap.Q)
+    return (Q / (Q + (1.0 / 0.03) ** 2)).to(torch.float32).sqrt()

@@ -1,0 +1,69 @@
+"""The map follows its keyframes: Gaussians and views move by the full similarity."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+import torch
+
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.mapping.gaussians.gaussians import GaussianMap
+from aquaflow.mapping.views import View
+
+
+@torch.no_grad()
+def move_gaussians(gaussians: GaussianMap, moves: Mapping[int, Sim3]) -> torch.Tensor:
+    """Move what belongs to the keyframes in ``moves``, place, orientation and size, in place.
+
+    ``moves`` holds for a keyframe's number the similarity that maps its old world to its new one.
+    Returns the rows [M] that were moved; the cost grows with M.
+
+    Raises:
+        ArithmeticError: where they go is not finite; nothing has moved then.
+    """
+    if not moves or len(gaussians) == 0:
+        return torch.zeros(0, dtype=torch.int64)
+    numbers = torch.tensor(sorted(moves), dtype=torch.int64)
+    rows = torch.nonzero(torch.isin(gaussians.keyframes, numbers))[:, 0]
+    which = torch.searchsorted(numbers, gaussians.keyframes[rows])
+    ordered = [moves[int(number)] for number in numbers]
+    R = torch.from_numpy(np.stack([S.R for S in ordered]))[which]
+    t = torch.from_numpy(np.stack([S.t for S in ordered]))[which]
+    scale = torch.tensor([S.scale for S in ordered], dtype=torch.float64)[which, None]
+    turn = torch.from_numpy(np.stack([S.quaternion for S in ordered]))[which]
+    means, quats = (gaussians.parameters[name] for name in ("means", "quats"))
+    turned = torch.einsum("nij,nj->ni", R, means[rows].double())
+    moved = (scale * turned + t).float()
+    facing = quaternion_product(turn, quats[rows].double()).float()
+    growth = torch.log(scale).float()
+    if not all(bool(torch.isfinite(each).all()) for each in (moved, facing, growth)):
+        raise ArithmeticError("a correction of the map is not finite")
+    means[rows], quats[rows] = moved, facing
+    gaussians.parameters["log_scales"][rows] += growth
+    return rows
+
+
+def move_views(views: Iterable[View], moves: Mapping[int, Sim3]) -> None:
+    """Re-anchor the views that hang on the keyframes in ``moves``.
+
+    Raises:
+        ArithmeticError: where they go is not finite; no view has moved then.
+    """
+    moved = [
+        (view, (moves[view.keyframe] @ view.T_wc).if_finite())
+        for view in views
+        if view.keyframe in moves
+    ]
+    for view, T_wc in moved:
+        view.T_wc = T_wc
+
+
+def quaternion_product(
+    a: torch.Tensor,  # [N, 4] wxyz
+    b: torch.Tensor,  # [N, 4] wxyz
+) -> torch.Tensor:
+    """[N, 4]: the rotation b, then the rotation a."""
+    aw, av, bw, bv = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
+    w = aw * bw - (av * bv).sum(1, keepdim=True)
+    return torch.cat([w, aw * bv + bw * av + torch.linalg.cross(av, bv)], dim=1)

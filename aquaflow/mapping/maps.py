@@ -1,0 +1,170 @@
+"""The maps of a dive, one for every sub-map: grown by what tracking hands over (Sec. 3.3, 3.4)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from aquaflow.config import Config
+from aquaflow.errors.failures import Failures
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes import Pointmap
+from aquaflow.mapping.gaussians.reanchoring import move_views
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.view_budget import alike, let_surplus_go
+from aquaflow.mapping.views import View, ViewStore
+from aquaflow.profiler import Profiler
+from aquaflow.render import select_renderer
+from aquaflow.render.contract import Renderer
+
+MIN_VIEWS = 3
+"""Fewer posed frames are not a map, and not worth refining."""
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Insertion:
+    """A view and the depths of its pixels."""
+
+    view: View
+    sub_map: int
+    pointmap: Pointmap
+
+
+@dataclass(frozen=True)
+class Growth:
+    """What one posed frame brings to the map of its sub-map."""
+
+    view: View
+    sub_map: int
+    steps: int
+    """Of the optimiser, afterwards."""
+    pointmap: Pointmap | None = None
+    """Depths of the view's own pixels, if new Gaussians may come from it."""
+    retired: tuple[Insertion, ...] = ()
+    """Keyframes that this one relieves, with their pointmaps as fused over their whole life."""
+
+
+class MapWork(Protocol):
+    """What tracking asks of the maps; done at once, or in a thread beside."""
+
+    @property
+    def mappers(self) -> dict[int, Mapper]:
+        """By sub-map. Nobody else's while a thread beside works on them."""
+        ...
+
+    @property
+    def held_out(self) -> dict[int, list[View]]:
+        """Per sub-map, the views that were tracked but never mapped."""
+        ...
+
+    def grow(self, growth: Growth) -> None:
+        """Add a view, insert Gaussians, optimise."""
+        ...
+
+    def hold_out(self, view: View, sub_map: int) -> None:
+        """Keep a view for judging the map, which never learns from it."""
+        ...
+
+    def insert(self, insertion: Insertion) -> None:
+        """Gaussians from a keyframe whose view the map has."""
+        ...
+
+    def correct(self, moves: Mapping[int, Sim3], merged: Mapping[int, int]) -> None:
+        """Gaussians and views go where their keyframes went; merged sub-maps become one map."""
+        ...
+
+    def refine(self, progress: Progress | None = None) -> None:
+        """After the last frame; whoever calls it has the maps for himself from here on."""
+        ...
+
+    def close(self, keep: bool = False) -> None:
+        """Remove what waits in the work folder; or, to ``keep`` it, write what does not yet."""
+        ...
+
+
+class Maps:
+    """Does the work at once; to be used from one thread at a time."""
+
+    def __init__(
+        self,
+        config: Config,
+        renderer: Renderer | None = None,
+        profiler: Profiler | None = None,
+        work: Path | None = None,
+        failures: Failures | None = None,
+    ) -> None:
+        """What does not fit into memory waits in the folder ``work``, if there is one.
+
+        The renderer is selected by the config if none is given. What a stage raises is counted in
+        ``failures``; the map goes on without it.
+        """
+        self.config, self.profiler = config, profiler or Profiler()
+        self.failures = failures or Failures()
+        self.renderer = renderer or select_renderer(config.mapping.renderer, config.threads)
+        self.mappers: dict[int, Mapper] = {}
+        self.held_out: dict[int, list[View]] = {}
+        self.views = ViewStore(work)
+
+    def grow(self, growth: Growth) -> None:
+        view, mapper = growth.view, self.mapper(growth.sub_map)
+        with self.profiler.stage("view"), self.failures.contain("view", view.frame_index):
+            self.views.keep(view)
+            mapper.add_view(view)  # now and then a view makes the water be fitted again
+            group = alike(view, mapper.views)
+            let_surplus_go(mapper.views, group, self.config.mapping.views_per_keyframe)
+
+        # Sec. 3.3.3: medium-guided insertion, from this frame and from the keyframe it retires.
+        for retired in growth.retired:
+            self.insert(retired)
+        if growth.pointmap is not None:
+            self.insert(Insertion(view, growth.sub_map, growth.pointmap))
+
+        # Sec. 3.4: joint optimisation of Gaussians and water.
+        with self.profiler.stage("optimise"):
+            mapper.optimise(growth.steps)
+
+    def hold_out(self, view: View, sub_map: int) -> None:
+        views = self.held_out.setdefault(sub_map, [])
+        views.append(self.views.keep(view))
+        let_surplus_go(views, views, self.config.mapping.held_out_most)
+
+    def insert(self, insertion: Insertion) -> None:
+        mapper, frame = self.mapper(insertion.sub_map), insertion.view.frame_index
+        with self.profiler.stage("insert"), self.failures.contain("insertion", frame) as insert:
+            mapper.insert(insertion.view, insertion.pointmap)
+        if insert.failed:
+            mapper.make_whole()
+
+    def correct(self, moves: Mapping[int, Sim3], merged: Mapping[int, int]) -> None:
+        for mapper in self.mappers.values():
+            mapper.move(moves)
+        for views in self.held_out.values():
+            move_views(views, moves)
+        for source, target in merged.items():
+            if source in self.mappers:
+                self.mapper(target).absorb(self.mappers.pop(source))
+            views = self.held_out.setdefault(target, [])
+            views.extend(self.held_out.pop(source, []))
+            let_surplus_go(views, views, self.config.mapping.held_out_most)
+
+    def refine(self, progress: Progress | None = None) -> None:
+        with self.profiler.stage("refine"):
+            for mapper in self.mappers.values():
+                if len(mapper.views) >= MIN_VIEWS:
+                    with self.failures.contain("refinement"):
+                        mapper.refine(progress)
+                mapper.make_whole()
+
+    def mapper(self, sub_map: int) -> Mapper:
+        """The map of a sub-map, made when first asked for."""
+        if sub_map not in self.mappers:
+            seed = self.config.seed + sub_map
+            self.mappers[sub_map] = Mapper(self.config.mapping, self.renderer, seed, self.failures)
+        return self.mappers[sub_map]
+
+    def close(self, keep: bool = False) -> None:
+        self.views.close(keep)

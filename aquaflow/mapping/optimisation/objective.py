@@ -1,0 +1,59 @@
+"""L_total (paper, Eq. 19): what one view says about the map."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from aquaflow.config import LossConfig
+from aquaflow.mapping.optimisation.losses import depth_loss, outlier_mask, radial_weight, scale_loss
+from aquaflow.mapping.rendering import Shown
+from aquaflow.mapping.views import View
+from aquaflow.render.activity import active_pixels
+from aquaflow.render.photometric import photometric_loss
+
+
+class Objective:
+    """The weighted sum of the paper's terms; keeps K_rad for every size of picture."""
+
+    def __init__(self, config: LossConfig, threads: int) -> None:
+        self.config, self.threads = config, threads
+        self._K_rad: dict[tuple[int, int], Tensor] = {}
+
+    def total(self, view: View, shown: Shown, parameters: Mapping[str, Tensor]) -> Tensor:
+        """L1, SSIM, depth and scale terms of ``shown``, the map drawn from ``view``."""
+        config, target = self.config, view.target()
+        mask = view.scene_mask()
+        if shown.active is not None:
+            mask &= active_pixels(shown.active, view.camera.width, view.camera.height)
+        if view.robust:
+            mask &= outlier_mask(shown.image, target, self.radial(view), config.tau_e)
+        loss = self._pictures(view, shown, target, mask)
+        inverse_range = view.inverse_range
+        if config.depth > 0.0 and inverse_range is not None:
+            assert view.range_confidence is not None
+            trust = self.radial(view) * mask * view.range_confidence
+            # The view's ranges are in its keyframe's unit; the map is in the world's.
+            expected = inverse_range / view.T_wc.scale
+            loss = loss + config.depth * depth_loss(shown.z, shown.alpha, expected, trust)
+        if config.scale > 0.0:
+            loss = loss + config.scale * scale_loss(torch.exp(parameters["log_scales"]))
+        return loss
+
+    def photometric(self, view: View, shown: Shown) -> Tensor:
+        """L1 and SSIM alone, nothing masked but the vehicle."""
+        return self._pictures(view, shown, view.target(), view.scene_mask())
+
+    def _pictures(self, view: View, shown: Shown, target: Tensor, mask: Tensor) -> Tensor:
+        return photometric_loss(
+            shown.image, target, self.radial(view), mask, self.config.ssim, self.threads
+        )
+
+    def radial(self, view: View) -> Tensor:
+        """K_rad [H, W]."""
+        size = (view.camera.height, view.camera.width)
+        if size not in self._K_rad:
+            self._K_rad[size] = radial_weight(*size)
+        return self._K_rad[size]

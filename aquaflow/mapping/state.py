@@ -1,0 +1,223 @@
+"""A map taken apart into facts and arrays, and put together again: it renders bit for bit the same.
+
+What there is to see: Gaussians and whose they are, water, shading, exposures and light, the
+decoder with its features and groups, and the posed cameras. With the optimiser's part, the map goes
+on being optimised as if it had never been away, once its views have their pictures again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from aquaflow.config import MappingConfig
+from aquaflow.errors import DamagedError
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.mapping.decoder.neural import NeuralGaussians
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.views import View
+from aquaflow.render.adam import SelectiveAdam
+from aquaflow.render.contract import Renderer
+from aquaflow.storage.arrays import Arrays, of_camera, of_sim3, prefixed, to_camera, to_sim3, under
+
+Facts = dict[str, Any]
+
+NO_PIXELS = np.zeros((0, 0, 3), np.uint8)
+"""A view's picture is no part of the map."""
+GROUPS = ("group", "slot", "table", "fill", "voxel", "features")
+
+
+def take_apart(mapper: Mapper, optimiser: bool = False) -> tuple[Facts, Arrays]:
+    """Facts for JSON, and arrays, which are copies; ``optimiser``: its state too."""
+    scene, cameras = mapper.scene, list(dict.fromkeys(view.camera for view in mapper.views))
+    facts: Facts = {
+        "config": mapper.config.model_dump(mode="json"),
+        "medium_active": mapper.medium.active,
+        "exposes": scene.exposes,
+        "sunlight_plays": scene.sunlight.plays,
+        "water_evidence": scene.water_evidence,
+        "beta_a_sigma": scene.beta_a_sigma,
+        "decoder": mapper.neural is not None,
+        "optimiser": optimiser,
+        "steps": mapper.steps,
+        "undone": mapper.undone,
+        "cameras": [of_camera(camera) for camera in cameras],
+    }
+    arrays = _prefixed("gaussians", mapper.gaussians.parameters)
+    arrays["keyframes"] = mapper.gaussians.keyframes.numpy().copy()
+    arrays["shading"] = scene.shading.copy()
+    arrays |= _prefixed("medium", mapper.medium.state_dict())
+    arrays |= _views(mapper.views, cameras)
+    if mapper.neural is not None:
+        arrays |= _decoder(mapper.neural)
+    if optimiser:
+        facts["next_water_fit"] = mapper._next_water_fit
+        facts["rates"] = {name: adam.learning_rates for name, adam in _adams(mapper).items()}
+        facts["rates"] |= {
+            name: each.param_groups[0]["lr"] for name, each in _torch(mapper).items()
+        }
+        arrays |= _optimisers(mapper)
+    return facts, arrays
+
+
+def put_together(facts: Facts, arrays: Mapping[str, Any], renderer: Renderer) -> Mapper:
+    """The map that was taken apart; its views have poses, exposures and light, but no pixels.
+
+    Raises:
+        KeyError, ValueError, TypeError, RuntimeError, AquaFlowError: these are no map's.
+    """
+    mapper = Mapper(MappingConfig.model_validate(facts["config"]), renderer, seed=0)
+    scene, gaussians = mapper.scene, mapper.gaussians
+    for name, width in gaussians.WIDTHS.items():
+        gaussians.parameters[name] = _tensor(arrays[f"gaussians.{name}"]).reshape(-1, width)
+    gaussians.keyframes = _tensor(arrays["keyframes"])
+    width = gaussians.local_features.shape[1]  # a decoder, if there is one, brings its own
+    gaussians.local_features = torch.zeros(len(gaussians.keyframes), width)
+    if any(len(tensor) != len(gaussians) for tensor in gaussians.parameters.values()):
+        raise DamagedError("its Gaussians differ in number")
+    scene.shading = np.array(arrays["shading"])
+    mapper.medium.load_state_dict(_under("medium", arrays))
+    mapper.medium.active, scene.exposes = bool(facts["medium_active"]), bool(facts["exposes"])
+    scene.sunlight.plays = bool(facts["sunlight_plays"])
+    scene.water_evidence, scene.beta_a_sigma = facts["water_evidence"], facts["beta_a_sigma"]
+    mapper.steps, mapper.undone = int(facts["steps"]), int(facts["undone"])
+    if len(facts["cameras"]) > len(arrays["views.numbers"]):
+        raise DamagedError("it has more cameras than views")
+    mapper.views = _read_views(arrays, [to_camera(values) for values in facts["cameras"]])
+    mapper._optimiser.extend(len(gaussians))
+    mapper._optimiser.bind(gaussians.parameters)
+    if not facts["decoder"]:
+        scene.neural = None  # baked, though the config began with one
+    elif mapper.neural is not None:
+        _read_decoder(mapper.neural, arrays)
+    if facts["optimiser"]:
+        mapper._next_water_fit = int(facts["next_water_fit"])
+        _read_optimisers(mapper, arrays, facts["rates"])
+    return mapper
+
+
+# --- views ----------------------------------------------------------------------------------------
+
+
+def _views(views: Sequence[View], cameras: list[CameraModel]) -> Arrays:
+    numbers = [
+        (v.frame_index, v.keyframe, v.robust, v.looks, v.moments[2], cameras.index(v.camera))
+        for v in views
+    ]
+    moments = [[*v.moments[0], *v.moments[1]] for v in views]
+    arrays = {
+        "views.numbers": np.array(numbers, np.int64).reshape(-1, 6),
+        "views.poses": of_sim3([view.T_wc for view in views]),
+        "views.log_gains": np.array([v.log_gain for v in views], np.float64).reshape(-1, 3),
+        "views.moments": np.array(moments, np.float64).reshape(-1, 12),
+    }
+    for i, view in enumerate(views):
+        if view.light is not None:
+            arrays[f"views.light{i}"] = view.light.numpy().copy()
+        if view.explained is not None:
+            arrays[f"views.explained{i}"] = view.explained.numpy().copy()
+    return arrays
+
+
+def _read_views(arrays: Mapping[str, Any], cameras: Sequence[CameraModel]) -> list[View]:
+    views = []
+    rows = (arrays[f"views.{name}"] for name in ("numbers", "poses", "log_gains", "moments"))
+    for i, (numbers, pose, log_gain, moments) in enumerate(zip(*rows, strict=True)):
+        index, keyframe, robust, looks, count, camera = numbers.tolist()
+        view = View(index, NO_PIXELS, cameras[camera], to_sim3(pose), keyframe, bool(robust))
+        view.log_gain, view.looks = log_gain.copy(), looks
+        view.moments = (moments[:6].copy(), moments[6:].copy(), count)
+        for name in ("light", "explained"):
+            if f"views.{name}{i}" in arrays:
+                setattr(view, name, _tensor(arrays[f"views.{name}{i}"]))
+        views.append(view)
+    return views
+
+
+# --- decoder --------------------------------------------------------------------------------------
+
+
+def _decoder(neural: NeuralGaussians) -> Arrays:
+    neural.settle()
+    groups = neural.groups
+    arrays = _prefixed("decoder", neural.decoder.state_dict())
+    arrays |= _prefixed("groups", {name: getattr(groups, name) for name in GROUPS})
+    arrays["groups.order"] = groups.order().numpy()
+    arrays["local"] = neural.gaussians.local_features.numpy().copy()
+    return arrays
+
+
+def _read_decoder(neural: NeuralGaussians, arrays: Mapping[str, Any]) -> None:
+    neural.decoder.load_state_dict(_under("decoder", arrays))
+    groups = {name: _tensor(arrays[f"groups.{name}"]) for name in (*GROUPS, "order")}
+    neural.groups.restore(**groups)
+    neural.adopt(_tensor(arrays["local"]))
+
+
+# --- optimisers -----------------------------------------------------------------------------------
+
+
+def _adams(mapper: Mapper) -> dict[str, SelectiveAdam]:
+    adams = {"adam": mapper._optimiser}
+    if mapper.neural is not None:
+        adams |= {"adam_local": mapper.neural._local, "adam_shared": mapper.neural._shared}
+    return adams
+
+
+def _torch(mapper: Mapper) -> dict[str, torch.optim.Adam]:
+    optimisers = {"adam_medium": mapper._medium_optimiser}
+    if mapper.neural is not None:
+        optimisers["adam_decoder"] = mapper.neural._weights
+    return optimisers
+
+
+def _optimisers(mapper: Mapper) -> Arrays:
+    arrays: Arrays = {"random": mapper._random.get_state().numpy().copy()}
+    for name, adam in _adams(mapper).items():
+        arrays[f"{name}.steps"] = adam.steps.numpy().copy()
+        arrays |= _prefixed(f"{name}.first", adam.first_moments)
+        arrays |= _prefixed(f"{name}.second", adam.second_moments)
+    for name, optimiser in _torch(mapper).items():
+        for i, state in optimiser.state_dict()["state"].items():
+            arrays |= _prefixed(f"{name}.{i}", state)
+    return arrays
+
+
+def _read_optimisers(mapper: Mapper, arrays: Mapping[str, Any], rates: Facts) -> None:
+    mapper._random.set_state(_tensor(arrays["random"]))
+    for name, adam in _adams(mapper).items():
+        adam.steps = _tensor(arrays[f"{name}.steps"])
+        adam.first_moments.update(_under(f"{name}.first", arrays))
+        adam.second_moments.update(_under(f"{name}.second", arrays))
+        adam.learning_rates.update(rates[name])
+        adam.bind({})
+    for name, optimiser in _torch(mapper).items():
+        whole = optimiser.state_dict()
+        for i in range(len(whole["param_groups"][0]["params"])):
+            state = _under(f"{name}.{i}", arrays)
+            if state:
+                whole["state"][i] = state
+        whole["param_groups"][0]["lr"] = float(rates[name])
+        optimiser.load_state_dict(whole)
+
+
+# --- arrays ---------------------------------------------------------------------------------------
+
+
+def _prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> Arrays:
+    """Copies, as arrays."""
+    return prefixed(prefix, {name: t.detach().numpy().copy() for name, t in tensors.items()})
+
+
+def _under(prefix: str, arrays: Mapping[str, Any]) -> dict[str, Tensor]:
+    """What :func:`_prefixed` put there."""
+    return {name: _tensor(array) for name, array in under(prefix, arrays).items()}
+
+
+def _tensor(array: npt.NDArray[Any]) -> Tensor:
+    return torch.from_numpy(np.array(array))

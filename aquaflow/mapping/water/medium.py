@@ -1,0 +1,94 @@
+"""The learnable medium: attenuation from the camera's orientation, and RGB backscatter.
+
+Colour against medium is not identifiable without constraints (docs/paper.md#deviations): rates are
+positive by softplus, colours lie in [0, 1] by sigmoid.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from aquaflow.config import MediumConfig
+from aquaflow.mapping.encoding import BANDS, sinusoidal_encoding
+from aquaflow.mapping.water.image_formation import Water
+from aquaflow.mapping.water.shading import TERMS
+
+MIN_RATE = 1e-4
+"""1 / map unit; a rate of zero has no finite parameter."""
+B_INF_RANGE = (0.01, 0.99)
+"""What the water may start from: 0 and 1 have no finite logit."""
+
+
+class Medium(nn.Module):
+    """beta_a = MLP_a(gamma(vec R)); B_inf, b, B_res, d learnable RGB (paper, Eq. 13 to 15)."""
+
+    def __init__(self, config: MediumConfig, generator: torch.Generator) -> None:
+        super().__init__()
+        inputs = 9 * (1 + 2 * BANDS)
+        self.hidden = nn.Linear(inputs, config.width)
+        self.output = nn.Linear(config.width, 3)
+        bound = 1.0 / math.sqrt(inputs)
+        with torch.no_grad():
+            self.hidden.weight.uniform_(-bound, bound, generator=generator)
+            self.hidden.bias.zero_()
+            # Isotropic water to begin with: the orientation has no say until the data gives it one.
+            self.output.weight.zero_()
+            self.output.bias.fill_(_inverse_softplus(config.initial_attenuation))
+        self.B_inf_logit = nn.Parameter(torch.full((3,), _logit(config.initial_B_inf)))
+        self.b_raw = nn.Parameter(torch.full((3,), _inverse_softplus(config.initial_attenuation)))
+        self.B_res_logit = nn.Parameter(torch.full((3,), _logit(config.initial_B_res)))
+        self.d_raw = nn.Parameter(
+            torch.full((3,), _inverse_softplus(config.initial_residual_decay))
+        )
+        self.unevenness: Tensor
+        self.register_buffer("unevenness", torch.zeros(TERMS))
+        """Coefficients of the backscatter's log-gain over the picture."""
+        self.active = config.enabled
+
+    def forward(
+        self,
+        R_wc: Tensor,  # [3, 3] camera to world
+    ) -> Water:
+        """The water as seen by a camera with this orientation."""
+        code = sinusoidal_encoding(R_wc.reshape(9))
+        beta_a = F.softplus(self.output(torch.tanh(self.hidden(code))))
+        return Water(
+            beta_a,
+            torch.sigmoid(self.B_inf_logit),
+            F.softplus(self.b_raw),
+            torch.sigmoid(self.B_res_logit),
+            F.softplus(self.d_raw),
+        )
+
+    @torch.no_grad()
+    def set_water(
+        self,
+        beta_a: Tensor,  # [3]
+        B_inf: Tensor,  # [3]
+        b: Tensor,  # [3]
+        unevenness: Tensor | None = None,  # [5]
+    ) -> None:
+        """Start from an estimate; the residual term is left as it is."""
+        self.output.weight.zero_()
+        self.output.bias.copy_(inverse_softplus(beta_a))
+        self.B_inf_logit.copy_(torch.logit(B_inf.clamp(*B_INF_RANGE)))
+        self.b_raw.copy_(inverse_softplus(b))
+        self.unevenness.zero_() if unevenness is None else self.unevenness.copy_(unevenness)
+
+
+def inverse_softplus(y: Tensor) -> Tensor:
+    """x with softplus(x) = y, for y > 0; guarded at both ends."""
+    y = y.clamp_min(MIN_RATE)
+    return y + torch.log(-torch.expm1(-y))
+
+
+def _inverse_softplus(y: float) -> float:
+    return float(inverse_softplus(torch.tensor(y)))
+
+
+def _logit(p: float) -> float:
+    return math.log(p / (1.0 - p))

@@ -1,0 +1,148 @@
+"""What may lie between a surface point's colour and the picture's, as one vector of numbers.
+
+The water has nine, its unevenness and the camera's shading five each, every view's exposure three,
+and one says how far the map is trusted about a point's neighbours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.config import WaterPriorsConfig
+from aquaflow.mapping.water.shading import TERMS
+
+Array = npt.NDArray[np.float64]
+
+RATE_RATIO_SIGMA = 0.5
+"""Prior: log of b over beta_a; both come from the same absorption and scattering."""
+RATE_SIGMA = 1.5
+"""Prior: log of beta_a around the start value, weak: a factor of 4.5 either way."""
+B_INF_LOGIT, B_INF_SIGMA = -1.0, 1.5
+"""Prior: logit of B_inf (0.27), weak."""
+WHITE_SIGMA = 0.5
+"""Prior, if believed: logit of a channel's B_inf over the mean of all (white backscatter)."""
+UNEVEN_SIGMA = 0.5
+"""Prior: log-gain of the backscatter at the edge of the picture; sunlit water is several times as
+bright looked at horizontally as from above."""
+TRUST, TRUST_SIGMA = 1.0, 1.0
+"""Prior: how much of the neighbours' light that the map tells of is really there. What is uncertain
+in the map weakens it: 0.5 to 0.9 on dives with known water."""
+SHADING_SIGMA = 0.3
+"""Prior: log-gain at the edge of the picture; a third is a strong lamp fall-off."""
+EXPOSURE_SIGMA = 0.5
+"""Prior: log-gain of a view against the mean of all; two stops span a dive's auto-exposure."""
+WATER = 9
+"""log beta_a, log b and logit B_inf, RGB each."""
+MAX_LOG_RATE = 5.0
+"""Guards the exponential; such water is black at a hundredth of a map unit."""
+MAX_LOGIT = 10.0
+"""Guards the exponential; B_inf is black or white to 0.005 %."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """What may lie between a point's colour and the picture's."""
+
+    water: bool = False
+    shading: bool = False
+    exposure: bool = False
+    uneven: bool = False
+    """Backscatter brighter on one side of the picture than on the other; takes water."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Parameters as what they stand for; those that the model lacks have no effect."""
+
+    beta_a: Array
+    """[3] per map unit."""
+    b: Array
+    """[3] per map unit."""
+    B_inf: Array
+    """[3]"""
+    unevenness: Array
+    """[5] log-gain of the backscatter over the picture."""
+    trust: float
+    """Of the neighbours' light that the map tells of, how much is there."""
+    shading: Array
+    """[5] log-gain over the picture."""
+    exposure: Array
+    """[V, 3] log-gain of each view, of mean zero: no sighting tells brighter points from brighter
+    views."""
+
+
+class Parameters:
+    """Where each number of a ``Model`` lies in the vector, what it stands for, and its prior.
+
+    In the order log beta_a, log b, logit B_inf, unevenness, trust, shading, exposures.
+    """
+
+    def __init__(
+        self, model: Model, views: int, start_beta: float, priors: WaterPriorsConfig
+    ) -> None:
+        self.model, self.views, self.believed = model, views, priors
+        sizes = (WATER * model.water, TERMS * model.uneven, 1, TERMS * model.shading)
+        ends = np.cumsum((0, *sizes, 3 * views * model.exposure)).tolist()
+        self.parts = [slice(*ends[k : k + 2]) for k in range(len(ends) - 1)]
+        self.water, self.uneven, self.trust, self.shading, self.exposure = self.parts
+        self.size = ends[-1]
+        self.start, self._sigma = np.zeros(self.size), np.empty(self.size)
+        if model.water:
+            self.start[self.water] = [np.log(start_beta)] * 6 + [B_INF_LOGIT] * 3
+            rates = [RATE_SIGMA] * 3 + [RATE_RATIO_SIGMA] * 3
+            self._sigma[self.water] = rates + [B_INF_SIGMA] * 3
+        self.start[self.trust], self._sigma[self.trust] = TRUST, TRUST_SIGMA
+        self._sigma[self.uneven] = UNEVEN_SIGMA
+        self._sigma[self.shading] = SHADING_SIGMA
+        self._sigma[self.exposure] = EXPOSURE_SIGMA
+
+    @property
+    def free(self) -> int:
+        """Parameters that the sightings choose; the mean exposure is none of them."""
+        return int(self.size) - 3 * self.model.exposure
+
+    def adopt(self, other: Parameters, x: Array) -> Array:
+        """The start, with the parameters of ``other``'s fit where both models have them."""
+        adopted = self.start.copy()
+        for mine, theirs in zip(self.parts, other.parts, strict=True):
+            if mine.stop - mine.start == theirs.stop - theirs.start:
+                adopted[mine] = x[theirs]
+        return adopted
+
+    def of_channel(self, c: int) -> npt.NDArray[np.int64]:
+        """Where in the vector the parameters lie that channel ``c`` depends on."""
+        water = [c, 3 + c, 6 + c] if self.model.water else []
+        shared = range(self.uneven.start, self.shading.stop)
+        return np.array([*water, *shared, *range(self.exposure.start + c, self.size, 3)], np.int64)
+
+    def trial(self, x: Array) -> Trial:
+        """What the parameters stand for."""
+        wet, model = np.zeros((3, 3)), self.model
+        if model.water:
+            rates, logit = np.clip(x[:6], -MAX_LOG_RATE, MAX_LOG_RATE), x[6:WATER]
+            wet[:2] = np.exp(rates).reshape(2, 3)
+            wet[2] = 1.0 / (1.0 + np.exp(-np.clip(logit, -MAX_LOGIT, MAX_LOGIT)))
+        unevenness = x[self.uneven] if model.uneven else np.zeros(TERMS)
+        shading = x[self.shading] if model.shading else np.zeros(TERMS)
+        exposure = x[self.exposure] if model.exposure else np.zeros(3 * self.views)
+        exposure = exposure.reshape(self.views, 3)
+        trust = float(x[self.trust][0])
+        centred = exposure - exposure.mean(axis=0)
+        return Trial(wet[0], wet[1], wet[2], unevenness, trust, shading, centred)
+
+    def priors(self, x: Array) -> tuple[Array, Array]:
+        """Whitened residuals [R] of the linear priors, and their derivatives [R, K]."""
+        rows = np.diag(1.0 / self._sigma)
+        residuals = (x - self.start) / self._sigma
+        if self.model.water:
+            rates = np.arange(3)
+            rows[3 + rates, rates] = -1.0 / RATE_RATIO_SIGMA
+            residuals[3:6] = (x[3:6] - x[:3]) / RATE_RATIO_SIGMA
+        if self.model.water and self.believed.white_backscatter:
+            tint = np.zeros((3, self.size))
+            tint[:, 6:WATER] = (np.eye(3) - 1.0 / 3.0) / WHITE_SIGMA
+            rows, residuals = np.vstack([rows, tint]), np.concatenate([residuals, tint @ x])
+        return residuals, rows

@@ -1,0 +1,1 @@
+"""Checkpoints of a live dive: writing, reading, and resuming from them."""

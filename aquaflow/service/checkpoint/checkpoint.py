@@ -1,0 +1,137 @@
+"""Checkpoints: what a kill or a power cut leaves, and how the next start goes on from there.
+
+A checkpoint's size is that of the map and a row for every frame; the last two are kept (see
+generations.py). Pictures and depths lie in ``work/``, one file for each keyframe and view, and are
+on the disk before a checkpoint that names them is.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from aquaflow import __version__
+from aquaflow.clocks.device import Learned
+from aquaflow.dive.run import DiveRun
+from aquaflow.errors import InputError
+from aquaflow.mapping.maps import Maps
+from aquaflow.service.checkpoint import maps as map_state
+from aquaflow.service.checkpoint import tracking
+from aquaflow.service.checkpoint.generations import (
+    FORMAT,
+    Checkpoint,
+    bring_to_disk,
+    state_file,
+    write_state,
+)
+from aquaflow.service.map_thread import Correction, MapThread
+from aquaflow.service.moment import Moment
+from aquaflow.slam import Slam
+from aquaflow.storage.arrays import Arrays, prefixed, under
+
+log = logging.getLogger(__name__)
+
+
+class UnusableStateError(InputError):
+    """A checkpoint that was read, and that this program cannot go on from."""
+
+
+class Checkpointer:
+    """Takes checkpoints: tracking's part in the loop, the map's part and the writing beside."""
+
+    def __init__(
+        self,
+        dive: Path,
+        run: DiveRun,
+        slam: Slam,
+        maps: MapThread,
+        every_s: float,
+        clocks: Callable[[], Mapping[str, Learned]],
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.taken = 0
+        self.failures = 0
+        self.size_bytes = 0
+        self.wrote_s = 0.0
+        """How long the last writing took."""
+        self._dive, self._run, self._slam, self._maps = dive, run, slam, maps
+        self._every_s, self._clocks, self._now_s = every_s, clocks, now_s
+        self._due_s = now_s() + every_s
+        self._writing = False
+
+    def look(self, disk_is_full: bool) -> None:
+        """Take a checkpoint if it is time, the last one is done, and there is room."""
+        if self._now_s() < self._due_s or self._writing or disk_is_full:
+            return
+        self._due_s = self._now_s() + self._every_s
+        self.take()
+
+    def take(self) -> None:
+        """Take one now; what the map still waits for, but corrections, is not in it."""
+        with self._run.profiler.stage("checkpoint"):
+            parts = tracking.take_apart(self._slam, self._run)
+            if parts is None:
+                return
+            facts, arrays = parts
+            try:
+                files = self._slam.keyframes.save()
+            except OSError as error:  # what it would name is not there
+                self._failed(error)
+                return
+        head = {"format": FORMAT, "version": __version__, "moment": Moment.now().to_json()}
+        head |= {"tracking": facts, "clocks": self._clocks()}
+        arrays = prefixed("tracking", arrays)
+
+        def write(maps: Maps, lacking: list[Correction]) -> None:
+            self._write(maps, lacking, head, arrays, files)
+
+        self._writing = True
+        self._maps.look("write a checkpoint", write)
+
+    def _write(
+        self,
+        maps: Maps,
+        lacking: list[Correction],
+        head: dict[str, Any],
+        arrays: Arrays,
+        files: list[Path],
+    ) -> None:
+        """In the mapping thread."""
+        began = time.monotonic()
+        try:
+            facts, own = map_state.take_apart(maps)
+            facts["lacking"], more = map_state.corrections_apart(lacking)
+            own |= more
+            bring_to_disk([*files, *maps.views.save()])
+            write_state(self._dive, head | {"mapping": facts}, arrays | prefixed("mapping", own))
+            self.taken += 1
+            self.size_bytes = state_file(self._dive).stat().st_size
+        except (InputError, OSError) as error:
+            self._failed(error)
+        finally:
+            self.wrote_s = time.monotonic() - began
+            self._writing = False
+
+    def _failed(self, error: Exception) -> None:
+        """The checkpoint before stays, and can be resumed from."""
+        self.failures += 1
+        log.warning("no checkpoint: %s", error)
+
+
+def restore(checkpoint: Checkpoint, slam: Slam, run: DiveRun, maps: Maps) -> None:
+    """Let fresh ``slam``, ``run`` and ``maps`` go on from ``checkpoint``.
+
+    Raises:
+        ConfigError: the config asks for pictures of another size.
+        UnusableStateError: it does not fit.
+    """
+    facts, arrays = checkpoint.facts, checkpoint.arrays
+    try:
+        tracking.put_together(slam, run, facts["tracking"], under("tracking", arrays))
+        map_state.put_together(maps, facts["mapping"], under("mapping", arrays))
+        map_state.catch_up(maps, facts["mapping"]["lacking"], under("mapping", arrays))
+    except (KeyError, ValueError, TypeError, IndexError, RuntimeError, InputError) as error:
+        raise UnusableStateError(f"{checkpoint.file} cannot be used: {error}") from error

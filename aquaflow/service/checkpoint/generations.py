@@ -1,0 +1,150 @@
+"""The last two checkpoints of a dive on the disk: if the newer one is damaged, the older one is
+there.
+
+``checkpoint/state.npz`` is the newest, ``checkpoint/previous.npz`` the one before. Both are written
+whole and hold no pickle. The CRC-32 of every entry is compared before anything in it is believed.
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from aquaflow.clocks.device import Learned
+from aquaflow.dive.folder import CHECKPOINT
+from aquaflow.errors import InputError
+from aquaflow.service.moment import Moment
+from aquaflow.storage.arrays import Arrays
+from aquaflow.storage.facts_file import UNREADABLE, read_facts_file, write_facts_file
+
+STATE, PREVIOUS = "state.npz", "previous.npz"
+FORMAT = 3
+
+
+class OtherFormatError(InputError):
+    """A checkpoint of another version of AquaFlow: not damaged, and of no use to this one."""
+
+
+def state_file(dive: Path) -> Path:
+    """Where a dive's newest checkpoint lies."""
+    return dive / CHECKPOINT / STATE
+
+
+def previous_file(dive: Path) -> Path:
+    """Where the one before lies."""
+    return dive / CHECKPOINT / PREVIOUS
+
+
+def generations(dive: Path) -> list[Path]:
+    """The files of its checkpoints, the newest first."""
+    return [path for path in (state_file(dive), previous_file(dive)) if path.is_file()]
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint as it was read."""
+
+    file: Path
+    facts: dict[str, Any]
+    arrays: Arrays
+
+    @property
+    def moment(self) -> Moment:
+        """When it was taken."""
+        return Moment(**self.facts["moment"])
+
+    @property
+    def clocks(self) -> dict[str, Learned]:
+        """What was known of the devices' clocks."""
+        known: dict[str, Learned] = self.facts["clocks"]
+        return known
+
+    @property
+    def frames(self) -> set[int]:
+        """Indices of the frames that it knows."""
+        return {int(index) for index in self.arrays["tracking.frames"]["index"]}
+
+    @property
+    def keyframes(self) -> int:
+        """How many keyframes it knows."""
+        return len(self.arrays["tracking.keyframes"])
+
+
+def write_state(dive: Path, facts: dict[str, Any], arrays: Arrays) -> None:
+    """Let this be the newest checkpoint of ``dive``, and the newest one that before it.
+
+    Raises:
+        InputError, OSError: it cannot be written; those that there are stay.
+    """
+    path = state_file(dive)
+    path.parent.mkdir(exist_ok=True)
+    fresh = path.with_name("fresh.npz")
+    try:
+        write_facts_file(fresh, facts, arrays, allow_nan=False)
+        if path.is_file():
+            _rename_or_link(path, previous_file(dive))
+        fresh.replace(path)
+    finally:
+        fresh.unlink(missing_ok=True)
+    bring_to_disk([path.parent])
+
+
+def _rename_or_link(path: Path, name: Path) -> None:
+    """Let the file have another name, and keep this one until it is replaced, where the file
+    system can do that (FAT cannot): at no moment is there no newest checkpoint."""
+    link = path.with_name("link.npz")
+    link.unlink(missing_ok=True)
+    try:
+        os.link(path, link)
+        link.replace(name)
+    except OSError:
+        path.replace(name)
+    finally:
+        link.unlink(missing_ok=True)  # still there if it was the same file as ``name``
+
+
+def read_state(path: Path) -> Checkpoint:
+    """The checkpoint in the file ``path``.
+
+    Raises:
+        OtherFormatError: another version of AquaFlow wrote it.
+        InputError: it is not there, or is damaged.
+    """
+    try:
+        with zipfile.ZipFile(path) as file:
+            damaged = file.testzip()
+        if damaged is not None:
+            raise InputError(f"{path} is damaged: {damaged} differs from its checksum")
+        facts, arrays = read_facts_file(path)
+        checkpoint = Checkpoint(path, facts, arrays)
+        known = facts["format"] == FORMAT
+        if known:
+            _ = checkpoint.moment, checkpoint.clocks, checkpoint.frames, checkpoint.keyframes
+    except FileNotFoundError as error:
+        raise InputError(f"{path} is not there") from error
+    except (*UNREADABLE, *UNEXPECTED) as error:
+        raise InputError(f"{path} is damaged: {type(error).__name__}") from error
+    if not known:
+        raise OtherFormatError(f"{path} was written by version {facts.get('version')}")
+    return checkpoint
+
+
+UNEXPECTED = (NotImplementedError, RuntimeError, MemoryError, OverflowError, AttributeError)
+"""What zipfile raises besides, where bits of its directory are wrong."""
+
+
+def bring_to_disk(paths: Iterable[Path]) -> None:
+    """What a power cut must not take (fsync); a file that is gone by now is none of it."""
+    for path in paths:
+        try:
+            descriptor = os.open(path, os.O_RDONLY)
+        except FileNotFoundError:
+            continue
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

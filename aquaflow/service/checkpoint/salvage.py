@@ -1,0 +1,136 @@
+"""What is left of a dive that is to be gone on with: damaged files are set aside, each costs
+itself, and what was lost is said.
+
+Every file of ``work/`` proves by its own checksum that it is whole. A keyframe without its file
+keeps its pose, and so do the frames that hang on it; a view without its file leaves the map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from aquaflow.dive.folder import MARKER, WORK
+from aquaflow.dive.frames_csv import FrameRow, or_lost
+from aquaflow.errors import InputError
+from aquaflow.mapping.maps import Maps
+from aquaflow.service.checkpoint.generations import (
+    Checkpoint,
+    OtherFormatError,
+    previous_file,
+    read_state,
+    state_file,
+)
+from aquaflow.service.checkpoint.salvage_rows import SalvagedRows, salvaged_rows
+from aquaflow.service.checkpoint.set_aside import SetAside
+from aquaflow.service.checkpoint.tracking import lost_since
+from aquaflow.slam import Slam
+from aquaflow.storage.spill import SUFFIX, read_thing
+
+MOST_NAMED = 5
+"""Numbers that a sentence lists."""
+
+
+@dataclass(frozen=True)
+class Salvaged:
+    """What there is to go on with."""
+
+    rows: list[FrameRow]
+    losses: list[str]
+    """A sentence for each loss, as far as the checkpoint's own files and the rows tell."""
+
+
+def salvaged(checkpoint: Checkpoint, dive: Path, name_of: Callable[[int], str]) -> Salvaged:
+    """Make ``dive`` ready to be gone on with from ``checkpoint``; ``name_of`` a frame's index.
+
+    Raises:
+        InputError: a damaged file cannot be set aside.
+    """
+    aside, losses = SetAside(dive), []
+    rows = salvaged_rows(dive / MARKER, checkpoint, name_of)
+    older = checkpoint.file != state_file(dive)
+    if older or not rows.whole:
+        for name in (MARKER, "trajectory.tum"):
+            aside.copy(dive / name, "as it was before the dive was gone on with")
+    if older:
+        losses.append(_newest_set_aside(dive, aside))
+    elif previous_file(dive).is_file() and not _is_whole(previous_file(dive)):
+        aside.move(previous_file(dive), "it is damaged")
+        losses.append("the checkpoint before the newest one was damaged, which the dive can spare")
+    for path in sorted((dive / WORK).glob(f"*/*{SUFFIX}")):
+        _look_at(path, checkpoint.keyframes if older else None, aside)
+    known = checkpoint.frames
+    after = [or_lost(row, known) for row in rows.rows]
+    return Salvaged(after, losses + _row_losses(rows, dive / MARKER))
+
+
+def lost_with_their_files(checkpoint: Checkpoint, slam: Slam, maps: Maps) -> list[str]:
+    """A sentence for each kind of things whose files were missed when ``slam`` and ``maps`` were
+    put together again."""
+    said = []
+    keyframes = lost_since(slam, checkpoint.facts["tracking"])
+    if keyframes:
+        hang = sum(tracked.keyframe in keyframes for tracked in slam.results())
+        said.append(
+            f"the files of {_named('keyframe', keyframes)} were damaged or gone: their {hang} "
+            "frames keep their poses, but these places are no longer recognised"
+        )
+    if maps.views.lost:
+        said.append(
+            f"the pictures of {_named('mapped frame', maps.views.lost)} were damaged or gone: the "
+            "map goes on without them"
+        )
+    return said
+
+
+def _newest_set_aside(dive: Path, aside: SetAside) -> str:
+    if state_file(dive).is_file():
+        aside.move(state_file(dive), "it is damaged, or another version's")
+    return (
+        "the newest checkpoint was damaged or gone: the dive went on from the one before, and "
+        "frames that came between the two have no pose"
+    )
+
+
+def _look_at(path: Path, keyframes: int | None, aside: SetAside) -> None:
+    """Set a file of ``work/`` aside if it is damaged, or would be written over: with an older
+    checkpoint, the keyframes that it does not know."""
+    try:
+        read_thing(path)
+    except InputError:
+        aside.move(path, "it is damaged, or not the one that it is named after")
+        return
+    if keyframes is not None and path.parent.name == "keyframes" and int(path.stem) >= keyframes:
+        aside.move(path, "it is whole, but the newest checkpoint, which knew it, is damaged")
+
+
+def _is_whole(path: Path) -> bool:
+    try:
+        read_state(path)
+    except OtherFormatError:
+        return True
+    except InputError:
+        return False
+    return True
+
+
+def _row_losses(rows: SalvagedRows, path: Path) -> list[str]:
+    if not path.is_file():
+        return [
+            f"{MARKER} was gone: {rows.rebuilt} rows were made from the checkpoint, those of "
+            "frames that were left out, and all reasons, are lost"
+        ]
+    if rows.whole:
+        return []
+    return [
+        f"{rows.unreadable} lines of {MARKER} were damaged, and {rows.rebuilt} rows were made from "
+        "the checkpoint"
+    ]
+
+
+def _named(kind: str, numbers: Iterable[int]) -> str:
+    ordered = sorted(numbers)
+    listed = ", ".join(map(str, ordered[:MOST_NAMED]))
+    more = "" if len(ordered) <= MOST_NAMED else f" and {len(ordered) - MOST_NAMED} more"
+    return f"{kind}{'' if len(ordered) == 1 else 's'} {listed}{more}"

@@ -1,0 +1,1 @@
+"""Health of the service: state, heartbeats, machine pressure, HTTP server."""

@@ -1,0 +1,119 @@
+"""The live window beside the loop; a slow or dead browser never slows it."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.config.viewer import ViewerConfig
+from aquaflow.mapping.maps import Maps
+from aquaflow.service.latest import Newest
+from aquaflow.service.loop import LiveLoop
+from aquaflow.service.map_thread import MapThread
+from aquaflow.tracking.frames import Tracked
+from aquaflow.viewer.snapshot import MapCopy, Pose, copied, shown
+from aquaflow.viewer.window import Window
+
+log = logging.getLogger(__name__)
+
+LONGEST_PATH = 5000
+"""Poses of the trajectory that are shown at most: thinned beyond."""
+LOOK_S = 0.1
+
+
+class LiveWindow:
+    """Takes what is new from the loop and the maps, and shows it from a thread of its own."""
+
+    def __init__(
+        self, config: ViewerConfig, maps: MapThread, report: Callable[[], dict[str, Any]]
+    ) -> None:
+        """Raises what :class:`Window` raises."""
+        self._config, self._maps, self._report = config, maps, report
+        self._window = Window(config, "AquaFlow")
+        self.address = self._window.address
+        self._poses: Newest[Pose] = Newest()
+        self._copies: Newest[MapCopy] = Newest()
+        self._path: list[tuple[float, float, float, float]] = []
+        self._pose_s = self._map_s = 0.0
+        self._asked = False
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
+        self._thread.start()
+
+    @property
+    def splats_shown(self) -> int:
+        """Gaussians that a browser gets at the moment."""
+        return self._window.splats_shown
+
+    def look(self, loop: LiveLoop) -> None:
+        """Called by the loop after every turn; hands over, and never waits."""
+        now, latest, frame = time.monotonic(), loop.latest, loop.picture
+        if latest is None or frame is None or latest.T_wc is None:
+            return
+        if now - self._pose_s >= 1.0 / self._config.pose_hz:
+            self._pose_s = now
+            self._hand_over(latest, frame.image)
+        if now - self._map_s >= self._config.refresh_s and not self._asked:
+            self._map_s, self._asked = now, True
+            sub_map = latest.sub_map
+            self._maps.look("show the map", lambda maps, _: self._copy(maps, sub_map))
+
+    def close(self) -> None:
+        self._closing.set()
+        self._thread.join(5.0)
+        self._window.close()
+
+    def _hand_over(self, latest: Tracked, image: npt.NDArray[np.uint8]) -> None:
+        assert latest.T_wc is not None
+        x, y, z = (float(v) for v in latest.T_wc.t)
+        self._path.append((x, y, z, latest.quality.inlier_share))
+        if len(self._path) > LONGEST_PATH:
+            self._path = self._path[::2]
+        step = max(1, image.shape[1] // self._config.picture_width)
+        small = np.ascontiguousarray(image[::step, ::step])
+        path = np.array(self._path, np.float32)
+        self._poses.put(Pose(latest.T_wc, latest.frame.camera, small, path))
+
+    def _copy(self, maps: Maps, sub_map: int) -> None:
+        """In the mapping thread."""
+        self._asked = False
+        mapper = maps.mappers.get(sub_map)
+        if mapper is not None and mapper.views and len(mapper.gaussians):
+            self._copies.put(copied(mapper))
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            try:
+                self._show()
+            except Exception:  # whatever a browser did to the server, the dive goes on
+                log.exception("the viewer failed to show the dive")
+                self._closing.wait(self._config.refresh_s)
+
+    def _show(self) -> None:
+        pose = self._poses.take(LOOK_S)
+        if pose is not None:
+            self._window.show_camera(pose.T_wc, pose.camera, pose.picture)
+            self._window.show_path(pose.path[:, :3], pose.path[:, 3])
+        copy = self._copies.take(0.0)
+        if copy is not None:
+            self._window.show_splats(shown(copy, self._config.splats))
+        self._window.show_health(in_words(self._report()))
+
+
+def in_words(report: dict[str, Any]) -> str:
+    """The health panel."""
+    lag = report["lag_ms"]
+    lines = [
+        f"**{report['state']}**: {report['reason']}",
+        f"{report['fps']:.1f} frames/s, lag {lag['p50'] or 0:.0f} ms (95 %: {lag['p95'] or 0:.0f})",
+        f"slowest stage: {report['slowest_stage'] or '-'}; {report['level']}",
+        f"{report['keyframes']} keyframes, {report['gaussians']} Gaussians",
+        f"{report['overtaken']} frames overtaken, {report['failures']} failed",
+    ]
+    return "\n\n".join(lines)

@@ -1,0 +1,237 @@
+"""The live loop: the newest frame is tracked, the map grows beside, and everybody is told."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from aquaflow.config.service import ServiceConfig
+from aquaflow.dive.run import DiveRun
+from aquaflow.errors import AquaFlowError
+from aquaflow.messages import Dropped, Frame
+from aquaflow.service.feed import Feed
+from aquaflow.service.health.counters import Counters
+from aquaflow.service.health.degradation import Ladder, Level
+from aquaflow.service.health.heartbeats import Beats
+from aquaflow.service.health.pressure import Pressure
+from aquaflow.service.health.state import Facts, Health, State, judged
+from aquaflow.service.health.systemd import Notifier
+from aquaflow.service.map_thread import MapThread
+from aquaflow.tracking.frames import FrameClass, Tracked
+
+log = logging.getLogger(__name__)
+
+STAGE = "tracking"
+IDLE_S = 0.25
+"""Without a frame for so long, the loop says that it is idle and lives."""
+BUSY_S = 0.01
+"""The same while frames of the past wait for their poses: one of them takes its turn."""
+LATE_MS = 150.0
+"""A frame that took longer from its arrival on is late, and mapping gives way; at 10 frames/s one
+that found tracking idle is ready in 60 to 100 ms."""
+PATIENCE_S = 2.0
+"""So long may a camera be silent before it is said to be waited for."""
+LOST_AFTER = 3
+"""Frames in a row without a pose until tracking is said to be lost; one may be a flake of snow."""
+MOST_FAILURES = 10
+"""Frames in a row that raise until the process gives up: it is not the pictures then."""
+
+
+class LiveLoop:
+    """Runs until told to stop, or until a recording ends."""
+
+    def __init__(
+        self,
+        run: DiveRun,
+        feed: Feed,
+        maps: MapThread,
+        config: ServiceConfig,
+        beats: Beats,
+        ladder: Ladder,
+        pressure: Callable[[], Pressure],
+        notifier: Notifier,
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.run_, self.feed, self.maps, self.config = run, feed, maps, config
+        self.beats, self.ladder, self.notifier = beats, ladder, notifier
+        self.stopping = threading.Event()
+        """Setting it ends the dive cleanly; may be done in a signal handler."""
+        self.health, self.counters = Health(now_s), Counters(run.profiler, now_s)
+        self.latest: Tracked | None = None
+        """The newest frame that has a pose, without its picture."""
+        self.picture: Frame | None = None
+        """The newest frame, prepared or not, for whoever looks on."""
+        self.pressure = pressure()
+        self.watchers: list[Callable[[LiveLoop], None]] = []
+        """Called after every frame and every idle moment; must not wait."""
+        self._read_pressure, self._now_s = pressure, now_s
+        self._frame_s = now_s()
+        self._pictured = False
+        self._ever_posed = any(tracked.T_wc is not None for tracked in run.results)
+        self._unposed = LOST_AFTER
+        """Frames in a row without a pose."""
+        self._failed_in_a_row = 0
+
+    def run(self) -> None:
+        """The loop.
+
+        Raises:
+            AquaFlowError: the source failed, or frame after frame did.
+        """
+        self.feed.start()
+        while not self.stopping.is_set() and not self.feed.newest.ended:
+            self.take(self.feed.newest.take(IDLE_S if self._past is None else BUSY_S))
+        if self.feed.failure is not None:
+            raise AquaFlowError(f"{self.feed.failure}; the service ends, to be started anew")
+
+    def take(self, frame: Frame | Dropped | None) -> None:
+        """One turn: a frame, the note that one is missing, or an idle moment."""
+        if frame is not None:
+            self._frame_s, self._pictured = self._now_s(), True
+        if isinstance(frame, Dropped):
+            self.run_.drop(frame)
+        elif frame is not None:
+            self._frame(frame)
+        elif self._past is not None:
+            self._catch_up(self._past)
+        self._tend()
+
+    def stop(self, reason: str) -> None:
+        """Say that the end has come."""
+        self.health.set(State.STOPPING, reason)
+        self.beats.retire(STAGE)  # from here on systemd's timeout of stopping counts
+        self.notifier.stopping()
+        self._tell()
+
+    def status(self) -> dict[str, Any]:
+        """Counts of all that was done by halves, for health and metrics.json."""
+        return {
+            **self.counters.to_json(),
+            "overtaken": self.feed.newest.overtaken,
+            "level": self.ladder.level.words,
+            "steps_down": self.ladder.steps_down,
+            "steps_up": self.ladder.steps_up,
+            "visits": {state.value: count for state, count in self.health.visits.items()},
+            "left_out_of_the_map": dict(self.maps.left_out),
+            "mapping_failures": self.maps.failures,
+            "mapping_waits": self.maps.waiting,
+            "mapping_rests": self.maps.rests,
+            "stage_failures": self.run_.slam.failures.to_json(),
+        }
+
+    # --- one frame ------------------------------------------------------------------------------
+
+    def _frame(self, frame: Frame) -> None:
+        self.picture = frame
+        if self.ladder.level is Level.RECORDING_ONLY:
+            self.run_.drop(
+                Dropped(frame.index, frame.t_ns, f"recording only: {self.ladder.reason}")
+            )
+        else:
+            self._track(frame)
+        self.maps.late = self.counters.frame(frame.arrival_ns) > LATE_MS
+
+    def _track(self, frame: Frame) -> None:
+        try:
+            decided = self.run_.frame(frame)
+        # A bad frame never ends the dive (docs/architecture.md#numbers-stay-finite).
+        except Exception as error:
+            self._failed(frame, error)
+            return
+        self._failed_in_a_row = 0
+        self.counters.classes.update(tracked.frame_class.value for tracked in decided)
+        own = [tracked for tracked in decided if tracked.frame.index == frame.index]
+        self._place(own[0] if own else None)
+
+    @property
+    def _past(self) -> Frame | None:
+        """A frame that waits for its pose until there is time."""
+        return self.run_.slam.tracker.past
+
+    def _catch_up(self, past: Frame) -> None:
+        try:
+            decided = self.run_.catch_up()
+        except Exception as error:  # costs that frame
+            self._failed(past, error)
+            return
+        self.counters.classes.update(tracked.frame_class.value for tracked in decided)
+
+    def _place(self, tracked: Tracked | None) -> None:
+        """Remember whether the newest frame has a pose; one that was skipped says nothing."""
+        if tracked is not None and tracked.T_wc is not None:
+            self.latest = tracked.bare()
+            self._ever_posed, self._unposed = True, 0
+        elif tracked is None or tracked.frame_class is not FrameClass.SKIPPED:
+            self._unposed += 1
+
+    def _failed(self, frame: Frame, error: Exception) -> None:
+        self.counters.failures += 1
+        self._failed_in_a_row += 1
+        log.exception("frame %d failed", frame.index)
+        self.run_.drop(Dropped(frame.index, frame.t_ns, f"failed: {error}"))
+        if self._failed_in_a_row >= MOST_FAILURES:
+            raise AquaFlowError(
+                f"{MOST_FAILURES} frames in a row failed, the last with: {error}; see log.jsonl"
+            ) from error
+
+    # --- between frames -------------------------------------------------------------------------
+
+    def _tend(self) -> None:
+        self.beats.beat(STAGE)
+        contain = self.run_.slam.failures.contain
+        with contain("resource check"):
+            self.ladder.look(self._need)
+            self.counters.look()
+        with contain("health state"):
+            self.health.set(*judged(self._facts()))
+        for watch in self.watchers:
+            with contain(f"service: {getattr(watch, '__qualname__', type(watch).__name__)}"):
+                watch(self)
+        with contain("notification of systemd"):
+            self._tell()
+
+    def _need(self) -> str | None:
+        self.pressure = self._read_pressure()
+        return self.pressure.need(self.config.limits)
+
+    def _facts(self) -> Facts:
+        devices = self.feed.describe()
+        cameras = [device for device in devices.values() if device["kind"] == "camera"]
+        return Facts(
+            self._now_s() - self._frame_s,
+            PATIENCE_S,
+            self._pictured,
+            str(cameras[0]["reason"]) if cameras else "",
+            self._unposed < LOST_AFTER,
+            self._ever_posed,
+            self._troubles(devices),
+        )
+
+    def _troubles(self, devices: dict[str, dict[str, object]]) -> list[str]:
+        troubles = []
+        if self.ladder.level is not Level.FULL:
+            troubles.append(f"{self.ladder.level.words}: {self.ladder.reason}")
+        if self.pressure.disk_is_full(self.config.limits):
+            troubles.append(f"disk full: {self.pressure.disk_free_mb:.0f} MB left")
+        if self.maps.failing:
+            troubles.append(f"mapping fails: {self.maps.last_failure}")
+        troubles += self.run_.slam.failures.repeated()
+        for name, device in devices.items():
+            if device["kind"] == "link" and device["state"] != "connected":
+                troubles.append(f"link '{name}': {device['state']}")
+            if device["kind"] == "recorder" and device["state"] != "recording":
+                troubles.append(f"not recording: {device['state']}")
+        return troubles
+
+    def _tell(self) -> None:
+        """Systemd hears READY once a sensor answered or its absence was declared; the watchdog is
+        fed only from here, and only while mapping lives too."""
+        state = self.health.state
+        if state not in (State.STARTING, State.STOPPING):
+            self.notifier.ready()
+        self.notifier.status(f"{state.value}: {self.health.reason}")
+        if self.beats.hung(self.config.hang_s) is None:
+            self.notifier.alive()

@@ -1,0 +1,1 @@
+"""Files and memory: atomic writes, arrays on disk, caches that spill to disk."""

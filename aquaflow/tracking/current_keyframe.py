@@ -1,0 +1,172 @@
+"""The keyframe that frames are tracked against: poses at it, and when another one takes its place.
+
+The paper makes a keyframe where matches fall below a share. That is right where the view has moved
+on, and only there: of a picture full of marine snow every match is missing too, and the frame
+should still show all of the keyframe. And where the vehicle is back at a keyframe that it left,
+that one is taken up again: hovering adds none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.config import TrackingConfig
+from aquaflow.errors import InputError
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
+from aquaflow.messages import Frame
+from aquaflow.prior.contract import Encoding, Float, Mask, PairGeometry, Prior
+from aquaflow.tracking.frames import FrameClass, Link, Quality, Tracked
+from aquaflow.tracking.loops.neighbours import Neighbours
+from aquaflow.tracking.pose.depth_fusion import fuse, transfer
+from aquaflow.tracking.pose.matcher import KeyframeMatcher, Matched
+from aquaflow.tracking.pose.visibility import agreeing, predicted_matches
+
+
+@dataclass
+class Attachment:
+    """A keyframe in use, and how the last frame was seen from it."""
+
+    keyframe: Keyframe
+    image: npt.NDArray[np.uint8] | None = None
+    """Its picture, as long as it may be encoded again."""
+    T_fk: Sim3 = field(default_factory=Sim3.identity)
+    motion: Sim3 = field(default_factory=Sim3.identity)
+    """From the frame before to the last one."""
+    matches: Float | None = None
+    """[H, W, 2] px of the last frame: where the next one's are looked for."""
+    mapped_parallax_px: float = 0.0
+    """Parallax of the last frame that went into the map."""
+
+    @property
+    def T_wc(self) -> Sim3:
+        """Pose of the last frame."""
+        return self.keyframe.T_wc @ self.T_fk.inverse()
+
+    def moved_to(self, T_fk: Sim3, matches: Float) -> None:
+        """A frame was placed."""
+        self.motion = T_fk @ self.T_fk.inverse()
+        self.T_fk, self.matches = T_fk, matches
+
+    def tracked(
+        self,
+        frame: Frame,
+        frame_class: FrameClass,
+        quality: Quality,
+        pointmap: Pointmap | None = None,
+        link: Link | None = None,
+    ) -> Tracked:
+        """The last frame, as it is told to others."""
+        sub_map, number = self.keyframe.sub_map, self.keyframe.number
+        return Tracked(frame, frame_class, sub_map, number, self.T_wc, quality, pointmap, link=link)
+
+
+class Follower:
+    """Places frames against keyframes, and says what each is good for."""
+
+    def __init__(self, prior: Prior, keyframes: KeyframeStore, config: TrackingConfig) -> None:
+        self._prior, self._keyframes, self._config = prior, keyframes, config
+        self._matcher, self._neighbours = KeyframeMatcher(config), Neighbours(config)
+
+    def place(
+        self,
+        at: Attachment,
+        encoding: Encoding,
+        camera: CameraModel,
+        pair: PairGeometry | None = None,
+    ) -> Matched | None:
+        """The frame's pose at the keyframe in use; None where too little speaks for any."""
+        predicted, seed = at.motion @ at.T_fk, None
+        if pair is None:
+            seed = at.matches if self._config.seed_matching else None
+            pair = self._prior.decode(self._reference(at), encoding, seed)
+        solved = self._matcher.pose(at.keyframe, camera, pair, predicted, at.T_fk)
+        if solved is None and seed is not None:
+            # After a wide step flow may hold on to a neighbour: on tiles it comes back from there.
+            pair = self._prior.decode(self._reference(at), encoding)
+            solved = self._matcher.pose(at.keyframe, camera, pair, predicted, at.T_fk)
+        return solved
+
+    def _reference(self, at: Attachment) -> Encoding:
+        if self._config.reuse_encodings or at.image is None:
+            return at.keyframe.encoding
+        return self._prior.encode(at.image, at.keyframe.pointmap.camera)
+
+    def take(self, at: Attachment, solved: Matched, camera: CameraModel) -> None:
+        """What the frame says about the next one's place, and about the keyframe's depths."""
+        T_fk, pointmap = solved.estimate.T, at.keyframe.pointmap
+        at.moved_to(T_fk, solved.pair.matches)
+        if self.hidden(solved):  # flakes have matches, too; the scene is where the pose puts it
+            known = pointmap.known(self._config.known_sigma)
+            at.matches = predicted_matches(pointmap, known, T_fk, camera, solved.pair.matches)
+        fuse(pointmap, solved.pair, T_fk, camera, self._config.sigma_px)
+
+    def hidden(self, solved: Matched) -> bool:
+        """True where something in front of the scene took the matches."""
+        return solved.visibility.seen < self._config.min_seen
+
+    def classify(self, at: Attachment, solved: Matched, camera: CameraModel) -> FrameClass:
+        """The paper's rules, keyframe by matched share and mapping frame by parallax; but what is
+        hidden is neither, unless the keyframe goes out of view."""
+        config = self._config
+        hidden = self.hidden(solved)
+        leaving = solved.visibility.overlap < config.keyframe_overlap
+        if solved.share < config.keyframe_share and (leaving or not hidden):
+            return FrameClass.KEYFRAME
+        threshold = config.mapping_parallax_widths * camera.width
+        if not hidden and solved.parallax_px - at.mapped_parallax_px > threshold:
+            return FrameClass.MAPPING
+        return FrameClass.COMMON
+
+    def pointmap(self, at: Attachment, solved: Matched, camera: CameraModel) -> Pointmap:
+        """The keyframe's depths in the frame's own pixels."""
+        pair, T_fk, pointmap = solved.pair, solved.estimate.T, at.keyframe.pointmap
+        reliable = self.shown(at, solved, camera) if self.hidden(solved) else pair.valid_back
+        return transfer(pointmap, pair.matches_back, reliable, T_fk, camera)
+
+    def shown(self, at: Attachment, solved: Matched, camera: CameraModel) -> Mask:
+        """[H, W] pixels of the frame that show what the keyframe shows."""
+        pair, pointmap = solved.pair, at.keyframe.pointmap
+        return agreeing(pointmap, pair.matches_back, pair.valid_back, solved.estimate.T, camera)
+
+    # --- keyframes left behind ----------------------------------------------------------------
+
+    def leave(self, at: Attachment) -> None:
+        """From here on this keyframe may be taken up again."""
+        self._neighbours.add(at.keyframe)
+
+    def earlier(
+        self, at: Attachment, encoding: Encoding, camera: CameraModel
+    ) -> tuple[Attachment, Matched] | None:
+        """A keyframe that was left and shows the last frame well; it is held from here on.
+
+        Only one that agrees with the keyframe in use about where the frame is: of a place that the
+        graph does not know to be the same, a new keyframe closes the loop.
+        """
+        nearest = self._neighbours.best(at.T_wc, camera, at.keyframe.sub_map)
+        for keyframe, T_fk in nearest[: self._config.return_candidates]:
+            if keyframe is at.keyframe:
+                continue
+            back = Attachment(keyframe, T_fk=T_fk)
+            try:
+                solved = self.place(back, encoding, camera)
+                if solved is None or not self._returned(solved, T_fk, camera):
+                    continue
+                self._keyframes.hold(keyframe.number)
+            except InputError:
+                continue  # a keyframe that cannot be read back costs itself
+            back.moved_to(solved.estimate.T, solved.pair.matches)
+            back.motion, back.mapped_parallax_px = at.motion, solved.parallax_px
+            return back, solved
+        return None
+
+    def _returned(self, solved: Matched, T_fk: Sim3, camera: CameraModel) -> bool:
+        if solved.share < self._config.return_share or self.hidden(solved):
+            return False
+        shift = camera.project(solved.estimate.T.apply(solved.points))
+        shift = np.linalg.norm(shift - camera.project(T_fk.apply(solved.points)), axis=1)
+        return bool(np.median(shift) < self._config.return_widths * camera.width)

@@ -1,0 +1,94 @@
+"""Every frame of a dive whose fate is known, in a row of numbers each: what a long dive can keep.
+
+A frame's pose is kept against its keyframe; the keyframe's own pose, which later corrections move,
+makes it the frame's pose in the world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.messages import CameraModel, Frame
+from aquaflow.storage.arrays import SIM3, Array, of_sim3, to_sim3
+from aquaflow.tracking.frames import FrameClass, Quality, Tracked
+
+CLASSES = list(FrameClass)
+NONE = -1
+"""The keyframe of a frame that has no pose."""
+CHUNK = 1024
+"""Rows that are made room for at once."""
+
+FRAME = np.dtype(
+    [
+        ("index", np.int64), ("t_ns", np.int64), ("class", np.uint8), ("sub_map", np.int32),
+        ("keyframe", np.int64), ("quality", np.float64, 4), ("T_kf", np.float64, SIM3),
+    ]
+)  # fmt: skip
+NO_PICTURE = np.empty((0, 0, 3), np.uint8)
+
+
+class FrameTable:
+    """Frames in the order in which their fate was decided; 165 bytes for each."""
+
+    def __init__(self) -> None:
+        self._chunks: list[Array] = []
+        self._count = 0
+        self._camera: CameraModel | None = None
+
+    @staticmethod
+    def of_rows(
+        rows: Array,  # [N] FRAME
+        camera: CameraModel,
+    ) -> FrameTable:
+        """The table that :meth:`rows` was asked of; ``camera`` took the frames."""
+        table = FrameTable()
+        table._chunks = [np.zeros(CHUNK, FRAME) for _ in range(-(-len(rows) // CHUNK))]
+        for i, chunk in enumerate(table._chunks):
+            part = rows[i * CHUNK : (i + 1) * CHUNK]
+            chunk[: len(part)] = part
+        table._count, table._camera = len(rows), camera
+        return table
+
+    def add(self, tracked: Tracked, T_kf: Sim3 | None) -> None:
+        """A frame and its pose against its keyframe; None: it has no pose."""
+        if self._count == len(self._chunks) * CHUNK:
+            self._chunks.append(np.zeros(CHUNK, FRAME))
+        frame, q = tracked.frame, tracked.quality
+        keyframe = NONE if T_kf is None else tracked.keyframe
+        pose = np.zeros(SIM3) if T_kf is None else of_sim3([T_kf])[0]
+        quality = (q.inlier_share, q.residual_px, q.matched_share, q.conditioning)
+        kind = CLASSES.index(tracked.frame_class)
+        self._chunks[-1][self._count % CHUNK] = (
+            frame.index, frame.t_ns, kind, tracked.sub_map, keyframe, quality, pose,
+        )  # fmt: skip
+        self._count += 1
+        self._camera = frame.camera
+
+    def rows(self) -> Array:
+        """[N] FRAME, a copy."""
+        return np.concatenate([np.zeros(0, FRAME), *self._chunks])[: self._count]
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __iter__(self) -> Iterator[tuple[Tracked, Sim3 | None]]:
+        return self.since(0)
+
+    def since(self, first: int) -> Iterator[tuple[Tracked, Sim3 | None]]:
+        """The frames from row ``first`` on, without pictures and reasons, and their poses against
+        their keyframes."""
+        for i in range(first, self._count):
+            yield self._frame(self._chunks[i // CHUNK][i % CHUNK])
+
+    def _frame(self, row: Array) -> tuple[Tracked, Sim3 | None]:
+        assert self._camera is not None
+        index, t_ns, sub_map = (int(row[name]) for name in ("index", "t_ns", "sub_map"))
+        frame = Frame(index, t_ns, t_ns, NO_PICTURE, self._camera)
+        kind, number = CLASSES[int(row["class"])], int(row["keyframe"])
+        if number == NONE:
+            return Tracked(frame, kind, sub_map), None
+        quality = Quality(*row["quality"].tolist())
+        return Tracked(frame, kind, sub_map, number, quality=quality), to_sim3(row["T_kf"])

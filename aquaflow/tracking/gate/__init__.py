@@ -1,0 +1,1 @@
+"""The frame gate: frames that cannot help are skipped before costly work."""

@@ -1,0 +1,124 @@
+"""The frame gate: pictures that cannot help are skipped before anything costly looks at them."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.config import GateConfig
+from aquaflow.tracking.gate.thumbnail import Float, Glance, Mask, look, motion_widths
+
+FIRST_LEVELS = 3
+"""Frames before sharpness has a level to fall from."""
+
+
+class GateKind(str, Enum):
+    """What the gate makes of a frame."""
+
+    PASS = "pass"
+    DUPLICATE = "duplicate"
+    DARK = "dark"
+    BLURRED = "blurred"
+    BLINDED = "blinded"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a frame is worth tracking, and the number that decided."""
+
+    kind: GateKind
+    reason: str = ""
+    """One clause for the dive's records; empty for an ordinary pass."""
+    measure: float = float("nan")
+    """For a duplicate and for an ordinary pass the motion in picture widths: infinite beyond some
+    pixels, NaN without a frame to compare with. For dark and blinded the textured share of the
+    picture; for blurred the sharpness over its running level."""
+
+    @property
+    def passed(self) -> bool:
+        return self.kind is GateKind.PASS
+
+    @property
+    def same_place(self) -> bool:
+        """True if the frame shows what the last one that passed showed."""
+        return self.kind is GateKind.DUPLICATE
+
+
+class FrameGate:
+    """Judges frames in the order of the stream; the same frames get the same verdicts."""
+
+    def __init__(self, config: GateConfig) -> None:
+        self._config = config
+        self._reference: Glance | None = None
+        self._levels: deque[Float] = deque(maxlen=config.blur_memory)
+        self._run = 0
+
+    def judge(
+        self,
+        image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
+        mask: Mask | None = None,  # [H, W] True where the scene is seen
+    ) -> Verdict:
+        """The verdict on the next frame of the stream.
+
+        Of frames that show nothing, only ``longest_run`` in a row are skipped; the following ones
+        pass until one is good again: the tracker has to know that it sees nothing.
+        """
+        glance = look(image, mask, self._config.min_snr)
+        verdict = self._useless(glance)
+        if verdict is not None:
+            return self._bounded(verdict)
+        self._run = 0
+        verdict = self._compared(glance)
+        if verdict.passed:
+            self._reference = glance
+            self._levels.append(glance.sharpness)
+        return verdict
+
+    def forget(self) -> None:
+        """Nothing is a duplicate of a frame that tracking lost: call this when it did."""
+        self._reference = None
+
+    def _useless(self, glance: Glance) -> Verdict | None:
+        """Dark, blinded or blurred; None for a picture that shows something."""
+        config = self._config
+        if glance.usable < config.min_usable:
+            says = f"texture above the noise in {100 * glance.usable:.0f} % of the picture"
+            dark = glance.level < config.dark_level
+            if dark and config.skip_dark:
+                return Verdict(GateKind.DARK, f"dark: {says}", glance.usable)
+            if not dark and config.skip_blinded:
+                return Verdict(GateKind.BLINDED, f"blinded: {says}", glance.usable)
+            return None
+        if not config.skip_blurred or len(self._levels) < FIRST_LEVELS:
+            return None
+        usual = np.median(np.stack(self._levels), axis=0)
+        left = float((glance.sharpness / np.maximum(usual, 1e-6)).min())
+        if left >= config.blur_loss:
+            return None
+        return Verdict(
+            GateKind.BLURRED, f"blurred: {100 * left:.0f} % of the usual sharpness", left
+        )
+
+    def _bounded(self, verdict: Verdict) -> Verdict:
+        self._run += 1
+        if self._run <= self._config.longest_run:
+            return verdict
+        # From here on nothing that came before is a measure for what comes: water may have changed.
+        self._reference = None
+        self._levels.clear()
+        reason = f"{verdict.reason}; {self._config.longest_run} such frames were skipped before it"
+        return Verdict(GateKind.PASS, reason, verdict.measure)
+
+    def _compared(self, glance: Glance) -> Verdict:
+        """Against the last frame that passed, so that slow drift adds up until it is seen."""
+        if not self._config.skip_duplicates or self._reference is None:
+            return Verdict(GateKind.PASS)
+        motion = motion_widths(self._reference, glance, self._config.static_share)
+        if motion >= self._config.duplicate_widths:
+            return Verdict(GateKind.PASS, measure=motion)
+        reason = f"duplicate: moved by {100 * motion:.3f} % of the width since the last frame used"
+        return Verdict(GateKind.DUPLICATE, reason, motion)

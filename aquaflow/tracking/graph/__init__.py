@@ -1,0 +1,1 @@
+"""The keyframe pose graph: edges, loop admission, optimisation (Sec. 3.2)."""

@@ -1,0 +1,159 @@
+"""The keyframe graph: links along the path, loops across it, and what they correct (Eq. 4).
+
+A loop starts an optimisation in a thread beside tracking, on a snapshot of the graph; its result is
+taken over by ``correction``. A replay waits for it at the next keyframe, so that the same frames
+give the same poses however long it took; a live run asks without waiting. Keyframes and links that
+came meanwhile are moved along, and loops that came meanwhile start the next optimisation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from aquaflow.config import TrackingConfig
+from aquaflow.errors.failures import Failures
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.keyframes import Keyframe, KeyframeStore
+from aquaflow.tracking.frames import Link
+from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph, edge_information, solve
+from aquaflow.tracking.graph.table import GraphResult
+from aquaflow.tracking.loops.relocaliser import Places
+
+
+@dataclass(frozen=True)
+class Correction:
+    """What an optimisation changed of the map made before it."""
+
+    moves: Mapping[int, Sim3] = field(default_factory=dict)
+    """By keyframe number: the similarity from where its world was to where it is."""
+    merged: Mapping[int, int] = field(default_factory=dict)
+    """Sub-maps that became part of another: from, into."""
+
+
+class KeyframeGraph:
+    """Grows with the keyframes; sets their poses and sub-maps when the graph was optimised.
+
+    To be used from one thread: nothing changes but in ``add`` and ``correction``.
+    """
+
+    def __init__(
+        self,
+        keyframes: KeyframeStore,
+        places: Places,
+        config: TrackingConfig,
+        failures: Failures | None = None,
+    ) -> None:
+        self.graph = PoseGraph(config.graph)
+        self._failures = failures or Failures()
+        self._keyframes, self._places, self._config = keyframes, places, config.graph
+        self.loops = 0
+        """Loop edges found."""
+        self._known: list[Keyframe] = []
+        """In the graph; the store may hold some that are not yet."""
+        self._beside = ThreadPoolExecutor(1, "keyframe graph")
+        self._optimisation: Future[GraphResult] | None = None
+        self._new_loops = False
+
+    @property
+    def optimising(self) -> bool:
+        """True if an optimisation was started and its correction has not been taken yet."""
+        return self._optimisation is not None
+
+    def add(self, number: int, link: Link | None) -> None:
+        """A new keyframe and how it hangs on the one it was tracked against.
+
+        If it closes a loop, an optimisation starts beside; after the one at work, if there is one.
+        """
+        keyframe = self._keyframes[number]
+        if link is not None:  # the earlier one may have been moved since they were linked
+            earlier = self._keyframes[link.keyframe]
+            keyframe.T_wc = (earlier.T_wc @ link.T_fk.inverse()).if_finite()
+            keyframe.sub_map = earlier.sub_map
+        self.graph.add_keyframe(number, keyframe.T_wc)
+        self._known.append(keyframe)
+        if link is not None:
+            sigma = self._config.link_scale_sigma
+            information = edge_information(link.covariance, sigma, link.T_fk)
+            self.graph.add_edge(Edge(number, link.keyframe, link.T_fk, information))
+        if self._config.enabled:
+            with self._failures.contain("loop search", keyframe.frame_index):
+                self._close_loops(keyframe)
+        with self._failures.contain("place index", keyframe.frame_index):
+            self._places.add(keyframe)
+        self._optimise()
+
+    def resume(self, graph: PoseGraph, loops: int) -> None:
+        """Go on with an earlier run's graph; the store holds its keyframes again.
+
+        One whose content was lost moves with the others, and is no place to be found again.
+        """
+        self.graph, self.loops = graph, loops
+        self._known = [known for known in self._keyframes.keyframes if known.number in graph]
+        for keyframe in self._known:
+            if keyframe.number not in self._keyframes.lost:
+                self._places.add(keyframe)
+
+    def correction(self, wait: bool) -> Correction:
+        """What the optimisation found, once; nothing if there is none, or it is still at work.
+
+        With ``wait`` its end is waited for. What was raised in its thread counts as a failure here.
+        """
+        if self._optimisation is None or not (wait or self._optimisation.done()):
+            return Correction()
+        finished, self._optimisation = self._optimisation, None
+        correction = Correction()
+        with self._failures.contain("graph optimisation"):
+            result = self.graph.apply(finished.result())
+            assert result is not None  # nobody else applies
+            correction = self._taken_over(result)
+        self._optimise()
+        return correction
+
+    def close(self) -> None:
+        """End the thread beside; an optimisation at work is given up when it has ended."""
+        self._beside.shutdown()
+
+    def _optimise(self) -> None:
+        """Start an optimisation if there are loops for it and none is at work."""
+        if self._new_loops and self._optimisation is None:
+            self._new_loops = False
+            self._optimisation = self._beside.submit(solve, self.graph.snapshot())
+
+    def _close_loops(self, keyframe: Keyframe) -> None:
+        """Edges to all earlier keyframes that prove to show the same place."""
+        number, component = keyframe.number, self.graph.component_of(keyframe.number)
+
+        def on_the_path(other: int) -> bool:
+            near = abs(number - other) < self._config.loop_gap
+            return near and self.graph.component_of(other) == component
+
+        for found in self._places.of_keyframe(keyframe, on_the_path):
+            T_fk, covariance = found.estimate.T, found.estimate.covariance
+            sigma = float(np.sqrt(covariance[6, 6]))
+            information = edge_information(covariance[:6, :6], sigma, T_fk)
+            edge = Edge(number, found.keyframe.number, T_fk, information, loop=True)
+            if self.graph.add_edge(edge):
+                self.loops += 1
+                self._new_loops = True
+
+    def _taken_over(self, result: GraphResult) -> Correction:
+        """Let the keyframes take over what came out."""
+        moves, merged = {}, {}
+        if result.poses:  # all at once: one by one, 10^4 keyframes would take half a second
+            keyframes = [self._keyframes[number] for number in result.poses]
+            before = Sim3Batch.of([keyframe.T_wc for keyframe in keyframes])
+            change = (Sim3Batch.of([*result.poses.values()]) @ before.inverse()).on_group()
+            for i, keyframe in enumerate(keyframes):
+                moves[keyframe.number] = change.element(i)
+                keyframe.T_wc = result.poses[keyframe.number]
+        for keyframe in self._known:
+            root = self._keyframes[self.graph.component_of(keyframe.number)]
+            if keyframe.sub_map != root.sub_map:
+                merged[keyframe.sub_map] = root.sub_map
+                keyframe.sub_map = root.sub_map
+        return Correction(moves, merged)

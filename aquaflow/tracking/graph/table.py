@@ -1,0 +1,142 @@
+"""Rows of a keyframe graph: append-only arrays that a snapshot can share without a copy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from aquaflow.config import GraphConfig
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.tracking.graph.equations import Index, Mask, Rows, poses_of
+
+_SIM3 = [("R", np.float64, (3, 3)), ("t", np.float64, 3), ("scale", np.float64)]
+
+NODE = np.dtype([("number", np.int64), ("component", np.int64), *_SIM3])
+"""A keyframe: its number, that of the first keyframe of its component, T_wc."""
+
+EDGE = np.dtype(
+    [
+        ("a", np.intp),
+        ("b", np.intp),
+        *_SIM3,
+        ("information", np.float64, (7, 7)),
+        ("covariance", np.float64, (7, 7)),
+        ("loop", np.bool_),
+    ]
+)
+"""An edge: rows of its two keyframes and T_ab."""
+
+TRUST = np.dtype([("trust", np.float64), ("allowed", np.float64)])
+"""Switch variable of an edge, 0 for a loop that is not (yet) believed; and its phi, the squared
+residual that a loop may keep at full trust."""
+
+ROUNDING = 1e-9
+"""Move, in m, rad and log-scale, that is none."""
+
+
+class Table:
+    """Rows that only ever grow: views handed out earlier never change."""
+
+    def __init__(self, dtype: np.dtype[np.void]) -> None:
+        self._buffer: Rows = np.zeros(16, dtype=dtype)
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def append(self, **values: object) -> None:
+        """One row more, named by field."""
+        if self._count == len(self._buffer):
+            grown = np.zeros(2 * self._count, dtype=self._buffer.dtype)
+            grown[: self._count] = self._buffer
+            self._buffer = grown
+        for name, value in values.items():
+            self._buffer[name][self._count] = value
+        self._count += 1
+
+    @property
+    def rows(self) -> Rows:
+        """Read-only view of all rows."""
+        view = self._buffer[: self._count]
+        view.flags.writeable = False
+        return view
+
+    def unseen(self, first: int) -> Rows:
+        """Writable view of the rows from ``first`` on, which no view handed out may hold."""
+        return self._buffer[first : self._count]
+
+    def replace(self, rows: Rows) -> None:
+        """Other contents for the same rows; views handed out before keep the old."""
+        self._buffer = rows
+        self._count = len(rows)
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A keyframe graph at one moment: read-only, so that another thread may work on it."""
+
+    nodes: Rows
+    """[N] NODE"""
+    edges: Rows
+    """[M] EDGE"""
+    trust: Rows
+    """[M] TRUST"""
+    joins: int
+    """Components that had been joined since the last result was applied."""
+    settled: int
+    """Edges before this one were there at the last optimisation."""
+    version: int
+    """How many results had been applied."""
+    config: GraphConfig
+
+
+@dataclass(frozen=True)
+class GraphResult:
+    """What an optimisation found."""
+
+    poses: Mapping[int, Sim3]
+    """New T_wc by keyframe number, of those that moved only."""
+    trust: Mapping[int, float]
+    """Switch variable in [0, 1] of every loop edge, by its place among all edges added."""
+    iterations: int
+    cost_before: float
+    """Robust cost of all edges it looked at; loops that are not believed add nothing."""
+    cost_after: float
+    snapshot: Snapshot
+    rows: Index
+    """[k] nodes of the snapshot that were solved."""
+    solved: Rows
+    """[k] NODE, with their new poses."""
+    edge_trust: Rows
+    """[M] TRUST"""
+
+
+def write_poses(rows: Rows, where: Index | Mask | slice, poses: Sim3Batch) -> None:
+    """Put similarities into NODE or EDGE rows, in place."""
+    rows["R"][where], rows["t"][where], rows["scale"][where] = poses.R, poses.t, poses.scale
+
+
+@dataclass(frozen=True)
+class Join:
+    """A component that became part of another: its poses went to S @ T."""
+
+    moved: int
+    into: int
+    S: Sim3Batch
+    """[1]"""
+
+    @property
+    def still(self) -> bool:
+        """True if the poses are where they should be already, but for rounding."""
+        return bool(np.abs(self.S.log()).max() < ROUNDING)
+
+    def apply(self, nodes: Rows) -> Index:
+        """Move the component's nodes into the frame of the other, in place; which they were."""
+        rows = np.flatnonzero(nodes["component"] == self.moved)
+        if not self.still:
+            write_poses(nodes, rows, (self.S @ poses_of(nodes[rows])).on_group())
+        nodes["component"][rows] = self.into
+        return rows

@@ -1,0 +1,1 @@
+"""Starting a map: two-view hypotheses, bundle adjustment, back-fill."""

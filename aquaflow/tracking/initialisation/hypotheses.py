@@ -1,0 +1,177 @@
+"""Which geometry explains frames that were all matched to one reference: a competition.
+
+Essential-matrix and homography poses, at each focal length that may be, are extended to some of the
+frames, bundle-adjusted, and judged by how well they explain them. The winner is adjusted to all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.config import InitialisationConfig
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.geometry.triangulation import triangulate
+from aquaflow.geometry.two_view import MIN_MATCHES, pose_candidates
+from aquaflow.messages import Frame
+from aquaflow.prior.contract import PairGeometry
+from aquaflow.tracking.initialisation.bundle import Bundle, BundleResult, adjust
+from aquaflow.tracking.pose.solver import PoseProblem, solve_pose
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """A frame matched to the reference, without a pose yet."""
+
+    frame: Frame
+    pixels: Array
+    """[P, 2] px, where the reference's sample points are seen."""
+    observed: npt.NDArray[np.bool_]
+    """[P]"""
+    parallax_px: float
+    pair: PairGeometry
+
+
+class Competition:
+    """One reference view and the frames that wait for their poses against it."""
+
+    def __init__(
+        self,
+        camera: CameraModel,
+        pixels_reference: Array,  # [P, 2] px
+        waiting: list[Waiting],
+        config: InitialisationConfig,
+    ) -> None:
+        self._camera, self._config, self._waiting = camera, config, waiting
+        self._pixels_reference = pixels_reference
+
+    def winner(self) -> BundleResult | None:
+        """The best candidate, adjusted to all frames in their order; None without candidates."""
+        judges = self._judges()
+        best: BundleResult | None = None
+        best_rank = (-1.0, 0.0)
+        for start in self._starts(judges):
+            result = self._adjust(start, judges)
+            # Over a plane two geometries explain every match; then the residual tells them apart.
+            rank = (round(self._explained(result.bundle, judges), 2), -result.residual_px)
+            if rank > best_rank:
+                best, best_rank = result, rank
+        if best is None:
+            return None
+        return self._adjust(self._completed(best, judges), self._waiting)
+
+    def explained(self, bundle: Bundle) -> float:
+        """Share of all observations in front of their camera and within a pixel of their match."""
+        return self._explained(bundle, self._waiting)
+
+    def _judges(self) -> list[Waiting]:
+        """The pairs' frames, which have most parallax, and some of the others down to the least."""
+        order = sorted(self._waiting, key=lambda frame: -frame.parallax_px)
+        first, rest = order[: self._config.pairs], order[self._config.pairs :]
+        count = min(self._config.judges - len(first), len(rest))
+        others = np.linspace(len(rest) - 1, 0, max(count, 0)).round().astype(int)
+        return first + [rest[i] for i in sorted(others)]
+
+    def _starts(self, judges: list[Waiting]) -> list[Bundle]:
+        """Candidate geometries from the pairs with the most parallax, at each candidate focal."""
+        starts = []
+        for camera in self._cameras():
+            for second in judges[: self._config.pairs]:
+                seen = second.observed
+                candidates = pose_candidates(
+                    self._pixels_reference[seen], second.pixels[seen], camera, camera
+                )
+                for candidate in candidates[: self._config.candidates]:
+                    bundle = self._extend(camera, second, candidate.T_ba, judges)
+                    if bundle is not None:
+                        starts.append(bundle)
+        return starts
+
+    def _cameras(self) -> list[CameraModel]:
+        camera = self._camera
+        if camera.calibrated:
+            return [camera]
+        return [camera.with_focal_scaled(factor) for factor in self._config.focal_factors]
+
+    def _extend(
+        self, camera: CameraModel, second: Waiting, T_ba: Sim3, judges: list[Waiting]
+    ) -> Bundle | None:
+        """Triangulate with one pair, then pose every other judge against the points."""
+        rays = camera.unproject(self._pixels_reference)
+        points = triangulate(rays, second.pixels, T_ba, camera, self._config.sigma_px)
+        good = points.good & second.observed
+        if good.sum() < MIN_MATCHES:
+            return None
+        rho = np.where(good, points.rho, np.median(points.rho[good]))
+        variance = np.where(good, points.variance, (0.5 * rho) ** 2)
+        T = []
+        for frame in judges:
+            near = _on_the_way(T_ba, frame.parallax_px / max(second.parallax_px, 1e-6))
+            known = frame is second
+            T.append(T_ba if known else self._posed(frame, camera, rho, variance, good, near))
+        return Bundle(T, rho, camera)
+
+    def _completed(self, best: BundleResult, judges: list[Waiting]) -> Bundle:
+        """The judges' geometry with the poses of all waiting frames."""
+        known = {id(frame): T for frame, T in zip(judges, best.bundle.T, strict=True)}
+        rho, camera = best.bundle.rho, best.bundle.camera
+        sure = np.ones(len(rho), bool)
+        T = []
+        for frame in self._waiting:
+            near = min(judges, key=lambda judge: abs(judge.parallax_px - frame.parallax_px))
+            own = known.get(id(frame))
+            if own is None:
+                own = self._posed(frame, camera, rho, best.rho_sigma**2, sure, known[id(near)])
+            T.append(own)
+        return Bundle(T, rho, camera)
+
+    def _posed(
+        self,
+        frame: Waiting,
+        camera: CameraModel,
+        rho: Array,  # [P]
+        variance: Array,  # [P] of rho
+        good: npt.NDArray[np.bool_],  # [P]
+        guess: Sim3,
+    ) -> Sim3:
+        """Reference to ``frame`` by the points that are good; the guess where that fails."""
+        seen = frame.observed & good
+        if seen.sum() < MIN_MATCHES:
+            return guess
+        problem = PoseProblem(
+            camera.unproject(self._pixels_reference)[seen] / rho[seen, None],
+            variance[seen],
+            frame.pixels[seen],
+            np.ones(int(seen.sum())),
+            camera,
+            self._config.sigma_px,
+        )
+        estimate = solve_pose(problem, guess)
+        return estimate.T if estimate is not None else guess
+
+    def _adjust(self, start: Bundle, frames: list[Waiting]) -> BundleResult:
+        pixels = np.stack([frame.pixels for frame in frames])
+        observed = np.stack([frame.observed for frame in frames])
+        solve_focal = not start.camera.calibrated and len(frames) >= 2
+        return adjust(self._pixels_reference, pixels, observed, start, solve_focal)
+
+    def _explained(self, bundle: Bundle, frames: list[Waiting]) -> float:
+        rays = bundle.camera.unproject(self._pixels_reference)
+        hits, total = 0, 0
+        for frame, T in zip(frames, bundle.T, strict=True):
+            Y = rays @ T.R.T + bundle.rho[:, None] * T.t
+            error = np.linalg.norm(bundle.camera.project(Y) - frame.pixels, axis=1)
+            good = (Y[:, 2] > 1e-3) & (error < self._config.inlier_px) & frame.observed
+            hits += int(good.sum())
+            total += int(frame.observed.sum())
+        return hits / max(total, 1)
+
+
+def _on_the_way(T: Sim3, share: float) -> Sim3:
+    """A guess at a pose between the reference and ``T``, that far along."""
+    return Sim3(T.R, T.t * min(share, 1.0)) if share > 0.5 else Sim3.identity()

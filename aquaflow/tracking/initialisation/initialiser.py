@@ -1,0 +1,167 @@
+"""Two-view initialisation that waits for parallax (docs/measurements.md#initialisation).
+
+Frames are matched to one reference until the parallax decides the geometry. Essential-matrix and
+homography poses then compete; the waiting frames get their poses from the winner.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.config import InitialisationConfig
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.geometry.two_view import (
+    MIN_MATCHES,
+    rotation_compensated_parallax_px,
+)
+from aquaflow.keyframes import Pointmap
+from aquaflow.messages import Frame
+from aquaflow.prior.contract import Encoding, Prior
+from aquaflow.tracking.initialisation.bundle import BundleResult
+from aquaflow.tracking.initialisation.hypotheses import Competition, Waiting
+from aquaflow.tracking.pose.depth_fusion import fuse
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Initialised:
+    """The winner: relative poses ``T_fk`` of the waiting frames, scale set by median depth 1."""
+
+    waiting: list[Waiting]
+    T: list[Sim3]
+    camera: CameraModel
+    """With the refined focal length, where it was unknown."""
+    residual_px: float
+    focal_sigma: float
+
+
+RETRY_GROWTH = 1.05
+"""Growth of the parallax after which a geometry that could not be trusted is tried again: an
+attempt takes seconds, and the next frame alone changes little."""
+
+
+class Initialiser:
+    """Collects frames against one reference and says when the geometry is decided."""
+
+    def __init__(
+        self,
+        frame: Frame,
+        reference: Encoding,
+        prior: Prior,
+        config: InitialisationConfig,
+    ) -> None:
+        self.frame, self.reference = frame, reference
+        self.waiting: list[Waiting] = []
+        self.thinned: list[Frame] = []
+        """Frames that were let go to bound memory; their poses can be filled in later."""
+        self._prior, self._config = prior, config
+        self._predicted: npt.NDArray[np.float32] | None = None
+        self._tried_px = 0.0
+        """Parallax at the last attempt."""
+        self._samples = _grid_samples(reference.interesting, config.points)
+
+    def add(self, frame: Frame, encoding: Encoding) -> bool:
+        """Match a frame to the reference; False when it no longer sees the same place."""
+        pair = self._prior.decode(self.reference, encoding, self._predicted)
+        rows, columns = self._samples
+        observed = pair.valid[rows, columns]
+        if observed.sum() < MIN_MATCHES or observed.mean() < self._config.min_share:
+            return False
+        pixels = pair.matches[rows, columns].astype(np.float64)
+        parallax = rotation_compensated_parallax_px(
+            self._pixels_reference[observed], pixels[observed], self.reference.camera
+        )
+        self.waiting.append(Waiting(frame, pixels, observed, parallax, pair))
+        self._predicted = pair.matches
+        self._thin()
+        return True
+
+    @property
+    def parallax_px(self) -> float:
+        return max((frame.parallax_px for frame in self.waiting), default=0.0)
+
+    @property
+    def ready(self) -> bool:
+        """Enough parallax and, unless the motion is fast, enough views to judge it by."""
+        return (
+            len(self.waiting) >= self._config.min_views
+            and self.parallax_px >= self._config.parallax_widths * self.reference.camera.width
+            and self.parallax_px >= RETRY_GROWTH * self._tried_px
+        )
+
+    def solve(self) -> Initialised | None:
+        """The best explanation of all waiting frames; None when none is good enough."""
+        self._tried_px = self.parallax_px
+        camera, pixels = self.reference.camera, self._pixels_reference
+        competition = Competition(camera, pixels, self.waiting, self._config)
+        result = competition.winner()
+        if result is None or not self._trustworthy(competition.explained(result.bundle), result):
+            return None
+        return Initialised(
+            self.waiting,
+            result.bundle.T,
+            result.bundle.camera,
+            result.residual_px,
+            result.focal_sigma,
+        )
+
+    def _trustworthy(self, explained: float, result: BundleResult) -> bool:
+        # A point that no waiting frame sees has no depth to judge by; of a wide step, most are so.
+        seen = np.any([frame.observed for frame in self.waiting], axis=0)
+        relative = result.rho_sigma[seen] / np.maximum(result.bundle.rho[seen], 1e-6)
+        focal_known = (
+            result.focal_sigma <= self._config.max_focal_sigma
+            or self.parallax_px > 3.0 * self._config.parallax_widths * result.bundle.camera.width
+        )
+        return (
+            self.parallax_px > self._config.sigma_px  # less is noise, which has depths of its own
+            and explained >= self._config.min_explained
+            and float(np.median(relative)) <= self._config.max_depth_sigma
+            and focal_known
+        )
+
+    @property
+    def _pixels_reference(self) -> Array:
+        rows, columns = self._samples
+        return np.stack([columns + 0.5, rows + 0.5], -1)
+
+    def _thin(self) -> None:
+        """Keep the number of waiting frames bounded: drop the one that adds least parallax."""
+        if len(self.waiting) <= self._config.max_waiting:
+            return
+        steps = np.diff([frame.parallax_px for frame in self.waiting[:-1]])
+        self.thinned.append(self.waiting.pop(int(np.argmin(np.abs(steps))) + 1).frame)
+
+
+def calibrated(camera: CameraModel) -> CameraModel:
+    """The same camera, no longer a guess."""
+    return replace(camera, calibrated=True)
+
+
+def _grid_samples(
+    interesting: npt.NDArray[np.bool_],  # [H, W]
+    count: int,
+) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Rows and columns of about ``count`` interesting pixels on a regular grid."""
+    height, width = interesting.shape
+    step = max(1, int(np.sqrt(height * width / count)))
+    grid = np.zeros_like(interesting)
+    grid[step // 2 :: step, step // 2 :: step] = True
+    rows, columns = np.nonzero(grid & interesting)
+    return rows, columns
+
+
+def fused_pointmap(solution: Initialised, camera: CameraModel, sigma_px: float) -> Pointmap:
+    """The reference's pointmap from all waiting frames, best parallax first."""
+    pointmap = Pointmap.unknown(camera)
+    pairs = sorted(
+        zip(solution.waiting, solution.T, strict=True), key=lambda item: -item[0].parallax_px
+    )
+    for waiting, T in pairs:
+        fuse(pointmap, waiting.pair, T, camera, sigma_px)
+    return pointmap

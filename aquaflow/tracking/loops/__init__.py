@@ -1,0 +1,1 @@
+"""Places seen before: retrieval, geometric verification, relocalisation."""

@@ -1,0 +1,65 @@
+"""Places seen before: which keyframes may show this one, and which of them prove to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from aquaflow.config import TrackingConfig
+from aquaflow.errors import InputError
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
+from aquaflow.prior.contract import Encoding
+from aquaflow.tracking.loops.retrieval import Retrieval
+from aquaflow.tracking.loops.verification import verify
+from aquaflow.tracking.pose.solver import PoseEstimate
+
+
+@dataclass(frozen=True)
+class Found:
+    """A keyframe that shows the same place, proven by geometry."""
+
+    keyframe: Keyframe
+    estimate: PoseEstimate
+    """``estimate.T`` is T_fk: keyframe to frame."""
+
+
+class Places:
+    """Retrieval, then verification of what is plausible; the store says what there is."""
+
+    def __init__(self, keyframes: KeyframeStore, config: TrackingConfig) -> None:
+        self._keyframes, self._config = keyframes, config
+        self._retrieval = Retrieval(config.retrieval)
+
+    def add(self, keyframe: Keyframe) -> None:
+        """From here on this place can be found again."""
+        self._retrieval.add(keyframe.number, keyframe.encoding)
+
+    def of_frame(self, encoding: Encoding, camera: CameraModel) -> Found | None:
+        """Where a lost frame is: the first keyframe, most similar first, that proves its pose."""
+        for candidate in self._retrieval.candidates(encoding, lambda _: False):
+            found = self._verified(candidate.number, encoding, camera)
+            if found is not None:
+                return found
+        return None
+
+    def of_keyframe(self, keyframe: Keyframe, exclude: Callable[[int], bool]) -> list[Found]:
+        """Earlier keyframes that show what ``keyframe`` shows, scales compared."""
+        encoding, pointmap = keyframe.encoding, keyframe.pointmap
+        numbers = [found.number for found in self._retrieval.candidates(encoding, exclude)]
+        found = [self._verified(n, encoding, encoding.camera, pointmap) for n in numbers]
+        return [place for place in found if place is not None]
+
+    def _verified(
+        self,
+        number: int,
+        encoding: Encoding,
+        camera: CameraModel,
+        pointmap: Pointmap | None = None,
+    ) -> Found | None:
+        past = self._keyframes[number]
+        try:
+            proof = verify(past, encoding, camera, self._config.verification, pointmap)
+        except InputError:
+            return None  # a keyframe that cannot be read back costs itself
+        return None if proof is None else Found(past, proof.estimate)

@@ -1,0 +1,107 @@
+"""One frame against one keyframe: matches, pose, and whether both can be believed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.config import TrackingConfig
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes import Keyframe
+from aquaflow.prior.contract import Encoding, Mask, PairGeometry
+from aquaflow.tracking.frames import Quality
+from aquaflow.tracking.pose.pnp import pose_from_scratch
+from aquaflow.tracking.pose.problem import pose_problem
+from aquaflow.tracking.pose.solver import PoseEstimate, PoseProblem, solve_pose
+from aquaflow.tracking.pose.visibility import Visibility, visibility
+
+
+@dataclass(frozen=True)
+class Matched:
+    """A frame that was placed against a keyframe."""
+
+    estimate: PoseEstimate
+    """``estimate.T`` is T_fk: keyframe to frame."""
+    pair: PairGeometry
+    share: float
+    """Matched part of what the keyframe shows."""
+    parallax_px: float
+    """Mean displacement of the matches."""
+    points: npt.NDArray[np.float64]
+    """[M, 3] of the keyframe that the pose was solved from."""
+    visibility: Visibility
+
+    @property
+    def quality(self) -> Quality:
+        """How well the pose is known."""
+        estimate = self.estimate
+        return Quality(
+            estimate.inlier_share, estimate.residual_px, self.share, estimate.conditioning
+        )
+
+
+class KeyframeMatcher:
+    """Poses from a prior's matches and a keyframe's pointmap (paper, Eq. 3)."""
+
+    def __init__(self, config: TrackingConfig) -> None:
+        self._config = config
+
+    def pose(
+        self,
+        keyframe: Keyframe,
+        camera: CameraModel,
+        pair: PairGeometry,
+        predicted: Sim3,
+        fallback: Sim3,
+    ) -> Matched | None:
+        """The pose from ``predicted``; from the matches alone, or from ``fallback``, where that
+        fails; None where too little speaks for any."""
+        config = self._config
+        known = keyframe.pointmap.known(config.known_sigma)
+        problem, pixels_k = self._problem(keyframe, pair, camera, known)
+        if len(problem.points) < config.min_matches:
+            return None
+        estimate = self._solve(problem, predicted)
+        if estimate is None or estimate.inlier_share < config.min_inlier_share:
+            estimate = self._solve(problem, pose_from_scratch(problem) or fallback)
+        if estimate is None or estimate.inlier_share < config.min_inlier_share:
+            return None
+        share = matched_share(keyframe.encoding, pair)
+        if share * estimate.inlier_share < config.min_support:
+            return None
+        displacement = np.linalg.norm(problem.pixels - pixels_k, axis=1)
+        looked_at = keyframe.encoding.interesting & known
+        visible = visibility(
+            keyframe.pointmap, looked_at, pair.matches, pair.valid, estimate.T, camera
+        )
+        return Matched(estimate, pair, share, float(displacement.mean()), problem.points, visible)
+
+    def _solve(self, problem: PoseProblem, initial: Sim3) -> PoseEstimate | None:
+        return solve_pose(problem, initial, self._config.stop_converged, self._config.residual)
+
+    def _problem(
+        self, keyframe: Keyframe, pair: PairGeometry, camera: CameraModel, known: Mask
+    ) -> tuple[PoseProblem, npt.NDArray[np.float64]]:
+        """At most ``matches`` matches whose depth is known, and their keyframe pixels."""
+        rows, columns = np.nonzero(pair.valid & known)
+        step = max(1, -(-len(rows) // self._config.matches))
+        rows, columns = rows[::step], columns[::step]
+        pixels_k = np.stack([columns + 0.5, rows + 0.5], -1)
+        pixels = pair.matches[rows, columns].astype(np.float64)
+        weights = pair.C[rows, columns].astype(np.float64)
+        sigma_px = self._config.sigma_px
+        problem = pose_problem(keyframe.pointmap, pixels_k, pixels, camera, sigma_px, weights)
+        return problem, pixels_k
+
+
+def matched_share(encoding: Encoding, pair: PairGeometry) -> float:
+    """min(valid matches, distinct matched pixels) over the pixels looked at (docs/paper.md)."""
+    looked_at = encoding.interesting
+    matched = looked_at & pair.valid
+    targets = np.floor(pair.matches[matched]).astype(np.int64)
+    hit = np.zeros_like(looked_at)
+    hit[targets[:, 1], targets[:, 0]] = True
+    return min(int(matched.sum()), int(hit.sum())) / max(int(looked_at.sum()), 1)

@@ -1,0 +1,59 @@
+"""Pose of a frame from its matches alone, where no prediction helps."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.geometry.similarity import Sim3, so3_exp
+from aquaflow.tracking.pose.solver import PoseProblem
+
+RANSAC_ITERATIONS = 200
+RANSAC_PX = 3.0
+MIN_INLIERS = 30
+LEAST_WIDTH = 1e-3
+"""Of a set of points over its length; thinner is a line, to the depths' own precision."""
+
+
+def pose_from_scratch(problem: PoseProblem) -> Sim3 | None:
+    """T_fk by PnP in RANSAC; None without consensus.
+
+    SQPnP raises on one degenerate sample (points on a line, or at one place), and with it ends the
+    whole search: there P3P, which skips such samples, searches again.
+    """
+    import cv2
+
+    if len(problem.points) < MIN_INLIERS:
+        return None
+    try:
+        pose = _consensus(problem, cv2.SOLVEPNP_SQPNP)
+    except cv2.error:
+        pose = _consensus(problem, cv2.SOLVEPNP_AP3P) if _is_no_line(problem.points) else None
+    return pose if pose is not None and pose.is_finite() else None
+
+
+def _is_no_line(
+    points: npt.NDArray[np.float64],  # [N, 3]
+) -> bool:
+    """True if the points span a plane; around a line the camera could be anywhere."""
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(spread[1] > LEAST_WIDTH * spread[0])
+
+
+def _consensus(problem: PoseProblem, solver: int) -> Sim3 | None:
+    import cv2
+
+    rays = problem.camera.unproject(problem.pixels)[:, :2]
+    found, w, t, inliers = cv2.solvePnPRansac(
+        problem.points,
+        rays,
+        np.eye(3),
+        None,
+        iterationsCount=RANSAC_ITERATIONS,
+        reprojectionError=RANSAC_PX / problem.camera.fx,
+        flags=solver,
+    )
+    if not found or inliers is None or len(inliers) < MIN_INLIERS:
+        return None
+    rotation, translation = (np.asarray(each[:, 0], dtype=np.float64) for each in (w, t))
+    return Sim3(so3_exp(rotation), translation)

@@ -1,0 +1,157 @@
+"""Pose of a frame against a keyframe's pointmap: Levenberg-Marquardt (paper, Eq. 3).
+
+Scale is held at 1 inside a keyframe, because a free scale shrinks at every link
+(docs/measurements.md#pose-solver); between keyframes it may be freed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.config.tracking import PoseResidual
+from aquaflow.geometry.similarity import Sim3, so3_exp
+from aquaflow.tracking.pose.covariance import Degeneracy, cell_sums, certainty
+from aquaflow.tracking.pose.residuals import ROWS, Matches, PoseProblem, Rows
+
+__all__ = ["PoseEstimate", "PoseProblem", "solve_pose"]
+
+Array = npt.NDArray[np.float64]
+
+HUBER = 1.345
+"""Whitened residual where the loss turns linear: 95 % efficiency under Gaussian noise."""
+INLIER = 3.0
+"""Whitened residual up to which a match counts as an inlier."""
+MAX_ITERATIONS = 15
+STOP_SIGMAS = 0.1
+"""A step of this many of the pose's own standard deviations is the last. Steps shrink at least
+threefold, also with a third of outliers: what is left is a twentieth of the noise."""
+SLACK = 1e-2
+"""Relative growth of the cost that refuses no step. The whitening depends on the pose, and outliers
+gain from a pose that is less certain; the scores leave that out, so near the solution the cost
+does not follow them."""
+FIRST_DAMPING = 1e-6
+MAX_DAMPING = 1e6
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """The pose that minimises the whitened Huber loss, and how well it is known."""
+
+    T: Sim3
+    """T_fk: keyframe to frame."""
+    covariance: Array
+    """[6, 6] of the left tangent [translation, rotation]; [7, 7] with log-scale if that is free.
+    Huge, never singular, along a direction that the matches say nothing about."""
+    inlier_share: float
+    residual_px: float
+    """Median reprojection error."""
+    conditioning: float
+    """Smallest over largest eigenvalue, translation in median depths: 0 for degenerate motion."""
+    degeneracy: Degeneracy
+
+
+def solve_pose(
+    problem: PoseProblem,
+    initial: Sim3,
+    stop_converged: bool = True,
+    residual: PoseResidual = "pixel",
+    free_scale: bool = False,
+) -> PoseEstimate | None:
+    """Levenberg-Marquardt from ``initial``; None without matches, or when the normal equations stay
+    unsolvable. Without ``stop_converged`` it takes all MAX_ITERATIONS.
+
+    A match that is no number is left out. With ``free_scale`` the pose is a similarity; the
+    ``pixel`` and ``ray`` residuals see its scale only through the frame's own points.
+
+    Raises:
+        ValueError: ``point`` is asked for and the problem has no points of the frame's own.
+    """
+    matches = Matches(problem, residual, free_scale)
+    if len(matches) == 0 or not initial.is_finite():
+        return None
+    linearise = ROWS[residual]
+    T, damping = initial, FIRST_DAMPING
+    rows = linearise(matches, T)
+    cost = _cost(rows.residual, matches.weights)
+    for _ in range(MAX_ITERATIONS):
+        H, g = _normal_equations(rows, matches.weights)
+        step = _damped_step(H, g, damping)
+        if step is None:
+            return None
+        candidate = _moved(T, step)
+        new_rows = linearise(matches, candidate)
+        new_cost = _cost(new_rows.residual, matches.weights)
+        still = stop_converged and float(step @ H @ step) < STOP_SIGMAS**2
+        if not np.isfinite(new_cost) or new_cost > cost * (1.0 + SLACK):
+            damping *= 10.0
+            if still or damping > MAX_DAMPING:
+                break
+            continue
+        T, rows, cost = candidate, new_rows, new_cost
+        damping = max(damping * 0.1, 1e-9)
+        if still:
+            break
+    return _summary(problem, matches, T, rows)
+
+
+def _moved(T: Sim3, step: Array) -> Sim3:
+    """First-order retraction of the left tangent."""
+    R = so3_exp(step[3:6])
+    growth = float(np.exp(step[6])) if len(step) == 7 else 1.0
+    return Sim3(R @ T.R, growth * (R @ T.t) + step[:3], growth * T.scale)
+
+
+def _huber_weights(residual: Array) -> Array:
+    return HUBER / np.maximum(np.abs(residual), HUBER)
+
+
+def _cost(residual: Array, weights: Array) -> float:
+    size = np.abs(residual)
+    near = np.minimum(size, HUBER)
+    # Half the square up to HUBER, the tangent from there on.
+    return float(((size - 0.5 * near) * near).sum(0) @ weights)
+
+
+def _normal_equations(rows: Rows, weights: Array) -> tuple[Array, Array]:
+    root = np.sqrt(_huber_weights(rows.residual) * weights)
+    J = (rows.J * root).reshape(len(rows.J), -1)
+    return J @ J.T, J @ (rows.residual * root).reshape(-1)
+
+
+def _damped_step(H: Array, g: Array, damping: float) -> Array | None:
+    """-(H + damping diag H)^-1 g by Cholesky, with more damping until it succeeds."""
+    diagonal = np.maximum(np.diag(H), 1e-12 * max(float(np.diag(H).max()), 1e-12))
+    while damping <= MAX_DAMPING:
+        try:
+            L = np.linalg.cholesky(H + damping * np.diag(diagonal))
+        except np.linalg.LinAlgError:
+            damping *= 10.0
+            continue
+        step = -np.linalg.solve(L.T, np.linalg.solve(L, g))
+        return step if np.isfinite(step).all() else None
+    return None
+
+
+def _summary(problem: PoseProblem, matches: Matches, T: Sim3, rows: Rows) -> PoseEstimate | None:
+    H, _ = _normal_equations(rows, matches.weights)
+    if not (np.isfinite(H).all() and T.is_finite()):
+        return None
+    Y = T.scale * (T.R @ matches.X) + T.t[:, None]
+    in_front = Y[2] > 0.0
+    depth = float(np.median(Y[2][in_front])) if in_front.any() else 1.0
+    pull = _huber_weights(rows.residual) * rows.residual * matches.weights
+    scores, camera = (rows.J * pull).sum(1), matches.camera
+    cells = cell_sums(scores, matches.u, matches.v, camera.width, camera.height)
+    covariance, degeneracy = certainty(H, cells, T, depth)
+
+    inlier = in_front & (np.abs(rows.residual) < INLIER).all(0)
+    residual_px = float("inf")
+    if inlier.any():
+        seen = camera.project(Y[:, inlier].T)
+        error_u, error_v = seen[:, 0] - matches.u[inlier], seen[:, 1] - matches.v[inlier]
+        residual_px = float(np.median(np.hypot(error_u, error_v)))
+    share = float(inlier.sum()) / len(problem.points)
+    return PoseEstimate(T, covariance, share, residual_px, degeneracy.conditioning, degeneracy)
