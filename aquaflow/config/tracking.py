@@ -150,7 +150,7 @@ class GraphConfig(Stage):
         2.0,
         ge=1,
         description="times worse than its covariance that the chain may have drifted for one loop "
-        "edge alone to be believed; false loops: tests/tracking/test_loop_admission.py",
+        "edge alone to be believed; false loops: tests/tracking/graph/test_loop_admission.py",
     )
     corroborated_drift_factor: float = Field(
         30.0,
@@ -275,7 +275,7 @@ class TrackingConfig(Stage):
         "pixel",
         description="what poses are solved from; point is the paper's and needs the frame's own "
         "points; RMS error of t over the baseline at 5 % depth noise: point 3.6, ray 1.9, pixel "
-        "0.4 % (tests/tracking/test_residuals.py); on the reef clip ray and pixel are equal",
+        "0.4 % (tests/tracking/pose/test_residuals.py); on the reef clip ray and pixel are equal",
     )
     reuse_encodings: bool = Field(
         True, description="skip: a keyframe's encoding is kept; False: made again for every frame"

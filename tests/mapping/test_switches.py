@@ -18,7 +18,7 @@ from tests.mapping.mapping_scenes import (
     settings,
     view_of,
 )
-from tests.mapping.water_observations import B_RES, LAMP, D, sighted
+from tests.mapping.water.water_observations import B_RES, LAMP, D, sighted
 
 
 def test_without_shading_the_fit_knows_no_lamp() -> None:

@@ -17,7 +17,7 @@ from aquaflow.mapping.decoder.observation import FURTHEST, encoded_observation, 
 from aquaflow.mapping.decoder.tokens import BUCKET, Tokens, visible_tokens
 from aquaflow.mapping.decoder.voxel_groups import EMPTY
 from aquaflow.mapping.encoding import sinusoidal_encoding
-from tests.mapping.decoder_scene import CENTRE, ROWS, Scene
+from tests.mapping.decoder.decoder_scene import CENTRE, ROWS, Scene
 
 VARIANTS = ("lgpd", "mlp")
 

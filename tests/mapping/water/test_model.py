@@ -11,7 +11,7 @@ from aquaflow.mapping.water.model import WaterModel
 from aquaflow.mapping.water.observations import MIN_RANGE_RATIO, Observations, informative, mean_by
 from aquaflow.mapping.water.parameters import MAX_LOG_RATE, Model
 from aquaflow.mapping.water.shading import TERMS
-from tests.mapping.water_observations import B_RES, D
+from tests.mapping.water.water_observations import B_RES, D
 
 POINTS, SIGHTINGS, VIEWS = 40, 6, 5
 

@@ -23,7 +23,7 @@ from aquaflow.tracking.graph.keyframe_graph import Correction, KeyframeGraph
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
 from aquaflow.tracking.loops.relocaliser import Found, Places
 from aquaflow.tracking.pose.solver import Degeneracy, PoseEstimate
-from tests.tracking.graph_scenes import LOOP_SIGMA, SIGMA, circle
+from tests.tracking.graph.graph_scenes import LOOP_SIGMA, SIGMA, circle
 
 COUNT = 24
 TRUTH = circle(COUNT)

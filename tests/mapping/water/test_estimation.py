@@ -25,7 +25,17 @@ from aquaflow.mapping.water.model import WaterModel
 from aquaflow.mapping.water.observations import Observations, informative, mean_by
 from aquaflow.mapping.water.parameters import Model
 from aquaflow.mapping.water.shading import TERMS, shading_basis
-from tests.mapping.water_observations import B_INF, B_RES, BETA, LAMP, Array, B, D, fitted, sighted
+from tests.mapping.water.water_observations import (
+    B_INF,
+    B_RES,
+    BETA,
+    LAMP,
+    Array,
+    B,
+    D,
+    fitted,
+    sighted,
+)
 
 
 @cache

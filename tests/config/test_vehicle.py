@@ -14,7 +14,7 @@ from aquaflow.config.vehicle import VehicleConfig, load_vehicle
 from aquaflow.errors import ConfigError, InputError
 from aquaflow.sources import open_camera
 
-EXAMPLES = sorted((Path(__file__).parents[1] / "deploy" / "config").glob("*.yaml"))
+EXAMPLES = sorted((Path(__file__).parents[2] / "deploy" / "config").glob("*.yaml"))
 
 COMMENTED_SETTING = re.compile(r"^( +)# ( *\w+:( .*)?)$", re.MULTILINE)
 """A sentence has a space before its first colon."""

@@ -14,7 +14,7 @@ from aquaflow.evaluation.bench.render.scene import Size, height_field
 from aquaflow.evaluation.bench.render.timing import Sample, interleaved, time_renderer
 from aquaflow.render.contract import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from aquaflow.render.reference import ReferenceRenderer, project
-from tests.bench.pretended_renderer import PEAK, TINY, Pretended, SlowedClock
+from tests.evaluation.bench.render.pretended_renderer import PEAK, TINY, Pretended, SlowedClock
 
 
 def brute_force_interactions(size: Size) -> int:

@@ -22,8 +22,8 @@ from aquaflow.evaluation.bench.render.parts import parts_of
 from aquaflow.evaluation.bench.render.scene import NAMES, SIZES, SMALL, Size, height_field
 from aquaflow.evaluation.bench.render.table import print_result
 from aquaflow.render.native.build import supported_isas
-from tests.bench.pretended_renderer import PEAK, TINY, Pretended, SlowedClock
 from tests.command_line import refused, run_aquaflow
+from tests.evaluation.bench.render.pretended_renderer import PEAK, TINY, Pretended, SlowedClock
 
 
 def quiet(stage: str, done: int, total: int | None) -> None:

@@ -8,7 +8,7 @@ import pytest
 from aquaflow.config import GraphConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.tracking.graph.pose_graph import Edge
-from tests.tracking.graph_scenes import LOOP_SIGMA, Dive
+from tests.tracking.graph.graph_scenes import LOOP_SIGMA, Dive
 
 FALSE = [(5, 40), (12, 70), (30, 62), (8, 55), (41, 88), (20, 83)]
 """Keyframes of a dive of 100 that are metres apart."""

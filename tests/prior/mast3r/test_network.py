@@ -16,7 +16,7 @@ from aquaflow.prior.mast3r.network import Mast3r, ViewGeometry
 from aquaflow.prior.mast3r.rotary import rotary_table
 from aquaflow.prior.mast3r.settings import FULL, PATCH_PX, TINY
 
-KEYS = Path(__file__).parents[3] / "shared" / "design" / "mast3r_keys.txt"
+KEYS = Path(__file__).parents[4] / "shared" / "design" / "mast3r_keys.txt"
 LAYOUT_SHA256 = "1e4692eac072c410a86211e06a9a3007d91134cf353bbabe874b0006754f9cc4"
 """Of the sorted lines "name shape" of the public checkpoint."""
 

@@ -11,7 +11,7 @@ from aquaflow.mapping.water.model import WaterModel
 from aquaflow.mapping.water.observations import informative
 from aquaflow.mapping.water.parameters import Model
 from aquaflow.mapping.water.priors import BRIGHT_LEVEL, DARK_LEVEL, beliefs
-from tests.mapping.water_observations import B_INF, B_RES, D, sighted
+from tests.mapping.water.water_observations import B_INF, B_RES, D, sighted
 
 NOTHING = {"dark_channel": False, "saturation": False}
 EACH = [

@@ -22,7 +22,7 @@ from aquaflow.mapping.decoder.decoder import Decoder, Trunk
 from aquaflow.mapping.decoder.observation import observation
 from aquaflow.mapping.decoder.tokens import visible_tokens
 from aquaflow.render.library import library_or_none
-from tests.mapping.decoder_scene import ROWS, Scene
+from tests.mapping.decoder.decoder_scene import ROWS, Scene
 from tests.mapping.mapping_scenes import CAMERA, path, view_of
 
 CENTRE = torch.tensor([0.1, -0.2, -1.0])

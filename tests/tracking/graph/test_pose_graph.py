@@ -12,7 +12,14 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.tracking.graph.equations import Equations, Misfit
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph, edge_information, solve
-from tests.tracking.graph_scenes import EXACT, INFORMATION, LOOP_SIGMA, Dive, largest_gap, moved
+from tests.tracking.graph.graph_scenes import (
+    EXACT,
+    INFORMATION,
+    LOOP_SIGMA,
+    Dive,
+    largest_gap,
+    moved,
+)
 
 Array = npt.NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from aquaflow.config import MediumConfig
 from aquaflow.mapping.water.estimation import EVERY_MODEL, WaterEstimate, models_for
 from aquaflow.mapping.water.parameters import Model
 from aquaflow.mapping.water.shading import TERMS, shading_basis
-from tests.mapping.water_observations import B_INF, BETA, LAMP, B, fitted, sighted
+from tests.mapping.water.water_observations import B_INF, BETA, LAMP, B, fitted, sighted
 
 BRIGHTER_ABOVE = np.array([0.0, -0.7, 0.0, 0.0, 0.1])
 

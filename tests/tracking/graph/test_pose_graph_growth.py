@@ -7,7 +7,7 @@ import pytest
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.tracking.graph.pose_graph import Edge, solve
-from tests.tracking.graph_scenes import (
+from tests.tracking.graph.graph_scenes import (
     EXACT,
     INFORMATION,
     LOOP_SIGMA,
