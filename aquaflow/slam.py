@@ -38,6 +38,15 @@ class Waiting:
     """Without its pictures."""
 
 
+@dataclass(frozen=True)
+class Anchored:
+    """A tracked frame with its pose against its keyframe, which later corrections leave."""
+
+    tracked: Tracked
+    T_kf: Sim3 | None = None
+    """None for a frame without a pose."""
+
+
 class Slam:
     """One dive: a tracker, its keyframes and their graph, and a map for every sub-map."""
 
@@ -83,69 +92,72 @@ class Slam:
         """Frames that the gate kept from tracking, by its reason's kind."""
         self._live = live
         self.frames = FrameTable()
-        """All frames whose fate is known, in the order in which it was decided."""
+        """Finished frames, in completion order."""
         self.used = 0
         """Frames that passed the gate so far."""
         self._waiting: dict[int, Waiting] = {}
         """By index, the frames that passed the gate and are not finished."""
-        self._latest: tuple[Tracked, Sim3] | None = None
-        """The frame placed last, if it has a pose, and that against its keyframe, T_kf."""
+        self._latest: Anchored | None = None
+        """The frame linked last, if it has a pose."""
         self._keyframe_views: dict[int, View] = {}
 
     def process(self, frame: Frame) -> list[Tracked]:
-        """Everything the paper does with one frame; returns the frames whose fate it decided."""
-        # Sec. 3.2: what was optimised beside tracking; keyframes move, and the map follows.
+        """One frame's way through the paper; returns the frames that it finished."""
+        # Sec. 3.2, Eq. 4: the graph as optimised meanwhile; keyframes move, and the map follows.
         if self._live:
-            self._correct(wait=False)
+            self._follow_graph(wait=False)
 
-        # Not in the paper: is the frame worth looking at (docs/architecture.md#skips)?
-        verdict = Verdict(GateKind.PASS)
-        with self.profiler.stage("gate"), self.failures.contain("frame gate", frame.index):
-            verdict = self.gate.judge(frame.image, frame.mask)
+        # Not in the paper: frames that cannot help are skipped before anything costly.
+        verdict = self._gate(frame)
         if not verdict.passed:
-            return [self._skip(frame, verdict)]
-        self._waiting[frame.index] = Waiting(self.used, without_pictures(frame))
-        self.used += 1
+            return [self._publish(self._skipped(frame, verdict))]
 
-        # Sec. 3.1 and 3.2: two-view prior, Sim(3) pose against the keyframe, frame class.
-        with self.profiler.stage("track"), self.failures.contain("tracking", frame.index) as run:
-            decided = self.tracker.track(frame)
-        if run.failed:
-            decided = [self._as_lost(frame)]
-        if self.tracker.lost:
-            self.gate.forget()
+        # Sec. 3.1, Eq. 1: encode the picture and match it to the keyframe in use.
+        # Sec. 3.2, Eq. 3: its Sim(3) pose, its class, and the poses of frames that waited for it.
+        tracked = self._track(frame)
 
-        # Sec. 3.2: loops between keyframes, which start the next optimisation of their graph.
-        # Sec. 3.3 and 3.4: grow and optimise the map.
-        return self._place_all(decided)
+        finished = []
+        for anchored in self._anchor(tracked):
+            # Sec. 3.2, Eq. 4: a new keyframe gets its link, and loops to earlier ones are closed.
+            linked = self._link(anchored)
+
+            # Sec. 3.3.3, Eqs. 16 and 17: medium-guided insertion of Gaussians.
+            # Sec. 3.4, Eqs. 18 to 23: joint optimisation of Gaussians and medium.
+            self._map(linked.tracked)
+
+            # The frame's row, from which its pose can be told after every later correction.
+            finished.append(self._publish(linked))
+        return finished
 
     def catch_up(self) -> list[Tracked]:
         """In a live run's idle moments: poses of the past, which waited for a map (Sec. 3.2)."""
-        newest, decided = self._latest, []
+        newest: Anchored | None = self._latest
+        tracked: list[Tracked] = []
         with self.profiler.stage("back-fill"), self.failures.contain("back-filling"):
-            decided = self.tracker.back_fill()
-        placed = self._place_all(decided)
+            tracked = self.tracker.back_fill()
+        finished = self._complete(tracked)
         self._latest = newest
-        return placed
+        return finished
 
     def finish(self, progress: Callable[[int, int], None] | None = None) -> list[Tracked]:
-        """After the last frame: what is still undecided, the last keyframes, the refinement."""
-        decided: list[Tracked] = []
+        """After the last frame: the frames that still wait, the last keyframe, the refinement."""
+        tracked: list[Tracked] = []
         with self.profiler.stage("track"), self.failures.contain("tracking"):
-            decided = self.tracker.finish()
-        placed = self._place_all(decided)
-        placed += self._place_all([self._as_lost(left.frame) for left in self._left()])
+            tracked = self.tracker.finish()
+        finished = self._complete(tracked)
+        # Frames that tracking no longer has: a stage failed that held them.
+        finished += self._complete([self._as_lost(left.frame) for left in self._waiting.values()])
         while self.graph.optimising:
-            self._correct(wait=True)
+            self._follow_graph(wait=True)
         with self.failures.contain("insertion"):
             for insertion in self._retired_keyframes():
                 self.maps.insert(insertion)
         with self.failures.contain("refinement"):
             self.maps.refine(progress)
-        settled = self.results(len(self.frames) - len(placed))
+        settled = self.results(len(self.frames) - len(finished))
         return [
-            replace(tracked, T_wc=now.T_wc, sub_map=now.sub_map)
-            for tracked, now in zip(placed, settled, strict=True)
+            replace(each, T_wc=now.T_wc, sub_map=now.sub_map)
+            for each, now in zip(finished, settled, strict=True)
         ]
 
     def close(self, keep: bool = False) -> None:
@@ -170,71 +182,105 @@ class Slam:
         """Take over the frames of an earlier run; ``used`` of them passed the gate."""
         self.frames, self.used = frames, used
 
+    # --- the steps of a frame -----------------------------------------------------------------
+
+    def _gate(self, frame: Frame) -> Verdict:
+        """Whether the frame is worth tracking; one that is, waits for its pose from here on."""
+        verdict = Verdict(GateKind.PASS)
+        with self.profiler.stage("gate"), self.failures.contain("frame gate", frame.index):
+            verdict = self.gate.judge(frame.image, frame.mask)
+        if verdict.passed:
+            self._waiting[frame.index] = Waiting(self.used, without_pictures(frame))
+            self.used += 1
+        else:
+            self.skipped[verdict.kind.value] += 1
+        return verdict
+
+    def _track(self, frame: Frame) -> list[Tracked]:
+        """The frames whose pose, or lack of one, this frame makes known."""
+        tracked: list[Tracked] = []
+        with self.profiler.stage("track"), self.failures.contain("tracking", frame.index) as run:
+            tracked = self.tracker.track(frame)
+        if self.tracker.lost:
+            self.gate.forget()
+        return [self._as_lost(frame)] if run.failed else tracked
+
+    def _anchor(self, tracked: list[Tracked]) -> list[Anchored]:
+        """T_kf of all frames, before a loop closure among them moves the keyframes."""
+        # A frame on which a stage failed may have been finished already.
+        return [self._anchored(each) for each in tracked if each.frame.index in self._waiting]
+
+    def _anchored(self, tracked: Tracked) -> Anchored:
+        if tracked.keyframe is None or tracked.T_wc is None:
+            return Anchored(tracked)
+        with self.failures.contain("pose", tracked.frame.index):
+            T_kf = self.keyframes[tracked.keyframe].T_wc.inverse() @ tracked.T_wc
+            return Anchored(tracked, T_kf.if_finite())
+        return Anchored(self._as_lost(tracked.frame))
+
+    def _link(self, anchored: Anchored) -> Anchored:
+        """Add a keyframe to the graph; the frame with its pose after that."""
+        tracked, T_kf = anchored.tracked, anchored.T_kf
+        if tracked.keyframe is None or T_kf is None:
+            self._latest = None
+            return anchored
+        if tracked.frame_class is FrameClass.KEYFRAME:
+            if not self._live:
+                self._follow_graph(wait=True)
+            index = tracked.frame.index
+            with self.profiler.stage("graph"), self.failures.contain("keyframe graph", index):
+                self.graph.add(tracked.keyframe, tracked.link)
+        settled = self._settled(tracked, T_kf)
+        linked = Anchored(settled, None if settled.T_wc is None else T_kf)
+        self._latest = linked if linked.T_kf is not None else None
+        return linked
+
+    def _map(self, tracked: Tracked) -> None:
+        """Hold the frame out, or let the map grow by it."""
+        if not self.config.mapping.enabled or tracked.T_wc is None:
+            return
+        with self.failures.contain("mapping", tracked.frame.index):
+            view = self._view(tracked)
+            if self.is_held_out(tracked.frame):
+                self.maps.hold_out(view, tracked.sub_map)
+            else:
+                self.maps.grow(self._growth(tracked, view))
+
+    def _publish(self, anchored: Anchored) -> Tracked:
+        """The frame is finished: its row goes into the table."""
+        self._waiting.pop(anchored.tracked.frame.index, None)
+        self.frames.add(anchored.tracked, anchored.T_kf)
+        return anchored.tracked
+
+    def _complete(self, tracked: list[Tracked]) -> list[Tracked]:
+        """The same steps for frames that are not the newest."""
+        finished = []
+        for anchored in self._anchor(tracked):
+            linked = self._link(anchored)
+            self._map(linked.tracked)
+            finished.append(self._publish(linked))
+        return finished
+
     # --- poses --------------------------------------------------------------------------------
 
-    def _place_all(self, decided: list[Tracked]) -> list[Tracked]:
-        """Anchor all frames before a loop among them moves the keyframes that they hang on."""
-        # A frame on which a stage failed may be known already.
-        decided = [tracked for tracked in decided if tracked.frame.index in self._waiting]
-        anchored = [self._anchored(tracked) for tracked in decided]
-        placed = [self._place(*each) for each in anchored]
-        for tracked, (_, T_kf) in zip(placed, anchored, strict=True):
-            self._waiting.pop(tracked.frame.index, None)
-            self.frames.add(tracked, None if tracked.T_wc is None else T_kf)
-        return placed
-
-    def _left(self) -> list[Waiting]:
-        """Frames that tracking no longer has: a stage failed that held them."""
-        return list(self._waiting.values())
+    def _skipped(self, frame: Frame, verdict: Verdict) -> Anchored:
+        """A frame that the gate refused; a duplicate has the pose of the frame before it."""
+        if not verdict.same_place or self._latest is None or self._latest.T_kf is None:
+            sub_map = self.tracker.sub_map
+            return Anchored(Tracked(frame, FrameClass.SKIPPED, sub_map, reason=verdict.reason))
+        before, T_kf = self._latest.tracked, self._latest.T_kf
+        skipped = replace(
+            self._settled(before, T_kf), frame=frame, frame_class=FrameClass.SKIPPED,
+            pointmap=None, reason=verdict.reason, link=None,
+        )  # fmt: skip
+        return Anchored(skipped, None if skipped.T_wc is None else T_kf)
 
     def _as_lost(self, frame: Frame) -> Tracked:
         reason = self.failures.reason(frame.index) or "tracking failed"
         return Tracked.lost(frame, self.tracker.sub_map, reason)
 
-    def _anchored(self, tracked: Tracked) -> tuple[Tracked, Sim3 | None]:
-        """With the pose against the frame's keyframe, T_kf, which later corrections leave."""
-        if tracked.keyframe is None or tracked.T_wc is None:
-            return tracked, None
-        with self.failures.contain("pose", tracked.frame.index):
-            T_kf = self.keyframes[tracked.keyframe].T_wc.inverse() @ tracked.T_wc
-            return tracked, T_kf.if_finite()
-        return self._as_lost(tracked.frame), None
-
-    def _place(self, tracked: Tracked, T_kf: Sim3 | None) -> Tracked:
-        """Let the keyframe graph and the map know of a frame; its pose after that."""
-        if tracked.keyframe is None or T_kf is None:
-            self._latest = None
-            return tracked
-        if tracked.frame_class is FrameClass.KEYFRAME:
-            if not self._live:
-                self._correct(wait=True)
-            index = tracked.frame.index
-            with self.profiler.stage("graph"), self.failures.contain("keyframe graph", index):
-                self.graph.add(tracked.keyframe, tracked.link)
-        settled = self._settled(tracked, T_kf)
-        self._latest = None if settled.T_wc is None else (settled, T_kf)
-        if self.config.mapping.enabled and settled.T_wc is not None:
-            with self.failures.contain("mapping", settled.frame.index):
-                self._map(settled)
-        return settled
-
-    def _skip(self, frame: Frame, verdict: Verdict) -> Tracked:
-        """A frame that was not looked at; one like the frame before it has that frame's pose."""
-        self.skipped[verdict.kind.value] += 1
-        if not verdict.same_place or self._latest is None:
-            sub_map, T_kf = self.tracker.sub_map, None
-            skipped = Tracked(frame, FrameClass.SKIPPED, sub_map, reason=verdict.reason)
-        else:
-            before, T_kf = self._latest
-            skipped = replace(
-                self._settled(before, T_kf), frame=frame, frame_class=FrameClass.SKIPPED,
-                pointmap=None, reason=verdict.reason, link=None,
-            )  # fmt: skip
-        self.frames.add(skipped, None if skipped.T_wc is None else T_kf)
-        return skipped
-
-    def _correct(self, wait: bool) -> None:
-        """The map follows its keyframes."""
+    def _follow_graph(self, wait: bool) -> None:
+        """Take over what the graph's optimisation found; the map follows its keyframes."""
         with self.profiler.stage("correct"):
             correction = self.graph.correction(wait)
         if correction.moves:
@@ -242,8 +288,8 @@ class Slam:
                 self.maps.correct(correction.moves, correction.merged)
 
     def results(self, first: int = 0) -> list[Tracked]:
-        """All frames whose fate is known, from the ``first`` decided on, without pictures and
-        reasons, with pose and sub-map as they are now, after all corrections of keyframes."""
+        """Finished frames from row ``first`` on, without pictures and reasons; pose and sub-map
+        are those of now, after all corrections of keyframes."""
         return [self._settled(tracked, T_kf) for tracked, T_kf in self.frames.since(first)]
 
     def _settled(self, tracked: Tracked, T_kf: Sim3 | None) -> Tracked:
@@ -258,17 +304,14 @@ class Slam:
 
     # --- the map ------------------------------------------------------------------------------
 
-    def _map(self, tracked: Tracked) -> None:
-        view = self._view(tracked)
-        if self.is_held_out(tracked.frame):
-            self.maps.hold_out(view, tracked.sub_map)
-            return
+    def _growth(self, tracked: Tracked, view: View) -> Growth:
+        """What the frame brings to the map; a new keyframe also retires the one before it."""
         retired: list[Insertion] = []
         if tracked.frame_class is FrameClass.KEYFRAME:
             retired = self._retired_keyframes()
             self._keyframe_views = {view.keyframe: view}
         steps = self._steps(tracked.frame_class)
-        self.maps.grow(Growth(view, tracked.sub_map, steps, tracked.pointmap, tuple(retired)))
+        return Growth(view, tracked.sub_map, steps, tracked.pointmap, tuple(retired))
 
     def is_held_out(self, frame: Frame) -> bool:
         """i % n == 0 and i != 0, i counts used frames (docs/paper.md#deviations-evaluation)."""

@@ -24,8 +24,8 @@ class _Placed:
     solved: Matched
     at: Attachment
     """What it was placed against."""
-    T_ak: Sim3
-    """From the keyframe that all poses hang on to ``at``."""
+    T_fk: Sim3
+    """From the keyframe that all poses refer to."""
 
     def as_keyframe(self, follower: Follower, camera: CameraModel) -> tuple[Attachment, Sim3]:
         """Itself with the depths that it took along, for others to be placed against; T_fk."""
@@ -35,7 +35,7 @@ class _Placed:
         keyframe = KeyframeStore().add(
             frame.index, frame.t_ns, self.encoding, Sim3.identity(), pointmap, sub_map
         )
-        return Attachment(keyframe), self.solved.estimate.T @ self.T_ak
+        return Attachment(keyframe), self.T_fk
 
 
 class BackFill:
@@ -66,7 +66,7 @@ class BackFill:
         if placed is None:
             return Tracked.lost(frame, at.keyframe.sub_map)
         self._last = placed
-        at.T_fk = placed.solved.estimate.T @ placed.T_ak
+        at.T_fk = placed.T_fk
         return at.tracked(frame, FrameClass.COMMON, placed.solved.quality)
 
     def _place(self, frame: Frame) -> _Placed | None:
@@ -74,12 +74,14 @@ class BackFill:
         encoding = self._prior.encode(frame.image, self._camera)
         solved = self._follower.place(self._at, encoding, self._camera)
         if solved is not None:
-            return _Placed(frame, encoding, solved, self._at, Sim3.identity())
+            return _Placed(frame, encoding, solved, self._at, solved.estimate.T)
         if self._last is None:
             return None
         at, T_ak = self._last.as_keyframe(self._follower, self._camera)
         solved = self._follower.place(at, encoding, self._camera)
-        return None if solved is None else _Placed(frame, encoding, solved, at, T_ak)
+        if solved is None:
+            return None
+        return _Placed(frame, encoding, solved, at, solved.estimate.T @ T_ak)
 
     def all(self) -> list[Tracked]:
         """Every frame that is left, the oldest first."""

@@ -30,6 +30,9 @@ REPORT: dict[str, Any] = {
     "lag_ms": {"p50": 80.0, "p95": 120.0}, "classes": {"common": 100},
     "left_out_of_the_map": {'said "so"\n': 2}, "visits": {"tracking": 1},
     "stage_shares": {"track": 0.4}, "changes": [],
+    "stage_failures": [
+        {"stage": "pose", "error": "cv2.error", "place": 'a "b"', "defect": False, "count": 2}
+    ],
 }  # fmt: skip
 
 
@@ -68,7 +71,7 @@ def test_health_is_json_and_metrics_are_prometheus(server: HealthServer) -> None
 
 
 def test_every_line_of_the_metrics_is_well_formed() -> None:
-    line = re.compile(r'^(# (HELP|TYPE) \w+ .+|\w+(\{\w+="([^"\\\n]|\\.)*"\})? -?[\d.e+-]+)$')
+    line = re.compile(r'^(# (HELP|TYPE) \w+ .+|\w+(\{(\w+="([^"\\\n]|\\.)*",?)+\})? -?[\d.e+-]+)$')
     lines = exposition(REPORT).splitlines()
     assert [text for text in lines if not line.match(text)] == []
     assert sum(text.startswith("aquaflow_state{") for text in lines) == len(State)
