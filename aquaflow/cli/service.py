@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 
 POOR_RESULT = 3
-"""Exit code of a dive that was written but has warnings: hardly any poses, or an empty map."""
+"""Exit code of a dive that was written but has warnings: hardly any poses, an empty map, or a
+calibration that does not fit."""
 
 
 def register(app: typer.Typer) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from aquaflow.config import Config
+from aquaflow.dive import calibration_findings
 from aquaflow.dive.deliverables import Deliverables
 from aquaflow.dive.folder import TRACE, DiveFolder
 from aquaflow.dive.frames_csv import FrameRow
@@ -23,6 +24,7 @@ from aquaflow.messages import CameraModel, Dropped, Frame
 from aquaflow.profiler import pace
 from aquaflow.slam import Slam
 from aquaflow.sources.preprocessing import Preparation
+from aquaflow.tracking.calibration_check import LensError, lens_error
 from aquaflow.tracking.frames import Tracked
 
 log = logging.getLogger(__name__)
@@ -61,6 +63,8 @@ class DiveRun:
         self.notes: list[str] = []
         self.warnings: list[str] = []
         self.config = config
+        self.lens_error: LensError | None = None
+        """What the dive says of the calibration, if one was given; known at the end."""
         self.live: dict[str, Any] | None = None
         """What a live run says of itself in metrics.json."""
         self.started = time.monotonic()
@@ -201,6 +205,7 @@ class DiveRun:
             made.evaluate()
         with self.profiler.stage("write"):
             made.write(SCALE_SOURCE)
+        self._check_calibration()
         with self.profiler.stage("report"):
             numbers = self._numbers(results, made.held_out)
             notes = self.notes + self.slam.failures.notes()
@@ -218,12 +223,29 @@ class DiveRun:
         notes = self.notes + self.slam.failures.notes()
         return Finished(self.folder.path, numbers, notes, self.warnings)
 
+    def _check_calibration(self) -> None:
+        if self.calibration is None:
+            return
+        with (
+            self.profiler.stage("calibration check"),
+            self.slam.failures.contain("calibration check"),
+        ):
+            self.lens_error = lens_error(self.slam.keyframes.keyframes)
+
+    def _calibration_numbers(self) -> dict[str, Any] | None:
+        if self.calibration is None or self.lens_error is None:
+            return None
+        return calibration_findings.to_json(self.lens_error, self.calibration)
+
     def _numbers(self, results: list[Tracked], held_out: list[HeldOut]) -> dict[str, Any]:
         wall_s = time.monotonic() - self.started
         gaussians = sum(len(mapper.gaussians) for mapper in self.slam.mappers.values())
         self.warnings = shortcomings(self.config, self.folder.rows, gaussians)
+        if self.calibration is not None and self.lens_error is not None and self.lens_error.wrong:
+            self.warnings.append(calibration_findings.warning(self.lens_error, self.calibration))
         numbers = metrics(self.slam, results, self.dropped, held_out, wall_s)
         numbers["warnings"], numbers["failures"] = self.warnings, self.slam.failures.to_json()
+        numbers["calibration_check"] = self._calibration_numbers()
         numbers["cpu_s"] = round(time.process_time() - self._cpu_before_s, 3)  # of all threads
         if self.live is not None:
             numbers["live"] = self.live

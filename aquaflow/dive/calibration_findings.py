@@ -1,0 +1,76 @@
+"""What the calibration check found, for metrics.json and in words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from aquaflow.messages import CameraModel
+from aquaflow.tracking.calibration_check import TOLERANCE, LensError
+
+REMEDY = (
+    "calibrate the camera in water, or leave out --calib to have the focal length estimated from "
+    "the dive; until then distances and shapes are distorted"
+)
+
+
+def to_json(error: LensError, calibration: CameraModel) -> dict[str, Any]:
+    """For metrics.json; what the dive cannot tell is None, with its standard deviation."""
+    focal_known, radial_known = error.known
+    focal, k1 = _fitting(error, calibration)
+    return {
+        "verdict": verdict(error),
+        "focal_px": round(focal, 1) if focal_known else None,
+        "focal_sigma_px": round(focal * float(error.sigma[0]), 1),
+        "focal_given_px": round(calibration.fx, 1),
+        "k1": round(k1, 4) if radial_known else None,
+        "k1_sigma": round(float(error.sigma[1]), 4),
+        "k1_given": _k1(calibration),
+        "chance": float(f"{error.chance:.1e}"),
+        "keyframes": error.views,
+        "matches": error.matches,
+    }
+
+
+def verdict(error: LensError) -> str:
+    """One of ``wrong``, ``fits`` and ``cannot be told``."""
+    if error.wrong:
+        return "wrong"
+    return "fits" if all(error.known) else "cannot be told"
+
+
+def warning(error: LensError, calibration: CameraModel) -> str:
+    """A sentence for a calibration that is wrong: what, how sure, what to do."""
+    focal, k1 = _fitting(error, calibration)
+    focal_named, radial_named = error.named
+    asked = []
+    if focal_named or not radial_named:
+        asked.append(
+            f"a focal length of {focal:.0f} px (standard deviation "
+            f"{focal * error.sigma[0]:.0f}) instead of {calibration.fx:.0f} px"
+        )
+    if radial_named or not focal_named:
+        asked.append(
+            f"a first radial distortion k1 of {k1:.3f} (standard deviation "
+            f"{error.sigma[1]:.3f}) instead of {_k1(calibration):.3f}"
+        )
+    return (
+        f"the calibration does not fit the dive: its pictures ask for {' and '.join(asked)}; a "
+        f"calibration good to {100.0 * TOLERANCE[0]:.0f} % would look so by chance once in "
+        f"{_times(error.chance)} dives; {REMEDY}"
+    )
+
+
+def _times(chance: float) -> str:
+    return "more than a million" if chance < 1e-6 else f"{10 ** int(-np.log10(chance)):,}"
+
+
+def _fitting(error: LensError, calibration: CameraModel) -> tuple[float, float]:
+    """Focal length, px of the calibration, and k1 that fit the dive."""
+    growth = float(np.exp(error.log_focal))
+    return calibration.fx * growth, error.radial + _k1(calibration) * growth**2
+
+
+def _k1(calibration: CameraModel) -> float:
+    return calibration.distortion[0] if calibration.is_distorted else 0.0

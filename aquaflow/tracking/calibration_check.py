@@ -1,0 +1,184 @@
+"""Does the calibration fit the dive? Focal length and first radial distortion, from matches alone.
+
+Keypoint matches between neighbouring keyframes go through a bundle adjustment that also solves for
+the error of the lens. Nothing is said unless the error found is larger than a good calibration's
+own, beyond chance, and the same whether or not the lens may have further terms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.stats import f as f_distribution
+
+from aquaflow.geometry.lens_error import TERMS
+from aquaflow.keyframes import Keyframe
+from aquaflow.tracking.lens_adjustment import LensAdjustment, adjust_lens, clusters_of
+from aquaflow.tracking.lens_equations import Array, Observations
+from aquaflow.tracking.loops.keypoints import match_keypoints
+
+MAX_VIEWS = 8
+"""Keyframes looked at: with the pairs below, ten pairs."""
+MIN_VIEWS = 4
+"""With fewer, the scatter between the views says nothing."""
+MATCHES_PER_PAIR = 200
+MIN_MATCHES = 300
+"""Of all pairs together."""
+TOLERANCE = np.array([0.02, 0.02])
+"""Error of log focal length and k1 that a good calibration in water may have."""
+SIGNIFICANCE = 1e-3
+"""Chance that a good calibration is called wrong."""
+KNOWN_SIGMA = np.array([0.03, 0.03])
+"""Above, log focal length or k1 cannot be told from the dive."""
+NAMED_SIGMAS = 3.0
+"""An error that is larger by itself is named in the warning."""
+GRID = 41
+"""Steps along each side of the tolerance."""
+
+
+@dataclass(frozen=True)
+class LensError:
+    """What the matches ask of a lens whose calibration was used for them."""
+
+    log_focal: float
+    """u: the focal length should be exp(u) times what it is."""
+    radial: float
+    """k: the first radial distortion that is left in the undistorted pictures."""
+    sigma: Array
+    """[2] standard deviations of u and k."""
+    chance: float
+    """Probability of such an estimate where the calibration is within ``TOLERANCE``."""
+    noise_given: float
+    """Of the matches, normalised units, with the calibration as it is."""
+    noise_fitted: float
+    """The same with u and k solved for."""
+    views: int
+    matches: int
+
+    @property
+    def wrong(self) -> bool:
+        """True if the calibration does not fit the dive."""
+        return self.chance < SIGNIFICANCE
+
+    @property
+    def known(self) -> tuple[bool, bool]:
+        """Whether the dive's motion lets u, and k, be told at all."""
+        focal, radial = self.sigma < KNOWN_SIGMA
+        return bool(focal), bool(radial)
+
+    @property
+    def named(self) -> tuple[bool, bool]:
+        """Whether u, and k, are wrong by themselves."""
+        excess = np.abs([self.log_focal, self.radial]) - TOLERANCE
+        focal, radial = excess > NAMED_SIGMAS * self.sigma
+        return bool(focal), bool(radial)
+
+
+def lens_error(keyframes: Sequence[Keyframe]) -> LensError | None:
+    """The error of the lens that ``keyframes`` show; None if there are too few, or too few matches.
+
+    Raises:
+        numpy.linalg.LinAlgError: the matches determine nothing at all.
+    """
+    chosen = most_turning(keyframes)
+    observations = None if len(chosen) < MIN_VIEWS else matched(chosen)
+    if observations is None:
+        return None
+    R_wc = np.stack([keyframe.T_wc.R for keyframe in chosen])
+    centres = np.stack([keyframe.T_wc.t for keyframe in chosen])
+    return estimated(observations, R_wc, centres)
+
+
+def estimated(observations: Observations, R_wc: Array, centres: Array) -> LensError:
+    """The error of the lens, from poses [V, 3, 3] and [V, 3] that are roughly right.
+
+    Raises:
+        numpy.linalg.LinAlgError: the matches determine nothing at all.
+    """
+    simple = adjust_lens(observations, R_wc, centres, terms=2)
+    full = adjust_lens(observations, R_wc, centres, terms=TERMS)
+    covariance = simple.covariance + _model_error(simple, full)
+    error = simple.adjusted.lens[:2]
+    return LensError(
+        float(error[0]),
+        float(error[1]),
+        np.sqrt(np.diag(covariance)),
+        _chance(error, covariance, len(np.unique(clusters_of(observations)))),
+        simple.sigma_held,
+        simple.sigma,
+        len(R_wc),
+        len(observations.matches),
+    )
+
+
+def _model_error(simple: LensAdjustment, full: LensAdjustment) -> Array:
+    """[2, 2] Of a lens of two terms: where more terms explain part of the noise, that part of the
+    estimates' difference is a matter of the model and not of the calibration."""
+    explained = max(0.0, 1.0 - (full.sigma / simple.sigma) ** 2)
+    difference = full.adjusted.lens[:2] - simple.adjusted.lens[:2]
+    return np.diag(explained * difference**2)
+
+
+def _chance(error: Array, covariance: Array, clusters: int) -> float:
+    """Hotelling's test against the nearest error within the tolerance."""
+    side = np.linspace(-1.0, 1.0, GRID)
+    within = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2) * TOLERANCE
+    off = error - within
+    squared = np.einsum("ni,ij,nj->n", off, np.linalg.inv(covariance), off).min()
+    freedom = clusters - 2
+    return float(f_distribution.sf(squared * freedom / (2.0 * (clusters - 1)), 2, freedom))
+
+
+def most_turning(keyframes: Sequence[Keyframe]) -> list[Keyframe]:
+    """The run of up to ``MAX_VIEWS`` keyframes of one sub-map in which the camera turns most.
+
+    A camera that only translates says nothing about its focal length.
+    """
+    turns = [_angle(a, b) for a, b in pairwise(keyframes)]
+    best: list[Keyframe] = []
+    best_turn = 0.0
+    for start, first in enumerate(keyframes):
+        run = [first]
+        for keyframe in keyframes[start + 1 : start + MAX_VIEWS]:
+            if keyframe.sub_map != first.sub_map:
+                break
+            run.append(keyframe)
+        turn = sum(turns[start : start + len(run) - 1])
+        if (len(run), turn) > (len(best), best_turn):
+            best, best_turn = run, turn
+    return best
+
+
+def _angle(a: Keyframe, b: Keyframe) -> float:
+    cosine = 0.5 * (float(np.sum(a.T_wc.R * b.T_wc.R)) - 1.0)
+    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def matched(keyframes: Sequence[Keyframe]) -> Observations | None:
+    """Keypoint matches of neighbours, and of every other keyframe; None for too few."""
+    views = range(len(keyframes))
+    pairs = [(i, i + 1) for i in views[:-1]] + [(i, i + 2) for i in views[:-2:2]]
+    encodings = [keyframe.encoding for keyframe in keyframes]
+    rows: dict[tuple[int, int], int] = {}
+    """Number of the point by its view and keypoint."""
+    point, view, pixels = [], [], []
+    for i, j in pairs:
+        mine, theirs = match_keypoints(encodings[i].keypoints, encodings[j].keypoints)
+        step = -(-len(mine) // MATCHES_PER_PAIR) or 1
+        for a, b in zip(mine[::step].tolist(), theirs[::step].tolist(), strict=True):
+            point.append(rows.setdefault((i, a), len(rows)))
+            view.append(j)
+            pixels.append(encodings[j].camera.unproject(encodings[j].keypoints.pixels[b])[:2])
+    if len(point) < MIN_MATCHES:
+        return None
+    points = [encodings[i].camera.unproject(encodings[i].keypoints.pixels[a])[:2] for i, a in rows]
+    return Observations(
+        np.array(points),
+        np.array([i for i, _ in rows], dtype=np.int64),
+        np.array(point, dtype=np.int64),
+        np.array(view, dtype=np.int64),
+        np.array(pixels),
+    )

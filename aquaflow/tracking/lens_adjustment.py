@@ -1,0 +1,136 @@
+"""Self-calibrating bundle adjustment: poses, inverse depths, and one error of the lens for all.
+
+Every point belongs to the view that it was sampled in, so that the points' block of the normal
+equations is diagonal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from aquaflow.geometry.lens_error import LENS_PRIOR_SIGMA, TERMS
+from aquaflow.tracking.lens_equations import (
+    Adjusted,
+    Array,
+    Equations,
+    Indices,
+    Observations,
+    Weighting,
+    residuals,
+    triangulated,
+)
+
+ROUNDS = 4
+"""Of weighting: in the first the lens is held, in the last two outliers are left out."""
+ITERATIONS = 12
+"""Of Levenberg-Marquardt in each round."""
+STOP_RELATIVE_DECREASE = 1e-5
+OUTLIER_SIGMAS = 6.0
+MEDIAN_SIGMAS = 1.1774
+"""Median length of a normal error in two dimensions, in standard deviations."""
+MIN_SIGMA = 1e-6
+"""Normalised units; noise below a thousandth of a pixel is a test without any."""
+
+
+@dataclass(frozen=True)
+class LensAdjustment:
+    """The solution, and how well it is known."""
+
+    adjusted: Adjusted
+    covariance: Array
+    """[2, 2] of u and k, from the scatter between the views: matches of one view share errors."""
+    sigma_held: float
+    """Noise of the matches, normalised units, that the calibration as it is leaves."""
+    sigma: float
+    """Noise of the matches with u and k solved for."""
+
+
+def adjust_lens(
+    observations: Observations,
+    R_wc: Array,  # [V, 3, 3]
+    centres: Array,  # [V, 3]
+    terms: int,
+) -> LensAdjustment:
+    """The first ``terms`` of the lens error that fit ``observations`` best; the others stay 0.
+
+    Raises:
+        numpy.linalg.LinAlgError: the matches determine nothing at all.
+    """
+    state = Adjusted(R_wc, centres, np.ones(len(observations.points)), np.zeros(TERMS))
+    sigmas: list[float] = []
+    weighting = Weighting(1.0, np.zeros(0, dtype=bool))
+    for number in range(ROUNDS):
+        state = replace(state, rho=triangulated(observations, state))
+        size = np.linalg.norm(residuals(observations, state), axis=-1)
+        ahead = state.rho[observations.point] > 0.0
+        sigma = _sigma(size[ahead])
+        used = ahead if number < ROUNDS - 2 else ahead & (size < OUTLIER_SIGMAS * sigma)
+        weighting = Weighting(sigma, used)
+        state = _solve(observations, state, weighting, terms if number else 0)
+        sigmas.append(_sigma(np.linalg.norm(residuals(observations, state), axis=-1)[used]))
+    covariance = _covariance(observations, state, weighting, terms)
+    return LensAdjustment(state, covariance, sigmas[0], sigmas[-1])
+
+
+def _solve(
+    observations: Observations, state: Adjusted, weighting: Weighting, terms: int
+) -> Adjusted:
+    """Levenberg-Marquardt with the weighting's scale held."""
+    damping, cost = 1e-4, _cost(observations, state, weighting)
+    for _ in range(ITERATIONS):
+        equations = Equations(observations, state, weighting)
+        candidate = equations.stepped(damping, terms)
+        new_cost = _cost(observations, candidate, weighting)
+        if not np.isfinite(new_cost) or new_cost >= cost:
+            damping *= 10.0
+            continue
+        decrease = (cost - new_cost) / max(cost, 1e-12)
+        state, cost, damping = candidate, new_cost, max(0.1 * damping, 1e-9)
+        if decrease < STOP_RELATIVE_DECREASE:
+            break
+    return state
+
+
+def _cost(observations: Observations, state: Adjusted, weighting: Weighting) -> float:
+    prior = 0.5 * float(np.sum((state.lens / LENS_PRIOR_SIGMA) ** 2))
+    return weighting.cost(residuals(observations, state)) + prior
+
+
+def _covariance(
+    observations: Observations, state: Adjusted, weighting: Weighting, terms: int
+) -> Array:
+    """[2, 2] of the lens: the sandwich estimator over the clusters of the points."""
+    clusters = clusters_of(observations)
+    count = len(np.unique(clusters))
+    equations = Equations(observations, state, weighting)
+    H = equations.reduced(np.ones(len(state.rho), dtype=bool))[0]
+    free = slice(0, len(H) - TERMS + terms)
+    inverse = np.linalg.inv(equations.held(H)[free, free])
+    scatter = np.zeros_like(inverse)
+    for cluster in np.unique(clusters):
+        _, gradient = equations.reduced(clusters == cluster)
+        scatter += np.outer(gradient[free], gradient[free]) * count / (count - 1.0)
+    lens = slice(len(inverse) - terms, len(inverse) - terms + 2)
+    sandwich = (inverse @ scatter @ inverse)[lens, lens]
+    # Few clusters may agree by chance better than the noise of their matches lets them.
+    return _larger(sandwich, inverse[lens, lens])
+
+
+def clusters_of(observations: Observations) -> Indices:
+    """[P] number of the view and quarter of the picture that each point was sampled in."""
+    right, lower = (observations.points > 0.0).T
+    return np.asarray(4 * observations.reference + 2 * lower + right, dtype=np.int64)
+
+
+def _larger(a: Array, b: Array) -> Array:
+    """[2, 2] a covariance that is nowhere smaller than either."""
+    root = np.linalg.cholesky(b)
+    whitened = np.linalg.solve(root, np.linalg.solve(root, a).T)
+    values, vectors = np.linalg.eigh(0.5 * (whitened + whitened.T))
+    return np.asarray(root @ (vectors * np.maximum(values, 1.0)) @ vectors.T @ root.T)
+
+
+def _sigma(size: Array) -> float:
+    return max(float(np.median(size)) / MEDIAN_SIGMAS, MIN_SIGMA) if len(size) else MIN_SIGMA

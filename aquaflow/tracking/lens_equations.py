@@ -1,0 +1,186 @@
+"""The normal equations of the self-calibrating bundle adjustment (``lens_adjustment``)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.geometry.lens_error import (
+    LENS_PRIOR_SIGMA,
+    TERMS,
+    by_lens,
+    rays_of,
+    seen_at,
+    slope,
+)
+from aquaflow.geometry.similarity import hat, so3_exp
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+HUBER_SIGMAS = 2.0
+GAUGE_DAMPING = 1e-9
+"""Of the mean diagonal: holds position, attitude and scale of the whole, which nothing measures."""
+MIN_Z = 1e-3
+"""Points behind a view are projected as if just in front of it, far outside of the picture."""
+
+
+@dataclass(frozen=True)
+class Observations:
+    """P points, each sampled in one view, and their M matches in other views; normalised plane."""
+
+    points: Array
+    """[P, 2]"""
+    reference: Indices
+    """[P] the view that a point was sampled in."""
+    point: Indices
+    """[M]"""
+    view: Indices
+    """[M]"""
+    matches: Array
+    """[M, 2]"""
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """What is solved for; V views."""
+
+    R_wc: Array
+    """[V, 3, 3]"""
+    centres: Array
+    """[V, 3]"""
+    rho: Array
+    """[P] inverse depth in the reference view."""
+    lens: Array
+    """[5] as in ``geometry.lens_error``."""
+
+
+@dataclass(frozen=True)
+class Weighting:
+    sigma: float
+    used: npt.NDArray[np.bool_]
+    """[M]"""
+
+    def weights(self, error: Array) -> Array:
+        """[M] Huber's, over the variance; 0 for what is not used."""
+        size = np.linalg.norm(error, axis=-1)
+        bound = HUBER_SIGMAS * self.sigma
+        huber = np.where(size < bound, 1.0, bound / np.maximum(size, 1e-12))
+        return np.asarray(np.where(self.used, huber / self.sigma**2, 0.0))
+
+    def cost(self, error: Array) -> float:
+        size = np.linalg.norm(error, axis=-1)[self.used] / self.sigma
+        tail = HUBER_SIGMAS * (size - 0.5 * HUBER_SIGMAS)
+        return float(np.where(size < HUBER_SIGMAS, 0.5 * size**2, tail).sum())
+
+
+class Equations:
+    """The normal equations at one state: 6 columns a view (centre, rotation), then u and k."""
+
+    def __init__(self, observations: Observations, state: Adjusted, weighting: Weighting) -> None:
+        self._observations, self._state = observations, state
+        error, J, along = _derivatives(observations, state)
+        weights = weighting.weights(error)
+        self._J, self._error = J, error
+        self._wJ = weights[:, None, None] * J
+        count = len(state.rho)
+        point = observations.point
+        self._H_pp = 1e-9 + np.bincount(point, weights * np.sum(along**2, axis=1), count)
+        self._g_p = np.bincount(point, weights * np.sum(along * error, axis=1), count)
+        self._H_pc = np.zeros((count, J.shape[-1]))
+        np.add.at(self._H_pc, point, np.einsum("mr,mrk->mk", along, self._wJ))
+
+    def reduced(self, points: npt.NDArray[np.bool_]) -> tuple[Array, Array]:
+        """H [C, C] and gradient [C] of the ``points`` [P], their depths eliminated."""
+        rows = points[self._observations.point]
+        columns = self._J.shape[-1]
+        J, wJ = self._J[rows].reshape(-1, columns), self._wJ[rows].reshape(-1, columns)
+        H_pc = self._H_pc[points]
+        gain = H_pc / self._H_pp[points, None]
+        return J.T @ wJ - gain.T @ H_pc, wJ.T @ self._error[rows].ravel() - gain.T @ self._g_p[
+            points
+        ]
+
+    def held(self, H: Array) -> Array:
+        """[C, C] with the prior of the lens and the gauge held."""
+        extra = np.full(len(H), GAUGE_DAMPING * float(np.trace(H)) / len(H))
+        extra[-TERMS:] += LENS_PRIOR_SIGMA**-2.0
+        return H + np.diag(extra)
+
+    def stepped(self, damping: float, terms: int) -> Adjusted:
+        state, everything = self._state, np.ones(len(self._state.rho), dtype=bool)
+        H, gradient = self.reduced(everything)
+        gradient[-TERMS:] += state.lens / LENS_PRIOR_SIGMA**2
+        free = slice(0, len(H) - TERMS + terms)
+        A = self.held(H) + damping * np.diag(np.diag(H))
+        step = np.zeros(len(H))
+        step[free] = -np.linalg.solve(A[free, free], gradient[free])
+        moves = step[:-TERMS].reshape(-1, 6)
+        R = np.stack([R @ so3_exp(move[3:]) for R, move in zip(state.R_wc, moves, strict=True)])
+        rho = state.rho - (self._g_p + self._H_pc @ step) / self._H_pp
+        return Adjusted(R, state.centres + moves[:, :3], rho, state.lens + step[-TERMS:])
+
+
+def _transformed(observations: Observations, state: Adjusted) -> tuple[Array, Array, Array, Array]:
+    """Of every match: its point's ray [M, 3], rotation into the view [M, 3, 3], the way between
+    the views there [M, 3], and the point in the view [M, 3], scaled to depth 1 in the reference."""
+    point, view = observations.point, observations.view
+    reference = observations.reference[point]
+    rays = rays_of(observations.points, state.lens)
+    rays = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)[point]
+    R_cw = np.swapaxes(state.R_wc, 1, 2)[view]
+    R = R_cw @ state.R_wc[reference]
+    way = _applied(R_cw, state.centres[reference] - state.centres[view])
+    return rays, R, way, _applied(R, rays) + state.rho[point, None] * way
+
+
+def residuals(observations: Observations, state: Adjusted) -> Array:
+    """[M, 2] of the normalised plane as it was seen."""
+    Y = _transformed(observations, state)[-1]
+    return seen_at(Y[:, :2] / np.maximum(Y[:, 2:], MIN_Z), state.lens) - observations.matches
+
+
+def _derivatives(observations: Observations, state: Adjusted) -> tuple[Array, Array, Array]:
+    """Residuals [M, 2], their derivatives [M, 2, C] by views and lens, and [M, 2] by rho."""
+    rays, R, way, Y = _transformed(observations, state)
+    z = np.maximum(Y[:, 2], MIN_Z)
+    at = Y[:, :2] / z[:, None]
+    project = np.zeros((len(at), 2, 3))
+    project[:, 0, 0] = project[:, 1, 1] = 1.0 / z
+    project[:, :, 2] = -at / z[:, None]
+    D = slope(at, state.lens) @ project
+    J = np.zeros((len(at), 2, 6 * len(state.R_wc) + TERMS))
+    reference, view = observations.reference[observations.point], observations.view
+    R_cw = np.swapaxes(state.R_wc, 1, 2)[view]
+    by_centre = D @ R_cw * state.rho[observations.point, None, None]
+    _put(J, reference, by_centre, -D @ R @ hat(rays))
+    _put(J, view, -by_centre, D @ hat(Y))
+    bent = np.linalg.solve(slope(rays[:, :2], state.lens), by_lens(rays[:, :2], state.lens))
+    J[:, :, -TERMS:] = by_lens(at, state.lens) - D @ R[:, :, :2] @ bent
+    return seen_at(at, state.lens) - observations.matches, J, _applied(D, way)
+
+
+def _put(J: Array, view: Indices, by_centre: Array, by_rotation: Array) -> None:
+    """Into the six columns of every match's ``view`` [M]."""
+    rows = np.arange(len(J))
+    for axis in range(3):
+        J[rows, :, 6 * view + axis] = by_centre[:, :, axis]
+        J[rows, :, 6 * view + 3 + axis] = by_rotation[:, :, axis]
+
+
+def triangulated(observations: Observations, state: Adjusted) -> Array:
+    """[P] inverse depths, linear least squares."""
+    rays, R, way, _ = _transformed(observations, state)
+    at_infinity, match = _applied(R, rays), rays_of(observations.matches, state.lens)
+    slope = way[:, :2] - match * way[:, 2:]
+    value = match * at_infinity[:, 2:] - at_infinity[:, :2]
+    count, point = len(state.rho), observations.point
+    top = np.bincount(point, np.sum(slope * value, axis=1), count)
+    return np.asarray(top / np.maximum(np.bincount(point, np.sum(slope**2, axis=1), count), 1e-18))
+
+
+def _applied(R: Array, vectors: Array) -> Array:
+    """[M, r] = R [M, r, 3] @ vectors [M, 3]."""
+    return np.asarray(np.einsum("mij,mj->mi", R, vectors))
