@@ -16,8 +16,9 @@ REMEDY = (
 
 
 def to_json(error: LensError, calibration: CameraModel) -> dict[str, Any]:
-    """For metrics.json; what the dive cannot tell is None, with its standard deviation."""
-    focal_known, radial_known = error.known
+    """For metrics.json; what the dive cannot tell is None. The noise of the matches is in px of the
+    calibration's own pictures."""
+    focal_known, radial_known = np.logical_or(error.known, error.named)
     focal, k1 = _fitting(error, calibration)
     return {
         "verdict": verdict(error),
@@ -27,6 +28,11 @@ def to_json(error: LensError, calibration: CameraModel) -> dict[str, Any]:
         "k1": round(k1, 4) if radial_known else None,
         "k1_sigma": round(float(error.sigma[1]), 4),
         "k1_given": _k1(calibration),
+        "noise_px": {
+            "as_given": round(error.noise_given * calibration.fx, 3),
+            "focal_and_k1_fitted": round(error.noise_fitted * calibration.fx, 3),
+            "further_terms_fitted": round(error.noise_further * calibration.fx, 3),
+        },
         "chance": float(f"{error.chance:.1e}"),
         "keyframes": error.views,
         "matches": error.matches,

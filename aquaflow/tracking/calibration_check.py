@@ -55,6 +55,8 @@ class LensError:
     """Of the matches, normalised units, with the calibration as it is."""
     noise_fitted: float
     """The same with u and k solved for."""
+    noise_further: float
+    """The same with r^4 and the centre solved for too: a lens that k1 alone does not describe."""
     views: int
     matches: int
 
@@ -109,6 +111,7 @@ def estimated(observations: Observations, R_wc: Array, centres: Array) -> LensEr
         _chance(error, covariance, len(np.unique(clusters_of(observations)))),
         simple.sigma_held,
         simple.sigma,
+        full.sigma,
         len(R_wc),
         len(observations.matches),
     )

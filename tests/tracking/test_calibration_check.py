@@ -172,7 +172,7 @@ def test_the_warning_says_what_how_sure_and_what_to_do(
     excess: tuple[float, float], words: str
 ) -> None:
     camera = CameraModel(1360, 1023, 1407.0, 1407.0, 680.0, 511.0, "radtan", (0.05, 0, 0, 0))
-    error = LensError(*excess, np.array([0.002, 0.002]), 3e-9, 1e-3, 5e-4, 8, 1500)
+    error = LensError(*excess, np.array([0.002, 0.002]), 3e-9, 1e-3, 5e-4, 5e-4, 8, 1500)
 
     said = warning(error, camera)
 

@@ -1,0 +1,77 @@
+"""A calibration that does not fit is said first: by the command, in the report, in metrics.json."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import Cli
+
+from aquaflow import dive_run, pipeline
+from aquaflow.config import Config
+from aquaflow.geometry.camera import load_camera, save_camera
+from aquaflow.keyframes import Keyframe
+from aquaflow.sources import open_recording
+
+TRACKING = Config.model_validate({"threads": 1, "mapping": {"enabled": False}})
+
+
+def test_a_wrong_focal_length_is_said_first_and_ends_with_3(
+    aquaflow: Cli, small_recording: Path, tmp_path: Path
+) -> None:
+    wrong, dive = tmp_path / "wrong", tmp_path / "dive"
+    shutil.copytree(small_recording, wrong)
+    save_camera(load_camera(wrong / "camera.yaml").with_focal_scaled(0.75), wrong / "camera.yaml")
+
+    ran = aquaflow("map", wrong, "--out", dive, "--tracking-only")
+
+    assert ran.code == 3, ran.err
+    assert ran.out.startswith("Warning: the calibration does not fit the dive")
+    numbers = json.loads((dive / "metrics.json").read_text())
+    [warning] = numbers["warnings"]
+    assert warning in ran.out
+    assert numbers["calibration_check"]["verdict"] == "wrong"
+    assert numbers["calibration_check"]["focal_px"] == pytest.approx(136.0, abs=20.0)
+    assert numbers["calibration_check"]["focal_given_px"] == 102.0
+    assert "the calibration does not fit the dive" in (dive / "report.html").read_text()
+
+
+def test_the_right_calibration_is_no_warning(small_dive: Path) -> None:
+    numbers = json.loads((small_dive / "metrics.json").read_text())
+    assert numbers["warnings"] == []
+    assert numbers["calibration_check"]["verdict"] != "wrong"
+    assert numbers["calibration_check"]["chance"] > 0.001
+
+
+def test_without_a_calibration_nothing_is_checked(small_recording: Path, tmp_path: Path) -> None:
+    source = tmp_path / "source"
+    shutil.copytree(small_recording, source)
+    (source / "camera.yaml").unlink()
+
+    finished = pipeline.map_recording(
+        open_recording(source), "uncalibrated", tmp_path / "dive", TRACKING
+    )
+
+    assert finished.metrics["calibration_check"] is None
+    assert "calibration check" not in finished.metrics["stage_ms"]
+
+
+@pytest.mark.usefixtures("contained")
+def test_a_check_that_fails_costs_itself(
+    small_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(keyframes: Sequence[Keyframe]) -> Any:
+        raise np.linalg.LinAlgError("planted")
+
+    monkeypatch.setattr(dive_run, "lens_error", fail)
+    finished = pipeline.map_recording(
+        open_recording(small_recording), "contained", tmp_path / "dive", TRACKING
+    )
+    assert [each["stage"] for each in finished.metrics["failures"]] == ["calibration check"]
+    assert finished.metrics["calibration_check"] is None
+    assert (finished.dive / "report.html").exists()
