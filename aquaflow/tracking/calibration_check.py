@@ -80,18 +80,21 @@ class LensError:
 
 
 def lens_error(keyframes: Sequence[Keyframe]) -> LensError | None:
-    """The error of the lens that ``keyframes`` show; None if there are too few, or too few matches.
+    """The error of the lens that ``keyframes`` show; None if they are too few or show too little.
 
     Raises:
-        numpy.linalg.LinAlgError: the matches determine nothing at all.
+        InputError: a keyframe cannot be read back.
     """
-    chosen = most_turning(keyframes)
+    chosen = most_turning([each for each in keyframes if each.T_wc.is_finite()])
     observations = None if len(chosen) < MIN_VIEWS else matched(chosen)
     if observations is None:
         return None
     R_wc = np.stack([keyframe.T_wc.R for keyframe in chosen])
     centres = np.stack([keyframe.T_wc.t for keyframe in chosen])
-    return estimated(observations, R_wc, centres)
+    try:
+        return estimated(observations, R_wc, centres)
+    except np.linalg.LinAlgError:
+        return None
 
 
 def estimated(observations: Observations, R_wc: Array, centres: Array) -> LensError:
@@ -104,6 +107,8 @@ def estimated(observations: Observations, R_wc: Array, centres: Array) -> LensEr
     full = adjust_lens(observations, R_wc, centres, terms=TERMS)
     covariance = simple.covariance + _model_error(simple, full)
     error = simple.adjusted.lens[:2]
+    if not np.isfinite(covariance).all():
+        raise np.linalg.LinAlgError("the matches determine no error of the lens")
     return LensError(
         float(error[0]),
         float(error[1]),

@@ -27,7 +27,9 @@ ROUNDS = 4
 ITERATIONS = 12
 """Of Levenberg-Marquardt in each round."""
 STOP_RELATIVE_DECREASE = 1e-5
+"""Of the cost."""
 OUTLIER_SIGMAS = 6.0
+"""Mismatches of keypoints lie tens of standard deviations off; the error of a lens does not."""
 MEDIAN_SIGMAS = 1.1774
 """Median length of a normal error in two dimensions, in standard deviations."""
 MIN_SIGMA = 1e-6
@@ -107,7 +109,7 @@ def _covariance(
     equations = Equations(observations, state, weighting)
     H = equations.reduced(np.ones(len(state.rho), dtype=bool))[0]
     free = slice(0, len(H) - TERMS + terms)
-    inverse = np.linalg.inv(equations.held(H)[free, free])
+    inverse: Array = np.asarray(np.linalg.inv(equations.held(H)[free, free]), dtype=np.float64)
     scatter = np.zeros_like(inverse)
     for cluster in np.unique(clusters):
         _, gradient = equations.reduced(clusters == cluster)

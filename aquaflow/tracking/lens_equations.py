@@ -21,6 +21,7 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 HUBER_SIGMAS = 2.0
+"""Lengths in two dimensions: nine in ten normal errors are shorter."""
 GAUGE_DAMPING = 1e-9
 """Of the mean diagonal: holds position, attitude and scale of the whole, which nothing measures."""
 MIN_Z = 1e-3
@@ -59,7 +60,10 @@ class Adjusted:
 
 @dataclass(frozen=True)
 class Weighting:
+    """Huber's weights of matches whose noise is ``sigma``."""
+
     sigma: float
+    """Normalised units."""
     used: npt.NDArray[np.bool_]
     """[M]"""
 
@@ -71,13 +75,14 @@ class Weighting:
         return np.asarray(np.where(self.used, huber / self.sigma**2, 0.0))
 
     def cost(self, error: Array) -> float:
+        """Huber's, of residuals [M, 2]."""
         size = np.linalg.norm(error, axis=-1)[self.used] / self.sigma
         tail = HUBER_SIGMAS * (size - 0.5 * HUBER_SIGMAS)
         return float(np.where(size < HUBER_SIGMAS, 0.5 * size**2, tail).sum())
 
 
 class Equations:
-    """The normal equations at one state: 6 columns a view (centre, rotation), then u and k."""
+    """The normal equations at one state: 6 columns a view (centre, rotation), then the lens."""
 
     def __init__(self, observations: Observations, state: Adjusted, weighting: Weighting) -> None:
         self._observations, self._state = observations, state
@@ -99,9 +104,8 @@ class Equations:
         J, wJ = self._J[rows].reshape(-1, columns), self._wJ[rows].reshape(-1, columns)
         H_pc = self._H_pc[points]
         gain = H_pc / self._H_pp[points, None]
-        return J.T @ wJ - gain.T @ H_pc, wJ.T @ self._error[rows].ravel() - gain.T @ self._g_p[
-            points
-        ]
+        gradient = wJ.T @ self._error[rows].ravel() - gain.T @ self._g_p[points]
+        return J.T @ wJ - gain.T @ H_pc, gradient
 
     def held(self, H: Array) -> Array:
         """[C, C] with the prior of the lens and the gauge held."""
@@ -110,6 +114,7 @@ class Equations:
         return H + np.diag(extra)
 
     def stepped(self, damping: float, terms: int) -> Adjusted:
+        """The state after a damped step in which only the first ``terms`` of the lens move."""
         state, everything = self._state, np.ones(len(self._state.rho), dtype=bool)
         H, gradient = self.reduced(everything)
         gradient[-TERMS:] += state.lens / LENS_PRIOR_SIGMA**2

@@ -154,6 +154,12 @@ def test_too_few_keyframes_or_matches_say_nothing() -> None:
     assert lens_error([keyframe(i, 0.1) for i in range(MIN_VIEWS)]) is None
 
 
+def test_keyframes_at_one_place_that_see_the_same_say_nothing() -> None:
+    still = [keyframe(0, 0.0, keypoints=200) for _ in range(6)]
+    found = lens_error(still)
+    assert found is None or (not found.wrong and not found.known[0])
+
+
 def test_a_keypoint_seen_in_several_keyframes_is_one_point() -> None:
     keyframes = [keyframe(i, 0.0, keypoints=200) for i in range(3)]
 
