@@ -53,7 +53,7 @@ def test_quaternions_are_normalised_and_reordered(tmp_path):
     [
         ("", "holds no pose"),
         (POSE + "1 2 3\n", "line 2: expected the 8 numbers .* found 3"),
-        (POSE + "1 2 3 x 0 0 0 1\n", "line 2: .* is not 8 numbers"),
+        (POSE + "1 2 3 x 0 0 0 1\n", "line 2: these are not 8 numbers"),
         (POSE + "1 2 3 nan 0 0 0 1\n", "line 2: a number is not finite"),
         (POSE + "1 2 3 4 0 0 0 0\n", "line 2: the quaternion's length is 0"),
         (POSE + POSE, "line 2: time 0 s does not come after 0 s"),
