@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 
 FLOORS = (
-    {"cli"},
+    {"cli", "api"},
     {"evaluation", "service", "doctor"},
     {"dive", "viewer"},
     {"slam", "export", "sim_drivers"},

@@ -26,7 +26,6 @@ from aquaflow.cli.stress import register as register_stress
 from aquaflow.errors.crash_report import one_sentence, print_anything, refuse_unreadable
 
 if TYPE_CHECKING:
-    from aquaflow.config import Config
     from aquaflow.dive.run import Finished
 
 app = typer.Typer(
@@ -89,10 +88,13 @@ def map_command(
     }  # fmt: skip
     optimiser = {"refine_steps": refine_steps, "refine_seconds": refine_seconds}
     mapping = {"optimiser": optimiser, "enabled": False if tracking_only else None}
-    settings = _configured(
+    from aquaflow.presets import configured
+
+    settings = configured(
         config,
         preset,
         {"seed": seed, "threads": threads, "source": source_settings, "mapping": mapping},
+        "command line",
     )
     from aquaflow.geometry.camera import load_camera
     from aquaflow.sources import open_recording
@@ -215,16 +217,6 @@ def config_command(
 
     settings = Config() if file is None else load_config(file)
     typer.echo(yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
-
-
-def _configured(path: Path | None, preset: str | None, overrides: dict[str, Any]) -> Config:
-    """The config file with the preset, and then the command line's options, on top."""
-    from aquaflow.config import Config, load_config, parse_config, presets
-
-    base = (Config() if path is None else load_config(path)).model_dump()
-    if preset is not None:
-        base = presets.merged(base, presets.preset(preset))
-    return parse_config(presets.merged(base, overrides), "command line")
 
 
 def _print_summary(finished: Finished) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from pathlib import Path
 from typing import Any
 
+from aquaflow.config import Config, load_config, parse_config
 from aquaflow.errors import ConfigError
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -44,6 +46,21 @@ def preset(name: str) -> dict[str, Any]:
     if name not in PRESETS:
         raise ConfigError(f"there is no preset '{name}'; choose {', '.join(PRESETS)}")
     return deepcopy(PRESETS[name])
+
+
+def configured(
+    path: Path | None, preset_name: str | None, overrides: dict[str, Any], origin: str
+) -> Config:
+    """The config file, on top of it the preset, and on top of both the ``overrides``.
+
+    Raises:
+        InputError: the file cannot be read.
+        ConfigError: an unknown preset or key, or a value out of range, in the file or ``origin``.
+    """
+    base = (Config() if path is None else load_config(path)).model_dump()
+    if preset_name is not None:
+        base = merged(base, preset(preset_name))
+    return parse_config(merged(base, overrides), origin)
 
 
 def merged(base: dict[str, Any], overrides: dict[str, Any]) -> dict[str, Any]:

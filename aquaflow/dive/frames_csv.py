@@ -21,14 +21,21 @@ class FrameRow:
     """One line of frames.csv."""
 
     index: int
+    """Position in the recording, counted before any sub-sampling."""
     source: str
+    """File name of the picture, or where it is in the film: ``clip.mp4#123``."""
     t_s: float
+    """Seconds since the recording's first frame."""
     frame_class: str
+    """``keyframe``, ``mapping``, ``common``, ``skipped``, ``lost`` or ``dropped``."""
     sub_map: int | None = None
+    """Number of the sub-map; None without a pose."""
     keyframe: int | None = None
+    """Number of the keyframe that the pose hangs on."""
     quality: float | None = None
     """Inlier share of the pose's matches."""
     reason: str = ""
+    """Why the frame has no pose; empty if it has one."""
 
     @staticmethod
     def of_cells(cells: Sequence[str]) -> FrameRow:
@@ -89,7 +96,7 @@ def read_rows(path: Path) -> list[FrameRow]:
             next(stream, None)
             return of_text(stream.read())
     except (OSError, ValueError) as error:
-        raise InputError(f"cannot read {path}: {reason_of(error)}; start with --new") from error
+        raise InputError(f"cannot read {path}: {reason_of(error)}; map the dive again") from error
 
 
 def readable_rows(path: Path) -> tuple[list[FrameRow], int]:

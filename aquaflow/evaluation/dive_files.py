@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from aquaflow.errors import InputError
 from aquaflow.evaluation.trajectory import Trajectory, associate, read_tum
@@ -52,14 +53,7 @@ def read_dive(dive: Path) -> EvaluatedDive:
         raise InputError(f"there is no dive folder at {dive}; give the folder 'aquaflow map' wrote")
     trajectory = read_tum(dive / "trajectory.tum")
     times, sources, sub_maps = _read_frames(dive / "frames.csv")
-    order = np.argsort(times, kind="stable")
-    poses, rows = associate(trajectory.t_s, np.array(times)[order], ROW_TOLERANCE_S)
-    if len(poses) < len(trajectory):
-        raise InputError(
-            f"{dive}: {len(trajectory) - len(poses)} of {len(trajectory)} poses in trajectory.tum "
-            "have no row in frames.csv; both must come from the same run"
-        )
-    row_of_pose = [int(order[row]) for row in rows]
+    row_of_pose = rows_of_poses(dive, trajectory, np.array(times))
     members = [sub_maps[row] for row in row_of_pose]
     largest, _ = Counter(members).most_common(1)[0]
     chosen = np.array([member == largest for member in members])
@@ -71,6 +65,26 @@ def read_dive(dive: Path) -> EvaluatedDive:
         sub_map=largest,
         sub_maps=len(set(members)),
     )
+
+
+def rows_of_poses(
+    dive: Path,
+    trajectory: Trajectory,
+    times_s: npt.NDArray[np.float64],  # [F] s, of the rows of frames.csv
+) -> npt.NDArray[np.intp]:
+    """[N] the row of frames.csv that each pose belongs to, found by its time.
+
+    Raises:
+        InputError: a pose has no row.
+    """
+    order = np.argsort(times_s, kind="stable")
+    poses, rows = associate(trajectory.t_s, times_s[order], ROW_TOLERANCE_S)
+    if len(poses) < len(trajectory):
+        raise InputError(
+            f"{dive}: {len(trajectory) - len(poses)} of {len(trajectory)} poses in trajectory.tum "
+            "have no row in frames.csv; both must come from the same run"
+        )
+    return order[rows]
 
 
 def _read_frames(path: Path) -> tuple[list[float], list[str], list[int]]:

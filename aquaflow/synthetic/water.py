@@ -36,7 +36,10 @@ BEAM_OVER_DIFFUSE = 2.2
 
 @dataclass(frozen=True)
 class Medium:
-    """Parameters of the image formation, RGB."""
+    """Parameters of the image formation, RGB.
+
+    Lengths are in metres in the truth of a synthetic dive, and in map units in a mapped dive.
+    """
 
     beta_a: Rgb
     """Attenuation, 1/m."""
@@ -50,11 +53,11 @@ class Medium:
     """Decay of the near residual, 1/m."""
 
     def transmission(self, z: FloatArray) -> FloatArray:
-        """exp(-beta_a z), [..., 3], for ranges z [...] in metres."""
+        """exp(-beta_a z), [..., 3], for ranges z [...] in the unit of length."""
         return np.asarray(np.exp(-np.asarray(self.beta_a, z.dtype) * z[..., None]))
 
     def backscatter(self, z: FloatArray) -> FloatArray:
-        """B(z), [..., 3], for ranges z [...] in metres; infinite z gives B_inf."""
+        """B(z), [..., 3], for ranges z [...] in the unit of length; infinite z gives B_inf."""
         kind = z.dtype
         grown = np.asarray(self.B_inf, kind) * (
             1 - np.exp(-np.asarray(self.b, kind) * z[..., None])

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from aquaflow.cli import _configured
 from aquaflow.config import Config, parse_config
-from aquaflow.config.presets import PRESETS, merged, preset
+from aquaflow.config.presets import PRESETS, configured, merged, preset
 from aquaflow.errors import ConfigError
 
 
@@ -45,7 +44,9 @@ def test_merging_changes_neither_side_and_none_overrides_nothing() -> None:
 def test_the_command_line_goes_over_the_preset_and_the_preset_over_the_file(tmp_path: Path) -> None:
     file = tmp_path / "config.yaml"
     file.write_text("seed: 5\nmapping: {optimiser: {refine_steps: 7, steps_common: 9}}\n")
-    found = _configured(file, "fast", {"mapping": {"optimiser": {"refine_steps": 11}}})
+    found = configured(
+        file, "fast", {"mapping": {"optimiser": {"refine_steps": 11}}}, "command line"
+    )
     assert found.seed == 5
     assert found.mapping.optimiser.refine_steps == 11
     assert found.mapping.optimiser.steps_common == 2

@@ -1,0 +1,65 @@
+"""Mapping a recording from Python, as ``aquaflow map`` does it on the command line."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from aquaflow.api.dive import Dive, read_dive
+from aquaflow.config.presets import configured
+from aquaflow.geometry.camera import CameraModel, load_camera
+from aquaflow.sources import RecordedCamera, open_recording
+
+if TYPE_CHECKING:
+    from aquaflow.dive.replay import Progress
+
+
+def map_recording(
+    source: str | os.PathLike[str] | RecordedCamera,
+    out: str | os.PathLike[str],
+    *,
+    calibration: str | os.PathLike[str] | CameraModel | None = None,
+    config: str | os.PathLike[str] | None = None,
+    preset: str | None = None,
+    settings: Mapping[str, Any] | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Dive:
+    """Map a recording into the dive folder ``out`` and read what came of it.
+
+    torch, OpenCV and BLAS get the number of threads that the config asks for, in this whole
+    process: results repeat bit for bit at a given number.
+
+    Args:
+        source: a video, a folder of pictures, an MCAP recording, a ROS bag, a synthetic dive, or
+            a camera of your own that is already open.
+        out: folder to write; the report and the map files are in it afterwards.
+        calibration: a ``camera.yaml`` or the camera itself; else the one that comes with the
+            recording, else a guess that is refined.
+        config: a YAML file of settings, see ``aquaflow config``.
+        preset: ``fast``, ``balanced`` or ``accurate``, on top of ``config``.
+        settings: single settings on top of both, nested as in the YAML file, such as
+            ``{"source": {"every": 2}}``.
+        overwrite: replace a dive that ``out`` holds already.
+        progress: called with the stage, the steps done and the number of steps (None: unknown).
+
+    Raises:
+        InputError: the recording cannot be read or the folder cannot be written.
+        ConfigError: a setting is unknown or out of range, or does not fit the pictures.
+        NotMappedError: the frames were read but gave no map; the folder says why.
+    """
+    file = None if config is None else Path(config)
+    chosen = configured(file, preset, dict(settings or {}), "settings")
+    camera = calibration
+    if camera is not None and not isinstance(camera, CameraModel):
+        camera = load_camera(Path(camera))
+    if isinstance(source, (str, os.PathLike)):
+        recording, name = open_recording(Path(source), fps=chosen.source.fps), Path(source).name
+    else:
+        recording, name = source, type(source).__name__
+    from aquaflow.dive import replay  # loads torch: after what can be refused without it
+
+    replay.map_recording(recording, name, Path(out), chosen, camera, overwrite, progress)
+    return read_dive(out)

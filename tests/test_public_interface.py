@@ -1,0 +1,108 @@
+"""``import aquaflow`` as a scientist uses it: a recording mapped, a dive and its map read."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import aquaflow
+from aquaflow.geometry.similarity import Sim3
+
+HASTY = Path(__file__).with_name("hasty.yaml")
+
+
+def test_every_public_name_is_there_and_listed() -> None:
+    assert {name for name in aquaflow.__all__ if getattr(aquaflow, name, None) is None} == set()
+    assert set(aquaflow.__all__) <= set(dir(aquaflow))
+
+
+def test_a_name_that_is_not_public_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'no_such_name'"):
+        _ = aquaflow.no_such_name
+
+
+def test_reading_the_names_loads_no_heavy_library() -> None:
+    heavy = ("torch", "cv2", "numpy")
+    code = f"import aquaflow, sys; dir(aquaflow); print([m for m in {heavy} if m in sys.modules])"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"
+
+
+def test_a_recording_is_mapped_and_read_back(small_recording: Path, tmp_path: Path) -> None:
+    stages = set()
+    dive = aquaflow.map_recording(
+        small_recording,
+        tmp_path / "dive",
+        config=HASTY,
+        settings={"source": {"stop": 8}},
+        progress=lambda stage, done, total: stages.add(stage),
+    )
+    assert dive.path == tmp_path / "dive"
+    assert len(dive) == dive.metrics["frames"] == 8
+    assert {"map", "refine"} <= stages
+
+
+def test_a_wrong_setting_is_refused_before_anything_is_written(
+    small_recording: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(aquaflow.AquaFlowError, match="no_such"):
+        aquaflow.map_recording(small_recording, tmp_path / "dive", settings={"no_such": 1})
+    assert not (tmp_path / "dive").exists()
+
+
+def test_a_dive_has_a_row_for_every_pose(small_dive: Path) -> None:
+    dive = aquaflow.read_dive(small_dive)
+    rows = [dive.frames[row] for row in dive.frame_of_pose]
+    assert len(rows) == len(dive.trajectory) == dive.metrics["tracked"]
+    np.testing.assert_allclose([row.t_s for row in rows], dive.trajectory.t_s, atol=1e-3)
+    assert dive.sub_map_of_pose.tolist() == [row.sub_map for row in rows]
+    assert dive.camera.width == 160
+    assert dive.medium is not None
+
+
+def test_a_folder_without_a_dive_is_refused_with_its_path(tmp_path: Path) -> None:
+    for read in (aquaflow.read_dive, aquaflow.load_map):
+        with pytest.raises(aquaflow.AquaFlowError, match=str(tmp_path)):
+            read(tmp_path)
+
+
+def test_a_map_shows_what_its_camera_saw(small_dive: Path) -> None:
+    import cv2
+
+    scene = aquaflow.load_map(str(small_dive))
+    view = scene.views[len(scene.views) // 2]
+    shown = scene.render(view.T_wc)
+    picture = small_dive / "heldout" / "000008_real.png"
+    assert shown.image.shape == cv2.imread(str(picture)).shape
+    held_out = aquaflow.read_dive(small_dive)
+    [pose] = [i for i, row in enumerate(held_out.frame_of_pose) if held_out.frames[row].index == 8]
+    trajectory = held_out.trajectory
+    T_wc = Sim3(trajectory.R_wc[pose], trajectory.positions[pose])
+    seen = cv2.imread(str(picture))[..., ::-1] / 255.0
+    error = np.abs(scene.render(T_wc, held_out.camera).image - seen).mean()
+    elsewhere = np.abs(shown.image - seen).mean()
+    assert error < 0.5 * elsewhere
+
+
+def test_a_map_gives_its_gaussians_and_its_medium_as_arrays(small_dive: Path) -> None:
+    scene = aquaflow.load_map(small_dive / "map.aqf")
+    gaussians = scene.gaussians
+    assert gaussians.means.shape == (len(scene), 3)
+    np.testing.assert_allclose(np.linalg.norm(gaussians.wxyz, axis=1), 1.0, atol=1e-5)
+    assert (gaussians.scales > 0).all()
+    medium, written = scene.medium, aquaflow.read_dive(small_dive).medium
+    assert medium is not None
+    assert written is not None
+    np.testing.assert_allclose(medium.beta_a, written.beta_a, rtol=1e-4)
+    np.testing.assert_allclose(medium.b, written.b, rtol=1e-4)
+
+
+def test_what_is_done_to_the_arrays_does_not_change_the_map(small_dive: Path) -> None:
+    scene = aquaflow.load_map(small_dive)
+    before = scene.gaussians.means.copy()
+    scene.gaussians.means[:] = 0.0
+    np.testing.assert_array_equal(scene.gaussians.means, before)
