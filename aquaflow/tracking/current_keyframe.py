@@ -8,7 +8,7 @@ that one is taken up again: hovering adds none.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -132,6 +132,26 @@ class Follower:
         """[H, W] pixels of the frame that show what the keyframe shows."""
         pair, pointmap = solved.pair, at.keyframe.pointmap
         return agreeing(pointmap, pair.matches_back, pair.valid_back, solved.estimate.T, camera)
+
+    def without_hidden(
+        self, frame: Frame, at: Attachment, solved: Matched, camera: CameraModel
+    ) -> Frame:
+        """The map learns from the pixels that show what the keyframe shows."""
+        shown = self.shown(at, solved, camera)
+        return replace(frame, mask=shown if frame.mask is None else shown & frame.mask)
+
+    def at_new_keyframe(
+        self,
+        frame: Frame,
+        encoding: Encoding,
+        T_wc: Sim3,
+        pointmap: Pointmap,
+        sub_map: int,
+        motion: Sim3 | None = None,
+    ) -> Attachment:
+        """The frame as a keyframe; ``motion``: from the frame before it."""
+        keyframe = self._keyframes.add(frame.index, frame.t_ns, encoding, T_wc, pointmap, sub_map)
+        return Attachment(keyframe, frame.image, motion=motion or Sim3.identity())
 
     # --- keyframes left behind ----------------------------------------------------------------
 

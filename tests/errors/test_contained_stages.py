@@ -117,9 +117,9 @@ def test_frames_that_a_failing_tracker_held_are_accounted_for(
 ) -> None:
     begin = Tracker._begin
 
-    def lose_all(self: Tracker, initialiser: Initialiser) -> Any:
+    def lose_all(self: Tracker) -> Any:
         monkeypatch.setattr(Tracker, "_begin", begin)
-        self._initialiser = None
+        self._start._initialiser = None
         raise FloatingPointError("planted")
 
     monkeypatch.setattr(Tracker, "_begin", lose_all)

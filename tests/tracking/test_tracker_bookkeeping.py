@@ -9,9 +9,9 @@ from aquaflow.config import InitialisationConfig, TrackingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
-from aquaflow.tracking import tracker as module
 from aquaflow.tracking.frames import FrameClass
 from aquaflow.tracking.tracker import Tracker
+from aquaflow.tracking.waiting_frames import BOUNDS, Bound, Wait
 from tests.tracking.tracked_clips import (
     PLACED,
     QUICK,
@@ -57,7 +57,7 @@ def test_thinned_frames_are_filled_in_too() -> None:
 def test_frames_that_wait_for_ever_are_given_up_oldest_first(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(module, "MAX_ORPHANS", 3)
+    monkeypatch.setitem(BOUNDS, Wait.FOR_A_KEYFRAME, Bound(3, "no parallax yet"))
     prior = told(path(8), blind=range(8))
     tracker = Tracker(prior, KeyframeStore(), QUICK)
     given_up = [[t.frame.index for t in tracker.track(f)] for f in prior.frames(SMALL)]

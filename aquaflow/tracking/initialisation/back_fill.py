@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from aquaflow.errors.failures import Failures
@@ -13,6 +14,7 @@ from aquaflow.prior.contract import Encoding, Prior
 from aquaflow.tracking.current_keyframe import Attachment, Follower
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.tracking.pose.matcher import Matched
+from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class BackFill:
 
     def __init__(
         self,
-        frames: list[Frame],
+        frames: Sequence[Frame],
         at: Attachment,
         camera: CameraModel,
         prior: Prior,
@@ -51,16 +53,18 @@ class BackFill:
         failures: Failures,
     ) -> None:
         """``at``: where the newest of the frames, which come oldest first, is looked for."""
-        self.frames = frames
-        """What is left."""
+        self._indices = frozenset(frame.index for frame in frames)
         self._at, self._camera = replace(at), camera
         self._prior, self._follower, self._failures = prior, follower, failures
         self._last: _Placed | None = None
 
-    def step(self) -> Tracked:
+    def left(self, waiting: Sequence[Frame]) -> list[Frame]:
+        """Its own frames among those that still wait."""
+        return [frame for frame in waiting if frame.index in self._indices]
+
+    def step(self, frame: Frame) -> Tracked:
         """The newest frame that is left, with its pose if it has one."""
-        frame, at = self.frames.pop(), self._at
-        placed = None
+        at, placed = self._at, None
         with self._failures.contain("pose", frame.index):
             placed = self._place(frame)
         if placed is None:
@@ -83,9 +87,58 @@ class BackFill:
             return None
         return _Placed(frame, encoding, solved, at, solved.estimate.T @ T_ak)
 
+    def all(self, frames: Sequence[Frame]) -> list[Tracked]:
+        """Every one of ``frames``, those that are left; the oldest first."""
+        return [self.step(frame) for frame in reversed(frames)][::-1]
+
+
+class BackFills:
+    """Places frames that waited for a keyframe: at once or, in a live run, in its idle time."""
+
+    def __init__(
+        self,
+        waiting: WaitingFrames,
+        prior: Prior,
+        follower: Follower,
+        failures: Failures,
+        live: bool,
+    ) -> None:
+        self._waiting, self._prior, self._follower = waiting, prior, follower
+        self._failures, self._live = failures, live
+        self._left: list[BackFill] = []
+        """Those of the frames in idle time, in the order in which they are gone through."""
+
+    def start(self, at: Attachment, camera: CameraModel) -> list[Tracked]:
+        """Against ``at``, all frames that wait for a keyframe; those that are placed at once."""
+        after = Wait.IN_IDLE_TIME if self._live else Wait.IN_HAND
+        frames = self._waiting.move(Wait.FOR_A_KEYFRAME, after)
+        if not frames:
+            return []
+        fill = BackFill(frames, at, camera, self._prior, self._follower, self._failures)
+        if not self._live:
+            return fill.all(frames)
+        waiting = self._waiting.of(Wait.IN_IDLE_TIME)
+        self._left = [each for each in (*self._left, fill) if each.left(waiting)]
+        return []
+
+    @property
+    def next(self) -> Frame | None:
+        """The frame whose turn it is at :meth:`step`."""
+        waiting = self._waiting.of(Wait.IN_IDLE_TIME)
+        return next((left[-1] for fill in self._left if (left := fill.left(waiting))), None)
+
+    def step(self) -> list[Tracked]:
+        """The pose of :attr:`next`, or that it has none; nothing if no frame waits."""
+        waiting = self._waiting.of(Wait.IN_IDLE_TIME)
+        self._left = [fill for fill in self._left if fill.left(waiting)]
+        if not self._left:
+            return []
+        frame = self._left[0].left(waiting)[-1]
+        self._waiting.put([frame], Wait.IN_HAND)
+        return [self._left[0].step(frame)]
+
     def all(self) -> list[Tracked]:
-        """Every frame that is left, the oldest first."""
-        tracked = []
-        while self.frames:
-            tracked.append(self.step())
-        return tracked[::-1]
+        """Every frame that waits for idle time."""
+        waiting = self._waiting.move(Wait.IN_IDLE_TIME, Wait.IN_HAND)
+        fills, self._left = self._left, []
+        return [tracked for fill in fills for tracked in fill.all(fill.left(waiting))]

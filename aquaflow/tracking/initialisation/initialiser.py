@@ -57,8 +57,7 @@ class Initialiser:
     ) -> None:
         self.frame, self.reference = frame, reference
         self.waiting: list[Waiting] = []
-        self.thinned: list[Frame] = []
-        """Frames that were let go to bound memory; their poses can be filled in later."""
+        """Frames that see the reference, in their order."""
         self._prior, self._config = prior, config
         self._predicted: npt.NDArray[np.float32] | None = None
         self._tried_px = 0.0
@@ -78,8 +77,15 @@ class Initialiser:
         )
         self.waiting.append(Waiting(frame, pixels, observed, parallax, pair))
         self._predicted = pair.matches
-        self._thin()
         return True
+
+    def thin(self) -> list[Frame]:
+        """Go on without the frame that adds least parallax, if there are more than are kept; that
+        frame, whose pose can be filled in later."""
+        if len(self.waiting) <= self._config.max_waiting:
+            return []
+        steps = np.diff([frame.parallax_px for frame in self.waiting[:-1]])
+        return [self.waiting.pop(int(np.argmin(np.abs(steps))) + 1).frame]
 
     @property
     def parallax_px(self) -> float:
@@ -129,13 +135,6 @@ class Initialiser:
     def _pixels_reference(self) -> Array:
         rows, columns = self._samples
         return np.stack([columns + 0.5, rows + 0.5], -1)
-
-    def _thin(self) -> None:
-        """Keep the number of waiting frames bounded: drop the one that adds least parallax."""
-        if len(self.waiting) <= self._config.max_waiting:
-            return
-        steps = np.diff([frame.parallax_px for frame in self.waiting[:-1]])
-        self.thinned.append(self.waiting.pop(int(np.argmin(np.abs(steps))) + 1).frame)
 
 
 def calibrated(camera: CameraModel) -> CameraModel:

@@ -8,9 +8,9 @@ from aquaflow.config import TrackingConfig
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.messages import Frame
 from aquaflow.prior.classical import ClassicalPrior
-from aquaflow.tracking import tracker as module
 from aquaflow.tracking.frames import Tracked
 from aquaflow.tracking.tracker import Tracker
+from aquaflow.tracking.waiting_frames import BOUNDS, Bound, Wait
 from tests.tracking.tracked_clips import error_share
 from tests.tracking.tracking_scenes import SeaFloor, black, filmed, lawn_path
 
@@ -70,7 +70,7 @@ def test_the_end_of_a_dive_leaves_nobody_waiting(clip: list[Frame]) -> None:
 def test_a_run_that_never_has_time_forgets_the_oldest_and_says_so(
     clip: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "MAX_PAST", 1)
+    monkeypatch.setitem(BOUNDS, Wait.IN_IDLE_TIME, Bound(1, "no time to look back"))
     decided, newest = until_started(live(), clip)
     forgotten = [tracked.frame.index for tracked in decided if tracked.T_wc is None]
     assert forgotten == list(range(1, newest - 1))
@@ -82,7 +82,16 @@ def test_a_run_that_never_has_time_forgets_the_oldest_and_says_so(
 def test_a_frame_of_the_past_that_shows_nothing_is_lost(clip: list[Frame]) -> None:
     tracker = live()
     _, newest = until_started(tracker, clip)
-    tracker._past[0].frames[-1] = black(newest - 1)
+    tracker._waiting.put([black(newest - 1)], Wait.IN_IDLE_TIME)
     (lost,) = tracker.back_fill()
     assert lost.T_wc is None
     assert lost.reason == "no pose found"
+
+
+def test_a_run_that_is_never_lost_keeps_nothing_of_the_frames_it_placed(clip: list[Frame]) -> None:
+    tracker = live()
+    for frame in clip:
+        tracker.track(frame)
+        while tracker.past is not None:
+            tracker.back_fill()
+    assert len(tracker._back_fills._left) <= 1

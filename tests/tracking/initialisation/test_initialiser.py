@@ -48,6 +48,7 @@ def started(
     initialiser = Initialiser(frames[0], prior.encode(frames[0].image, camera), prior, config)
     for frame in frames[1:]:
         assert initialiser.add(frame, prior.encode(frame.image, camera))
+        initialiser.thin()
     return initialiser
 
 
@@ -213,9 +214,14 @@ def test_each_match_starts_from_the_one_before() -> None:
 
 def test_waiting_frames_are_thinned_and_none_is_forgotten() -> None:
     config = CONFIG.model_copy(update={"max_waiting": 3})
-    initialiser = started(prior_of(MOVING), config)
+    prior = prior_of(MOVING)
+    first, *others = prior.frames(CAMERA)
+    initialiser = Initialiser(first, prior.encode(first.image, CAMERA), prior, config)
+    thinned = []
+    for frame in others:
+        assert initialiser.add(frame, prior.encode(frame.image, CAMERA))
+        thinned += [each.index for each in initialiser.thin()]
     waiting = [w.frame.index for w in initialiser.waiting]
-    thinned = [frame.index for frame in initialiser.thinned]
     assert len(waiting) == 3
     assert sorted(waiting + thinned) == [1, 2, 3, 4, 5, 6]
     assert 6 in waiting

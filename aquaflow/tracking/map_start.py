@@ -1,0 +1,111 @@
+"""The start of a map: frames wait for a geometry, with one reference after the other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from aquaflow.config import TrackingConfig
+from aquaflow.errors.failures import Failures
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes import Pointmap
+from aquaflow.messages import Frame
+from aquaflow.prior.contract import Encoding, PairGeometry, Prior
+from aquaflow.tracking.initialisation.initialiser import Initialiser, calibrated, fused_pointmap
+from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
+
+
+@dataclass(frozen=True)
+class Posed:
+    """A frame of the start: its pose against the reference, and its matches to it."""
+
+    frame: Frame
+    T_fk: Sim3
+    pair: PairGeometry
+
+
+@dataclass(frozen=True)
+class Started:
+    """The first keyframe of a map, and the frames that were placed with it."""
+
+    reference: Frame
+    encoding: Encoding
+    """Of the reference, with ``camera``."""
+    pointmap: Pointmap
+    camera: CameraModel
+    """With the refined focal length, where it was unknown."""
+    focal_sigma: float
+    posed: list[Posed]
+
+
+class MapStart:
+    """Collects frames against a reference until their geometry is decided."""
+
+    def __init__(
+        self,
+        prior: Prior,
+        config: TrackingConfig,
+        waiting: WaitingFrames,
+        failures: Failures,
+        live: bool,
+    ) -> None:
+        """A ``live`` run goes on from the newest frame: the others wait for idle time."""
+        self._prior, self._config = prior, config
+        self._waiting, self._failures, self._live = waiting, failures, live
+        self._initialiser: Initialiser | None = None
+
+    def add(self, frame: Frame, encoding: Encoding) -> bool:
+        """Match a frame to the reference; False if that fails, or if there is none."""
+        initialiser, matched = self._initialiser, False
+        if initialiser is None:
+            return False
+        with self._failures.contain("initialisation", frame.index):
+            matched = initialiser.add(frame, encoding)
+        if matched:
+            self._waiting.put([frame], Wait.INITIALISING)
+            self._waiting.put(initialiser.thin(), Wait.THINNED)
+        return matched
+
+    @property
+    def ready(self) -> bool:
+        """True if :meth:`solve` is worth an attempt."""
+        return self._initialiser is not None and self._initialiser.ready
+
+    def solve(self) -> Started | None:
+        """The start of a map by the frames that wait; None where no geometry is good enough."""
+        initialiser, started = self._initialiser, None
+        if initialiser is None or not initialiser.waiting:
+            return None
+        with self._failures.contain("initialisation", initialiser.frame.index):
+            started = self._solve(initialiser)
+        if started is not None:
+            frames = [started.reference, *(posed.frame for posed in started.posed)]
+            self._waiting.put(frames, Wait.IN_HAND)
+            self.end()
+        return started
+
+    def _solve(self, initialiser: Initialiser) -> Started | None:
+        solution = initialiser.solve()
+        if solution is None:
+            return None
+        reference, camera = initialiser.frame, calibrated(solution.camera)
+        encoding = self._prior.encode(reference.image, camera)
+        pointmap = fused_pointmap(solution, camera, self._config.sigma_px)
+        posed = [
+            Posed(waiting.frame, T, waiting.pair)
+            for waiting, T in zip(solution.waiting, solution.T, strict=True)
+        ]
+        posed = posed[-1:] if self._live else posed
+        return Started(reference, encoding, pointmap, camera, solution.focal_sigma, posed)
+
+    def restart(self, frame: Frame, encoding: Encoding) -> None:
+        """``frame`` is the reference from here on."""
+        self.end()
+        self._initialiser = Initialiser(frame, encoding, self._prior, self._config.initialisation)
+        self._waiting.put([frame], Wait.INITIALISING)
+
+    def end(self) -> None:
+        """Frames that still wait for a geometry wait for a keyframe instead."""
+        self._initialiser = None
+        self._waiting.move(Wait.THINNED, Wait.FOR_A_KEYFRAME)
+        self._waiting.move(Wait.INITIALISING, Wait.FOR_A_KEYFRAME)

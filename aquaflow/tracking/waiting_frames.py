@@ -1,0 +1,102 @@
+"""Frames that tracking was given and that have not left it: each is in one state, and leaves once.
+
+A state holds no more than a bound: ``initialising`` thins out beyond
+``tracking.initialisation.max_waiting``, ``lost`` frames begin a new sub-map at
+``tracking.lost_after``, and where frames wait without an end the oldest leave without a pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from enum import Enum
+from typing import NamedTuple
+
+from aquaflow.messages import Frame
+from aquaflow.tracking.frames import Tracked
+
+
+class Wait(Enum):
+    """What a frame waits for. Those that still do at a dive's end are given up in this order."""
+
+    IN_HAND = "in hand"
+    """Nothing: this call of tracking decides about it."""
+    FOR_A_KEYFRAME = "for a keyframe"
+    """A keyframe that shows its place."""
+    LOST = "lost"
+    """The next frame that is placed, or so many lost ones that a new sub-map is begun."""
+    THINNED = "thinned"
+    """A keyframe; initialisation goes on without it."""
+    INITIALISING = "initialising"
+    """Enough parallax to initialisation's reference, or it is that reference."""
+    IN_IDLE_TIME = "in idle time"
+    """A moment in which a live run has no newer frame: its keyframe is there."""
+
+
+class Bound(NamedTuple):
+    """How many frames a state may hold, and why the oldest beyond that get no pose."""
+
+    most: int
+    reason: str
+
+
+BOUNDS = {
+    Wait.FOR_A_KEYFRAME: Bound(60, "no parallax yet"),
+    Wait.IN_IDLE_TIME: Bound(120, "no time to look back"),
+}
+"""Bounds memory while nothing moves, and while a live run has no time."""
+
+
+class WaitingFrames:
+    """By state, the frames in the order in which they came into it."""
+
+    def __init__(self) -> None:
+        self._frames: dict[Wait, dict[int, Frame]] = {state: {} for state in Wait}
+
+    def enter(self, frame: Frame) -> None:
+        """A frame that tracking is given; it is in hand."""
+        self._frames[Wait.IN_HAND][frame.index] = frame
+
+    def of(self, state: Wait) -> list[Frame]:
+        """The frames in ``state``."""
+        return list(self._frames[state].values())
+
+    def count(self, state: Wait) -> int:
+        return len(self._frames[state])
+
+    def put(self, frames: Iterable[Frame], state: Wait) -> None:
+        """Into ``state``, behind those in it; frames that have left stay out."""
+        for frame in frames:
+            held = [each.pop(frame.index, None) for each in self._frames.values()]
+            if any(each is not None for each in held):
+                self._frames[state][frame.index] = frame
+
+    def move(self, before: Wait, after: Wait) -> list[Frame]:
+        """All frames of one state into another; these frames."""
+        frames = self.of(before)
+        self.put(frames, after)
+        return frames
+
+    def settle(
+        self, decided: Iterable[Tracked], as_lost: Callable[[Frame, str], Tracked]
+    ) -> list[Tracked]:
+        """All frames that leave now, each once: the oldest beyond a bound, those ``decided``, and
+        those in hand that are not decided, which are lost."""
+        leaving: list[Tracked] = []
+        for state, bound in BOUNDS.items():
+            surplus = self.of(state)[: max(0, self.count(state) - bound.most)]
+            for frame in surplus:
+                del self._frames[state][frame.index]
+                leaving.append(as_lost(frame, bound.reason))
+        in_hand = self._frames[Wait.IN_HAND]
+        for tracked in decided:
+            if in_hand.pop(tracked.frame.index, None) is not None:
+                leaving.append(tracked)
+        leaving += [as_lost(frame, "no pose found") for frame in in_hand.values()]
+        in_hand.clear()
+        return leaving
+
+    def give_up(self, as_lost: Callable[[Frame, str], Tracked]) -> list[Tracked]:
+        """All frames leave without a pose."""
+        for state in Wait:
+            self.move(state, Wait.IN_HAND)
+        return self.settle([], as_lost)
