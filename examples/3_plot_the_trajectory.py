@@ -1,0 +1,43 @@
+"""Plot a trajectory with its truth and its errors.
+
+python examples/3_plot_the_trajectory.py DIVE poses.tum PLOT.png
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+import aquaflow
+from aquaflow.evaluation.trajectory import associate, read_tum
+from aquaflow.geometry.alignment import align
+
+
+def main(dive_folder: str, truth_file: str, plot: str) -> None:
+    dive, truth = aquaflow.read_dive(dive_folder), read_tum(Path(truth_file))
+    # Sub-maps that never met have no common frame of reference: take the largest.
+    sub_maps = dive.sub_map_of_pose
+    ours = dive.trajectory.select(sub_maps == np.bincount(sub_maps).argmax())
+    of_ours, of_truth = associate(ours.t_s, truth.t_s)
+    # One camera knows no metres, so the map is scaled to the truth (Sim(3) alignment).
+    found = align(ours.positions[of_ours], truth.positions[of_truth], with_scale=True)
+    aligned = found.T_target_source.apply(ours.positions[of_ours])
+    error_m = np.linalg.norm(aligned - truth.positions[of_truth], axis=1)
+    print(f"1 map unit is {found.T_target_source.scale:.3f} m")
+    print(f"absolute trajectory error: {np.sqrt((error_m**2).mean()):.4f} m RMS")
+
+    figure, (path, errors) = plt.subplots(1, 2, figsize=(10.0, 4.0), layout="constrained")
+    path.plot(*truth.positions[:, :2].T, "k-", label="truth")
+    path.plot(*aligned[:, :2].T, ".", label="AquaFlow")
+    path.set(xlabel="x, m", ylabel="y, m", aspect="equal")
+    path.legend()
+    errors.plot(ours.t_s[of_ours], 1e3 * error_m)
+    errors.set(xlabel="time, s", ylabel="position error, mm")
+    figure.savefig(plot)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
