@@ -1,5 +1,8 @@
 // Which tiles of the picture are drawn.
 #pragma once
+
+#include <cstddef>
+#include <cstdint>
 #include <vector>
 
 namespace aq {

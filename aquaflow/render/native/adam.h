@@ -6,6 +6,15 @@
 // result does not depend on the number of threads.
 #pragma once
 
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+
+#include "pool.h"
+#include "simd.h"
+
 namespace aq {
 
 // Layout shared with adam.py.

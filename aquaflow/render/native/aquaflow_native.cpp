@@ -2,36 +2,23 @@
 //
 // No torch or Python headers: the library serves every version of both. All arrays are contiguous
 // float32 in row-major order. Functions return 0, or 1 when memory ran out.
+#include <algorithm>
 #include <cstdint>
 #include <new>
 #include <stdexcept>
 
-#include "constants.h"
-#include "simd.h"
-
-#include "pool.h"
-
-#include "activity.h"
-#include "context.h"
-#include "footprint.h"
-
-#include "project.h"
-#include "tiles.h"
-
-#include "moments.h"
-
-#include "blend.h"
-#include "project_backward.h"
-
-#include "row_ring.h"
-
-#include "photometric.h"
-
 #include "adam.h"
-#include "image_formation.h"
-
+#include "blend.h"
+#include "constants.h"
+#include "context.h"
 #include "decode_view.h"
 #include "decode_view_backward.h"
+#include "image_formation.h"
+#include "photometric.h"
+#include "pool.h"
+#include "project.h"
+#include "project_backward.h"
+#include "tiles.h"
 
 #ifndef AQ_SOURCE_HASH
 #error "build with aquaflow/render/native/build.py, which passes AQ_SOURCE_HASH"

@@ -4,6 +4,19 @@
 // transmittance is recovered by division and every threshold decides exactly as it did forward.
 #pragma once
 
+#include <algorithm>
+#include <atomic>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+
+#include "constants.h"
+#include "context.h"
+#include "moments.h"
+#include "pool.h"
+#include "simd.h"
+#include "tiles.h"
+
 namespace aq {
 
 // Pixel offsets inside a block, and their products.

@@ -1,6 +1,7 @@
 // Constants of the splatting model, mirrored in aquaflow/render/contract.py; a test compares the two.
 #pragma once
 
+
 namespace aq {
 
 constexpr float kDilationPx2 = 0.3f;          // low-pass filter of EWA splatting, added to V'

@@ -1,8 +1,16 @@
 // What a forward pass leaves for its backward pass: projected Gaussians and tile lists.
 #pragma once
+
 #include <algorithm>
 #include <chrono>
+#include <cstddef>
+#include <cstdint>
+#include <ratio>
 #include <vector>
+
+#include "activity.h"
+#include "constants.h"
+#include "simd.h"
 
 namespace aq {
 

@@ -6,6 +6,16 @@
 // The definition is Decoder.residuals and apply_residuals in aquaflow/mapping/decoder/decoder.py.
 #pragma once
 
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+
+#include "image_formation.h"
+#include "pool.h"
+#include "simd.h"
+
 namespace aq {
 
 constexpr int kMaxWidth = 64, kMaxCode = 36, kResiduals = 9, kBands = 4;

@@ -1,6 +1,17 @@
 // Gradient of decode_view.h. Blocks are decoded again: that is cheaper than to keep what was in them.
 #pragma once
 
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <vector>
+
+#include "adam.h"
+#include "decode_view.h"
+#include "pool.h"
+#include "simd.h"
+
 namespace aq {
 
 // Sums over Gaussians, lane by lane: of one thread, for the weights.

@@ -2,8 +2,14 @@
 // share. Symbols as in EWA splatting (Zwicker et al. 2001): W view rotation, J Jacobian of the
 // projection, V covariance, V' = J W V W^T J^T + dilation. V = (E S)(E S)^T with E from the quaternion.
 #pragma once
+
 #include <algorithm>
 #include <cmath>
+#include <cstdint>
+
+#include "constants.h"
+#include "context.h"
+#include "simd.h"
 
 namespace aq {
 

@@ -6,7 +6,13 @@
 // Pixels are taken in blocks and turned into planes, so that every line of the arithmetic is one vector.
 #pragma once
 
+#include <algorithm>
+#include <cstddef>
 #include <cstring>
+#include <vector>
+
+#include "constants.h"
+#include "pool.h"
 
 namespace aq {
 

@@ -2,6 +2,12 @@
 // measured from its centre, and the colour gradient. One cache line per Gaussian and thread.
 #pragma once
 
+#if defined(__AVX2__)
+#include <immintrin.h>
+#endif
+
+#include "simd.h"
+
 namespace aq {
 
 enum Moment { kG, kGx, kGy, kGxx, kGxy, kGyy, kColour };

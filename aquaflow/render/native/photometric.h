@@ -7,6 +7,15 @@
 // transposed. Rows stream through rings, two at a time, so intermediate maps stay in the core's cache.
 #pragma once
 
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <vector>
+
+#include "constants.h"
+#include "pool.h"
+#include "row_ring.h"
+
 namespace aq {
 
 constexpr int kStrip = 256;  // floats of a row whose window sums are kept at a time

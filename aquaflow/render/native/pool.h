@@ -7,14 +7,19 @@
 // busy (another Python thread renders) the caller runs all parts itself, with the same result. A job whose
 // parts draw their work from a counter must itself see to it that the result does not depend on who drew.
 #pragma once
+
+#include <unistd.h>
+
 #include <atomic>
 #include <condition_variable>
+#include <cstdint>
 #include <exception>
 #include <mutex>
 #include <new>
 #include <thread>
 #include <vector>
-#include <unistd.h>
+
+#include "simd.h"
 
 namespace aq {
 

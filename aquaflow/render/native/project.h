@@ -2,6 +2,17 @@
 // lanes, so that the compiler vectorises over Gaussians.
 #pragma once
 
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+
+#include "constants.h"
+#include "context.h"
+#include "footprint.h"
+#include "pool.h"
+#include "simd.h"
+
 namespace aq {
 
 constexpr int kChunk = 64;

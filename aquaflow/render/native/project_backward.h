@@ -2,6 +2,17 @@
 // so that memory is read as a stream, and in chunks, so that the compiler vectorises over Gaussians.
 #pragma once
 
+#include <algorithm>
+#include <cstddef>
+
+#include "constants.h"
+#include "context.h"
+#include "footprint.h"
+#include "moments.h"
+#include "pool.h"
+#include "project.h"
+#include "simd.h"
+
 namespace aq {
 
 struct GaussianGradients {

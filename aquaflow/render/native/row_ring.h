@@ -1,6 +1,12 @@
 // The rows of an image's maps that a vertical window reaches, so that no map is ever kept as a whole.
 #pragma once
 
+#include <algorithm>
+#include <cstddef>
+#include <vector>
+
+#include "constants.h"
+
 namespace aq {
 
 constexpr int kSsimRadius = kSsimWindow / 2, kChannels = 3;

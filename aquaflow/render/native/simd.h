@@ -1,6 +1,7 @@
 // One vector register = one block of pixels. GCC/clang vector extensions, intrinsics only where the
 // extension is slow. Widths: 4x4 pixels for AVX-512, 4x2 for AVX2, 4x1 for SSE4 and NEON.
 #pragma once
+
 #include <cstdint>
 #if defined(__AVX2__)
 #include <immintrin.h>

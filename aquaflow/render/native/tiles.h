@@ -1,7 +1,20 @@
 // Front-to-back lists of splats for every tile: radix sort by depth, then an exact ellipse test that
 // also says which blocks of the tile a splat reaches.
 #pragma once
+
+#include <algorithm>
+#include <cstddef>
+#include <cstdint>
 #include <cstring>
+#include <stdexcept>
+#include <utility>
+#include <vector>
+
+#include "activity.h"
+#include "constants.h"
+#include "context.h"
+#include "pool.h"
+#include "simd.h"
 
 namespace aq {
 
