@@ -30,7 +30,8 @@ class ActiveTiles {
 
   bool touch(const TileBox& b) const {
     return all_ || count_before(b.x1 + 1, b.y1 + 1) - count_before(b.x0, b.y1 + 1) -
-                           count_before(b.x1 + 1, b.y0) + count_before(b.x0, b.y0) > 0;
+                           count_before(b.x1 + 1, b.y0) + count_before(b.x0, b.y0) >
+                       0;
   }
 
  private:

@@ -1,9 +1,9 @@
-// Adam over the rows (Gaussians) that were visible, each with its own step count, so that a Gaussian's
-// first visible step is a proper first step.
+// Adam over the rows (Gaussians) that were visible, each with its own step count, so that a
+// Gaussian's first visible step is a proper first step.
 //
-// In chunks of rows: rows are judged one by one, then short rows (means, scales, ...) are stepped as one
-// flat array, with each row's coefficients repeated over its elements. Without sums across rows: the
-// result does not depend on the number of threads.
+// In chunks of rows: rows are judged one by one, then short rows (means, scales, ...) are stepped
+// as one flat array, with each row's coefficients repeated over its elements. Without sums across
+// rows: the result does not depend on the number of threads.
 #pragma once
 
 #include <algorithm>
@@ -27,10 +27,11 @@ struct AdamGroup {
   float learning_rate;
 };
 
-constexpr float kLargestGradient = 1e18f;  // its square is still finite; NaN fails the comparison too
-constexpr int kAdamRows = 8192;            // of a chunk: long runs of each array; its gradients stay cached
-constexpr int kAdamBlock = 64;             // rows stepped or passed over together
-constexpr int kAdamRowsPerThread = 4096;   // fewer are done before another thread is awake
+// Its square is still finite; NaN fails the comparison too.
+constexpr float kLargestGradient = 1e18f;
+constexpr int kAdamRows = 8192;  // of a chunk: long runs of each array; its gradients stay cached
+constexpr int kAdamBlock = 64;   // rows stepped or passed over together
+constexpr int kAdamRowsPerThread = 4096;  // fewer are done before another thread is awake
 
 struct AdamStep {
   int groups;
@@ -40,8 +41,8 @@ struct AdamStep {
   int32_t* steps;          // [rows] visible steps so far
   double beta1, beta2;     // 1 - beta2 needs more digits than a float keeps
   float eps;
-  const float* bias;       // [bias_rows, 2]: 1 / (1 - beta1^t), 1 / sqrt(1 - beta2^t) for t = 1, 2, ...
-  int bias_rows;           // later steps use the last row, where both are 1
+  const float* bias;  // [bias_rows, 2]: 1 / (1 - beta1^t), 1 / sqrt(1 - beta2^t) for t = 1, 2, ...
+  int bias_rows;      // later steps use the last row, where both are 1
 };
 
 // Bias corrections of a chunk's rows; zero, which they never are, for a row that is not stepped.
@@ -57,8 +58,8 @@ struct AdamCoefficients {
 };
 
 // Always writes, if only what was there: processors are slow at masked stores.
-AQ_INLINE void step_element(const AdamCoefficients& k, float bias1, float bias2, float gradient, float& param,
-                            float& first_moment, float& second_moment) {
+AQ_INLINE void step_element(const AdamCoefficients& k, float bias1, float bias2, float gradient,
+                            float& param, float& first_moment, float& second_moment) {
   const bool stepped = bias1 > 0;
   const float x = stepped ? gradient : 0.0f;  // what is not stepped may be NaN
   const float take1 = stepped ? k.take1 : 0.0f, take2 = stepped ? k.take2 : 0.0f;
@@ -104,7 +105,8 @@ static bool sound_rows(const AdamStep& s, int begin, int rows) {
 }
 
 // Counts the steps of the rows and returns how many are visible but not sound.
-static int start_rows(const AdamStep& s, int begin, int rows, bool all_sound, float* bias1, float* bias2) {
+static int start_rows(const AdamStep& s, int begin, int rows, bool all_sound, float* bias1,
+                      float* bias2) {
   const uint8_t* visible = s.visible + begin;
   int32_t* steps = s.steps + begin;
   int skipped = 0;
@@ -159,8 +161,8 @@ static void step_long_rows(const AdamCoefficients& k, const AdamGroup& g, int be
   }
 }
 
-static void step_rows(const AdamStep& s, const AdamGroup& g, int begin, int rows, const float* bias1,
-                      const float* bias2) {
+static void step_rows(const AdamStep& s, const AdamGroup& g, int begin, int rows,
+                      const float* bias1, const float* bias2) {
   const AdamCoefficients k(s, g);
   switch (g.dim) {
     case 1: return step_short_rows<1>(k, g, begin, rows, bias1, bias2);

@@ -65,20 +65,21 @@ __attribute__((used)) const char aq_source_hash[] = "aquaflow-source:" AQ_SOURCE
 
 // Mirrored by contract.py; order as in library.py.
 AQ_EXPORT void aq_constants(double* out) {
-  const double all[] = {kDilationPx2, kMaxAlpha,      kMinAlpha,       kMinTransmittance, kNearPlane,
-                        kTangentMargin, kMinQuatNormSq, kMaxSigmaPx, kRadiusSigmas, kTile};
+  const double all[] = {kDilationPx2,   kMaxAlpha,      kMinAlpha,   kMinTransmittance, kNearPlane,
+                        kTangentMargin, kMinQuatNormSq, kMaxSigmaPx, kRadiusSigmas,     kTile};
   for (double value : all) *out++ = value;
 }
 
 AQ_EXPORT void* aq_context_new() { return new (std::nothrow) Context(); }
 AQ_EXPORT void aq_context_free(void* context) { delete static_cast<Context*>(context); }
 
-// viewmat [4, 4] world -> camera; intrinsics [4] fx fy cx cy, pixel centres at half-integers; active
-// [tiles_y, tiles_x] tiles to draw, or null for all.
+// viewmat [4, 4] world -> camera; intrinsics [4] fx fy cx cy, pixel centres at half-integers;
+// active [tiles_y, tiles_x] tiles to draw, or null for all.
 AQ_EXPORT int aq_forward(void* context, int count, int channels, int width, int height, int threads,
-               const float* means, const float* quats, const float* scales, const float* opacities,
-               const float* colours, const float* viewmat, const float* intrinsics, float* image,
-               float* alpha, uint8_t* visible, float* radius_px, const uint8_t* active) {
+                         const float* means, const float* quats, const float* scales,
+                         const float* opacities, const float* colours, const float* viewmat,
+                         const float* intrinsics, float* image, float* alpha, uint8_t* visible,
+                         float* radius_px, const uint8_t* active) {
   return guarded([&] {
     Context& ctx = *static_cast<Context*>(context);
     ctx.count = count, ctx.channels = channels;
@@ -90,15 +91,17 @@ AQ_EXPORT int aq_forward(void* context, int count, int channels, int width, int 
     const GaussianInputs in{means, quats, scales, opacities, colours};
     ctx.timed(kProject, [&] { project(ctx, in, visible, radius_px); });
     ctx.timed(kTileLists, [&] { build_tile_lists(ctx); });
-    ctx.timed(kBlend, [&] { channels == 3 ? blend<3>(ctx, image, alpha) : blend<4>(ctx, image, alpha); });
+    ctx.timed(kBlend,
+              [&] { channels == 3 ? blend<3>(ctx, image, alpha) : blend<4>(ctx, image, alpha); });
   });
 }
 
 // Needs the inputs and the image of the forward pass that the context belongs to. g_viewmat [4, 4].
-AQ_EXPORT int aq_backward(void* context, const float* means, const float* quats, const float* scales,
-                const float* opacities, const float* colours, const float* image,
-                const float* g_image, const float* g_alpha, float* g_means, float* g_quats,
-                float* g_scales, float* g_opacities, float* g_colours, float* g_viewmat) {
+AQ_EXPORT int aq_backward(void* context, const float* means, const float* quats,
+                          const float* scales, const float* opacities, const float* colours,
+                          const float* image, const float* g_image, const float* g_alpha,
+                          float* g_means, float* g_quats, float* g_scales, float* g_opacities,
+                          float* g_colours, float* g_viewmat) {
   return guarded([&] {
     Context& ctx = *static_cast<Context*>(context);
     const GaussianGradients out{g_means, g_quats, g_scales, g_opacities, g_colours};
@@ -111,21 +114,23 @@ AQ_EXPORT int aq_backward(void* context, const float* means, const float* quats,
     const GaussianInputs in{means, quats, scales, opacities, colours};
     const float* gradient = nullptr;
     ctx.timed(kBlendBackward, [&] {
-      gradient = ctx.channels == 3 ? blend_backward<3>(ctx, pixels) : blend_backward<4>(ctx, pixels);
+      gradient =
+          ctx.channels == 3 ? blend_backward<3>(ctx, pixels) : blend_backward<4>(ctx, pixels);
     });
     ctx.timed(kProjectBackward, [&] { project_backward(ctx, in, gradient, out, g_viewmat); });
   });
 }
 
-// [5] milliseconds of the context's last passes, by Stage; backward's are zero where it has not run.
+// [5] milliseconds of the context's last passes, by Stage; backward's are zero where it has not
+// run.
 AQ_EXPORT void aq_stage_ms(void* context, double* out) {
   std::copy_n(static_cast<const Context*>(context)->stage_ms, (int)kStages, out);
 }
 
 // See photometric.h. g_rendered may be null when no gradient is wanted.
 AQ_EXPORT int aq_photometric(const float* rendered, const float* target, const float* weight,
-                   const float* mask, int width, int height, float ssim_weight, int threads, float* loss,
-                   float* g_rendered) {
+                             const float* mask, int width, int height, float ssim_weight,
+                             int threads, float* loss, float* g_rendered) {
   return guarded([&] {
     *loss = photometric({rendered, target, weight, mask, width, height, ssim_weight},
                         std::min(std::max(threads, 1), kMaxThreads), g_rendered);
@@ -133,36 +138,43 @@ AQ_EXPORT int aq_photometric(const float* rendered, const float* target, const f
 }
 
 // See image_formation.h: drawn [P, 4], alpha [P] and water [15] give image [P, 3] and range [P].
-AQ_EXPORT int aq_compose_water(const float* drawn, const float* alpha, const float* water, int pixels,
-                     int threads, float* image, float* range) {
+AQ_EXPORT int aq_compose_water(const float* drawn, const float* alpha, const float* water,
+                               int pixels, int threads, float* image, float* range) {
   return guarded([&] {
-    compose_water({drawn, alpha, water, pixels}, std::min(std::max(threads, 1), kMaxThreads), image, range);
+    compose_water({drawn, alpha, water, pixels}, std::min(std::max(threads, 1), kMaxThreads), image,
+                  range);
   });
 }
 
 AQ_EXPORT int aq_compose_water_backward(const float* drawn, const float* alpha, const float* water,
-                              int pixels, int threads, const float* g_image, const float* g_range,
-                              float* g_drawn, float* g_alpha, float* g_water) {
+                                        int pixels, int threads, const float* g_image,
+                                        const float* g_range, float* g_drawn, float* g_alpha,
+                                        float* g_water) {
   return guarded([&] {
-    compose_water_backward({drawn, alpha, water, pixels}, std::min(std::max(threads, 1), kMaxThreads),
-                           g_image, g_range, g_drawn, g_alpha, g_water);
+    compose_water_backward({drawn, alpha, water, pixels},
+                           std::min(std::max(threads, 1), kMaxThreads), g_image, g_range, g_drawn,
+                           g_alpha, g_water);
   });
 }
 
 // See decode_view.h: the attributes come in as the initial ones.
-AQ_EXPORT int aq_decode_view(const DecoderView* in, int threads, float* quats, float* log_scales, float* raw_colours) {
+AQ_EXPORT int aq_decode_view(const DecoderView* in, int threads, float* quats, float* log_scales,
+                             float* raw_colours) {
   return guarded([&] {
     decode_view(*in, std::min(std::max(threads, 1), kMaxThreads), quats, log_scales, raw_colours);
   });
 }
 
-AQ_EXPORT int aq_decode_view_backward(const DecoderView* in, int threads, const DecoderGradients* out) {
-  return guarded([&] { decode_view_backward(*in, std::min(std::max(threads, 1), kMaxThreads), *out); });
+AQ_EXPORT int aq_decode_view_backward(const DecoderView* in, int threads,
+                                      const DecoderGradients* out) {
+  return guarded(
+      [&] { decode_view_backward(*in, std::min(std::max(threads, 1), kMaxThreads), *out); });
 }
 
 // See adam.h. Returns the number of visible rows skipped for a non-finite gradient.
 AQ_EXPORT int aq_adam_step(int groups, const AdamGroup* group, int rows, const uint8_t* visible,
-                 int32_t* steps, double beta1, double beta2, float eps, const float* bias, int bias_rows, int threads) {
+                           int32_t* steps, double beta1, double beta2, float eps, const float* bias,
+                           int bias_rows, int threads) {
   return adam_step({groups, group, rows, visible, steps, beta1, beta2, eps, bias, bias_rows},
                    std::min(std::max(threads, 1), kMaxThreads));
 }

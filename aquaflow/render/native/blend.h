@@ -1,4 +1,5 @@
-// Drawing: every tile blends its splats front to back; backward walks the same lists in the same order.
+// Drawing: every tile blends its splats front to back; backward walks the same lists in the same
+// order.
 //
 // Front-to-back backward: what lies behind a splat is the pixel's total minus the prefix, so no
 // transmittance is recovered by division and every threshold decides exactly as it did forward.
@@ -36,13 +37,14 @@ AQ_INLINE BlockPixels block_pixels() {
   return p;
 }
 
-// First-order part of a splat's exponent at every block's corner: the exponent at offset (x, y) in a
-// block is value + slope_x x + slope_y y + (qa x^2 + qb x y + qc y^2).
+// First-order part of a splat's exponent at every block's corner: the exponent at offset (x, y) in
+// a block is value + slope_x x + slope_y y + (qa x^2 + qb x y + qc y^2).
 struct alignas(kCacheLine) BlockExpansion {
   float value[kBlockVecs * kLanes], slope_x[kBlockVecs * kLanes], slope_y[kBlockVecs * kLanes];
 };
 
-AQ_INLINE void expand(const Splat& s, float u, float v, const BlockCorners& corners, BlockExpansion& e) {
+AQ_INLINE void expand(const Splat& s, float u, float v, const BlockCorners& corners,
+                      BlockExpansion& e) {
   for (int j = 0; j < kBlockVecs; j++) {
     const Vec dx = corners.x[j] - u, dy = corners.y[j] - v;
     const Vec slope_x = (2 * s.qa) * dx + s.qb * dy, slope_y = (2 * s.qc) * dy + s.qb * dx;
@@ -101,7 +103,8 @@ static int64_t blend_tile(Context& ctx, int tile, float* image, float* alpha) {
   int64_t work = kTileWork;
   const TileEntry* entries = ctx.entries.data();
   for (int k = ctx.tile_offset[tile]; k < end && live; k++) {
-    if (k + kPrefetchDistance < end) __builtin_prefetch(&ctx.splats[entries[k + kPrefetchDistance].splat]);
+    if (k + kPrefetchDistance < end)
+      __builtin_prefetch(&ctx.splats[entries[k + kPrefetchDistance].splat]);
     BlockMask blocks = entries[k].blocks & live;
     if (!blocks) continue;
     const Splat& s = ctx.splats[entries[k].splat];
@@ -172,7 +175,8 @@ AQ_INLINE void centre_moments(const BlockPixels& px, float u, float v, MomentLan
 }
 
 template <int C>
-static void blend_tile_backward(const Context& ctx, int tile, const ImageGradients& g, float* gradient) {
+static void blend_tile_backward(const Context& ctx, int tile, const ImageGradients& g,
+                                float* gradient) {
   const BlockPixels px = block_pixels();
   const BlockCorners corners = block_corners();
   const int left = tile % ctx.tiles_x * kTile, top = tile / ctx.tiles_x * kTile;
@@ -216,8 +220,8 @@ static void blend_tile_backward(const Context& ctx, int tile, const ImageGradien
       const Vec own = w * dot, behind = at.behind - own;
       at.behind = behind;
       // a clamped alpha has no gradient
-      const Vec ga = keep(greater(splat(kMaxAlpha), raw),
-                          own - behind * (alpha / (splat(1.0f) - alpha)));
+      const Vec ga =
+          keep(greater(splat(kMaxAlpha), raw), own - behind * (alpha / (splat(1.0f) - alpha)));
 #pragma GCC unroll 4
       for (int c = 0; c < C; c++) m.lane[kColour + c] += w * at.g_colour[c];
       m.lane[kG] += ga;
@@ -232,7 +236,8 @@ static void blend_tile_backward(const Context& ctx, int tile, const ImageGradien
   }
 }
 
-// Threads take tiles as they come: no tile depends on another, so the picture does not depend on that.
+// Threads take tiles as they come: no tile depends on another, so the picture does not depend on
+// that.
 template <int C>
 static void blend(Context& ctx, float* image, float* alpha) {
   ctx.transmittance.resize((size_t)ctx.camera.width * ctx.camera.height);

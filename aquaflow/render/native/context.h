@@ -45,8 +45,8 @@ struct BlockOffsets {
 };
 constexpr BlockOffsets kOffsets;
 
-// A projected Gaussian, one cache line. log2 alpha(x, y) = qa dx^2 + qb dx dy + qc dy^2 + log2_opacity
-// with dx = x - u, dy = y - v and pixel centres at whole numbers.
+// A projected Gaussian, one cache line. log2 alpha(x, y) = qa dx^2 + qb dx dy + qc dy^2 +
+// log2_opacity with dx = x - u, dy = y - v and pixel centres at whole numbers.
 struct alignas(kCacheLine) Splat {
   float u, v, qa, qb, qc, log2_opacity;
   float colour[4];
@@ -57,8 +57,8 @@ struct alignas(kCacheLine) Splat {
 static_assert(sizeof(Splat) == kCacheLine, "a splat must fill one cache line");
 
 struct Camera {
-  float w[3][3], d[3];                    // world -> camera: t = w x + d
-  float fx, fy, cx, cy;                   // pixels
+  float w[3][3], d[3];                               // world -> camera: t = w x + d
+  float fx, fy, cx, cy;                              // pixels
   float tan_x_min, tan_x_max, tan_y_min, tan_y_max;  // where the Jacobian's ray is clamped
   int width, height;
 };
@@ -85,22 +85,22 @@ struct AlignedBuffer {
 };
 
 struct Context {
-  double stage_ms[kStages] = {};          // wall time; backward's are zero until it has run
+  double stage_ms[kStages] = {};  // wall time; backward's are zero until it has run
   int count = 0, visible = 0, threads = 1, channels = 3;
   int tiles_x = 0, tiles_y = 0;
   Camera camera{};
   ActiveTiles active;
-  std::vector<Splat> splats;              // [count], storage order
-  std::vector<float> depth;               // [count], metres; negative = culled
-  std::vector<uint32_t> key, key_swap;    // radix sort
+  std::vector<Splat> splats;            // [count], storage order
+  std::vector<float> depth;             // [count], metres; negative = culled
+  std::vector<uint32_t> key, key_swap;  // radix sort
   std::vector<uint32_t> order, order_swap;
-  std::vector<int32_t> tile_offset;       // [tiles + 1]
-  std::vector<int32_t> tile_cursor;       // [threads, tiles]
-  std::vector<std::vector<TileHit>> hits; // per thread
-  std::vector<TileEntry> entries;         // front to back inside each tile
-  std::vector<float> transmittance;       // [H, W] what is left behind the last Gaussian
-  std::vector<int64_t> work_before;       // [tiles + 1] work of drawing the tiles before
-  AlignedBuffer<float> gradient;          // [threads, count, kGradientFloats]
+  std::vector<int32_t> tile_offset;        // [tiles + 1]
+  std::vector<int32_t> tile_cursor;        // [threads, tiles]
+  std::vector<std::vector<TileHit>> hits;  // per thread
+  std::vector<TileEntry> entries;          // front to back inside each tile
+  std::vector<float> transmittance;        // [H, W] what is left behind the last Gaussian
+  std::vector<int64_t> work_before;        // [tiles + 1] work of drawing the tiles before
+  AlignedBuffer<float> gradient;           // [threads, count, kGradientFloats]
 
   int tiles() const { return tiles_x * tiles_y; }
 
@@ -108,7 +108,8 @@ struct Context {
   void timed(Stage stage, const Work& work) {
     const auto start = std::chrono::steady_clock::now();
     work();
-    const std::chrono::duration<double, std::milli> passed = std::chrono::steady_clock::now() - start;
+    const std::chrono::duration<double, std::milli> passed =
+        std::chrono::steady_clock::now() - start;
     stage_ms[stage] = passed.count();
   }
 
@@ -116,12 +117,13 @@ struct Context {
   // splats in the core's cache.
   int first_tile(int part) const {
     const int64_t target = work_before.back() * part / threads;
-    return (int)(std::lower_bound(work_before.begin(), work_before.end(), target) - work_before.begin());
+    return (int)(std::lower_bound(work_before.begin(), work_before.end(), target) -
+                 work_before.begin());
   }
 };
 
-// The tiles that the box around a splat's ellipse touches on the picture; some tile for a culled splat,
-// whose numbers may be none (zero comes first: it wins against NaN).
+// The tiles that the box around a splat's ellipse touches on the picture; some tile for a culled
+// splat, whose numbers may be none (zero comes first: it wins against NaN).
 AQ_INLINE TileBox tile_box(const Context& ctx, const Splat& s) {
   const auto clamped = [](float pixel, int tiles) {
     return (int)std::min(std::max(0.0f, pixel * (1.0f / kTile)), (float)(tiles - 1));

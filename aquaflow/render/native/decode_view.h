@@ -1,9 +1,12 @@
-// The part of the neural Gaussians' decoder that knows the view (paper, Sec. 3.3.1), forward and backward:
+// The part of the neural Gaussians' decoder that knows the view (paper, Sec. 3.3.1), forward and
+// backward:
 //
-//   o = [v, d],  h = relu(trunk + W gamma(o)),  r = tanh(heads h + bias) limits,  attributes = initial + r
+//   o = [v, d],  h = relu(trunk + W gamma(o)),  r = tanh(heads h + bias) limits,  attributes =
+//   initial + r
 //
-// Gaussians are taken in blocks, one lane each, so that every line of the arithmetic is a vector of them.
-// The definition is Decoder.residuals and apply_residuals in aquaflow/mapping/decoder/decoder.py.
+// Gaussians are taken in blocks, one lane each, so that every line of the arithmetic is a vector of
+// them. The definition is Decoder.residuals and apply_residuals in
+// aquaflow/mapping/decoder/decoder.py.
 #pragma once
 
 #include <algorithm>
@@ -20,21 +23,22 @@ namespace aq {
 
 constexpr int kMaxWidth = 64, kMaxCode = 36, kResiduals = 9, kBands = 4;
 constexpr int kVecs = 2, kCrowd = kVecs * kLanes;  // Gaussians of a block
-constexpr int kUnits = 4;                          // hidden units whose sums are in registers at once
+constexpr int kUnits = 4;  // hidden units whose sums are in registers at once
 constexpr float kFurthest = 16.0f, kNearest = 1e-6f;  // of observation.py
 constexpr float kPi = 3.14159265358979f;
 
 typedef Vec Lanes[kVecs];  // one number of each Gaussian of a block
 
 struct DecoderView {
-  int count, width, code;            // Gaussians decoded, d, length of gamma(o): 36, or 27 without distance
-  const int64_t *rows, *places;      // [count] Gaussian, and row of its trunk; each at most once
-  const float* means;                // [N, 3]
-  const float* centre;               // [3] of the camera
-  const float* trunk;                // [P, d]
-  const float* view;                 // [d, code]
-  const float *heads, *bias, *limits;  // [9, d / 2], [9], [9]: six of geometry on the first half of h
-  const float* quats;                // [N, 4] initial
+  int count, width, code;  // Gaussians decoded, d, length of gamma(o): 36, or 27 without distance
+  const int64_t *rows, *places;  // [count] Gaussian, and row of its trunk; each at most once
+  const float* means;            // [N, 3]
+  const float* centre;           // [3] of the camera
+  const float* trunk;            // [P, d]
+  const float* view;             // [d, code]
+  const float *heads, *bias,
+      *limits;         // [9, d / 2], [9], [9]: six of geometry on the first half of h
+  const float* quats;  // [N, 4] initial
 };
 
 // What a block of Gaussians is decoded to, and all that its gradient needs.
@@ -47,7 +51,8 @@ struct DecodedBlock {
 AQ_INLINE void load(const float* from, Lanes& to) { std::memcpy(&to, from, sizeof to); }
 AQ_INLINE void store(const Lanes& from, float* to) { std::memcpy(to, &from, sizeof from); }
 
-// sin and cos of pi x for |x| <= kFurthest, absolute error 2e-7: the period, then its half, folded away.
+// sin and cos of pi x for |x| <= kFurthest, absolute error 2e-7: the period, then its half, folded
+// away.
 AQ_INLINE void sin_cos_pi(float x, float& sine, float& cosine) {
   const float half = 0.5f * x;
   float t = x - 2.0f * (float)(int)(half + (half < 0 ? -0.5f : 0.5f));
@@ -86,7 +91,8 @@ static void encode(const DecoderView& in, int first, DecodedBlock& block) {
 #pragma omp simd
     for (int i = 0; i < kCrowd; i++) sin_cos_pi(o[c][i], sine[c][i], cosine[c][i]);
     for (int level = 0; level < kBands; level++) {
-      float *s = block.code[inputs * (1 + 2 * level) + c], *k = block.code[inputs * (2 + 2 * level) + c];
+      float *s = block.code[inputs * (1 + 2 * level) + c],
+            *k = block.code[inputs * (2 + 2 * level) + c];
 #pragma omp simd
       for (int i = 0; i < kCrowd; i++) {
         s[i] = sine[c][i], k[i] = cosine[c][i];
@@ -130,7 +136,7 @@ static void decode_block(const DecoderView& in, int first, DecodedBlock& block) 
     }
   }
   for (int r = 0; r < kResiduals; r++) {
-    const float(*h)[kCrowd] = block.hidden + (r < 6 ? 0 : half);
+    const float (*h)[kCrowd] = block.hidden + (r < 6 ? 0 : half);
     Lanes sum;
     for (int v = 0; v < kVecs; v++) sum[v] = splat(in.bias[r]);
     for (int j = 0; j < half; j++) {

@@ -1,4 +1,5 @@
-// Gradient of decode_view.h. Blocks are decoded again: that is cheaper than to keep what was in them.
+// Gradient of decode_view.h. Blocks are decoded again: that is cheaper than to keep what was in
+// them.
 #pragma once
 
 #include <cmath>
@@ -36,9 +37,9 @@ struct WeightSums {
 
 struct DecoderGradients {
   const float *log_scales, *raw_colours;  // [N, 3], also the gradients of the initial ones
-  float* quats;                           // [N, 4] comes in of the decoded ones, goes out of the initial
-  float* trunk;                           // [P, d]; places that were not decoded are left as they are
-  float *view, *heads, *bias;             // [d, code], [9, d / 2], [9]
+  float* quats;                // [N, 4] comes in of the decoded ones, goes out of the initial
+  float* trunk;                // [P, d]; places that were not decoded are left as they are
+  float *view, *heads, *bias;  // [d, code], [9, d / 2], [9]
 };
 
 // Of the heads' outputs before tanh, [9] rows of the block; zero for padding.
@@ -62,7 +63,8 @@ static void residual_gradients(const DecoderView& in, int first, const DecodedBl
   for (int r = 0; r < kResiduals; r++) {
     const float limit = in.limits[r], inverse = 1.0f / limit;
 #pragma omp simd
-    for (int i = 0; i < kCrowd; i++) {  // what is not sound, or no number, must not reach the weights
+    for (int i = 0; i < kCrowd;
+         i++) {  // what is not sound, or no number, must not reach the weights
       const float t = block.residual[r][i] * inverse, x = g[r][i] * limit * (1.0f - t * t);
       g[r][i] = block.sound[i] > 0.0f && std::fabs(x) < kLargestGradient ? x : 0.0f;
     }
@@ -72,7 +74,8 @@ static void residual_gradients(const DecoderView& in, int first, const DecodedBl
 static void block_backward(const DecoderView& in, int first, const DecodedBlock& block,
                            const DecoderGradients& out, WeightSums& sums) {
   const int half = in.width / 2;
-  const size_t heads_at = (size_t)in.width * in.code, bias_at = heads_at + (size_t)kResiduals * half;
+  const size_t heads_at = (size_t)in.width * in.code,
+               bias_at = heads_at + (size_t)kResiduals * half;
   alignas(64) float g[kResiduals][kCrowd], g_hidden[kMaxWidth][kCrowd];
   residual_gradients(in, first, block, out, g);
   Lanes one;
@@ -122,8 +125,9 @@ inline void decode_view_backward(const DecoderView& in, int threads, const Decod
   for (size_t weight = 0; weight < view + heads + kResiduals; weight++) {
     double total = 0;
     for (const WeightSums& part : sums) total += part.total(weight);
-    float* at = weight < view ? out.view + weight
-                : weight < view + heads ? out.heads + (weight - view) : out.bias + (weight - view - heads);
+    float* at = weight < view           ? out.view + weight
+                : weight < view + heads ? out.heads + (weight - view)
+                                        : out.bias + (weight - view - heads);
     *at = (float)total;
   }
 }

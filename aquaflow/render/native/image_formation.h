@@ -2,8 +2,9 @@
 //
 //   I = J exp(-beta z) + a (B_inf (1 - exp(-b z)) + B_res exp(-d z)) + (1 - a) B_inf
 //
-// per pixel and channel, with J premultiplied by alpha a, and z = accumulated range / max(a, kMinSolid).
-// Pixels are taken in blocks and turned into planes, so that every line of the arithmetic is one vector.
+// per pixel and channel, with J premultiplied by alpha a, and z = accumulated range / max(a,
+// kMinSolid). Pixels are taken in blocks and turned into planes, so that every line of the
+// arithmetic is one vector.
 #pragma once
 
 #include <algorithm>
@@ -23,8 +24,8 @@ constexpr int kWater = 15, kBlock = 64;
 // Each [3] RGB, in this order.
 enum WaterRow { kBeta, kBInf, kScatter, kBRes, kDecay };
 
-// exp(-x) for 0 <= x <= kMaxOpticalDepth, relative error 2e-7: 2^n by the exponent bits, the rest by
-// the Taylor series of 2^f on [-1/2, 1/2].
+// exp(-x) for 0 <= x <= kMaxOpticalDepth, relative error 2e-7: 2^n by the exponent bits, the rest
+// by the Taylor series of 2^f on [-1/2, 1/2].
 inline float exp_negative(float x) {
   const float y = -kLog2e * x;
   const int n = (int)(y - 0.5f);
@@ -54,12 +55,14 @@ struct WaterBlock {
       solid[i] = std::max(a[i], kMinSolid);
       z[i] = drawn[4 * i + 3] / solid[i];
     }
-    for (int i = n; i < kBlock; i++) J[0][i] = J[1][i] = J[2][i] = a[i] = z[i] = 0.0f, solid[i] = 1.0f;
+    for (int i = n; i < kBlock; i++)
+      J[0][i] = J[1][i] = J[2][i] = a[i] = z[i] = 0.0f, solid[i] = 1.0f;
   }
 
   void attenuate(const float* water) {
     for (int c = 0; c < 3; c++) {
-      const float beta = water[3 * kBeta + c], b = water[3 * kScatter + c], d = water[3 * kDecay + c];
+      const float beta = water[3 * kBeta + c], b = water[3 * kScatter + c],
+                  d = water[3 * kDecay + c];
 #pragma omp simd
       for (int i = 0; i < kBlock; i++) {
         const float range = std::max(z[i], 0.0f);
@@ -89,7 +92,8 @@ inline void compose_water(const WaterImages& in, int threads, float* image, floa
         const float B_inf = in.water[3 * kBInf + c], B_res = in.water[3 * kBRes + c];
         float* out = image + 3 * (size_t)first + c;
         for (int i = 0; i < n; i++)
-          out[3 * i] = block.J[c][i] * block.T[c][i] + B_inf * (1.0f - block.a[i] * block.far[c][i]) +
+          out[3 * i] = block.J[c][i] * block.T[c][i] +
+                       B_inf * (1.0f - block.a[i] * block.far[c][i]) +
                        block.a[i] * B_res * block.near[c][i];
       }
     }
@@ -97,10 +101,12 @@ inline void compose_water(const WaterImages& in, int threads, float* image, floa
 }
 
 // Gradients of one block; sums over its pixels go to g_water [15] in double.
-inline void water_block_backward(const WaterBlock& block, const float* water, const float (*g)[kBlock],
-                                 float (*g_J)[kBlock], float* g_a, float* g_z, double* g_water) {
+inline void water_block_backward(const WaterBlock& block, const float* water,
+                                 const float (*g)[kBlock], float (*g_J)[kBlock], float* g_a,
+                                 float* g_z, double* g_water) {
   for (int c = 0; c < 3; c++) {
-    const float beta = water[3 * kBeta + c], B_inf = water[3 * kBInf + c], b = water[3 * kScatter + c];
+    const float beta = water[3 * kBeta + c], B_inf = water[3 * kBInf + c],
+                b = water[3 * kScatter + c];
     const float B_res = water[3 * kBRes + c], d = water[3 * kDecay + c];
     float s_beta = 0, s_inf = 0, s_b = 0, s_res = 0, s_d = 0;
 #pragma omp simd reduction(+ : s_beta, s_inf, s_b, s_res, s_d)
@@ -124,7 +130,8 @@ inline void water_block_backward(const WaterBlock& block, const float* water, co
 
 // g_image [P, 3] and g_range [P] come in; g_drawn [P, 4], g_alpha [P] and g_water [15] go out.
 inline void compose_water_backward(const WaterImages& in, int threads, const float* g_image,
-                                   const float* g_range, float* g_drawn, float* g_alpha, float* g_water) {
+                                   const float* g_range, float* g_drawn, float* g_alpha,
+                                   float* g_water) {
   std::vector<double> sums((size_t)threads * kWater, 0.0);
   Pool::run(threads, [&](int part) {
     WaterBlock block;

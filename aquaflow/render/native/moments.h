@@ -1,5 +1,5 @@
-// What the tiles sum up for one Gaussian: moments of g = alpha dL/dalpha over its pixels, with dx, dy
-// measured from its centre, and the colour gradient. One cache line per Gaussian and thread.
+// What the tiles sum up for one Gaussian: moments of g = alpha dL/dalpha over its pixels, with dx,
+// dy measured from its centre, and the colour gradient. One cache line per Gaussian and thread.
 #pragma once
 
 #if defined(__AVX2__)

@@ -2,9 +2,10 @@
 //
 //   (1 - l) mean(weight |M (rendered - target)|) + l (1 - mean(SSIM(M rendered, M target)))
 //
-// SSIM as Wang et al. 2004: 11 x 11 Gaussian window, sigma 1.5, images padded with zeros, mean over all
-// pixels and channels. Images are [H, W, 3]: a horizontal tap is three floats away, so no plane is ever
-// transposed. Rows stream through rings, two at a time, so intermediate maps stay in the core's cache.
+// SSIM as Wang et al. 2004: 11 x 11 Gaussian window, sigma 1.5, images padded with zeros, mean over
+// all pixels and channels. Images are [H, W, 3]: a horizontal tap is three floats away, so no plane
+// is ever transposed. Rows stream through rings, two at a time, so intermediate maps stay in the
+// core's cache.
 #pragma once
 
 #include <algorithm>
@@ -115,7 +116,8 @@ class PhotometricBand {
 
   // Vertical window sums of a ring's map for rows y and y + 1, floats [begin, begin + size).
   template <int Maps>
-  void window_sums(RowRing<Maps>& ring, int map, int y, int begin, int size, float* first, float* second) const {
+  void window_sums(RowRing<Maps>& ring, int map, int y, int begin, int size, float* first,
+                   float* second) const {
     const float* rows[kSsimWindow + 1];
     for (int k = 0; k <= kSsimWindow; k++) rows[k] = ring.row(y + k - kSsimRadius, map) + begin;
     const SsimTaps taps = taps_;
@@ -173,7 +175,8 @@ class PhotometricBand {
   void ssim_gradient_row(int y) {
     const SsimTaps taps = taps_;
     const float* from[kPartials];
-    for (int map = 0; map < kPartials; map++) from[map] = columns_.row(y, map) - kSsimRadius * kChannels;
+    for (int map = 0; map < kPartials; map++)
+      from[map] = columns_.row(y, map) - kSsimRadius * kChannels;
     const float *x = masked_.row(y, 0), *t = masked_.row(y, 1);
     float* to = gradient_ + (size_t)y * n_;
     const float scale = -ssim_scale_;
@@ -193,7 +196,8 @@ class PhotometricBand {
   void finish_rows(int begin, int end) {
     if (gradient_)
       for (int map = 0; map < kPartials; map++)
-        window_sums(partials_, map, begin, 0, n_, columns_.row(begin, map), columns_.row(begin + 1, map));
+        window_sums(partials_, map, begin, 0, n_, columns_.row(begin, map),
+                    columns_.row(begin + 1, map));
     for (int y = begin; y < end; y++) finish_row(y);
   }
 
@@ -228,12 +232,12 @@ class PhotometricBand {
   RowRing<1> squares_, product_;      // x^2 + y^2, x y
   RowRing<kStatistics> blurred_;
   RowRing<kPartials> partials_;
-  RowRing<kPartials> columns_;        // vertical window sums of the partials
+  RowRing<kPartials> columns_;  // vertical window sums of the partials
   const SsimTaps taps_;
 };
 
-// Returns the loss; writes dL/drendered [H, W, 3] unless `gradient` is null. Rows are summed in order,
-// and bands begin at the first of two rows: nothing depends on the number of threads.
+// Returns the loss; writes dL/drendered [H, W, 3] unless `gradient` is null. Rows are summed in
+// order, and bands begin at the first of two rows: nothing depends on the number of threads.
 static float photometric(const PhotometricInput& in, int threads, float* gradient) {
   std::vector<double> row_loss(in.height, 0.0);
   Pool::run(threads, [&](int part) {

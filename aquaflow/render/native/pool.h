@@ -1,11 +1,12 @@
 // A small persistent pool of threads with a static schedule.
 //
-// run(n, job) calls job(0) ... job(n - 1) once each. What a part computes depends on its number only,
-// never on the thread that ran it, so results repeat bit for bit at a given n. Part k is offered to
-// thread k, whose cache may still hold what it worked on before; the caller takes what nobody has begun
-// when its own part is done, so that a machine busy with other programs costs no wait. When the pool is
-// busy (another Python thread renders) the caller runs all parts itself, with the same result. A job whose
-// parts draw their work from a counter must itself see to it that the result does not depend on who drew.
+// run(n, job) calls job(0) ... job(n - 1) once each. What a part computes depends on its number
+// only, never on the thread that ran it, so results repeat bit for bit at a given n. Part k is
+// offered to thread k, whose cache may still hold what it worked on before; the caller takes what
+// nobody has begun when its own part is done, so that a machine busy with other programs costs no
+// wait. When the pool is busy (another Python thread renders) the caller runs all parts itself,
+// with the same result. A job whose parts draw their work from a counter must itself see to it that
+// the result does not depend on who drew.
 #pragma once
 
 #include <unistd.h>
@@ -61,8 +62,8 @@ class Pool {
     (*static_cast<const Job*>(job))(part);
   }
 
-  // Threads do not survive fork(): a child process gets a pool of its own, the parent's is left alone.
-  // Null where there is no memory for it.
+  // Threads do not survive fork(): a child process gets a pool of its own, the parent's is left
+  // alone. Null where there is no memory for it.
   static Pool* instance() {
     static std::mutex guard;
     static Pool* pool = nullptr;
@@ -89,7 +90,8 @@ class Pool {
     job_ = job;
     unfinished_.store(helpers, std::memory_order_relaxed);
     const uint64_t round = round_ + 1;
-    for (int part = 1; part <= helpers; part++) offered_[part].store(round, std::memory_order_release);
+    for (int part = 1; part <= helpers; part++)
+      offered_[part].store(round, std::memory_order_release);
     {
       std::lock_guard<std::mutex> lock(sleep_);
       round_.store(round, std::memory_order_release);
@@ -98,16 +100,17 @@ class Pool {
     return true;
   }
 
-  // Runs the part if it is still on offer in this round. A thread that wakes too late finds nothing: the
-  // round does not end, and its job does not go away, before every part has been taken.
+  // Runs the part if it is still on offer in this round. A thread that wakes too late finds
+  // nothing: the round does not end, and its job does not go away, before every part has been
+  // taken.
   void take(int part, uint64_t round) {
     if (!offered_[part].compare_exchange_strong(round, 0, std::memory_order_acq_rel)) return;
     attempt(part);
     unfinished_.fetch_sub(1, std::memory_order_release);
   }
 
-  // An exception must leave neither a thread (it would end the process) nor run() while others work on
-  // the job. Kernels throw only when memory runs out.
+  // An exception must leave neither a thread (it would end the process) nor run() while others work
+  // on the job. Kernels throw only when memory runs out.
   void attempt(int part) {
     try {
       call_(job_, part);
@@ -118,8 +121,10 @@ class Pool {
 
   void finish() {
     for (int spins = 0; unfinished_.load(std::memory_order_acquire) != 0; spins++) {
-      if (spins < kSpinsBeforeSleep) spin_pause();
-      else std::this_thread::yield();
+      if (spins < kSpinsBeforeSleep)
+        spin_pause();
+      else
+        std::this_thread::yield();
     }
   }
 
@@ -149,7 +154,8 @@ class Pool {
   const void* job_ = nullptr;
 };
 
-// [begin, end) of part number `part` when `count` items are cut into `parts` runs of whole `grain`s.
+// [begin, end) of part number `part` when `count` items are cut into `parts` runs of whole
+// `grain`s.
 AQ_INLINE int part_begin(int count, int grain, int parts, int part) {
   const int64_t grains = (count + grain - 1) / grain;
   const int64_t begin = grains * part / parts * grain;

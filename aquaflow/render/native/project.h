@@ -1,5 +1,5 @@
-// Projection of all Gaussians: one Splat, one depth and one radius each. Chunks of structure-of-arrays
-// lanes, so that the compiler vectorises over Gaussians.
+// Projection of all Gaussians: one Splat, one depth and one radius each. Chunks of
+// structure-of-arrays lanes, so that the compiler vectorises over Gaussians.
 #pragma once
 
 #include <algorithm>
@@ -50,11 +50,11 @@ AQ_INLINE void project_one(const Camera& cam, const Mat3& W, Vec3 mean, Quat qua
   const float extent_x = std::sqrt(std::max(reach, 0.0f) * xx);
   const float extent_y = std::sqrt(std::max(reach, 0.0f) * yy);
   const float half_gap = 0.5f * (xx - yy);
-  const float sigma = std::sqrt(
-      0.5f * (xx + yy) + std::sqrt(half_gap * half_gap + covariance * covariance));
-  const bool sound = finite3(mean) & finite3(scale) & (scale.x > 0) & (scale.y > 0) & (scale.z > 0) &
-                     (f.quat_norm_sq > kMinQuatNormSq) & (f.quat_norm_sq < HUGE_VALF) &
-                     (opacity < HUGE_VALF) & (sigma < kMaxSigmaPx);
+  const float sigma =
+      std::sqrt(0.5f * (xx + yy) + std::sqrt(half_gap * half_gap + covariance * covariance));
+  const bool sound = finite3(mean) & finite3(scale) & (scale.x > 0) & (scale.y > 0) &
+                     (scale.z > 0) & (f.quat_norm_sq > kMinQuatNormSq) &
+                     (f.quat_norm_sq < HUGE_VALF) & (opacity < HUGE_VALF) & (sigma < kMaxSigmaPx);
   const bool seen = (f.t.z > kNearPlane) & (opacity > kMinAlpha) & (u + extent_x > 0) &
                     (u - extent_x < cam.width) & (v + extent_y > 0) & (v - extent_y < cam.height);
   const bool ok = sound & seen;
@@ -88,8 +88,8 @@ AQ_INLINE Splat make_splat(const ProjectedChunk& p, int j, const float* colour, 
   return s;
 }
 
-static void project_chunk(Context& ctx, const GaussianInputs& in, int begin, int size, uint8_t* visible,
-                          float* radius_px) {
+static void project_chunk(Context& ctx, const GaussianInputs& in, int begin, int size,
+                          uint8_t* visible, float* radius_px) {
   ProjectedChunk p;
   const Camera cam = ctx.camera;
   const Mat3 W = view_rotation(cam);

@@ -1,5 +1,6 @@
-// From gradients of the splats to gradients of the Gaussians and of the view matrix. In storage order,
-// so that memory is read as a stream, and in chunks, so that the compiler vectorises over Gaussians.
+// From gradients of the splats to gradients of the Gaussians and of the view matrix. In storage
+// order, so that memory is read as a stream, and in chunks, so that the compiler vectorises over
+// Gaussians.
 #pragma once
 
 #include <algorithm>
@@ -50,7 +51,8 @@ AQ_INLINE CovarianceGradient covariance_gradient(float a, float b, float c, floa
 }
 
 AQ_INLINE Quat quat_gradient(Quat q, float inverse_norm, const Mat3& g) {
-  const float gw = 2 * (q.x * (g.r2.y - g.r1.z) + q.y * (g.r0.z - g.r2.x) + q.z * (g.r1.x - g.r0.y));
+  const float gw =
+      2 * (q.x * (g.r2.y - g.r1.z) + q.y * (g.r0.z - g.r2.x) + q.z * (g.r1.x - g.r0.y));
   const float gx = 2 * (-2 * q.x * (g.r1.y + g.r2.z) + q.y * (g.r0.y + g.r1.x) +
                         q.z * (g.r0.z + g.r2.x) + q.w * (g.r2.y - g.r1.z));
   const float gy = 2 * (q.x * (g.r0.y + g.r1.x) - 2 * q.y * (g.r0.x + g.r2.z) +
@@ -99,10 +101,10 @@ AQ_INLINE void project_one_backward(const Camera& cam, const Mat3& W, const Back
   out.view[3][j] = gt.x, out.view[7][j] = gt.y, out.view[11][j] = gt.z;
 }
 
-// Adds up the threads' sums. A culled Gaussian, whose records may hold anything, is replaced by a sound
-// one with zero gradient.
-static void load_chunk(const Context& ctx, const GaussianInputs& in, const float* gradient, int begin,
-                       int size, BackwardChunk& k) {
+// Adds up the threads' sums. A culled Gaussian, whose records may hold anything, is replaced by a
+// sound one with zero gradient.
+static void load_chunk(const Context& ctx, const GaussianInputs& in, const float* gradient,
+                       int begin, int size, BackwardChunk& k) {
   for (int j = 0; j < size; j++) {
     const size_t i = begin + j;
     const Splat& s = ctx.splats[i];
@@ -124,8 +126,8 @@ static void load_chunk(const Context& ctx, const GaussianInputs& in, const float
   }
 }
 
-static void store_chunk(const BackwardChunk& k, const GradientChunk& g, int channels, int begin, int size,
-                        const GaussianGradients& out) {
+static void store_chunk(const BackwardChunk& k, const GradientChunk& g, int channels, int begin,
+                        int size, const GaussianGradients& out) {
   for (int j = 0; j < size; j++) {
     const size_t i = begin + j;
     for (int q = 0; q < 3; q++) out.means[3 * i + q] = g.mean[q][j];

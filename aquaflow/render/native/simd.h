@@ -32,7 +32,9 @@ AQ_INLINE Vec splat(float x) {
 #if defined(__AVX512F__)
 
 typedef __mmask16 Mask;
-AQ_INLINE Mask greater(Vec a, Vec b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GT_OQ); }
+AQ_INLINE Mask greater(Vec a, Vec b) {
+  return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GT_OQ);
+}
 AQ_INLINE bool any(Mask m) { return m != 0; }
 AQ_INLINE uint32_t bits(Mask m) { return m; }
 AQ_INLINE Vec keep(Mask m, Vec a) { return (Vec)_mm512_maskz_mov_ps(m, (__m512)a); }
@@ -80,7 +82,8 @@ AQ_INLINE float sum(Vec a) { return (a[0] + a[1]) + (a[2] + a[3]); }
 #endif
 
 // 2^x, relative error 3e-6 for x in [-16, 16]; what lies outside is masked by the callers. The
-// polynomial is the one of fourth degree with the least relative error on [-1/2, 1/2] and value 1 at 0.
+// polynomial is the one of fourth degree with the least relative error on [-1/2, 1/2] and value 1
+// at 0.
 AQ_INLINE Vec exp2(Vec x) {
 #if defined(__AVX512F__)
   const Vec whole = (Vec)_mm512_roundscale_ps((__m512)x, _MM_FROUND_TO_NEAREST_INT);

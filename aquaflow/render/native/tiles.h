@@ -1,5 +1,5 @@
-// Front-to-back lists of splats for every tile: radix sort by depth, then an exact ellipse test that
-// also says which blocks of the tile a splat reaches.
+// Front-to-back lists of splats for every tile: radix sort by depth, then an exact ellipse test
+// that also says which blocks of the tile a splat reaches.
 #pragma once
 
 #include <algorithm>
@@ -89,7 +89,8 @@ AQ_INLINE BlockMask reached_blocks(const Splat& s, float u, float v, const Block
     const Vec x0 = corners.x[j] - u, x1 = x0 + (float)(kBlockW - 1);
     const Vec y0 = corners.y[j] - v, y1 = y0 + (float)(kBlockH - 1);
     const Vec x_near = max(x0, min(x1, zero)), y_near = max(y0, min(y1, zero));
-    const Vec y_best = max(y0, min(y1, s.slope_y * x_near)), x_best = max(x0, min(x1, s.slope_x * y_near));
+    const Vec y_best = max(y0, min(y1, s.slope_y * x_near)),
+              x_best = max(x0, min(x1, s.slope_x * y_near));
     const Vec column = (s.qa * x_near + s.qb * y_best) * x_near + s.qc * y_best * y_best;
     const Vec row = (s.qa * x_best + s.qb * y_near) * x_best + s.qc * y_near * y_near;
     out |= (BlockMask)bits(greater(max(column, row), limit)) << (j * kLanes);
@@ -97,7 +98,8 @@ AQ_INLINE BlockMask reached_blocks(const Splat& s, float u, float v, const Block
   return out;
 }
 
-// Hits of the splats [n part / parts, n (part + 1) / parts) in depth order, and their number per tile.
+// Hits of the splats [n part / parts, n (part + 1) / parts) in depth order, and their number per
+// tile.
 static size_t find_hits(Context& ctx, int part) {
   const BlockCorners corners = block_corners();
   const int begin = (int)((int64_t)ctx.visible * part / ctx.threads);
@@ -107,7 +109,8 @@ static size_t find_hits(Context& ctx, int part) {
   std::vector<TileHit>& hits = ctx.hits[part];
   size_t n = 0;
   for (int k = begin; k < end; k++) {
-    if (k + kPrefetchDistance < end) __builtin_prefetch(&ctx.splats[ctx.order[k + kPrefetchDistance]]);
+    if (k + kPrefetchDistance < end)
+      __builtin_prefetch(&ctx.splats[ctx.order[k + kPrefetchDistance]]);
     const Splat& s = ctx.splats[ctx.order[k]];
     const TileBox box = tile_box(ctx, s);
     const size_t need = n + (size_t)(box.x1 - box.x0 + 1) * (box.y1 - box.y0 + 1);

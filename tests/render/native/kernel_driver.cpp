@@ -30,7 +30,9 @@ void* operator new(size_t size, const std::nothrow_t&) noexcept {
     return nullptr;
   }
 }
-void* operator new(size_t size, std::align_val_t alignment) { return allocate(size, (size_t)alignment); }
+void* operator new(size_t size, std::align_val_t alignment) {
+  return allocate(size, (size_t)alignment);
+}
 void operator delete(void* memory) noexcept { std::free(memory); }
 void operator delete(void* memory, size_t) noexcept { std::free(memory); }
 void operator delete(void* memory, std::align_val_t) noexcept { std::free(memory); }
@@ -45,10 +47,12 @@ class Scene {
     if (!file_) std::perror(path), std::exit(2);
     int32_t header[6];
     read(header, sizeof header);
-    count = header[0], channels = header[1], width = header[2], height = header[3], threads = header[4];
+    count = header[0], channels = header[1], width = header[2], height = header[3],
+    threads = header[4];
     const size_t n = count, pixels = (size_t)width * height;
-    for (size_t size : {3 * n, 4 * n, 3 * n, n, channels * n, (size_t)16, (size_t)4, pixels * channels, pixels,
-                        3 * pixels, pixels, pixels, (size_t)aq::kWater}) {
+    for (size_t size :
+         {3 * n, 4 * n, 3 * n, n, channels * n, (size_t)16, (size_t)4, pixels * channels, pixels,
+          3 * pixels, pixels, pixels, (size_t)aq::kWater}) {
       arrays.emplace_back(size);
       read(arrays.back().data(), size * sizeof(float));
     }
@@ -57,8 +61,21 @@ class Scene {
     std::fclose(file_);
   }
 
-  enum { kMeans, kQuats, kScales, kOpacities, kColours, kViewmat, kIntrinsics, kGImage, kGAlpha, kTarget,
-         kWeight, kMask, kWaterRates };
+  enum {
+    kMeans,
+    kQuats,
+    kScales,
+    kOpacities,
+    kColours,
+    kViewmat,
+    kIntrinsics,
+    kGImage,
+    kGAlpha,
+    kTarget,
+    kWeight,
+    kMask,
+    kWaterRates
+  };
   const float* operator[](int array) const { return arrays[array].data(); }
 
   int count, channels, width, height, threads;
@@ -67,7 +84,8 @@ class Scene {
 
  private:
   void read(void* to, size_t bytes) {
-    if (bytes && std::fread(to, 1, bytes, file_) != bytes) std::fputs("scene too short\n", stderr), std::exit(2);
+    if (bytes && std::fread(to, 1, bytes, file_) != bytes)
+      std::fputs("scene too short\n", stderr), std::exit(2);
   }
   std::FILE* file_;
 };
@@ -91,18 +109,20 @@ static void draw(const Scene& s, bool short_of_memory, std::FILE* result) {
   };
   Floats image(pixels * c), alpha(pixels), radius(n);
   std::vector<uint8_t> visible(n);
-  Floats g_means(3 * n), g_quats(4 * n), g_scales(3 * n), g_opacities(n), g_colours(c * n), g_viewmat(16);
+  Floats g_means(3 * n), g_quats(4 * n), g_scales(3 * n), g_opacities(n), g_colours(c * n),
+      g_viewmat(16);
   void* context = aq_context_new();
   run(short_of_memory, [&] {
-    return aq_forward(context, s.count, s.channels, s.width, s.height, s.threads, s[s.kMeans], s[s.kQuats],
-                      s[s.kScales], s[s.kOpacities], s[s.kColours], s[s.kViewmat], s[s.kIntrinsics],
-                      image.data(), alpha.data(), visible.data(), radius.data(),
+    return aq_forward(context, s.count, s.channels, s.width, s.height, s.threads, s[s.kMeans],
+                      s[s.kQuats], s[s.kScales], s[s.kOpacities], s[s.kColours], s[s.kViewmat],
+                      s[s.kIntrinsics], image.data(), alpha.data(), visible.data(), radius.data(),
                       s.active.empty() ? nullptr : s.active.data());
   });
   run(short_of_memory, [&] {
-    return aq_backward(context, s[s.kMeans], s[s.kQuats], s[s.kScales], s[s.kOpacities], s[s.kColours],
-                       image.data(), s[s.kGImage], s[s.kGAlpha], g_means.data(), g_quats.data(),
-                       g_scales.data(), g_opacities.data(), g_colours.data(), g_viewmat.data());
+    return aq_backward(context, s[s.kMeans], s[s.kQuats], s[s.kScales], s[s.kOpacities],
+                       s[s.kColours], image.data(), s[s.kGImage], s[s.kGAlpha], g_means.data(),
+                       g_quats.data(), g_scales.data(), g_opacities.data(), g_colours.data(),
+                       g_viewmat.data());
   });
   aq_context_free(context);
 
@@ -114,14 +134,15 @@ static void draw(const Scene& s, bool short_of_memory, std::FILE* result) {
                               rendered.data(), range.data());
     });
     run(short_of_memory, [&] {
-      return aq_compose_water_backward(image.data(), alpha.data(), s[s.kWaterRates], (int)pixels, s.threads,
-                                       s[s.kTarget], s[s.kGAlpha], g_drawn.data(), g_a.data(), g_water.data());
+      return aq_compose_water_backward(image.data(), alpha.data(), s[s.kWaterRates], (int)pixels,
+                                       s.threads, s[s.kTarget], s[s.kGAlpha], g_drawn.data(),
+                                       g_a.data(), g_water.data());
     });
   }
   Floats loss(1), g_rendered(3 * pixels);
   run(short_of_memory, [&] {
-    return aq_photometric(rendered.data(), s[s.kTarget], s[s.kWeight], s[s.kMask], s.width, s.height, 0.2f,
-                          s.threads, loss.data(), g_rendered.data());
+    return aq_photometric(rendered.data(), s[s.kTarget], s[s.kWeight], s[s.kMask], s.width,
+                          s.height, 0.2f, s.threads, loss.data(), g_rendered.data());
   });
 
   Floats means(s.arrays[s.kMeans]), first(3 * n), second(3 * n);
@@ -130,14 +151,15 @@ static void draw(const Scene& s, bool short_of_memory, std::FILE* result) {
   const AdamGroup group{means.data(), g_means.data(), first.data(), second.data(), 3, 1e-3f};
   run(short_of_memory, [&] {
     const int more_threads = s.threads + 1;  // the pool has to grow
-    const int skipped = aq_adam_step(1, &group, s.count, visible.data(), steps.data(), 0.9, 0.999, 1e-8f,
-                                     bias.data(), 1, more_threads);
+    const int skipped = aq_adam_step(1, &group, s.count, visible.data(), steps.data(), 0.9, 0.999,
+                                     1e-8f, bias.data(), 1, more_threads);
     return skipped < 0 ? skipped : 0;
   });
   for (const Floats* values : {&image, &alpha}) write(*values);
   write(Floats(visible.begin(), visible.end()));
-  for (const Floats* values : {&radius, &g_means, &g_quats, &g_scales, &g_opacities, &g_colours, &g_viewmat,
-                               &rendered, &range, &g_drawn, &g_a, &g_water, &loss, &g_rendered, &means})
+  for (const Floats* values :
+       {&radius, &g_means, &g_quats, &g_scales, &g_opacities, &g_colours, &g_viewmat, &rendered,
+        &range, &g_drawn, &g_a, &g_water, &loss, &g_rendered, &means})
     write(*values);
 }
 
