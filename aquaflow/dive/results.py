@@ -212,7 +212,7 @@ def metrics(
         "scale_source": SCALE_SOURCE,
         "renderer": f"{slam.renderer.name} ({slam.renderer.isa}, {slam.renderer.threads} threads)",
         "prior": slam.prior.name,
-        "device": "cpu",
+        "device": "cuda" if slam.renderer.isa == "cuda" else "cpu",
         "seed": slam.config.seed,
         "version": __version__,
         "protocol": PROTOCOL,

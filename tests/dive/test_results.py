@@ -50,6 +50,12 @@ RESULTS = [
 ]
 
 
+def test_the_device_is_that_of_the_renderer(slam: Slam, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert metrics(slam, RESULTS, [], [], 1.0)["device"] == "cpu"
+    monkeypatch.setattr(slam.renderer, "isa", "cuda")
+    assert metrics(slam, RESULTS, [], [], 1.0)["device"] == "cuda"
+
+
 def test_the_sub_map_with_most_poses_is_the_dives() -> None:
     assert largest_sub_map(RESULTS) == 1
 
