@@ -22,13 +22,6 @@ def from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
     )
 
 
-def tilt_of(q: Quaternion) -> tuple[float, float]:
-    """Roll and pitch of a body in NED."""
-    w, x, y, z = q
-    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    return roll, math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
-
-
 def normalised(q: Quaternion) -> Quaternion:
     """Raises ZeroDivisionError for the zero quaternion."""
     norm = math.sqrt(sum(value * value for value in q))

@@ -24,7 +24,7 @@ def main(dive_folder: str, truth_file: str, plot: str) -> None:
     of_ours, of_truth = associate(ours.t_s, truth.t_s)
     # One camera knows no metres, so the map is scaled to the truth (Sim(3) alignment).
     found = align(ours.positions[of_ours], truth.positions[of_truth], with_scale=True)
-    aligned = found.T_target_source.apply(ours.positions[of_ours])
+    aligned = ours.select(of_ours).transformed(found.T_target_source).positions
     error_m = np.linalg.norm(aligned - truth.positions[of_truth], axis=1)
     print(f"1 map unit is {found.T_target_source.scale:.3f} m")
     print(f"absolute trajectory error: {np.sqrt((error_m**2).mean()):.4f} m RMS")

@@ -9,13 +9,12 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.messages import Frame
-from aquaflow.sources import CameraSource, open_recording
+from aquaflow.sources import CameraSource
 
 NS_PER_S = 1_000_000_000
 
@@ -78,13 +77,6 @@ class CameraFeed:
         self._jump_ns = 0
         self._shots = self._forever()
         self._next: Shot | None = None
-
-    @classmethod
-    def of_recording(
-        cls, path: Path, fps: float = 30.0, faults: CameraFaults | None = None
-    ) -> CameraFeed:
-        """Of a folder of images, a video or a synthetic dive."""
-        return cls(open_recording(path), fps, faults)
 
     @property
     def plugged_in(self) -> bool:

@@ -25,7 +25,7 @@ from drivers.rotation import from_euler
 from sim_drivers.telemetry_log import TelemetryLog
 
 HEAD = b"\xa3\x95"
-DESCRIPTION, DESCRIPTION_BYTES = 128, 89
+DESCRIPTION = 128
 FORMATS = {
     "b": "b", "B": "B", "M": "B", "h": "h", "H": "H", "i": "i", "I": "I", "f": "f", "d": "d",
     "q": "q", "Q": "Q", "n": "4s", "N": "16s", "Z": "64s", "c": "h", "C": "H", "e": "i", "E": "I",

@@ -1,4 +1,4 @@
-"""A synthetic dive as a camera, with the truth that it was rendered from."""
+"""A synthetic dive as a camera."""
 
 from __future__ import annotations
 
@@ -22,13 +22,3 @@ class SyntheticDive(ImageFolder):
     @classmethod
     def open(cls, path: Path, fps: float | None = None) -> SyntheticDive:
         return cls(path, fps)
-
-    @property
-    def poses_path(self) -> Path:
-        """True camera poses, TUM, metres."""
-        return self.folder / "poses.tum"
-
-    @property
-    def medium_path(self) -> Path:
-        """True water, rates per metre."""
-        return self.folder / "medium.yaml"

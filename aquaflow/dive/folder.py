@@ -71,8 +71,6 @@ class DiveFolder:
         self.path = path
         self._recorded = bytearray()
         """The rows so far as lines of frames.csv: a tenth of what they take as objects."""
-        self.unwritten = 0
-        """Rows that the disk did not take when they came."""
         if resume is None:
             self._claim(overwrite)
         else:
@@ -126,12 +124,11 @@ class DiveFolder:
 
     def record(self, rows: Iterable[FrameRow]) -> None:
         """Append frames in the order in which their fate was decided."""
-        new = list(rows)
+        lines = self._add(rows)
         try:
-            self._frames.write(self._add(new))
+            self._frames.write(lines)
             self._frames.flush()
         except OSError as error:  # a full disk ends no dive; all rows are written at its end
-            self.unwritten += len(new)
             log.warning("frames.csv takes no more for now: %s", error.strerror)
 
     def _add(self, rows: Iterable[FrameRow]) -> bytes:

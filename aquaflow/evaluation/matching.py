@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
-from aquaflow.prior import flow as dense
 from aquaflow.prior.contract import Float, Mask, Prior
 
 Picture: TypeAlias = npt.NDArray[np.uint8]
@@ -128,18 +127,6 @@ def matcher_of(prior: Prior) -> Matcher:
     def match(a: Picture, b: Picture) -> tuple[Float, Mask]:
         found = prior.decode(prior.encode(a, camera), prior.encode(b, camera))
         return found.matches, found.valid
-
-    return match
-
-
-def flow_alone() -> Matcher:
-    """DIS flow from nothing: what every prior has to beat."""
-    matcher = dense.FlowMatcher()
-
-    def match(a: Picture, b: Picture) -> tuple[Float, Mask]:
-        here, there = dense.normalised_grey(a), dense.normalised_grey(b)
-        flow = matcher(here, there, dense.texture(here), dense.texture(there))
-        return dense.pixel_grid(*here.shape) + flow.forward, flow.valid
 
     return match
 

@@ -33,20 +33,6 @@ def psnr(
     return -10.0 * float(np.log10(error))
 
 
-def psnr_after_gain(
-    image: Image,  # [H, W, 3] in [0, 1]
-    reference: Image,  # [H, W, 3] in [0, 1]
-    mask: Mask | None = None,  # [H, W]
-) -> float:
-    """PSNR once each channel has its own least-squares gain.
-
-    The brightness and white balance of a picture without water are a convention; what remains
-    after one gain per channel is the error of the restoration.
-    """
-    gain = channel_gain(image, reference, mask)
-    return psnr(np.clip(image.astype(np.float64) * gain, 0.0, 1.0), reference, mask)
-
-
 def channel_gain(
     image: Image,  # [..., 3]
     reference: Image,  # [..., 3]

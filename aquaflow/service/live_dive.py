@@ -82,7 +82,7 @@ class LiveDive:
         self._salvaged = _salvaged(choice, self._plain, feed)
         rows = None if self._salvaged is None else self._salvaged.rows
         self.folder = DiveFolder(choice.folder, self._plain, overwrite, rows)
-        self.feed, self._service = feed, service
+        self.feed = feed
         self._beats, self._ladder = Beats(), Ladder(service.limits)
         self._notifier = Notifier()
         self.parts = self._assembled(name, choice, service)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing
 
-MARK_1, MARK_2 = 0xFE, 0xFD
+MARK_2 = 0xFD
 MARKS = re.compile(b"[\xfd\xfe]")
 HEADER_1, HEADER_2 = 6, 10
 CHECKSUM = 2

@@ -25,7 +25,6 @@ class PtyWire:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.lost_bytes = 0
         self._fds: tuple[int, int] | None = None
         self.plug()
 
@@ -58,7 +57,6 @@ class PtyWire:
                     break
             except OSError:
                 break
-        self.lost_bytes += len(left)
 
     def receive(self) -> bytes | None:
         if self._fds is None:

@@ -12,7 +12,6 @@ from aquaflow.evaluation.matching import (
     LEVELS,
     WIDTH,
     Level,
-    flow_alone,
     homography_pair,
     homography_recall,
     matcher_of,
@@ -81,9 +80,7 @@ def test_relit_pictures_differ_from_each_other_and_repeat() -> None:
     assert np.abs(one.astype(int) - other).mean() > 5.0
 
 
-def test_priors_and_flow_alone_find_mild_changes() -> None:
-    pictures = [textured()]
-    for matcher in (flow_alone(), matcher_of(ClassicalPrior())):
-        found = homography_recall(matcher, pictures, MILD, 1, seed=1)
-        assert found["recall"] > 0.95
-        assert found["precision"] > 0.95
+def test_a_prior_finds_mild_changes() -> None:
+    found = homography_recall(matcher_of(ClassicalPrior()), [textured()], MILD, 1, seed=1)
+    assert found["recall"] > 0.95
+    assert found["precision"] > 0.95

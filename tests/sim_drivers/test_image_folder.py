@@ -225,8 +225,6 @@ def test_synthetic_dive_is_recognised_before_a_plain_folder(tmp_path):
     assert SyntheticDive.recognises(tmp_path)
     assert SyntheticDive.specificity > ImageFolder.specificity
     assert values(source) == [9]
-    assert source.poses_path == tmp_path / "poses.tum"
-    assert source.medium_path == tmp_path / "medium.yaml"
     source.close()
 
 
