@@ -60,9 +60,11 @@ fuzz: setup ## Feed every command what nothing sane would, for FUZZ_SECONDS=120.
 coverage: setup ## Run the tests of `make test` and show how much of each file they reach.
 	$(TESTS) -m 'not slow and not kernel' --cov --cov-report=term --cov-report=html:out/coverage
 
-check: setup ## Lint, formatting, types.
+check: setup ## Lint, formatting, unused code, types.
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
+	$(BIN)/clang-format --dry-run --Werror $(KERNELS) $(wildcard tests/render/native/*.cpp)
+	$(BIN)/vulture
 	$(BIN)/mypy
 
 docs: setup ## Build the documentation into out/site; a broken internal link fails.
