@@ -42,7 +42,7 @@ class SelectiveAdam:
 
     def __init__(
         self,
-        groups: Mapping[str, tuple[Tensor, float]],
+        groups: Mapping[str, tuple[Tensor, float]],  # each tensor [N, ...]
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-15,
         threads: int | None = None,
@@ -69,7 +69,7 @@ class SelectiveAdam:
     def step(
         self,
         visible: Tensor,  # [N] bool
-        grads: Mapping[str, Tensor],
+        grads: Mapping[str, Tensor],  # each [N, ...]
     ) -> int:
         """Step the visible rows of the tensors named in ``grads``; returns rows skipped.
 
@@ -102,13 +102,19 @@ class SelectiveAdam:
         second = {name: change(moment) for name, moment in self.second_moments.items()}
         self.steps, self.first_moments, self.second_moments = change(self.steps), first, second
 
-    def bind(self, params: Mapping[str, Tensor]) -> None:
+    def bind(
+        self,
+        params: Mapping[str, Tensor],  # each [N, ...]
+    ) -> None:
         """Replace the tensors named in ``params``; raises AquaFlowError if they do not fit."""
         bound = {**self.params, **params}
         self._check_params(bound)
         self.params = bound
 
-    def _check_params(self, params: Mapping[str, Tensor]) -> None:
+    def _check_params(
+        self,
+        params: Mapping[str, Tensor],  # each [N, ...]
+    ) -> None:
         for name, tensor in params.items():
             moment = self.first_moments.get(name)
             if moment is None or tensor.shape != moment.shape or len(tensor) != len(self.steps):
@@ -121,7 +127,11 @@ class SelectiveAdam:
                     f"SelectiveAdam tensor {name} is not contiguous float32; pass a plain tensor."
                 )
 
-    def _check_step(self, visible: Tensor, grads: Mapping[str, Tensor]) -> None:
+    def _check_step(
+        self,
+        visible: Tensor,  # [N] bool
+        grads: Mapping[str, Tensor],  # each [N, ...]
+    ) -> None:
         self._check_params(self.params)  # a caller may have forgotten to bind after keep
         if visible.dtype != torch.bool or tuple(visible.shape) != (len(self.steps),):
             raise AquaFlowError(
@@ -135,7 +145,12 @@ class SelectiveAdam:
                     "tensor; name and shape it as in the groups."
                 )
 
-    def _step_native(self, library: Library, visible: Tensor, grads: Mapping[str, Tensor]) -> int:
+    def _step_native(
+        self,
+        library: Library,
+        visible: Tensor,  # [N] bool
+        grads: Mapping[str, Tensor],  # each [N, ...]
+    ) -> int:
         seen = visible.contiguous()
         plain = {name: g.detach().to(torch.float32).contiguous() for name, g in grads.items()}
         groups = (_NativeGroup * len(plain))()
@@ -160,7 +175,11 @@ class SelectiveAdam:
             self.threads,
         )
 
-    def _step_torch(self, visible: Tensor, grads: Mapping[str, Tensor]) -> int:
+    def _step_torch(
+        self,
+        visible: Tensor,  # [N] bool
+        grads: Mapping[str, Tensor],  # each [N, ...]
+    ) -> int:
         sound = sound_rows(grads, len(visible))
         rows = torch.nonzero(visible & sound)[:, 0]
         bias = self._bias[self.steps[rows].long().clamp(max=len(self._bias) - 1)]
@@ -178,7 +197,10 @@ class SelectiveAdam:
         return int((visible & ~sound).sum())
 
 
-def sound_rows(grads: Mapping[str, Tensor], rows: int) -> Tensor:
+def sound_rows(
+    grads: Mapping[str, Tensor],  # each [rows, ...]
+    rows: int,
+) -> Tensor:
     """[rows] bool: every gradient of the row is a number, and its square is one too."""
     sound = [(g.abs() < LARGEST_GRADIENT).reshape(rows, -1).all(1) for g in grads.values()]
     return torch.stack(sound).all(0) if sound else torch.ones(rows, dtype=torch.bool)

@@ -109,16 +109,16 @@ class Renderer(Protocol):
 
 
 def check_inputs(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colours: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
+    means: Tensor,  # [N, 3] m, world
+    quats: Tensor,  # [N, 4] wxyz
+    scales: Tensor,  # [N, 3] m
+    opacities: Tensor,  # [N]
+    colours: Tensor,  # [N, C]
+    viewmat: Tensor,  # [4, 4] world -> camera
+    K: Tensor,  # [3, 3] px
     width: int,
     height: int,
-    active: Tensor | None = None,
+    active: Tensor | None = None,  # [ceil(H/16), ceil(W/16)] bool, tiles to draw
 ) -> None:
     """Raise AquaFlowError naming the first input whose shape or type breaks the contract."""
     n = len(means) if means.dim() else 0

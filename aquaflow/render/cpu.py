@@ -105,12 +105,12 @@ class _Rasterise(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        colours: Tensor,
-        viewmat: Tensor,
+        means: Tensor,  # [N, 3] m, world
+        quats: Tensor,  # [N, 4] wxyz
+        scales: Tensor,  # [N, 3] m
+        opacities: Tensor,  # [N]
+        colours: Tensor,  # [N, C]
+        viewmat: Tensor,  # [4, 4] world -> camera
         intrinsics: Tensor,  # [4] fx fy cx cy, px
         active: Tensor | None,  # [tiles]
         pool: _ContextPool,
@@ -136,7 +136,12 @@ class _Rasterise(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable  # type: ignore[untyped-decorator]
-    def backward(ctx: Any, g_image: Tensor, g_alpha: Tensor, *_: Tensor) -> tuple[Any, ...]:
+    def backward(
+        ctx: Any,
+        g_image: Tensor,  # [H, W, C]
+        g_alpha: Tensor,  # [H, W]
+        *_: Tensor,
+    ) -> tuple[Any, ...]:
         *gaussians, image = ctx.saved_tensors
         gradients = [*(torch.empty_like(tensor) for tensor in gaussians), torch.empty(4, 4)]
         incoming = [g_image.contiguous(), g_alpha.contiguous()]

@@ -99,15 +99,17 @@ class _DecodeView(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        quats: Tensor,
-        log_scales: Tensor,
-        raw_colours: Tensor,
-        trunk: Tensor,
-        view: Tensor,
-        heads: Tensor,
-        bias: Tensor,
-        limits: Tensor,
-        fixed: tuple[Tensor, Tensor, Tensor, Tensor],
+        quats: Tensor,  # [N, 4] wxyz
+        log_scales: Tensor,  # [N, 3]
+        raw_colours: Tensor,  # [N, 3]
+        trunk: Tensor,  # [P, d]
+        view: Tensor,  # [d, E]
+        heads: Tensor,  # [9, d / 2]
+        bias: Tensor,  # [9]
+        limits: Tensor,  # [9]
+        fixed: tuple[
+            Tensor, Tensor, Tensor, Tensor
+        ],  # rows [V], places [V], means [N, 3], centre [3]
         threads: int,
         library: Library,
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -121,7 +123,10 @@ class _DecodeView(torch.autograd.Function):
     @staticmethod
     @once_differentiable  # type: ignore[untyped-decorator]
     def backward(
-        ctx: Any, g_quats: Tensor, g_log_scales: Tensor, g_raw_colours: Tensor
+        ctx: Any,
+        g_quats: Tensor,  # [N, 4]
+        g_log_scales: Tensor,  # [N, 3]
+        g_raw_colours: Tensor,  # [N, 3]
     ) -> tuple[Any, ...]:
         trunk, view, heads, bias, limits, quats = ctx.saved_tensors
         g_base, g_log_scales, g_raw_colours = (
@@ -142,13 +147,13 @@ class _DecodeView(torch.autograd.Function):
 
 
 def _inputs(
-    trunk: Tensor,
-    view: Tensor,
-    heads: Tensor,
-    bias: Tensor,
-    limits: Tensor,
-    quats: Tensor,
-    fixed: tuple[Tensor, Tensor, Tensor, Tensor],
+    trunk: Tensor,  # [P, d]
+    view: Tensor,  # [d, E]
+    heads: Tensor,  # [9, d / 2]
+    bias: Tensor,  # [9]
+    limits: Tensor,  # [9]
+    quats: Tensor,  # [N, 4] wxyz
+    fixed: tuple[Tensor, Tensor, Tensor, Tensor],  # rows [V], places [V], means [N, 3], centre [3]
 ) -> _NativeView:
     rows, places, means, centre = fixed
     tensors = (rows, places, means, centre, trunk, view, heads, bias, limits, quats)

@@ -126,7 +126,11 @@ class GsplatRenderer:
 
 
 def _sound(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colours: Tensor
+    means: Tensor,  # [N, 3] m, world
+    quats: Tensor,  # [N, 4] wxyz
+    scales: Tensor,  # [N, 3] m
+    opacities: Tensor,  # [N]
+    colours: Tensor,  # [N, C]
 ) -> Tensor:
     """[N] bool: finite and not degenerate; gsplat itself does not look."""
     with torch.no_grad():

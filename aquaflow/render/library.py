@@ -86,7 +86,9 @@ class Library:
         return list(out)
 
 
-def pointer(tensor: Tensor) -> int:
+def pointer(
+    tensor: Tensor,  # [...] contiguous, on the CPU
+) -> int:
     """Address of a contiguous CPU tensor; the caller keeps it alive during the call."""
     return tensor.data_ptr()
 

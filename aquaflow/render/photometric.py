@@ -27,7 +27,9 @@ def ssim(
     g = torch.exp(-t * t / (2 * SSIM_SIGMA_PX**2))
     g = g / g.sum()
 
-    def window_mean(image: Tensor) -> Tensor:
+    def window_mean(
+        image: Tensor,  # [C, 1, H, W]
+    ) -> Tensor:
         rows = F.conv2d(image, g.view(1, 1, 1, -1), padding=(0, SSIM_WINDOW // 2))
         return F.conv2d(rows, g.view(1, 1, -1, 1), padding=(SSIM_WINDOW // 2, 0))
 
@@ -83,11 +85,18 @@ def photometric_loss(
     return loss
 
 
-def _plain(tensor: Tensor) -> Tensor:
+def _plain(
+    tensor: Tensor,  # [...]
+) -> Tensor:
     return tensor.detach().to(torch.float32).contiguous()
 
 
-def _check(rendered: Tensor, target: Tensor, weight: Tensor, mask: Tensor | None) -> None:
+def _check(
+    rendered: Tensor,  # [H, W, 3]
+    target: Tensor,  # [H, W, 3]
+    weight: Tensor,  # [H, W]
+    mask: Tensor | None,  # [H, W]
+) -> None:
     if rendered.dim() != 3 or rendered.shape[2] != 3:
         raise AquaFlowError(
             f"Loss input rendered has shape {tuple(rendered.shape)}; pass an [H, W, 3] image."
@@ -107,10 +116,10 @@ class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        rendered: Tensor,
-        target: Tensor,
-        weight: Tensor,
-        mask: Tensor | None,
+        rendered: Tensor,  # [H, W, 3]
+        target: Tensor,  # [H, W, 3]
+        weight: Tensor,  # [H, W]
+        mask: Tensor | None,  # [H, W]
         ssim_weight: float,
         threads: int,
         library: Library,
@@ -135,6 +144,9 @@ class _Photometric(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable  # type: ignore[untyped-decorator]
-    def backward(ctx: Any, g_loss: Tensor) -> tuple[Any, ...]:
+    def backward(
+        ctx: Any,
+        g_loss: Tensor,  # []
+    ) -> tuple[Any, ...]:
         (gradient,) = ctx.saved_tensors
         return (g_loss * gradient, *[None] * 6)

@@ -48,7 +48,9 @@ class Footprints:
         return visible, radius_px
 
 
-def rotation_matrices(quats: Tensor) -> Tensor:
+def rotation_matrices(
+    quats: Tensor,  # [M, 4] wxyz, any positive length
+) -> Tensor:
     """[M, 4] wxyz of any positive length -> [M, 3, 3]."""
     w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
     rows = [
@@ -60,12 +62,12 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 
 
 def find_sound(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colours: Tensor,
-    viewmat: Tensor,
+    means: Tensor,  # [N, 3] m, world
+    quats: Tensor,  # [N, 4] wxyz
+    scales: Tensor,  # [N, 3] m
+    opacities: Tensor,  # [N]
+    colours: Tensor,  # [N, C]
+    viewmat: Tensor,  # [4, 4] world -> camera
 ) -> Tensor:
     """Indices of the Gaussians that are finite, positive and in front of the camera."""
     with torch.no_grad():
@@ -79,7 +81,12 @@ def find_sound(
         return torch.nonzero(finite & positive & torch.isfinite(norm_sq) & (z > NEAR_PLANE_M))[:, 0]
 
 
-def jacobian(t: Tensor, K: Tensor, width: int, height: int) -> Tensor:
+def jacobian(
+    t: Tensor,  # [M, 3] m, camera frame
+    K: Tensor,  # [3, 3] px
+    width: int,
+    height: int,
+) -> Tensor:
     """[M, 2, 3] of the projection at camera-frame means t, its ray clamped near the image."""
     (fx, _, cx), (_, fy, cy) = K[0].tolist(), K[1].tolist()
     margin_x, margin_y = TANGENT_MARGIN * 0.5 * width / fx, TANGENT_MARGIN * 0.5 * height / fy
@@ -93,12 +100,12 @@ def jacobian(t: Tensor, K: Tensor, width: int, height: int) -> Tensor:
 
 def footprints_of(
     index: Tensor,  # [M] sound Gaussians
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
+    means: Tensor,  # [N, 3] m, world
+    quats: Tensor,  # [N, 4] wxyz
+    scales: Tensor,  # [N, 3] m
+    opacities: Tensor,  # [N]
+    viewmat: Tensor,  # [4, 4] world -> camera
+    K: Tensor,  # [3, 3] px
     width: int,
     height: int,
 ) -> Footprints:
@@ -125,16 +132,16 @@ def footprints_of(
 
 
 def project(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colours: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
+    means: Tensor,  # [N, 3] m, world
+    quats: Tensor,  # [N, 4] wxyz
+    scales: Tensor,  # [N, 3] m
+    opacities: Tensor,  # [N]
+    colours: Tensor,  # [N, C]
+    viewmat: Tensor,  # [4, 4] world -> camera
+    K: Tensor,  # [3, 3] px
     width: int,
     height: int,
-    active: Tensor | None = None,
+    active: Tensor | None = None,  # [ceil(H/16), ceil(W/16)] bool, tiles to draw
 ) -> Footprints:
     """Footprints of the visible Gaussians, nearest first, in the inputs' dtype.
 
@@ -169,7 +176,10 @@ def alpha_at(
     return torch.where(alpha > MIN_ALPHA, alpha, torch.zeros_like(alpha))
 
 
-def blend_weights(alpha: Tensor, dim: int) -> Tensor:
+def blend_weights(
+    alpha: Tensor,  # [...] in [0, 1]
+    dim: int,
+) -> Tensor:
     """Weights of Gaussians that lie front to back along ``dim``."""
     edge = torch.zeros_like(alpha.narrow(dim, 0, min(1, alpha.shape[dim])))
     shifted = torch.cat([edge, alpha.narrow(dim, 0, max(0, alpha.shape[dim] - 1))], dim)

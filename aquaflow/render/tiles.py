@@ -66,7 +66,12 @@ class _TileLists:
     footprint: Tensor  # [L] long
 
 
-def _tile_lists(footprints: Footprints, active: Tensor, width: int, height: int) -> _TileLists:
+def _tile_lists(
+    footprints: Footprints,
+    active: Tensor,  # [rows, columns] bool
+    width: int,
+    height: int,
+) -> _TileLists:
     """Pairs of footprints and active tiles that their boxes touch."""
     with torch.no_grad():
         centre, extent = footprints.centre, footprints.extent
@@ -102,7 +107,11 @@ def _batches(lists: _TileLists) -> list[tuple[int, int, int]]:
 
 
 def _draw(
-    footprints: Footprints, colours: Tensor, width: int, height: int, active: Tensor
+    footprints: Footprints,
+    colours: Tensor,  # [N, C]
+    width: int,
+    height: int,
+    active: Tensor,  # [rows, columns] bool
 ) -> Tensor:
     """[H, W, C + 1]: premultiplied colours, then alpha."""
     lists = _tile_lists(footprints, active, width, height)
@@ -135,7 +144,11 @@ def _padded(
     return lists.footprint[torch.where(filled, at, 0)] if longest else at, filled
 
 
-def _tile_corners(tile: Tensor, tiles_x: int, like: Tensor) -> Tensor:
+def _tile_corners(
+    tile: Tensor,  # [T] long
+    tiles_x: int,
+    like: Tensor,  # [...] of the dtype that is wanted
+) -> Tensor:
     """[T, 2] px."""
     return TILE_PX * torch.stack([tile % tiles_x, tile // tiles_x], 1).to(like.dtype)
 

@@ -58,7 +58,12 @@ def compose_water(
 class _ComposeWater(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, drawn: Tensor, alpha: Tensor, water: Tensor, threads: int, library: Library
+        ctx: Any,
+        drawn: Tensor,  # [H, W, 4] premultiplied colour and range
+        alpha: Tensor,  # [H, W]
+        water: Tensor,  # [5, 3]
+        threads: int,
+        library: Library,
     ) -> tuple[Tensor, Tensor]:
         height, width = alpha.shape
         image, z = torch.empty(height, width, 3), torch.empty(height, width)
@@ -70,7 +75,11 @@ class _ComposeWater(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable  # type: ignore[untyped-decorator]
-    def backward(ctx: Any, g_image: Tensor, g_z: Tensor) -> tuple[Any, ...]:
+    def backward(
+        ctx: Any,
+        g_image: Tensor,  # [H, W, 3]
+        g_z: Tensor,  # [H, W]
+    ) -> tuple[Any, ...]:
         drawn, alpha, water = ctx.saved_tensors
         incoming = (g_image.contiguous(), g_z.contiguous())
         gradients = [torch.empty_like(tensor) for tensor in (drawn, alpha, water)]
