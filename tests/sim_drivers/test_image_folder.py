@@ -148,9 +148,9 @@ def test_times_come_from_timestamps_and_count_from_the_first(folder):
     ("text", "sentence"),
     [
         ("1\n2\n", "holds 2 times for 3 pictures"),
-        ("1\nx\n3\n", "line 2: 'x' is not a time in seconds"),
-        ("1\n1\n3\n", "line 2: time 1 does not come after"),
-        ("1\nnan\n3\n", "line 2: time nan does not come after"),
+        ("1\nx\n3\n", "line 2: this is not a time in seconds"),
+        ("1\n1\n3\n", "line 2: the time does not come after"),
+        ("1\nnan\n3\n", "line 2: the time does not come after"),
     ],
 )
 def test_malformed_timestamps_are_one_sentence(folder, text, sentence):
