@@ -40,6 +40,7 @@ class Pointmap:
 
     @staticmethod
     def unknown(camera: CameraModel) -> Pointmap:
+        """One that knows nothing of any pixel."""
         shape = (camera.height, camera.width)
         return Pointmap(camera, np.zeros(shape), np.full(shape, UNKNOWN_VARIANCE))
 
@@ -63,6 +64,7 @@ class Pointmap:
             return np.where(self.rho[..., None] > 1e-6, rays / self.rho[..., None], np.nan)
 
     def copy(self) -> Pointmap:
+        """With arrays of its own."""
         return Pointmap(self.camera, self.rho.copy(), self.variance.copy(), self.fused)
 
 
@@ -88,6 +90,7 @@ class Keyframe:
 
     @property
     def encoding(self) -> Encoding:
+        """What the prior keeps of the keyframe's picture."""
         return self._store.content(self.number).encoding
 
     @property

@@ -33,6 +33,8 @@ log = logging.getLogger(__name__)
 
 
 class CameraState(Enum):
+    """Where a camera is between unplugged and delivering pictures."""
+
     CLOSED = "closed"
     CONNECTING = "connecting"
     STREAMING = "streaming"
@@ -100,6 +102,7 @@ class LiveCamera:
 
     @property
     def counters(self) -> CameraCounters:
+        """Counts of pictures so far."""
         self._counts.overtaken = self._newest.overtaken
         self._counts.stamps_repaired = self._clock.repaired
         return self._counts

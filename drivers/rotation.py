@@ -57,4 +57,5 @@ def rotate(q: Quaternion, v: Vector) -> Vector:
 
 
 def cross(a: Vector, b: Vector) -> Vector:
+    """The vector product a x b."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])

@@ -66,6 +66,7 @@ class Supervisor:
 
     @property
     def counters(self) -> LinkCounters:
+        """The decoder's counts so far."""
         return self._decoder.counters
 
     def stop(self) -> None:
@@ -73,6 +74,7 @@ class Supervisor:
         self._stopping.set()
 
     def run(self) -> None:
+        """Serve the link, and open it anew when it is lost, until stopped."""
         while not self._stopping.is_set():
             try:
                 self._serve_one_link()

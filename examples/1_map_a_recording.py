@@ -11,6 +11,7 @@ import aquaflow
 
 
 def main(source: str, out: str) -> None:
+    """Map ``source`` into ``out`` and print what came of it."""
     dive = aquaflow.map_recording(
         source,
         out,

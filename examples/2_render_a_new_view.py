@@ -17,6 +17,7 @@ ASIDE = 0.1  # map units: a tenth of the median depth that the first keyframe sa
 
 
 def main(dive: str, picture: str) -> None:
+    """Draw the map in ``dive`` from next to its middle view."""
     scene = aquaflow.load_map(dive)
     view = scene.views[len(scene.views) // 2]
     # Camera axes are x right, y down, z forward; T_wc takes them to the world.

@@ -17,6 +17,7 @@ from aquaflow.geometry.alignment import align
 
 
 def main(dive_folder: str, truth_file: str, plot: str) -> None:
+    """Align the dive with the truth and plot path and errors."""
     dive, truth = aquaflow.read_dive(dive_folder), read_tum(Path(truth_file))
     # Sub-maps that never met have no common frame of reference: take the largest.
     sub_maps = dive.sub_map_of_pose

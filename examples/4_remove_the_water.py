@@ -20,6 +20,7 @@ LEAST_LIGHT = 0.05  # transmission below which noise is all that is left of the 
 
 
 def main(dive_folder: str, picture: str) -> None:
+    """Restore the first held-out frame of the dive."""
     dive = aquaflow.read_dive(dive_folder)
     if dive.medium is None:
         print(f"{dive_folder} models no water: there is nothing to remove")

@@ -80,6 +80,7 @@ class CameraFeed:
 
     @property
     def plugged_in(self) -> bool:
+        """False while the simulated device is away."""
         return self._now_ns() >= self.away_until_ns
 
     def come_back(self) -> None:

@@ -29,27 +29,32 @@ class Buffers:
         self._lock = threading.Lock()
 
     def request(self, count: int, size: int) -> None:
+        """VIDIOC_REQBUFS: make ``count`` buffers; EBUSY while streaming."""
         if self._on:
             raise refused(errno.EBUSY)
         self.memory = [np.zeros(size, np.uint8) for _ in range(count)]
 
     def existing(self, index: int) -> int:
+        """``index``, or EINVAL if there is no such buffer."""
         if index >= len(self.memory):
             raise refused(errno.EINVAL)
         return index
 
     def queue(self, index: int) -> None:
+        """VIDIOC_QBUF: the buffer may be filled."""
         with self._lock:
             if self.existing(index) in self._queued:
                 raise refused(errno.EINVAL)
             self._queued.append(index)
 
     def start(self) -> None:
+        """VIDIOC_STREAMON."""
         if not self._queued:
             raise refused(errno.EINVAL)
         self._on = True
 
     def stop(self) -> None:
+        """VIDIOC_STREAMOFF: no buffer is queued afterwards."""
         self._on = False
         self._queued.clear()
 

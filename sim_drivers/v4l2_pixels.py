@@ -28,6 +28,7 @@ class PixelFormat:
 
     @property
     def image_bytes(self) -> int:
+        """Size of a buffer that holds any picture of this format."""
         return self.stride * self.height or self.width * self.height * 3
 
 

@@ -50,6 +50,7 @@ def main() -> None:
 def options(
     version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
 ) -> None:
+    """Options of the program itself, without a command."""
     if version:
         typer.echo(__version__)
         raise typer.Exit

@@ -35,6 +35,7 @@ def isa_level(cpuinfo: str) -> str:
 
 
 def processor(machine: Machine) -> Finding:
+    """Name, cores and vector instructions of the processor."""
     cpuinfo = machine.text("proc/cpuinfo")
     rows = [line.partition(":") for line in cpuinfo.splitlines()]
     names = [value.strip() for key, _, value in rows if key.strip() == "model name"]
@@ -46,6 +47,7 @@ def processor(machine: Machine) -> Finding:
 
 
 def memory(machine: Machine) -> Finding:
+    """Memory in all and free, GB."""
     gigabytes = {
         key: float(value.split()[0]) * 1024.0 / 1e9
         for key, _, value in (line.partition(":") for line in _lines(machine, "proc/meminfo"))
@@ -65,6 +67,7 @@ def _lines(machine: Machine, path: str) -> Iterator[str]:
 
 
 def compiler(machine: Machine) -> Finding:
+    """The C++ compiler, if there is one."""
     for name in COMPILERS:
         if place := machine.which(name):
             return Finding("C++ compiler", place, "builds the fast rasteriser at installation")
@@ -81,6 +84,7 @@ def _variants(machine: Machine) -> list[str]:
 
 
 def renderer(machine: Machine) -> Finding:
+    """The renderer that maps are drawn with."""
     variants = ", ".join(_variants(machine)) or "no compiled variant"
     chosen = machine.renderer()
     if chosen is None:
@@ -94,6 +98,7 @@ def renderer(machine: Machine) -> Finding:
 
 
 def gpu(machine: Machine) -> Finding:
+    """Whether torch and gsplat can use a GPU."""
     usable = machine.gpu()
     gsplat = machine.module_present("gsplat")
     if usable and gsplat:
@@ -117,6 +122,7 @@ def gpu(machine: Machine) -> Finding:
 
 
 def disk(machine: Machine) -> Finding:
+    """Room where dives are written, GB."""
     free_gb = shutil.disk_usage(machine.disk).free / 1e9
     advice = "free some space or write dives elsewhere" if free_gb < LOW_DISK_GB else ""
     return Finding("disk", f"{free_gb:.0f} GB free at {machine.disk}", "holds the dives", advice)

@@ -13,6 +13,7 @@ ARPHRD_CAN = "280"
 
 
 def video(machine: Machine) -> Finding:
+    """Whether OpenCV reads video files."""
     if not machine.module_present("cv2"):
         return Finding(
             "video files",
@@ -35,6 +36,7 @@ def video(machine: Machine) -> Finding:
 
 
 def cameras(machine: Machine) -> Finding:
+    """Cameras that Video4Linux knows."""
     # A camera has several nodes; the first (index 0) is the one that captures.
     nodes = [
         node
@@ -52,6 +54,7 @@ def cameras(machine: Machine) -> Finding:
 
 
 def oak(machine: Machine) -> Finding:
+    """Luxonis cameras on USB, and whether their library is installed."""
     products = [
         machine.text(f"sys/bus/usb/devices/{vendor.parent.name}/product") or "unnamed"
         for vendor in machine.paths("sys/bus/usb/devices/*/idVendor")
@@ -66,6 +69,7 @@ def oak(machine: Machine) -> Finding:
 
 
 def serial(machine: Machine) -> Finding:
+    """Serial ports, and whether this user may open them."""
     ports = machine.paths(
         "dev/serial/by-id/*", "dev/ttyUSB*", "dev/ttyACM*", "dev/ttyAMA*", "dev/ttyTHS*"
     )
@@ -87,6 +91,7 @@ def _access(nodes: list[Path], group: str) -> str:
 
 
 def can(machine: Machine) -> Finding:
+    """CAN interfaces, and whether they are up."""
     found = [
         f"{kind.parent.name} ({machine.text(f'sys/class/net/{kind.parent.name}/operstate') or '?'})"
         for kind in machine.paths("sys/class/net/*/type")

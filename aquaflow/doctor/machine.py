@@ -23,6 +23,7 @@ class Finding:
 
     @property
     def ok(self) -> bool:
+        """True if nothing is to be done."""
         return not self.advice
 
 

@@ -43,6 +43,7 @@ class MediumError:
     """False if the dive found the water clear and modelled none."""
 
     def to_json(self) -> dict[str, Any]:
+        """As plain values with the names above."""
         return asdict(self)
 
 

@@ -65,6 +65,7 @@ class CameraModel:
 
     @property
     def is_distorted(self) -> bool:
+        """True if any coefficient of the distortion is not zero."""
         return self.distortion_model != "none" and any(k != 0.0 for k in self.distortion)
 
     def scaled(self, width: int, height: int) -> CameraModel:

@@ -80,6 +80,7 @@ class Sim3:
 
     @staticmethod
     def identity() -> Sim3:
+        """The similarity that changes nothing."""
         return Sim3(np.eye(3), np.zeros(3))
 
     @staticmethod
@@ -97,6 +98,7 @@ class Sim3:
         return np.concatenate([u, w, [sigma]])
 
     def inverse(self) -> Sim3:
+        """The similarity that undoes this one."""
         s = 1.0 / self.scale
         return Sim3(self.R.T, -s * (self.R.T @ self.t), s)
 
@@ -110,6 +112,7 @@ class Sim3:
         self,
         points: Array,  # [..., 3]
     ) -> Array:
+        """The points [..., 3] in the frame that this maps to."""
         return self.scale * (points @ self.R.T) + self.t
 
     @property

@@ -82,6 +82,7 @@ class Sim3Batch:
         return Sim3(self.R[i].copy(), self.t[i].copy(), float(self.scale[i]))
 
     def inverse(self) -> Sim3Batch:
+        """The inverse of each."""
         R, s = self.R.transpose(0, 2, 1), 1.0 / self.scale
         return Sim3Batch(R, -s[:, None] * _rotate(R, self.t), s)
 

@@ -320,14 +320,17 @@ class Mapper:
 
     @property
     def neural(self) -> NeuralGaussians | None:
+        """The scene's decoder; None without one."""
         return self.scene.neural
 
     @property
     def gaussians(self) -> GaussianMap:
+        """The scene's Gaussians."""
         return self.scene.gaussians
 
     @property
     def medium(self) -> Medium:
+        """The scene's medium."""
         return self.scene.medium
 
     @property

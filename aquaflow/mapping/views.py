@@ -141,6 +141,7 @@ class View:
         return torch.from_numpy(V).to(torch.float32)
 
     def K(self) -> Tensor:
+        """[3, 3] float32 intrinsics, px."""
         return torch.from_numpy(self.camera.K).to(torch.float32)
 
 

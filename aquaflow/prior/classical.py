@@ -32,6 +32,7 @@ class ClassicalPrior:
         image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
         camera: CameraModel,
     ) -> FlowEncoding:
+        """Grey picture and texture, for dense flow."""
         grey = dense.normalised_grey(image)
         return FlowEncoding(camera, grey, dense.texture(grey))
 

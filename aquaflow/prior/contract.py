@@ -92,7 +92,9 @@ class PairGeometry(Protocol):
         ...
 
     @property
-    def Q_b(self) -> Float: ...
+    def Q_b(self) -> Float:
+        """[H, W] confidence of X_b, as Q_a."""
+        ...
 
     @property
     def D_a(self) -> Float | None:
@@ -100,7 +102,9 @@ class PairGeometry(Protocol):
         ...
 
     @property
-    def D_b(self) -> Float | None: ...
+    def D_b(self) -> Float | None:
+        """[H, W, d] descriptors of b, as D_a."""
+        ...
 
 
 class Prior(Protocol):
@@ -114,7 +118,9 @@ class Prior(Protocol):
         self,
         image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
         camera: CameraModel,
-    ) -> Encoding: ...
+    ) -> Encoding:
+        """What decoding needs of a picture; once for each picture."""
+        ...
 
     def decode(
         self,

@@ -139,4 +139,5 @@ class FlowPair:
 
     @property
     def Q_b(self) -> Float:
+        """[H, W] confidence of X_b; 0 where unknown."""
         return self._in_b[1]

@@ -115,6 +115,7 @@ class HybridPrior:
         image: Picture,  # [H, W, 3] RGB
         camera: CameraModel,
     ) -> HybridEncoding:
+        """What dense flow and the network's comparison need of a picture."""
         grey = dense.normalised_grey(image)
         fitted = self._describer.fitted(image)
         return HybridEncoding(camera, grey, dense.texture(grey), fitted, self._describer)

@@ -22,10 +22,12 @@ class Picture:
 
     @property
     def topic(self) -> str:
+        """Topic of the MCAP file."""
         return f"/{self.camera}"
 
     @property
     def size(self) -> int:
+        """Bytes that it takes in memory."""
         if isinstance(self.frame, Dropped):
             return SAMPLE_BYTES
         received = 0 if self.frame.encoded is None else len(self.frame.encoded.data)
@@ -41,6 +43,7 @@ class Sample:
 
     @property
     def topic(self) -> str:
+        """Topic of the MCAP file."""
         return f"/telemetry/{self.sample.source}"
 
 
@@ -54,10 +57,12 @@ class LinkBytes:
 
     @property
     def topic(self) -> str:
+        """Topic of the MCAP file."""
         return f"/links/{self.link}"
 
     @property
     def size(self) -> int:
+        """Bytes that it takes in memory."""
         return SAMPLE_BYTES + len(self.data)
 
 

@@ -71,6 +71,7 @@ class Library:
         return int(context)
 
     def free_context(self, context: int) -> None:
+        """Give back what :meth:`new_context` made."""
         self._dll.aq_context_free(context)
 
     def stage_ms(self, context: int) -> list[float]:

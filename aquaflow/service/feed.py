@@ -38,6 +38,7 @@ class Heard:
         self._latest: dict[tuple[str, str], TelemetrySample] = {}
 
     def take(self, sample: TelemetrySample) -> None:
+        """Count the sample and keep it as the latest of its source and kind."""
         self.samples += 1
         self._latest[sample.source, type(sample).__name__] = sample
 
@@ -93,7 +94,9 @@ class Feed(Protocol):
         """Tell the vehicle; False if nobody there understands."""
         ...
 
-    def start(self) -> None: ...
+    def start(self) -> None:
+        """Begin to read the sources, in threads."""
+        ...
 
     def close(self) -> None: ...
 
@@ -189,6 +192,7 @@ class LiveFeed(_Pumps):
         return isinstance(self._telemetry, Hears) and self._telemetry.tell(word)
 
     def start(self) -> None:
+        """Open cameras and telemetry, and read them in threads."""
         for name, camera in self._cameras.items():
             mapped = name == self.name
             if mapped or self._recorder is not None:
@@ -261,6 +265,7 @@ class PlaybackFeed(_Pumps):
         return False
 
     def start(self) -> None:
+        """Play the recording back in a thread."""
         self.pump("recording", self._events, last=True)
 
     def close(self) -> None:

@@ -22,6 +22,7 @@ class Moment:
 
     @staticmethod
     def now(boot_id: Path = BOOT_ID) -> Moment:
+        """Both clocks, and the boot that the monotonic one counts from."""
         try:
             boot = boot_id.read_text().strip()
         except OSError:
@@ -44,4 +45,5 @@ class Moment:
         return max(now.wall_ns - self.wall_ns, 0) / 3.6e12
 
     def to_json(self) -> dict[str, Any]:
+        """As plain values."""
         return asdict(self)

@@ -31,6 +31,7 @@ def to_sim3(row: Array) -> Sim3:
 
 
 def of_camera(camera: CameraModel) -> dict[str, Any]:
+    """The camera as plain values for JSON."""
     return asdict(camera)
 
 
@@ -50,11 +51,13 @@ class Cameras:
         self.known: list[CameraModel] = []
 
     def number(self, camera: CameraModel) -> int:
+        """Its place in the list, where it is added if it is new."""
         if camera not in self.known:
             self.known.append(camera)
         return self.known.index(camera)
 
     def to_json(self) -> list[dict[str, Any]]:
+        """All of them, as plain values."""
         return [of_camera(camera) for camera in self.known]
 
 

@@ -134,4 +134,5 @@ class SyntheticConfig(BaseModel):
 
     @property
     def focal_px(self) -> float:
+        """Focal length, px."""
         return self.focal_widths * self.width

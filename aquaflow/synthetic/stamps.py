@@ -97,6 +97,7 @@ def boulder(rng: np.random.Generator) -> Stamp:
 
 
 def pebble(rng: np.random.Generator) -> Stamp:
+    """A stone of 1.5 to 6 cm."""
     return _stone(rng, float(rng.uniform(0.015, 0.06)), cracked=False)
 
 

@@ -37,11 +37,20 @@ class Geometry(Protocol):
     """What a network says of one view; see mast3r.network.ViewGeometry."""
 
     @property
-    def X(self) -> Tensor: ...
+    def X(self) -> Tensor:
+        """Pointmap [..., 3]."""
+        ...
+
     @property
-    def Q(self) -> Tensor: ...
+    def Q(self) -> Tensor:
+        """Confidence of the points."""
+        ...
+
     @property
-    def D(self) -> Tensor: ...
+    def D(self) -> Tensor:
+        """Descriptors [..., d]."""
+        ...
+
     @property
     def C(self) -> Tensor: ...
 

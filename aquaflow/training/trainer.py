@@ -33,7 +33,9 @@ class Task(Protocol):
     """What is learnt."""
 
     @property
-    def network(self) -> nn.Module: ...
+    def network(self) -> nn.Module:
+        """What is trained."""
+        ...
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
         """Of the batch that ``step`` stands for, and the terms it is made of."""

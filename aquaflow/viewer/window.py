@@ -67,6 +67,7 @@ class Window:
 
     @property
     def splats_shown(self) -> int:
+        """Number of Gaussians in the window."""
         return 0 if self._splats is None else len(self._splats)
 
     def show_splats(self, splats: Splats) -> None:

@@ -14,6 +14,8 @@ MAX_STANDARD, MAX_EXTENDED = 0x7FF, 0x1FFF_FFFF
 
 
 class CanFrame(NamedTuple):
+    """One frame of a CAN bus."""
+
     identifier: int
     extended: bool
     data: bytes
@@ -42,5 +44,6 @@ class CanFraming(Framing):
 
 
 def frame_of(record: bytes) -> CanFrame:
+    """The frame in a record of :class:`CanFraming`."""
     identifier, length, payload = RECORD.unpack(record)
     return CanFrame(identifier & ~EXTENDED, bool(identifier & EXTENDED), payload[:length])

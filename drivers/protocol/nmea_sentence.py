@@ -32,6 +32,8 @@ def checksum(body: bytes) -> int:
 
 
 def framing(require_checksum: bool) -> LineFraming:
+    """Finds sentences in a stream; ``require_checksum`` drops those that carry none."""
+
     def intact(packet: bytes) -> bool:
         match = BODY.fullmatch(packet)
         if match is None:

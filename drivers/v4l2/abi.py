@@ -42,6 +42,8 @@ def fourcc(name: str) -> int:
 
 
 class Capability(ctypes.Structure):
+    """``struct v4l2_capability``."""
+
     _fields_ = (
         ("driver", ctypes.c_char * 16),
         ("card", ctypes.c_char * 32),
@@ -54,6 +56,8 @@ class Capability(ctypes.Structure):
 
 
 class PixFormat(ctypes.Structure):
+    """``struct v4l2_pix_format``."""
+
     _fields_ = tuple(
         (name, c_uint32)
         for name in (
@@ -69,14 +73,20 @@ class _FormatUnion(ctypes.Union):
 
 
 class Format(ctypes.Structure):
+    """``struct v4l2_format``."""
+
     _fields_ = (("type", c_uint32), ("fmt", _FormatUnion))
 
 
 class Fraction(ctypes.Structure):
+    """``struct v4l2_fract``."""
+
     _fields_ = (("numerator", c_uint32), ("denominator", c_uint32))
 
 
 class StreamParameters(ctypes.Structure):
+    """``struct v4l2_streamparm``."""
+
     _fields_ = (
         ("type", c_uint32),
         ("capability", c_uint32),
@@ -87,6 +97,8 @@ class StreamParameters(ctypes.Structure):
 
 
 class RequestBuffers(ctypes.Structure):
+    """``struct v4l2_requestbuffers``."""
+
     _fields_ = (
         ("count", c_uint32),
         ("type", c_uint32),
@@ -97,6 +109,8 @@ class RequestBuffers(ctypes.Structure):
 
 
 class Buffer(ctypes.Structure):
+    """``struct v4l2_buffer``."""
+
     _fields_ = (
         ("index", c_uint32),
         ("type", c_uint32),
@@ -115,10 +129,14 @@ class Buffer(ctypes.Structure):
 
 
 class Control(ctypes.Structure):
+    """``struct v4l2_control``."""
+
     _fields_ = (("id", c_uint32), ("value", c_int32))
 
 
 class QueryControl(ctypes.Structure):
+    """``struct v4l2_queryctrl``."""
+
     _fields_ = (
         ("id", c_uint32),
         ("type", c_uint32),
@@ -133,6 +151,8 @@ class QueryControl(ctypes.Structure):
 
 
 class FormatDescription(ctypes.Structure):
+    """``struct v4l2_fmtdesc``."""
+
     _fields_ = (
         ("index", c_uint32),
         ("type", c_uint32),
@@ -144,6 +164,8 @@ class FormatDescription(ctypes.Structure):
 
 
 class FrameSize(ctypes.Structure):
+    """``struct v4l2_frmsizeenum``."""
+
     _fields_ = (
         ("index", c_uint32),
         ("pixelformat", c_uint32),

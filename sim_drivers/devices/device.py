@@ -84,6 +84,7 @@ class SimulatedDevice(Generic[Packet]):
         self._thread = threading.Thread(target=self._run, name="simulated device", daemon=True)
 
     def start(self) -> SimulatedDevice[Packet]:
+        """Begin to send, in a thread."""
         self._started_ns = time.monotonic_ns()
         self._thread.start()
         return self

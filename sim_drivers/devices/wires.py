@@ -82,6 +82,7 @@ class UdpWire:
 
     @property
     def port(self) -> int:
+        """That it sends from."""
         return int(self._socket.getsockname()[1])
 
     def send(self, packet: bytes) -> None:
@@ -111,6 +112,7 @@ class TcpWire:
 
     @property
     def port(self) -> int:
+        """That it listens on."""
         return int(self._server.getsockname()[1])
 
     def unplug(self) -> None:

@@ -33,9 +33,11 @@ class Job:
         return parse_config(merged(wanted, self.overrides or {}), f"benchmark of {self.scene.name}")
 
     def to_text(self) -> str:
+        """As JSON, for the worker process."""
         return json.dumps(asdict(self))
 
     @staticmethod
     def from_text(text: str) -> Job:
+        """The job that :meth:`to_text` wrote."""
         data = json.loads(text)
         return Job(**{**data, "scene": Scene(**data["scene"])})

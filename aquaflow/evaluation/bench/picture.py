@@ -116,6 +116,7 @@ def _drawable(value: float) -> bool:
 
 
 def shape_of(row: Row) -> str:
+    """The marker of the run that a row is of."""
     return SHAPES.get(contender_of(row), OTHER_SHAPE)
 
 

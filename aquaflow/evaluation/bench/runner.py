@@ -45,6 +45,7 @@ class Contender:
 
     @property
     def name(self) -> str:
+        """The peer's name, or the preset's."""
         return self.peer or self.preset
 
 

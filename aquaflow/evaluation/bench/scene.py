@@ -29,6 +29,7 @@ class Scene:
     """Of a preset's refining steps: small pictures converge sooner."""
 
     def to_json(self) -> dict[str, Any]:
+        """As plain values."""
         return asdict(self)
 
 

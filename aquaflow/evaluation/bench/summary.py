@@ -19,6 +19,7 @@ class Spread:
     runs: int
 
     def text(self, form: str) -> str:
+        """The median in the format ``form``, with half the range where there are several runs."""
         shown = format(self.median, form)
         return shown if self.runs < 2 else f"{shown} ± {format(self.half_range, form)}"
 
@@ -42,9 +43,11 @@ class Line:
 
     @property
     def failures(self) -> list[str]:
+        """Why runs failed, one sentence each."""
         return [row["failed"] for row in self.rows if row["failed"]]
 
     def spread(self, column: Column) -> Spread | None:
+        """Of the runs that did not fail; None if none has a value."""
         values = [column.value(row) for row in self.rows if not row["failed"]]
         known = [value for value in values if value is not None]
         if not known:
@@ -52,6 +55,7 @@ class Line:
         return Spread(median(known), (max(known) - min(known)) / 2.0, len(known))
 
     def cell(self, column: Column) -> str:
+        """The text of the cell in ``column``; - without a value."""
         found = self.spread(column)
         return "-" if found is None else found.text(column.form)
 

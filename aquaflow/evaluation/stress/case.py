@@ -106,6 +106,7 @@ class Check:
         self.below(f"{what}: quaternion length - 1", abs(length - 1.0), ROTATION_ERROR)
 
     def outcome(self) -> Outcome:
+        """Passed, or the first failure and how many more there are."""
         if self._failures:
             more = len(self._failures) - 1
             detail = self._failures[0] + (f" (and {more} more)" if more else "")

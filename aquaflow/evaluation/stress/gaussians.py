@@ -29,6 +29,7 @@ class Cloud:
     colours: Tensor
 
     def tensors(self) -> list[Tensor]:
+        """In the order of the renderer's arguments."""
         return [self.means, self.quats, self.scales, self.opacities, self.colours]
 
 

@@ -50,6 +50,7 @@ class Floor:
         self._texture = 120.0 + 32.0 * texture / texture.std()
 
     def height(self, x: Array, y: Array) -> Array:
+        """Depth of the floor below the origin at x, y, m; the shape of x."""
         relief = np.sin(3.1 * x + 0.5) + 0.8 * np.cos(3.7 * y + 1.3 * x)
         return np.asarray(DEPTH_M + self.relief_m * relief)
 
@@ -117,6 +118,7 @@ class Tracking:
 
     @property
     def posed(self) -> dict[int, Tracked]:
+        """Frames that have a pose, by index."""
         return {t.frame.index: t for t in self.tracked if t.T_wc is not None}
 
 

@@ -211,6 +211,7 @@ def camera(summary: CameraSummary) -> str:
 
 
 def notes(data: ReportData) -> str:
+    """What the reader has to know of the run; empty if there is nothing."""
     if not data.notes:
         return ""
     items = "".join(f"<li>{html.escape(note)}</li>" for note in data.notes)

@@ -42,6 +42,7 @@ class GaussianMap:
 
     @property
     def means(self) -> Tensor:
+        """[N, 3] centres, world."""
         return self.parameters["means"]
 
     @property

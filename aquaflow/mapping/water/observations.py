@@ -34,6 +34,7 @@ class Observations:
 
     @property
     def points(self) -> int:
+        """Number P of points."""
         return int(self.point.max()) + 1 if len(self.point) else 0
 
 

@@ -117,6 +117,7 @@ def source_hash(directory: Path = NATIVE_DIR) -> str:
 
 
 def library_path(isa: str, directory: Path = NATIVE_DIR) -> Path:
+    """Where the library of the variant ``isa`` lies."""
     return directory / f"libaquaflow_{isa}.so"
 
 

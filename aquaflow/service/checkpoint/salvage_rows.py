@@ -25,6 +25,7 @@ class SalvagedRows:
 
     @property
     def whole(self) -> bool:
+        """True if nothing was damaged."""
         return not self.unreadable and not self.rebuilt
 
 

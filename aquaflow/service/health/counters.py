@@ -69,6 +69,7 @@ class Counters:
         return {"p50": round(float(half), 1), "p95": round(float(most), 1)}
 
     def to_json(self) -> dict[str, Any]:
+        """For /health: counts, frames per second, times in ms."""
         return {
             "frames": self.frames,
             "failures": self.failures,

@@ -27,6 +27,7 @@ class Level(IntEnum):
 
     @property
     def words(self) -> str:
+        """The name for messages."""
         return self.name.lower().replace("_", " ")
 
 

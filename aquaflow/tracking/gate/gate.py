@@ -40,6 +40,7 @@ class Verdict:
 
     @property
     def passed(self) -> bool:
+        """True if the frame goes on."""
         return self.kind is GateKind.PASS
 
     @property

@@ -36,6 +36,8 @@ class Bundle:
 
 @dataclass(frozen=True)
 class BundleResult:
+    """What an adjustment found, and how well."""
+
     bundle: Bundle
     residual_px: float
     """Median reprojection error over all observations."""

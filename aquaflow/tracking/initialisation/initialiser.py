@@ -89,6 +89,7 @@ class Initialiser:
 
     @property
     def parallax_px(self) -> float:
+        """Largest of the waiting frames; 0 without any."""
         return max((frame.parallax_px for frame in self.waiting), default=0.0)
 
     @property

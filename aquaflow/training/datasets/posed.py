@@ -41,7 +41,9 @@ class Sequence(Protocol):
     """Pictures of one scene in one world; neighbours in order are near each other."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """For messages and figures."""
+        ...
 
     def __len__(self) -> int: ...
 

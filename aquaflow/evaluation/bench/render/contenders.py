@@ -27,11 +27,20 @@ class Contender(Protocol):
     """Something that draws a scene and differentiates it, and says how long that took."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Of the renderer or program, for the table."""
+        ...
+
     @property
-    def isa(self) -> str: ...
+    def isa(self) -> str:
+        """Instruction set that it runs on, or ``torch``, ``cuda``."""
+        ...
+
     @property
-    def threads(self) -> int: ...
+    def threads(self) -> int:
+        """Threads that it runs on."""
+        ...
+
     @property
     def slow(self) -> bool:
         """Seconds rather than milliseconds: run once, after the others."""
@@ -57,14 +66,17 @@ class Timed:
 
     @property
     def name(self) -> str:
+        """Of the renderer."""
         return self.renderer.name
 
     @property
     def isa(self) -> str:
+        """Of the renderer."""
         return self.renderer.isa
 
     @property
     def threads(self) -> int:
+        """Of the renderer."""
         return self.renderer.threads
 
     @property

@@ -34,10 +34,12 @@ class Size:
 
     @property
     def pixels(self) -> int:
+        """Of the picture."""
         return self.width * self.height
 
     @property
     def picture(self) -> str:
+        """Width and height for the table."""
         return f"{self.width} x {self.height}"
 
 
