@@ -13,6 +13,7 @@ from aquaflow.config.service import ListenConfig, is_loopback
 from aquaflow.errors import ConfigError, InputError, reason_of
 
 COOKIE = "aquaflow_token"
+"""Name of the cookie in which a browser keeps the token."""
 SHORTEST_TOKEN = 16
 """Characters; shorter ones can be guessed."""
 

@@ -14,6 +14,7 @@ MOST_LINES = 20
 """Lines of one reason; a library's message has a few."""
 
 FRAME_COLUMNS = ("index", "source", "t_s", "class", "sub_map", "keyframe", "quality", "reason")
+"""Columns of frames.csv, as the fields of :class:`FrameRow`."""
 
 
 @dataclass(frozen=True)

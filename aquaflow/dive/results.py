@@ -30,10 +30,13 @@ PROTOCOL = {
     "psnr": "mean over held-out frames of the PSNR of each",
     "ate": "see `aquaflow evaluate`, which knows the truth",
 }
+"""How the numbers of metrics.json were measured."""
 
 SCALE_SOURCE = "none: the median depth of the first keyframe is 1 map unit"
+"""One camera knows no metres: every start is scaled to median depth 1 (see initialisation)."""
 
 RANGE_PERCENTILES = (5.0, 95.0)
+"""Percent; what lies outside are single pixels at edges of the map."""
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,11 @@ ISA_LEVELS = (
 """Linux flag names of the x86-64 psABI's levels, the highest first."""
 
 COMPILERS = ("g++", "clang++", "c++")
+"""Commands of C++ compilers, the one that is tried first in front."""
 
 LOW_MEMORY_GB = 4.0
+"""Below, a smaller resolution is advised; a judgement: a small dive takes 0.45 GB (benchmark), a
+large one and the operating system several times that."""
 LOW_DISK_GB = 5.0
 """An hour of 1080p recording at 10 Mbit/s takes 4.5 GB."""
 

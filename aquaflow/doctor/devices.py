@@ -8,6 +8,7 @@ from pathlib import Path
 from aquaflow.doctor.machine import Finding, Machine
 
 LUXONIS_USB_VENDOR = "03e7"
+"""Vendor number of Luxonis' processor (Movidius) on USB, hexadecimal."""
 ARPHRD_CAN = "280"
 """Value of ``/sys/class/net/*/type`` for a CAN interface (linux/if_arp.h)."""
 

@@ -22,6 +22,7 @@ DEBUG = "AQUAFLOW_DEBUG"
 """Environment variable: set to anything, tracebacks go to stderr."""
 
 FAILED = 1
+"""Exit status after an error."""
 OUR_MISTAKE = 70
 """EX_SOFTWARE of sysexits.h."""
 INTERRUPTED = 130

@@ -19,6 +19,7 @@ ROW_TOLERANCE_S = 1e-3
 """``trajectory.tum`` and ``frames.csv`` may round a time differently; frames are further apart."""
 
 FRAME_COLUMNS = ("index", "source", "t_s", "class", "sub_map")
+"""Columns that the evaluation needs; peers in the benchmark write no others."""
 
 
 @dataclass(frozen=True)

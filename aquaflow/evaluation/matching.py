@@ -30,6 +30,7 @@ MARGIN_X, MARGIN_Y = 40, 30
 RIM_PX = 3.0
 """A true match this close to the second picture's rim does not count."""
 WITHIN_PX = 2.0
+"""Error up to which a match counts as right."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,7 @@ class Level:
 
 
 LEVELS = (Level.scaled("mild", 0.3), Level.scaled("medium", 1.0), Level.scaled("hard", 1.6))
+"""Easy to hard; shares of the same largest motion."""
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ BACKSCATTER_SPAN_M = (0.5, 8.0)
 """Ranges over which the two backscatter curves are compared: a hand's width to turbid distance."""
 
 BACKSCATTER_SAMPLES = 64
+"""Ranges, evenly spaced over the span, at which the curves are compared."""
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ Pictures = npt.NDArray[np.float32]
 """[N, H, W, 3] in [0, 1]."""
 
 SYNTHETIC_MARK = "synth.yaml"
+"""The file by which a folder is known to be a synthetic dive."""
 SYNTHETIC_CLEAN = "clean"
 """A synthetic dive keeps its pictures without water in this folder."""
 

@@ -8,6 +8,7 @@ from typing import Any
 Values = Mapping[str, Any]
 
 LABEL_WIDTH = 26
+"""Characters of the first column."""
 
 
 def in_words(result: Values) -> list[str]:

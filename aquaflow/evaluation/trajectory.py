@@ -16,6 +16,7 @@ from aquaflow.geometry.similarity import (
 )
 
 TUM_FIELDS = "t_s tx ty tz qx qy qz qw"
+"""Columns of a TUM trajectory: s, position, quaternion with its real part last."""
 
 ASSOCIATION_TOLERANCE_S = 0.01
 """Two poses are of the same moment if their times differ by less: one centimetre at 1 m/s."""

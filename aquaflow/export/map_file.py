@@ -17,7 +17,9 @@ from aquaflow.storage.facts_file import UNREADABLE, read_facts_file, write_facts
 
 SUFFIX = ".aqf"
 KIND = "aquaflow map"
+"""What the facts say that the file is."""
 FORMAT = 1
+"""Raised whenever an older AquaFlow could no longer read the file."""
 
 
 def write_map_file(path: Path, mapper: Mapper, optimiser: bool = False) -> None:

@@ -26,6 +26,7 @@ PROPERTIES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
+"""Columns of a 3DGS file without higher harmonics, in the order that viewers expect."""
 
 OPACITY_MARGIN = 1e-6
 """Opacities are kept this far from 0 and 1, where the logit is infinite."""
@@ -43,6 +44,7 @@ PLY_TYPES = {
     **dict.fromkeys(("int", "int32"), "<i4"),
     **dict.fromkeys(("uint", "uint32"), "<u4"),
 }
+"""Names of PLY number types and the numpy types that they are."""
 
 
 @dataclass(frozen=True)

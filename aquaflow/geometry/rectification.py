@@ -14,7 +14,10 @@ BORDER_SAMPLES = 200
 """Points per picture edge that decide how far to zoom in."""
 
 NEWTON_ITERATIONS = 50
+"""Limit of the search for the point that is distorted to a given one."""
 MAX_UNDISTORTION_ERROR_PX = 0.01
+"""Error up to which that search counts as successful; beyond, the lens model has no inverse
+there."""
 
 
 class Rectifier:

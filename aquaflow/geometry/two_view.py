@@ -18,7 +18,10 @@ from aquaflow.geometry.triangulation import triangulate
 Array = npt.NDArray[np.float64]
 
 INLIER_PX = 1.0
+"""MAGSAC's threshold for the essential matrix: five times the noise of a refined match (see
+prior/flow.py). A homography gets double."""
 RANSAC_CONFIDENCE = 0.999
+"""Probability of having drawn a sample without outliers."""
 MIN_MATCHES = 40
 """Fewer matches than this decide nothing (docs/measurements.md#pose-solver)."""
 

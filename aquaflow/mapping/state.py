@@ -30,6 +30,7 @@ Facts = dict[str, Any]
 NO_PIXELS = np.zeros((0, 0, 3), np.uint8)
 """A view's picture is no part of the map."""
 GROUPS = ("group", "slot", "table", "fill", "voxel", "features")
+"""Tables of the voxel groups, in the order of their names in the file."""
 
 
 def take_apart(mapper: Mapper, optimiser: bool = False) -> tuple[Facts, Arrays]:

@@ -34,6 +34,7 @@ planes start 0.5 instead of 1.0 px off."""
 FARTHEST_CELLS = 100.0
 """On the horizon of that motion displacements have no end."""
 HORIZON = 1e-3
+"""Least absolute value of the homogeneous coordinate that is divided by."""
 SMOOTH_CELLS = 1.5
 """Sigma of the smoothing."""
 MOTION_WEIGHT = 0.02

@@ -15,6 +15,7 @@ Float = npt.NDArray[np.float32]
 Grey = npt.NDArray[np.uint8]
 
 CLAHE_CLIP = 2.0
+"""OpenCV's clip limit of the histogram in each tile."""
 CLAHE_TILES = (8, 8)
 """Local contrast normalisation: water takes contrast unevenly (docs/measurements.md)."""
 
@@ -42,6 +43,7 @@ MIN_TEXTURE = 30.0
 """Smoothed squared Sobel gradient of the normalised grey image below which flow only guesses."""
 
 BORDER_PX = 2.0
+"""Matches this near to the rim of the picture are not believed."""
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,10 @@ from aquaflow.config.stage import Stage
 from aquaflow.errors import InputError, path_of_key
 
 CARD = "prior.json"
+"""Names the network, its inputs and its licence."""
 ENCODER, DECODER = "encoder.onnx", "decoder.onnx"
 READ_BYTES = 1 << 20
+"""Read at a time for the checksum."""
 
 
 class PriorCard(Stage):

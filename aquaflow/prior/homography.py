@@ -10,12 +10,15 @@ from aquaflow.prior.contract import Keypoints
 from aquaflow.prior.flow import Float, Grey, pixel_grid
 
 SIFT_FEATURES = 2000
+"""Strongest keypoints of a picture that are kept."""
 SIFT_CONTRAST = 0.015
 """Below OpenCV's 0.04: water lowers contrast (docs/measurements.md#initialisation)."""
 LOWE_RATIO = 0.8
+"""Best over second-best distance of a match that is believed (D. Lowe, IJCV 2004: 0.8)."""
 RANSAC_PX = 4.0
 """Loose on purpose: relief does not follow a homography, the flow takes care of the rest."""
 MIN_INLIERS = 12
+"""Three times the minimal sample of four."""
 MIN_DENOMINATOR = 1e-6
 """On the plane's horizon the denominator is zero."""
 

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from aquaflow.errors import AquaFlowError
 
 OPSET = 18
+"""ONNX operator set of exported files."""
 INLINE_BYTES = 1 << 30
 """Weights up to this lie in the ONNX file itself, larger ones beside it: a file ends at 2 GiB."""
 

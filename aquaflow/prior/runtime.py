@@ -29,8 +29,11 @@ PROVIDERS: dict[str, str] = {
     "cuda": "CUDAExecutionProvider",
     "tensorrt": "TensorrtExecutionProvider",
 }
+"""onnxruntime's names of the devices."""
 FASTEST_FIRST = ("tensorrt", "cuda", "cpu")
+"""The order in which ``auto`` tries devices."""
 LOG_ERRORS_ONLY = 3
+"""onnxruntime's severity level from which it prints."""
 
 TENSORRT_WORKSPACE_BYTES = 1 << 30
 """Scratch memory of TensorRT's kernels: a Jetson shares its memory with everything else."""

@@ -13,7 +13,9 @@ from aquaflow.config.recording import RecordingConfig
 from aquaflow.messages import CameraModel, Encoded, Frame
 
 FOXGLOVE_DISTORTION = {"none": "", "radtan": "plumb_bob", "fisheye": "kannala_brandt"}
+"""Distortion models by Foxglove's names."""
 PLUMB_BOB_COEFFICIENTS = 5
+"""That ``plumb_bob`` has."""
 
 
 def picture_message(frame: Frame, name: str, settings: RecordingConfig) -> Any:

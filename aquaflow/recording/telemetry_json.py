@@ -26,6 +26,7 @@ KINDS: dict[str, type[TelemetrySample]] = {
     "altitude": Altitude,
     "lights": Lights,
 }
+"""Telemetry samples by the name that they are recorded under."""
 KIND_OF: dict[type[TelemetrySample], str] = {sample: kind for kind, sample in KINDS.items()}
 
 LENGTHS = {"wxyz": 4, "rate_rad_s": 3, "acceleration_m_s2": 3, "velocity_m_s": 3}

@@ -20,6 +20,7 @@ from aquaflow.render.library import Library, pointer
 MAX_WIDTH = 64
 """Widest decoder that the kernel takes; its width is a multiple of UNITS."""
 UNITS = 4
+"""Hidden units that the kernel sums at once: kUnits of native/decode_view.h."""
 
 
 @dataclass(frozen=True)

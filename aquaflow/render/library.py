@@ -34,7 +34,9 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
         [_INT, _POINTER, _INT] + [_POINTER] * 2 + [_DOUBLE] * 2 + [_FLOAT, _POINTER] + [_INT] * 2,
     ),
 }
+"""Result and parameters of each function of the library."""
 _BUILD_LOCK = threading.Lock()
+"""One thread builds; the others wait for its library."""
 
 STAGES = ("project", "sort and bin", "blend", "blend backward", "project backward")
 """Stages of drawing and differentiating, in the order of ``aq_stage_ms``."""

@@ -16,6 +16,7 @@ SSIM_WINDOW = 11
 SSIM_SIGMA_PX = 1.5
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
+"""Window, sigma and constants as Wang et al. 2004 have them, for values in [0, 1]."""
 
 
 def ssim(

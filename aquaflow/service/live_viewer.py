@@ -25,6 +25,7 @@ log = logging.getLogger(__name__)
 LONGEST_PATH = 5000
 """Poses of the trajectory that are shown at most: thinned beyond."""
 LOOK_S = 0.1
+"""Wait for a new pose, until the thread looks whether it shall end."""
 
 
 class LiveWindow:

@@ -25,6 +25,7 @@ from aquaflow.tracking.frames import FrameClass, Tracked
 log = logging.getLogger(__name__)
 
 STAGE = "tracking"
+"""Name of this thread among the heartbeats."""
 IDLE_S = 0.25
 """Without a frame for so long, the loop says that it is idle and lives."""
 BUSY_S = 0.01

@@ -28,6 +28,7 @@ from aquaflow.service.health.heartbeats import Beats
 log = logging.getLogger(__name__)
 
 STAGE = "mapping"
+"""Name of this thread among the heartbeats."""
 IDLE_S = 0.2
 """How often an idle thread says that it lives."""
 STEPS_AT_ONCE = 4

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+"""Changes with every start of the kernel, and with it the zero of the monotonic clock."""
 LEAST_GAP_NS = 1_000_000_000
 """From the last moment before another boot to the first after it, if the wall clock says less."""
 

@@ -14,6 +14,7 @@ from aquaflow.service.live_dive import Parts
 GOOD = (State.TRACKING, State.INITIALISING)
 """States in which nothing is to be done about it."""
 CHANGES_TOLD = 10
+"""Latest changes of state that the report lists."""
 
 
 def report(parts: Parts, hang_s: float, now_s: float | None = None) -> dict[str, Any]:

@@ -17,7 +17,9 @@ from aquaflow.errors import InputError
 from aquaflow.messages import CameraModel, Dropped, Frame, TelemetrySample
 
 CAMERAS = "aquaflow.cameras"
+"""Group of entry points whose classes are cameras, live or recorded."""
 TELEMETRY = "aquaflow.telemetry"
+"""Group of entry points whose classes read telemetry."""
 LINKS = "links"
 """The entry point of live telemetry; the others of its group read recordings."""
 

@@ -12,6 +12,7 @@ from importlib.metadata import entry_points
 from typing import Any, TypeAlias
 
 DISCOVERY = "aquaflow.discovery"
+"""Group of entry points whose functions list the devices of one kind."""
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from aquaflow.storage.arrays import Arrays
 from aquaflow.storage.atomic import atomic_write
 
 FACTS = "facts"
+"""Name of the array that holds the facts as JSON."""
 MOST_FACTS_BYTES = 1 << 26
 """A camera takes 200 bytes, and no dive has a camera for each of 300,000 views."""
 UNREADABLE = (

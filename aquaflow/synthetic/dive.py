@@ -46,6 +46,7 @@ TEXEL_PX = 0.6
 TEXELS_MOST = 14e6
 """Keeps the memory that a dive is made in at about 1.5 GB."""
 MIP_LEVELS = 6
+"""Of the floor's texture, each half as fine as the one before."""
 
 
 def camera_of(config: SyntheticConfig) -> CameraModel:

@@ -24,13 +24,17 @@ __all__ = ["HeightField"]
 COARSE = 2
 """The highest points are kept on cells this many times larger."""
 BALLS_M = (0.02, 0.04, 0.08, 0.16, 0.32, 0.64)
+"""Radii within which the highest point is kept."""
 FEW = 2
 """How many of them single rays look at: what is farther, their bundle has passed."""
 BUNDLE_STEPS = 24
+"""Steps of a bundle of rays through empty water."""
 COMPACT_EVERY = 4
+"""Steps after which rays that have ended are left out."""
 LEAST_CELLS = 1.25
 """Smallest step, in cells (about 8 mm): what it could cut off a finger of coral is under 1 mm."""
 SECANT_STEPS = 5
+"""Illinois steps that refine where a ray meets the surface."""
 
 
 class HeightField:

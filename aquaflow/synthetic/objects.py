@@ -26,7 +26,9 @@ Array: TypeAlias = npt.NDArray[np.float64]
 Rgb: TypeAlias = tuple[float, float, float]
 
 TEXEL_M = 0.002
+"""Edge of a texel of the objects' paint."""
 TEXELS = 1024
+"""Along an edge of the paint, which repeats: 2 m."""
 GRAIN, GLAZE_GRAIN = 0.16, 0.04
 """Relative standard deviation of the albedo of paint, and of tiles."""
 

@@ -27,6 +27,7 @@ Array: TypeAlias = npt.NDArray[np.float64]
 MAX_TURN_RATE_DEG_S = 6.0
 """Sway slows down to this where a short dive would make it faster: flow stays below 6 % of W."""
 MAX_CLIMB_M_S = 0.3
+"""Fastest change of height with which the vehicle follows the floor."""
 
 
 def survey_to_world(config: SyntheticConfig) -> tuple[Array, Array]:

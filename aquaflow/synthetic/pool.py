@@ -16,11 +16,15 @@ Array: TypeAlias = npt.NDArray[np.float64]
 MARGIN_M = 1.4
 """Between the vehicle's way and the walls."""
 DEPTH_M = 3.2
+"""Of the basin: the height of its walls."""
 THICKNESS_M = 0.2
+"""Of floor and walls."""
 TILES_M = (0.12, 0.25)
 """Range of the tiles' edges."""
 FLOOR, WALL = (0.52, 0.66, 0.70), (0.66, 0.74, 0.74)
+"""Albedo of the glaze, RGB."""
 DIRT = (0.38, 0.42, 0.36)
+"""Albedo of algae and stains, RGB."""
 DIRTY = -0.3
 """``Shape.covered``: algae and stains darken some 3 % of the tiles."""
 

@@ -16,6 +16,7 @@ from aquaflow.synthetic.relief import Relief
 __all__ = ["AMBIENT", "SUN", "SUN_DIRECTION", "TEXELS_PER_CELL", "bake"]
 
 TEXELS_PER_CELL = 2
+"""Texels of the colours along an edge of the relief's cell."""
 SUN_DIRECTION = np.array([-0.45, 0.35, 0.82]) / np.linalg.norm([-0.45, 0.35, 0.82])
 """Towards the sun: x, y of the survey frame, and up."""
 AMBIENT = 0.55

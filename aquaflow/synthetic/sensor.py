@@ -21,6 +21,7 @@ SNOW_RANGE_M = (0.15, 2.5)
 SNOW_SIZE_M = (0.0004, 0.0015)
 """Radius of a particle; visible marine snow is 0.5 to several mm across."""
 SNOW_ALBEDO = 0.75
+"""Of a particle."""
 CURRENT_M_S = np.array([0.015, 0.03, 0.008])
 """Drift of the particles over ground, survey frame: a slight current, and sinking."""
 BLUR_PX = 0.55

@@ -27,6 +27,7 @@ __all__ = [
 CLEARWAY_M = 1.0
 """Nothing taller than LOW_M stands nearer than this to the vehicle's way."""
 LOW_M = 0.22
+"""Height up to which things may stand under the vehicle."""
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ __all__ = ["laid"]
 JOINT_SHARE = 0.05
 """Width of a joint over the edge of a tile."""
 JOINT_ALBEDO = 0.24
+"""Of the grout."""
 TINT = 0.03
 """Standard deviation of the tiles' albedo, from one to the next: one kiln, one batch."""
 APART = (67.3, 41.9)

@@ -20,11 +20,16 @@ log = logging.getLogger(__name__)
 PATIENCE_S = 10.0
 """A client that does not come out with its request is let go."""
 LONGEST_HEAD = 16_384
+"""Bytes of a request until its empty line."""
 MOST_CONNECTIONS = 64
+"""Open at a time; a browser opens six."""
 BYTES = 65_536
+"""Read at a time."""
 
 CLOSING = b"Connection: close\r\n\r\n"
+"""Headers of an answer after which the connection ends."""
 REFUSED = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 15\r\n" + CLOSING + b"Give the token\n"
+"""Answer to a request without the token."""
 
 
 class Door:

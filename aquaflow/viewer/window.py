@@ -25,6 +25,7 @@ LABELS = {
     "clear": "without the water",
     "coverage": "how often it was seen",
 }
+"""What the colours show, in words."""
 FRUSTUM_SHARE = 0.06
 """Size of the camera in the scene, of the scene's own."""
 LINE_SHARE = 0.0015

@@ -25,6 +25,7 @@ MOVED_WIDTHS = 0.01
 FAR_WIDTHS = 0.25
 """Shift of a frame that nothing is known about: beyond what flow alone follows."""
 LEAST_RUNS = 3
+"""Timed runs of each contender, however slow it is."""
 
 
 @dataclass(frozen=True)

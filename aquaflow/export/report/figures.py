@@ -45,6 +45,7 @@ STYLE: Any = {
 }
 
 CURVE_SAMPLES = 128
+"""Points of each drawn curve."""
 
 
 def path_svg(path: PathPlot) -> str:

@@ -21,6 +21,7 @@ IMAGE_WIDTH_PX = 720
 """Widest picture in the report; three stand side by side in 62 rem."""
 
 JPEG_QUALITY = 88
+"""Of the pictures in the report."""
 
 MINIMUM_PATH = 2
 """Poses below which there is no path to draw."""

@@ -14,6 +14,7 @@ from aquaflow.config.mapping import VoxelConfig
 from aquaflow.mapping.decoder.growable import GrowingRows
 
 EMPTY = -1
+"""Stands for no number in these tables."""
 
 REACH = 2**20
 """Voxels counted along one axis from the origin; what lies further counts as in the last one."""

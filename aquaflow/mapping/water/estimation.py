@@ -37,6 +37,7 @@ WATER_IS_USUAL = 10.0
 """Log odds for water before anything is seen: a dive is in water until very strong evidence (5,
 Kass and Raftery 1995), twice over, speaks against it."""
 MAX_STEPS = 30
+"""Limit of Levenberg-Marquardt in one fit."""
 LEAST_GAIN = 1e-5
 """Relative fall of the cost at which a fit has converged."""
 DAMPING = 1e-3, 1e6

@@ -13,6 +13,7 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 
 TERMS = 5
+"""x, y, x^2, x y and y^2: vignetting and a lamp at the side; a constant would be exposure."""
 MAX_LOG_GAIN = 2.0
 """Guards the exponential: a picture seven times darker at its edge shows nothing there anyway."""
 

@@ -30,6 +30,7 @@ POINTS = 2500
 MIN_WEIGHT_PX = 3.0
 """Sum of blending weights below which a Gaussian is hardly in the picture."""
 MIN_VIEWS = 4
+"""Views that must see a Gaussian for it to say anything about the water."""
 BORDER = 0.97
 """Gaussians whose centre is further out than this share of the picture are cut by its edge."""
 

@@ -31,8 +31,11 @@ WIDTH, HEIGHT = 320, 240
 MOST_CELLS = 512
 """Largest side of a picture in multiples of 16."""
 ONE_WAY = Compared._fields
+"""Outputs of one direction of matching."""
 OUTPUTS = tuple(f"{name}_{way}" for way in ("ab", "ba") for name in ONE_WAY)
+"""Outputs of the decoder, from a to b and back."""
 INPUTS = ("Dc_a", "Dc_b", "rays_a", "rays_b")
+"""Inputs of the decoder: coarse descriptors and viewing rays of both pictures."""
 
 Progress = Callable[[str, int, int], None]
 

@@ -14,6 +14,7 @@ from torch.nn import functional as F
 from aquaflow.prior.mast3r.settings import NetworkSize
 
 POINT_AND_CONFIDENCE = 4
+"""Channels: x, y, z and a confidence."""
 
 
 class ResidualConvUnit(nn.Module):

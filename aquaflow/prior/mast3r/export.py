@@ -20,6 +20,7 @@ from aquaflow.prior.onnx_file import OPSET, relative_difference, write_onnx
 from aquaflow.prior.runtime import RuntimeSettings, Session
 
 OUTPUTS = tuple(f"{symbol}_{view}" for view in "ab" for symbol in ViewGeometry._fields)
+"""Outputs of the decoder, of each view."""
 
 TINY_PX = (48, 32)
 """Width and height that the tiny network is verified at."""

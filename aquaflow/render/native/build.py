@@ -27,6 +27,7 @@ X86_64_V2 = {
     "sse4_2": "-msse4.2",
     "ssse3": "-mssse3",
 }
+"""Linux flag names and compiler options of the psABI level."""
 X86_64_V3 = X86_64_V2 | {
     "abm": "-mlzcnt",
     "avx2": "-mavx2",
@@ -36,6 +37,7 @@ X86_64_V3 = X86_64_V2 | {
     "fma": "-mfma",
     "movbe": "-mmovbe",
 }
+"""The same for the next level: AVX2, FMA."""
 X86_64_V4 = X86_64_V3 | {
     "avx512bw": "-mavx512bw",
     "avx512cd": "-mavx512cd",
@@ -51,6 +53,7 @@ CPU_FLAGS = {"avx512": X86_64_V4, "avx2": X86_64_V3, "sse4": X86_64_V2, "neon": 
 """What a library may use, and /proc/cpuinfo must list."""
 
 EXTRA_FLAGS = {"avx512": ("-mprefer-vector-width=512",), "neon": ("-march=armv8-a",)}
+"""What the variant needs on top of its instructions: GCC uses half of AVX-512 unless asked."""
 
 ISAS = {
     "x86_64": ("avx512", "avx2", "sse4"),
@@ -75,6 +78,7 @@ COMPILE_FLAGS = (
     "-freciprocal-math",
     "-ffp-contract=fast",
 )
+"""The same for every variant."""
 LINK_FLAGS = ("-shared", "-pthread")
 """Never -ffast-math here: a library linked with it switches denormals off in the whole process."""
 

@@ -23,6 +23,7 @@ from aquaflow.storage.facts_file import UNREADABLE, read_facts_file, write_facts
 
 STATE, PREVIOUS = "state.npz", "previous.npz"
 FORMAT = 3
+"""Of the checkpoint; raised whenever an older one can no longer be resumed from."""
 
 
 class OtherFormatError(InputError):

@@ -13,6 +13,7 @@ from pathlib import Path
 from aquaflow.errors import InputError
 
 WHY = "why.txt"
+"""The file that says why a folder was set aside."""
 
 
 class SetAside:

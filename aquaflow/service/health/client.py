@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 from aquaflow.errors import InputError, reason_of
 
 PATIENCE_S = 5.0
+"""Wait for an answer; the service answers within milliseconds or hangs."""
 MOST_BYTES = 1 << 20
 """Of an answer; a report has a few thousand."""
 MOST_NAME = 253

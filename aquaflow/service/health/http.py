@@ -26,6 +26,7 @@ MOST_CLIENTS = 16
 JSON, HTML = "application/json", "text/html; charset=utf-8"
 
 NOT_ALLOWED = {"error": "give the token, or ask on board by the name localhost"}
+"""Answer to a request without the token."""
 
 REGISTRATION = {
     "name": "AquaFlow",

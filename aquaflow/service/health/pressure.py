@@ -10,6 +10,7 @@ from aquaflow.recording.disk import free_bytes
 
 MB = 1_000_000
 MILLIDEGREES = 1000.0
+"""In a degree: the unit of thermal zones in /sys."""
 HOTTEST_C = 150.0
 """Zones that claim more are not wired up."""
 

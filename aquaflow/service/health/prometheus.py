@@ -8,6 +8,7 @@ from typing import Any
 from aquaflow.service.health.state import State
 
 TYPE = "text/plain; version=0.0.4; charset=utf-8"
+"""Content type of Prometheus' text format."""
 
 COUNTERS = {
     "frames": "Frames that were looked at.",
@@ -18,12 +19,14 @@ COUNTERS = {
     "steps_up": "Steps back up.",
     "telemetry_samples": "Telemetry samples received.",
 }
+"""Metrics that only grow: name and help."""
 GAUGES = {
     "fps": "Frames per second, lately.",
     "mapping_waits": "Requests that wait for mapping.",
     "keyframes": "Keyframes of the dive.",
     "gaussians": "Gaussians of all maps.",
 }
+"""Metrics that rise and fall: name and help."""
 
 
 def exposition(report: Mapping[str, Any]) -> str:

@@ -12,6 +12,7 @@ from aquaflow.service.loop import LiveLoop
 from aquaflow.sources.outbound import Number, Sentence
 
 EVERY_S = 1.0
+"""Period of the numbers that the autopilot logs."""
 SPACING_S = 2.0
 """Between sentences: a state that flaps must not fill the pilot's screen."""
 
@@ -21,6 +22,7 @@ SEVERITY: dict[State, Literal["error", "warning", "notice", "info"]] = {
     State.DEGRADED: "warning",
     State.TRACKING: "notice",
 }
+"""How urgent each state is to the pilot."""
 
 
 class VehicleReport:

@@ -25,6 +25,7 @@ from aquaflow.tracking.graph.equations import (
 from aquaflow.tracking.graph.linear_system import System
 
 DAMPING_LIMIT = 1e3
+"""At which no step leads down any more: the descent has ended."""
 LARGEST_TURN = 1.0
 """Rotation (rad) and log-scale of one step; longer steps are shortened as a whole."""
 SHORTENINGS = 3

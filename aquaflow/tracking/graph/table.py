@@ -13,6 +13,7 @@ from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.tracking.graph.equations import Index, Mask, Rows, poses_of
 
 _SIM3 = [("R", np.float64, (3, 3)), ("t", np.float64, 3), ("scale", np.float64)]
+"""Columns of a similarity."""
 
 NODE = np.dtype([("number", np.int64), ("component", np.int64), *_SIM3])
 """A keyframe: its number, that of the first keyframe of its component, T_wc."""

@@ -17,8 +17,11 @@ from aquaflow.geometry.similarity import Sim3, so3_exp
 Array = npt.NDArray[np.float64]
 
 HUBER_PX = 1.0
+"""Reprojection error where the loss turns linear."""
 MAX_ITERATIONS = 25
+"""Limit of Levenberg-Marquardt."""
 STOP_RELATIVE_DECREASE = 1e-5
+"""Relative fall of the cost at which the adjustment has converged."""
 MIN_RHO = 1e-3
 """Points further than 1000 scene units are held there: infinity has no parallax to solve for."""
 

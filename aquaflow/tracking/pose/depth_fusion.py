@@ -26,6 +26,8 @@ may drift: where tracking had diverged, after 65,000 frames at one place, a keyf
 GATE_SIGMAS = 3.0
 """A measurement further off than this disagrees: it does not move the depth, it lowers trust."""
 DISAGREEMENT_INFLATION = 1.3
+"""Growth of the variance of a depth that a measurement disagrees with: about five in a row double
+its sigma."""
 TRANSFER_INFLATION = 1.5
 """Variance growth when a pointmap moves to another keyframe through matches."""
 MIN_KNOWN_NEIGHBOURS = 0.25

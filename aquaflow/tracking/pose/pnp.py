@@ -9,8 +9,11 @@ from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.tracking.pose.solver import PoseProblem
 
 RANSAC_ITERATIONS = 200
+"""Samples that are tried at most."""
 RANSAC_PX = 3.0
+"""Reprojection error up to which a match agrees with a pose."""
 MIN_INLIERS = 30
+"""Matches that must agree on a pose."""
 LEAST_WIDTH = 1e-3
 """Of a set of points over its length; thinner is a line, to the depths' own precision."""
 

@@ -254,3 +254,4 @@ ROWS: dict[PoseResidual, Callable[[Matches, Sim3], Rows]] = {
     "ray": ray_rows,
     "pixel": pixel_rows,
 }
+"""The function that makes the equations of each kind of residual."""

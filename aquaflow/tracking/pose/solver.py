@@ -25,6 +25,7 @@ HUBER = 1.345
 INLIER = 3.0
 """Whitened residual up to which a match counts as an inlier."""
 MAX_ITERATIONS = 15
+"""Limit of Levenberg-Marquardt for one pose."""
 STOP_SIGMAS = 0.1
 """A step of this many of the pose's own standard deviations is the last. Steps shrink at least
 threefold, also with a third of outliers: what is left is a twentieth of the noise."""
@@ -33,7 +34,9 @@ SLACK = 1e-2
 gain from a pose that is less certain; the scores leave that out, so near the solution the cost
 does not follow them."""
 FIRST_DAMPING = 1e-6
+"""Damping to begin with, relative to the diagonal."""
 MAX_DAMPING = 1e6
+"""At which no step helps any more."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,9 @@ from aquaflow.prior.homography import LOWE_RATIO, detect
 from aquaflow.training.datasets.posed import Array, Frames, Posed
 
 RANSAC_PX = 2.0
+"""Reprojection error up to which a keypoint agrees with a pose."""
 RANSAC_ITERATIONS = 300
+"""Samples that are tried."""
 MIN_INLIERS = 40
 """Keypoints that agree on the pose; chance makes ten agree (VerificationConfig)."""
 MIN_LENGTH = 2

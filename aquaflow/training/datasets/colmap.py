@@ -28,6 +28,7 @@ from aquaflow.training.datasets.posed import (
 SIMPLE_PINHOLE, PINHOLE = 0, 1
 """COLMAP's numbers of the camera models that undistorted pictures have."""
 PARAMETERS = {SIMPLE_PINHOLE: 3, PINHOLE: 4}
+"""Number of parameters of the camera models without distortion."""
 POINT_BYTES = 24
 """Of a 2D point in images.bin: x, y, and the 3D point's number."""
 

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from aquaflow.errors import DamagedError, InputError, reason_of
 
 MAGIC = 20000630
+"""The first four bytes of an OpenEXR file."""
 LINES = {0: 1, 2: 1, 3: 16}
 """Lines of a block by compression: none, zip of one line, zip."""
 DTYPES: dict[int, np.dtype[Any]] = {1: np.dtype("<f2"), 2: np.dtype("<f4")}

@@ -26,6 +26,7 @@ HIGHLIGHT = 250
 HIGHLIGHT_BORDER_PX = 2
 """Around a highlight, its glare."""
 CONTRAST_WINDOW_PX = 15
+"""Edge of the window that the contrast is measured in."""
 VEILED = 0.7
 """Grey levels of contrast: rounding alone makes 0.3, and where no more is left only the veil is
 seen."""

@@ -36,6 +36,7 @@ WIDER = Motion(baseline=0.45, power=1.0, tilt=0.1, roll=0.2)
 FIELD_OF_VIEW_DEG = (40.0, 95.0)
 """Horizontal: a narrow inspection camera to an action camera, both in water."""
 ALTITUDE_M = (0.8, 3.0)
+"""Of the first camera above the floor."""
 PITCH_DEG = (12.0, 90.0)
 """Below the horizon: from looking forward to looking down."""
 CLEARANCE_M = 0.25

@@ -13,6 +13,7 @@ from aquaflow.training.pair_generator.scene import Scene, Solids, Terrain
 STEPS = 64
 """Along a ray, each a constant factor further than the last."""
 SECANTS = 5
+"""Steps that refine where a ray meets the floor."""
 NEAREST, FURTHEST = 0.05, 14.0
 """Depths in metres between which something is looked for."""
 NOWHERE = 1e6

@@ -15,9 +15,13 @@ MEAN_LEVEL = (0.25, 0.55)
 UNEVENNESS = 0.2
 """Deviation of the logarithm of a slow brightness pattern: lamps, shadows, vignetting."""
 NOISE = (0.002, 0.02)
+"""Standard deviation of the noise, in full scale."""
 GAMMA = (0.55, 1.1)
+"""Exponent of the tone curve."""
 BLUR_PX = (0.15, 0.8)
+"""Sigma of lens and motion."""
 BLUR_TAPS = 7
+"""Width of the kernel: 3.75 sigmas of the widest blur to either side."""
 SNOW_PER_PIXEL = (-0.003, 0.002)
 """Bright particles; none where the draw is negative."""
 
