@@ -89,7 +89,7 @@ def map_command(
     }  # fmt: skip
     optimiser = {"refine_steps": refine_steps, "refine_seconds": refine_seconds}
     mapping = {"optimiser": optimiser, "enabled": False if tracking_only else None}
-    from aquaflow.presets import configured
+    from aquaflow.config.presets import configured
 
     settings = configured(
         config,

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Cli
 
-from aquaflow import dive_run, pipeline
 from aquaflow.config import Config
+from aquaflow.dive import replay, run
 from aquaflow.geometry.camera import load_camera, save_camera
 from aquaflow.keyframes import Keyframe
 from aquaflow.sources import open_recording
+from tests.command_line import Cli
 
 TRACKING = Config.model_validate({"threads": 1, "mapping": {"enabled": False}})
 
@@ -53,7 +53,7 @@ def test_without_a_calibration_nothing_is_checked(small_recording: Path, tmp_pat
     shutil.copytree(small_recording, source)
     (source / "camera.yaml").unlink()
 
-    finished = pipeline.map_recording(
+    finished = replay.map_recording(
         open_recording(source), "uncalibrated", tmp_path / "dive", TRACKING
     )
 
@@ -68,8 +68,8 @@ def test_a_check_that_fails_costs_itself(
     def fail(keyframes: Sequence[Keyframe]) -> Any:
         raise np.linalg.LinAlgError("planted")
 
-    monkeypatch.setattr(dive_run, "lens_error", fail)
-    finished = pipeline.map_recording(
+    monkeypatch.setattr(run, "lens_error", fail)
+    finished = replay.map_recording(
         open_recording(small_recording), "contained", tmp_path / "dive", TRACKING
     )
     assert [each["stage"] for each in finished.metrics["failures"]] == ["calibration check"]
