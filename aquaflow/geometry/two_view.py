@@ -89,7 +89,11 @@ def rotation_compensated_parallax_px(
     return float(np.median(np.linalg.norm(camera.project(ua @ R.T) - pixels_b, axis=1)))
 
 
-def _essential_poses(a: Array, b: Array, K: Array) -> list[tuple[Sim3, str]]:
+def _essential_poses(
+    a: Array,  # [N, 2] px
+    b: Array,  # [N, 2] px
+    K: Array,  # [3, 3] px
+) -> list[tuple[Sim3, str]]:
     import cv2
 
     E, _ = cv2.findEssentialMat(
@@ -101,7 +105,11 @@ def _essential_poses(a: Array, b: Array, K: Array) -> list[tuple[Sim3, str]]:
     return [(Sim3(R, sign * t[:, 0]), "essential") for R in (R1, R2) for sign in (1.0, -1.0)]
 
 
-def _homography_poses(a: Array, b: Array, K: Array) -> list[tuple[Sim3, str]]:
+def _homography_poses(
+    a: Array,  # [N, 2] px
+    b: Array,  # [N, 2] px
+    K: Array,  # [3, 3] px
+) -> list[tuple[Sim3, str]]:
     import cv2
 
     H, _ = cv2.findHomography(a, b, cv2.USAC_MAGSAC, 2.0 * INLIER_PX)

@@ -40,7 +40,11 @@ SECANT_STEPS = 5
 class HeightField:
     """A height map that rays can be shot at. Heights and positions in metres, z up here."""
 
-    def __init__(self, area: Area, height: FloatMap) -> None:
+    def __init__(
+        self,
+        area: Area,
+        height: FloatMap,  # [rows, columns] m
+    ) -> None:
         self.top = float(height.max())
         self._cell = area.cell
         self._height = torch.from_numpy(height)[None, None]
@@ -50,7 +54,12 @@ class HeightField:
         self._scale = (2.0 / (columns * area.cell), 2.0 / (rows * area.cell))
         self._shift = (-area.x0 * self._scale[0] - 1.0, -area.y0 * self._scale[1] - 1.0)
 
-    def _sample(self, maps: torch.Tensor, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    def _sample(
+        self,
+        maps: torch.Tensor,  # [1, K, rows, columns]
+        x: torch.Tensor,  # [N] m
+        y: torch.Tensor,  # [N] m
+    ) -> torch.Tensor:
         grid = torch.stack(
             [x * self._scale[0] + self._shift[0], y * self._scale[1] + self._shift[1]], dim=-1
         )
@@ -59,7 +68,11 @@ class HeightField:
         )
         return out[0, :, 0]
 
-    def height(self, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    def height(
+        self,
+        x: torch.Tensor,  # [N] m
+        y: torch.Tensor,  # [N] m
+    ) -> torch.Tensor:
         """Height [N] at positions x, y [N]."""
         return self._sample(self._height, x, y)[0]
 
@@ -83,7 +96,12 @@ class HeightField:
             t = torch.where(moving, (t + 0.9 * (empty - spread * t)).clamp_max(max_range), t)
         return t
 
-    def _above(self, origin: torch.Tensor, rays: torch.Tensor, spread: float) -> torch.Tensor:
+    def _above(
+        self,
+        origin: torch.Tensor,  # [3] m
+        rays: torch.Tensor,  # [3, N] unit vectors
+        spread: float,
+    ) -> torch.Tensor:
         """Range [N] at which a ray comes down to the highest point; infinite if it does not."""
         clearance = (origin[2] - self.top).clamp_min(0.0)
         down = -rays[2] + spread
@@ -126,7 +144,11 @@ class HeightField:
         return torch.where(t < max_range, t, torch.inf)
 
     def _refined(
-        self, origin: torch.Tensor, rays: torch.Tensor, above: torch.Tensor, below: torch.Tensor
+        self,
+        origin: torch.Tensor,  # [3] m
+        rays: torch.Tensor,  # [3, N] unit vectors
+        above: torch.Tensor,  # [N] m
+        below: torch.Tensor,  # [N] m
     ) -> torch.Tensor:
         """The range [N] of the surface between ``above`` and ``below`` it (Illinois secant)."""
         gap_above = self._gap(origin, rays, above).clamp_min(1e-9)
@@ -141,12 +163,20 @@ class HeightField:
             above, below = torch.where(over, t, above), torch.where(over, below, t)
         return above + (below - above) * (gap_above / (gap_above - gap_below).clamp_min(1e-12))
 
-    def _gap(self, origin: torch.Tensor, rays: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+    def _gap(
+        self,
+        origin: torch.Tensor,  # [3] m
+        rays: torch.Tensor,  # [3, N] unit vectors
+        t: torch.Tensor,  # [N] m
+    ) -> torch.Tensor:
         x, y, z = (origin[k] + t * rays[k] for k in range(3))
         return z - self.height(x, y)
 
 
-def _crests(height: FloatMap, cell: float) -> FloatMap:
+def _crests(
+    height: FloatMap,  # [rows, columns] m
+    cell: float,
+) -> FloatMap:
     """Highest point [K, h, w] within each of BALLS_M, on cells COARSE times larger."""
     rows, columns = height.shape
     blocks = height.reshape(rows // COARSE, COARSE, columns // COARSE, COARSE)

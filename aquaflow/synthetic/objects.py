@@ -63,7 +63,9 @@ class Shape:
 
 
 def _local(
-    shape: Shape, origin: torch.Tensor, rays: torch.Tensor
+    shape: Shape,
+    origin: torch.Tensor,  # [3] m
+    rays: torch.Tensor,  # [3, N] unit vectors
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Origin [3] and rays [3, N] in the shape's axes."""
     R = torch.tensor(shape.R.T, dtype=torch.float32)
@@ -73,7 +75,11 @@ def _local(
     return o, d
 
 
-def hit(shape: Shape, origin: torch.Tensor, rays: torch.Tensor) -> torch.Tensor:
+def hit(
+    shape: Shape,
+    origin: torch.Tensor,  # [3] m
+    rays: torch.Tensor,  # [3, N] unit vectors
+) -> torch.Tensor:
     """Range [N] (m) at which ``rays`` [3, N] enter the shape; infinite where they miss."""
     o, d = _local(shape, origin, rays)
     if shape.kind == "sphere":
@@ -90,18 +96,28 @@ def hit(shape: Shape, origin: torch.Tensor, rays: torch.Tensor) -> torch.Tensor:
     return torch.where((disc > 0.0) & (enter < leave) & (enter > 0.0), enter, torch.inf)
 
 
-def _dot(o: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
+def _dot(
+    o: torch.Tensor,  # [3, ...]
+    d: torch.Tensor,  # [3, ...]
+) -> torch.Tensor:
     return o[0] * d[0] + o[1] * d[1] + o[2] * d[2]
 
 
-def _quadratic(a: torch.Tensor, b: torch.Tensor, c: torch.Tensor) -> torch.Tensor:
+def _quadratic(
+    a: torch.Tensor,  # [N]
+    b: torch.Tensor,  # [N]
+    c: torch.Tensor,  # [] or [N]
+) -> torch.Tensor:
     disc = b * b - a * c
     t = (-b - disc.clamp_min(0.0).sqrt()) / a
     return torch.where((disc > 0.0) & (t > 0.0), t, torch.inf)
 
 
 def _slabs(
-    o: torch.Tensor, d: torch.Tensor, size: tuple[float, float, float], axes: tuple[int, ...]
+    o: torch.Tensor,  # [3] or [3, N], in the shape's axes
+    d: torch.Tensor,  # [3, N]
+    size: tuple[float, float, float],
+    axes: tuple[int, ...],
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Ranges [N] of entering the last and leaving the first pair of planes."""
     near = torch.full_like(d[0], -torch.inf)
@@ -144,7 +160,10 @@ def radiance(
     return ((paint + grown * (growth - paint)) * light).clamp(0.004, 0.98)
 
 
-def _surface(shape: Shape, p: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def _surface(
+    shape: Shape,
+    p: torch.Tensor,  # [3, N] m
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Outward normal [3, N] and texture position u, v [N] (m) of local points [3, N]."""
     half = torch.tensor(shape.size)[:, None]
     if shape.kind == "cylinder":
@@ -193,7 +212,12 @@ def casters(relief: Relief, shapes: list[Shape]) -> FloatMap:
     return height
 
 
-def _tops(shape: Shape, x: Array, y: Array, down: torch.Tensor) -> FloatMap:
+def _tops(
+    shape: Shape,
+    x: Array,  # [H, W] m
+    y: Array,  # [H, W] m
+    down: torch.Tensor,  # [3] unit vector
+) -> FloatMap:
     """Height [H, W] of the shape's upper side; -inf beside it."""
     # All rays are parallel: a ray's own start is a shift of the shape.
     R = torch.tensor(shape.R.T, dtype=torch.float32)

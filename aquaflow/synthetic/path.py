@@ -61,30 +61,48 @@ class Path:
     t_ws: Array
     R_bc: Array
 
-    def centre_s(self, t: Array) -> Array:
+    def centre_s(
+        self,
+        t: Array,  # [N] s
+    ) -> Array:
         """Camera centre [N, 3] in the survey frame at times t [N] s."""
         return np.asarray(self.position(t))
 
-    def centre_w(self, t: Array) -> Array:
+    def centre_w(
+        self,
+        t: Array,  # [N] s
+    ) -> Array:
         """Camera centre [N, 3] in the world."""
         return self.centre_s(t) @ self.R_ws.T + self.t_ws
 
-    def velocity_w(self, t: Array) -> Array:
+    def velocity_w(
+        self,
+        t: Array,  # [N] s
+    ) -> Array:
         """Velocity over ground [N, 3] m/s in the world."""
         return np.asarray(self.position(t, 1)) @ self.R_ws.T
 
-    def R_wb(self, t: Array) -> Array:
+    def R_wb(
+        self,
+        t: Array,  # [N] s
+    ) -> Array:
         """Body in the world [N, 3, 3]."""
         angles = [a * np.sin(w * t + p) - a * math.sin(p) for a, w, p in self.sway]
         angles[2] = angles[2] + self.heading(t)
         survey = Rotation.from_euler("ZYX", np.stack(angles[::-1], axis=1)).as_matrix()
         return np.asarray(self.R_ws @ survey @ self.R_ws.T)
 
-    def R_wc(self, t: Array) -> Array:
+    def R_wc(
+        self,
+        t: Array,  # [N] s
+    ) -> Array:
         """Camera in the world [N, 3, 3]."""
         return np.asarray(self.R_wb(t) @ self.R_bc)
 
-    def rate_b(self, t: Array) -> Array:
+    def rate_b(
+        self,
+        t: Array,  # [N] s
+    ) -> Array:
         """Angular rate [N, 3] rad/s in the body frame, by central difference."""
         half = 1e-4
         before, after = self.R_wb(t - half), self.R_wb(t + half)
@@ -120,7 +138,11 @@ def plan_path(
     return Path(spline, CubicSpline(at, way.heading), tuple(sway), R_ws, t_ws, mounting(config))
 
 
-def _followed(relief: Array, config: SyntheticConfig, way: Way) -> Array:
+def _followed(
+    relief: Array,  # [DENSE + 1] m
+    config: SyntheticConfig,
+    way: Way,
+) -> Array:
     """What the vehicle follows of the relief: smoothed over 0.6 m, the altimeter's footprint."""
     step = config.speed_m_s * config.duration_s / DENSE
     if not way.closed:

@@ -24,7 +24,12 @@ SUN = 0.62
 """Share of the light from all around, and from the sun; a horizontal white plane reflects ~1."""
 
 
-def bake(kind: SceneKind, relief: Relief, casters: FloatMap, rng: np.random.Generator) -> FloatMap:
+def bake(
+    kind: SceneKind,
+    relief: Relief,
+    casters: FloatMap,  # [H, W] m
+    rng: np.random.Generator,
+) -> FloatMap:
     """Radiance [2 H, 2 W, 3] in [0, 1] over the relief's area, and as a fourth channel steepness.
 
     Steepness is 0 below 35 degrees and 1 above 60: there a map seen from above has too few texels,
@@ -54,7 +59,7 @@ def bake(kind: SceneKind, relief: Relief, casters: FloatMap, rng: np.random.Gene
 def _albedo(
     kind: SceneKind,
     relief: Relief,
-    micro: FloatMap,
+    micro: FloatMap,  # [2 H, 2 W] noise
     shape: tuple[int, int],
     texel: float,
     rng: np.random.Generator,
@@ -79,7 +84,10 @@ def _albedo(
 
 
 def _mix(
-    colour: FloatMap, weight: FloatMap, other: tuple[float, float, float], share: float
+    colour: FloatMap,  # [H, W, 3]
+    weight: FloatMap,  # [H, W]
+    other: tuple[float, float, float],
+    share: float,
 ) -> None:
     """Blend ``colour`` [H, W, 3] towards ``other`` where ``weight`` [H, W] is 1, in place."""
     weight = (np.float32(share) * weight)[..., None]
@@ -87,7 +95,11 @@ def _mix(
 
 
 def _light(
-    relief: Relief, casters: FloatMap, micro: FloatMap, shape: tuple[int, int], texel: float
+    relief: Relief,
+    casters: FloatMap,  # [H, W] m
+    micro: FloatMap,  # [2 H, 2 W] noise
+    shape: tuple[int, int],
+    texel: float,
 ) -> FloatMap:
     """Light [2 H, 2 W] that reaches the ground, from normals, hollows and shadows."""
     cover = np.clip(resized(relief.cover, shape), 0.0, 1.0)
@@ -103,7 +115,10 @@ def _light(
     return np.asarray(ambient + SUN * facing * np.clip(resized(shadow, shape), 0, 1), np.float32)
 
 
-def _openness(height: FloatMap, cell: float) -> FloatMap:
+def _openness(
+    height: FloatMap,  # [H, W] m
+    cell: float,
+) -> FloatMap:
     """How much of the sky a point sees, [H, W]: lower than its surroundings is darker."""
     total = np.ones_like(height)
     for radius, weight in ((0.04, 0.35), (0.15, 0.45), (0.45, 0.35)):
@@ -112,7 +127,10 @@ def _openness(height: FloatMap, cell: float) -> FloatMap:
     return total
 
 
-def _sunlit(height: FloatMap, cell: float) -> FloatMap:
+def _sunlit(
+    height: FloatMap,  # [H, W] m
+    cell: float,
+) -> FloatMap:
     """1 in the sun, 0 in the shade, with a half-shade that widens with distance; [H, W]."""
     along = SUN_DIRECTION[:2] / np.linalg.norm(SUN_DIRECTION[:2])
     rise = SUN_DIRECTION[2] / np.linalg.norm(SUN_DIRECTION[:2])

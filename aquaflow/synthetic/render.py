@@ -94,7 +94,10 @@ def render(
     return view
 
 
-def _pixel_mean(values: npt.NDArray[np.floating], k: int) -> npt.NDArray[np.floating]:
+def _pixel_mean(
+    values: npt.NDArray[np.floating],  # [k H, k W, 3]
+    k: int,
+) -> npt.NDArray[np.floating]:
     """Mean of k x k subsamples, [k H, k W, 3] -> [H, W, 3]."""
     total = np.zeros_like(values[::k, ::k])
     for i in range(k):
@@ -103,7 +106,12 @@ def _pixel_mean(values: npt.NDArray[np.floating], k: int) -> npt.NDArray[np.floa
     return np.asarray(total / np.float32(k * k))
 
 
-def _rays(camera: CameraModel, rotation: Array, rows: Array, columns: Array) -> torch.Tensor:
+def _rays(
+    camera: CameraModel,
+    rotation: Array,  # [3, 3] camera to the area's axes, z up
+    rows: Array,  # [R] px
+    columns: Array,  # [C] px
+) -> torch.Tensor:
     """Unit vectors [3, R * C] (z up) through pixel coordinates rows x columns."""
     x = torch.tensor((columns - camera.cx) / camera.fx, dtype=torch.float32)[None, :]
     y = torch.tensor((rows - camera.cy) / camera.fy, dtype=torch.float32)[:, None]
@@ -116,8 +124,8 @@ def _rays(camera: CameraModel, rotation: Array, rows: Array, columns: Array) -> 
 def _ranges(
     scene: Scene,
     camera: CameraModel,
-    rotation: Array,
-    origin: torch.Tensor,
+    rotation: Array,  # [3, 3]
+    origin: torch.Tensor,  # [3] m
     part: slice,
     k: int,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -148,7 +156,10 @@ def _ranges(
 
 
 def _may_meet(
-    shape: objects.Shape, origin: torch.Tensor, axes: torch.Tensor, spread: float
+    shape: objects.Shape,
+    origin: torch.Tensor,  # [3] m
+    axes: torch.Tensor,  # [3, N] unit vectors
+    spread: float,
 ) -> bool:
     """False if no ray within ``spread`` of ``axes`` [3, N] passes the shape's ball."""
     to = torch.tensor(shape.centre, dtype=torch.float32) - origin
@@ -160,8 +171,8 @@ def _may_meet(
 def _trace(
     scene: Scene,
     camera: CameraModel,
-    rotation: Array,
-    origin: torch.Tensor,
+    rotation: Array,  # [3, 3]
+    origin: torch.Tensor,  # [3] m
     part: slice,
     k: int,
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
@@ -190,7 +201,11 @@ def _trace(
 
 
 def _grain(
-    scene: Scene, x: torch.Tensor, y: torch.Tensor, z: torch.Tensor, size: torch.Tensor
+    scene: Scene,
+    x: torch.Tensor,  # [N] m
+    y: torch.Tensor,  # [N] m
+    z: torch.Tensor,  # [N] m
+    size: torch.Tensor,  # [N] m
 ) -> torch.Tensor:
     """Relative change [N] of the radiance on steep faces; ``size`` (m) is the ray's footprint."""
     texel = objects.TEXEL_M
@@ -200,7 +215,10 @@ def _grain(
     return change
 
 
-def _footprint(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+def _footprint(
+    x: torch.Tensor,  # [R, C] m
+    y: torch.Tensor,  # [R, C] m
+) -> torch.Tensor:
     """Size [R, C] (m) on the map of a ray's surroundings, from where its neighbours hit.
 
     The geometric mean of the two sides; the nearer of two neighbours counts, so that the edge of a

@@ -66,7 +66,7 @@ def _set(
     relief: Relief,
     stamp: Stamp,
     place: np.ndarray[tuple[int], np.dtype[np.float64]],  # [2] m from the area's corner
-    rough: FloatMap,
+    rough: FloatMap,  # [rows, columns] noise of the area
     tallest: float,
 ) -> None:
     cell = relief.area.cell
@@ -111,7 +111,11 @@ def _stone(rng: np.random.Generator, radius: float, cracked: bool) -> Stamp:
     tilt = rng.uniform(-0.25, 0.25, 2)
     top = radius * rng.uniform(0.45, 0.95)
 
-    def shape(x: FloatMap, y: FloatMap, rough: FloatMap) -> FloatMap:
+    def shape(
+        x: FloatMap,  # [1, w] m
+        y: FloatMap,  # [h, 1] m
+        rough: FloatMap,  # [h, w] noise
+    ) -> FloatMap:
         height = top + tilt[0] * x + tilt[1] * y
         for k in range(count):
             side = slope[k] * (reach[k] - x * math.cos(turn[k]) - y * math.sin(turn[k]))
@@ -131,7 +135,11 @@ def brain_coral(rng: np.random.Generator) -> Stamp:
     radius = float(rng.uniform(0.08, 0.3))
     flat = rng.uniform(0.5, 0.9)
 
-    def shape(x: FloatMap, y: FloatMap, rough: FloatMap) -> FloatMap:
+    def shape(
+        x: FloatMap,  # [1, w] m
+        y: FloatMap,  # [h, 1] m
+        rough: FloatMap,  # [h, w] noise
+    ) -> FloatMap:
         rho = (x * x + y * y) / radius**2
         dome = flat * radius * np.sqrt(np.maximum(1.0 - rho, 0.0))
         winding = np.sin(2.0 * math.pi * (x + 0.02 * rough) / 0.035 + 5.0 * np.sin(y / 0.02))
@@ -146,7 +154,11 @@ def table_coral(rng: np.random.Generator) -> Stamp:
     height = rng.uniform(0.12, 0.28)
     lobes, phase = int(rng.integers(4, 9)), rng.uniform(0.0, 6.28)
 
-    def shape(x: FloatMap, y: FloatMap, rough: FloatMap) -> FloatMap:
+    def shape(
+        x: FloatMap,  # [1, w] m
+        y: FloatMap,  # [h, 1] m
+        rough: FloatMap,  # [h, w] noise
+    ) -> FloatMap:
         rho = np.sqrt(x * x + y * y) / radius
         edge = 0.85 + 0.09 * np.sin(lobes * np.arctan2(y, x) + phase) + 0.03 * rough
         plate = height + 0.05 * rho + 0.008 * rough
@@ -163,7 +175,11 @@ def branching_coral(rng: np.random.Generator) -> Stamp:
     tall = rng.uniform(0.35, 0.9, count) * radius
     thick = rng.uniform(0.012, 0.03, count)
 
-    def shape(x: FloatMap, y: FloatMap, rough: FloatMap) -> FloatMap:
+    def shape(
+        x: FloatMap,  # [1, w] m
+        y: FloatMap,  # [h, 1] m
+        rough: FloatMap,  # [h, w] noise
+    ) -> FloatMap:
         height = np.full(np.broadcast_shapes(x.shape, y.shape), -1.0, np.float32)
         for (cx, cy), top, width in zip(place, tall, thick, strict=True):
             rho = np.sqrt((x - cx) ** 2 + (y - cy) ** 2) / width
@@ -180,7 +196,11 @@ def sponge(rng: np.random.Generator) -> Stamp:
     radius = float(rng.uniform(0.05, 0.14))
     height = radius * rng.uniform(1.0, 1.8)
 
-    def shape(x: FloatMap, y: FloatMap, rough: FloatMap) -> FloatMap:
+    def shape(
+        x: FloatMap,  # [1, w] m
+        y: FloatMap,  # [h, 1] m
+        rough: FloatMap,  # [h, w] noise
+    ) -> FloatMap:
         rho = np.sqrt(x * x + y * y) / radius
         ribs = 0.06 * np.cos(11.0 * np.arctan2(y, x))
         barrel = height * (1.0 - 0.8 * np.exp(-((rho / 0.45) ** 2))) * (1.0 + ribs)

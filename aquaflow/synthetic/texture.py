@@ -52,11 +52,21 @@ class MipAtlas:
         fine = self._level(u, v, lower)
         return fine + (self._level(u, v, lower + 1.0) - fine) * share
 
-    def mirrored(self, u: torch.Tensor, v: torch.Tensor, footprint: torch.Tensor) -> torch.Tensor:
+    def mirrored(
+        self,
+        u: torch.Tensor,  # [N] texels
+        v: torch.Tensor,  # [N] texels
+        footprint: torch.Tensor,  # [N] texels
+    ) -> torch.Tensor:
         """As :meth:`sample`, the texture repeated as in a mirror, so without seams."""
         return self.sample(_fold(u, self.width), _fold(v, self.height), footprint)
 
-    def _level(self, u: torch.Tensor, v: torch.Tensor, level: torch.Tensor) -> torch.Tensor:
+    def _level(
+        self,
+        u: torch.Tensor,  # [N] texels
+        v: torch.Tensor,  # [N] texels
+        level: torch.Tensor,  # [N] whole numbers
+    ) -> torch.Tensor:
         scale = torch.exp2(-level)
         index = level.long()
         wide, tall = self.width * scale, self.height * scale
@@ -71,5 +81,8 @@ class MipAtlas:
         return out[0, :, 0]
 
 
-def _fold(u: torch.Tensor, size: int) -> torch.Tensor:
+def _fold(
+    u: torch.Tensor,  # [N] texels
+    size: int,
+) -> torch.Tensor:
     return (torch.remainder(u, 2.0 * size) - size).abs()

@@ -158,7 +158,11 @@ def _solve(problem: WaterModel, before: Sequence[_Fit]) -> _Fit:
     return _Fit(problem, x, float(np.mean(errors)), noise)
 
 
-def _descend(problem: WaterModel, x: Array, noise: float) -> Array:
+def _descend(
+    problem: WaterModel,
+    x: Array,  # [K] parameters
+    noise: float,
+) -> Array:
     """Levenberg-Marquardt on the robust cost."""
     damping, give_up = DAMPING
     cost = _cost(problem, x, noise)
@@ -177,7 +181,11 @@ def _descend(problem: WaterModel, x: Array, noise: float) -> Array:
     return x
 
 
-def _cost(problem: WaterModel, x: Array, noise: float) -> float:
+def _cost(
+    problem: WaterModel,
+    x: Array,  # [K] parameters
+    noise: float,
+) -> float:
     """Soft L1 of the sightings' whitened errors and squares of the priors', together."""
     total = float((problem.priors(x)[0] ** 2).sum())
     looks = [problem.look(x, c) for c in range(3)]
@@ -187,7 +195,11 @@ def _cost(problem: WaterModel, x: Array, noise: float) -> float:
     return total + sum(belief.residual**2 for belief in problem.beliefs(colours))
 
 
-def _normal_equations(problem: WaterModel, x: Array, noise: float) -> tuple[Array, Array]:
+def _normal_equations(
+    problem: WaterModel,
+    x: Array,  # [K] parameters
+    noise: float,
+) -> tuple[Array, Array]:
     """J^T W J and J^T W r of the same cost, the weights those of soft L1."""
     residuals, rows = problem.priors(x)
     H, g = rows.T @ rows, rows.T @ residuals

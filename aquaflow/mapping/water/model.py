@@ -53,12 +53,20 @@ class WaterModel(Parameters):
         self._beyond = seen.z - mean_by(seen.point, seen.z[:, None])[seen.point, 0]
         self._cell = seen.point * self.views + seen.view
 
-    def look(self, x: Array, c: int) -> tuple[Array, Array]:
+    def look(
+        self,
+        x: Array,  # [K] parameters
+        c: int,
+    ) -> tuple[Array, Array]:
         """Errors [M] of one channel, predicted minus seen, and the best J [P] of every point."""
         predicted, J, _ = self._predict(self.trial(x), c)
         return predicted - self.seen.colour[:, c], J
 
-    def derivatives(self, x: Array, c: int) -> tuple[Array, Array]:
+    def derivatives(
+        self,
+        x: Array,  # [K] parameters
+        c: int,
+    ) -> tuple[Array, Array]:
         """Of :meth:`look`'s errors [K, M] and J [K, P] by the parameters ``of_channel(c)``."""
         trial, seen, points = self.trial(x), self.seen, self.seen.points
         predicted, J, a = self._predict(trial, c)
@@ -83,7 +91,13 @@ class WaterModel(Parameters):
         stacked = np.stack(by_J)
         return np.stack(direct) + a * stacked[:, seen.point], stacked
 
-    def _changes(self, trial: Trial, c: int, predicted: Array, light: Array) -> list[Change]:
+    def _changes(
+        self,
+        trial: Trial,
+        c: int,
+        predicted: Array,  # [M]
+        light: Array,  # [M]
+    ) -> list[Change]:
         """By all parameters but exposures; ``light`` [M] is what comes from the points."""
         gain, seen = self._gain(trial, c), self.seen
         blended, basis = self._blended(trial, c, gain), list(self._basis.T)
@@ -103,7 +117,10 @@ class WaterModel(Parameters):
             changes += [(predicted * term, term) for term in basis]
         return changes
 
-    def beliefs(self, J: Array) -> list[Belief]:
+    def beliefs(
+        self,
+        J: Array,  # [3, P]
+    ) -> list[Belief]:
         """About the points' colours [3, P]; none where there is no water to take from them."""
         return beliefs(J, self.believed) if self.model.water else []
 
@@ -124,7 +141,12 @@ class WaterModel(Parameters):
         grown = -np.expm1(-trial.b[c] * self.seen.z)
         return np.asarray(self._uneven(trial) * (trial.B_inf[c] * grown + self._near[:, c]))
 
-    def _blended(self, trial: Trial, c: int, gain: Array) -> Array:
+    def _blended(
+        self,
+        trial: Trial,
+        c: int,
+        gain: Array,  # [M]
+    ) -> Array:
         """[M] what the neighbours add to a point's colour, if the map is right."""
         depth = np.clip(trial.beta_a[c] * self._beyond, -MAX_DEPTH, MAX_DEPTH)
         return np.asarray(gain * np.exp(-depth) * self.seen.blend[:, c])

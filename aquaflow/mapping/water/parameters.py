@@ -104,7 +104,11 @@ class Parameters:
         """Parameters that the sightings choose; the mean exposure is none of them."""
         return int(self.size) - 3 * self.model.exposure
 
-    def adopt(self, other: Parameters, x: Array) -> Array:
+    def adopt(
+        self,
+        other: Parameters,
+        x: Array,  # [K] parameters
+    ) -> Array:
         """The start, with the parameters of ``other``'s fit where both models have them."""
         adopted = self.start.copy()
         for mine, theirs in zip(self.parts, other.parts, strict=True):
@@ -118,7 +122,10 @@ class Parameters:
         shared = range(self.uneven.start, self.shading.stop)
         return np.array([*water, *shared, *range(self.exposure.start + c, self.size, 3)], np.int64)
 
-    def trial(self, x: Array) -> Trial:
+    def trial(
+        self,
+        x: Array,  # [K] parameters
+    ) -> Trial:
         """What the parameters stand for."""
         wet, model = np.zeros((3, 3)), self.model
         if model.water:
@@ -133,7 +140,10 @@ class Parameters:
         centred = exposure - exposure.mean(axis=0)
         return Trial(wet[0], wet[1], wet[2], unevenness, trust, shading, centred)
 
-    def priors(self, x: Array) -> tuple[Array, Array]:
+    def priors(
+        self,
+        x: Array,  # [K] parameters
+    ) -> tuple[Array, Array]:
         """Whitened residuals [R] of the linear priors, and their derivatives [R, K]."""
         rows = np.diag(1.0 / self._sigma)
         residuals = (x - self.start) / self._sigma

@@ -41,12 +41,18 @@ def residuals(poses: Sim3Batch, edges: Rows) -> tuple[Array, Sim3Batch]:
     return (poses_of(edges).inverse() @ T_ba.inverse()).log(), T_ba
 
 
-def chi_squares(r: Array, edges: Rows) -> Array:
+def chi_squares(
+    r: Array,  # [m, 7]
+    edges: Rows,
+) -> Array:
     """[m] squared residuals in the metric of the edges' information."""
     return np.asarray(np.einsum("ei,eij,ej->e", r, edges["information"], r))
 
 
-def trust_of(chi2: Array, phi: Array) -> Array:
+def trust_of(
+    chi2: Array,  # [m]
+    phi: Array,  # [m]
+) -> Array:
     """[m] switch variables of dynamic covariance scaling."""
     return np.asarray(np.minimum(1.0, 2.0 * phi / (phi + chi2)))
 
@@ -135,11 +141,16 @@ class Equations:
         return np.asarray((self._gather @ blocks).reshape(-1, 7, 7))
 
 
-def _transposed(blocks: Array) -> Array:
+def _transposed(
+    blocks: Array,  # [m, 7, 7]
+) -> Array:
     return blocks.transpose(0, 2, 1)
 
 
-def wanted_moves(at: Equations, poses: Mask) -> Array:
+def wanted_moves(
+    at: Equations,
+    poses: Mask,  # [n]
+) -> Array:
     """[n] sigmas that each of ``poses`` [n] would move if it alone could; zero for the others."""
     wanted = np.zeros(len(poses))
     if poses.any():
@@ -150,7 +161,10 @@ def wanted_moves(at: Equations, poses: Mask) -> Array:
     return wanted
 
 
-def damping_of(diagonal: Array, factor: float) -> Array:
+def damping_of(
+    diagonal: Array,  # [n, 7, 7]
+    factor: float,
+) -> Array:
     """[n, 7] Levenberg's term, never zero: a pose without information stays where it is."""
     entries = np.einsum("nii->ni", diagonal)
     return np.asarray(

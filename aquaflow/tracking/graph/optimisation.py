@@ -55,24 +55,36 @@ class Optimisation:
             candidates = self._stirred(candidates, bool(new.span.any()))
         return self._result()
 
-    def _strained(self, edges: Index) -> Index:
+    def _strained(
+        self,
+        edges: Index,  # [k] numbers of edges
+    ) -> Index:
         """Those of ``edges`` that could move a pose by more than the tolerance."""
         return edges[self._misfit(edges).chi2 > self.config.tolerance_sigmas**2]
 
-    def _misfit(self, edges: Index) -> Misfit:
+    def _misfit(
+        self,
+        edges: Index,  # [k] numbers of edges
+    ) -> Misfit:
         rows, allowed = self.edges[edges], self.allowed[edges]
         return Misfit(self.descent.poses, rows, allowed, self.config.huber_sigmas)
 
     def _pending(self) -> Mask:
         return self.edges["loop"] & ~self.counts & ~self.dropped
 
-    def _ends(self, edges: Index) -> Mask:
+    def _ends(
+        self,
+        edges: Index,  # [k] numbers of edges
+    ) -> Mask:
         """[N] the poses at the ends of edges."""
         ends = np.zeros(len(self.snapshot.nodes), dtype=bool)
         ends[self.edges["a"][edges]] = ends[self.edges["b"][edges]] = True
         return ends
 
-    def _beside(self, fresh: Index) -> Index:
+    def _beside(
+        self,
+        fresh: Index,  # [k] numbers of edges
+    ) -> Index:
         """Loops not yet believed that are new, or that new ones may corroborate."""
         pending = np.flatnonzero(self._pending())
         new = np.intersect1d(pending, fresh)
@@ -84,7 +96,11 @@ class Optimisation:
             near &= np.abs(gap) <= self.config.corroboration_window
         return pending[near.any(axis=1)]
 
-    def _stirred(self, candidates: Index, closed: bool) -> Index:
+    def _stirred(
+        self,
+        candidates: Index,  # [k] numbers of edges
+        closed: bool,
+    ) -> Index:
         """Loops to weigh again: all if a loop closed, else the rest and those at moved poses."""
         pending = self._pending()
         if closed:

@@ -95,9 +95,9 @@ class _System:
 
     def __init__(
         self,
-        pixels_reference: Array,
-        pixels: Array,
-        observed: npt.NDArray[np.bool_],
+        pixels_reference: Array,  # [P, 2] px
+        pixels: Array,  # [V, P, 2] px
+        observed: npt.NDArray[np.bool_],  # [V, P]
         solve_focal: bool,
     ) -> None:
         self.pixels_reference, self.pixels = pixels_reference, pixels
@@ -145,7 +145,13 @@ class _System:
             g_p += wJp[0] * e[0] + wJp[1] * e[1]
         return H_cc, H_cp, H_pp, g_c, g_p
 
-    def _jacobians(self, bundle: Bundle, v: int, Y: Array, rays: Array) -> tuple[Array, Array]:
+    def _jacobians(
+        self,
+        bundle: Bundle,
+        v: int,
+        Y: Array,  # [P, 3] camera frame
+        rays: Array,  # [P, 3] at z = 1
+    ) -> tuple[Array, Array]:
         """d error / d camera [6 or 7, 2, P] and d error / d rho [2, P] of view ``v``, whose points
         are at Y. The camera moves by the left tangent: translation, then rotation."""
         camera, T = bundle.camera, bundle.T[v]

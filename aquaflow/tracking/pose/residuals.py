@@ -239,7 +239,14 @@ def _epipolar(
     return np.where(still, 1.0, u * shorten), v * shorten, spread
 
 
-def _image_row(J: Array, p: Array, q: Array, x: Array, y: Array, iz: Array) -> None:
+def _image_row(
+    J: Array,  # [6 or 7, M], written to
+    p: Array,  # [M]
+    q: Array,  # [M]
+    x: Array,  # [M]
+    y: Array,  # [M]
+    iz: Array,  # [M] 1 / depth
+) -> None:
     """Derivative [6 or 7, M] of p x + q y for p, q held; x and y are the point's image at z = 1.
 
     The projection does not change when everything grows: the scale's row stays zero.

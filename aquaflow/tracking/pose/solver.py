@@ -100,31 +100,46 @@ def solve_pose(
     return _summary(problem, matches, T, rows)
 
 
-def _moved(T: Sim3, step: Array) -> Sim3:
+def _moved(
+    T: Sim3,
+    step: Array,  # [6 or 7]
+) -> Sim3:
     """First-order retraction of the left tangent."""
     R = so3_exp(step[3:6])
     growth = float(np.exp(step[6])) if len(step) == 7 else 1.0
     return Sim3(R @ T.R, growth * (R @ T.t) + step[:3], growth * T.scale)
 
 
-def _huber_weights(residual: Array) -> Array:
+def _huber_weights(
+    residual: Array,  # [R, M], R residuals of each match
+) -> Array:
     return HUBER / np.maximum(np.abs(residual), HUBER)
 
 
-def _cost(residual: Array, weights: Array) -> float:
+def _cost(
+    residual: Array,  # [R, M], R residuals of each match
+    weights: Array,  # [M]
+) -> float:
     size = np.abs(residual)
     near = np.minimum(size, HUBER)
     # Half the square up to HUBER, the tangent from there on.
     return float(((size - 0.5 * near) * near).sum(0) @ weights)
 
 
-def _normal_equations(rows: Rows, weights: Array) -> tuple[Array, Array]:
+def _normal_equations(
+    rows: Rows,
+    weights: Array,  # [M]
+) -> tuple[Array, Array]:
     root = np.sqrt(_huber_weights(rows.residual) * weights)
     J = (rows.J * root).reshape(len(rows.J), -1)
     return J @ J.T, J @ (rows.residual * root).reshape(-1)
 
 
-def _damped_step(H: Array, g: Array, damping: float) -> Array | None:
+def _damped_step(
+    H: Array,  # [n, n]
+    g: Array,  # [n]
+    damping: float,
+) -> Array | None:
     """-(H + damping diag H)^-1 g by Cholesky, with more damping until it succeeds."""
     diagonal = np.maximum(np.diag(H), 1e-12 * max(float(np.diag(H).max()), 1e-12))
     while damping <= MAX_DAMPING:
