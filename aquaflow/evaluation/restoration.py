@@ -108,7 +108,9 @@ def _stored(dive: Path, indices: list[int], kind: str) -> Pictures:
     return _in_unit(pictures)
 
 
-def _in_unit(pictures: list[npt.NDArray[Any]]) -> Pictures:
+def _in_unit(
+    pictures: list[npt.NDArray[Any]],  # [H, W, 3] each, 8 bit
+) -> Pictures:
     return np.stack(pictures).astype(np.float32) / np.float32(255.0)
 
 

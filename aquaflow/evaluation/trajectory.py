@@ -49,7 +49,10 @@ class Trajectory:
         """Sum of the distances between successive positions, in the file's unit."""
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
-    def select(self, chosen: npt.NDArray[np.intp] | npt.NDArray[np.bool_]) -> Trajectory:
+    def select(
+        self,
+        chosen: npt.NDArray[np.intp] | npt.NDArray[np.bool_],  # [K] indices or [N] mask
+    ) -> Trajectory:
         """The poses at ``chosen`` (indices or a mask)."""
         return Trajectory(self.t_s[chosen], self.positions[chosen], self.wxyz[chosen])
 
@@ -132,7 +135,10 @@ def associate(
     return kept, to_second[kept]
 
 
-def _nearest(of: npt.NDArray[np.float64], among: npt.NDArray[np.float64]) -> npt.NDArray[np.intp]:
+def _nearest(
+    of: npt.NDArray[np.float64],  # [N] s
+    among: npt.NDArray[np.float64],  # [M] s, increasing
+) -> npt.NDArray[np.intp]:
     """Indices [N] into ``among`` [M] of the times nearest to ``of`` [N], the earlier on a tie."""
     after = np.clip(np.searchsorted(among, of), 1, max(len(among) - 1, 1))
     before = after - 1

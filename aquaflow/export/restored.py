@@ -104,7 +104,10 @@ def _pictures(
         )
 
 
-def _with_picture(view: View, image: npt.NDArray[np.uint8]) -> View:
+def _with_picture(
+    view: View,
+    image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
+) -> View:
     """``view``, whose pixels the map's file does not keep, with its picture."""
     size = (view.camera.height, view.camera.width)
     if image.shape[:2] != size:

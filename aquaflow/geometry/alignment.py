@@ -73,7 +73,8 @@ def align(
 
 
 def _checked(
-    source: npt.NDArray[np.floating], target: npt.NDArray[np.floating]
+    source: npt.NDArray[np.floating],  # [N, 3]
+    target: npt.NDArray[np.floating],  # [N, 3]
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Both lists as float64 [N, 3], or the sentence that says why they cannot be aligned."""
     x = np.asarray(source, dtype=np.float64)
@@ -99,7 +100,9 @@ def _checked(
     return x, y
 
 
-def _on_a_line(centred: npt.NDArray[np.float64]) -> bool:
+def _on_a_line(
+    centred: npt.NDArray[np.float64],  # [N, 3]
+) -> bool:
     """True if centred points [N, 3] spread in one direction only."""
     spread = np.linalg.svd(centred, compute_uv=False)
     return bool(spread[1] <= LINE_SPREAD * spread[0])

@@ -143,7 +143,10 @@ class Sim3:
         return self
 
 
-def _left_jacobian(w: Array, sigma: float) -> Array:
+def _left_jacobian(
+    w: Array,  # [3] rad
+    sigma: float,
+) -> Array:
     """V with ``exp([u, w, sigma]).t == V @ u``: the integral of e^(sigma t) exp(t hat(w)) dt."""
     theta = float(np.linalg.norm(w))
     growth = _WEIGHTS * np.exp(sigma * _NODES)

@@ -68,10 +68,17 @@ class Sim3Batch:
     def __len__(self) -> int:
         return len(self.scale)
 
-    def __getitem__(self, index: Index) -> Sim3Batch:
+    def __getitem__(
+        self,
+        index: Index,  # [K] indices, or [N] mask
+    ) -> Sim3Batch:
         return Sim3Batch(self.R[index], self.t[index], self.scale[index])
 
-    def replaced(self, index: Index, other: Sim3Batch) -> Sim3Batch:
+    def replaced(
+        self,
+        index: Index,  # [K] indices, or [N] mask
+        other: Sim3Batch,
+    ) -> Sim3Batch:
         """A copy in which ``other`` stands at ``index``."""
         R, t, scale = self.R.copy(), self.t.copy(), self.scale.copy()
         R[index], t[index], scale[index] = other.R, other.t, other.scale

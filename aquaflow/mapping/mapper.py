@@ -45,7 +45,9 @@ MOST_FAILED_STEPS = 10
 """Steps in a row that raise until the final refinement gives up: the next would, too."""
 
 
-def is_number(value: Tensor) -> bool:
+def is_number(
+    value: Tensor,  # []
+) -> bool:
     """True if a loss or a norm may be acted on."""
     return bool(torch.isfinite(value))
 
@@ -301,7 +303,10 @@ class Mapper:
         self._optimiser.bind(self._parameters)
         self._drop_unsound()
 
-    def _keep(self, keep: Tensor) -> None:
+    def _keep(
+        self,
+        keep: Tensor,  # [N] bool
+    ) -> None:
         """Drop the Gaussians where ``keep`` [N] is False, their optimiser state with them."""
         if not bool(keep.all()):
             (self.neural or self.gaussians).keep(keep)

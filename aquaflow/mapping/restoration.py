@@ -32,7 +32,9 @@ def restored_picture(scene: Scene, view: View, shown: Shown) -> Tensor:
     return torch.where(usable[..., None], picture, shown.radiance)
 
 
-def common_exposure(pictures: Iterable[Tensor]) -> float:
+def common_exposure(
+    pictures: Iterable[Tensor],  # each [H, W, 3]
+) -> float:
     """One gain for all restored pictures, so that the bright end of the dive is not cut off.
 
     Without water a scene may be brighter than the camera's white; 1 where it is not.
@@ -41,6 +43,8 @@ def common_exposure(pictures: Iterable[Tensor]) -> float:
     return min(1.0, BRIGHT_LEVEL / max(brightest, 1e-6))
 
 
-def to_bytes(image: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:
+def to_bytes(
+    image: npt.NDArray[np.floating],  # [H, W, 3]
+) -> npt.NDArray[np.uint8]:
     """[H, W, 3] in [0, 1] as 8-bit."""
     return np.asarray(np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)

@@ -86,7 +86,7 @@ class Scene:
     def draw(
         self,
         view: View,
-        parameters: Mapping[str, Tensor] | None = None,
+        parameters: Mapping[str, Tensor] | None = None,  # of a GaussianMap
         viewmat: Tensor | None = None,  # [4, 4]
         learn: bool = False,
         active: Tensor | None = None,  # [rows, columns] bool, the tiles to draw

@@ -210,7 +210,10 @@ def _read_optimisers(mapper: Mapper, arrays: Mapping[str, Any], rates: Facts) ->
 # --- arrays ---------------------------------------------------------------------------------------
 
 
-def _prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> Arrays:
+def _prefixed(
+    prefix: str,
+    tensors: Mapping[str, Tensor],  # of any shape
+) -> Arrays:
     """Copies, as arrays."""
     return prefixed(prefix, {name: t.detach().numpy().copy() for name, t in tensors.items()})
 
@@ -220,5 +223,7 @@ def _under(prefix: str, arrays: Mapping[str, Any]) -> dict[str, Tensor]:
     return {name: _tensor(array) for name, array in under(prefix, arrays).items()}
 
 
-def _tensor(array: npt.NDArray[Any]) -> Tensor:
+def _tensor(
+    array: npt.NDArray[Any],  # of any shape
+) -> Tensor:
     return torch.from_numpy(np.array(array))

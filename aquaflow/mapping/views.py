@@ -96,31 +96,46 @@ class View:
         return self._pixels.image
 
     @property
-    def mask(self) -> npt.NDArray[np.bool_] | None:
+    def mask(
+        self,
+    ) -> npt.NDArray[np.bool_] | None:
         """[H, W], True where the picture shows the scene; to change it, set it."""
         return self._pixels.mask
 
     @mask.setter
-    def mask(self, mask: npt.NDArray[np.bool_] | None) -> None:
+    def mask(
+        self,
+        mask: npt.NDArray[np.bool_] | None,  # [H, W]
+    ) -> None:
         self._change(mask=mask)
 
     @property
-    def inverse_range(self) -> Tensor | None:
+    def inverse_range(
+        self,
+    ) -> Tensor | None:
         """[H, W] 1 / range from tracking, in the keyframe's unit: T_wc.scale makes it the world's.
         0 where unknown."""
         return self._pixels.inverse_range
 
     @inverse_range.setter
-    def inverse_range(self, inverse_range: Tensor | None) -> None:
+    def inverse_range(
+        self,
+        inverse_range: Tensor | None,  # [H, W]
+    ) -> None:
         self._change(inverse_range=inverse_range)
 
     @property
-    def range_confidence(self) -> Tensor | None:
+    def range_confidence(
+        self,
+    ) -> Tensor | None:
         """[H, W] in [0, 1]."""
         return self._pixels.range_confidence
 
     @range_confidence.setter
-    def range_confidence(self, range_confidence: Tensor | None) -> None:
+    def range_confidence(
+        self,
+        range_confidence: Tensor | None,  # [H, W]
+    ) -> None:
         self._change(range_confidence=range_confidence)
 
     def target(self) -> Tensor:

@@ -145,7 +145,12 @@ class FlowMatcher:
         valid = inside & (error < FORWARD_BACKWARD_PX) & textured
         return Flow(forward, backward, error.astype(np.float32), valid)
 
-    def _flow(self, a: Grey, b: Grey, start: Float | None) -> Float:
+    def _flow(
+        self,
+        a: Grey,  # [H, W]
+        b: Grey,  # [H, W]
+        start: Float | None,
+    ) -> Float:
         # Where a start is NaN, OpenCV reads outside of the picture and ends the process.
         if start is None or not np.isfinite(start).all():
             return refine(a, b, self._unseeded.calc(a, b, None))

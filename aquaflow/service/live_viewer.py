@@ -70,7 +70,11 @@ class LiveWindow:
         self._thread.join(5.0)
         self._window.close()
 
-    def _hand_over(self, latest: Tracked, image: npt.NDArray[np.uint8]) -> None:
+    def _hand_over(
+        self,
+        latest: Tracked,
+        image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
+    ) -> None:
         assert latest.T_wc is not None
         x, y, z = (float(v) for v in latest.T_wc.t)
         self._path.append((x, y, z, latest.quality.inlier_share))

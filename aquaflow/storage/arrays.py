@@ -25,7 +25,9 @@ def of_sim3(poses: Sequence[Sim3]) -> npt.NDArray[np.float64]:
     return np.array(rows, np.float64).reshape(-1, SIM3)
 
 
-def to_sim3(row: Array) -> Sim3:
+def to_sim3(
+    row: Array,  # [13]
+) -> Sim3:
     """The similarity in one row of :func:`of_sim3`."""
     return Sim3(row[:9].reshape(3, 3).copy(), row[9:12].copy(), float(row[12]))
 

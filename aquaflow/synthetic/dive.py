@@ -195,7 +195,12 @@ def _write_pictures(
             pending.result()
 
 
-def _save(out: Path, index: int, picture: npt.NDArray[np.uint8], view: render.View) -> None:
+def _save(
+    out: Path,
+    index: int,
+    picture: npt.NDArray[np.uint8],  # [H, W, 3] RGB
+    view: render.View,
+) -> None:
     name = f"{index:06d}"
     _save_png(out / "images" / f"{name}.png", picture)
     _save_png(out / "clean" / f"{name}.png", quantised(view.clean))
@@ -204,6 +209,9 @@ def _save(out: Path, index: int, picture: npt.NDArray[np.uint8], view: render.Vi
     np.savez(out / "range" / f"{name}.npz", range_m=stored, hit=hit)
 
 
-def _save_png(path: Path, rgb: npt.NDArray[np.uint8]) -> None:
+def _save_png(
+    path: Path,
+    rgb: npt.NDArray[np.uint8],  # [H, W, 3] RGB
+) -> None:
     if not cv2.imwrite(str(path), rgb[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 2]):
         raise OSError(f"{path} was not written")

@@ -42,13 +42,19 @@ def fractal(
     return total / np.float32(math.sqrt(max(0.6 * power, 1e-12)))
 
 
-def resized(values: npt.NDArray[np.float32], shape: tuple[int, int]) -> FloatMap:
+def resized(
+    values: npt.NDArray[np.float32],  # [h, w] or [h, w, c]
+    shape: tuple[int, int],
+) -> FloatMap:
     """``values`` [h, w] or [h, w, c] interpolated to ``shape`` by bicubic splines."""
     out = cv2.resize(values, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC)
     return np.asarray(out, np.float32)
 
 
-def blur(values: FloatMap, sigma_px: float) -> FloatMap:
+def blur(
+    values: FloatMap,  # [h, w]
+    sigma_px: float,
+) -> FloatMap:
     """Gaussian blur; wide ones are done at reduced resolution, where they cost little."""
     if sigma_px > 8.0:
         height, width = values.shape[:2]
@@ -62,7 +68,11 @@ def blur(values: FloatMap, sigma_px: float) -> FloatMap:
     return np.asarray(out, np.float32)
 
 
-def smoothstep(values: FloatMap, low: float, high: float) -> FloatMap:
+def smoothstep(
+    values: FloatMap,  # [...]
+    low: float,
+    high: float,
+) -> FloatMap:
     """0 below ``low``, 1 above ``high``, smooth between."""
     x = np.clip((values - np.float32(low)) / np.float32(high - low), 0.0, 1.0)
     return np.asarray(x * x * (3.0 - 2.0 * x), np.float32)

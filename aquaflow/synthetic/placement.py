@@ -56,7 +56,11 @@ def place_objects(
     return shapes
 
 
-def _in_pool(low: Array, high: Array, rng: np.random.Generator) -> list[Shape]:
+def _in_pool(
+    low: Array,  # [2] m
+    high: Array,  # [2] m
+    rng: np.random.Generator,
+) -> list[Shape]:
     """Crates and a mooring on the tiles, on both sides of the way, and a rope across."""
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     shapes = []
@@ -70,7 +74,10 @@ def _in_pool(low: Array, high: Array, rng: np.random.Generator) -> list[Shape]:
 
 
 def _pipeline(
-    low: Array, high: Array, ground: Callable[[float, float], float], rng: np.random.Generator
+    low: Array,  # [2] m
+    high: Array,  # [2] m
+    ground: Callable[[float, float], float],
+    rng: np.random.Generator,
 ) -> list[Shape]:
     y = float(0.5 * (low[1] + high[1]))
     radius = 0.17

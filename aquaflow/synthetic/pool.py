@@ -36,7 +36,11 @@ def corners(
     return way.min(axis=0) - MARGIN_M, way.max(axis=0) + MARGIN_M
 
 
-def tiled_basin(low: Array, high: Array, rng: np.random.Generator) -> list[Shape]:
+def tiled_basin(
+    low: Array,  # [2] m
+    high: Array,  # [2] m
+    rng: np.random.Generator,
+) -> list[Shape]:
     """Floor and four walls between two corners [2] (m); the floor's top is at z = 0."""
     tile = float(rng.uniform(*TILES_M))
     middle, half = 0.5 * (low + high), 0.5 * (high - low)

@@ -66,7 +66,11 @@ def _rates(config: SyntheticConfig) -> dict[str, float]:
 
 
 def _measure(
-    kind: str, t: Array, config: SyntheticConfig, vehicle: VehiclePath, rng: np.random.Generator
+    kind: str,
+    t: Array,  # [N] s
+    config: SyntheticConfig,
+    vehicle: VehiclePath,
+    rng: np.random.Generator,
 ) -> Array:
     """Values [N, 1..4] of one instrument at times t [N]."""
     noise = config.telemetry

@@ -35,7 +35,11 @@ def laid(
     return paint * (1.0 + tint) * (1.0 - joint) + JOINT_ALBEDO * joint
 
 
-def _joint(x: torch.Tensor, footprint: torch.Tensor, edge_m: float) -> torch.Tensor:
+def _joint(
+    x: torch.Tensor,  # [N]
+    footprint: torch.Tensor,  # [N]
+    edge_m: float,
+) -> torch.Tensor:
     """Share [N] of a footprint around ``x`` that joints across it take."""
     joint = JOINT_SHARE * edge_m
     size = footprint.clamp(1e-6, edge_m)

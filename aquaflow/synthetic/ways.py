@@ -88,7 +88,10 @@ def _lane(length: float, lanes: int, spacing: float) -> float:
     return (length - 2.0 * (lanes - 1) * spacing) / lanes
 
 
-def _equal_arcs(points: Array, count: int) -> Array:
+def _equal_arcs(
+    points: Array,  # [N, 2] m
+    count: int,
+) -> Array:
     """The polyline ``points`` [N, 2] at count + 1 equal steps of arc length."""
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     at = np.linspace(0.0, arc[-1], count + 1)

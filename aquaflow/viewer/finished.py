@@ -106,7 +106,8 @@ def _poses(path: Path) -> tuple[list[Sim3], npt.NDArray[np.float64]]:
 
 
 def _of_frames(
-    folder: Path, times: npt.NDArray[np.float64]
+    folder: Path,
+    times: npt.NDArray[np.float64],  # [N] s
 ) -> tuple[npt.NDArray[np.float64], list[Path | None]]:
     """Quality and picture of the frame at each time."""
     shown = _shown_by_microsecond(folder / "frames.csv")

@@ -98,7 +98,10 @@ class Window:
         self._scene.add_line_segments("path", points, colours, thickness=0.003 * self._size)
 
     def show_camera(
-        self, T_wc: Sim3, camera: CameraModel, picture: npt.NDArray[np.uint8] | None
+        self,
+        T_wc: Sim3,
+        camera: CameraModel,
+        picture: npt.NDArray[np.uint8] | None,  # [H, W, 3] RGB
     ) -> None:
         """The camera where it is, with what it sees: ``picture`` [H, W, 3] RGB."""
         fov = 2.0 * float(np.arctan(0.5 * camera.height / camera.fy))

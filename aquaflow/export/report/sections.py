@@ -146,7 +146,9 @@ def _example(example: HeldOutExample) -> str:
     )
 
 
-def _jpeg(image: npt.NDArray[np.uint8]) -> str:
+def _jpeg(
+    image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
+) -> str:
     """A data URI of the picture, no wider than the report shows it."""
     from PIL import Image
 

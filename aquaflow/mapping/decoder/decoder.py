@@ -183,7 +183,9 @@ def apply_residuals(
     return {**parameters, **whole}
 
 
-def _all_sound(features: Tensor) -> bool:
+def _all_sound(
+    features: Tensor,  # [N, F]
+) -> bool:
     """Every feature is a number of sensible size."""
     if features.numel() == 0:
         return True

@@ -8,7 +8,10 @@ from torch import Tensor
 class GrowingRows:
     """A tensor that takes rows at its end, at a cost that grows with the new rows alone."""
 
-    def __init__(self, rows: Tensor) -> None:
+    def __init__(
+        self,
+        rows: Tensor,  # [N, ...]
+    ) -> None:
         self._buffer, self._count = rows.clone(), len(rows)
 
     @property

@@ -146,7 +146,10 @@ class NeuralGaussians:
         hidden = trunk.hidden.detach().requires_grad_()
         return Window(trunk, hidden, local, shared, list(zip(views, seen, strict=True)))
 
-    def _context(self, seen: Sequence[Tensor]) -> Tensor:
+    def _context(
+        self,
+        seen: Sequence[Tensor],  # each [N] bool
+    ) -> Tensor:
         """[N] bool: what a trunk is made of, for views that show ``seen`` (each [N] bool)."""
         if not self.config.visible_groups:
             return torch.ones(len(self.gaussians), dtype=torch.bool)
@@ -156,7 +159,7 @@ class NeuralGaussians:
         self,
         trunk: Trunk,
         seen: Tensor,  # [N] bool
-        parameters: Mapping[str, Tensor],
+        parameters: Mapping[str, Tensor],  # of a GaussianMap
         viewmat: Tensor,  # [4, 4]
     ) -> dict[str, Tensor]:
         viewmat = viewmat.detach()

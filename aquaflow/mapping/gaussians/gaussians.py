@@ -60,7 +60,11 @@ class GaussianMap:
         """[N, 3] clean radiance J >= 0."""
         return radiance(self.parameters["raw_colours"])
 
-    def extend(self, new: Mapping[str, Tensor], keyframe: int) -> None:
+    def extend(
+        self,
+        new: Mapping[str, Tensor],  # each [M, ...]
+        keyframe: int,
+    ) -> None:
         """Append Gaussians (tensors by the names above) that ``keyframe`` saw."""
         self._grow(new, torch.full((len(new["means"]),), keyframe, dtype=torch.int64))
 
@@ -93,7 +97,7 @@ class GaussianMap:
 
     def _replace(
         self,
-        parameters: dict[str, Tensor],
+        parameters: dict[str, Tensor],  # each [N, ...]
         keyframes: Tensor,  # [N] int64
         features: Tensor,  # [N, F]
     ) -> None:

@@ -22,7 +22,12 @@ class Objective:
         self.config, self.threads = config, threads
         self._K_rad: dict[tuple[int, int], Tensor] = {}
 
-    def total(self, view: View, shown: Shown, parameters: Mapping[str, Tensor]) -> Tensor:
+    def total(
+        self,
+        view: View,
+        shown: Shown,
+        parameters: Mapping[str, Tensor],  # of a GaussianMap
+    ) -> Tensor:
         """L1, SSIM, depth and scale terms of ``shown``, the map drawn from ``view``."""
         config, target = self.config, view.target()
         mask = view.scene_mask()
@@ -46,7 +51,13 @@ class Objective:
         """L1 and SSIM alone, nothing masked but the vehicle."""
         return self._pictures(view, shown, view.target(), view.scene_mask())
 
-    def _pictures(self, view: View, shown: Shown, target: Tensor, mask: Tensor) -> Tensor:
+    def _pictures(
+        self,
+        view: View,
+        shown: Shown,
+        target: Tensor,  # [H, W, 3]
+        mask: Tensor,  # [H, W] bool
+    ) -> Tensor:
         return photometric_loss(
             shown.image, target, self.radial(view), mask, self.config.ssim, self.threads
         )

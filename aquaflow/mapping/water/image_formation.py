@@ -66,5 +66,8 @@ class Water:
         return restored.clamp(0.0, MAX_RESTORED), recoverable
 
 
-def _optical_depth(rate: Tensor, z: Tensor) -> Tensor:
+def _optical_depth(
+    rate: Tensor,  # [3] 1 / map unit
+    z: Tensor,  # [...] map units
+) -> Tensor:
     return (rate * z[..., None]).clamp(0.0, MAX_OPTICAL_DEPTH)

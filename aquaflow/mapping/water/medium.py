@@ -80,7 +80,9 @@ class Medium(nn.Module):
         self.unevenness.zero_() if unevenness is None else self.unevenness.copy_(unevenness)
 
 
-def inverse_softplus(y: Tensor) -> Tensor:
+def inverse_softplus(
+    y: Tensor,  # [...]
+) -> Tensor:
     """x with softplus(x) = y, for y > 0; guarded at both ends."""
     y = y.clamp_min(MIN_RATE)
     return y + torch.log(-torch.expm1(-y))

@@ -48,7 +48,13 @@ def beliefs(
     return found
 
 
-def _ranked(J: Array, c: int, share: float, level: float, sigma: float) -> Belief:
+def _ranked(
+    J: Array,  # [3, P]
+    c: int,
+    share: float,
+    level: float,
+    sigma: float,
+) -> Belief:
     """The point with ``share`` of the others below it, against the level that it should have."""
     rank = int(share * (J.shape[1] - 1))
     point = int(np.argpartition(J[c], rank)[rank])
@@ -57,7 +63,10 @@ def _ranked(J: Array, c: int, share: float, level: float, sigma: float) -> Belie
     return Belief(float((J[c, point] - level) / sigma), {c: by_J})
 
 
-def _grey(J: Array, c: int) -> Belief:
+def _grey(
+    J: Array,  # [3, P]
+    c: int,
+) -> Belief:
     """The channel's mean against the geometric mean of all three."""
     means = np.maximum(J.mean(axis=1), LEAST_MEAN)
     share = (np.arange(3) == c) - 1.0 / 3.0

@@ -96,7 +96,12 @@ class PoseOut:
         camera_m = self._scale.metres * (AXES @ T_wc.t)
         return R, camera_m - R @ self._camera_m
 
-    def _send(self, latest: Tracked, R: Array, t_m: Array) -> None:
+    def _send(
+        self,
+        latest: Tracked,
+        R: Array,  # [3, 3]
+        t_m: Array,  # [3] m
+    ) -> None:
         before, self._before = self._before, (latest, R, t_m)
         moved_m = 0.0 if before is None else float(np.linalg.norm(t_m - before[2]))
         jumped = before is not None and self._jumped(before[0], latest, moved_m)
@@ -131,7 +136,11 @@ class PoseOut:
 
 
 def _motion(
-    before: tuple[Tracked, Array, Array], latest: Tracked, R: Array, t_m: Array, quality: float
+    before: tuple[Tracked, Array, Array],
+    latest: Tracked,
+    R: Array,  # [3, 3]
+    t_m: Array,  # [3] m
+    quality: float,
 ) -> BodyMotion:
     tracked, R_before, t_before = before
     rotation = Rotation.from_matrix(R_before.T @ R).as_rotvec()

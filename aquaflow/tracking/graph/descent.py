@@ -80,7 +80,11 @@ class Neighbourhood:
         self.local["a"], self.local["b"] = place[self.local["a"]], place[self.local["b"]]
         self.rim = (near & self.may_move & ~self.active)[self.nodes]
 
-    def grown(self, wanting: Mask, reach: int) -> Mask:
+    def grown(
+        self,
+        wanting: Mask,  # [n] of the local poses
+        reach: int,
+    ) -> Mask:
         """[N] the active poses and all within ``reach`` hops of local ones that want to move."""
         wider = np.zeros_like(self.active)
         wider[self.nodes[wanting]] = True
@@ -153,7 +157,12 @@ class Descent:
         """``strain``, or 0 where no loop edge would feel it."""
         return strain if strain > self._config.loop_chi2 else 0.0
 
-    def _around(self, counts: Mask, active: Mask, asked: Mask) -> tuple[Neighbourhood, Misfit]:
+    def _around(
+        self,
+        counts: Mask,  # [M] edges
+        active: Mask,  # [N] poses
+        asked: Mask,  # [N] poses
+    ) -> tuple[Neighbourhood, Misfit]:
         around = Neighbourhood(self._edges, counts, self._may_move, active, asked)
         if around.active.any():
             self._system = System(around.local, around.active[around.nodes])

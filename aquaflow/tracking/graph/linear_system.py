@@ -70,7 +70,11 @@ class System:
         if self._last is not None:
             self._last = (share * self._last[0], self._last[1])
 
-    def _corrected(self, factor: SuperLU, gradient: Array) -> Array:
+    def _corrected(
+        self,
+        factor: SuperLU,
+        gradient: Array,  # [n]
+    ) -> Array:
         """The two loops of BFGS around the factor."""
         if self._last is not None:
             taken, before = self._last

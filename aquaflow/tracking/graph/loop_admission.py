@@ -123,7 +123,10 @@ class Admission:
     """[M]"""
     config: GraphConfig
 
-    def admitted(self, candidates: Index) -> Admitted:
+    def admitted(
+        self,
+        candidates: Index,  # [k] numbers of edges
+    ) -> Admitted:
         """The surest of the candidates that are believed; ask again when these have closed."""
         config, loops = self.config, self.edges[candidates]
         span, quiet = np.zeros((2, len(self.poses)), dtype=bool)

@@ -66,7 +66,9 @@ def edge_information(
     return _information_and_covariance(np.linalg.pinv(whole, hermitian=True))[0]
 
 
-def _information_and_covariance(information: Array) -> tuple[Array, Array]:
+def _information_and_covariance(
+    information: Array,  # [7, 7]
+) -> tuple[Array, Array]:
     """The nearest positive semi-definite information, and its inverse with unknowns bounded."""
     values, vectors = np.linalg.eigh(0.5 * (information + information.T))
     values = np.clip(values, 0.0, LEAST_SIGMA**-2)

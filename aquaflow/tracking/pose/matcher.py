@@ -83,7 +83,11 @@ class KeyframeMatcher:
         return solve_pose(problem, initial, self._config.stop_converged, self._config.residual)
 
     def _problem(
-        self, keyframe: Keyframe, pair: PairGeometry, camera: CameraModel, known: Mask
+        self,
+        keyframe: Keyframe,
+        pair: PairGeometry,
+        camera: CameraModel,
+        known: Mask,  # [H, W]
     ) -> tuple[PoseProblem, npt.NDArray[np.float64]]:
         """At most ``matches`` matches whose depth is known, and their keyframe pixels."""
         rows, columns = np.nonzero(pair.valid & known)
