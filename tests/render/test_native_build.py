@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -143,3 +144,17 @@ def test_clang_builds_kernels_that_draw_the_same(
     got = CpuRenderer(2)(*leaves, WIDTH, HEIGHT)
     wanted = ReferenceRenderer()(*leaves, WIDTH, HEIGHT)
     assert (got.image - wanted.image).abs().max() < 1e-4
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "header", sorted(native.NATIVE_DIR.glob("*.h")), ids=lambda path: path.name
+)
+def test_every_header_compiles_alone(header: Path) -> None:
+    compiler = native.find_compiler()
+    assert compiler is not None
+    isa = native.target_isas(compiler)[0]
+    command = [*compiler, *native.compile_flags(isa), "-fsyntax-only", "-xc++", str(header)]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
