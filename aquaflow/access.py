@@ -1,4 +1,4 @@
-"""Who may look: everybody on this machine, from elsewhere only who knows the token."""
+"""Access control: open to this machine; other clients need the token."""
 
 from __future__ import annotations
 

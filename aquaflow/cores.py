@@ -17,7 +17,7 @@ def core_count() -> int:
 
 
 def usable_threads(asked: int | None) -> int:
-    """``asked``, or every core if None, and never more than there are; says so where it is less."""
+    """``asked``, or every core if None, and never more than there are; warns where it is less."""
     cores = core_count()
     if asked is None or asked <= cores:
         return asked or cores

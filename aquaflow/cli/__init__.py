@@ -78,7 +78,7 @@ def map_command(
     tracking_only: Annotated[bool, typer.Option(help="Trajectory without a map.")] = False,
     overwrite: Annotated[bool, typer.Option(help="Replace the dive in --out.")] = False,
     realtime: Annotated[
-        bool, typer.Option(help="As the live loop would: newest frame, mapping beside.")
+        bool, typer.Option(help="As the live loop would: newest frame only, mapping in parallel.")
     ] = False,
     profile: Annotated[bool, typer.Option(help="Write trace.json for Chrome's tracing.")] = False,
     as_json: Json = False,

@@ -29,12 +29,12 @@ def duration(value: float | None) -> float | None:
 Seconds = Annotated[float | None, typer.Option(callback=duration, help="Stop after this long.")]
 
 LOG_WIDTH = 200
-"""Columns of a table where nobody looks on a terminal: a log must neither cut nor fold numbers."""
+"""Table width without a terminal: a log must neither cut nor fold numbers."""
 
 
 @contextmanager
 def progress_bars(quiet: bool) -> Iterator[Any]:
-    """A function (stage, done, total) that draws one bar per stage where somebody looks on."""
+    """A function (stage, done, total) that draws a bar per stage on a terminal."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,

@@ -38,13 +38,13 @@ REORDERED_NS = 500_000_000
 """UDP brings messages late by less; a device clock that goes back further was started anew."""
 
 STEP_NS = 100_000_000
-"""A message this much faster than the fastest of the window tells of a clock set forward."""
+"""A message this much faster than the fastest of the window shows a clock that was set forward."""
 
 CONTRADICTIONS = 3
 """So many messages in a row make a new clock; a single one is a damaged time stamp."""
 
 Learned = Sequence[Sequence[int | None]]
-"""The buckets of a mapping, for whoever keeps them over a restart of the process."""
+"""The buckets of a mapping, to be stored across a restart of the process."""
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,7 @@ class ClockMapping:
         return offset_ns < self._line.at(device_ns) - step
 
     def _begin_anew(self) -> None:
-        """Forget the old clock and learn the new one from the messages that told of it."""
+        """Forget the old clock and learn the new one from the messages that revealed it."""
         self.resets += 1
         log.warning("the clock of %s began anew (%d times so far)", self.name, self.resets)
         told, self._contradictions = self._contradictions, []

@@ -1,4 +1,4 @@
-"""Settings of live cameras: one model for each kind of driver, told apart by ``kind``."""
+"""Settings of live cameras: one model for each kind of driver, selected by ``kind``."""
 
 from __future__ import annotations
 
@@ -103,8 +103,8 @@ class StreamConfig(LiveCameraConfig):
         0.0,
         ge=0,
         le=2.0,
-        description="from exposure to arrival, taken off the times; streams do not tell it. "
-        "Measure: film a clock beside its own picture",
+        description="from exposure to arrival, taken off the times; streams do not report it. "
+        "Measure: film a clock next to its own image",
     )
 
 

@@ -20,7 +20,7 @@ class SerialConfig(Stage):
 
 
 class UdpConfig(Stage):
-    """Datagrams. ``listen`` binds the port and answers whoever sent last (BlueOS: an endpoint of
+    """Datagrams. ``listen`` binds the port and answers the last sender (BlueOS: an endpoint of
     type UDP client); ``send`` talks to the address first and hears its answers."""
 
     kind: Literal["udp"] = "udp"

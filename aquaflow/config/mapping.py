@@ -46,7 +46,7 @@ class MediumConfig(Stage):
     )
     fit: bool = Field(True, description="False: the water starts from the values below, no fit")
     off_when_clear: bool = Field(
-        True, description="False: stays on even where the sightings speak for no water"
+        True, description="False: stays on even where the observations show no water"
     )
     shading: bool = Field(True, description="False: the fit knows no lamp or lens fall-off")
     exposure: bool = Field(
@@ -212,7 +212,7 @@ class DecoderConfig(Stage):
     variant: Literal["lgpd", "mlp"] = Field(
         "lgpd", description="mlp: as many weights without attention (the paper's w/o LGPD)"
     )
-    distance: bool = Field(True, description="False: the decoder is not told the distance")
+    distance: bool = Field(True, description="False: the decoder does not get the distance")
     width: int = Field(32, ge=4, multiple_of=4, description="token width; paper silent")
     local_width: int = Field(16, ge=1, description="feature of a Gaussian (ARTDECO: 16)")
     global_width: int = Field(16, ge=1, description="feature of a group (ARTDECO: 16)")

@@ -16,7 +16,7 @@ class PriorConfig(Stage):
     kind: Literal["compact", "classical", "folder"] = Field(
         "classical",
         description="compact: learned coarse matches, refined by flow; without its weights or "
-        "onnxruntime, classical takes its place and says so. classical: SIFT homography and flow, "
+        "onnxruntime, classical replaces it, with a warning. classical: SIFT homography and flow, "
         "no network. folder: the exported prior in `folder`, or an error",
     )
     folder: Path | None = Field(
@@ -32,7 +32,7 @@ class PriorConfig(Stage):
         "TensorRT makes it fp16 itself",
     )
     threads: int = Field(
-        1, ge=1, description="of the network; mapping beside it has a use for the other cores"
+        1, ge=1, description="of the network; mapping runs in parallel and needs the other cores"
     )
     engine_cache: Path | None = Field(
         None, description="folder that TensorRT keeps its engines in; building one takes minutes"

@@ -14,7 +14,7 @@ from aquaflow.config.telemetry import MountingConfig
 
 
 def is_loopback(host: str) -> bool:
-    """True if nobody but this machine reaches a socket bound to ``host``."""
+    """True if a socket bound to ``host`` is reachable from this machine only."""
     if host == "localhost":
         return True
     try:
@@ -41,7 +41,7 @@ class ListenConfig(Stage):
 
 
 class LiveMappingConfig(Stage):
-    """How mapping goes along beside tracking."""
+    """How mapping runs in parallel to tracking."""
 
     backlog: int = Field(
         8, ge=1, description="frames that wait for mapping; then common frames are left out, at "
@@ -105,18 +105,18 @@ class PoseConfig(Stage):
 
 
 class VehicleReportConfig(Stage):
-    """What the pilot is told over MAVLink."""
+    """Messages to the pilot over MAVLink."""
 
     status_text: bool = Field(True, description="STATUSTEXT when the state changes")
     values: bool = Field(True, description="NAMED_VALUE_FLOAT once a second: AQ_STATE, AQ_LAG, ...")
 
 
 class ServiceConfig(Stage):
-    """What ``aquaflow run`` does beside mapping."""
+    """What ``aquaflow run`` does in addition to mapping."""
 
     dives: Path = Field(Path("dives"), description="folder that gets a folder for each dive")
     camera: str | None = Field(None, description="name of the camera that maps; None: the first")
-    record: bool = Field(False, description="record cameras and telemetry beside, as `record` does")
+    record: bool = Field(False, description="also record cameras and telemetry, as `record` does")
     hang_s: float = Field(
         60.0, gt=0, description="s without a sign of life of a stage until the process gives up; "
         "one fit of the water may take 10 s on two cores",

@@ -31,16 +31,16 @@ class DeviceConfig(Stage):
 
 
 class Assumptions(Stage):
-    """What may be taken for granted where a device tells only part of a quantity.
+    """What may be assumed where a device measures only part of a quantity.
 
     A heading without roll and pitch is no attitude. With ``level`` it becomes one: true within the
     few degrees by which a passively stable ROV leans, wrong for gravity on any other vehicle.
     """
 
-    level: bool = Field(False, description="roll and pitch are 0 where nothing tells them")
+    level: bool = Field(False, description="roll and pitch are 0 where nothing measures them")
     no_side_slip: bool = Field(False, description="the vehicle moves only where it points")
     speed_sigma_m_s: float = Field(
-        0.2, gt=0, description="m/s, 1 sigma of a velocity that only a speed log tells"
+        0.2, gt=0, description="m/s, 1 sigma of a velocity that only a speed log measures"
     )
 
 
@@ -98,7 +98,7 @@ class MavlinkConfig(DeviceConfig):
         101_325.0, ge=50_000, le=120_000, description="Pa; read it at the surface before diving"
     )
     local_velocity_sigma_m_s: float = Field(
-        0.1, gt=0, description="m/s, 1 sigma of LOCAL_POSITION_NED, which tells none (judgement)"
+        0.1, gt=0, description="m/s, 1 sigma of LOCAL_POSITION_NED, which has none (judgement)"
     )
     lights: LightsConfig | None = None
 
@@ -111,8 +111,8 @@ class NmeaConfig(DeviceConfig):
     require_checksum: bool = Field(True, description="refuse sentences that carry none")
     depth_sentences: tuple[Literal["DBT", "DPT", "DBS"], ...] = Field(
         ("DBS",),
-        description="of these, the ones that tell the vehicle's own depth, from a pressure sensor; "
-        "the others tell the distance to the bottom",
+        description="those that measure the vehicle's own depth, from a pressure sensor; "
+        "the others measure the distance to the bottom",
     )
     assume: Assumptions = Assumptions()
 

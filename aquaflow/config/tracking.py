@@ -19,7 +19,7 @@ class InitialisationConfig(Stage):
     min_share: float = Field(
         0.25, gt=0, lt=1, description="matched part of the samples below which the place is lost"
     )
-    min_views: int = Field(2, ge=1, description="frames beside the reference to judge by")
+    min_views: int = Field(2, ge=1, description="frames besides the reference to decide by")
     max_waiting: int = Field(24, ge=3, description="frames kept while waiting; bounds memory")
     parallax_widths: float = Field(
         0.04,
@@ -81,7 +81,7 @@ class GateConfig(Stage):
         0.05, ge=0, lt=1, description="textured share of the picture that a pose can come from"
     )
     dark_level: float = Field(
-        20.0, ge=0, le=255, description="grey level that tells dark from blinded, in the reason"
+        20.0, ge=0, le=255, description="grey level that separates dark from blinded, in the reason"
     )
     blur_loss: float = Field(
         0.065,
@@ -150,7 +150,7 @@ class GraphConfig(Stage):
         2.0,
         ge=1,
         description="times worse than its covariance that the chain may have drifted for one loop "
-        "edge alone to be believed; false loops: tests/tracking/graph/test_loop_admission.py",
+        "single edge to be accepted; false loops: tests/tracking/graph/test_loop_admission.py",
     )
     corroborated_drift_factor: float = Field(
         30.0,

@@ -1,4 +1,4 @@
-"""The settings of a vehicle: its cameras and telemetry, beside those of mapping."""
+"""The settings of a vehicle: its cameras and telemetry, in addition to those of mapping."""
 
 from __future__ import annotations
 

@@ -123,7 +123,7 @@ class DiveFolder:
     # --- while the dive runs ------------------------------------------------------------------
 
     def record(self, rows: Iterable[FrameRow]) -> None:
-        """Append frames in the order in which their fate was decided."""
+        """Append finished frames, in completion order."""
         lines = self._add(rows)
         try:
             self._frames.write(lines)

@@ -1,4 +1,4 @@
-"""The lines of frames.csv: what became of each frame."""
+"""The rows of frames.csv: the result of each frame."""
 
 from __future__ import annotations
 

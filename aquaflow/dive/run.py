@@ -1,4 +1,4 @@
-"""One run into a dive folder, live or replayed: the fate of each frame, the results at the end."""
+"""One run into a dive folder, live or replayed: each frame's result, and the dive's."""
 
 from __future__ import annotations
 
@@ -77,13 +77,13 @@ class DiveRun:
 
     @property
     def results(self) -> list[Tracked]:
-        """All frames whose fate is known, with their poses as they are now; made when asked for."""
+        """Finished frames with their current poses; computed on demand."""
         return self.slam.results()
 
     # --- while frames come --------------------------------------------------------------------
 
     def frame(self, frame: Frame) -> list[Tracked]:
-        """One frame's way, and whose fate it decided; a picture that cannot be prepared costs
+        """Process a frame; the frames that it finished; a picture that cannot be prepared costs
         itself, not the dive."""
         begun = time.monotonic()
         prepared = self._prepared(frame)
@@ -119,7 +119,7 @@ class DiveRun:
             self.first_pose_s = now - self.started
 
     def drop(self, frame: Dropped) -> None:
-        """A frame that reached nobody."""
+        """A frame that no consumer received."""
         self.dropped.append(frame)
         log.warning("frame %d left out: %s", frame.index, frame.reason)
         row = FrameRow(
@@ -132,7 +132,7 @@ class DiveRun:
         self.folder.record([row])
 
     def decide(self, decided: list[Tracked]) -> None:
-        """Frames whose fate is known."""
+        """Finished frames."""
         with self.profiler.stage("record"):
             self.folder.record(self._row(tracked) for tracked in decided)
 

@@ -50,7 +50,7 @@ def cameras(machine: Machine) -> Finding:
     found = ", ".join(
         f"/dev/{node.name} ({name or 'no name'})" for node, name in zip(nodes, names, strict=True)
     )
-    used = "read live, driver v4l2; `aquaflow devices` tells its id"
+    used = "read live, driver v4l2; `aquaflow devices` prints its id"
     return Finding("USB and CSI cameras", found, used, _access(nodes, "video"))
 
 

@@ -44,7 +44,7 @@ def _module_present(name: str) -> bool:
 def renderer_name() -> str | None:
     """What renders here without being asked for, and on which instruction set; None if nothing."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a fallback is told in the findings
+        warnings.simplefilter("ignore")  # a fallback is reported in the findings
         try:
             from aquaflow.render import select_renderer
 

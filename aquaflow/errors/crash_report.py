@@ -1,7 +1,7 @@
-"""The last net of the command line: whatever ends a command is one sentence and an exit code.
+"""The last net of the command line: every failure of a command is one sentence and an exit code.
 
 1: the input or the machine, and what to do about it. 70: our own mistake, which says so; its
-traceback is kept in a file for whoever mends it.
+traceback is kept in a file for the developers.
 """
 
 from __future__ import annotations

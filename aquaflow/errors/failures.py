@@ -184,7 +184,7 @@ class Failures:
 
 
 class Contained:
-    """One run of a stage; ``failed`` tells afterwards whether it raised."""
+    """One run of a stage; ``failed`` is True afterwards if it raised."""
 
     __slots__ = ("_failures", "_frame", "_full_disk", "_stage", "error")
 

@@ -1,4 +1,4 @@
-"""YAML from files that anybody may have written: small, plain, finite, or refused in one sentence.
+"""YAML from untrusted files: small, plain, finite, or refused in one sentence.
 
 Every YAML file that AquaFlow reads comes through here. PyYAML's safe loader makes no objects of
 foreign classes, but it follows a document that contains itself, a number of any length, and

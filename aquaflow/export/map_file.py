@@ -36,7 +36,7 @@ def read_map_file(path: Path, renderer: Renderer) -> Mapper:
     """The map, to be drawn by ``renderer``; its views have no pictures.
 
     Raises:
-        InputError: the file is not there, damaged, none of ours, or of a newer AquaFlow.
+        InputError: the file is not there, damaged, not an AquaFlow map, or of a newer AquaFlow.
     """
     try:
         facts, arrays = read_facts_file(path)

@@ -49,11 +49,11 @@ class Growth:
 
 
 class MapWork(Protocol):
-    """What tracking asks of the maps; done at once, or in a thread beside."""
+    """What tracking asks of the maps; done at once, or in a thread."""
 
     @property
     def mappers(self) -> dict[int, Mapper]:
-        """By sub-map. Nobody else's while a thread beside works on them."""
+        """By sub-map. Owned by the mapping thread while it runs."""
         ...
 
     @property
@@ -78,7 +78,7 @@ class MapWork(Protocol):
         ...
 
     def refine(self, progress: Progress | None = None) -> None:
-        """After the last frame; whoever calls it has the maps for himself from here on."""
+        """After the last frame; the caller owns the maps from here on."""
         ...
 
     def close(self, keep: bool = False) -> None:

@@ -45,7 +45,7 @@ class Scene:
         self.shading = np.zeros(TERMS)
         """Coefficients of the log-gain over the picture."""
         self.exposes = False
-        """True once the sightings told of views that are brighter than others."""
+        """True once the observations showed that some views are brighter than others."""
         self.sunlight = Sunlight(sunlight or SunlightConfig())
         self.water_evidence: float | None = None
         """For water against none, in units of the log likelihood; None before the first fit."""

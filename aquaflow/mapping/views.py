@@ -80,7 +80,7 @@ class View:
         return self._lies_in is store and self.frame_index in store
 
     def let_go(self) -> None:
-        """Give the pixels up, for good: nobody looks at this view any more."""
+        """Delete the pixels; the view must not be used afterwards."""
         del self._lies_in[self.frame_index]
 
     @property

@@ -55,7 +55,7 @@ class FlowEncoding:
 
 
 class FlowPair:
-    """Matches at once; pointmaps, up to scale, when somebody asks for them."""
+    """Matches at once; pointmaps, up to scale, on demand."""
 
     D_a: Float | None = None
     D_b: Float | None = None

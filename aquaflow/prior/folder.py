@@ -41,7 +41,7 @@ class PriorCard(Stage):
 
 
 def write_card(folder: Path, card: PriorCard) -> None:
-    """Write ``card`` beside the files it describes."""
+    """Write ``card`` into the folder of the files it describes."""
     (folder / CARD).write_text(card.model_dump_json(indent=2) + "\n")
 
 

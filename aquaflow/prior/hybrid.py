@@ -32,7 +32,7 @@ WARM_UP = (240, 320, 3)
 
 
 class Describer(Protocol):
-    """A network that tells the cells of pictures apart."""
+    """A network whose descriptors distinguish the cells of pictures."""
 
     name: str
     metric: bool

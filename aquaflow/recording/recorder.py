@@ -37,7 +37,7 @@ class Recorder:
         settings: RecordingConfig,
         free: Callable[[Path], int] = free_bytes,
     ) -> None:
-        """Begin the recording; ``free`` tells the free bytes of the disk under a folder.
+        """Begin the recording; ``free`` returns the free bytes of the disk under a folder.
 
         Raises:
             InputError: the folder holds a recording, cannot be written, or the disk is full.
@@ -65,7 +65,7 @@ class Recorder:
         self._put(LinkBytes(link, arrival_ns, bytes(data)))
 
     def close(self) -> RecorderStatus:
-        """Write what waits, end the last file, and tell what was done; may be called again."""
+        """Write what waits, end the last file, and return the status; may be called again."""
         self._closing.set()
         self._waiting.wake()
         self._thread.join()
@@ -123,7 +123,7 @@ class Recorder:
             self._writer.write(item)
         except OSError:
             raise
-        except Exception as error:  # one message that cannot be encoded costs itself
+        except Exception as error:  # a message that cannot be encoded is skipped and counted
             self._waiting.refuse(item.topic)
             log.warning("not recorded, of %s: %s", item.topic, error)
 

@@ -26,7 +26,7 @@ Progress: TypeAlias = Callable[[str, int, int | None], None]
 
 
 class Session:
-    """Pumps sources into a recorder until they end, time is up, or somebody says stop."""
+    """Pumps sources into a recorder until they end, time is up, or it is stopped."""
 
     def __init__(self, recorder: Recorder) -> None:
         self.recorder = recorder

@@ -1,4 +1,4 @@
-"""A queue of one between whoever makes things and whoever looks at the newest of them."""
+"""A queue of one item between producer and consumer: the newest wins."""
 
 from __future__ import annotations
 

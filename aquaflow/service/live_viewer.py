@@ -1,4 +1,4 @@
-"""The live window beside the loop; a slow or dead browser never slows it."""
+"""The live viewer of a running dive; a slow or dead browser never slows the loop."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The live loop: the newest frame is tracked, the map grows beside, and everybody is told."""
+"""The live loop: tracks the newest frame, maps in parallel, publishes the results."""
 
 from __future__ import annotations
 

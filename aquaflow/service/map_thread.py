@@ -1,4 +1,4 @@
-"""Mapping beside tracking: one thread that does in order what tracking asked for.
+"""Mapping in parallel to tracking: one thread that runs tracking's requests in order.
 
 Tracking never waits for it. What is asked for and too much is left out and counted, common frames
 first; between requests the thread goes on optimising until every view has had its steps.

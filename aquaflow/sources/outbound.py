@@ -1,4 +1,4 @@
-"""What AquaFlow tells a vehicle: sentences, numbers, and where it is."""
+"""Messages from AquaFlow to a vehicle: sentences, values, pose."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The keyframe that frames are tracked against: poses at it, and when another one takes its place.
+"""Tracking against the current keyframe; keyframe selection.
 
 The paper makes a keyframe where matches fall below a share. That is right where the view has moved
 on, and only there: of a picture full of marine snow every match is missing too, and the frame

@@ -1,4 +1,4 @@
-"""Every frame of a dive whose fate is known, in a row of numbers each: what a long dive can keep.
+"""Finished frames of a dive, one row of numbers each, to bound the memory of a long dive.
 
 A frame's pose is kept against its keyframe; the keyframe's own pose, which later corrections move,
 makes it the frame's pose in the world.

@@ -1,4 +1,4 @@
-"""The door in front of the viewer's server, which knows no token and trusts every address.
+"""Token-checking TCP proxy for viser, which has no authentication.
 
 A connection is let through when its first request may be answered (:mod:`aquaflow.access`); from
 then on bytes go both ways, web socket included. The server itself is bound to loopback.

@@ -1,4 +1,4 @@
-"""The Pareto front: the runs that no other run beats in both time and error."""
+"""The Pareto front: the runs that no other run improves in both time and error."""
 
 from __future__ import annotations
 

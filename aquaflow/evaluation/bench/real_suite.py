@@ -1,4 +1,4 @@
-"""Suite ``real``: every clip folder of a data directory, with the truth that lies beside it."""
+"""Suite ``real``: every clip folder of a data directory, with its ground truth."""
 
 from __future__ import annotations
 

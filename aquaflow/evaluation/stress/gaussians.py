@@ -134,7 +134,7 @@ def opacity_0_and_1(check: Check, seed: int) -> None:
 
 @case("gaussians", "render.reference.NEAR_PLANE_M")
 def behind_the_camera(check: Check, seed: int) -> None:
-    """Behind the camera and mirrored into the picture if nobody looks."""
+    """Behind the camera and mirrored into the picture if it is not checked."""
     _drawn(check, _spoiled(seed, lambda g, i: g.means.__setitem__(i, -g.means[i])), _half())
 
 

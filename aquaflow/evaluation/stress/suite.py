@@ -106,7 +106,7 @@ def run_case(case: Case, seed: int) -> Result:
 def run_cases(
     chosen: list[Case], seed: int, finished: Callable[[Result, int, int], None] | None = None
 ) -> list[Result]:
-    """Run ``chosen`` in order; ``finished`` is told each result, its number and their count."""
+    """Run ``chosen`` in order; ``finished`` gets each result, its number and their count."""
     results = []
     for number, case in enumerate(chosen, 1):
         results.append(run_case(case, seed))

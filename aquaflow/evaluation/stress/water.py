@@ -65,8 +65,8 @@ def transmission_to_0(check: Check, seed: int) -> None:
     check.finite("restored", restored)
     check.below("restored radiance", float(restored.detach().max()), 2.0)
     dark = _ranges()[0] > 0.99
-    check.true("dark pixels are not believed", not bool(recoverable[0][dark].any()))
-    check.true("near pixels are believed", bool(recoverable[0][0]))
+    check.true("dark pixels are not recoverable", not bool(recoverable[0][dark].any()))
+    check.true("near pixels are recoverable", bool(recoverable[0][0]))
 
 
 @case("water", "mapping.medium.B_INF_RANGE")

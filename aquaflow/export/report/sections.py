@@ -105,7 +105,7 @@ def timeline(data: ReportData) -> str:
         f'shape-rendering="crispEdges" role="img">{"".join(stripes)}</svg>'
     )
     return _section(
-        "What became of each frame",
+        "Result of each frame",
         "The dive from its first frame (left) to its last (right).",
         f'{strip}<ul class="key">{key}</ul>',
     )

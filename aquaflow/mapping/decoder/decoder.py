@@ -36,7 +36,7 @@ TURN, LOG_SCALE, COLOUR = 3, 3, 3
 
 @dataclass(frozen=True)
 class Trunk:
-    """What the decoder knows before it is told the view."""
+    """The view-independent part of the decoder's result."""
 
     tokens: Tokens
     hidden: Tensor

@@ -1,4 +1,4 @@
-"""Which tiles of a view a step looks at: not those that show the vehicle, nor those explained.
+"""Active tiles of a view in a step: neither on the vehicle nor explained already.
 
 A tile whose error is no more than the camera's own noise can teach the map nothing; it is neither
 drawn nor differentiated until the next full look at its view, which may find that the map around it

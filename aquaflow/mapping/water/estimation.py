@@ -81,7 +81,7 @@ class _Fit:
     problem: WaterModel
     x: Array
     error: float
-    """Mean absolute error of the sightings."""
+    """Mean absolute error of the observations."""
     noise: float
 
     @property
@@ -93,7 +93,7 @@ class _Fit:
 
 
 def models_for(config: MediumConfig) -> list[Model]:
-    """What the config lets the sightings choose from."""
+    """The models that the config allows."""
     water = {config.enabled, config.enabled and not config.off_when_clear}
     return [
         model

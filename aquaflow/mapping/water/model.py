@@ -25,7 +25,7 @@ Change = tuple[Array, Array | float]
 BELIEVED = WaterPriorsConfig()
 """The priors that pay."""
 NOISE = 0.01
-"""Least colour noise of one sighting."""
+"""Least colour noise of one observation."""
 MAX_LOG_GAIN = 2.0
 """Guards the exponential of shading, exposure and unevenness."""
 MAX_DEPTH = 30.0

@@ -16,7 +16,7 @@ MIN_RANGE_RATIO = 1.25
 
 @dataclass(frozen=True)
 class Observations:
-    """Surface points in several pictures; one row per sighting."""
+    """Surface points in several pictures; one row per observation."""
 
     point: Index
     """[M] number of the point, 0 to P - 1."""
@@ -42,7 +42,7 @@ def mean_by(
     point: Index,  # [M]
     values: Array,  # [M, K]
 ) -> Array:
-    """[P, K] mean over each point's sightings."""
+    """[P, K] mean over each point's observations."""
     count = np.maximum(np.bincount(point), 1)
     return np.stack([np.bincount(point, column) / count for column in values.T], axis=-1)
 

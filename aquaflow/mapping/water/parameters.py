@@ -101,7 +101,7 @@ class Parameters:
 
     @property
     def free(self) -> int:
-        """Parameters that the sightings choose; the mean exposure is none of them."""
+        """Parameters that are estimated; excludes the mean exposure, a gauge freedom."""
         return int(self.size) - 3 * self.model.exposure
 
     def adopt(

@@ -1,4 +1,4 @@
-"""What is usually true of a scene without its water: weak priors on the colours of its points."""
+"""Weak priors on the colours of surface points without water."""
 
 from __future__ import annotations
 

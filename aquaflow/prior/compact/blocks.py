@@ -41,7 +41,7 @@ def convolved(channels: int, out: int, size: int, stride: int, dilation: int = 1
 
 
 class Residual(nn.Module):
-    """Two convolutions beside the identity."""
+    """Residual block of two convolutions."""
 
     def __init__(self, channels: int, dilation: int = 1) -> None:
         super().__init__()

@@ -126,7 +126,7 @@ def library_path(isa: str, directory: Path = NATIVE_DIR) -> Path:
 
 
 def is_current(library: Path) -> bool:
-    """Whether ``library`` exists and was built from the sources beside this file."""
+    """Whether ``library`` exists and was built from the sources in this folder."""
     try:
         return f"aquaflow-source:{source_hash()}".encode() in library.read_bytes()
     except OSError:

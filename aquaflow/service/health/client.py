@@ -1,4 +1,4 @@
-"""Asking a running service how it is."""
+"""Client for the status of a running service."""
 
 from __future__ import annotations
 

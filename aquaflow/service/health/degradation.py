@@ -1,4 +1,4 @@
-"""Doing with less: stated steps down when the machine runs short, and up again when it does not."""
+"""Graceful degradation: load-shedding levels, entered and left by machine pressure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Signs of life: each stage beats when work was done or idleness declared, and a guard listens.
+"""Heartbeats of each stage and the watchdog that checks them.
 
 A thread of Python's cannot be killed. A stage that hangs therefore takes the process down, and
 whoever started it (systemd, Docker) starts it anew; the dive resumes from its checkpoint.

@@ -1,4 +1,4 @@
-"""What systemd is told: READY, WATCHDOG, STATUS, STOPPING (sd_notify(3), in the standard library).
+"""Messages to systemd: READY, WATCHDOG, STATUS, STOPPING (sd_notify(3), in the standard library).
 
 The watchdog is fed by the loop itself, after a frame or a declared idle moment, while the other
 stages live too; never from a side thread, which would keep a hung loop alive.

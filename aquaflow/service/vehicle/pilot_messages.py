@@ -1,4 +1,4 @@
-"""What the pilot is told: a sentence at each change of state, numbers once a second."""
+"""Messages to the pilot: a sentence at each change of state, values once a second."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a small grey thumbnail tells of a picture: texture above the noise, sharpness, motion.
+"""Measures of a small grey thumbnail: texture above the noise, sharpness, motion.
 
 Measured in tiles, so that one fish or one lamp does not decide for the whole picture, and at one
 size, so that it costs the same at every resolution.

@@ -1,4 +1,4 @@
-"""Which geometry explains frames that were all matched to one reference: a competition.
+"""Hypotheses of the geometry of frames matched to one reference; the best explains them.
 
 Essential-matrix and homography poses, at each focal length that may be, are extended to some of the
 frames, bundle-adjusted, and judged by how well they explain them. The winner is adjusted to all.

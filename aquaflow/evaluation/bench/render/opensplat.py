@@ -1,4 +1,4 @@
-"""OpenSplat's CPU kernels beside ours, through a program that the user brings.
+"""OpenSplat's CPU kernels compared with ours, through a program that the user brings.
 
 OpenSplat is AGPL: AquaFlow neither holds nor loads any of it. The program is called as
 ``COMMAND FOLDER``, once for every sample. FOLDER holds ``scene.json`` (``n``, ``width``,

@@ -66,6 +66,6 @@ def _shares(
 
 
 def _stages(samples: Sequence[Sample]) -> dict[str, float] | None:
-    """Medians of the stages; None where the renderer does not tell them."""
+    """Medians of the stages; None where the renderer does not report them."""
     names = list(samples[0].stage_ms)
     return {n: spread_of([s.stage_ms[n] for s in samples]).median for n in names} or None

@@ -26,7 +26,7 @@ def print_result(result: dict[str, Any], console: Console) -> None:
 
 
 def renderer_table(rows: Sequence[Row]) -> Table:
-    """One line for each contender and size; columns for stages where somebody tells them."""
+    """One line for each contender and size; columns for stages where a renderer reports them."""
     stages = list(dict.fromkeys(name for row in rows for name in row["stage_ms"] or ()))
     table = _table(("picture", "Gaussians", "renderer", "threads"))
     for title in (
@@ -109,5 +109,5 @@ def sentences(result: dict[str, Any]) -> list[str]:
         each = ", ".join(f"{name} {error:.1e}" for name, error in errors.items())
         said.append(f"Relative gradient error against the float64 reference, worst kernel: {each}.")
     if not any(row["stage_ms"] for row in result["rows"]):
-        said.append("No stages: none of these renderers tells where its time goes.")
+        said.append("No stages: none of these renderers reports the time of its stages.")
     return [*said, *result["notes"]]

@@ -33,7 +33,7 @@ class Sample:
     fwd_ms: float
     bwd_ms: float
     fwd_cpu_ms: float | None = None
-    """None: more than one thread took part, or nobody counted."""
+    """None: more than one thread took part, or it was not counted."""
     bwd_cpu_ms: float | None = None
     stage_ms: Mapping[str, float] = field(default_factory=dict)
 
