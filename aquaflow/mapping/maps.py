@@ -110,12 +110,14 @@ class Maps:
         self.views = ViewStore(work)
 
     def grow(self, growth: Growth) -> None:
-        view, mapper = growth.view, self.mapper(growth.sub_map)
-        with self.profiler.stage("view"), self.failures.contain("view", view.frame_index):
-            self.views.keep(view)
-            mapper.add_view(view)  # now and then a view makes the water be fitted again
-            group = alike(view, mapper.views)
-            let_surplus_go(mapper.views, group, self.config.mapping.views_per_keyframe)
+        view = growth.view
+        with self.profiler.stage("view"):
+            mapper = self.mapper(growth.sub_map)
+            with self.failures.contain("view", view.frame_index):
+                self.views.keep(view)
+                mapper.add_view(view)  # now and then a view makes the water be fitted again
+                group = alike(view, mapper.views)
+                let_surplus_go(mapper.views, group, self.config.mapping.views_per_keyframe)
 
         # Sec. 3.3.3: medium-guided insertion, from this frame and from the keyframe it retires.
         for retired in growth.retired:

@@ -223,7 +223,14 @@ def test_a_file_that_is_not_yaml_is_an_input_error(tmp_path: Path) -> None:
         load_camera(path)
 
 
-@pytest.mark.parametrize("text", ["", "- 1\n- 2\n", "just words\n"])
+def test_an_empty_file_lacks_its_first_key(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text("")
+    with pytest.raises(ConfigError, match="key 'width': field required"):
+        load_camera(path)
+
+
+@pytest.mark.parametrize("text", ["- 1\n- 2\n", "just words\n"])
 def test_a_file_without_keys_is_a_config_error(tmp_path: Path, text: str) -> None:
     path = tmp_path / "camera.yaml"
     path.write_text(text)
