@@ -107,7 +107,7 @@ HEADER = "ply\nformat binary_little_endian 1.0\nelement vertex 1\n"
             HEADER.encode() + b"property float x\nend_header\n",
             "holds no Gaussians: it lacks f_dc_0",
         ),
-        (HEADER.encode() + b"property list uchar int i\nend_header\n", "a property that no Gaussian map has"),
+        (HEADER.encode() + b"property list uchar int i\nend_header\n", "that no Gaussian map has"),
     ],
 )
 def test_files_that_are_no_map_are_one_sentence(tmp_path, content, sentence):
