@@ -21,21 +21,11 @@ from aquaflow.prior.factory import make_prior
 from aquaflow.profiler import Profiler
 from aquaflow.render import select_renderer
 from aquaflow.tracking.frame_table import FrameTable
-from aquaflow.tracking.frames import FrameClass, Tracked, without_pictures
+from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.tracking.gate.gate import FrameGate, GateKind, Verdict
 from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph
 from aquaflow.tracking.loops.relocaliser import Places
 from aquaflow.tracking.tracker import Tracker
-
-
-@dataclass(frozen=True)
-class Waiting:
-    """A frame that passed the gate and is not finished."""
-
-    used_before: int
-    """Frames that passed the gate before it."""
-    frame: Frame
-    """Without its pictures."""
 
 
 @dataclass(frozen=True)
@@ -95,10 +85,10 @@ class Slam:
         """Finished frames, in completion order."""
         self.used = 0
         """Frames that passed the gate so far."""
-        self._waiting: dict[int, Waiting] = {}
-        """By index, the frames that passed the gate and are not finished."""
-        self._latest: Anchored | None = None
-        """The frame linked last, if it has a pose."""
+        self._to_hold_out: set[int] = set()
+        """Indices of the frames in tracking that the map shall not see."""
+        self._latest: int | None = None
+        """The row of the frame linked last, if it has a pose."""
         self._keyframe_views: dict[int, View] = {}
 
     def process(self, frame: Frame) -> list[Tracked]:
@@ -131,9 +121,8 @@ class Slam:
 
     def catch_up(self) -> list[Tracked]:
         """In a live run's idle moments: poses of the past, which waited for a map (Sec. 3.2)."""
-        newest: Anchored | None = self._latest
-        tracked: list[Tracked] = []
-        with self.profiler.stage("back-fill"), self.failures.contain("back-filling"):
+        newest = self._latest
+        with self.profiler.stage("back-fill"):
             tracked = self.tracker.back_fill()
         finished = self._complete(tracked)
         self._latest = newest
@@ -141,12 +130,9 @@ class Slam:
 
     def finish(self, progress: Callable[[int, int], None] | None = None) -> list[Tracked]:
         """After the last frame: the frames that still wait, the last keyframe, the refinement."""
-        tracked: list[Tracked] = []
-        with self.profiler.stage("track"), self.failures.contain("tracking"):
+        with self.profiler.stage("track"):
             tracked = self.tracker.finish()
         finished = self._complete(tracked)
-        # Frames that tracking no longer has: a stage failed that held them.
-        finished += self._complete([self._as_lost(left.frame) for left in self._waiting.values()])
         while self.graph.optimising:
             self._follow_graph(wait=True)
         with self.failures.contain("insertion"):
@@ -185,12 +171,13 @@ class Slam:
     # --- the steps of a frame -----------------------------------------------------------------
 
     def _gate(self, frame: Frame) -> Verdict:
-        """Whether the frame is worth tracking; one that is, waits for its pose from here on."""
+        """Whether the frame is worth tracking; it is decided here which of those are held out."""
         verdict = Verdict(GateKind.PASS)
         with self.profiler.stage("gate"), self.failures.contain("frame gate", frame.index):
             verdict = self.gate.judge(frame.image, frame.mask)
         if verdict.passed:
-            self._waiting[frame.index] = Waiting(self.used, without_pictures(frame))
+            if self._is_next_held_out():
+                self._to_hold_out.add(frame.index)
             self.used += 1
         else:
             self.skipped[verdict.kind.value] += 1
@@ -198,17 +185,15 @@ class Slam:
 
     def _track(self, frame: Frame) -> list[Tracked]:
         """The frames whose pose, or lack of one, this frame makes known."""
-        tracked: list[Tracked] = []
-        with self.profiler.stage("track"), self.failures.contain("tracking", frame.index) as run:
+        with self.profiler.stage("track"):
             tracked = self.tracker.track(frame)
         if self.tracker.lost:
             self.gate.forget()
-        return [self._as_lost(frame)] if run.failed else tracked
+        return tracked
 
     def _anchor(self, tracked: list[Tracked]) -> list[Anchored]:
         """T_kf of all frames, before a loop closure among them moves the keyframes."""
-        # A frame on which a stage failed may have been finished already.
-        return [self._anchored(each) for each in tracked if each.frame.index in self._waiting]
+        return [self._anchored(each) for each in tracked]
 
     def _anchored(self, tracked: Tracked) -> Anchored:
         if tracked.keyframe is None or tracked.T_wc is None:
@@ -232,7 +217,7 @@ class Slam:
                 self.graph.add(tracked.keyframe, tracked.link)
         settled = self._settled(tracked, T_kf)
         linked = Anchored(settled, None if settled.T_wc is None else T_kf)
-        self._latest = linked if linked.T_kf is not None else None
+        self._latest = None if linked.T_kf is None else len(self.frames)
         return linked
 
     def _map(self, tracked: Tracked) -> None:
@@ -241,14 +226,14 @@ class Slam:
             return
         with self.failures.contain("mapping", tracked.frame.index):
             view = self._view(tracked)
-            if self.is_held_out(tracked.frame):
+            if tracked.frame.index in self._to_hold_out:
                 self.maps.hold_out(view, tracked.sub_map)
             else:
                 self.maps.grow(self._growth(tracked, view))
 
     def _publish(self, anchored: Anchored) -> Tracked:
         """The frame is finished: its row goes into the table."""
-        self._waiting.pop(anchored.tracked.frame.index, None)
+        self._to_hold_out.discard(anchored.tracked.frame.index)
         self.frames.add(anchored.tracked, anchored.T_kf)
         return anchored.tracked
 
@@ -265,10 +250,10 @@ class Slam:
 
     def _skipped(self, frame: Frame, verdict: Verdict) -> Anchored:
         """A frame that the gate refused; a duplicate has the pose of the frame before it."""
-        if not verdict.same_place or self._latest is None or self._latest.T_kf is None:
+        if not verdict.same_place or self._latest is None:
             sub_map = self.tracker.sub_map
             return Anchored(Tracked(frame, FrameClass.SKIPPED, sub_map, reason=verdict.reason))
-        before, T_kf = self._latest.tracked, self._latest.T_kf
+        before, T_kf = self.frames[self._latest]
         skipped = replace(
             self._settled(before, T_kf), frame=frame, frame_class=FrameClass.SKIPPED,
             pointmap=None, reason=verdict.reason, link=None,
@@ -281,10 +266,10 @@ class Slam:
 
     def _follow_graph(self, wait: bool) -> None:
         """Take over what the graph's optimisation found; the map follows its keyframes."""
-        with self.profiler.stage("correct"):
-            correction = self.graph.correction(wait)
-        if correction.moves:
-            with self.failures.contain("correction of the map"):
+        with self.failures.contain("correction of the map"):
+            with self.profiler.stage("correct"):
+                correction = self.graph.correction(wait)
+            if correction.moves:
                 self.maps.correct(correction.moves, correction.merged)
 
     def results(self, first: int = 0) -> list[Tracked]:
@@ -313,9 +298,9 @@ class Slam:
         steps = self._steps(tracked.frame_class)
         return Growth(view, tracked.sub_map, steps, tracked.pointmap, tuple(retired))
 
-    def is_held_out(self, frame: Frame) -> bool:
+    def _is_next_held_out(self) -> bool:
         """i % n == 0 and i != 0, i counts used frames (docs/paper.md#deviations-evaluation)."""
-        every, i = self.config.mapping.hold_out_every, self._waiting[frame.index].used_before
+        every, i = self.config.mapping.hold_out_every, self.used
         return every > 0 and i != 0 and i % every == 0
 
     def _retired_keyframes(self) -> list[Insertion]:

@@ -81,10 +81,12 @@ class FrameTable:
         """The frames from row ``first`` on, without pictures and reasons, and their poses against
         their keyframes."""
         for i in range(first, self._count):
-            yield self._frame(self._chunks[i // CHUNK][i % CHUNK])
+            yield self[i]
 
-    def _frame(self, row: Array) -> tuple[Tracked, Sim3 | None]:
+    def __getitem__(self, i: int) -> tuple[Tracked, Sim3 | None]:
+        """The frame of row ``i``, as :meth:`since` gives it."""
         assert self._camera is not None
+        row = self._chunks[i // CHUNK][i % CHUNK]
         index, t_ns, sub_map = (int(row[name]) for name in ("index", "t_ns", "sub_map"))
         frame = Frame(index, t_ns, t_ns, NO_PICTURE, self._camera)
         kind, number = CLASSES[int(row["class"])], int(row["keyframe"])

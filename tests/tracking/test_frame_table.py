@@ -55,6 +55,14 @@ def test_a_table_goes_on_from_its_rows() -> None:
     assert np.array_equal(again.rows(), table_of(count + 1).rows())
 
 
+def test_a_row_is_read_by_its_number() -> None:
+    table = table_of(CHUNK + 7)
+    for i in (0, 4, CHUNK, CHUNK + 6):
+        found, pose = table[i]
+        assert found.frame.index == i
+        assert (pose is None) == (i % 5 == 4)
+
+
 def test_an_empty_table_has_no_rows() -> None:
     assert len(FrameTable().rows()) == 0
     assert list(FrameTable.of_rows(FrameTable().rows(), CAMERA)) == []
