@@ -18,9 +18,9 @@ from aquaflow.errors import InputError
 from aquaflow.geometry.camera import guess_camera, load_camera
 from aquaflow.messages import CameraModel, Dropped, Frame
 from aquaflow.sources import is_asked
+from aquaflow.sources.newest import Newest
 from drivers.capture import Capture, OpenCapture, RawPicture, UnusablePictureError
 from drivers.exposure_clock import ExposureClock
-from drivers.newest import NewestPicture
 from drivers.sequence import SequenceGaps
 
 READ_S = 0.2
@@ -93,7 +93,7 @@ class LiveCamera:
         self._size: tuple[int, int] | None = None
         self._counts = CameraCounters()
         self._clock = ExposureClock()
-        self._newest = NewestPicture()
+        self._newest: Newest[RawPicture] = Newest(let_go=lambda picture: picture.release())
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self._failure: Exception | None = None
@@ -153,7 +153,7 @@ class LiveCamera:
     def close(self) -> None:
         """End iteration and give the device back; may be called from any thread, and again."""
         self._closing.set()
-        self._newest.end()
+        self._newest.end(discard=True)
         if self._thread is not None:
             self._thread.join(JOIN_S)
         elif self._opened is not None:
@@ -201,7 +201,7 @@ class LiveCamera:
         except Exception as error:  # a consumer must hear of it, not wait forever
             self._failure = error
         finally:
-            self._newest.end()
+            self._newest.end(discard=True)
 
     def _lost(self, error: OSError) -> None:
         if str(error) != self.reason:

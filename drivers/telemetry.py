@@ -12,8 +12,8 @@ from aquaflow.clocks.device import ClockReport, Learned
 from aquaflow.config.telemetry import AnyDevice, TelemetryConfig
 from aquaflow.messages import TelemetrySample
 from aquaflow.sources import RawTap
+from aquaflow.sources.newest import Newest
 from aquaflow.sources.outbound import Hears, Word
-from drivers.latest import LatestQueue
 from drivers.link import LinkCounters
 from drivers.mounting import BodyFrame, Mounting
 from drivers.protocol.packets import PacketDecoder
@@ -78,7 +78,7 @@ class LinkTelemetry:
         tap: RawTap | None = None,
         links: Mapping[str, OpenLink] | None = None,
     ) -> None:
-        self._queue: LatestQueue[_Waiting] = LatestQueue(config.queue_samples, _count_dropped)
+        self._queue: Newest[_Waiting] = Newest(config.queue_samples, _count_dropped)
         self._body = BodyFrame()
         self.decoders = {name: decoder_of(name, device) for name, device in config.devices.items()}
         self.links: dict[str, Supervisor] = {}
@@ -141,7 +141,7 @@ class LinkTelemetry:
 
     def _deliverer(self, mounting: Mounting, counters: LinkCounters) -> Deliver:
         def deliver(samples: list[TelemetrySample]) -> None:
-            self._queue.put([_Waiting(sample, mounting, counters) for sample in samples])
+            self._queue.put_all([_Waiting(sample, mounting, counters) for sample in samples])
 
         return deliver
 

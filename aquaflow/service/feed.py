@@ -18,8 +18,8 @@ from aquaflow.recording.playback import Playback, arrived
 from aquaflow.recording.recorder import Recorder
 from aquaflow.recording.session import HasSamples
 from aquaflow.service.dive_clock import Continued
-from aquaflow.service.latest import Newest
 from aquaflow.sources import CameraSource, TelemetrySource
+from aquaflow.sources.newest import Newest
 from aquaflow.sources.outbound import Hears, Word
 
 log = logging.getLogger(__name__)
@@ -146,8 +146,8 @@ class _Pumps:
 
 
 class LiveFeed(_Pumps):
-    """Devices. The camera's picture is decoded when somebody waits for it, so that it is the
-    newest; with a recorder every picture is."""
+    """Devices. The newest picture wins in the camera's own queue, and is decoded when somebody
+    waits for it; with a recorder every picture is decoded, and the newest wins in this one."""
 
     def __init__(
         self,

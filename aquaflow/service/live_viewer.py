@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.mapping.maps import Maps
-from aquaflow.service.latest import Newest
 from aquaflow.service.loop import LiveLoop
 from aquaflow.service.map_thread import MapThread
+from aquaflow.sources.newest import Newest
 from aquaflow.tracking.frames import Tracked
 from aquaflow.viewer.snapshot import MapCopy, Pose, copied, shown
 from aquaflow.viewer.window import Window

@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from aquaflow.config.cameras import OakConfig
 from aquaflow.messages import Acceleration, AngularRate, CameraModel, TelemetrySample
+from aquaflow.sources.newest import Newest
 from drivers.capture import RawPicture, UnusablePictureError
-from drivers.latest import LatestQueue
 from drivers.live import LiveCamera
 from drivers.mounting import BodyFrame, Mounting
 from drivers.oak.backend import ImuReading, OakBackend, OakPicture, OpenBackend
@@ -76,7 +76,7 @@ class OakCamera(LiveCamera):
         self._oak = config
         self._open_backend = open_backend or DaiBackend
         self._mounting, self._body = Mounting(config.mounting), BodyFrame()
-        self._samples: LatestQueue[TelemetrySample] = LatestQueue(MAX_SAMPLES, self._drop)
+        self._samples: Newest[TelemetrySample] = Newest(MAX_SAMPLES, self._drop)
         self.dropped_samples = 0
         """Oldest samples dropped because nobody fetched them."""
         self._last_imu_ns = -1
@@ -125,7 +125,7 @@ class OakCamera(LiveCamera):
             AngularRate(t_ns, arrival_ns, self.name, (rate[0], rate[1], rate[2])),
             Acceleration(t_ns, arrival_ns, self.name, (force[0], force[1], force[2])),
         ]
-        self._samples.put([self._body.refer(sample, self._mounting) for sample in samples])
+        self._samples.put_all([self._body.refer(sample, self._mounting) for sample in samples])
 
     def _drop(self, sample: TelemetrySample) -> None:
         self.dropped_samples += 1

@@ -13,7 +13,6 @@ from aquaflow.config.telemetry import parse_telemetry
 from aquaflow.errors import InputError
 from aquaflow.messages import Altitude, Depth, Velocity
 from aquaflow.sources import TELEMETRY
-from drivers.latest import LatestQueue
 from drivers.telemetry import LinkTelemetry
 from sim_drivers.devices.device import SimulatedDevice, boot_clock
 from sim_drivers.faults import jumping_clock
@@ -192,20 +191,6 @@ def test_closing_does_not_wait_for_a_link_that_is_stuck(tmp_path, monkeypatch, c
     assert "left behind" in caplog.text
     stuck.set()
     rig.wire.close()
-
-
-def test_what_is_put_after_the_end_is_counted_as_dropped():
-    overtaken: list[int] = []
-    queue: LatestQueue[int] = LatestQueue(3, overtaken.append)
-    queue.put([1, 2, 3, 4])
-    queue.end()
-    assert overtaken == [1]
-    assert [queue.take() for _ in range(4)] == [2, 3, 4, None]
-
-    queue.put([5])
-
-    assert overtaken == [1, 5]
-    assert queue.take() is None
 
 
 def test_a_missing_library_is_one_sentence_and_starts_no_thread(monkeypatch, tmp_path):

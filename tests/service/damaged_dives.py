@@ -22,10 +22,10 @@ from aquaflow.messages import Dropped, Frame
 from aquaflow.service.checkpoint.generations import STATE, Checkpoint
 from aquaflow.service.checkpoint.resume import newest_usable
 from aquaflow.service.dive_clock import Continued
-from aquaflow.service.latest import Newest
 from aquaflow.service.live_dive import LiveDive
 from aquaflow.service.onboard import begun
 from aquaflow.sources import open_recording
+from aquaflow.sources.newest import Newest
 from aquaflow.storage.spill import read_thing
 from aquaflow.synthetic import SyntheticConfig, write_dive
 from tests.service.live_scenes import VEHICLE, ToldFeed, caught_up
@@ -45,7 +45,7 @@ class OneByOne(Newest[Frame | Dropped]):
         self.frames = deque(frames)
         self.at_end: Callable[[], object] = lambda: None
 
-    def take(self, timeout_s: float) -> Frame | Dropped | None:
+    def take(self, timeout_s: float | None = None) -> Frame | Dropped | None:
         if self.frames:
             return self.frames.popleft()
         self.at_end()

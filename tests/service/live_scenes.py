@@ -25,11 +25,11 @@ from aquaflow.service.health.degradation import Ladder
 from aquaflow.service.health.heartbeats import Beats
 from aquaflow.service.health.pressure import Pressure
 from aquaflow.service.health.systemd import Notifier
-from aquaflow.service.latest import Newest
 from aquaflow.service.live_dive import LiveDive
 from aquaflow.service.loop import LiveLoop
 from aquaflow.service.map_thread import MapThread
 from aquaflow.slam import Slam
+from aquaflow.sources.newest import Newest
 from aquaflow.sources.outbound import Word
 from aquaflow.tracking.frames import FrameClass, Tracked
 

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from aquaflow.messages import Dropped, Frame
 from aquaflow.service.checkpoint.generations import state_file
-from aquaflow.service.latest import Newest
+from aquaflow.sources.newest import Newest
 
 ROOM_BYTES = 64
 """No file can become larger: nothing new can be written, what is there stays."""
