@@ -63,6 +63,7 @@ class WaitingFrames:
         return list(self._frames[state].values())
 
     def count(self, state: Wait) -> int:
+        """How many frames are in ``state``."""
         return len(self._frames[state])
 
     def put(self, frames: Iterable[Frame], state: Wait) -> None:

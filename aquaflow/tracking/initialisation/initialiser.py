@@ -103,11 +103,13 @@ class Initialiser:
 
     def solve(self) -> Initialised | None:
         """The best explanation of all waiting frames; None when none is good enough."""
-        self._tried_px = self.parallax_px
         camera, pixels = self.reference.camera, self._pixels_reference
         competition = Competition(camera, pixels, self.waiting, self._config)
         result = competition.winner()
-        if result is None or not self._trustworthy(competition.explained(result.bundle), result):
+        explained = 0.0 if result is None else competition.explained(result.bundle)
+        trusted = result is not None and self._trustworthy(explained, result)
+        self._tried_px = self.parallax_px  # not where this raised: the next frame tries again
+        if result is None or not trusted:
             return None
         return Initialised(
             self.waiting,

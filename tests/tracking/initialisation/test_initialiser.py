@@ -10,6 +10,7 @@ import pytest
 from aquaflow.config import InitialisationConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_log
+from aquaflow.tracking.initialisation.hypotheses import Competition
 from aquaflow.tracking.initialisation.initialiser import Initialiser, calibrated
 from tests.tracking.tracking_scenes import KnownPrior, KnownView, depth_map, pose
 
@@ -159,6 +160,20 @@ def test_a_geometry_that_was_refused_is_not_tried_again_before_the_parallax_has_
     assert not initialiser.ready
     initialiser.waiting += started(prior_of(MOVING, noise_px=0.5), refusing).waiting[-1:]
     assert initialiser.ready
+
+
+def test_an_attempt_that_raised_is_made_again_with_the_next_frame(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    initialiser = started(prior_of(MOVING), CONFIG)
+    monkeypatch.setattr(Competition, "winner", raise_once)
+    with pytest.raises(np.linalg.LinAlgError):
+        initialiser.solve()
+    assert initialiser.ready
+
+
+def raise_once(_: Competition) -> None:
+    raise np.linalg.LinAlgError("planted")
 
 
 def test_nothing_waiting_is_no_solution() -> None:
