@@ -101,6 +101,8 @@ def _frames(
         if reading.error is not None:
             if not any_read:
                 raise reading.error
+            if recording.frame_count is not None and start >= recording.frame_count:
+                return  # closing failed after the last frame
             failed_in_a_row += 1
             yield Dropped(start, t_ns, "reading failed, see log.jsonl")
             start += source.every

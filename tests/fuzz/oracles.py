@@ -25,7 +25,11 @@ DOCUMENTED = {
 OUR_MISTAKE = 70
 """Documented as well, and what is looked for."""
 MOST_MEMORY_MB = 3000.0
-NOTICES = ("The public MASt3R weights",)
+IGNORED_INTERRUPT = re.compile(
+    r"Exception ignored in.*?^KeyboardInterrupt:?\s*$", re.DOTALL | re.MULTILINE
+)
+"""What Python itself prints where Ctrl-C falls into a destructor, and nobody can prevent."""
+NOTICES = ("The public MASt3R weights", "note: ")
 """Sentences that a command rightly says before it fails."""
 SILENT_FAILURES = frozenset({"status", "stress"})
 """Commands whose exit code 1 is an answer, which stands on stdout."""
@@ -86,6 +90,8 @@ def _how_it_ended(command: str, argv: list[str], folder: Path, ended: Ended) -> 
     if ended.hung:
         return [Find("hang", _program_lines(ended.err) or "no output")]
     said = ended.err + ended.out
+    if ended.interrupted:
+        said = IGNORED_INTERRUPT.sub("", said)
     found = []
     if "Traceback (most recent" in said or "Exception ignored" in said:
         found.append(Find("traceback", said[-6000:]))
