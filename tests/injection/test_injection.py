@@ -23,6 +23,7 @@ def injection(*arguments: object, timeout_s: float) -> subprocess.CompletedProce
     )  # fmt: skip
 
 
+@pytest.mark.slow  # its live dives wait for minutes on some machines
 def test_a_sample_of_all_faults_leaves_every_dive_whole() -> None:
     done = injection("--sample", SAMPLE, "--seed", 16, timeout_s=1200.0)
     assert done.returncode == 0, done.stdout + done.stderr
