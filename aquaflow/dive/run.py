@@ -156,7 +156,7 @@ class DiveRun:
 
         Raises:
             NotMappedError: too few frames could be placed; the folder says why.
-        InputError: the disk was too full for all files; those with room were written.
+            InputError: the disk was too full for all files; those with room were written.
         """
         attempt = self.slam.failures.attempt
         self.decide(self.slam.finish(progress))
@@ -207,6 +207,7 @@ class DiveRun:
             made.write(SCALE_SOURCE)
         self._check_calibration()
         with self.profiler.stage("report"):
+            self.warnings = self._shortcomings()
             numbers = self._numbers(results, made.held_out)
             notes = self.notes + self.slam.failures.notes()
             made.write_report(self.dropped, numbers, notes)
@@ -232,6 +233,13 @@ class DiveRun:
         ):
             self.lens_error = lens_error(self.slam.keyframes.keyframes)
 
+    def _shortcomings(self) -> list[str]:
+        gaussians = sum(len(mapper.gaussians) for mapper in self.slam.mappers.values())
+        found = shortcomings(self.config, self.folder.rows, gaussians)
+        if self.calibration is not None and self.lens_error is not None and self.lens_error.wrong:
+            found.append(calibration_findings.warning(self.lens_error, self.calibration))
+        return found
+
     def _calibration_numbers(self) -> dict[str, Any] | None:
         if self.calibration is None or self.lens_error is None:
             return None
@@ -239,10 +247,6 @@ class DiveRun:
 
     def _numbers(self, results: list[Tracked], held_out: list[HeldOut]) -> dict[str, Any]:
         wall_s = time.monotonic() - self.started
-        gaussians = sum(len(mapper.gaussians) for mapper in self.slam.mappers.values())
-        self.warnings = shortcomings(self.config, self.folder.rows, gaussians)
-        if self.calibration is not None and self.lens_error is not None and self.lens_error.wrong:
-            self.warnings.append(calibration_findings.warning(self.lens_error, self.calibration))
         numbers = metrics(self.slam, results, self.dropped, held_out, wall_s)
         numbers["warnings"], numbers["failures"] = self.warnings, self.slam.failures.to_json()
         numbers["calibration_check"] = self._calibration_numbers()

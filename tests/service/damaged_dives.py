@@ -268,7 +268,7 @@ def many(killed: Path, frames: list[Frame], count: int, seed: int) -> list[Outco
     return outcomes
 
 
-if __name__ == "__main__":  # damaged_dives.py COUNT [SEED]: the figures
+if __name__ == "__main__":  # python -m tests.service.damaged_dives COUNT [SEED]: the figures
     with TemporaryDirectory() as work:
         seen = killed_dive(Path(work))
         results = many(Path(work) / "dive", seen, int(sys.argv[1]), int((*sys.argv, "0")[2]))
