@@ -178,15 +178,15 @@ class Mapper:
         The water stays this map's own: it is the same water, and is fitted again to all views. So
         does the decoder: what the other's says of its Gaussians, seen from its own views, is kept.
         """
-        count = len(other.gaussians)
+        count, views = len(other.gaussians), in_time([*self.views, *other.views])
         # Only a decoder needs to know from where each is seen: cameras times Gaussians.
         centres = None if self.neural is None else other.scene.bake(other.views)
         self.gaussians.append(other.gaussians)
+        self.views = views  # from here on make_whole mends what a failure leaves
         self._optimiser.extend(count)
         if self.neural is not None and centres is not None:
             self.neural.insert(centres, count)
         self._optimiser.bind(self._parameters)
-        self.views = in_time([*self.views, *other.views])
         self.steps, self.undone = self.steps + other.steps, self.undone + other.undone
 
     # --- optimising ---------------------------------------------------------------------------
@@ -297,7 +297,10 @@ class Mapper:
         self._keep(sound)
 
     def make_whole(self) -> None:
-        """After a failure: every row of the optimiser belongs to a Gaussian, and all are finite."""
+        """After a failure: every row of the optimisers and groups belongs to a Gaussian, and all
+        Gaussians are finite."""
+        if self.neural is not None:
+            self.neural.make_whole()
         if len(self._optimiser.steps) != len(self.gaussians):
             self._optimiser = self._new_optimiser()
         self._optimiser.bind(self._parameters)

@@ -143,15 +143,30 @@ class Maps:
 
     def correct(self, moves: Mapping[int, Sim3], merged: Mapping[int, int]) -> None:
         for mapper in self.mappers.values():
-            mapper.move(moves)
+            with self.failures.contain("correction of the map") as run:
+                mapper.move(moves)
+            if run.failed:
+                mapper.make_whole()
         for views in self.held_out.values():
             move_views(views, moves)
         for source, target in merged.items():
-            if source in self.mappers:
-                self.mapper(target).absorb(self.mappers.pop(source))
+            self._merge(source, target)
             views = self.held_out.setdefault(target, [])
             views.extend(self.held_out.pop(source, []))
             let_surplus_go(views, views, self.config.mapping.held_out_most)
+
+    def _merge(self, source: int, target: int) -> None:
+        """One map of two; a failure before the Gaussians came over leaves both as they are."""
+        if source not in self.mappers:
+            return
+        mapper, other = self.mapper(target), self.mappers[source]
+        before = len(mapper.gaussians)
+        with self.failures.contain("merging of maps") as merge:
+            mapper.absorb(other)
+        if merge.failed:
+            mapper.make_whole()
+        if not merge.failed or len(mapper.gaussians) > before:
+            del self.mappers[source]
 
     def refine(self, progress: Progress | None = None) -> None:
         with self.profiler.stage("refine"):

@@ -24,6 +24,7 @@ from aquaflow.mapping.decoder.decode import (
 )
 from aquaflow.mapping.decoder.decoder import Decoder, Trunk
 from aquaflow.mapping.decoder.observation import observation
+from aquaflow.mapping.decoder.regrouping import is_whole, regrouped
 from aquaflow.mapping.decoder.tokens import visible_tokens
 from aquaflow.mapping.decoder.voxel_groups import VoxelGroups
 from aquaflow.mapping.gaussians.gaussians import GaussianMap
@@ -61,13 +62,9 @@ class NeuralGaussians:
         gaussians.local_features = torch.zeros(len(gaussians), config.local_width)
         self.groups = VoxelGroups(config.voxels, config.global_width)
         self.decoder = Decoder(config, generator)
-        rate = config.feature_rate
-        self._local = SelectiveAdam(
-            {"local": (gaussians.local_features, rate)}, betas, threads=threads
-        )
-        self._shared = SelectiveAdam(
-            {"shared": (self.groups.features, rate)}, betas, threads=threads
-        )
+        self._betas = betas
+        self._local = self._feature_optimiser("local", gaussians.local_features)
+        self._shared = self._feature_optimiser("shared", self.groups.features)
         self._weights = torch.optim.Adam(self.decoder.parameters(), lr=config.rate, betas=betas)
         self._expected: list[View] = []
         self._window: Window | None = None
@@ -75,6 +72,14 @@ class NeuralGaussians:
         """The trunk that ``seen_from`` used last, while nothing has changed."""
         self.skipped = 0
         """Windows whose weights were not stepped, as a gradient was not finite."""
+
+    def _feature_optimiser(
+        self,
+        name: str,
+        features: Tensor,  # [N, F]
+    ) -> SelectiveAdam:
+        groups = {name: (features, self.config.feature_rate)}
+        return SelectiveAdam(groups, self._betas, threads=self.threads)
 
     # --- learning -----------------------------------------------------------------------------
 
@@ -266,6 +271,23 @@ class NeuralGaussians:
         """Take over local features, and groups that were restored, with optimisers at step 0."""
         self.gaussians.local_features = local
         self._local.extend(len(local) - len(self._local.steps))
+        self._bind()
+
+    def make_whole(self) -> None:
+        """After a failure: each Gaussian has its place in a group, each row its optimiser state.
+
+        The window that was open is given up: what its views asked for is not learned.
+        """
+        self._looked = self._window = None
+        self._weights.zero_grad(set_to_none=True)
+        count = len(self.gaussians)
+        whole = is_whole(self.groups, count)
+        if not whole:
+            self.groups = regrouped(self.groups, self.gaussians.means)
+        if not whole or len(self._shared.steps) != len(self.groups):
+            self._shared = self._feature_optimiser("shared", self.groups.features)
+        if len(self._local.steps) != count:
+            self._local = self._feature_optimiser("local", self.gaussians.local_features)
         self._bind()
 
     def _bind(self) -> None:

@@ -13,7 +13,7 @@ from aquaflow.config import MappingConfig
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.mapping.decoder.decode import DECODED
 from aquaflow.mapping.decoder.neural import NeuralGaussians
-from aquaflow.mapping.decoder.voxel_groups import EMPTY
+from aquaflow.mapping.decoder.voxel_groups import EMPTY, VoxelGroups
 from aquaflow.mapping.mapper import Mapper
 from tests.mapping.mapping_scenes import (
     copied,
@@ -226,3 +226,48 @@ def test_an_empty_map_decodes_to_nothing() -> None:
         mapper.add_view(view)
     mapper.optimise(3)
     assert float(mapper.show(mapper.views[0]).alpha.max()) == 0.0
+
+
+@pytest.mark.parametrize("table", ["_group", "_slot", "_table", "_fill", "_voxel", "_features"])
+def test_tables_that_a_failure_left_half_changed_are_made_whole(table: str) -> None:
+    mapper = grown(neural())
+    mapper.optimise(6)  # the window is open
+    decoder = decoder_of(mapper)
+    decoder.groups.features.fill_(0.25)
+    rows = getattr(decoder.groups, table)
+    rows.extend(rows.rows[:2].clone())
+    mapper.make_whole()
+    assert is_whole(mapper)
+    known = 0.25 if table != "_features" else decoder.groups.features.max()
+    assert bool((decoder.groups.features == known).any())
+    mapper.optimise(8)
+    decoder.settle()
+    assert is_whole(mapper)
+
+
+def test_a_whole_map_keeps_its_groups_after_a_failure_elsewhere() -> None:
+    mapper = grown(neural())
+    groups = decoder_of(mapper).groups
+    mapper.make_whole()
+    assert decoder_of(mapper).groups is groups
+
+
+def test_a_sub_map_whose_groups_could_not_be_placed_comes_over_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    mapper, other = grown(neural()), grown(settings())
+    count, views = len(mapper.gaussians), len(mapper.views)
+    place = VoxelGroups._place
+
+    def failing(groups: VoxelGroups, *arguments: Any) -> int:
+        place(groups, *arguments)
+        monkeypatch.setattr(VoxelGroups, "_place", place)
+        raise RuntimeError("once")
+
+    monkeypatch.setattr(VoxelGroups, "_place", failing)
+    with pytest.raises(RuntimeError, match="once"):
+        mapper.absorb(other)
+    mapper.make_whole()
+    assert is_whole(mapper)
+    assert len(mapper.gaussians) == count + len(other.gaussians)
+    assert len(mapper.views) == views + len(other.views)

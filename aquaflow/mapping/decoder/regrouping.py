@@ -1,0 +1,43 @@
+"""Voxel groups made anew after a failure that left their tables half changed."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from aquaflow.mapping.decoder.voxel_groups import EMPTY, VoxelGroups
+
+
+def is_whole(
+    groups: VoxelGroups,
+    count: int,  # N Gaussians in the map
+) -> bool:
+    """True if every Gaussian has one place in one group, and all tables say the same."""
+    group, slot, table = groups.group, groups.slot, groups.table
+    if len(group) != count or len(slot) != count:
+        return False
+    if not len(groups) == len(table) == len(groups.voxel) == len(groups.features):
+        return False
+    inside = (group >= 0) & (group < len(groups)) & (slot >= 0) & (slot < table.shape[1])
+    if not bool(inside.all()) or not torch.equal(table[group, slot], torch.arange(count)):
+        return False
+    taken = (table != EMPTY).sum(1)
+    listed = torch.equal(torch.sort(groups.order()).values, torch.arange(len(groups)))
+    return listed and torch.equal(taken, groups.fill) and int(taken.sum()) == count
+
+
+def regrouped(
+    groups: VoxelGroups,
+    means: Tensor,  # [N, 3] of all Gaussians
+) -> VoxelGroups:
+    """All Gaussians placed anew; a voxel's first group keeps the feature known of that voxel."""
+    new = VoxelGroups(groups.config, groups.features.shape[1])
+    new.insert(means)
+    known: dict[int, Tensor] = {}
+    for voxel, feature in zip(groups.voxel.tolist(), groups.features, strict=False):
+        known.setdefault(voxel, feature)
+    for group, voxel in enumerate(new.voxel.tolist()):
+        feature = known.pop(voxel, None)
+        if feature is not None and bool(torch.isfinite(feature).all()):
+            new.features[group] = feature
+    return new

@@ -1,0 +1,110 @@
+"""Maps that follow the graph: what fails for one sub-map leaves the others, and itself, whole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from aquaflow.config import Config
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.mapping.gaussians.gaussians import GaussianMap
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.maps import Maps
+from aquaflow.render.adam import SelectiveAdam
+from tests.mapping.mapping_scenes import grown, settings
+
+pytestmark = pytest.mark.usefixtures("contained", "one_thread")
+
+ASIDE = {0: Sim3(np.eye(3), np.array([1.0, 0.0, 0.0]))}
+"""Moves of keyframes."""
+
+
+def two_maps() -> Maps:
+    maps = Maps(Config(mapping=settings()))
+    maps.mappers = {number: grown(settings()) for number in (0, 1)}
+    for mapper in maps.mappers.values():
+        mapper.failures = maps.failures
+    return maps
+
+
+def once(monkeypatch: pytest.MonkeyPatch, owner: type, name: str) -> None:
+    """Let a method do its work, raise, and never raise again."""
+    method: Callable[..., Any] = getattr(owner, name)
+
+    def failing(*arguments: Any) -> None:
+        monkeypatch.setattr(owner, name, method)
+        raise RuntimeError("once")
+
+    monkeypatch.setattr(owner, name, failing)
+
+
+def failed_stages(maps: Maps) -> list[str]:
+    return [entry["stage"] for entry in maps.failures.to_json()]
+
+
+def is_usable(mapper: Mapper) -> bool:
+    """Every row of the optimiser belongs to a Gaussian, and steps can be taken."""
+    before = mapper.steps
+    mapper.optimise(2)
+    return len(mapper._optimiser.steps) == len(mapper.gaussians) and mapper.steps == before + 2
+
+
+def test_two_sub_maps_become_one() -> None:
+    maps = two_maps()
+    count = sum(len(mapper.gaussians) for mapper in maps.mappers.values())
+    maps.correct({}, {1: 0})
+    assert list(maps.mappers) == [0]
+    assert len(maps.mappers[0].gaussians) == count
+    assert is_usable(maps.mappers[0])
+
+
+def test_held_out_views_follow_their_keyframes() -> None:
+    maps = two_maps()
+    held_out = maps.mappers[0].views.pop()
+    maps.hold_out(held_out, sub_map=0)
+    before = held_out.T_wc.t[0]
+    maps.correct(ASIDE, {})
+    assert held_out.T_wc.t[0] - before == pytest.approx(1.0)
+
+
+def test_a_merge_that_fails_after_the_gaussians_came_over_is_a_merge(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    maps = two_maps()
+    count = sum(len(mapper.gaussians) for mapper in maps.mappers.values())
+    views = sum(len(mapper.views) for mapper in maps.mappers.values())
+    once(monkeypatch, SelectiveAdam, "extend")
+    maps.correct({}, {1: 0})
+    assert failed_stages(maps) == ["merging of maps"]
+    assert list(maps.mappers) == [0]
+    assert (len(maps.mappers[0].gaussians), len(maps.mappers[0].views)) == (count, views)
+    assert is_usable(maps.mappers[0])
+
+
+def test_a_merge_that_fails_before_leaves_two_maps(monkeypatch: pytest.MonkeyPatch) -> None:
+    maps = two_maps()
+    counts = [len(mapper.gaussians) for mapper in maps.mappers.values()]
+    once(monkeypatch, GaussianMap, "append")
+    maps.correct({}, {1: 0})
+    assert failed_stages(maps) == ["merging of maps"]
+    assert [len(mapper.gaussians) for mapper in maps.mappers.values()] == counts
+    assert all(is_usable(mapper) for mapper in maps.mappers.values())
+
+
+def test_a_move_that_fails_in_one_map_is_made_in_the_other(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    maps = two_maps()
+    before = [mapper.gaussians.means.clone() for mapper in maps.mappers.values()]
+    once(monkeypatch, Mapper, "move")
+    maps.correct(ASIDE, {})
+    assert failed_stages(maps) == ["correction of the map"]
+    shifts = [
+        float((mapper.gaussians.means - old)[:, 0].mean())
+        for mapper, old in zip(maps.mappers.values(), before, strict=True)
+    ]
+    assert shifts == pytest.approx([0.0, 1.0], abs=1e-4)
+    assert all(is_usable(mapper) for mapper in maps.mappers.values())
