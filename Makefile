@@ -13,6 +13,7 @@ KERNELS := $(wildcard aquaflow/render/native/*.cpp aquaflow/render/native/*.h)
 
 OUT ?= out/dive
 FUZZ_SECONDS ?= 120
+FAULTS ?= 24
 SYNTHETIC := out/synthetic
 
 export PIP_NO_CACHE_DIR := 1
@@ -20,7 +21,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export XDG_CACHE_HOME := $(CURDIR)/$(VENV)/cache
 export MPLCONFIGDIR := $(CURDIR)/$(VENV)/cache/matplotlib
 
-.PHONY: help setup run test test-all test-kernel fuzz coverage check docs clean
+.PHONY: help setup run test test-ci test-injection test-all test-kernel fuzz coverage check docs clean
 
 help: ## Show this list.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -45,7 +46,13 @@ run: setup
 endif
 
 test: setup ## Run the tests that take seconds.
-	$(TESTS) -m 'not slow and not kernel'
+	$(TESTS) -m 'not slow and not kernel and not ci'
+
+test-ci: setup ## Run the tests that take tens of seconds: compilers, wheels, whole dives.
+	$(TESTS) -m ci
+
+test-injection: setup ## Let FAULTS=24 calls into libraries fail, one in each small dive.
+	$(BIN)/python -m tests.injection --sample $(FAULTS) --seed 16
 
 test-all: setup ## Run all tests, also those on whole recordings.
 	$(BIN)/pytest
@@ -58,7 +65,7 @@ fuzz: setup ## Feed every command what nothing sane would, for FUZZ_SECONDS=120.
 	$(BIN)/python -m tests.fuzz --seconds $(FUZZ_SECONDS)
 
 coverage: setup ## Run the tests of `make test` and show how much of each file they reach.
-	$(TESTS) -m 'not slow and not kernel' --cov --cov-report=term --cov-report=html:out/coverage
+	$(TESTS) -m 'not slow and not kernel and not ci' --cov --cov-report=term --cov-report=html:out/coverage
 
 check: setup ## Lint, formatting, unused code, types.
 	$(BIN)/ruff check

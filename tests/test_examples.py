@@ -40,6 +40,7 @@ def test_there_are_five_short_examples() -> None:
     assert max(len(file.read_text().splitlines()) for file in files) < MOST_LINES
 
 
+@pytest.mark.ci
 def test_a_recording_is_mapped_and_its_result_is_read(example, small_recording, tmp_path) -> None:
     said = example(1, small_recording, tmp_path / "dive")
     assert "of 12 frames have a pose" in said

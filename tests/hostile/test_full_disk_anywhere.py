@@ -42,7 +42,7 @@ def half_written(folder: Path) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("room_bytes", [64, 40_000])
+@pytest.mark.parametrize("room_bytes", [64, pytest.param(40_000, marks=pytest.mark.ci)])
 def test_mapping_onto_a_full_disk_is_told_in_one_sentence(
     small_recording: Path, tmp_path: Path, room_bytes: int
 ) -> None:
@@ -55,6 +55,7 @@ def test_mapping_onto_a_full_disk_is_told_in_one_sentence(
     assert half_written(dive) == []
 
 
+@pytest.mark.ci
 def test_a_benchmark_onto_a_full_disk_is_told_in_one_sentence(
     small_recording: Path, tmp_path: Path
 ) -> None:

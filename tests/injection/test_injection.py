@@ -1,4 +1,7 @@
-"""What any library throws at any frame costs that frame or that step, never the dive."""
+"""What any library throws at any frame costs that frame or that step, never the dive.
+
+A sample of the faults is `make test-injection`, which `.ci/run` calls.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,6 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-SAMPLE = 12
-"""Faults in the quick tests: each costs about a second of one core."""
 
 
 def injection(*arguments: object, timeout_s: float) -> subprocess.CompletedProcess[str]:
@@ -21,12 +22,6 @@ def injection(*arguments: object, timeout_s: float) -> subprocess.CompletedProce
         [sys.executable, "-m", "tests.injection", *map(str, arguments)],
         cwd=ROOT, env=environment, capture_output=True, text=True, timeout=timeout_s, check=False,
     )  # fmt: skip
-
-
-@pytest.mark.slow  # its live dives wait for minutes on some machines
-def test_a_sample_of_all_faults_leaves_every_dive_whole() -> None:
-    done = injection("--sample", SAMPLE, "--seed", 16, timeout_s=1200.0)
-    assert done.returncode == 0, done.stdout + done.stderr
 
 
 @pytest.mark.slow

@@ -37,6 +37,7 @@ def rows_without_names(dive: Path) -> list[list[str]]:
     return [[value for key, value in row.items() if key != "source"] for row in table]
 
 
+@pytest.mark.ci
 def test_a_recorded_dive_maps_to_the_bytes_that_its_source_maps_to(
     aquaflow: Cli, recorded: Path, small_dive: Path, tmp_path: Path
 ) -> None:

@@ -39,6 +39,7 @@ print(peak() - before)
 
 
 @pytest.mark.skipif(native.find_compiler() is None, reason="no C++ compiler")
+@pytest.mark.ci
 def test_two_million_gaussians_are_drawn_and_differentiated_in_bounded_memory() -> None:
     done = subprocess.run([sys.executable, "-c", DRAW], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -95,6 +95,7 @@ def test_the_first_error_of_the_compiler_is_told(
 
 @needs_compiler
 @pytest.mark.skipif(len(native.supported_isas()) < 2, reason="only one variant runs here")
+@pytest.mark.ci
 def test_where_the_fastest_variant_cannot_be_built_the_next_one_is_taken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -14,6 +14,8 @@ from aquaflow.render.native import build as native
 from tests.render.kernel_driver import Task, compile_driver, run_driver
 from tests.render.render_scenes import Scene, random_scene
 
+pytestmark = pytest.mark.ci
+
 CHECKS = "address,undefined,float-cast-overflow"
 SANITIZE = ("-O1", "-g1", f"-fsanitize={CHECKS}", "-fno-sanitize-recover=all")
 NAN, INF = float("nan"), float("inf")

@@ -38,9 +38,12 @@ def setuptools_is_recent() -> bool:
         return False
 
 
-pytestmark = pytest.mark.skipif(
-    not setuptools_is_recent(), reason="no setuptools >= 77 here to build a wheel with"
-)
+pytestmark = [
+    pytest.mark.ci,
+    pytest.mark.skipif(
+        not setuptools_is_recent(), reason="no setuptools >= 77 here to build a wheel with"
+    ),
+]
 
 
 def pip(*arguments: object, cwd: Path, **environment: str) -> str:

@@ -121,6 +121,7 @@ def test_a_page_gets_the_section_between_its_markers(tmp_path: Path, name: str) 
         write_readme(readme, picture, result["machine"], result["runs"])
 
 
+@pytest.mark.ci
 def test_a_worker_that_fails_or_crashes_is_a_row(tmp_path: Path) -> None:
     gone = Job(Scene("gone", str(tmp_path / "gone")), "fast", str(tmp_path / "dive"))
     assert "there is nothing at" in in_process(gone)["failed"]
@@ -167,6 +168,7 @@ def test_an_ablation_with_a_failed_scene_gives_no_mean(tmp_path: Path) -> None:
     assert "wall: none of 10 frames" in result["rows"][0]["failed"][0]
 
 
+@pytest.mark.ci
 def test_bench_on_a_small_dive(small_recording: Path, tmp_path: Path) -> None:
     out, scene = tmp_path / "bench", scene_at(small_recording)
     few = {"mapping": {"optimiser": {"refine_steps": 20, "heldout_steps": 5}}}

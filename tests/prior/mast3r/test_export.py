@@ -27,6 +27,8 @@ from aquaflow.prior.mast3r.network import Mast3r
 from aquaflow.prior.mast3r.settings import TINY
 from aquaflow.prior.runtime import RuntimeSettings, Session
 
+pytestmark = pytest.mark.ci
+
 pytest.importorskip("onnxruntime", reason="pip install 'aquaflow[prior]'")
 pytest.importorskip("onnxscript", reason="pip install 'aquaflow[export]'")
 

@@ -111,6 +111,7 @@ def test_an_edge_that_agrees_with_the_map_costs_no_step() -> None:
     assert list(result.trust.values()) == [1.0]
 
 
+@pytest.mark.ci
 def test_ten_thousand_keyframes_are_optimised() -> None:
     count = 10_000
     dive = Dive(count, seed=8, noise=0.1)

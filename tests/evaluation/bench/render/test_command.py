@@ -109,6 +109,7 @@ def small_benchmark(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("small_benchmark")
+@pytest.mark.ci
 def test_the_benchmark_writes_rows_gradients_and_a_picture(tmp_path: Path) -> None:
     arguments = ["bench", "render", "--quick", "--repeats", "2", "--json", "--out", str(tmp_path)]
     ran = CliRunner().invoke(app, arguments)
