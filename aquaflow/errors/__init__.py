@@ -102,7 +102,10 @@ def _words(name: str) -> str:
 
 def printable(name: str) -> str:
     r"""A file name to show: bytes that are not UTF-8 as ``\xe9``, a line break as ``\n``."""
-    raw = name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    try:
+        raw = name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    except UnicodeEncodeError:  # half a character from a file's text, which no name on disk has
+        raw = name.encode("utf-8", "backslashreplace").decode("utf-8")
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in raw)
 
 

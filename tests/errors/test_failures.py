@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aquaflow.dive.log import JsonLog
-from aquaflow.errors import ConfigError, InputError, NotMappedError
+from aquaflow.errors import ConfigError, InputError, NotMappedError, printable
 from aquaflow.errors.failures import RECENT_S, REPEATED, Failures
 
 OWN = (
@@ -189,3 +189,11 @@ def test_a_step_that_fails_again_is_left() -> None:
     failures = Failures(strict=False)
     assert failures.attempt("writing", lambda: raise_in(OWN, "raise ValueError")) is None
     assert failures.total == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [("r\udce9ef", "r\\xe9ef"), ("a\nb", "a\\nb"), ("half \ud811", "half \\ud811"), ("岩", "岩")],
+)
+def test_any_name_can_be_shown(name: str, shown: str) -> None:
+    assert printable(name) == shown

@@ -75,6 +75,8 @@ class Initialiser:
         parallax = rotation_compensated_parallax_px(
             self._pixels_reference[observed], pixels[observed], self.reference.camera
         )
+        # What is not a number compares with nothing: one such frame would hold up every start.
+        parallax = parallax if np.isfinite(parallax) else 0.0
         self.waiting.append(Waiting(frame, pixels, observed, parallax, pair))
         self._predicted = pair.matches
         return True

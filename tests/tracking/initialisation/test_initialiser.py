@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from aquaflow.config import InitialisationConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_log
+from aquaflow.tracking.initialisation import initialiser as initialiser_module
 from aquaflow.tracking.initialisation.hypotheses import Competition
 from aquaflow.tracking.initialisation.initialiser import Initialiser, calibrated
 from tests.tracking.tracking_scenes import KnownPrior, KnownView, depth_map, pose
@@ -169,6 +171,20 @@ def test_an_attempt_that_raised_is_made_again_with_the_next_frame(
     monkeypatch.setattr(Competition, "winner", raise_once)
     with pytest.raises(np.linalg.LinAlgError):
         initialiser.solve()
+    assert initialiser.ready
+
+
+def test_a_parallax_that_is_no_number_does_not_hold_up_the_start(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    prior = prior_of(MOVING)
+    frames = prior.frames(CAMERA)
+    initialiser = Initialiser(frames[0], prior.encode(frames[0].image, CAMERA), prior, CONFIG)
+    with monkeypatch.context() as broken:
+        broken.setattr(initialiser_module, "rotation_compensated_parallax_px", lambda *_: math.nan)
+        initialiser.add(frames[1], prior.encode(frames[1].image, CAMERA))
+    for frame in frames[2:]:
+        initialiser.add(frame, prior.encode(frame.image, CAMERA))
     assert initialiser.ready
 
 
