@@ -233,7 +233,11 @@ class KeyframeStore:
         packed = self._prior.pack(content.encoding)
         return arrays | {f"encoding.{name}": array for name, array in packed.items()}
 
-    def _unpack(self, number: int, arrays: Arrays) -> _Content:
+    def _unpack(
+        self,
+        number: int,
+        arrays: Arrays,  # as from _pack
+    ) -> _Content:
         assert self._prior is not None
         encoding_camera, pointmap_camera = self._cameras[number]
         rho, variance, fused = (arrays.pop(name) for name in ("rho", "variance", "fused"))

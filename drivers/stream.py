@@ -134,7 +134,9 @@ def _opened(config: StreamConfig) -> Any:
                 os.environ[OPTIONS] = before
 
 
-def _rgb(bgr: npt.NDArray[np.uint8] | None) -> npt.NDArray[np.uint8]:
+def _rgb(
+    bgr: npt.NDArray[np.uint8] | None,  # [H, W, 3]
+) -> npt.NDArray[np.uint8]:
     import cv2
 
     if bgr is None:

@@ -198,7 +198,12 @@ class McapCamera:
                 yield self._frame(place, image, encoded)
         yield from gone
 
-    def _frame(self, place: _Place, image: npt.NDArray[np.uint8], encoded: Encoded | None) -> Frame:
+    def _frame(
+        self,
+        place: _Place,
+        image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
+        encoded: Encoded | None,
+    ) -> Frame:
         height, width = image.shape[:2]
         camera = self._stated or guess_camera(width, height)
         frame = Frame(place.index, place.t_ns, place.arrival_ns, image, camera, encoded=encoded)

@@ -58,7 +58,7 @@ class ReplayOak:
         self,
         feed: CameraFeed,
         calibration: CameraModel | None = None,
-        imu_to_camera: npt.NDArray[np.float64] | None = IMU_TO_CAMERA,
+        imu_to_camera: npt.NDArray[np.float64] | None = IMU_TO_CAMERA,  # [3, 3]
     ) -> None:
         self.feed = feed
         self.calibration = calibration

@@ -91,14 +91,14 @@ def received_as(data: bytes) -> Encoded | None:
 
 
 def grey_16_white(
-    grey: npt.NDArray[np.uint8 | np.int32],  # as from read_picture
+    grey: npt.NDArray[np.uint8 | np.int32],  # [H, W] as from read_picture
 ) -> int:
     """The value that is white in 16-bit pictures like this one: 2^12 or 2^16."""
     return TWELVE_BITS if int(grey.max()) < TWELVE_BITS else 1 << 16
 
 
 def to_rgb(
-    picture: npt.NDArray[np.uint8 | np.int32],  # as from read_picture
+    picture: npt.NDArray[np.uint8 | np.int32],  # [H, W, 3] or [H, W] as from read_picture
     white: int,
 ) -> npt.NDArray[np.uint8]:
     """[H, W, 3] uint8 RGB; 16-bit grey is scaled so that ``white`` becomes 256."""

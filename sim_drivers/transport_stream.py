@@ -47,7 +47,11 @@ def encoded(
 class _Sender(ABC):
     """A thread that sends a stream over and over at its own pace, while it is plugged in."""
 
-    def __init__(self, images: list[npt.NDArray[np.uint8]], fps: float) -> None:
+    def __init__(
+        self,
+        images: list[npt.NDArray[np.uint8]],  # [H, W, 3] RGB each
+        fps: float,
+    ) -> None:
         self.plugged_in = threading.Event()
         self.plugged_in.set()
         self._ending = threading.Event()
@@ -81,7 +85,12 @@ class _Sender(ABC):
 class UdpCamera(_Sender):
     """Sends to a port of this computer, whether or not anyone listens."""
 
-    def __init__(self, port: int, images: list[npt.NDArray[np.uint8]], fps: float = 25.0) -> None:
+    def __init__(
+        self,
+        port: int,
+        images: list[npt.NDArray[np.uint8]],  # [H, W, 3] RGB each
+        fps: float = 25.0,
+    ) -> None:
         super().__init__(images, fps)
         self._address = ("127.0.0.1", port)
 
@@ -95,7 +104,11 @@ class UdpCamera(_Sender):
 class RtspCamera(_Sender):
     """An RTSP server for one client at a time, RTP interleaved in its connection (RFC 2326)."""
 
-    def __init__(self, images: list[npt.NDArray[np.uint8]], fps: float = 25.0) -> None:
+    def __init__(
+        self,
+        images: list[npt.NDArray[np.uint8]],  # [H, W, 3] RGB each
+        fps: float = 25.0,
+    ) -> None:
         super().__init__(images, fps)
         self._server = socket.create_server(("127.0.0.1", 0))
         self._server.settimeout(0.05)

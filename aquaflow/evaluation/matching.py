@@ -100,7 +100,11 @@ def relit(
 
 
 def homography_recall(
-    matcher: Matcher, pictures: Sequence[Picture], level: Level, pairs: int, seed: int = 0
+    matcher: Matcher,
+    pictures: Sequence[Picture],  # [H, W, 3] RGB each
+    level: Level,
+    pairs: int,
+    seed: int = 0,
 ) -> dict[str, float]:
     """Means over ``pairs``: ``recall`` within 2 px of all pixels that have a match, ``kept`` of
     them by the matcher's own check, ``precision`` within 2 px of what it kept."""

@@ -72,7 +72,10 @@ def evaluate_restoration(dive: Path, clean: Path, crop: str | None) -> Restorati
     return Restoration(len(indices), _mean_psnr(restored, reference), _mean_psnr(raw, reference))
 
 
-def _mean_psnr(pictures: Pictures, reference: Pictures) -> float:
+def _mean_psnr(
+    pictures: Pictures,  # [N, H, W, 3] in [0, 1]
+    reference: Pictures,  # [N, H, W, 3] in [0, 1]
+) -> float:
     gain = channel_gain(pictures, reference)
     matched = np.clip(pictures * gain, 0.0, 1.0)
     return float(np.mean([psnr(ours, true) for ours, true in zip(matched, reference, strict=True)]))

@@ -162,15 +162,22 @@ def _motion_error(
     return np.linalg.norm(moved_est - moved_true, axis=1), angle
 
 
-def _in_camera(R_wc: Positions, vectors: Positions) -> Positions:
+def _in_camera(
+    R_wc: Positions,  # [P, 3, 3]
+    vectors: Positions,  # [P, 3] world
+) -> Positions:
     """World vectors [P, 3] in camera axes, with rotations [P, 3, 3]."""
     return np.asarray(np.einsum("pji,pj->pi", R_wc, vectors))
 
 
-def _angle_deg(rotations: Positions) -> Positions:
+def _angle_deg(
+    rotations: Positions,  # [P, 3, 3]
+) -> Positions:
     """Turn angles [P] of rotations [P, 3, 3]; scipy's logarithm has no arccos to guard."""
     return np.asarray(np.degrees(Rotation.from_matrix(rotations).magnitude()))
 
 
-def _rms(values: Positions) -> float:
+def _rms(
+    values: Positions,  # [P]
+) -> float:
     return float(np.sqrt(np.mean(values**2)))

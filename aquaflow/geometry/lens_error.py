@@ -42,20 +42,29 @@ def rays_of(
     return np.asarray(rays)
 
 
-def _factor(rays: Array, lens: Array) -> Array:
+def _factor(
+    rays: Array,  # [N, 2] x and y at z = 1
+    lens: Array,  # [5]
+) -> Array:
     """[N, 1] of the radial distortion."""
     squared = _squared(rays)
     return np.asarray(1.0 + lens[1] * squared + lens[2] * squared**2)
 
 
-def slope(rays: Array, lens: Array) -> Array:
+def slope(
+    rays: Array,  # [N, 2] x and y at z = 1
+    lens: Array,  # [5]
+) -> Array:
     """[N, 2, 2] of :func:`seen_at` by the rays."""
     growth = (2.0 * lens[1] + 4.0 * lens[2] * _squared(rays))[..., None]
     bend = growth * rays[:, :, None] * rays[:, None, :]
     return np.asarray(np.exp(lens[0]) * (_factor(rays, lens)[..., None] * np.eye(2) + bend))
 
 
-def by_lens(rays: Array, lens: Array) -> Array:
+def by_lens(
+    rays: Array,  # [N, 2] x and y at z = 1
+    lens: Array,  # [5]
+) -> Array:
     """[N, 2, 5] of :func:`seen_at` by the errors of the lens."""
     squared, scaled = _squared(rays), np.exp(lens[0]) * rays
     radial = [_factor(rays, lens) * scaled, squared * scaled, squared**2 * scaled]
@@ -63,6 +72,8 @@ def by_lens(rays: Array, lens: Array) -> Array:
     return np.concatenate([np.stack(radial, axis=-1), centre], axis=-1)
 
 
-def _squared(rays: Array) -> Array:
+def _squared(
+    rays: Array,  # [N, 2] x and y at z = 1
+) -> Array:
     """[N, 1] squared radius."""
     return np.asarray(np.sum(rays**2, axis=-1, keepdims=True))

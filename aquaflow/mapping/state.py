@@ -224,6 +224,6 @@ def _under(prefix: str, arrays: Mapping[str, Any]) -> dict[str, Tensor]:
 
 
 def _tensor(
-    array: npt.NDArray[Any],  # of any shape
+    array: npt.NDArray[Any],  # [...] of any shape
 ) -> Tensor:
     return torch.from_numpy(np.array(array))

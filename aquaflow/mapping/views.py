@@ -216,7 +216,10 @@ def _pack(pixels: Pixels) -> Arrays:
     return {name: array for name, array in arrays.items() if array is not None}
 
 
-def _unpack(number: int, arrays: Arrays) -> Pixels:
+def _unpack(
+    number: int,
+    arrays: Arrays,  # as from _pack
+) -> Pixels:
     ranges = {
         name: torch.from_numpy(arrays[name]) if name in arrays else None
         for name in ("inverse_range", "range_confidence")

@@ -41,7 +41,11 @@ class ClassicalPrior:
         assert isinstance(encoding, FlowEncoding)
         return encoding.pack()
 
-    def unpack(self, arrays: Mapping[str, npt.NDArray[Any]], camera: CameraModel) -> FlowEncoding:
+    def unpack(
+        self,
+        arrays: Mapping[str, npt.NDArray[Any]],  # as from pack
+        camera: CameraModel,
+    ) -> FlowEncoding:
         """The encoding with all that was computed of it."""
         encoding = FlowEncoding(camera, arrays["grey"], arrays["texture"])
         encoding.restore(arrays)
@@ -62,7 +66,11 @@ class ClassicalPrior:
         return FlowPair(a, b, best_flow(self._matcher, a, b, _starts(a, b, predicted)))
 
 
-def _starts(a: FlowEncoding, b: FlowEncoding, predicted: Float | None) -> Iterator[Float | None]:
+def _starts(
+    a: FlowEncoding,
+    b: FlowEncoding,
+    predicted: Float | None,  # [H, W, 2] px, expected matches of a in b
+) -> Iterator[Float | None]:
     yield from from_prediction(predicted)
     if predicted is None:
         yield None

@@ -133,7 +133,11 @@ class Prior(Protocol):
         """The arrays of an encoding, not copied, for a file; what was not computed is left out."""
         ...
 
-    def unpack(self, arrays: Mapping[str, npt.NDArray[Any]], camera: CameraModel) -> Encoding:
+    def unpack(
+        self,
+        arrays: Mapping[str, npt.NDArray[Any]],  # as from pack
+        camera: CameraModel,
+    ) -> Encoding:
         """The encoding that ``pack`` took apart, equal in every bit; ``arrays`` become its own."""
         ...
 

@@ -79,12 +79,20 @@ class CompactDescriber:
         found = self._encoder({self._input: as_input(picture)})["Dc"][0]
         return np.ascontiguousarray(unit(found.transpose(1, 2, 0)).astype(np.float16))
 
-    def cells(self, a: Half, b: Half) -> tuple[Float, Float]:
+    def cells(
+        self,
+        a: Half,  # [h / 8, w / 8, d]
+        b: Half,  # [h / 8, w / 8, d]
+    ) -> tuple[Float, Float]:
         """The features themselves."""
         return a.astype(np.float32), b.astype(np.float32)
 
     def range_of(
-        self, a: Half, b: Half, camera_a: CameraModel, camera_b: CameraModel
+        self,
+        a: Half,  # [h / 8, w / 8, d]
+        b: Half,  # [h / 8, w / 8, d]
+        camera_a: CameraModel,
+        camera_b: CameraModel,
     ) -> LearnedRange:
         """By comparing rays: nearly monocular, and up to a factor (docs/measurements.md)."""
         found = self._decoder(
@@ -129,13 +137,21 @@ class Mast3rDescriber:
         """[1, N, D] tokens."""
         return self._encoder({"image": as_input(picture)})["tokens"].astype(np.float16)
 
-    def cells(self, a: Half, b: Half) -> tuple[Float, Float]:
+    def cells(
+        self,
+        a: Half,  # [1, N, D]
+        b: Half,  # [1, N, D]
+    ) -> tuple[Float, Float]:
         """[h / 8, w / 8, d] the descriptors at the cells' centres."""
         found = self._decoded(a, b)
         return found["D_a"][0, MIDDLE, MIDDLE], found["D_b"][0, MIDDLE, MIDDLE]
 
     def range_of(
-        self, a: Half, b: Half, camera_a: CameraModel, camera_b: CameraModel
+        self,
+        a: Half,  # [1, N, D]
+        b: Half,  # [1, N, D]
+        camera_a: CameraModel,
+        camera_b: CameraModel,
     ) -> LearnedRange:
         """Of its points, in metres. Its confidence Q weighed errors while it was trained, so that
         an error of POINTS_ALPHA / Q metres is what it expects."""
@@ -145,7 +161,11 @@ class Mast3rDescriber:
         expected = POINTS_ALPHA / found["Q_a"][0, MIDDLE, MIDDLE]
         return LearnedRange(np.log(distance), (expected / distance) ** 2, self.metric)
 
-    def _decoded(self, a: Half, b: Half) -> dict[str, Float]:
+    def _decoded(
+        self,
+        a: Half,  # [1, N, D]
+        b: Half,  # [1, N, D]
+    ) -> dict[str, Float]:
         tokens = {"tokens_a": a.astype(np.float32), "tokens_b": b.astype(np.float32)}
         return self._decoder(tokens)
 

@@ -149,7 +149,7 @@ class FlowMatcher:
         self,
         a: Grey,  # [H, W]
         b: Grey,  # [H, W]
-        start: Float | None,
+        start: Float | None,  # [H, W, 2] px, a to b
     ) -> Float:
         # Where a start is NaN, OpenCV reads outside of the picture and ends the process.
         if start is None or not np.isfinite(start).all():

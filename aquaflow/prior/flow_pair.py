@@ -48,7 +48,10 @@ class FlowEncoding:
             arrays |= {"pixels": keypoints.pixels, "descriptors": keypoints.descriptors}
         return arrays
 
-    def restore(self, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    def restore(
+        self,
+        arrays: Mapping[str, npt.NDArray[Any]],  # as from pack
+    ) -> None:
         """Take back what was computed when first asked for, and packed."""
         if "pixels" in arrays:
             self.keypoints = Keypoints(arrays["pixels"], arrays["descriptors"])

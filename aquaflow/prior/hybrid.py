@@ -51,12 +51,20 @@ class Describer(Protocol):
         """What is computed once for a picture and kept with it."""
         ...
 
-    def cells(self, a: Half, b: Half) -> tuple[Float, Float]:
+    def cells(
+        self,
+        a: Half,  # [...] features of one picture
+        b: Half,  # [...] of the other
+    ) -> tuple[Float, Float]:
         """[rows, columns, d] unit descriptors of cells that cover each picture, from features."""
         ...
 
     def range_of(
-        self, a: Half, b: Half, camera_a: CameraModel, camera_b: CameraModel
+        self,
+        a: Half,  # [...] features of one picture
+        b: Half,  # [...] of the other
+        camera_a: CameraModel,
+        camera_b: CameraModel,
     ) -> LearnedRange:
         """Distances in the first picture; cameras are those of the pictures before fitting."""
         ...
@@ -80,7 +88,10 @@ class HybridEncoding(FlowEncoding):
         features = vars(self).get("features")
         return arrays if features is None else arrays | {"features": features}
 
-    def restore(self, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    def restore(
+        self,
+        arrays: Mapping[str, npt.NDArray[Any]],  # as from pack
+    ) -> None:
         """Take back what was computed when first asked for, and packed."""
         super().restore(arrays)
         if "features" in arrays:
@@ -125,7 +136,11 @@ class HybridPrior:
         assert isinstance(encoding, HybridEncoding)
         return encoding.pack()
 
-    def unpack(self, arrays: Mapping[str, npt.NDArray[Any]], camera: CameraModel) -> HybridEncoding:
+    def unpack(
+        self,
+        arrays: Mapping[str, npt.NDArray[Any]],  # as from pack
+        camera: CameraModel,
+    ) -> HybridEncoding:
         """The encoding with all that was computed of it."""
         encoding = HybridEncoding(
             camera, arrays["grey"], arrays["texture"], arrays["picture"], self._describer
@@ -151,7 +166,9 @@ class HybridPrior:
 
 
 def _starts(
-    a: HybridEncoding, b: HybridEncoding, predicted: Float | None
+    a: HybridEncoding,
+    b: HybridEncoding,
+    predicted: Float | None,  # [H, W, 2] px, expected matches of a in b
 ) -> Iterator[Float | None]:
     yield from from_prediction(predicted)
     height, width = a.grey.shape

@@ -23,7 +23,7 @@ INLINE_BYTES = 1 << 30
 
 def write_onnx(
     graph: nn.Module,
-    example: tuple[Tensor, ...],
+    example: tuple[Tensor, ...],  # [...] each, as the graph takes them
     inputs: Sequence[str],
     outputs: Sequence[str],
     path: Path,
@@ -58,7 +58,10 @@ def write_onnx(
         )
 
 
-def relative_difference(expected: npt.NDArray[np.float32], found: npt.NDArray[np.float32]) -> float:
+def relative_difference(
+    expected: npt.NDArray[np.float32],  # [...]
+    found: npt.NDArray[np.float32],  # [...] as expected
+) -> float:
     """Largest difference, relative to the largest expected value."""
     scale = max(float(np.abs(expected).max()), float(np.finfo(np.float32).tiny))
     return float(np.abs(expected - found).max()) / scale

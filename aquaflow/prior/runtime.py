@@ -81,7 +81,8 @@ class Session:
         self.outputs = [value.name for value in self._session.get_outputs()]
 
     def __call__(
-        self, inputs: Mapping[str, npt.NDArray[Any]]
+        self,
+        inputs: Mapping[str, npt.NDArray[Any]],  # by name, shapes as the network's
     ) -> dict[str, npt.NDArray[np.float32]]:
         """All outputs by name, in the processor's own memory."""
         if self.device == "cpu":

@@ -140,7 +140,7 @@ class _Rasterise(torch.autograd.Function):
         ctx: Any,
         g_image: Tensor,  # [H, W, C]
         g_alpha: Tensor,  # [H, W]
-        *_: Tensor,
+        *_: Tensor,  # [...] of the outputs that have no gradient
     ) -> tuple[Any, ...]:
         *gaussians, image = ctx.saved_tensors
         gradients = [*(torch.empty_like(tensor) for tensor in gaussians), torch.empty(4, 4)]

@@ -108,9 +108,7 @@ class _DecodeView(torch.autograd.Function):
         heads: Tensor,  # [9, d / 2]
         bias: Tensor,  # [9]
         limits: Tensor,  # [9]
-        fixed: tuple[
-            Tensor, Tensor, Tensor, Tensor
-        ],  # rows [V], places [V], means [N, 3], centre [3]
+        fixed: tuple[Tensor, Tensor, Tensor, Tensor],  # [V], [V], [N, 3], [3]: see _inputs
         threads: int,
         library: Library,
     ) -> tuple[Tensor, Tensor, Tensor]:

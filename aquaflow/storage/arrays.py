@@ -63,12 +63,18 @@ class Cameras:
         return [of_camera(camera) for camera in self.known]
 
 
-def prefixed(prefix: str, arrays: Arrays) -> Arrays:
+def prefixed(
+    prefix: str,
+    arrays: Arrays,  # by name, of any shape
+) -> Arrays:
     """The same arrays under ``prefix.name``."""
     return {f"{prefix}.{name}": array for name, array in arrays.items()}
 
 
-def under(prefix: str, arrays: Mapping[str, Array]) -> Arrays:
+def under(
+    prefix: str,
+    arrays: Mapping[str, Array],  # by name, of any shape
+) -> Arrays:
     """What :func:`prefixed` put there."""
     start = f"{prefix}."
     return {name[len(start) :]: array for name, array in arrays.items() if name.startswith(start)}

@@ -29,7 +29,10 @@ UNREADABLE = (
 
 
 def write_facts_file(
-    path: Path, facts: dict[str, Any], arrays: Arrays, allow_nan: bool = True
+    path: Path,
+    facts: dict[str, Any],
+    arrays: Arrays,  # by name, of any shape
+    allow_nan: bool = True,
 ) -> None:
     """Write both, whole or not at all.
 

@@ -33,14 +33,23 @@ class Area:
     """Rows (y), columns (x)."""
 
     @classmethod
-    def around(cls, low: Array, high: Array, cell: float) -> Area:
+    def around(
+        cls,
+        low: Array,  # [2] x, y, m
+        high: Array,  # [2] x, y, m
+        cell: float,
+    ) -> Area:
         """The area from ``low`` to ``high`` ([2] m), rounded up."""
         count = [
             SIZE_MULTIPLE * math.ceil((high[k] - low[k]) / (cell * SIZE_MULTIPLE)) for k in (1, 0)
         ]
         return cls(float(low[0]), float(low[1]), cell, (count[0], count[1]))
 
-    def sample(self, values: FloatMap, xy: Array) -> Array:
+    def sample(
+        self,
+        values: FloatMap,  # [rows, columns] at the cells' centres
+        xy: Array,  # [N, 2] m, survey frame
+    ) -> Array:
         """Bilinear ``values`` at points [N, 2] (m), clamped to the area."""
         at = [(xy[:, 1] - self.y0) / self.cell - 0.5, (xy[:, 0] - self.x0) / self.cell - 0.5]
         return np.asarray(map_coordinates(values, at, order=1, mode="nearest"), np.float64)

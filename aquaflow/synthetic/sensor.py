@@ -65,9 +65,9 @@ class Snow:
 
     def _blend(
         self,
-        image: Image,
-        range_m: Image,
-        pixel: Array,
+        image: Image,  # [H, W, 3], changed in place
+        range_m: Image,  # [H, W] m
+        pixel: Array,  # [2] px
         distance: float,
         k: int,
         camera: CameraModel,
@@ -113,6 +113,8 @@ def expose(
     return quantised(image)
 
 
-def quantised(image: Image) -> npt.NDArray[np.uint8]:
+def quantised(
+    image: Image,  # [H, W, 3]
+) -> npt.NDArray[np.uint8]:
     """Radiance in [0, 1] as 0 to 255, linear, clipped."""
     return np.asarray(np.rint(np.clip(image, 0.0, 1.0) * 255.0), np.uint8)

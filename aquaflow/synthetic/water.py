@@ -52,11 +52,17 @@ class Medium:
     d: Rgb
     """Decay of the near residual, 1/m."""
 
-    def transmission(self, z: FloatArray) -> FloatArray:
+    def transmission(
+        self,
+        z: FloatArray,  # [...]
+    ) -> FloatArray:
         """exp(-beta_a z), [..., 3], for ranges z [...] in the unit of length."""
         return np.asarray(np.exp(-np.asarray(self.beta_a, z.dtype) * z[..., None]))
 
-    def backscatter(self, z: FloatArray) -> FloatArray:
+    def backscatter(
+        self,
+        z: FloatArray,  # [...]
+    ) -> FloatArray:
         """B(z), [..., 3], for ranges z [...] in the unit of length; infinite z gives B_inf."""
         kind = z.dtype
         grown = np.asarray(self.B_inf, kind) * (

@@ -97,7 +97,11 @@ def lens_error(keyframes: Sequence[Keyframe]) -> LensError | None:
         return None
 
 
-def estimated(observations: Observations, R_wc: Array, centres: Array) -> LensError:
+def estimated(
+    observations: Observations,
+    R_wc: Array,  # [V, 3, 3]
+    centres: Array,  # [V, 3] world
+) -> LensError:
     """The error of the lens, from poses [V, 3, 3] and [V, 3] that are roughly right.
 
     Raises:
@@ -130,7 +134,11 @@ def _model_error(simple: LensAdjustment, full: LensAdjustment) -> Array:
     return np.diag(explained * difference**2)
 
 
-def _chance(error: Array, covariance: Array, clusters: int) -> float:
+def _chance(
+    error: Array,  # [2] u and k
+    covariance: Array,  # [2, 2] of u and k
+    clusters: int,
+) -> float:
     """Hotelling's test against the nearest error within the tolerance."""
     side = np.linspace(-1.0, 1.0, GRID)
     within = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2) * TOLERANCE

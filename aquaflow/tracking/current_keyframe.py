@@ -47,7 +47,11 @@ class Attachment:
         """Pose of the last frame."""
         return self.keyframe.T_wc @ self.T_fk.inverse()
 
-    def moved_to(self, T_fk: Sim3, matches: Float) -> None:
+    def moved_to(
+        self,
+        T_fk: Sim3,
+        matches: Float,  # [H, W, 2] px
+    ) -> None:
         """A frame was placed."""
         self.motion = T_fk @ self.T_fk.inverse()
         self.T_fk, self.matches = T_fk, matches

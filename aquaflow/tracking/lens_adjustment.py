@@ -126,7 +126,10 @@ def clusters_of(observations: Observations) -> Indices:
     return np.asarray(4 * observations.reference + 2 * lower + right, dtype=np.int64)
 
 
-def _larger(a: Array, b: Array) -> Array:
+def _larger(
+    a: Array,  # [2, 2]
+    b: Array,  # [2, 2]
+) -> Array:
     """[2, 2] a covariance that is nowhere smaller than either."""
     root = np.linalg.cholesky(b)
     whitened = np.linalg.solve(root, np.linalg.solve(root, a).T)
@@ -134,5 +137,7 @@ def _larger(a: Array, b: Array) -> Array:
     return np.asarray(root @ (vectors * np.maximum(values, 1.0)) @ vectors.T @ root.T)
 
 
-def _sigma(size: Array) -> float:
+def _sigma(
+    size: Array,  # [M] lengths of residuals, normalised plane
+) -> float:
     return max(float(np.median(size)) / MEDIAN_SIGMAS, MIN_SIGMA) if len(size) else MIN_SIGMA

@@ -67,14 +67,20 @@ class Weighting:
     used: npt.NDArray[np.bool_]
     """[M]"""
 
-    def weights(self, error: Array) -> Array:
+    def weights(
+        self,
+        error: Array,  # [M, 2] normalised plane
+    ) -> Array:
         """[M] Huber's, over the variance; 0 for what is not used."""
         size = np.linalg.norm(error, axis=-1)
         bound = HUBER_SIGMAS * self.sigma
         huber = np.where(size < bound, 1.0, bound / np.maximum(size, 1e-12))
         return np.asarray(np.where(self.used, huber / self.sigma**2, 0.0))
 
-    def cost(self, error: Array) -> float:
+    def cost(
+        self,
+        error: Array,  # [M, 2] normalised plane
+    ) -> float:
         """Huber's, of residuals [M, 2]."""
         size = np.linalg.norm(error, axis=-1)[self.used] / self.sigma
         tail = HUBER_SIGMAS * (size - 0.5 * HUBER_SIGMAS)
@@ -97,7 +103,10 @@ class Equations:
         self._H_pc = np.zeros((count, J.shape[-1]))
         np.add.at(self._H_pc, point, np.einsum("mr,mrk->mk", along, self._wJ))
 
-    def reduced(self, points: npt.NDArray[np.bool_]) -> tuple[Array, Array]:
+    def reduced(
+        self,
+        points: npt.NDArray[np.bool_],  # [P] which of them
+    ) -> tuple[Array, Array]:
         """H [C, C] and gradient [C] of the ``points`` [P], their depths eliminated."""
         rows = points[self._observations.point]
         columns = self._J.shape[-1]
@@ -107,7 +116,10 @@ class Equations:
         gradient = wJ.T @ self._error[rows].ravel() - gain.T @ self._g_p[points]
         return J.T @ wJ - gain.T @ H_pc, gradient
 
-    def held(self, H: Array) -> Array:
+    def held(
+        self,
+        H: Array,  # [C, C]
+    ) -> Array:
         """[C, C] with the prior of the lens and the gauge held."""
         extra = np.full(len(H), GAUGE_DAMPING * float(np.trace(H)) / len(H))
         extra[-TERMS:] += LENS_PRIOR_SIGMA**-2.0
@@ -167,7 +179,12 @@ def _derivatives(observations: Observations, state: Adjusted) -> tuple[Array, Ar
     return seen_at(at, state.lens) - observations.matches, J, _applied(D, way)
 
 
-def _put(J: Array, view: Indices, by_centre: Array, by_rotation: Array) -> None:
+def _put(
+    J: Array,  # [M, 2, C], changed in place
+    view: Indices,  # [M]
+    by_centre: Array,  # [M, 2, 3]
+    by_rotation: Array,  # [M, 2, 3]
+) -> None:
     """Into the six columns of every match's ``view`` [M]."""
     rows = np.arange(len(J))
     for axis in range(3):
@@ -186,6 +203,9 @@ def triangulated(observations: Observations, state: Adjusted) -> Array:
     return np.asarray(top / np.maximum(np.bincount(point, np.sum(slope**2, axis=1), count), 1e-18))
 
 
-def _applied(R: Array, vectors: Array) -> Array:
+def _applied(
+    R: Array,  # [M, r, 3]
+    vectors: Array,  # [M, 3]
+) -> Array:
     """[M, r] = R [M, r, 3] @ vectors [M, 3]."""
     return np.asarray(np.einsum("mij,mj->mi", R, vectors))

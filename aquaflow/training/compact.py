@@ -182,7 +182,7 @@ def _around(
     D_a: Tensor,  # [B, N, d]
     D_b: Tensor,  # [B, d, h, w]
     there: Tensor,  # [B, N, 2] px
-    sharpness: Tensor,
+    sharpness: Tensor,  # []
     reach: int,
 ) -> tuple[Tensor, Tensor]:
     """[B, N] cross-entropy in a window around the truth, and whether its best lies within 2 px."""

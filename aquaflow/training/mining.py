@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from aquaflow.errors import InputError
@@ -127,7 +128,11 @@ class MinedPairs:
         b = self._view(second, T_aw)
         return Pair(_without(a, moved(a, b)), _without(b, moved(b, a)))
 
-    def _view(self, posed: Posed, T_rw: np.ndarray) -> View:  # type: ignore[type-arg]
+    def _view(
+        self,
+        posed: Posed,
+        T_rw: npt.NDArray[np.floating],  # [4, 4] world to reference
+    ) -> View:
         return view_of(posed, self.width, self.height, T_rw)
 
 
@@ -150,7 +155,10 @@ def load_index(path: Path) -> list[PairIndex]:
         )
 
 
-def _without(view: View, mask: torch.Tensor) -> View:
+def _without(
+    view: View,
+    mask: torch.Tensor,  # [B, H, W] bool
+) -> View:
     return View(view.image, view.depth, view.K, view.T_wc, view.valid & ~mask)
 
 

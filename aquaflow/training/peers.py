@@ -27,7 +27,10 @@ class Peers:
         """True for the one process that writes files."""
         return self.rank == 0
 
-    def average(self, parameters: Iterable[Tensor]) -> None:
+    def average(
+        self,
+        parameters: Iterable[Tensor],  # [...] each
+    ) -> None:
         """Replace every gradient by its mean over the processes."""
 
     def wait(self) -> None:
@@ -42,7 +45,10 @@ class Together(Peers):
         if torch.cuda.is_available():
             self.device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
 
-    def average(self, parameters: Iterable[Tensor]) -> None:
+    def average(
+        self,
+        parameters: Iterable[Tensor],  # [...] each
+    ) -> None:
         """What one process has no gradient for counts as zero."""
         for parameter in parameters:
             if not parameter.requires_grad:

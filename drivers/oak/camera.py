@@ -113,7 +113,7 @@ class OakCamera(LiveCamera):
     def _queue_sample(
         self,
         reading: ImuReading,
-        rotation: npt.NDArray[np.float64],
+        rotation: npt.NDArray[np.float64],  # [3, 3] IMU to body
         t_ns: int,
         arrival_ns: int,
     ) -> None:

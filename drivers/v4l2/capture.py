@@ -101,13 +101,20 @@ class V4l2Capture:
             release=partial(self._queue, int(buffer.index)),
         )
 
-    def _decode(self, data: npt.NDArray[np.uint8], flags: int) -> npt.NDArray[np.uint8]:
+    def _decode(
+        self,
+        data: npt.NDArray[np.uint8],  # [bytes used]
+        flags: int,
+    ) -> npt.NDArray[np.uint8]:
         if flags & abi.BUF_FLAG_ERROR:
             raise UnusablePictureError("was damaged on its way from the camera")
         pix = self._pix
         return to_rgb(data, self.pixels, pix.width, pix.height, pix.bytesperline)
 
-    def _file(self, data: npt.NDArray[np.uint8]) -> Encoded | None:
+    def _file(
+        self,
+        data: npt.NDArray[np.uint8],  # [bytes used]
+    ) -> Encoded | None:
         return Encoded("jpeg", data.tobytes()) if self.pixels in JPEG_PIXELS else None
 
     def _queue(self, index: int) -> None:

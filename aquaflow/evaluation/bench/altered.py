@@ -89,7 +89,11 @@ def _read(dive: Path, index: int) -> npt.NDArray[np.uint8]:
 
 
 def _write_picture(
-    dive: Path, out: Path, old: int, new: int, picture: npt.NDArray[np.uint8]
+    dive: Path,
+    out: Path,
+    old: int,
+    new: int,
+    picture: npt.NDArray[np.uint8],  # [H, W, 3] BGR
 ) -> None:
     cv2.imwrite(str(out / "images" / f"{new:06d}.png"), picture)
     for folder, suffix in (("clean", "png"), ("range", "npz")):

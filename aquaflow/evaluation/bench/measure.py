@@ -62,7 +62,10 @@ def depth_error(dive: Path, truth: Path, metres_per_unit: float) -> float | None
     return float(np.concatenate(errors).mean())
 
 
-def _like(values: np.ndarray[Any, Any], shape: tuple[int, ...]) -> np.ndarray[Any, Any]:
+def _like(
+    values: np.ndarray[Any, Any],  # [h, w]
+    shape: tuple[int, ...],
+) -> np.ndarray[Any, Any]:
     """The nearest of ``values`` [h, w] for every pixel of a picture of ``shape``."""
     rows = (np.arange(shape[0]) + 0.5) * values.shape[0] / shape[0]
     columns = (np.arange(shape[1]) + 0.5) * values.shape[1] / shape[1]

@@ -74,7 +74,9 @@ def _precisions(folder: Path) -> list[str]:
 
 
 def _recall(
-    contenders: Sequence[Contender], pictures: Sequence[Picture], progress: Progress
+    contenders: Sequence[Contender],
+    pictures: Sequence[Picture],  # [H, W, 3] RGB each
+    progress: Progress,
 ) -> dict[str, dict[str, dict[str, float]]]:
     """By contender and level: see ``homography_recall``."""
     first = {f"{c.name} {c.variant}": c for c in reversed(contenders)}

@@ -115,6 +115,11 @@ def sea_floor(width: int, height: int) -> Picture:
     return np.asarray(np.clip(127.0 + 28.0 * total, 0, 255), dtype=np.uint8)
 
 
-def _view(floor: Picture, width: int, height: int, moved: float) -> Picture:
+def _view(
+    floor: Picture,  # [H, W, 3] RGB
+    width: int,
+    height: int,
+    moved: float,
+) -> Picture:
     left = round(moved * width)
     return np.ascontiguousarray(floor[:height, left : left + width])

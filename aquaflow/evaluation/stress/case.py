@@ -83,7 +83,11 @@ class Check:
         if not ratio <= 1.0:
             self._failures.append(f"{what} is {value:.3g}, more than {bound:.3g}")
 
-    def finite(self, what: str, *arrays: npt.ArrayLike | torch.Tensor | None) -> None:
+    def finite(
+        self,
+        what: str,
+        *arrays: npt.ArrayLike | torch.Tensor | None,  # [...] any shape
+    ) -> None:
         """Every entry is expected to be a number."""
         for array in arrays:
             if array is None:

@@ -47,7 +47,11 @@ def cloud(seed: int, count: int = COUNT) -> Cloud:
     )
 
 
-def _drawn(check: Check, gaussians: Cloud, culled: Tensor | None = None) -> None:
+def _drawn(
+    check: Check,
+    gaussians: Cloud,
+    culled: Tensor | None = None,  # [N] bool
+) -> None:
     """Both renderers: finite forward and backward, alpha in [0, 1], ``culled`` [N] without trace.
 
     The gradient is that of a plain sum over picture and alpha.
@@ -68,7 +72,10 @@ def _drawn(check: Check, gaussians: Cloud, culled: Tensor | None = None) -> None
             check.true(f"{renderer.name} gives no gradient to what it culls", all(still))
 
 
-def draw(renderer: Renderer, inputs: list[Tensor]) -> Rendering:
+def draw(
+    renderer: Renderer,
+    inputs: list[Tensor],  # five of [N, ...], then [4, 4]
+) -> Rendering:
     """The picture of a cloud's five tensors, from the view matrix that follows them."""
     means, quats, scales, opacities, colours, viewmat = inputs
     K = torch.from_numpy(CAMERA.K).to(torch.float32)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -22,18 +23,28 @@ from aquaflow.tracking.pose.solver import PoseProblem, solve_pose
 HEIGHT, WIDTH = 24, 32
 
 
-def _relative(got: Tensor, wanted: Tensor) -> float:
+def _relative(
+    got: Tensor,  # [...]
+    wanted: Tensor,  # [...] as got
+) -> float:
     """Norm of the difference over the norm of ``wanted``."""
     difference = got.detach().double() - wanted.detach()
     return float(difference.norm() / wanted.detach().norm().clamp_min(1e-30))
 
 
-def _leaves(tensors: Sequence[Tensor], dtype: torch.dtype) -> list[Tensor]:
+def _leaves(
+    tensors: Sequence[Tensor],  # [...] each
+    dtype: torch.dtype,
+) -> list[Tensor]:
     return [tensor.detach().to(dtype).requires_grad_() for tensor in tensors]
 
 
 def _gradients_agree(
-    check: Check, stage: str, single: Sequence[Tensor], double: Sequence[Tensor], bound: float
+    check: Check,
+    stage: str,
+    single: Sequence[Tensor],  # [...] each, float32
+    double: Sequence[Tensor],  # [...] each, float64
+    bound: float,
 ) -> None:
     for a, b in zip(single, double, strict=True):
         assert a.grad is not None
@@ -105,7 +116,10 @@ def pose_solver_from_float32(check: Check, seed: int) -> None:
     check.below("pose: error of R", float(np.abs(rounded.R - exact.R).max()), 1e-6)
 
 
-def _solved(points: np.ndarray, pixels: np.ndarray) -> Sim3:  # type: ignore[type-arg]
+def _solved(
+    points: npt.NDArray[np.float64],  # [N, 3]
+    pixels: npt.NDArray[np.float64],  # [N, 2] px
+) -> Sim3:
     ones = np.ones(len(points))
     estimate = solve_pose(
         PoseProblem(points, 1e-6 * ones, pixels, ones, VIEW, 0.5), Sim3.identity()

@@ -35,7 +35,10 @@ def _points(seed: int) -> Array:
     return CAMERA.unproject(_pixels(seed)) * depth
 
 
-def _problem(points: Array, pixels: Array) -> PoseProblem:
+def _problem(
+    points: Array,  # [N, 3]
+    pixels: Array,  # [N, 2] px
+) -> PoseProblem:
     return PoseProblem(
         points, np.full(len(points), 1e-6), pixels, np.ones(len(points)), CAMERA, 0.5
     )
@@ -169,7 +172,9 @@ def degenerate_alignment(check: Check, seed: int) -> None:
     check.true("a line is called a line", alignment.collinear)
 
 
-def _alignment_refused(points: Array) -> bool:
+def _alignment_refused(
+    points: Array,  # [N, 3]
+) -> bool:
     try:
         align(points, points, with_scale=True)
     except InputError:

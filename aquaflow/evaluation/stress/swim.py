@@ -49,7 +49,11 @@ class Floor:
             texture += weight * smooth / smooth.std()
         self._texture = 120.0 + 32.0 * texture / texture.std()
 
-    def height(self, x: Array, y: Array) -> Array:
+    def height(
+        self,
+        x: Array,  # [...] m
+        y: Array,  # [...] m, as x
+    ) -> Array:
         """Depth of the floor below the origin at x, y, m; the shape of x."""
         relief = np.sin(3.1 * x + 0.5) + 0.8 * np.cos(3.7 * y + 1.3 * x)
         return np.asarray(DEPTH_M + self.relief_m * relief)

@@ -132,7 +132,10 @@ def depth_loss_at_range_0(check: Check, seed: int) -> None:
     check.below("loss", float(loss.detach()), 1e3)
 
 
-def _off(values: Tensor, wanted: float) -> float:
+def _off(
+    values: Tensor,  # [3]
+    wanted: float,
+) -> float:
     """Largest error of learnable values."""
     return float((values.detach() - wanted).abs().max())
 

@@ -94,8 +94,8 @@ def path_axes(figure: Figure, path: PathPlot) -> None:
 
 def _draw_view(
     axes: Axes,
-    ours: npt.NDArray[np.floating],
-    truth: npt.NDArray[np.floating] | None,
+    ours: npt.NDArray[np.floating],  # [N, 3] along the path's main directions
+    truth: npt.NDArray[np.floating] | None,  # [M, 3] along the same
     path: PathPlot,
     u: int,
     v: int,

@@ -192,7 +192,11 @@ def cell_rays(
     return torch.stack([x[:, None].expand(-1, rows, -1), y[:, :, None].expand(-1, -1, columns)], 1)
 
 
-def _cells(height: int, width: int, like: Tensor) -> tuple[Tensor, Tensor]:
+def _cells(
+    height: int,
+    width: int,
+    like: Tensor,  # [...], for its device and type
+) -> tuple[Tensor, Tensor]:
     """[height * width] column and row of each cell, as numbers that can be averaged."""
     column = torch.arange(width, device=like.device, dtype=like.dtype)
     row = torch.arange(height, device=like.device, dtype=like.dtype)

@@ -96,7 +96,7 @@ class Checkpointer:
         maps: Maps,
         lacking: list[Correction],
         head: dict[str, Any],
-        arrays: Arrays,
+        arrays: Arrays,  # of the tracking
         files: list[Path],
     ) -> None:
         """In the mapping thread."""

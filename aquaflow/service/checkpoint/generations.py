@@ -75,7 +75,11 @@ class Checkpoint:
         return len(self.arrays["tracking.keyframes"])
 
 
-def write_state(dive: Path, facts: dict[str, Any], arrays: Arrays) -> None:
+def write_state(
+    dive: Path,
+    facts: dict[str, Any],
+    arrays: Arrays,  # by name, of any shape
+) -> None:
     """Let this be the newest checkpoint of ``dive``, and the newest one that before it.
 
     Raises:

@@ -28,7 +28,11 @@ def take_apart(maps: Maps) -> tuple[dict[str, Any], Arrays]:
     return facts, arrays
 
 
-def put_together(maps: Maps, facts: dict[str, Any], arrays: Arrays) -> None:
+def put_together(
+    maps: Maps,
+    facts: dict[str, Any],
+    arrays: Arrays,  # as from take_apart
+) -> None:
     """Let fresh ``maps`` go on where those that were taken apart stood.
 
     A view whose file was lost is left out; the Gaussians that it brought stay.
@@ -59,7 +63,11 @@ def corrections_apart(lacking: Sequence[Correction]) -> tuple[list[dict[str, Any
     return facts, arrays
 
 
-def catch_up(maps: Maps, lacking: list[dict[str, Any]], arrays: Arrays) -> None:
+def catch_up(
+    maps: Maps,
+    lacking: list[dict[str, Any]],
+    arrays: Arrays,  # as from corrections_apart
+) -> None:
     """Let the maps follow the corrections of :func:`corrections_apart`."""
     for i, facts in enumerate(lacking):
         numbers, moves = arrays[f"lacking{i}.keyframes"], arrays[f"lacking{i}.moves"]
@@ -79,7 +87,10 @@ def _held_out(views: Sequence[View]) -> tuple[list[dict[str, Any]], Arrays]:
     return [of_camera(camera) for camera in cameras], arrays
 
 
-def _read_held_out(cameras: list[dict[str, Any]], arrays: Arrays) -> list[View]:
+def _read_held_out(
+    cameras: list[dict[str, Any]],
+    arrays: Arrays,  # as from _held_out
+) -> list[View]:
     known = [to_camera(values) for values in cameras]
     rows = zip(arrays["numbers"].tolist(), arrays["poses"], strict=True)
     return [

@@ -61,7 +61,12 @@ def take_apart(slam: Slam, run: DiveRun) -> tuple[dict[str, Any], Arrays] | None
     return facts, arrays
 
 
-def put_together(slam: Slam, run: DiveRun, facts: dict[str, Any], arrays: Arrays) -> None:
+def put_together(
+    slam: Slam,
+    run: DiveRun,
+    facts: dict[str, Any],
+    arrays: Arrays,  # as from take_apart
+) -> None:
     """Let a fresh ``slam`` and ``run`` go on where those that were taken apart stood.
 
     Raises:

@@ -136,7 +136,7 @@ class PoseOut:
 
 
 def _motion(
-    before: tuple[Tracked, Array, Array],
+    before: tuple[Tracked, Array, Array],  # with its R [3, 3] and t_m [3]
     latest: Tracked,
     R: Array,  # [3, 3]
     t_m: Array,  # [3] m

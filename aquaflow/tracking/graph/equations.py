@@ -30,12 +30,17 @@ DAMPING = 1e-9
 """First damping, over the diagonal: enough for a direction that no edge knows."""
 
 
-def poses_of(rows: Rows) -> Sim3Batch:
+def poses_of(
+    rows: Rows,  # [n] NODE or EDGE
+) -> Sim3Batch:
     """The similarities in NODE or EDGE rows."""
     return Sim3Batch(rows["R"], rows["t"], rows["scale"])
 
 
-def residuals(poses: Sim3Batch, edges: Rows) -> tuple[Array, Sim3Batch]:
+def residuals(
+    poses: Sim3Batch,
+    edges: Rows,  # [m] EDGE
+) -> tuple[Array, Sim3Batch]:
     """[m, 7] residuals of the edges, and T_ba of the present poses."""
     T_ba = poses[edges["b"]].inverse() @ poses[edges["a"]]
     return (poses_of(edges).inverse() @ T_ba.inverse()).log(), T_ba
@@ -43,7 +48,7 @@ def residuals(poses: Sim3Batch, edges: Rows) -> tuple[Array, Sim3Batch]:
 
 def chi_squares(
     r: Array,  # [m, 7]
-    edges: Rows,
+    edges: Rows,  # [m] EDGE
 ) -> Array:
     """[m] squared residuals in the metric of the edges' information."""
     return np.asarray(np.einsum("ei,eij,ej->e", r, edges["information"], r))

@@ -110,7 +110,12 @@ def _ordering(
     return np.asarray(factor.perm_c, dtype=np.intp)
 
 
-def _assembled(blocks: Array, rows: Index, columns: Index, count: int) -> sparse.csc_matrix:
+def _assembled(
+    blocks: Array,  # [B, 7, 7]
+    rows: Index,  # [B] of blocks
+    columns: Index,  # [B] of blocks
+    count: int,
+) -> sparse.csc_matrix:
     """Block-sparse symmetric matrix [7 count, 7 count]."""
     order = np.argsort(rows * count + columns, kind="stable")
     starts = np.searchsorted(rows[order], np.arange(count + 1))

@@ -59,7 +59,10 @@ class Chains:
             path.append(int(before[path[-1]]))
         return np.array(path[::-1], dtype=np.intp)
 
-    def covariance(self, path: Index) -> Array:
+    def covariance(
+        self,
+        path: Index,  # [k] numbers of poses
+    ) -> Array:
         """[7, 7] of the pose of the path's end seen from its start, in the tangent of the end."""
         if len(path) < 2:
             return np.zeros((7, 7))
@@ -79,7 +82,12 @@ class Chains:
 class Claim:
     """A loop edge against the chain between its ends."""
 
-    def __init__(self, loop: Rows, r: Array, chains: Chains) -> None:
+    def __init__(
+        self,
+        loop: Rows,  # [] EDGE
+        r: Array,  # [7]
+        chains: Chains,
+    ) -> None:
         self.loop, self.r, self.chains = loop, r, chains
 
     @cached_property
@@ -159,7 +167,12 @@ class Admission:
             span[claims[i].path] = True
         return Admitted(candidates[believed], allowed[believed], span, quiet)
 
-    def _corroborated(self, loops: Rows, i: int, chains: Chains) -> bool:
+    def _corroborated(
+        self,
+        loops: Rows,  # [k] EDGE
+        i: int,
+        chains: Chains,
+    ) -> bool:
         """True if enough others make the same claim as loop ``i``, from other keyframes."""
         config = self.config
         far_a, far_b = abs(loops["a"] - loops["a"][i]), abs(loops["b"] - loops["b"][i])
@@ -173,7 +186,11 @@ class Admission:
                 return True
         return False
 
-    def _gap(self, pair: Rows, chains: Chains) -> float:
+    def _gap(
+        self,
+        pair: Rows,  # [2] EDGE
+        chains: Chains,
+    ) -> float:
         """chi2 of the difference between two claims, seen from the second loop's b."""
         claimed, seen = self.poses[pair["a"]] @ poses_of(pair), self.poses[pair["b"]]
         T_ji = seen[:1].inverse() @ seen[1:]

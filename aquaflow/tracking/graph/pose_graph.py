@@ -103,7 +103,11 @@ class PoseGraph:
         return {"nodes": self._nodes.rows, "edges": self._edges.rows, "trust": self._trust.rows}
 
     @classmethod
-    def of_tables(cls, tables: Mapping[str, Rows], config: GraphConfig) -> PoseGraph:
+    def of_tables(
+        cls,
+        tables: Mapping[str, Rows],  # as from tables
+        config: GraphConfig,
+    ) -> PoseGraph:
         """The graph that ``tables`` took apart; every edge counts as new to the next solving."""
         graph = cls(config)
         for table, rows in (
@@ -224,7 +228,11 @@ class PoseGraph:
         found = {number: poses.element(i) for i, number in enumerate(ordered)}
         return replace(result, poses=found)
 
-    def _carry(self, nodes: Rows, result: GraphResult) -> set[int]:
+    def _carry(
+        self,
+        nodes: Rows,  # [N] NODE, changed in place
+        result: GraphResult,
+    ) -> set[int]:
         """Move keyframes that are newer than a result with the one before them, in place."""
         before, count = self._nodes.rows, len(result.snapshot.nodes)
         solved = np.zeros(count, dtype=bool)

@@ -69,7 +69,10 @@ class Table:
         """Writable view of the rows from ``first`` on, which no view handed out may hold."""
         return self._buffer[first : self._count]
 
-    def replace(self, rows: Rows) -> None:
+    def replace(
+        self,
+        rows: Rows,  # [n] of the table's dtype
+    ) -> None:
         """Other contents for the same rows; views handed out before keep the old."""
         self._buffer = rows
         self._count = len(rows)
@@ -115,7 +118,11 @@ class GraphResult:
     """[M] TRUST"""
 
 
-def write_poses(rows: Rows, where: Index | Mask | slice, poses: Sim3Batch) -> None:
+def write_poses(
+    rows: Rows,  # [n] NODE or EDGE
+    where: Index | Mask | slice,  # [k] numbers or [n] bool
+    poses: Sim3Batch,
+) -> None:
     """Put similarities into NODE or EDGE rows, in place."""
     rows["R"][where], rows["t"][where], rows["scale"][where] = poses.R, poses.t, poses.scale
 
@@ -134,7 +141,10 @@ class Join:
         """True if the poses are where they should be already, but for rounding."""
         return bool(np.abs(self.S.log()).max() < ROUNDING)
 
-    def apply(self, nodes: Rows) -> Index:
+    def apply(
+        self,
+        nodes: Rows,  # [N] NODE
+    ) -> Index:
         """Move the component's nodes into the frame of the other, in place; which they were."""
         rows = np.flatnonzero(nodes["component"] == self.moved)
         if not self.still:

@@ -84,7 +84,10 @@ def _matches(a: tuple[Posed, Keypoints], b: tuple[Posed, Keypoints]) -> tuple[Ar
     return (rays * z[:, None])[known], there[known]
 
 
-def _posed(reader: Callable[[], Posed], T_wc: Array) -> Posed:
+def _posed(
+    reader: Callable[[], Posed],
+    T_wc: Array,  # [4, 4] m
+) -> Posed:
     return replace(reader(), T_wc=T_wc)
 
 

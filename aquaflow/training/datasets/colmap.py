@@ -69,7 +69,12 @@ def _workspace(folder: Path, root: Path) -> Frames:
     return Frames(str(folder.relative_to(root)), tuple(readers))
 
 
-def _frame(image: Path, depth: Path, camera: _Camera, T_wc: Array) -> Posed:
+def _frame(
+    image: Path,
+    depth: Path,
+    camera: _Camera,
+    T_wc: Array,  # [4, 4] in the model's unit
+) -> Posed:
     picture, metres = read_image(image), read_depth_map(depth)
     height, width = picture.shape[:2]
     if metres.shape != (height, width):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from aquaflow.training.datasets.posed import Posed
@@ -11,7 +12,12 @@ from aquaflow.training.datasets.validity import valid_pixels
 from aquaflow.training.pairs import View
 
 
-def view_of(posed: Posed, width: int, height: int, T_rw: np.ndarray | None = None) -> View:  # type: ignore[type-arg]
+def view_of(
+    posed: Posed,
+    width: int,
+    height: int,
+    T_rw: npt.NDArray[np.floating] | None = None,  # [4, 4] world to reference
+) -> View:
     """[1, ...] the picture's middle, as large as fits; poses are of the camera to ``r``.
 
     Depth is never averaged: between near and far there is nothing.

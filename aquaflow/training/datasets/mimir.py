@@ -58,7 +58,12 @@ def _camera(folder: Path, root: Path) -> Frames:
     return Frames(str(folder.relative_to(root)), tuple(readers))
 
 
-def _frame(image: Path, depth: Path, K: Array, T_wc: Array) -> Posed:
+def _frame(
+    image: Path,
+    depth: Path,
+    K: Array,  # [3, 3] px
+    T_wc: Array,  # [4, 4] m
+) -> Posed:
     return Posed(read_image(image), read_exr(depth), K, T_wc)
 
 

@@ -64,7 +64,11 @@ def _trajectory(folder: Path, side: str, root: Path) -> Frames:
     return Frames(str(folder.relative_to(root)), tuple(readers))
 
 
-def _frame(image: Path, depth_stem: Path, T_wc: Array) -> Posed:
+def _frame(
+    image: Path,
+    depth_stem: Path,
+    T_wc: Array,  # [4, 4] m
+) -> Posed:
     picture = read_image(image)
     height, width = picture.shape[:2]
     K = pinhole(width / 2, width / 2, width / 2, height / 2)

@@ -56,5 +56,8 @@ def _edges(view: View) -> Tensor:
     return across | F.pad(down, (0, 0, 1, 0)) | F.pad(down, (0, 0, 0, 1))
 
 
-def _differ(one: Tensor, other: Tensor) -> Tensor:
+def _differ(
+    one: Tensor,  # [B, h, w] m
+    other: Tensor,  # [B, h, w] m
+) -> Tensor:
     return (one > SMOOTH * other) | (other > SMOOTH * one)

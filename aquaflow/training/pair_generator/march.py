@@ -58,7 +58,11 @@ def first_hits(
     return Hits(depth, normal, material)
 
 
-def _floor(terrain: Terrain, centre: Tensor, rays: Tensor) -> Tensor:
+def _floor(
+    terrain: Terrain,
+    centre: Tensor,  # [B, 3] world, m
+    rays: Tensor,  # [B, N, 3] world, of unit depth
+) -> Tensor:
     """[B, N] depth of the floor along each ray."""
     down = rays[..., 2].clamp_max(-1e-4)
     falls = rays[..., 2] < -1e-4
@@ -105,7 +109,12 @@ def _slope(
     return F.normalize(torch.cat([-tilt, torch.ones_like(tilt[..., :1])], -1), dim=-1)
 
 
-def _body(solids: Solids, index: int, centre: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+def _body(
+    solids: Solids,
+    index: int,
+    centre: Tensor,  # [B, 3] world, m
+    rays: Tensor,  # [B, N, 3] world, of unit depth
+) -> tuple[Tensor, Tensor]:
     """[B, N] depth and [B, N, 3] normal of one body of each scene; NOWHERE where it is missed."""
     R, half = solids.R[:, index], solids.half[:, index, None]
     origin = ((centre - solids.centre[:, index])[:, None] @ R) / half
@@ -120,7 +129,10 @@ def _body(solids: Solids, index: int, centre: Tensor, rays: Tensor) -> tuple[Ten
     return torch.where(seen, t, NOWHERE), normal
 
 
-def _unit_sphere(origin: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
+def _unit_sphere(
+    origin: Tensor,  # [B, 1, 3] in half sizes
+    along: Tensor,  # [B, N, 3] in half sizes
+) -> tuple[Tensor, Tensor]:
     a, b = (along * along).sum(-1), (origin * along).sum(-1)
     discriminant = b * b - a * ((origin * origin).sum(-1) - 1.0)
     t = (-b - discriminant.clamp_min(0.0).sqrt()) / a
@@ -128,7 +140,10 @@ def _unit_sphere(origin: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
     return t, origin + t[..., None].clamp_max(FURTHEST) * along
 
 
-def _unit_box(origin: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
+def _unit_box(
+    origin: Tensor,  # [B, 1, 3] in half sizes
+    along: Tensor,  # [B, N, 3] in half sizes
+) -> tuple[Tensor, Tensor]:
     inverse = 1.0 / torch.where(along.abs() < 1e-6, 1e-6, along)
     one, other = (-1.0 - origin) * inverse, (1.0 - origin) * inverse
     enter, axis = torch.minimum(one, other).max(-1)

@@ -85,7 +85,10 @@ def _packed(view: View, name: str) -> dict[str, Tensor]:
     }
 
 
-def _view(stacked: dict[str, Tensor], name: str) -> View:
+def _view(
+    stacked: dict[str, Tensor],  # as from _packed
+    name: str,
+) -> View:
     depth = stacked[f"depth_{name}"].float()
     image = stacked[f"image_{name}"].float() * (BRIGHTEST / 255.0)
     return View(image, depth, stacked[f"K_{name}"], stacked[f"T_wc_{name}"], depth > 0)

@@ -87,7 +87,12 @@ def _radiance(
     return (colour * shade[:, None]).clamp(0.0, BRIGHTEST) * hits.found[:, None]
 
 
-def _sunlight(draw: Draw, scene: Scene, hits: Hits, points: Tensor) -> Tensor:
+def _sunlight(
+    draw: Draw,
+    scene: Scene,
+    hits: Hits,
+    points: Tensor,  # [B, N, 3] world, m
+) -> Tensor:
     """[B, N] sky plus sun, the sun gathered by the waves into a pattern that has moved on."""
     light = scene.light
     lambert = (hits.normal * light.sun[:, None]).sum(-1).clamp_min(0.0)
@@ -99,7 +104,13 @@ def _sunlight(draw: Draw, scene: Scene, hits: Hits, points: Tensor) -> Tensor:
     return ambient + (1.0 - ambient) * lambert * gathered
 
 
-def _lamplight(draw: Draw, scene: Scene, hits: Hits, rays: Tensor, facing: Tensor) -> Tensor:
+def _lamplight(
+    draw: Draw,
+    scene: Scene,
+    hits: Hits,
+    rays: Tensor,  # [B, N, 3] camera, of unit depth
+    facing: Tensor,  # [B, N] cosine
+) -> Tensor:
     """[B, N] of lamps beside the camera: they fall off with range, and towards the beam's rim."""
     batch = len(rays)
     at = hits.depth[..., None].clamp_max(FURTHEST) * rays - scene.light.lamp[:, None]

@@ -41,7 +41,10 @@ def taken(
     return (image * (1.0 + draw.normal(batch, 3, 1, 1, sigma=0.06))).clamp(0.0, 1.0)
 
 
-def _exposed(draw: Draw, image: Tensor) -> Tensor:
+def _exposed(
+    draw: Draw,
+    image: Tensor,  # [B, 3, H, W]
+) -> Tensor:
     """Mean level as automatic exposure wants it, white balance from none to complete."""
     batch = len(image)
     mean = image.mean(dim=(2, 3), keepdim=True).clamp_min(0.02)
@@ -50,13 +53,19 @@ def _exposed(draw: Draw, image: Tensor) -> Tensor:
     return image * level / torch.lerp(mean.mean(1, keepdim=True), mean, balance)
 
 
-def _uneven(draw: Draw, image: Tensor) -> Tensor:
+def _uneven(
+    draw: Draw,
+    image: Tensor,  # [B, 3, H, W]
+) -> Tensor:
     """[B, 1, H, W] gain."""
     coarse = draw.normal(len(image), 1, 4, 5) * draw.uniform(len(image), 1, 1, 1, high=UNEVENNESS)
     return F.interpolate(coarse, size=image.shape[-2:], mode="bicubic", align_corners=False).exp()
 
 
-def _snow(draw: Draw, image: Tensor) -> Tensor:
+def _snow(
+    draw: Draw,
+    image: Tensor,  # [B, 3, H, W]
+) -> Tensor:
     """[B, 1, H, W] light of particles that drift by, out of focus to a degree of their own."""
     batch, _, height, width = image.shape
     share = draw.uniform(batch, 1, 1, 1, low=SNOW_PER_PIXEL[0], high=SNOW_PER_PIXEL[1])
@@ -68,7 +77,10 @@ def _snow(draw: Draw, image: Tensor) -> Tensor:
     return light + far + near
 
 
-def _blurred(draw: Draw, image: Tensor) -> Tensor:
+def _blurred(
+    draw: Draw,
+    image: Tensor,  # [B, 3, H, W]
+) -> Tensor:
     """By an elongated Gaussian of its own for each picture: defocus, water, motion."""
     batch, channels, height, width = image.shape
     sigma = draw.uniform(batch, 1, 1, low=BLUR_PX[0], high=BLUR_PX[1])

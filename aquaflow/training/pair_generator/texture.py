@@ -47,7 +47,12 @@ class Atlas:
         far = self._level(places, fine.long() + 1, material)
         return near + (far - near) * (level - fine)[:, None]
 
-    def _level(self, places: Tensor, level: Tensor, material: Tensor) -> Tensor:
+    def _level(
+        self,
+        places: Tensor,  # [B, N, 2] in periods
+        level: Tensor,  # [B, N] int64
+        material: Tensor,  # [B, N] int64
+    ) -> Tensor:
         scale = torch.exp2(level.float())[..., None]
         # The mean of 2^l texels lies at their middle, not at the first of them.
         places = places - (scale - 1.0) / (2.0 * self.size)

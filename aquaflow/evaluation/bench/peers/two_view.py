@@ -98,7 +98,10 @@ def _advance(state: _State, frame: Frame) -> _State:
     return _State(grey, depth, state.T_wc @ T_old_new, length)
 
 
-def _follow(old: npt.NDArray[np.uint8], new: npt.NDArray[np.uint8]) -> tuple[Array, Array]:
+def _follow(
+    old: npt.NDArray[np.uint8],  # [H, W] grey
+    new: npt.NDArray[np.uint8],  # [H, W] grey
+) -> tuple[Array, Array]:
     """Corners [M, 2] in the old picture and where they went (OpenCV's pixels)."""
     corners = cv2.goodFeaturesToTrack(old, CORNERS, QUALITY, APART_PX)
     if corners is None:
@@ -116,7 +119,11 @@ def _follow(old: npt.NDArray[np.uint8], new: npt.NDArray[np.uint8]) -> tuple[Arr
     return start[kept], end[kept]
 
 
-def _motion(old: Array, new: Array, K: Array) -> _Step | None:
+def _motion(
+    old: Array,  # [M, 2] OpenCV's pixels
+    new: Array,  # [M, 2] OpenCV's pixels
+    K: Array,  # [3, 3] px
+) -> _Step | None:
     """Rotation, direction and depths from two sets of pixels [M, 2]; None where they disagree."""
     shifted = K.copy()
     shifted[:2, 2] -= 0.5  # our pixel centres are at 0.5, OpenCV's at 0
@@ -151,7 +158,8 @@ def _length(state: _State, moved: _Step) -> float:
 
 
 def _cells(
-    pixels: Array, shape: tuple[int, ...]
+    pixels: Array,  # [M, 2] OpenCV's pixels
+    shape: tuple[int, ...],
 ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
     """Column and row of each pixel [M, 2], inside the picture."""
     at = np.round(pixels).astype(np.intp)

@@ -67,7 +67,11 @@ class SplatScene:
         moved = [tensor.detach().to(device=device, dtype=dtype) for tensor in self.inputs]
         return [tensor.requires_grad_() for tensor in moved]
 
-    def drawn_by(self, renderer: Renderer, leaves: Sequence[Tensor]) -> Rendering:
+    def drawn_by(
+        self,
+        renderer: Renderer,
+        leaves: Sequence[Tensor],  # five of [N, ...], then [4, 4], as NAMES
+    ) -> Rendering:
         """The picture, with ``leaves`` in place of the inputs."""
         means, quats, scales, opacities, colours, viewmat = leaves
         gaussians = (means, quats, scales, opacities, colours)
