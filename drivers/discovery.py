@@ -8,10 +8,12 @@ from pathlib import Path
 from aquaflow.sources.discovery import FoundDevice
 
 LUXONIS_USB_VENDOR = "03e7"
+"""USB vendor under which OAK cameras appear: Movidius, whose chip they carry."""
 ARPHRD_CAN = "280"
 """Value of ``/sys/class/net/*/type`` for a CAN interface (linux/if_arp.h)."""
 
 SERIAL_PORTS = ("ttyUSB*", "ttyACM*", "ttyAMA*", "ttyTHS*")
+"""USB adapters, USB devices such as autopilots, the UARTs of a Raspberry Pi and of a Jetson."""
 
 
 def v4l2_cameras(root: Path = Path("/")) -> list[FoundDevice]:

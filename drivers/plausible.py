@@ -18,6 +18,7 @@ from aquaflow.messages import (
 DEPTH_M = (-20.0, 11_500.0)
 """Above the surface only by a wrong surface pressure; the deepest sea is 10,935 m."""
 MAX_ALTITUDE_M = 11_500.0
+"""No further above ground than the deepest sea is deep."""
 MAX_SPEED_M_S = 20.0
 """The fastest vehicles do 10 m/s."""
 MAX_RATE_RAD_S = 40.0

@@ -24,6 +24,7 @@ from drivers.live import LiveCamera
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+"""Environment variable from which OpenCV takes the options of FFmpeg."""
 
 OPEN_TIMEOUT_S = 5.0
 """A camera on the tether answers within a second, and within this while it boots."""

@@ -24,11 +24,13 @@ SEARCH_MS = 500
 """The library's own 10 s would keep a user waiting who only forgot the cable."""
 
 PICTURE_QUEUE = 4
+"""Pictures; the queue drops the oldest, so a short one keeps what is read fresh."""
 IMU_QUEUE = 200
 """Half a second at 400 Hz; pictures are read at least five times a second."""
 
 TIMESYNC_PERIOD = timedelta(seconds=5)
 TIMESYNC_SAMPLES = 10
+"""depthai's own defaults (DeviceBase.hpp), stated so that no later version changes them."""
 
 
 def depthai() -> Any:

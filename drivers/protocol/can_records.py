@@ -11,6 +11,7 @@ from drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing
 from drivers.transport.can import EXTENDED, RECORD
 
 MAX_STANDARD, MAX_EXTENDED = 0x7FF, 0x1FFF_FFFF
+"""The largest identifiers of 11 and of 29 bits."""
 
 
 class CanFrame(NamedTuple):

@@ -30,10 +30,12 @@ SCALARS: dict[str, Callable[[int, int, str, float], TelemetrySample]] = {
     "altitude": Altitude,
     "lights": Lights,
 }
+"""Kinds of samples with one value, by their name in the config."""
 VECTORS: dict[str, Callable[[int, int, str, Vector], TelemetrySample]] = {
     "angular_rate": AngularRate,
     "acceleration": Acceleration,
 }
+"""Kinds of samples with three values, in body axes."""
 
 
 class DbcDecoder(PacketDecoder):

@@ -16,6 +16,7 @@ from drivers.protocol.mavlink_speech import message_of
 from drivers.protocol.packets import PacketDecoder
 
 DIALECT = "pymavlink.dialects.v20.ardupilotmega"
+"""ArduPilot's messages; they include the common ones, which PX4 sends too."""
 OUR_COMPONENT = 197
 """MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY."""
 TALK_EVERY_NS = 1_000_000_000

@@ -14,10 +14,15 @@ from drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing
 
 MARK_2 = 0xFD
 MARKS = re.compile(b"[\xfd\xfe]")
+"""First bytes of a packet: 0xFD of MAVLink 2, 0xFE of MAVLink 1."""
 HEADER_1, HEADER_2 = 6, 10
+"""Bytes before the payload of MAVLink 1 and 2, first byte included."""
 CHECKSUM = 2
+"""Bytes after the payload."""
 SIGNED = 0x01
+"""Incompatibility flag of a packet that a signature follows."""
 SIGNATURE = 13
+"""Bytes of a signature: link, time and hash."""
 
 
 class Header(NamedTuple):

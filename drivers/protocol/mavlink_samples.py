@@ -23,8 +23,11 @@ from aquaflow.messages import (
 from drivers.rotation import Quaternion, from_euler, inverse, normalised, rotate
 
 GRAVITY_M_S2 = 9.80665
+"""Standard gravity: the g of MAVLink's milli-g, and what turns pressure into depth."""
 MILLI_G = GRAVITY_M_S2 / 1000.0
+"""m/s^2; unit of RAW_IMU and SCALED_IMU2."""
 HPA = 100.0
+"""Pa; unit of the pressure messages."""
 DOWN = 25
 """MAV_SENSOR_ROTATION_PITCH_270: a range finder that looks down."""
 INVALID_SIGNAL = 1
@@ -32,6 +35,7 @@ INVALID_SIGNAL = 1
 HIGHRES_ACCELERATION, HIGHRES_GYRO = 0x07, 0x38
 """Bits of HIGHRES_IMU.fields_updated."""
 ATTITUDE_LIFE_NS = 500_000_000
+"""An older attitude does not turn a velocity into body axes; autopilots send several a second."""
 
 
 class Stamp(NamedTuple):

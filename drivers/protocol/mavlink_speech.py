@@ -18,11 +18,16 @@ from aquaflow.sources.outbound import (
 )
 
 SEVERITIES = {"error": 3, "warning": 4, "notice": 5, "info": 6}
+"""MAV_SEVERITY."""
 LOCAL_FRD, BODY_FRD = 20, 12
 """MAV_FRAME of the world and of the body."""
 ESTIMATOR_VISION = 2
+"""MAV_ESTIMATOR_TYPE_VISION: a camera, without inertial sensors."""
 UNKNOWN = float("nan")
+"""As ODOMETRY wants it in velocities, and in the first number of a covariance, that are not
+known."""
 ROWS, COLUMNS = np.triu_indices(6)
+"""The upper triangle row by row: 21 numbers of a 6 x 6 covariance."""
 LARGEST = 1e6
 """Metres; beyond is no position."""
 

@@ -15,7 +15,9 @@ from drivers.protocol.packets import PacketDecoder
 from drivers.protocol.partial import PartialMotion
 
 KNOT_M_S = 1852.0 / 3600.0
+"""m/s; a nautical mile of 1852 m in an hour."""
 FOOT_M, FATHOM_M = 0.3048, 1.8288
+"""International foot, and six of them."""
 
 Fields = list[str]
 

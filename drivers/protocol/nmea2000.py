@@ -16,12 +16,16 @@ from drivers.protocol.packets import PacketDecoder
 from drivers.protocol.partial import PartialMotion
 
 HEADING, RATE_OF_TURN, ATTITUDE, SPEED, WATER_DEPTH = 127250, 127251, 127257, 128259, 128267
+"""Parameter group numbers."""
 
 NOT_AVAILABLE = {"H": 0xFFFF, "h": 0x7FFF, "I": 0xFFFF_FFFF, "i": 0x7FFF_FFFF}
+"""The largest value of each type, by struct's letter."""
 RESERVED = 2
 """The two values below 'not available' mean 'out of range' and 'reserved'."""
 TRUE, MAGNETIC = 0, 1
+"""References of a heading; the others are 'error' and 'not available'."""
 ANGLE_RAD, RATE_RAD_S, SPEED_M_S, DEPTH_M = 1e-4, 3.125e-8, 0.01, 0.01
+"""Value of one count of each field."""
 
 
 def group_of(identifier: int) -> int:

@@ -16,6 +16,7 @@ from drivers.protocol.lines import LineFraming
 LONGEST = 256
 """Bytes. The standard has 82; proprietary sentences are longer."""
 BODY = re.compile(rb"[$!]([\x20-\x7e]*?)(?:\*([0-9A-Fa-f]{2}))?[ \t]*[\r\n]")
+"""A sentence: what the checksum covers, and the two digits of it, if there are any."""
 
 
 class Sentence(NamedTuple):

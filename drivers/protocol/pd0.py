@@ -15,15 +15,21 @@ from drivers.device_clock import DeviceClock
 from drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing, PacketDecoder
 
 MARK = b"\x7f\x7f"
+"""Header ID and data source ID."""
 HEADER = 6
+"""Bytes: the mark, the ensemble's length, a spare one, the number of data types."""
 CHECKSUM = 2
+"""Bytes: the sum of all before, modulo 65536."""
 LONGEST = 8192
 """Bytes; a water profile of 128 cells has about 3000."""
 MAX_TYPES = 16
+"""Data types of an ensemble. A DVL sends seven or so; a larger number is damage."""
 FIXED_LEADER, VARIABLE_LEADER, BOTTOM_TRACK = 0x0000, 0x0080, 0x0600
+"""IDs of the data types that are read."""
 INSTRUMENT, SHIP = 1, 2
 """Bits 3 and 4 of the fixed leader's byte 25; 0 is beam, 3 is earth coordinates."""
 BAD_VELOCITY = -32_768
+"""mm/s; what the DVL writes for a velocity that it could not measure."""
 MIN_BEAMS = 3
 """With three of four beams the velocity and the mean range are still right."""
 

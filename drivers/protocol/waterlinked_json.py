@@ -15,6 +15,7 @@ from drivers.protocol.waterlinked import attitude, bottom_track, measured_ns
 LONGEST = 16_384
 """Bytes; a velocity report has about 1000, answers to commands a few times that."""
 START = re.compile(rb"(?<=[\r\n])\{")
+"""A report begins on a line of its own."""
 
 
 def parse(line: bytes) -> dict[str, Any] | None:

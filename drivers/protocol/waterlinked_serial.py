@@ -13,7 +13,9 @@ from drivers.protocol.waterlinked import attitude, bottom_track, measured_ns
 LONGEST = 512
 """Bytes; a velocity report with covariance has about 200."""
 POLYNOMIAL = 0x07
+"""Of the CRC-8, x^8 + x^2 + x + 1 (Water Linked's serial protocol)."""
 LINE = re.compile(rb"(w[\x20-\x29\x2b-\x7e]*)\*([0-9a-f]{2})[\r\n]")
+"""What the CRC covers, and the two digits of it."""
 
 
 def _crc_table() -> tuple[int, ...]:
@@ -26,6 +28,7 @@ def _crc_table() -> tuple[int, ...]:
 
 
 CRC_TABLE = _crc_table()
+"""CRC-8 of every byte."""
 
 
 def crc8(data: bytes) -> int:

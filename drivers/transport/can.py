@@ -21,6 +21,7 @@ RECORD = struct.Struct("<IB3x8s")
 EXTENDED = 0x8000_0000
 """Flag of a 29 bit identifier."""
 MAX_FRAMES = MAX_READ_BYTES // RECORD.size
+"""Frames of one read."""
 
 
 class CanLink:

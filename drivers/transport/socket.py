@@ -12,6 +12,7 @@ from drivers.link import MAX_READ_BYTES, LinkLostError
 CONNECT_TIMEOUT_S = 3.0
 """A device on the vehicle's own network answers in milliseconds, or is not there."""
 WRITE_TIMEOUT_S = 1.0
+"""A write waits only while the peer reads nothing; what is sent is worth no longer wait."""
 
 
 class UdpLink:

@@ -10,20 +10,25 @@ from ctypes import c_int32, c_uint8, c_uint32, c_uint64
 
 VIDEO_CAPTURE = 1
 MEMORY_MMAP = 1
+"""V4L2_BUF_TYPE_VIDEO_CAPTURE, V4L2_MEMORY_MMAP: pictures in buffers mapped from the kernel."""
 
 CAP_VIDEO_CAPTURE = 0x00000001
 CAP_STREAMING = 0x04000000
+"""V4L2_CAP_*: the device takes pictures; it hands them over in such buffers."""
 CAP_DEVICE_CAPS = 0x80000000
 """Set where ``device_caps`` speaks for this node alone."""
 
 BUF_FLAG_ERROR = 0x0040
+"""The picture may be damaged."""
 BUF_FLAG_TIMESTAMP_MASK = 0xE000
 BUF_FLAG_TIMESTAMP_MONOTONIC = 0x2000
+"""The stamp is on CLOCK_MONOTONIC."""
 BUF_FLAG_TSTAMP_SRC_MASK = 0x70000
 BUF_FLAG_TSTAMP_SRC_SOE = 0x10000
 """The stamp is that of the start of exposure; without it, of the end of the frame."""
 
 FRMSIZE_DISCRETE = 1
+"""V4L2_FRMSIZE_TYPE_DISCRETE: one size, not a range of them."""
 
 CID_AUTO_WHITE_BALANCE = 0x0098090C
 CID_AUTOGAIN = 0x00980912
@@ -31,7 +36,9 @@ CID_GAIN = 0x00980913
 CID_WHITE_BALANCE_TEMPERATURE = 0x0098091A
 CID_EXPOSURE_AUTO = 0x009A0901
 CID_EXPOSURE_ABSOLUTE = 0x009A0902
+"""V4L2_CID_*: controls (linux/v4l2-controls.h)."""
 EXPOSURE_MANUAL = 1
+"""Value of CID_EXPOSURE_AUTO."""
 EXPOSURE_UNIT_S = 100e-6
 """Unit of CID_EXPOSURE_ABSOLUTE."""
 
@@ -198,3 +205,4 @@ G_CTRL = _request(3, 27, Control)
 S_CTRL = _request(3, 28, Control)
 QUERYCTRL = _request(3, 36, QueryControl)
 ENUM_FRAMESIZES = _request(3, 74, FrameSize)
+"""VIDIOC_*: requests of ioctl."""

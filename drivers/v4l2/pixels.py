@@ -11,7 +11,9 @@ BYTES_PER_PIXEL = {"YUYV": 2, "GREY": 1}
 """Of the formats that are not compressed."""
 
 JPEG_PIXELS = frozenset({"MJPG", "JPEG"})
+"""V4L2's two names of a picture that is a JPEG file."""
 JPEG_START = b"\xff\xd8"
+"""SOI, the marker that a JPEG file begins with."""
 
 
 def to_rgb(
