@@ -17,6 +17,7 @@ from aquaflow.messages import Frame
 from aquaflow.sources import CameraSource
 
 NS_PER_S = 1_000_000_000
+"""Nanoseconds of a second."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,9 @@ from sim_drivers.telemetry_log import ByteLog, LogTime, Read
 
 LINE = re.compile(r"\((\d+)\.(\d{1,9})\)\s+(\S+)\s+([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#([0-9A-Fa-f]*)")
 EXTENDED_DIGITS = 8
+"""Hexadecimal digits of a 29-bit identifier; one of 11 bits has three."""
 MAX_DATA_BYTES = 8
+"""Of a classic CAN frame."""
 
 
 class Candump(ByteLog):

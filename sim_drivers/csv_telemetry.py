@@ -28,6 +28,7 @@ NAVQUEST_SHARE, NAVQUEST_SIGMA_M_S = 0.002, 0.001
 """LinkQuest NavQuest 600, data sheet: 0.2 % of the velocity and 1 mm/s."""
 
 TIME, STAMP = "%time", "field.header.stamp"
+"""Columns of a table that rostopic echo -p wrote: when a message was recorded, and measured; ns."""
 
 
 class CsvTelemetry(TelemetryLog):

@@ -25,13 +25,17 @@ from drivers.rotation import from_euler
 from sim_drivers.telemetry_log import TelemetryLog
 
 HEAD = b"\xa3\x95"
+"""First bytes of a record; the third is its type."""
 DESCRIPTION = 128
+"""Type of the FMT records, which describe all others."""
 FORMATS = {
     "b": "b", "B": "B", "M": "B", "h": "h", "H": "H", "i": "i", "I": "I", "f": "f", "d": "d",
     "q": "q", "Q": "Q", "n": "4s", "N": "16s", "Z": "64s", "c": "h", "C": "H", "e": "i", "E": "I",
     "L": "i", "a": "64s", "g": "e",
 }  # fmt: skip
+"""Letters of FMT as struct's."""
 SCALES = {"c": 0.01, "C": 0.01, "e": 0.01, "E": 0.01, "L": 1e-7}
+"""Value of one count of the scaled integers: hundredths, and 1e-7 degrees."""
 FIRST = 0
 """The IMU and EKF core that are used; the others repeat them."""
 
@@ -144,3 +148,4 @@ def _range(record: dict[str, Any], t_ns: int, source: str) -> list[TelemetrySamp
 
 
 CONVERSIONS = {"ATT": _attitude, "IMU": _inertial, "CTUN": _height, "RFND": _range}
+"""The records that are read, by name."""

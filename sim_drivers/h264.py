@@ -15,8 +15,11 @@ import numpy.typing as npt
 from aquaflow.errors import InputError
 
 NAL_START = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
+"""Start code of Annex B, and the first byte of the unit that follows."""
 SEQUENCE_PARAMETERS = 7
+"""Type of a sequence parameter set (H.264, Table 7-1)."""
 TYPE_MASK = 0x1F
+"""Lowest five bits of a unit's first byte: its type."""
 
 Label = TypeVar("Label")
 

@@ -27,10 +27,14 @@ DEFAULT_FPS = 10.0
 """Pictures without times; stills from survey vehicles come at 1 to 10 a second."""
 
 TIMESTAMPS = "timestamps.txt"
+"""One time in seconds for each picture."""
 CALIBRATION = "camera.yaml"
+"""The camera, if it is known."""
 SUBFOLDER = "images"
+"""The pictures may be in this folder of the one that is named; so may both files."""
 
 NS_PER_S = 1_000_000_000
+"""Nanoseconds of a second."""
 
 
 class ImageFolder:

@@ -32,6 +32,7 @@ from aquaflow.sources import (
 from sim_drivers.telemetry_log import ByteLog
 
 MANIFEST = "replay.yaml"
+"""File that makes a folder a recording of several files."""
 MOST_S = 1e9
 """30 years between a log's beginning and the first picture: clocks that were never set."""
 

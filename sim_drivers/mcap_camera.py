@@ -22,8 +22,11 @@ from sim_drivers.picture import UnreadablePictureError, received_as
 from sim_drivers.picture_message import compressed_picture, raw_picture
 
 COMPRESSED, RAW, VIDEO = "CompressedImage", "RawImage", "CompressedVideo"
+"""Foxglove's messages."""
 RAW_NAMES = frozenset({RAW, "Image"})
+"""Foxglove's and ROS's messages of pictures that are not compressed."""
 OURS = "aquaflow"
+"""Name of the metadata that AquaFlow's recorder writes."""
 
 
 def picture_kind(message: McapMessage) -> str | None:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from mcap.records import Channel, McapRecord, Message, Schema
 
 SUFFIX = ".mcap"
+"""Of an MCAP file."""
 
 RECORD_LIMIT = 1 << 28
 """bytes; a damaged length must not fill the memory."""

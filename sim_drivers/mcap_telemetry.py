@@ -15,7 +15,9 @@ from sim_drivers.mcap_messages import McapMessages, mcap_files
 from sim_drivers.telemetry_log import DecodedReads, Read
 
 TELEMETRY = "/telemetry/"
+"""The recorder writes samples to topics below this one."""
 LINKS = "/links/"
+"""And what links received, as it came, below this one."""
 
 
 class McapTelemetry:

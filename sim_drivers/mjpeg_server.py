@@ -9,7 +9,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from sim_drivers.camera_feed import CameraFeed, Shot
 
 BOUNDARY = "picture"
+"""Separates the pictures of the stream; any word will do."""
 JPEG_QUALITY = 95
+"""Percent, OpenCV's own default."""
 
 WAIT_S = 0.05
 """Longest wait for a picture before the server looks whether it shall end."""

@@ -15,6 +15,7 @@ from aquaflow.config.telemetry import AnyDevice, NmeaConfig
 from sim_drivers.telemetry_log import ByteLog, LogTime, Read
 
 SENTENCE = re.compile(rb"[$!][^$!\r\n]*")
+"""A sentence on a line, whatever stands before it."""
 LINES_HZ = 10
 """A guess: a compass talks at 10 Hz, a sounder at 1 to 10."""
 

@@ -18,11 +18,13 @@ DEVICE_EPOCH_NS = 1_000_000_000_000
 
 ISO = 400.0
 EXPOSURE_S = 0.008
+"""Gain and exposure that simulated pictures state unless a test asks for others."""
 
 IMU_TO_CAMERA = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 """The simulated IMU has x forward, y right, z down."""
 
 GRAVITY_M_S2 = 9.80665
+"""Standard gravity; an IMU at rest feels it upwards."""
 
 
 @dataclass

@@ -15,11 +15,13 @@ import numpy.typing as npt
 from aquaflow.messages import Encoded
 
 EXTENSIONS = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm"})
+"""Of pictures that Pillow reads."""
 
 TWELVE_BITS = 1 << 12
 """Industrial cameras store 12 bits in 16; taking the high byte of those leaves 16 grey levels."""
 
 GREY_16_MODES = frozenset({"I;16", "I;16B", "I;16L", "I;16N", "I"})
+"""Pillow's modes of 16-bit grey; as I it has widened them to 32 bits."""
 
 
 class UnreadablePictureError(Exception):

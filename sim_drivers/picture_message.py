@@ -19,9 +19,11 @@ CHANNELS = {
 """Bytes a pixel of the encodings with one byte a channel (sensor_msgs/image_encodings.h)."""
 
 GREY_16 = frozenset({"mono16", "16uc1"})
+"""Names of 16-bit grey, in small letters."""
 BAYER = {"bayer_rggb8": "BG", "bayer_bggr8": "RG", "bayer_gbrg8": "GR", "bayer_grbg8": "GB"}
 """OpenCV names a pattern by its second row."""
 YUYV = frozenset({"yuv422_yuy2", "yuyv"})
+"""Names of 4:2:2 pictures that begin with luma."""
 
 
 def compressed_picture(data: bytes) -> npt.NDArray[np.uint8]:

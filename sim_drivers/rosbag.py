@@ -15,10 +15,14 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 ROS_1_SUFFIX, ROS_2_FILE = ".bag", "metadata.yaml"
+"""A bag of ROS 1 is a file, one of ROS 2 a folder with this file in it."""
 ROS_2_STORAGE = frozenset({".db3", ".mcap"})
+"""Suffixes of the files next to it that hold the messages."""
 
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+"""Messages with a picture."""
 PICTURES = frozenset({RAW, COMPRESSED})
+"""All of them."""
 
 LONGEST_DELAY_NS = 10_000_000_000
 """Between a header's stamp and reception; a longer one means two clocks."""

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+"""Message with a camera's calibration."""
 
 DISTORTIONS: dict[str, DistortionModel] = {
     "plumb_bob": "radtan",
@@ -38,6 +39,7 @@ DISTORTIONS: dict[str, DistortionModel] = {
     "equidistant": "fisheye",
     "fisheye": "fisheye",
 }
+"""ROS's distortion models, and the names here of those that are known."""
 
 
 class RosbagCamera:

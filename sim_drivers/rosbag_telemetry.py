@@ -25,7 +25,9 @@ from sim_drivers.rosbag import decoded, is_bag, messages_in, opened, origin_of, 
 Convert: TypeAlias = Callable[[Any, int, int, str], list[TelemetrySample]]
 
 NED_FROM_ENU = (0.0, math.sqrt(0.5), math.sqrt(0.5), 0.0)
+"""Quaternion wxyz: half a turn about the horizontal axis between north and east."""
 FLU_FROM_FRD = (0.0, 1.0, 0.0, 0.0)
+"""Quaternion wxyz: half a turn about the forward axis."""
 
 SURFACE_PA, WATER_KG_M3, GRAVITY_M_S2 = 101_325.0, 1029.0, 9.80665
 """As the defaults of the MAVLink driver: standard air, salt water."""
@@ -136,3 +138,4 @@ CONVERSIONS: dict[str, Convert] = {
     "sensor_msgs/msg/Range": _range,
     "geometry_msgs/msg/TwistWithCovarianceStamped": _twist,
 }
+"""Messages that are read."""

@@ -11,6 +11,7 @@ from aquaflow.synthetic.telemetry import read_telemetry
 from sim_drivers.synthetic import SyntheticDive
 
 TELEMETRY = "telemetry.csv"
+"""File of a synthetic dive."""
 
 
 class SyntheticTelemetry:

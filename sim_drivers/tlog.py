@@ -10,12 +10,17 @@ from aquaflow.config.telemetry import AnyDevice, MavlinkConfig
 from sim_drivers.telemetry_log import LONGEST_PAUSE_NS, ByteLog, LogTime, Read
 
 STAMP_BYTES = 8
+"""Microseconds since 1970 before every packet, big-endian."""
 MAVLINK_1, MAVLINK_2 = 0xFE, 0xFD
+"""First bytes of a packet of either version."""
 MARKS = re.compile(rb"[\xfd\xfe]")
+"""First bytes of a packet."""
 FRAMING_BYTES = {MAVLINK_1: 8, MAVLINK_2: 12}
 """Of a packet without payload: header and checksum."""
 SIGNED_FLAG, SIGNATURE_BYTES = 0x01, 13
+"""Flag of a packet that a signature follows, and the signature's length."""
 SHORTEST = STAMP_BYTES + 3
+"""Bytes from which a packet's length can be read: stamp, first byte, length and flags."""
 
 
 class Tlog(ByteLog):

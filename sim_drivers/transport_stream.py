@@ -24,6 +24,7 @@ SDP = (
     "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=camera\r\nc=IN IP4 0.0.0.0\r\nt=0 0\r\n"
     f"m=video 0 RTP/AVP {RTP_MPEG_TS}\r\na=control:track\r\n"
 )
+"""What DESCRIBE answers: one track, MPEG-TS over RTP."""
 
 
 def encoded(

@@ -25,14 +25,21 @@ from sim_drivers.v4l2_pixels import PixelFormat, encoded
 
 QUERYCAP, ENUM_FMT, S_FMT, REQBUFS, QUERYBUF, QBUF, DQBUF = 0, 2, 5, 8, 9, 15, 17
 STREAMON, STREAMOFF, S_PARM, G_CTRL, S_CTRL, QUERYCTRL, ENUM_FRAMESIZES = 18, 19, 22, 27, 28, 36, 74
+"""Numbers of the requests, VIDIOC_* of linux/videodev2.h."""
 
 CAPS = 0x80000000 | 0x04000000 | 0x00000001
+"""V4L2_CAP_*: of the device, with DEVICE_CAPS, STREAMING and VIDEO_CAPTURE."""
 CAPTURE_CAPS = 0x04000000 | 0x00000001
+"""Of the node that takes pictures: STREAMING and VIDEO_CAPTURE."""
 METADATA_CAPS = 0x04000000 | 0x00800000
+"""Of the second node that UVC cameras have: STREAMING and META_CAPTURE."""
 MONOTONIC_START_OF_EXPOSURE = 0x2000 | 0x10000
+"""V4L2_BUF_FLAG_*: the stamp's clock, and what is stamped."""
 ERROR = 0x0040
+"""V4L2_BUF_FLAG_ERROR."""
 
 EXPOSURE_ABSOLUTE, WHITE_BALANCE = 0x009A0902, 0x0098091A
+"""V4L2_CID_*: the controls that the camera has by default."""
 
 
 @dataclass

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 JPEG_QUALITY = 95
+"""Percent, OpenCV's own default."""
 
 
 @dataclass(frozen=True)

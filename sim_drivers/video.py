@@ -20,6 +20,7 @@ from sim_drivers.images import CALIBRATION, DEFAULT_FPS, NS_PER_S
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 EXTENSIONS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".ts"})
+"""Of files in containers that FFmpeg reads and cameras write."""
 
 COUNT_TOLERANCE = 1
 """Some containers give a duration instead of a count; one frame less is not a cut-off video."""

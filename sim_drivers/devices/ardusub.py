@@ -21,9 +21,13 @@ from aquaflow.messages import (
 )
 
 GRAVITY_M_S2 = 9.80665
+"""Standard gravity: MAVLink sends accelerations in milli-g."""
 SALT_WATER_KG_M3 = 1029.0
+"""As the default of the MAVLink driver."""
 SURFACE_HPA = 1013.25
+"""Standard air; the MAVLink driver's default too."""
 BEAT_NS = 1_000_000_000
+"""Heartbeats come at 1 Hz."""
 
 
 class ArduSub:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from can import Message
 
 PRIORITY, ADDRESS = 2, 35
+"""Of the simulated node on the bus; the driver reads neither."""
 
 
 class Nmea2000Instruments(Listener["Message"]):

@@ -18,6 +18,7 @@ Clock: TypeAlias = Callable[[int], int]
 POLL_S = 0.005
 """How soon a request is answered."""
 CLOSE_TIMEOUT_S = 5.0
+"""The thread looks every POLL_S whether it shall end; one that is stuck is left behind."""
 
 
 class Speaker(Protocol[Packet]):

@@ -10,6 +10,7 @@ from sim_drivers.devices.device import Listener
 from sim_drivers.devices.waterlinked import euler_deg
 
 KNOT_M_S = 1852.0 / 3600.0
+"""m/s; a nautical mile of 1852 m in an hour."""
 
 
 def sentence(body: str) -> bytes:

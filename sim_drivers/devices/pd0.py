@@ -9,7 +9,10 @@ from aquaflow.messages import Altitude, TelemetrySample, Velocity
 from sim_drivers.devices.device import Listener
 
 SHIP_COORDINATES = 2 << 3
+"""Byte 25 of the fixed leader: bits 3 and 4 are 2 for ship axes."""
 FIXED_BYTES, VARIABLE_BYTES, BOTTOM_BYTES = 58, 77, 81
+"""Lengths of the fixed leader, the variable leader and the bottom track, as far as they are
+read."""
 EPOCH = datetime(2026, 1, 1, tzinfo=timezone.utc)
 """Where the real time clock stood when the device was switched on."""
 

@@ -11,6 +11,7 @@ from aquaflow.messages import Altitude, Attitude, TelemetrySample, Velocity
 from sim_drivers.devices.device import Listener
 
 NO_BOTTOM_M = -1.0
+"""What a DVL sends as altitude while it has none."""
 
 
 def line(body: str) -> bytes:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 PATIENCE_S = 1.0
 """A reader that takes nothing for so long is not there; a serial line does not wait for it."""
 READ_BYTES = 4096
+"""Most that one read takes; the rest comes with the next one."""
 
 
 class PtyWire:
