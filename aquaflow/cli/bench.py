@@ -17,6 +17,7 @@ Data = Annotated[Path | None, typer.Argument(help="Of --suite real: a folder for
 Scenes = Annotated[list[Path] | None, typer.Option("--scene", help="Recording; may be repeated.")]
 
 DIVES = "dives"
+"""The command that is meant where none is named."""
 
 
 class _DivesUnlessNamed(TyperGroup):

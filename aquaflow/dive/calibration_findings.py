@@ -13,6 +13,7 @@ REMEDY = (
     "calibrate the camera in water, or leave out --calib to have the focal length estimated from "
     "the dive; until then distances and shapes are distorted"
 )
+"""What a user can do about a calibration that does not fit."""
 
 
 def to_json(error: LensError, calibration: CameraModel) -> dict[str, Any]:

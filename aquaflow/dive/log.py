@@ -13,6 +13,7 @@ LOGGERS = ("aquaflow", "py.warnings")
 
 
 _FORMATTER = logging.Formatter()
+"""Writes tracebacks, and nothing else."""
 
 
 class JsonLog(logging.Handler):

@@ -70,8 +70,11 @@ _KINDS = {
     RecursionError: "it is nested too deeply",
     MemoryError: "it needs more memory than there is",
 }
+"""What Python's own errors mean for a file."""
 _NAME = re.compile(r"[A-Za-z_][\w-]{0,40}|\d{1,6}", re.ASCII)
+"""What may be shown of a key: a name as ours are, or a place in a list."""
 _POSITION = re.compile(r"\bline:? (\d+)(?:[ ,(]*col(?:umn)?:? (\d+))?", re.IGNORECASE)
+"""Where a parser's message says that it stopped."""
 
 
 def reason_of(error: BaseException) -> str:

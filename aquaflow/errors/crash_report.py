@@ -28,6 +28,7 @@ OUR_MISTAKE = 70
 INTERRUPTED = 130
 """As a shell reports an end by Ctrl-C."""
 STOPPED = "stopped; what was written so far stays where it is"
+"""The last line of a command that Ctrl-C ended."""
 
 
 @contextmanager

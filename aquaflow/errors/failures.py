@@ -49,6 +49,7 @@ ATTEMPTS = 2
 
 OWN_PACKAGES = ("aquaflow", "drivers", "sim_drivers")
 ROOT = Path(__file__).resolve().parents[2]
+"""Folders of this repository, and where they are; code elsewhere is another library's."""
 
 
 T = TypeVar("T")

@@ -16,6 +16,7 @@ from aquaflow.render.contract import Renderer
 from aquaflow.storage.facts_file import UNREADABLE, read_facts_file, write_facts_file
 
 SUFFIX = ".aqf"
+"""Of a map file."""
 KIND = "aquaflow map"
 """What the facts say that the file is."""
 FORMAT = 1

@@ -16,6 +16,7 @@ LENS_PRIOR_SIGMA = np.array([0.3, 0.3, 0.1, 0.01, 0.01])
 has k = 0.3, and the centre of a picture is known to a hundredth of the focal length."""
 
 TERMS = len(LENS_PRIOR_SIGMA)
+"""Numbers of a lens error: u, k, l, x0 and y0."""
 ROUNDS = 15
 """Fixed-point steps of the inverse; more change less than a thousandth of a pixel."""
 MIN_FACTOR = 0.1

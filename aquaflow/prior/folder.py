@@ -14,6 +14,7 @@ from aquaflow.errors import InputError, path_of_key
 CARD = "prior.json"
 """Names the network, its inputs and its licence."""
 ENCODER, DECODER = "encoder.onnx", "decoder.onnx"
+"""Files of the network."""
 READ_BYTES = 1 << 20
 """Read at a time for the checksum."""
 

@@ -11,8 +11,11 @@ from aquaflow.errors import InputError
 from aquaflow.recording.telemetry_json import sample_schema
 
 LIBRARY = "aquaflow"
+"""Who wrote the file, in its header."""
 RAW_BYTES = "application/octet-stream"
+"""Encoding of what a link received, as it came."""
 JSON_OBJECT = b'{"type": "object"}'
+"""Schema of objects that have none of their own."""
 
 
 def require_mcap() -> None:

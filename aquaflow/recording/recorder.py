@@ -26,6 +26,7 @@ from aquaflow.recording.writing import DiveWriter
 log = logging.getLogger(__name__)
 
 MB = 1_000_000
+"""Bytes of a megabyte, the unit of the settings."""
 
 
 class Recorder:

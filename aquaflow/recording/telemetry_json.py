@@ -28,6 +28,7 @@ KINDS: dict[str, type[TelemetrySample]] = {
 }
 """Telemetry samples by the name that they are recorded under."""
 KIND_OF: dict[type[TelemetrySample], str] = {sample: kind for kind, sample in KINDS.items()}
+"""The same the other way round."""
 
 LENGTHS = {"wxyz": 4, "rate_rad_s": 3, "acceleration_m_s2": 3, "velocity_m_s": 3}
 """Fields that are arrays."""

@@ -29,6 +29,7 @@ FORMAT = "1"
 """Of topics and metadata."""
 
 MB = 1_000_000
+"""Bytes of a megabyte, the unit of the settings."""
 
 LATE_KEY_S = 10.0
 """A video's next key frame is waited for this long before a new file begins without it."""

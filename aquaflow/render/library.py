@@ -17,6 +17,7 @@ _POINTER = ctypes.c_void_p
 _INT = ctypes.c_int
 _FLOAT = ctypes.c_float
 _DOUBLE = ctypes.c_double
+"""C types of the kernels' arguments and results."""
 _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "aq_constants": (None, [_POINTER]),
     "aq_context_new": (_POINTER, []),

@@ -34,6 +34,7 @@ _HOMES = {
     "read_truth": "truth",
     "write_dive": "dive",
 }
+"""Module of each public name, imported when it is first asked for."""
 
 
 def __getattr__(name: str) -> object:

@@ -11,6 +11,7 @@ from aquaflow.synthetic.config import Display
 __all__ = ["burn_in"]
 
 WHITE, BLACK = (255, 255, 255), (0, 0, 0)
+"""A white letter with a black rim is legible on any picture."""
 START_S = 10 * 3600 + 41 * 60 + 27
 """Time of day of the first picture."""
 CHARACTER_WIDTHS = 0.0016

@@ -31,6 +31,7 @@ Array: TypeAlias = npt.NDArray[np.float64]
 HEADER = ("t_s", "arrival_s", "kind", "source", "v0", "v1", "v2", "v3")
 """Columns of telemetry.csv; the values of each kind are in v0 to v3."""
 SOURCE = "synthetic"
+"""The instruments' name in telemetry.csv."""
 
 
 def write_telemetry(

@@ -93,6 +93,7 @@ _BASES = {
     "reef": _reef, "flat_sand": _sand, "wall": _wall, "pipe": _sand, "pool": _bedding,
     "survey": _reef,
 }  # fmt: skip
+"""Large shapes of each scene."""
 _REEF = _Plan(
     1.0,
     -0.1,
@@ -105,6 +106,7 @@ _REEF = _Plan(
         (stamps.pebble, 10.0),
     ),
 )
+"""Rock in patches, with what grows on it."""
 _PLANS = {
     "reef": _REEF,
     "survey": _REEF,
@@ -122,3 +124,4 @@ _PLANS = {
     ),
     "pipe": _Plan(0.0, 0.0, ((stamps.boulder, 0.12), (stamps.sponge, 0.1), (stamps.pebble, 7.0))),
 }
+"""What lies on the large shapes of each scene."""

@@ -25,6 +25,7 @@ MAX_VIEWS = 8
 MIN_VIEWS = 4
 """With fewer, the scatter between the views says nothing."""
 MATCHES_PER_PAIR = 200
+"""At most; of more, an even choice: matches of one pair of views share errors."""
 MIN_MATCHES = 300
 """Of all pairs together."""
 TOLERANCE = np.array([0.02, 0.02])

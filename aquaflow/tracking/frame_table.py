@@ -16,6 +16,7 @@ from aquaflow.storage.arrays import SIM3, Array, of_sim3, to_sim3
 from aquaflow.tracking.frames import FrameClass, Quality, Tracked
 
 CLASSES = list(FrameClass)
+"""A row holds a class by its place in here."""
 NONE = -1
 """The keyframe of a frame that has no pose."""
 CHUNK = 1024
@@ -27,7 +28,9 @@ FRAME = np.dtype(
         ("keyframe", np.int64), ("quality", np.float64, 4), ("T_kf", np.float64, SIM3),
     ]
 )  # fmt: skip
+"""One row; ``T_kf`` is the frame's pose in its keyframe."""
 NO_PICTURE = np.empty((0, 0, 3), np.uint8)
+"""A frame out of the table has no pixels any more."""
 
 
 class FrameTable:

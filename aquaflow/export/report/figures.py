@@ -21,6 +21,7 @@ INK, GRID = "#010203", "#040506"
 CHANNELS = (("red", "#e8505b"), ("green", "#2fa66a"), ("blue", "#3b82d6"))
 SUB_MAP_COLOURS = ("#1098ad", "#f08c00", "#7048e8", "#d6336c", "#66a80f", "#868e96")
 TRUTH_COLOUR = "#e8505b"
+"""Distinct on light and on dark paper; with more sub-maps the colours come again."""
 
 STYLE: Any = {
     "svg.fonttype": "none",
@@ -43,6 +44,7 @@ STYLE: Any = {
     "ytick.major.size": 0.0,
     "legend.frameon": False,
 }
+"""Matplotlib's settings; text stays text, so that the page's font is used."""
 
 CURVE_SAMPLES = 128
 """Points of each drawn curve."""

@@ -34,12 +34,14 @@ FRAME_CLASSES = {
     "lost": "lost: no pose found",
     "dropped": "dropped: the picture was unusable",
 }
+"""Classes of frames as the report's key explains them, in the order in which it lists them."""
 
 FOCAL_WORDS = {
     "calibrated": "from the calibration",
     "guessed": "guessed, as no calibration was given",
     "refined": "estimated from the dive, as no calibration was given",
 }
+"""Where the focal length comes from, in words."""
 
 
 def warnings(data: ReportData) -> str:

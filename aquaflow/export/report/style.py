@@ -63,3 +63,4 @@ details summary { cursor: pointer; color: var(--accent); }
 footer { color: var(--soft); font-size: .86rem; margin-top: 1.6rem; }
 @media print { body { padding: 0; } section, .tile { break-inside: avoid; } }
 """
+"""Colours of the frame classes are here, by the classes' names."""

@@ -26,6 +26,7 @@ from aquaflow.prior.onnx_file import OPSET, relative_difference, write_onnx
 from aquaflow.prior.runtime import RuntimeSettings, Session
 
 LICENCE = "Apache-2.0; trained on generated pictures only"
+"""Of the exported network, as its card says."""
 WIDTH, HEIGHT = 320, 240
 """Size that parity is measured at, and as many pixels as larger pictures are brought down to."""
 MOST_CELLS = 512

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from aquaflow.errors import AquaFlowError
 
 INT8_ENCODER = "encoder_int8.onnx"
+"""File of the encoder in 8 bits, next to the one in 32."""
 
 
 def quantise(

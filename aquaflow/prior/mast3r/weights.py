@@ -21,6 +21,7 @@ LICENCE_NOTICE = (
     "The public MASt3R weights are under CC BY-NC-SA 4.0 and the terms of their training data: "
     "not for commercial use. What is exported from them is under the same terms."
 )
+"""Shown by whatever reads the weights, and kept in the card of what is exported."""
 
 NAMED = 3
 """Tensors that an error names; the rest is counted."""

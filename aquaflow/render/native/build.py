@@ -18,6 +18,7 @@ from pathlib import Path
 
 NATIVE_DIR = Path(__file__).resolve().parent
 SOURCE = "aquaflow_native.cpp"
+"""What is compiled, in this folder; the headers next to it are included."""
 
 X86_64_V2 = {
     "cx16": "-mcx16",

@@ -22,6 +22,7 @@ from aquaflow.storage.arrays import Arrays
 from aquaflow.storage.facts_file import UNREADABLE, read_facts_file, write_facts_file
 
 STATE, PREVIOUS = "state.npz", "previous.npz"
+"""The newest checkpoint, and the one before it."""
 FORMAT = 3
 """Of the checkpoint; raised whenever an older one can no longer be resumed from."""
 

@@ -24,6 +24,7 @@ MOST_CLIENTS = 16
 """Requests at a time; more are turned away, so that threads stay bounded."""
 
 JSON, HTML = "application/json", "text/html; charset=utf-8"
+"""Content types of the answers."""
 
 NOT_ALLOWED = {"error": "give the token, or ask on board by the name localhost"}
 """Answer to a request without the token."""

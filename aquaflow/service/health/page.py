@@ -30,3 +30,4 @@ async function look() {
 look(); setInterval(look, 2000);
 </script></body></html>
 """
+"""Holds no data itself: its script asks for /health."""

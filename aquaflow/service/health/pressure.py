@@ -9,6 +9,7 @@ from aquaflow.config.service import LimitsConfig
 from aquaflow.recording.disk import free_bytes
 
 MB = 1_000_000
+"""Bytes of a megabyte, the unit of the settings."""
 MILLIDEGREES = 1000.0
 """In a degree: the unit of thermal zones in /sys."""
 HOTTEST_C = 150.0

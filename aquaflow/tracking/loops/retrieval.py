@@ -23,6 +23,7 @@ from aquaflow.prior.contract import Encoding, Float
 from aquaflow.tracking.loops.keypoints import rooted
 
 SEED = 0
+"""The same dive gives the same words."""
 DIMENSIONS = 32
 """Principal directions of the descriptors that words differ in; 64 separate worse (measured)."""
 SIGNS = 64
