@@ -14,6 +14,7 @@ from aquaflow.evaluation.trajectory import Trajectory, read_tum
 
 SYNTHETIC_POSES = "poses.tum"
 SYNTHETIC_MEDIUM = "medium.yaml"
+"""Files of a synthetic dive."""
 POSITION_COLUMNS = ("file", "easting_m", "northing_m")
 """Of a survey's table of positions; metres in a projected grid such as UTM."""
 

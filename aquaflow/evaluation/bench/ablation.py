@@ -17,6 +17,7 @@ from aquaflow.evaluation.bench.runner import Perform, Progress, Row, in_process,
 from aquaflow.evaluation.bench.scene import Scene
 
 PRESET = "balanced"
+"""The preset whose parts are left out, one at a time."""
 CI_SCENES = ("reef, loop", "wall, murky, slow")
 """Of the ci suite: relief and much water; the others would double the time."""
 
@@ -156,6 +157,7 @@ SHOWN = (
     ("ms_per_frame", "ms/frame", ".0f"),
     ("cpu_ms_per_frame", "CPU ms/frame", ".0f"),
 )
+"""Keys of a row, their titles and formats."""
 
 
 def print_ablation(rows: Sequence[Row], console: Console) -> None:

@@ -19,6 +19,7 @@ NOISE_SIGMA = 0.005
 """Of full scale: a camera that stands still does not see the same noise twice."""
 
 KEPT = ("camera.yaml", "medium.yaml", "synth.yaml")
+"""Files that do not change with the pictures."""
 
 
 def pause(dive: Path, out: Path, at: int, frames: int) -> None:

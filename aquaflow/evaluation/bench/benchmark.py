@@ -24,11 +24,14 @@ from aquaflow.evaluation.bench.scene import Scene, scene_at
 from aquaflow.storage.atomic import write_json
 
 JSON_FILE, PICTURE_FILE = "bench.json", "bench.png"
+"""What a benchmark writes."""
 PEERS = ("two-view", "colmap")
+"""By name; see ``peers``."""
 PEERS_AT = "balanced"
 """Peers get the frames that this preset prepares."""
 
 SUITES = ("ci", "real")
+"""Synthetic dives, and a folder of recordings."""
 
 
 def scenes_of(

@@ -22,10 +22,14 @@ PLAIN: dict[str, dict[str, object]] = {
     "wall, murky, slow": {"scene": "wall", "water": "coastal_5C", "speed_m_s": 0.5},
 }
 PIPE: dict[str, object] = {"scene": "pipe", "water": "oceanic_IB"}
+"""The first three scenes by name, and the pipe that a pause is made in: what differs from SMALL."""
 PAUSED, DIMMED = "pipe, clear, pause", "reef, light change"
 DIMMED_FROM = "reef, loop"
+"""Scenes that are made of others: the pipe with a pause, a reef whose light changes."""
 PAUSE_AT, PAUSE_FRAMES = 12, 5
 DIM_AT, DIM_GAIN = 12, 0.65
+"""Picture at which it happens, half-way through; how many the pause adds, and what light is
+left."""
 
 REFINE_SHARE = 0.1
 """Of a preset's refining steps; the pictures have a ninth of the default's pixels."""

@@ -12,6 +12,7 @@ from typing import Any
 from aquaflow import __version__
 
 PACKAGES = ("torch", "numpy", "opencv-python-headless", "pycolmap")
+"""Those whose version changes a benchmark's numbers."""
 
 
 def describe() -> dict[str, Any]:

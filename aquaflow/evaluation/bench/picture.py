@@ -21,10 +21,14 @@ COLOURS = (
     "#1098ad", "#e8590c", "#7048e8", "#2f9e44", "#d6336c", "#b08900", "#495057", "#1c7ed6",
     "#a61e4d", "#5c940d",
 )  # fmt: skip
+"""Of the scenes, in turn."""
 SHAPES = {"fast": "^", "balanced": "o", "accurate": "s", "two-view": "v", "colmap": "D"}
 OTHER_SHAPE = "P"
+"""Markers of the contenders."""
 FRONT = "#868e96"
+"""Grey for what belongs to no scene."""
 MARKER_SIZE = 52.0
+"""Points squared, as Matplotlib has it."""
 FEW_DIGITS = 10.0
 """Ratio of an axis' ends above which not every digit is labelled: 1, 2 and 5 are."""
 LONE_DIGITS = 1000.0

@@ -13,6 +13,7 @@ from aquaflow.evaluation.bench.table import failures, markdown
 from aquaflow.storage.atomic import atomic_write
 
 BEGIN, END = "<!-- bench: begin -->", "<!-- bench: end -->"
+"""Comments between which the results stand."""
 
 
 def write_readme(

@@ -15,6 +15,7 @@ from aquaflow.sources import open_recording
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv")
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+"""Suffixes by which a folder's videos and folders of pictures are found."""
 SIDE_BY_SIDE = "side_by_side"
 """In a file's name: the left half is seen through water, the right half is the same without it."""
 

@@ -18,6 +18,7 @@ from aquaflow.evaluation.bench.job import Job
 from aquaflow.evaluation.bench.scene import Scene
 
 WORKER = "aquaflow.evaluation.bench.worker"
+"""A run has a process of its own, so that its peak memory is its own too."""
 
 LIMIT_S = 3600.0
 """A run that takes longer is stopped, and marked as failed."""

@@ -116,6 +116,7 @@ COLUMNS = (
     Column("Gaussians", lambda row: row["gaussians"], ".0f"),
     Column("MB", lambda row: row["peak_rss_mb"], ".0f"),
 )
+"""Columns of the table; the three above are the axes of the picture too."""
 NOTES = (
     "ms/frame is the whole run over its frames, refining included; p50 and p95 are of one frame "
     "while frames come in. Peers find poses only; AquaFlow's time holds the map too.",
@@ -124,6 +125,7 @@ NOTES = (
     "restored is the PSNR of held-out views without water against the scene without water; - means "
     "that there is no truth, or no such thing.",
 )
+"""Printed below the table: what its titles leave open."""
 
 
 def _times_100(value: float | None) -> float | None:

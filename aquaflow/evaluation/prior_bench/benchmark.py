@@ -26,6 +26,7 @@ PAIRS = 12
 """Of each level that recall is measured on: a standard error of some 2 %."""
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+"""Of pictures."""
 
 Progress = Callable[[str, int, int], None]
 

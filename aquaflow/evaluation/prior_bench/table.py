@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 WORK = {"tracked": "near its prediction", "found": "moved far, none expected"}
+"""What a pair of pictures asks of a prior."""
 
 
 def print_result(result: dict[str, Any], console: Console) -> None:

@@ -42,6 +42,7 @@ class Case:
 
 
 REGISTRY: dict[str, Case] = {}
+"""All cases by name; importing a module adds its own."""
 
 
 def case(

@@ -15,6 +15,7 @@ from aquaflow.evaluation.stress.case import Check, case
 from aquaflow.evaluation.stress.swim import Tracking, clear_swim, clear_tracking, sound, track
 
 HOUR_NS = 3_600_000_000_000
+"""Nanoseconds of an hour."""
 
 
 def _clocked(check: Check, seed: int, time_ns: Callable[[int], int]) -> None:

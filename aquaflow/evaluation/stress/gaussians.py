@@ -16,6 +16,7 @@ from aquaflow.render.tiles import TileRenderer
 
 CAMERA = CameraModel(32, 24, 28.0, 28.0, 16.0, 12.0)
 COUNT = 24
+"""Small and few, so that a case is quick; every other Gaussian is spoiled."""
 
 
 @dataclass

@@ -24,6 +24,7 @@ from aquaflow.tracking.initialisation.bundle import Bundle, adjust
 from aquaflow.tracking.pose.solver import PoseProblem, solve_pose
 
 POINTS = 200
+"""Of each problem, all over the picture."""
 
 
 @case("motion", "tracking.initialisation.Initialiser.ready")

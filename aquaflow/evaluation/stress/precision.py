@@ -21,6 +21,7 @@ from aquaflow.render.water import compose_water, compose_water_torch
 from aquaflow.tracking.pose.solver import PoseProblem, solve_pose
 
 HEIGHT, WIDTH = 24, 32
+"""Of random pictures, wider than SSIM's window."""
 
 
 def _relative(

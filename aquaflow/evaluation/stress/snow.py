@@ -17,8 +17,11 @@ DRIFT_WIDTHS = 0.015
 OWN_WIDTHS = 0.008
 """Standard deviation, per frame, of each flake's own way."""
 BRIGHTNESS = (190, 255)
+"""Grey levels: flakes near the lens are close to overexposed."""
 SUBPIXEL_BITS = 4
+"""Fractional bits of OpenCV's coordinates: flakes move by a sixteenth of a pixel."""
 EDGE_PX = 1.1
+"""OpenCV draws a disc so much wider than its radius."""
 
 
 def marine_snow(

@@ -18,8 +18,11 @@ from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.tracking.tracker import Tracker
 
 TINY = CAMERA.scaled(64, 48)
+"""A camera for thousands of frames."""
 SHORT, LONG = 200, 20_000
+"""Frames or steps: of a quick case, and of one that would show what slowly grows."""
 RADIUS_M, STEP_M = 2.0, 0.05
+"""Of the circle, and along it from frame to frame: a round is 251 frames."""
 WARM = 50
 """Frames or steps until every buffer has been made once."""
 KEYFRAME_KB = 256.0

@@ -21,6 +21,7 @@ Array = npt.NDArray[np.float64]
 
 POINTS = 300
 TRUTH = pose((0.1, -0.05, 0.02), (0.02, -0.03, 0.05))
+"""Of each problem: its points, and the pose to be found, m and rad."""
 
 
 def _pixels(seed: int, count: int = POINTS) -> Array:

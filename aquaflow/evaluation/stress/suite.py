@@ -20,10 +20,12 @@ from aquaflow.evaluation.stress.case import REGISTRY, Case, Outcome
 FAMILIES = (
     "images", "motion", "time", "water", "gaussians", "solvers", "precision", "soak",
 )  # fmt: skip
+"""As the table groups the cases."""
 _MODULES = (
     "images", "motion", "clock", "water", "gaussians", "optimisation", "solvers", "precision",
     "soak",
 )  # fmt: skip
+"""Those that register cases, in the order of the table."""
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from aquaflow.render.water import compose_water, compose_water_torch
 RATES = (0.0, 1e-8, 0.01, 0.5, 5.0, 50.0)
 """1/m"""
 RANGES_M = (0.01, 0.1, 1.0, 10.0, 100.0, 1000.0)
+"""A centimetre to a kilometre: further than a camera sees in any water."""
 LARGEST_ATTENUATION = 3.0e3
 """exp(8): what the clamped optical depth allows."""
 

@@ -23,6 +23,7 @@ from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation
 
 FEWEST_POSES = 3
+"""As an alignment of the path with the truth needs."""
 
 
 @dataclass(frozen=True)

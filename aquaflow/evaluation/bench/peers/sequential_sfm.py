@@ -15,6 +15,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.messages import Frame
 
 SEED = 0
+"""The same pictures give the same poses."""
 
 
 class PeerMissingError(AquaFlowError):

@@ -21,13 +21,18 @@ from aquaflow.messages import Frame
 Array = npt.NDArray[np.float64]
 
 CORNERS, QUALITY, APART_PX = 800, 0.005, 5
+"""Of goodFeaturesToTrack: most corners, share of the best one's strength, and distance."""
 WINDOW_PX, LEVELS = 15, 4
+"""Of the pyramid of Lucas and Kanade: window, and levels above the picture itself."""
 ROUND_TRIP_PX = 0.7
 """A corner that does not come back to where it started was lost."""
 STILL_PX = 0.4
 """Median motion below which the camera stands still: no geometry comes from noise."""
 FEWEST = 12
+"""Matches: five determine the essential matrix, and about as many again must confirm it."""
 RANSAC_PX, RANSAC_CONFIDENCE = 0.7, 0.999
+"""Distance to the epipolar line (px), and the probability that a sample without outlier is
+drawn."""
 NEAR_PX = 5
 """Corners are found anew in every picture; within this window they are the same corner."""
 SHORTEST, LONGEST = 0.2, 5.0

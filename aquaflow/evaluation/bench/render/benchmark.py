@@ -26,6 +26,7 @@ from aquaflow.evaluation.bench.render.timing import Sample, interleaved
 from aquaflow.storage.atomic import write_json
 
 JSON_FILE, PICTURE_FILE = "render_bench.json", "render_bench.png"
+"""What a benchmark writes."""
 
 FAILURES = (AquaFlowError, MemoryError, RuntimeError, ImportError)
 """What costs a contender its row at a size, and nobody else anything; torch and gsplat raise

@@ -27,8 +27,11 @@ NOTE = (
     "tensor as contiguous and sorts by the wrong key: compare its times, not its pictures. Its "
     "kernel is serial and draws three channels where the others draw four."
 )
+"""Printed with its numbers."""
 LIMIT_S = 600.0
+"""A program that takes longer has failed."""
 CHANNELS = 3
+"""Red, green, blue; the others draw the range too."""
 
 
 class OpenSplat:

@@ -16,12 +16,14 @@ from aquaflow.render.photometric import photometric_loss
 
 PICTURES = ((320, 240), (640, 480))
 ROWS = (30_000, 100_000)
+"""Sizes of pictures, and numbers of Gaussians."""
 SEEN_SHARES = (1.0, 0.3)
 """Of the Gaussians: what a view shows of a map."""
 WIDTHS = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "colours": 3}
 """Numbers of one Gaussian that an optimiser steps."""
 SSIM_WEIGHT = 0.2
 LEARNING_RATE = 1e-3
+"""The weight as the paper has it; any rate, as the time of a step does not depend on it."""
 
 
 @dataclass(frozen=True)

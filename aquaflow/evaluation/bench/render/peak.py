@@ -19,11 +19,14 @@ import torch
 from aquaflow.render.native import build
 
 VECTOR_BYTES = {"avx512": 64, "avx2": 32, "sse4": 16, "neon": 16}
+"""Of a vector register."""
 CHAINS = 12
 """Independent accumulators: more than latency times units of any processor of these."""
 STEPS = 1_000_000
 ATTEMPTS = 8
 MATRIX = 1024
+"""Rounds of the loop, attempts, rows of a matrix: long enough to time, and the best attempt
+counts."""
 
 SOURCE = """
 typedef float Vector __attribute__((vector_size(BYTES)));
@@ -40,6 +43,7 @@ extern "C" __attribute__((visibility("default"))) float multiply_add(long steps)
   return all[0];
 }
 """
+"""Multiplies and adds, and touches no memory."""
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,10 @@ QUANTITIES: tuple[tuple[str, Callable[[Row], float]], ...] = (
     ("forward", lambda row: row["fwd_ms"]),
     ("forward + backward", lambda row: row["fwd_ms"] + row["bwd_ms"]),
 )
+"""What is drawn, a row of panels for each: milliseconds."""
 PANEL_INCHES = (3.6, 3.1)
 LEGEND_INCHES = 2.4
+"""Width and height of a panel, width of the legend."""
 
 
 def draw(rows: Sequence[Row], path: Path, title: str) -> None:

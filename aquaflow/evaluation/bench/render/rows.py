@@ -14,6 +14,7 @@ from aquaflow.evaluation.bench.render.timing import Sample, spread_of
 Row = dict[str, Any]
 
 PASSES = (("fwd", FORWARD_FLOP), ("bwd", BACKWARD_FLOP))
+"""By their name in a row, with the operations of one Gaussian at one pixel."""
 
 
 def row_of(

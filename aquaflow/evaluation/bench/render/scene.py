@@ -12,10 +12,12 @@ from torch import Tensor
 from aquaflow.render.contract import Renderer, Rendering
 
 CLOSEST_M, FARTHEST_M = 1.0, 5.0
+"""Ranges at which a vehicle maps."""
 DEPTH_NOISE = 0.01
 """Relative: a map's surface is not smooth."""
 SIGMA_PX = (2.0, 4.0)
 OPACITY = (0.5, 0.95)
+"""Standard deviation on the picture, and opacity: evenly between these."""
 FOCAL_WIDTHS = 0.8
 """Focal length in image widths: 64 degrees across, as an underwater housing leaves it."""
 TURN_RAD = 0.3
@@ -46,6 +48,7 @@ class Size:
 COUNTS = (10_000, 30_000, 100_000, 300_000)
 PICTURES = ((320, 240), (640, 480), (1280, 720))
 SIZES = tuple(Size(n, *picture) for picture in PICTURES for n in COUNTS)
+"""Numbers of Gaussians, sizes of pictures, and each with each."""
 QUICK_SIZES = (Size(30_000, 320, 240), Size(100_000, 640, 480))
 """Those of the renderer's bars."""
 SMALL = Size(400, 96, 72)

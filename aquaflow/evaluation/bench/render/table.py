@@ -13,6 +13,7 @@ from aquaflow.evaluation.bench.render.rows import Row
 from aquaflow.evaluation.bench.summary import Spread
 
 UNKNOWN = "-"
+"""Printed where there is no number."""
 
 
 def print_result(result: dict[str, Any], console: Console) -> None:
