@@ -11,6 +11,7 @@ from drivers.transport.can import EXTENDED, RECORD
 from sim_drivers.telemetry_log import ByteLog, LogTime, Read
 
 LINE = re.compile(r"\((\d+)\.(\d{1,9})\)\s+(\S+)\s+([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#([0-9A-Fa-f]*)")
+"""As candump -L writes it: seconds and their fraction, bus, identifier, data."""
 EXTENDED_DIGITS = 8
 """Hexadecimal digits of a 29-bit identifier; one of 11 bits has three."""
 MAX_DATA_BYTES = 8

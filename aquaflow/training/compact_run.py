@@ -33,9 +33,11 @@ from aquaflow.training.schedule import Schedule
 from aquaflow.training.trainer import Progress, TrainingPlan, train
 
 POOL, HELD_OUT, HELD_OUT_WIDER, PRIOR = "pool", "held_out", "held_out_wider", "prior"
+"""Folders of a run: training pairs, two sets of held-out ones, the exported prior."""
 CALIBRATION_SEED = 2000
 """Of the water over the pictures that 8-bit ranges are taken from."""
 CALIBRATION_SHARDS = 2
+"""Of the pool, 16 pairs: the pictures that the ranges are taken from."""
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 NOT_FIGURES = ("step", "cpu_s", "rate")
+"""Keys of the history that are not drawn."""
 
 
 def draw_curve(history: list[dict[str, float]], path: Path) -> None:

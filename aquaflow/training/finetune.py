@@ -34,8 +34,10 @@ READERS: dict[str, Callable[[Path], list[Frames]]] = {
     "flsea": flsea,
     "colmap": colmap,
 }
+"""Data sets that can be named, and what reads them."""
 
 INDEX, WEIGHTS = "pairs.jsonl", "mast3r.pth"
+"""Files of a run: the pairs that were found, the weights of the network."""
 HELD_OUT_EVERY = 50
 """Of so many pairs one is never trained on."""
 HELD_OUT = 64

@@ -25,6 +25,7 @@ from aquaflow.training.schedule import Schedule
 log = logging.getLogger(__name__)
 
 CHECKPOINT, HISTORY, CURVE = "checkpoint.pt", "history.json", "curve.png"
+"""Files of a run."""
 
 Progress = Callable[[str, int, int], None]
 

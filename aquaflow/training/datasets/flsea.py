@@ -21,6 +21,7 @@ from aquaflow.training.datasets.chaining import chained
 from aquaflow.training.datasets.posed import Frames, Posed, nothing_in, read_image
 
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+"""Suffixes of pictures."""
 
 
 def flsea(root: Path) -> list[Frames]:

@@ -28,6 +28,7 @@ from aquaflow.training.datasets.posed import (
 )
 
 CALIBRATION = "stereo.yaml"
+"""File with the calibration of the rig."""
 
 
 class StereoRig(Stage):

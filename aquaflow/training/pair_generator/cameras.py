@@ -28,6 +28,7 @@ class Motion:
 
 
 TRAINING = Motion()
+"""Of the pairs that are learned from: all of the defaults."""
 WIDE = Motion(baseline=0.45, power=1.5, tilt=0.07, roll=0.12)
 """Of the held-out pairs: the motion of the prototypes' measurements (docs/measurements.md)."""
 WIDER = Motion(baseline=0.45, power=1.0, tilt=0.1, roll=0.2)
