@@ -86,12 +86,12 @@ def put_together(facts: Facts, arrays: Mapping[str, Any], renderer: Renderer) ->
     mapper.medium.active, scene.exposes = bool(facts["medium_active"]), bool(facts["exposes"])
     scene.sunlight.plays = bool(facts["sunlight_plays"])
     scene.water_evidence, scene.beta_a_sigma = facts["water_evidence"], facts["beta_a_sigma"]
-    mapper.steps, mapper.undone = int(facts["steps"]), int(facts["undone"])
+    mapper.optimiser.steps, mapper.optimiser.undone = int(facts["steps"]), int(facts["undone"])
     if len(facts["cameras"]) > len(arrays["views.numbers"]):
         raise DamagedError("it has more cameras than views")
     mapper.views = _read_views(arrays, [to_camera(values) for values in facts["cameras"]])
-    mapper._optimiser.extend(len(gaussians))
-    mapper._optimiser.bind(gaussians.parameters)
+    mapper.optimiser.adam.extend(len(gaussians))
+    mapper.optimiser.adam.bind(gaussians.parameters)
     if not facts["decoder"]:
         scene.neural = None  # baked, though the config began with one
     elif mapper.neural is not None:
@@ -164,14 +164,14 @@ def _read_decoder(neural: NeuralGaussians, arrays: Mapping[str, Any]) -> None:
 
 
 def _adams(mapper: Mapper) -> dict[str, SelectiveAdam]:
-    adams = {"adam": mapper._optimiser}
+    adams = {"adam": mapper.optimiser.adam}
     if mapper.neural is not None:
         adams |= {"adam_local": mapper.neural._local, "adam_shared": mapper.neural._shared}
     return adams
 
 
 def _torch(mapper: Mapper) -> dict[str, torch.optim.Adam]:
-    optimisers = {"adam_medium": mapper._medium_optimiser}
+    optimisers = {"adam_medium": mapper.optimiser.medium_adam}
     if mapper.neural is not None:
         optimisers["adam_decoder"] = mapper.neural._weights
     return optimisers

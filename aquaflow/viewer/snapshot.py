@@ -60,7 +60,7 @@ def copied(mapper: Mapper) -> MapCopy:
         centre = torch.from_numpy(view.T_wc.t).to(torch.float32)
         z = torch.linalg.vector_norm(mapper.gaussians.means - centre, dim=-1)
         seen = clear * water.transmission(z) + water.backscatter(z)
-    steps = mapper._optimiser.steps.numpy().copy()
+    steps = mapper.optimiser.adam.steps.numpy().copy()
     return MapCopy(plain, steps, seen.numpy().copy(), clear.numpy().copy())
 
 

@@ -19,6 +19,7 @@ from aquaflow.dive.run import Finished
 from aquaflow.errors import InputError
 from aquaflow.errors.failures import Failures
 from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.optimisation.map_optimiser import MapOptimiser
 from aquaflow.mapping.scene import Scene
 from aquaflow.messages import Dropped, Frame
 from aquaflow.prior.classical import ClassicalPrior
@@ -59,7 +60,7 @@ STAGES: list[tuple[type, str, int, str]] = [
     (KeyframeGraph, "add", 3, "keyframe graph"),
     (Mapper, "add_view", 3, "view"),
     (Mapper, "insert", 2, "insertion"),
-    (Mapper, "_step", 5, "optimisation"),
+    (MapOptimiser, "step", 5, "optimisation"),
     (Scene, "fit_water", 1, "water fit"),
     (Mapper, "register", 1, "held-out pose"),
 ]

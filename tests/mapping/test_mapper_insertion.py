@@ -74,7 +74,7 @@ def test_at_the_cap_what_is_least_worth_makes_room_where_the_picture_is_bare() -
         elsewhere = view_of(view.image, pose((0.0, 0.0, -9.0)))
         elsewhere.keyframe = 1
         assert mapper.insert(elsewhere, flat_pointmap()) == expected
-        assert len(mapper.gaussians) == len(mapper._optimiser.steps) == 1000
+        assert len(mapper.gaussians) == len(mapper.optimiser.adam.steps) == 1000
         faint = mapper.gaussians.opacities < 0.1
         assert int(faint.sum()) == 300 - expected
         assert int((mapper.gaussians.keyframes == 1).sum()) == expected

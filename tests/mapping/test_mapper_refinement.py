@@ -46,7 +46,9 @@ def test_refining_moves_poses_but_the_first_and_improves_the_map() -> None:
 
 def test_refining_uses_every_view_equally_often(monkeypatch: pytest.MonkeyPatch) -> None:
     mapper, used = grown(DRY), []
-    monkeypatch.setattr(mapper, "_step", lambda view, refine_poses: used.append(view.frame_index))
+    monkeypatch.setattr(
+        mapper.optimiser, "step", lambda view, refine_pose: used.append(view.frame_index)
+    )
     mapper.refine()
     for turn in range(3):
         assert sorted(used[4 * turn : 4 * turn + 4]) == [0, 1, 2, 3]
@@ -70,7 +72,7 @@ def test_the_rate_of_the_means_falls_to_its_final_share() -> None:
     mapper = grown(DRY)
     mapper.refine()
     rates = DRY.optimiser
-    assert mapper._optimiser.learning_rates["means"] == pytest.approx(
+    assert mapper.optimiser.adam.learning_rates["means"] == pytest.approx(
         rates.means * rates.means_final
     )
 

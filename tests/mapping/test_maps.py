@@ -49,7 +49,7 @@ def is_usable(mapper: Mapper) -> bool:
     """Every row of the optimiser belongs to a Gaussian, and steps can be taken."""
     before = mapper.steps
     mapper.optimise(2)
-    return len(mapper._optimiser.steps) == len(mapper.gaussians) and mapper.steps == before + 2
+    return len(mapper.optimiser.adam.steps) == len(mapper.gaussians) and mapper.steps == before + 2
 
 
 def test_two_sub_maps_become_one() -> None:

@@ -42,8 +42,8 @@ def soaked_map(seed: int, settings: MappingConfig) -> Mapper:
         "raw_colours": sound.colours[:, :3],
     }
     mapper.gaussians.extend({name: tensor.contiguous() for name, tensor in new.items()}, 0)
-    mapper._optimiser.extend(COUNT)
-    mapper._optimiser.bind(mapper.gaussians.parameters)
+    mapper.optimiser.adam.extend(COUNT)
+    mapper.optimiser.adam.bind(mapper.gaussians.parameters)
     rng = np.random.default_rng(seed)
     for i in range(3):
         image = rng.integers(0, 256, (CAMERA.height, CAMERA.width, 3), dtype=np.uint8)
@@ -60,7 +60,7 @@ def _mapper(seed: int) -> tuple[Mapper, View]:
     return mapper, mapper.views[0]
 
 
-@case("gaussians", "mapping.mapper.is_number")
+@case("gaussians", "mapping.optimisation.map_optimiser.is_number")
 def nan_in_range_input(check: Check, seed: int) -> None:
     """A range that is no number costs the step: the map stays, and the step is counted."""
     mapper, view = _mapper(seed)
@@ -73,7 +73,7 @@ def nan_in_range_input(check: Check, seed: int) -> None:
     check.finite("map", *mapper.gaussians.parameters.values())
 
 
-@case("gaussians", "mapping.mapper.Mapper._drop_unsound")
+@case("gaussians", "mapping.optimisation.map_optimiser.MapOptimiser.drop_unsound")
 def nan_in_the_map(check: Check, seed: int) -> None:
     """One Gaussian gone wrong costs itself, not the optimisation."""
     mapper, _ = _mapper(seed)

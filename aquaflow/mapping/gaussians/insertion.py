@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 import torch
@@ -14,6 +16,51 @@ from aquaflow.mapping.views import View
 
 LOG_GAIN = 3.0
 """A Laplacian-of-Gaussian response, L1 over RGB, of 1 / LOG_GAIN counts as certain structure."""
+
+
+@dataclass(frozen=True)
+class TrackedRange:
+    """How far away tracking sees the scene, along every pixel's ray."""
+
+    z: Tensor
+    """[H, W], in the keyframe's unit; 0 where unknown."""
+    known: Tensor
+    """[H, W] bool"""
+    confidence: Tensor
+    """[H, W] in [0, 1]: Q of the paper, saturating at a relative range sigma of 3 %."""
+
+    def keep_in(self, view: View) -> None:
+        """Let the view's depth loss use it."""
+        view.inverse_range = torch.where(self.known, 1.0 / self.z.clamp_min(1e-6), 0.0)
+        view.range_confidence = self.confidence
+
+
+def tracked_range(pointmap: Pointmap, known_sigma: float) -> TrackedRange:
+    """Known where the relative standard deviation is below ``known_sigma``."""
+    camera = pointmap.camera
+    known = torch.from_numpy(pointmap.known(known_sigma))
+    length = torch.from_numpy(camera.unproject(camera.pixel_centres())).norm(dim=-1)
+    depth = torch.from_numpy(1.0 / pointmap.rho.clip(1e-6))
+    Q = torch.from_numpy(pointmap.Q)
+    confidence = (Q / (Q + (1.0 / 0.03) ** 2)).to(torch.float32).sqrt()
+    return TrackedRange(
+        torch.where(known, length * depth, 0.0).to(torch.float32), known, confidence
+    )
+
+
+def alpha_where_agreed(
+    alpha: Tensor,  # [H, W] of the map
+    z: Tensor,  # [H, W] range of the map
+    tracked_z: Tensor,  # [H, W] range, in the same unit
+    config: InsertionConfig,
+) -> Tensor:
+    """[H, W]: the map's alpha where its surface lies at the tracked range, elsewhere 0.
+
+    Where the map already explains the ray, only structure that it lacks asks for more Gaussians;
+    where it is bare or its surface lies elsewhere, any pixel may.
+    """
+    agree = (z - tracked_z).abs() < config.agreement * tracked_z
+    return torch.where(agree, alpha, 0.0)
 
 
 def structure(
@@ -120,19 +167,3 @@ def new_gaussians(
     }
     sound = torch.stack([torch.isfinite(values).all(dim=-1) for values in new.values()]).all(0)
     return new if bool(sound.all()) else {name: values[sound] for name, values in new.items()}
-
-
-def range_of(pointmap: Pointmap, known_sigma: float) -> tuple[Tensor, Tensor]:
-    """Range along the ray [H, W] and where it is known, of a tracked frame."""
-    camera = pointmap.camera
-    known = pointmap.known(known_sigma)
-    length = torch.from_numpy(camera.unproject(camera.pixel_centres())).norm(dim=-1)
-    depth = torch.from_numpy(1.0 / pointmap.rho.clip(1e-6))
-    mask = torch.from_numpy(known)
-    return torch.where(mask, length * depth, 0.0).to(torch.float32), mask
-
-
-def confidence_of(pointmap: Pointmap) -> Tensor:
-    """[H, W] in [0, 1]: Q of the paper, saturating at a relative range sigma of 3 %."""
-    Q = torch.from_numpy(pointmap.Q)
-    return (Q / (Q + (1.0 / 0.03) ** 2)).to(torch.float32).sqrt()

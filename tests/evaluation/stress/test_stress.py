@@ -14,9 +14,9 @@ from aquaflow.evaluation.stress import suite, swim
 from aquaflow.evaluation.stress.case import REGISTRY, Check
 from aquaflow.geometry import camera, similarity, triangulation
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.mapping import mapper, views
+from aquaflow.mapping import views
 from aquaflow.mapping.gaussians import gaussians
-from aquaflow.mapping.optimisation import losses
+from aquaflow.mapping.optimisation import losses, map_optimiser
 from aquaflow.mapping.water import image_formation, medium
 from aquaflow.prior import flow, homography
 from aquaflow.render import adam, reference, water
@@ -101,7 +101,7 @@ GUARDS: list[tuple[str, list[tuple[object, str, object]]]] = [
     ("projection_at_depth_0", [(camera, "MIN_DEPTH", -INFINITY)]),
     ("homography_horizon", [(homography, "MIN_DENOMINATOR", 0.0)]),
     ("poses_rounded_to_float32", [(similarity, "on_so3", lambda R: R)]),
-    ("nan_in_range_input", [(mapper, "is_number", always)]),
+    ("nan_in_range_input", [(map_optimiser, "is_number", always)]),
     ("nan_in_pose_gradient", [(views, "is_usable", always)]),
     (
         "gradients_that_are_not_finite",
@@ -147,7 +147,7 @@ def test_a_pose_that_too_little_supports_is_not_believed(monkeypatch: pytest.Mon
 def test_without_the_finite_check_an_unsound_gaussian_stops_the_map(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(mapper.Mapper, "_drop_unsound", lambda self: None)
+    monkeypatch.setattr(map_optimiser.MapOptimiser, "drop_unsound", lambda self: None)
     assert not suite.run_case(REGISTRY["nan_in_the_map"], seed=0).outcome.passed
 
 

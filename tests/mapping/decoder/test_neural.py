@@ -91,7 +91,7 @@ def test_a_window_of_views_learns_at_its_end_and_prunings_end_it() -> None:
     decoder.expect(ahead)
     learned = decoder._local.steps.clone()
     for view in ahead:
-        mapper._step(view, refine_poses=False)
+        mapper.optimiser.step(view, refine_pose=False)
         assert torch.equal(decoder._local.steps, learned)
     decoder.settle()
     assert bool((decoder._local.steps > learned).any())
@@ -105,11 +105,11 @@ def test_steps_that_are_left_out_leave_the_window_whole() -> None:
     mapper = grown(neural(views_per_trunk=3))
     decoder, views = decoder_of(mapper), mapper.views
     decoder.expect([views[0], views[1], views[2], views[3]])
-    mapper._step(views[0], refine_poses=False)
+    mapper.optimiser.step(views[0], refine_pose=False)
     opened = decoder._window
-    mapper._step(views[2], refine_poses=False)
+    mapper.optimiser.step(views[2], refine_pose=False)
     assert decoder._window is opened
-    mapper._step(views[3], refine_poses=False)
+    mapper.optimiser.step(views[3], refine_pose=False)
     assert decoder._window is not opened
     assert decoder._window is not None
     assert decoder._window.views == []
@@ -127,7 +127,7 @@ def test_groups_and_features_follow_what_the_map_does() -> None:
     # The decoder is told directions in the world, so a turn of it is not free; it is not much.
     assert float((mapper.show(mapper.views[0]).image - looked).abs().mean()) < 0.02
     keep = torch.arange(len(mapper.gaussians)) % 3 != 0
-    mapper._keep(keep)
+    mapper.optimiser.keep(keep)
     assert is_whole(mapper)
 
 
@@ -199,7 +199,7 @@ def test_a_gradient_that_is_no_number_does_not_reach_the_weights() -> None:
     before = [weight.detach().clone() for weight in decoder.decoder.parameters()]
     view = mapper.views[0]
     decoder.expect([view])
-    mapper._step(view, refine_poses=False)
+    mapper.optimiser.step(view, refine_pose=False)
     window = decoder._window
     assert window is not None
     assert window.hidden.grad is not None

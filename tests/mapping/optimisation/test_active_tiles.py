@@ -78,8 +78,8 @@ def test_a_step_leaves_alone_what_only_explained_tiles_show() -> None:
     config = settings(optimiser={"noise_floor": 0.01, "full_look_every": 100})
     mapper = Mapper(config, renderer(), 0)
     mapper.scene.gaussians.extend(floor().parameters, keyframe=0)
-    mapper._optimiser.extend(len(mapper.gaussians))
-    mapper._optimiser.bind(mapper.gaussians.parameters)
+    mapper.optimiser.adam.extend(len(mapper.gaussians))
+    mapper.optimiser.adam.bind(mapper.gaussians.parameters)
     wrong = picture(floor(), path(1)[0])
     wrong[:16, :16] = 255
     mapper.add_view(view_of(wrong))

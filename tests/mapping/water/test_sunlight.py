@@ -132,8 +132,8 @@ def test_a_map_in_playing_light_is_that_of_its_mean() -> None:
         for view in views[:10] + views[11:]:
             mapper.add_view(view)
         mapper.scene.gaussians = floor()
-        mapper._optimiser.extend(len(true))
-        mapper._optimiser.bind(mapper._parameters)
+        mapper.optimiser.adam.extend(len(true))
+        mapper.optimiser.adam.bind(mapper.gaussians.parameters)
         mapper.refine()
         assert mapper.scene.sunlight.plays is enabled
         mapper.register(views[10])

@@ -84,8 +84,8 @@ def test_the_map_comes_back_bit_for_bit(cut: Cut, back: LiveDive) -> None:
 def test_the_optimisers_and_the_random_state_come_back(cut: Cut, back: LiveDive) -> None:
     new, saved = back.parts.maps.mappers[0], read_state(state_file(cut.folder)).arrays
     for kind, moments in (
-        ("first", new._optimiser.first_moments),
-        ("second", new._optimiser.second_moments),
+        ("first", new.optimiser.adam.first_moments),
+        ("second", new.optimiser.adam.second_moments),
     ):
         for name, tensor in moments.items():
             assert np.array_equal(tensor.numpy(), saved[f"mapping.map0.adam.{kind}.{name}"])

@@ -1,0 +1,162 @@
+"""One step of the joint optimisation of Gaussians, medium and pose (paper, Sec. 3.4).
+
+It owns the optimisers' state, of which every Gaussian has a row: whatever adds or drops Gaussians
+does it here.
+"""
+
+from __future__ import annotations
+
+import logging
+
+import torch
+from torch import Tensor
+
+from aquaflow.config import MappingConfig
+from aquaflow.mapping.decoder.decode import DECODED
+from aquaflow.mapping.optimisation.active_tiles import look, tiles_to_draw
+from aquaflow.mapping.optimisation.objective import Objective
+from aquaflow.mapping.rendering import Shown
+from aquaflow.mapping.scene import Scene
+from aquaflow.mapping.views import View, refine_pose
+from aquaflow.render.adam import SelectiveAdam
+
+log = logging.getLogger(__name__)
+
+
+def is_number(
+    value: Tensor,  # []
+) -> bool:
+    """True if a loss or a norm may be acted on."""
+    return bool(torch.isfinite(value))
+
+
+class MapOptimiser:
+    """Steps a scene towards its views."""
+
+    def __init__(self, config: MappingConfig, scene: Scene, objective: Objective) -> None:
+        """Rows for the Gaussians that the scene has by now, at step 0."""
+        self.config, self.scene = config, scene
+        self._objective = objective
+        self.adam = self._new_adam()
+        """Of the Gaussians' parameters."""
+        self.medium_adam = torch.optim.Adam(scene.medium.parameters(), lr=config.medium.rate)
+        self.steps = 0
+        """Steps taken."""
+        self.undone = 0
+        """Steps that were undone because their loss or gradient was not finite."""
+
+    def _new_adam(self) -> SelectiveAdam:
+        rates, parameters = self.config.optimiser, self.scene.gaussians.parameters
+        groups = {name: (tensor, getattr(rates, name)) for name, tensor in parameters.items()}
+        return SelectiveAdam(groups, rates.betas, threads=self.scene.renderer.threads)
+
+    # --- one step -----------------------------------------------------------------------------
+
+    def step(self, view: View, refine_pose: bool) -> None:
+        """Render, compare (Eqs. 18 to 23), differentiate, move; undone if anything is not finite.
+
+        The view's pose moves too if ``refine_pose``.
+        """
+        if len(self.scene.gaussians) == 0:  # all pruned since the steps began
+            return
+        leaves = {
+            name: tensor.detach().requires_grad_(self._is_optimised(name))
+            for name, tensor in self.scene.gaussians.parameters.items()
+        }
+        viewmat = view.viewmat().requires_grad_(refine_pose)
+        self.medium_adam.zero_grad(set_to_none=True)
+        active = tiles_to_draw(view, self.config.optimiser)
+        if self.config.optimiser.skip_explained and active is not None and not active.any():
+            view.looks += 1
+            return
+        neural = self.scene.neural
+        seen = leaves if neural is None else neural.decode(view, leaves, viewmat)
+        shown = self.scene.draw(view, seen, viewmat, learn=True, active=active)
+        look(view, shown.image, self.config.optimiser)
+        loss = self._objective.total(view, shown, seen)
+        if not is_number(loss):
+            self._undo("loss", view)
+            self.drop_unsound()
+            return
+        torch.autograd.backward(loss)
+        gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+        self.adam.step(shown.visible, gradients)
+        self._step_medium(view)
+        self._step_pose(view, viewmat)
+        self.steps += 1
+        if self.steps % self.config.optimiser.prune_every == 0:
+            self._prune(shown, view)
+
+    def _is_optimised(self, name: str) -> bool:
+        """Places and opacities always are; with residuals, the rest only if so configured."""
+        frozen = self.scene.neural is not None and not self.config.decoder.optimise_initial
+        return not (frozen and name in DECODED)
+
+    def _step_medium(self, view: View) -> None:
+        medium = self.scene.medium
+        if not medium.active:
+            return
+        norm = torch.nn.utils.clip_grad_norm_(medium.parameters(), self.config.medium.max_gradient)
+        if not is_number(norm):
+            self._undo("medium gradient", view)
+            return
+        self.medium_adam.step()
+
+    def _step_pose(
+        self,
+        view: View,
+        viewmat: Tensor,  # [4, 4]
+    ) -> None:
+        if viewmat.grad is not None:
+            refine_pose(view, viewmat.grad, self.config.optimiser.poses)
+
+    def _undo(self, what: str, view: View) -> None:
+        self.undone += 1
+        log.warning("non-finite %s on frame %d: step undone", what, view.frame_index)
+
+    # --- Gaussians come and go ----------------------------------------------------------------
+
+    def extend(
+        self,
+        count: int,
+        centres: Tensor | None,  # [3] or [count, 3]
+    ) -> None:
+        """Rows for the map's last ``count`` Gaussians, which were seen from the cameras at
+        ``centres``; only a decoder needs to know these."""
+        self.adam.extend(count)
+        if self.scene.neural is not None and centres is not None:
+            self.scene.neural.insert(centres, count)
+        self.adam.bind(self.scene.gaussians.parameters)
+
+    def keep(
+        self,
+        mask: Tensor,  # [N] bool
+    ) -> None:
+        """Drop the Gaussians where ``mask`` is False, their optimiser state with them."""
+        if not bool(mask.all()):
+            (self.scene.neural or self.scene.gaussians).keep(mask)
+            self.adam.keep(mask)
+            self.adam.bind(self.scene.gaussians.parameters)
+
+    def _prune(self, shown: Shown, view: View) -> None:
+        """Drop Gaussians that are all but transparent, or that fill the picture."""
+        opaque = self.scene.gaussians.opacities > self.config.optimiser.prune_opacity
+        widest = self.config.optimiser.prune_radius_widths * view.camera.width
+        self.keep(opaque & (shown.radius_px < widest))
+
+    def drop_unsound(self) -> None:
+        """Drop Gaussians that are not finite: the scale loss of one would spoil every step."""
+        sound = torch.isfinite(self.scene.gaussians.scales.prod(dim=-1))
+        for tensor in self.scene.gaussians.parameters.values():
+            sound &= torch.isfinite(tensor).all(dim=-1)
+        self.keep(sound)
+
+    def make_whole(self) -> None:
+        """After a failure: every row of the optimisers and groups belongs to a Gaussian, and all
+        Gaussians are finite."""
+        if self.scene.neural is not None:
+            self.scene.neural.make_whole()
+        if len(self.adam.steps) != len(self.scene.gaussians):
+            self.adam = self._new_adam()
+        self.adam.bind(self.scene.gaussians.parameters)
+        self.drop_unsound()
