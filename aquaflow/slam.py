@@ -5,13 +5,12 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from aquaflow.config import Config
 from aquaflow.errors import ConfigError
 from aquaflow.errors.failures import Failures
-from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.maps import Growth, Insertion, Maps, MapWork
@@ -20,21 +19,13 @@ from aquaflow.messages import Frame
 from aquaflow.prior.factory import make_prior
 from aquaflow.profiler import Profiler
 from aquaflow.render import select_renderer
+from aquaflow.tracking.anchored import Anchored, Anchors
 from aquaflow.tracking.frame_table import FrameTable
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.tracking.gate.gate import FrameGate, GateKind, Verdict
 from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph
 from aquaflow.tracking.loops.relocaliser import Places
 from aquaflow.tracking.tracker import Tracker
-
-
-@dataclass(frozen=True)
-class Anchored:
-    """A tracked frame with its pose against its keyframe, which later corrections leave."""
-
-    tracked: Tracked
-    T_kf: Sim3 | None = None
-    """None for a frame without a pose."""
 
 
 class Slam:
@@ -71,6 +62,7 @@ class Slam:
             self.prior.warm_up()
         self.keyframes = KeyframeStore(work, self.prior)
         places = Places(self.keyframes, config.tracking)
+        self._anchors = Anchors(self.keyframes, self.failures)
         self.gate = FrameGate(config.tracking.gate)
         self.tracker = Tracker(
             self.prior, self.keyframes, config.tracking, places, live, self.failures
@@ -106,16 +98,18 @@ class Slam:
         # Sec. 3.2, Eq. 3: its Sim(3) pose, its class, and the poses of frames that waited for it.
         tracked = self._track(frame)
 
+        # For this frame, and for those that waited for it:
+        # Sec. 3.2, Eq. 4: a new keyframe gets its link, and loops to earlier ones are closed.
+        # Sec. 3.3.3, Eqs. 16 and 17: medium-guided insertion of Gaussians.
+        # Sec. 3.4, Eqs. 18 to 23: joint optimisation of Gaussians and medium.
+        # The frame's row, from which its pose follows after every later correction.
+        return self._link_map_publish(tracked)
+
+    def _link_map_publish(self, tracked: list[Tracked]) -> list[Tracked]:
         finished = []
         for anchored in self._anchor(tracked):
-            # Sec. 3.2, Eq. 4: a new keyframe gets its link, and loops to earlier ones are closed.
             linked = self._link(anchored)
-
-            # Sec. 3.3.3, Eqs. 16 and 17: medium-guided insertion of Gaussians.
-            # Sec. 3.4, Eqs. 18 to 23: joint optimisation of Gaussians and medium.
             self._map(linked.tracked)
-
-            # The frame's row, from which its pose can be told after every later correction.
             finished.append(self._publish(linked))
         return finished
 
@@ -124,7 +118,7 @@ class Slam:
         newest = self._latest
         with self.profiler.stage("back-fill"):
             tracked = self.tracker.back_fill()
-        finished = self._complete(tracked)
+        finished = self._link_map_publish(tracked)
         self._latest = newest
         return finished
 
@@ -132,7 +126,7 @@ class Slam:
         """After the last frame: the frames that still wait, the last keyframe, the refinement."""
         with self.profiler.stage("track"):
             tracked = self.tracker.finish()
-        finished = self._complete(tracked)
+        finished = self._link_map_publish(tracked)
         while self.graph.optimising:
             self._follow_graph(wait=True)
         with self.failures.contain("insertion"):
@@ -193,15 +187,7 @@ class Slam:
 
     def _anchor(self, tracked: list[Tracked]) -> list[Anchored]:
         """T_kf of all frames, before a loop closure among them moves the keyframes."""
-        return [self._anchored(each) for each in tracked]
-
-    def _anchored(self, tracked: Tracked) -> Anchored:
-        if tracked.keyframe is None or tracked.T_wc is None:
-            return Anchored(tracked)
-        with self.failures.contain("pose", tracked.frame.index):
-            T_kf = self.keyframes[tracked.keyframe].T_wc.inverse() @ tracked.T_wc
-            return Anchored(tracked, T_kf.if_finite())
-        return Anchored(self._as_lost(tracked.frame))
+        return [self._anchors.anchored(each) for each in tracked]
 
     def _link(self, anchored: Anchored) -> Anchored:
         """Add a keyframe to the graph; the frame with its pose after that."""
@@ -215,7 +201,7 @@ class Slam:
             index = tracked.frame.index
             with self.profiler.stage("graph"), self.failures.contain("keyframe graph", index):
                 self.graph.add(tracked.keyframe, tracked.link)
-        settled = self._settled(tracked, T_kf)
+        settled = self._anchors.settled(tracked, T_kf)
         linked = Anchored(settled, None if settled.T_wc is None else T_kf)
         self._latest = None if linked.T_kf is None else len(self.frames)
         return linked
@@ -237,15 +223,6 @@ class Slam:
         self.frames.add(anchored.tracked, anchored.T_kf)
         return anchored.tracked
 
-    def _complete(self, tracked: list[Tracked]) -> list[Tracked]:
-        """The same steps for frames that are not the newest."""
-        finished = []
-        for anchored in self._anchor(tracked):
-            linked = self._link(anchored)
-            self._map(linked.tracked)
-            finished.append(self._publish(linked))
-        return finished
-
     # --- poses --------------------------------------------------------------------------------
 
     def _skipped(self, frame: Frame, verdict: Verdict) -> Anchored:
@@ -255,14 +232,10 @@ class Slam:
             return Anchored(Tracked(frame, FrameClass.SKIPPED, sub_map, reason=verdict.reason))
         before, T_kf = self.frames[self._latest]
         skipped = replace(
-            self._settled(before, T_kf), frame=frame, frame_class=FrameClass.SKIPPED,
+            self._anchors.settled(before, T_kf), frame=frame, frame_class=FrameClass.SKIPPED,
             pointmap=None, reason=verdict.reason, link=None,
         )  # fmt: skip
         return Anchored(skipped, None if skipped.T_wc is None else T_kf)
-
-    def _as_lost(self, frame: Frame) -> Tracked:
-        reason = self.failures.reason(frame.index) or "tracking failed"
-        return Tracked.lost(frame, self.tracker.sub_map, reason)
 
     def _follow_graph(self, wait: bool) -> None:
         """Take over what the graph's optimisation found; the map follows its keyframes."""
@@ -275,17 +248,7 @@ class Slam:
     def results(self, first: int = 0) -> list[Tracked]:
         """Finished frames from row ``first`` on, without pictures and reasons; pose and sub-map
         are those of now, after all corrections of keyframes."""
-        return [self._settled(tracked, T_kf) for tracked, T_kf in self.frames.since(first)]
-
-    def _settled(self, tracked: Tracked, T_kf: Sim3 | None) -> Tracked:
-        """Where the frame is now; one whose pose cannot be computed has none."""
-        if tracked.keyframe is None or T_kf is None:
-            return tracked
-        keyframe = self.keyframes[tracked.keyframe]
-        with self.failures.contain("pose", tracked.frame.index):
-            T_wc = (keyframe.T_wc @ T_kf).if_finite()
-            return replace(tracked, T_wc=T_wc, sub_map=keyframe.sub_map)
-        return self._as_lost(tracked.frame)
+        return [self._anchors.settled(tracked, T_kf) for tracked, T_kf in self.frames.since(first)]
 
     # --- the map ------------------------------------------------------------------------------
 
