@@ -17,13 +17,10 @@ from aquaflow.messages import CameraModel, Dropped, Frame
 from aquaflow.profiler import Profiler
 from aquaflow.slam import Slam
 from aquaflow.sources import RecordedCamera
+from aquaflow.sources.reading import read_on
 
 Progress = Callable[[str, int, int | None], None]
 """Called with the stage, the steps done and, where known, the steps there are."""
-
-
-MOST_UNREADABLE = 5
-"""Frames in a row that a recording fails on until the rest is given up."""
 
 
 def map_recording(
@@ -88,32 +85,20 @@ def _replay(
 def _frames(
     run: DiveRun, recording: RecordedCamera, source: SourceConfig
 ) -> Iterator[Frame | Dropped]:
-    """The frames to map; after one that the recording fails on, reading goes on with the next.
+    def read(start: int) -> Iterator[Frame | Dropped]:
+        frames = recording.frames(source.every, start, source.stop)
+        while True:
+            with run.profiler.stage("read"):
+                frame = next(frames, None)
+            if frame is None:
+                return
+            yield frame
 
-    Raises:
-        Exception: the recording fails before its first frame; whatever its reader raised.
-    """
-    start, t_ns, failed_in_a_row, any_read = source.start, 0, 0, False
-    frames = recording.frames(source.every, start, source.stop)
-    while failed_in_a_row < MOST_UNREADABLE:
-        with run.profiler.stage("read"), run.slam.failures.contain("reading", start) as reading:
-            frame = next(frames, None)
-        if reading.error is not None:
-            if not any_read:
-                raise reading.error
-            if recording.frame_count is not None and start >= recording.frame_count:
-                return  # closing failed after the last frame
-            failed_in_a_row += 1
-            yield Dropped(start, t_ns, "reading failed, see log.jsonl")
-            start += source.every
-            frames = recording.frames(source.every, start, source.stop)
-            continue
-        if frame is None:
-            return
-        any_read, failed_in_a_row = True, 0
-        start, t_ns = frame.index + source.every, frame.t_ns
-        yield frame
-    run.notes.append(f"{run.name} could not be read after frame {start}; the dive ends there")
+    def give_up(frame: int) -> None:
+        run.notes.append(f"{run.name} could not be read after frame {frame}; the dive ends there")
+
+    count, failures = recording.frame_count, run.slam.failures
+    return read_on(read, source.start, source, count, failures, give_up)
 
 
 def fix_threads(threads: int) -> None:

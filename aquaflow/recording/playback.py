@@ -61,6 +61,11 @@ class Playback:
                     self._sleep_s(wait_s)
             yield event
 
+    @property
+    def frame_count(self) -> int | None:
+        """Number of the camera's frames, where it knows it."""
+        return None if self._camera is None else self._camera.frame_count
+
     def _samples(self, source: TelemetrySource) -> Iterator[TelemetrySample]:
         with self._failures.contain("telemetry"):
             yield from source.samples()

@@ -11,16 +11,16 @@ from typing import Protocol, runtime_checkable
 
 from aquaflow.clocks.device import Learned
 from aquaflow.config import SourceConfig
-from aquaflow.dive.replay import MOST_UNREADABLE
 from aquaflow.errors.failures import Failures
 from aquaflow.messages import CameraModel, Dropped, Frame, TelemetrySample
-from aquaflow.recording.playback import Playback, arrived
+from aquaflow.recording.playback import Event, Playback, arrived
 from aquaflow.recording.recorder import Recorder
 from aquaflow.recording.session import HasSamples
 from aquaflow.service.dive_clock import Continued
 from aquaflow.sources import CameraSource, TelemetrySource
 from aquaflow.sources.newest import Newest
 from aquaflow.sources.outbound import Hears, Word
+from aquaflow.sources.reading import read_on
 
 log = logging.getLogger(__name__)
 
@@ -252,11 +252,6 @@ class PlaybackFeed(_Pumps):
         super().__init__(failures)
         self.calibration, self.name_of, self._notes = calibration, name_of, notes
         self._playback, self._source = playback, source
-        self._next = source.start
-        """The frame to read."""
-        self._read: Frame | Dropped | None = None
-        """The last one that was."""
-        self._failed_in_a_row = 0
 
     def describe(self) -> dict[str, dict[str, object]]:
         return {}
@@ -273,38 +268,26 @@ class PlaybackFeed(_Pumps):
         self._playback.close()
 
     def _events(self) -> None:
-        """After a frame on which reading failed, it goes on with the next."""
-        self._next = self._source.start
-        while self._next < self.continued.first_index:
-            self._next += self._source.every
-        while self._failed_in_a_row < MOST_UNREADABLE:
-            with self.failures.contain("reading", self._next) as reading:
-                self._play()
-            if reading.error is None:
-                break
-            if self._read is None:
-                raise reading.error
-            self._failed_in_a_row += 1
-            reason = "reading failed, see log.jsonl"
-            self.newest.put(Dropped(self._next, self._read.t_ns, reason))
-            self._next += self._source.every
-        else:
-            self.notes.append(f"the recording could not be read after frame {self._next}")
-        self.notes += self._notes
-
-    def _play(self) -> None:
-        source = self._source
-        for event in self._playback.events(source.every, self._next, source.stop):
+        source, start = self._source, self._source.start
+        while start < self.continued.first_index:
+            start += source.every
+        count = self._playback.frame_count
+        for event in read_on(self._read, start, source, count, self.failures, self._give_up):
             if self.closing.is_set():
-                return
+                break
             # Moments stay as recorded, so that frames.csv can be compared with a replay's.
             now = arrived(event, 0, time.monotonic_ns())
             if isinstance(now, (Frame, Dropped)):
-                self._read, self._next = now, now.index + source.every
-                self._failed_in_a_row = 0
                 self.newest.put(now)
             else:
                 self.heard.take(now)
+        self.notes += self._notes
+
+    def _read(self, start: int) -> Iterator[Event]:
+        return self._playback.events(self._source.every, start, self._source.stop)
+
+    def _give_up(self, frame: int) -> None:
+        self.notes.append(f"the recording could not be read after frame {frame}")
 
 
 def _state_of(device: object) -> dict[str, object]:

@@ -198,15 +198,26 @@ class FailsOnce(Pictures):
             yield frame
 
 
-def test_a_picture_that_cannot_be_read_costs_itself() -> None:
+class FailsAtTheEnd(Pictures):
+    """A recording that fails when it is closed after its last picture."""
+
+    def frames(self, every: int = 1, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        yield from super().frames(every, start, stop)
+        raise OSError(errno.EIO, "Input/output error")
+
+
+@pytest.mark.parametrize(("recording", "dropped"), [(FailsOnce, [5]), (FailsAtTheEnd, [])])
+def test_a_picture_that_cannot_be_read_costs_itself(
+    recording: type[Pictures], dropped: list[int]
+) -> None:
     failures, taken = Failures(strict=False), list[Frame | Dropped]()
-    playback = Playback(FailsOnce(), [], failures=failures)
+    playback = Playback(recording(), [], failures=failures)
     feed = PlaybackFeed(playback, SourceConfig(), None, str, [], failures)
     feed.newest.put = taken.append  # type: ignore[method-assign]
     feed.start()
     until(lambda: feed.newest.ended)
     feed.close()
     assert [frame.index for frame in taken] == list(range(40))
-    assert [frame.index for frame in taken if isinstance(frame, Dropped)] == [5]
+    assert [frame.index for frame in taken if isinstance(frame, Dropped)] == dropped
     assert feed.failure is None
     assert failures.total == 1
