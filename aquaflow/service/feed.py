@@ -1,4 +1,17 @@
-"""Where frames and telemetry come from: threads pump, and none of them ever waits for mapping."""
+"""Where frames and telemetry come from: threads pump, and none of them ever waits for mapping.
+
+Between a camera and tracking lie two queues in which the newest wins, and both are needed. The
+camera's own (drivers/live.py) holds a raw picture, in a buffer of the device, until it is decoded.
+The one here holds a frame until tracking takes it. Only one of them leaves frames out: without a
+recorder a picture is decoded when tracking waits for one, so that none is overtaken here; with a
+recorder every picture is decoded and recorded in the thread that reads, and the newest of these
+waits here.
+
+With the camera's queue alone, recording would be as slow as tracking, and the loop, whose heartbeat
+needs a timeout, would wait inside a driver's iterator, which has none. With this one alone,
+pictures that nothing uses would be decoded, or would keep the device's buffers. A recording that is
+played back has only this one.
+"""
 
 from __future__ import annotations
 

@@ -87,6 +87,7 @@ def test_only_pictures_that_are_asked_for_are_decoded(tmp_path: Path) -> None:
         until(lambda: (frame := feed.newest.take(1.0)) is None or taken.append(frame) is None)
         until(lambda: front.counters.received > 20)
         assert front.counters.delivered <= len(taken) + 2
+        assert feed.newest.overtaken == 0  # what is left out, the camera's own queue leaves out
     finally:
         feed.close()
 
