@@ -12,6 +12,7 @@ Importing this package is cheap: torch, OpenCV and matplotlib load where they ar
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -20,7 +21,10 @@ if TYPE_CHECKING:
     from aquaflow.api.recording import map_recording
     from aquaflow.errors import AquaFlowError
 
-__version__ = "0.1.0"
+try:
+    __version__ = version("aquaflow")
+except PackageNotFoundError:  # imported from a checkout that was never installed
+    __version__ = "0+unknown"
 
 __all__ = [
     "AquaFlowError",

@@ -31,8 +31,9 @@ if renderer.name == "cpu":
 """
 
 
-def setuptools_is_recent() -> bool:
+def build_requirements_are_here() -> bool:
     try:
+        importlib.metadata.version("setuptools-scm")
         return int(importlib.metadata.version("setuptools").partition(".")[0]) >= 77
     except importlib.metadata.PackageNotFoundError:
         return False
@@ -41,7 +42,8 @@ def setuptools_is_recent() -> bool:
 pytestmark = [
     pytest.mark.ci,
     pytest.mark.skipif(
-        not setuptools_is_recent(), reason="no setuptools >= 77 here to build a wheel with"
+        not build_requirements_are_here(),
+        reason="no setuptools >= 77 and setuptools-scm here to build a wheel with",
     ),
 ]
 
