@@ -9,6 +9,7 @@ INSTALLED := $(VENV)/.installed
 WORKERS ?= 2
 # Tests of one file run in one process: they share what the file's fixtures made.
 TESTS := $(BIN)/pytest -n $(WORKERS) --dist loadfile
+MKDOCS := NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 KERNELS := $(wildcard aquaflow/render/native/*.cpp aquaflow/render/native/*.h)
 
 OUT ?= out/dive
@@ -67,15 +68,16 @@ fuzz: setup ## Feed every command what nothing sane would, for FUZZ_SECONDS=120.
 coverage: setup ## Run the tests of `make test` and show how much of each file they reach.
 	$(TESTS) -m 'not slow and not kernel and not ci' --cov --cov-report=term --cov-report=html:out/coverage
 
-check: setup ## Lint, formatting, unused code, types.
+check: setup ## Lint, formatting, unused code, links of the documentation, types.
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/clang-format --dry-run --Werror $(KERNELS) $(wildcard tests/render/native/*.cpp)
 	$(BIN)/vulture
+	$(MKDOCS) --quiet
 	$(BIN)/mypy
 
 docs: setup ## Build the documentation into out/site; a broken internal link fails.
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	$(MKDOCS)
 	@echo 'Open $(CURDIR)/out/site/index.html in a browser.'
 
 clean: ## Remove the environment, outputs, caches and compiled kernels.
