@@ -33,7 +33,7 @@ from aquaflow.config.tracking import (
     TrackingConfig,
     VerificationConfig,
 )
-from aquaflow.errors.plain_yaml import read_mapping, write_mapping
+from aquaflow.errors.plain_yaml import read_mapping
 
 __all__ = [
     "Config",
@@ -54,7 +54,6 @@ __all__ = [
     "VerificationConfig",
     "VoxelConfig",
     "WaterPriorsConfig",
-    "dump_config",
     "load_config",
     "parse_config",
     "read_yaml",
@@ -99,8 +98,3 @@ def read_yaml(path: Path) -> dict[str, Any]:
         ConfigError: it holds something else.
     """
     return read_mapping(path, "config", "write `key: value` lines; see `aquaflow config`")
-
-
-def dump_config(config: Config, path: Path) -> None:
-    """Write the effective configuration."""
-    write_mapping(path, config.model_dump(mode="json"))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from aquaflow.config import Config, dump_config
+from aquaflow.config import Config
 from aquaflow.dive.frames_csv import FrameRow, header, of_text, to_text
 from aquaflow.dive.log import JsonLog
 from aquaflow.dive.results import HeldOut, WaterSummary, water_of
@@ -24,11 +24,12 @@ from aquaflow.export.ply import Splats, write_ply
 from aquaflow.export.png import write_png
 from aquaflow.export.report import ReportData, write_report
 from aquaflow.export.tum import write_tum
-from aquaflow.geometry.camera import CameraModel, save_camera
+from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.gaussians.gaussians import radiance
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.storage.atomic import atomic_write, write_json
+from aquaflow.storage.atomic import atomic_write, write_json, write_yaml
+from aquaflow.storage.camera_file import save_camera
 
 log = logging.getLogger(__name__)
 
@@ -75,7 +76,7 @@ class DiveFolder:
             self._claim(overwrite)
         else:
             self._add(resume)
-        dump_config(config, path / "config.yaml")
+        write_yaml(path / "config.yaml", config.model_dump(mode="json"))
         self._rewrite_frames(self._recorded)
         self._frames = (path / MARKER).open("ab")
         self._log = JsonLog(path / "log.jsonl", append=resume is not None)

@@ -57,25 +57,6 @@ def read_mapping(path: Path, what: str, hint: str) -> dict[str, Any]:
     return value
 
 
-def write_mapping(path: Path, data: dict[str, Any]) -> None:
-    """Write a YAML file that is whole or as it was before.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.write_text(yaml.safe_dump(data, sort_keys=False))
-        part.replace(path)
-    except OSError as error:
-        raise InputError(
-            f"cannot write {path}: {error.strerror or error}; give a folder with room that can be "
-            "written to"
-        ) from error
-    finally:
-        part.unlink(missing_ok=True)
-
-
 def _problems(root: dict[Any, Any]) -> Iterator[str]:
     """What is not plain and finite, as words that follow the file's name; stops at any depth."""
     waiting: list[tuple[tuple[str, ...], Any]] = [((), root)]

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from aquaflow.errors import ConfigError, path_of_key, words_of
-from aquaflow.errors.plain_yaml import read_mapping, write_mapping
+from aquaflow.errors.plain_yaml import read_mapping
 
 DistortionModel = Literal["none", "radtan", "fisheye"]
 
@@ -204,20 +204,3 @@ def load_camera(path: Path) -> CameraModel:
         distortion=tuple(file.distortion),
         port=Port(kind=file.port),
     )
-
-
-def save_camera(camera: CameraModel, path: Path) -> None:
-    """Write ``camera`` in the format that :func:`load_camera` reads."""
-    data = {
-        "width": camera.width,
-        "height": camera.height,
-        "model": "pinhole",
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "distortion_model": camera.distortion_model,
-        "distortion": list(camera.distortion),
-        "port": camera.port.kind,
-    }
-    write_mapping(path, data)

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import yaml
+
 from aquaflow.errors import InputError
 
 
@@ -43,5 +45,16 @@ def write_json(path: Path, data: dict[str, Any]) -> None:
         ValueError: a number is not finite.
     """
     text = json.dumps(data, indent=2, allow_nan=False) + "\n"
+    with atomic_write(path) as stream:
+        stream.write(text.encode("utf-8"))
+
+
+def write_yaml(path: Path, data: dict[str, Any]) -> None:
+    """A YAML file, whole or not there, with its keys in the order of ``data``.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    text = yaml.safe_dump(data, sort_keys=False)
     with atomic_write(path) as stream:
         stream.write(text.encode("utf-8"))

@@ -16,7 +16,8 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from aquaflow.errors import InputError, reason_of
-from aquaflow.geometry.camera import CameraModel, save_camera
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.storage.camera_file import save_camera
 from aquaflow.synthetic import objects, pool, radiance, render
 from aquaflow.synthetic import path as paths
 from aquaflow.synthetic.config import SyntheticConfig

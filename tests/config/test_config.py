@@ -10,8 +10,9 @@ import pytest
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from aquaflow.config import Config, Stage, dump_config, load_config, parse_config
+from aquaflow.config import Config, Stage, load_config, parse_config
 from aquaflow.errors import ConfigError, InputError
+from aquaflow.storage.atomic import write_yaml
 
 
 def nested(path: str, value: object) -> dict[str, Any]:
@@ -110,7 +111,7 @@ def test_what_was_dumped_loads_as_it_was(tmp_path: Path) -> None:
         "here",
     )
     path = tmp_path / "config.yaml"
-    dump_config(config, path)
+    write_yaml(path, config.model_dump(mode="json"))
     assert load_config(path) == config
     assert set(yaml.safe_load(path.read_text())) == set(Config.model_fields)
 

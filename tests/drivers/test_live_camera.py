@@ -12,8 +12,9 @@ import pytest
 
 from aquaflow.config.cameras import LiveCameraConfig
 from aquaflow.errors import InputError
-from aquaflow.geometry.camera import guess_camera, save_camera
+from aquaflow.geometry.camera import guess_camera
 from aquaflow.messages import CameraModel, Dropped, Frame
+from aquaflow.storage.camera_file import save_camera
 from drivers.capture import Capture, RawPicture
 from drivers.live import CameraState, LiveCamera
 from tests.drivers.camera_scenes import QUICK, closing, settled

@@ -9,9 +9,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from aquaflow.config import Config, dump_config, parse_config
+from aquaflow.config import Config, parse_config
 from aquaflow.errors import InputError
 from aquaflow.evaluation.restoration import evaluate_restoration
+from aquaflow.storage.atomic import write_yaml
 
 WIDTH, HEIGHT = 96, 72
 INDICES = (8, 16)
@@ -37,7 +38,7 @@ def save(path: Path, rgb: Picture) -> None:
 
 def write_dive(folder: Path, restored_gain: tuple[float, float, float] | None) -> Path:
     (folder / "heldout").mkdir(parents=True)
-    dump_config(Config.model_validate({}), folder / "config.yaml")
+    write_yaml(folder / "config.yaml", Config.model_validate({}).model_dump(mode="json"))
     for index in INDICES:
         picture = scene(index)
         save(folder / "heldout" / f"{index:06d}_real.png", in_water(picture))
@@ -91,7 +92,10 @@ def test_a_synthetic_dive_is_compared_with_its_clean_pictures(tmp_path: Path) ->
 
 def test_the_clean_pictures_are_resized_as_the_dive_was(tmp_path: Path) -> None:
     dive = write_dive(tmp_path / "dive", (0.8, 0.8, 0.8))
-    dump_config(parse_config({"source": {"width": WIDTH}}, "test"), dive / "config.yaml")
+    write_yaml(
+        dive / "config.yaml",
+        parse_config({"source": {"width": WIDTH}}, "test").model_dump(mode="json"),
+    )
     large = tmp_path / "large"
     large.mkdir()
     for index in range(COUNT):

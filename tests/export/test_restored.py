@@ -13,12 +13,13 @@ import torch
 from typer.testing import CliRunner
 
 from aquaflow.cli import app
-from aquaflow.config import Config, MappingConfig, dump_config
+from aquaflow.config import Config, MappingConfig
 from aquaflow.errors import InputError
 from aquaflow.export.map_file import write_map_file
 from aquaflow.export.restored import export_restored
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import to_bytes
+from aquaflow.storage.atomic import write_yaml
 from tests.mapping.mapping_scenes import floor, renderer, view_of
 
 Dive = tuple[Path, Path, npt.NDArray[np.uint8]]
@@ -40,7 +41,10 @@ def dive(tmp_path: Path) -> Dive:
     for index in range(5):
         cv2.imwrite(str(recording / f"{index:06d}.png"), to_bytes(shown.image.numpy())[..., ::-1])
     write_map_file(folder / "map.aqf", mapper)
-    dump_config(Config.model_validate({"source": {"width": 64}}), folder / "config.yaml")
+    write_yaml(
+        folder / "config.yaml",
+        Config.model_validate({"source": {"width": 64}}).model_dump(mode="json"),
+    )
     return folder, recording, to_bytes(shown.radiance.clamp(0.0, 1.0).numpy())
 
 

@@ -17,8 +17,8 @@ from aquaflow.geometry.camera import (
     Port,
     guess_camera,
     load_camera,
-    save_camera,
 )
+from aquaflow.storage.camera_file import save_camera
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 CALIBRATIONS = sorted(SHARED.glob("*/camera.yaml"))

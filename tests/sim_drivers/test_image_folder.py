@@ -9,8 +9,9 @@ import pytest
 from PIL import Image
 
 from aquaflow.errors import ConfigError, InputError
-from aquaflow.geometry.camera import guess_camera, save_camera
+from aquaflow.geometry.camera import guess_camera
 from aquaflow.messages import Dropped, Frame
+from aquaflow.storage.camera_file import save_camera
 from sim_drivers.images import ImageFolder
 from sim_drivers.synthetic import SyntheticDive
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from aquaflow.errors import InputError
-from aquaflow.geometry.camera import guess_camera, save_camera
+from aquaflow.geometry.camera import guess_camera
 from aquaflow.messages import Dropped
+from aquaflow.storage.camera_file import save_camera
 from sim_drivers import video
 from sim_drivers.video import VideoFile
 
