@@ -10,7 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config import GateConfig
-from aquaflow.tracking.gate.thumbnail import Float, Glance, Mask, look, motion_widths
+from aquaflow.tracking.gate.thumbnail import (
+    Float,
+    Mask,
+    Thumbnail,
+    measure_thumbnail,
+    motion_widths,
+)
 
 FIRST_LEVELS = 3
 """Frames before sharpness has a level to fall from."""
@@ -54,7 +60,7 @@ class FrameGate:
 
     def __init__(self, config: GateConfig) -> None:
         self._config = config
-        self._reference: Glance | None = None
+        self._reference: Thumbnail | None = None
         self._levels: deque[Float] = deque(maxlen=config.blur_memory)
         self._run = 0
 
@@ -68,36 +74,36 @@ class FrameGate:
         Of frames that show nothing, only ``longest_run`` in a row are skipped; the following ones
         pass until one is good again: the tracker has to know that it sees nothing.
         """
-        glance = look(image, mask, self._config.min_snr)
-        verdict = self._useless(glance)
+        thumbnail = measure_thumbnail(image, mask, self._config.min_snr)
+        verdict = self._useless(thumbnail)
         if verdict is not None:
             return self._bounded(verdict)
         self._run = 0
-        verdict = self._compared(glance)
+        verdict = self._compared(thumbnail)
         if verdict.passed:
-            self._reference = glance
-            self._levels.append(glance.sharpness)
+            self._reference = thumbnail
+            self._levels.append(thumbnail.sharpness)
         return verdict
 
     def forget(self) -> None:
         """Nothing is a duplicate of a frame that tracking lost: call this when it did."""
         self._reference = None
 
-    def _useless(self, glance: Glance) -> Verdict | None:
+    def _useless(self, thumbnail: Thumbnail) -> Verdict | None:
         """Dark, blinded or blurred; None for a picture that shows something."""
         config = self._config
-        if glance.usable < config.min_usable:
-            says = f"texture above the noise in {100 * glance.usable:.0f} % of the picture"
-            dark = glance.level < config.dark_level
+        if thumbnail.usable < config.min_usable:
+            says = f"texture above the noise in {100 * thumbnail.usable:.0f} % of the picture"
+            dark = thumbnail.level < config.dark_level
             if dark and config.skip_dark:
-                return Verdict(GateKind.DARK, f"dark: {says}", glance.usable)
+                return Verdict(GateKind.DARK, f"dark: {says}", thumbnail.usable)
             if not dark and config.skip_blinded:
-                return Verdict(GateKind.BLINDED, f"blinded: {says}", glance.usable)
+                return Verdict(GateKind.BLINDED, f"blinded: {says}", thumbnail.usable)
             return None
         if not config.skip_blurred or len(self._levels) < FIRST_LEVELS:
             return None
         usual = np.median(np.stack(self._levels), axis=0)
-        left = float((glance.sharpness / np.maximum(usual, 1e-6)).min())
+        left = float((thumbnail.sharpness / np.maximum(usual, 1e-6)).min())
         if left >= config.blur_loss:
             return None
         return Verdict(
@@ -114,11 +120,11 @@ class FrameGate:
         reason = f"{verdict.reason}; {self._config.longest_run} such frames were skipped before it"
         return Verdict(GateKind.PASS, reason, verdict.measure)
 
-    def _compared(self, glance: Glance) -> Verdict:
+    def _compared(self, thumbnail: Thumbnail) -> Verdict:
         """Against the last frame that passed, so that slow drift adds up until it is seen."""
         if not self._config.skip_duplicates or self._reference is None:
             return Verdict(GateKind.PASS)
-        motion = motion_widths(self._reference, glance, self._config.static_share)
+        motion = motion_widths(self._reference, thumbnail, self._config.static_share)
         if motion >= self._config.duplicate_widths:
             return Verdict(GateKind.PASS, measure=motion)
         reason = f"duplicate: moved by {100 * motion:.3f} % of the width since the last frame used"

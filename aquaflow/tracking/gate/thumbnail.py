@@ -41,10 +41,10 @@ LINEAR_PX = 0.5
 
 
 @dataclass(frozen=True)
-class Glance:
-    """What is measured on one picture alone."""
+class Thumbnail:
+    """A small grey version of one picture and the measures taken on it."""
 
-    thumbnail: Float
+    grey: Float
     """[h, w] grey levels, smoothed for motion."""
     seen: Float
     """[h, w] 1 where the scene is seen: not masked, not saturated."""
@@ -59,12 +59,12 @@ class Glance:
     not change it."""
 
 
-def look(
+def measure_thumbnail(
     image: npt.NDArray[np.uint8],  # [H, W, 3]
     mask: Mask | None,  # [H, W]
     min_snr: float,
-) -> Glance:
-    """Everything but motion; a tile shows texture from ``min_snr`` on."""
+) -> Thumbnail:
+    """Measure everything but motion; a tile with at least ``min_snr`` has texture."""
     grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
     height, width = grey.shape
     small_width = min(THUMBNAIL_WIDTH, width)
@@ -92,23 +92,23 @@ def look(
     relief = float(_step_energies(_shrunk(thumbnail, coarse)).mean())
     sharpness = _step_energies(thumbnail) / max(relief, 1e-6)
     smooth = np.asarray(cv2.GaussianBlur(thumbnail, (0, 0), SMOOTHING_PX), dtype=np.float32)
-    return Glance(smooth, seen, snr, usable, level, sharpness)
+    return Thumbnail(smooth, seen, snr, usable, level, sharpness)
 
 
-def motion_widths(reference: Glance, glance: Glance, share: float) -> float:
+def motion_widths(reference: Thumbnail, thumbnail: Thumbnail, share: float) -> float:
     """Displacement, in picture widths, that ``share`` of the textured tiles stay below.
 
     One Lucas-Kanade step for each tile. Infinite where the difference is no small motion, or where
     nothing is textured enough to tell.
     """
-    seen = reference.seen * glance.seen
-    old, new = _same_exposure(reference.thumbnail, glance.thumbnail, seen)
+    seen = reference.seen * thumbnail.seen
+    old, new = _same_exposure(reference.grey, thumbnail.grey, seen)
     gx, gy = _gradients(0.5 * (old + new))
     d = (new - old) * seen
     gx, gy = gx * seen, gy * seen
     xx, xy, yy = (_shrunk(product, TILES) for product in (gx * gx, gx * gy, gy * gy))
     xd, yd, dd = (_shrunk(product, TILES) for product in (gx * d, gy * d, d * d))
-    textured = (np.minimum(reference.snr, glance.snr) > MOTION_SNR) & (xx + yy > 0)
+    textured = (np.minimum(reference.snr, thumbnail.snr) > MOTION_SNR) & (xx + yy > 0)
     if not textured.any():
         return float("inf")
     trace = (xx + yy)[textured]
@@ -120,7 +120,7 @@ def motion_widths(reference: Glance, glance: Glance, share: float) -> float:
     xx, xy, yy = xx[textured] + ridge, xy[textured], yy[textured] + ridge
     xd, yd = xd[textured], yd[textured]
     size = np.hypot(yy * xd - xy * yd, xx * yd - xy * xd) / (xx * yy - xy * xy)
-    width = int(glance.thumbnail.shape[1])
+    width = int(thumbnail.grey.shape[1])
     return float(np.quantile(size, share)) / width
 
 
