@@ -26,8 +26,8 @@ from aquaflow.service.checkpoint.salvage import Salvaged, lost_with_their_files,
 from aquaflow.service.checkpoint.tracking import refuse_another_size
 from aquaflow.service.dive_clock import Continued
 from aquaflow.service.feed import Feed
-from aquaflow.service.health.degradation import Ladder
-from aquaflow.service.health.heartbeats import Beats, Guard
+from aquaflow.service.health.degradation import Degradation
+from aquaflow.service.health.heartbeats import Heartbeats, Watchdog
 from aquaflow.service.health.pressure import Machine
 from aquaflow.service.health.systemd import Notifier
 from aquaflow.service.loop import LiveLoop
@@ -83,10 +83,10 @@ class LiveDive:
         rows = None if self._salvaged is None else self._salvaged.rows
         self.folder = DiveFolder(choice.folder, self._plain, overwrite, rows)
         self.feed = feed
-        self._beats, self._ladder = Beats(), Ladder(service.limits)
+        self._heartbeats, self._degradation = Heartbeats(), Degradation(service.limits)
         self._notifier = Notifier()
         self.parts = self._assembled(name, choice, service)
-        self._guard = Guard(self._beats, service.hang_s)
+        self._watchdog = Watchdog(self._heartbeats, service.hang_s)
         self._finished = False
 
     def _assembled(self, name: str, choice: Choice, service: ServiceConfig) -> Parts:
@@ -96,7 +96,7 @@ class LiveDive:
         renderer = select_renderer(config.mapping.renderer, threads)
         failures = feed.failures
         maps = Maps(config, renderer, profiler, self.folder.work, failures)
-        thread = MapThread(maps, service.mapping, self._beats, lambda: self._ladder.level)
+        thread = MapThread(maps, service.mapping, self._heartbeats, lambda: self._degradation.level)
         slam = Slam(config, profiler, self.folder.work, True, thread, failures)
         run = DiveRun(name, self.folder, config, slam, feed.calibration, feed.name_of)
         continued = Continued()
@@ -121,7 +121,7 @@ class LiveDive:
             log.warning("%s", note)
         feed.go_on(continued)
         loop = LiveLoop(
-            run, feed, thread, service, self._beats, self._ladder,
+            run, feed, thread, service, self._heartbeats, self._degradation,
             Machine(self.folder.path), self._notifier,
         )  # fmt: skip
         every_s = service.checkpoint.every_s
@@ -165,7 +165,7 @@ class LiveDive:
         """Give everything back; an unfinished dive keeps what it can be resumed from."""
         keep = not self._finished
         for close in (
-            self._guard.close,
+            self._watchdog.close,
             self.feed.close,
             partial(self.parts.slam.close, keep),
             partial(self.folder.close, keep),

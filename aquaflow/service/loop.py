@@ -14,8 +14,8 @@ from aquaflow.errors import AquaFlowError
 from aquaflow.messages import Dropped, Frame
 from aquaflow.service.feed import Feed
 from aquaflow.service.health.counters import Counters
-from aquaflow.service.health.degradation import Ladder, Level
-from aquaflow.service.health.heartbeats import Beats
+from aquaflow.service.health.degradation import Degradation, DegradationLevel
+from aquaflow.service.health.heartbeats import Heartbeats
 from aquaflow.service.health.pressure import Pressure
 from aquaflow.service.health.state import Facts, Health, State, judged
 from aquaflow.service.health.systemd import Notifier
@@ -50,14 +50,14 @@ class LiveLoop:
         feed: Feed,
         maps: MapThread,
         config: ServiceConfig,
-        beats: Beats,
-        ladder: Ladder,
+        heartbeats: Heartbeats,
+        degradation: Degradation,
         pressure: Callable[[], Pressure],
         notifier: Notifier,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self.run_, self.feed, self.maps, self.config = run, feed, maps, config
-        self.beats, self.ladder, self.notifier = beats, ladder, notifier
+        self.heartbeats, self.degradation, self.notifier = heartbeats, degradation, notifier
         self.stopping = threading.Event()
         """Setting it ends the dive cleanly; may be done in a signal handler."""
         self.health, self.counters = Health(now_s), Counters(run.profiler, now_s)
@@ -103,7 +103,7 @@ class LiveLoop:
     def stop(self, reason: str) -> None:
         """Say that the end has come."""
         self.health.set(State.STOPPING, reason)
-        self.beats.retire(STAGE)  # from here on systemd's timeout of stopping counts
+        self.heartbeats.retire(STAGE)  # from here on systemd's timeout of stopping counts
         self.notifier.stopping()
         self._tell()
 
@@ -112,9 +112,9 @@ class LiveLoop:
         return {
             **self.counters.to_json(),
             "overtaken": self.feed.newest.overtaken,
-            "level": self.ladder.level.words,
-            "steps_down": self.ladder.steps_down,
-            "steps_up": self.ladder.steps_up,
+            "level": self.degradation.level.words,
+            "steps_down": self.degradation.steps_down,
+            "steps_up": self.degradation.steps_up,
             "visits": {state.value: count for state, count in self.health.visits.items()},
             "left_out_of_the_map": dict(self.maps.left_out),
             "mapping_failures": self.maps.failures,
@@ -127,9 +127,9 @@ class LiveLoop:
 
     def _frame(self, frame: Frame) -> None:
         self.picture = frame
-        if self.ladder.level is Level.RECORDING_ONLY:
+        if self.degradation.level is DegradationLevel.RECORDING_ONLY:
             self.run_.drop(
-                Dropped(frame.index, frame.t_ns, f"recording only: {self.ladder.reason}")
+                Dropped(frame.index, frame.t_ns, f"recording only: {self.degradation.reason}")
             )
         else:
             self._track(frame)
@@ -181,11 +181,11 @@ class LiveLoop:
     # --- between frames -------------------------------------------------------------------------
 
     def _tend(self) -> None:
-        self.beats.beat(STAGE)
+        self.heartbeats.beat(STAGE)
         contain = self.run_.slam.failures.contain
         with contain("resource check"):
-            self.ladder.look(self._need)
-            self.counters.look()
+            self.degradation.update(self._need)
+            self.counters.update()
         with contain("health state"):
             self.health.set(*judged(self._facts()))
         for watch in self.watchers:
@@ -213,8 +213,8 @@ class LiveLoop:
 
     def _troubles(self, devices: dict[str, dict[str, object]]) -> list[str]:
         troubles = []
-        if self.ladder.level is not Level.FULL:
-            troubles.append(f"{self.ladder.level.words}: {self.ladder.reason}")
+        if self.degradation.level is not DegradationLevel.FULL:
+            troubles.append(f"{self.degradation.level.words}: {self.degradation.reason}")
         if self.pressure.disk_is_full(self.config.limits):
             troubles.append(f"disk full: {self.pressure.disk_free_mb:.0f} MB left")
         if self.maps.failing:
@@ -234,5 +234,5 @@ class LiveLoop:
         if state not in (State.STARTING, State.STOPPING):
             self.notifier.ready()
         self.notifier.status(f"{state.value}: {self.health.reason}")
-        if self.beats.hung(self.config.hang_s) is None:
+        if self.heartbeats.hung(self.config.hang_s) is None:
             self.notifier.alive()

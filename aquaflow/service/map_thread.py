@@ -22,8 +22,8 @@ from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.maps import Growth, Insertion, Maps, Progress
 from aquaflow.mapping.views import View
 from aquaflow.service.half_size import halved
-from aquaflow.service.health.degradation import Level
-from aquaflow.service.health.heartbeats import Beats
+from aquaflow.service.health.degradation import DegradationLevel
+from aquaflow.service.health.heartbeats import Heartbeats
 
 log = logging.getLogger(__name__)
 
@@ -63,8 +63,8 @@ class MapThread:
         self,
         maps: Maps,
         config: LiveMappingConfig,
-        beats: Beats,
-        level: Callable[[], Level] = lambda: Level.FULL,
+        heartbeats: Heartbeats,
+        level: Callable[[], DegradationLevel] = lambda: DegradationLevel.FULL,
         rest: Callable[[float], object] | None = None,
     ) -> None:
         """``rest`` for some seconds, from which ``refine`` and ``close`` wake the thread."""
@@ -79,7 +79,7 @@ class MapThread:
         """Set by tracking that is late: the thread then rests as long as it worked."""
         self.rests = 0
         """Requests after which it did."""
-        self._maps, self._config, self._beats, self._level = maps, config, beats, level
+        self._maps, self._config, self._heartbeats, self._level = maps, config, heartbeats, level
         self._jobs: deque[tuple[str, Job]] = deque()
         self._growing = 0
         """Growths that wait."""
@@ -100,16 +100,16 @@ class MapThread:
             return
         level = self._level()
         growth = replace(growth, retired=tuple(map(_owned, growth.retired)))
-        if level >= Level.FEWER_STEPS:
+        if level >= DegradationLevel.FEWER_STEPS:
             growth = replace(growth, steps=growth.steps // FEWER)
-        if level >= Level.SMALLER_IMAGES:
+        if level >= DegradationLevel.SMALLER_IMAGES:
             growth = halved(growth)
         with self._changed:
             self._growing += 1
         self._post("grow", partial(self._grow, growth))
 
     def hold_out(self, view: View, sub_map: int) -> None:
-        if self._level() < Level.TRACKING_ONLY:
+        if self._level() < DegradationLevel.TRACKING_ONLY:
             self._post("hold out", lambda maps: maps.hold_out(view, sub_map))
 
     def insert(self, insertion: Insertion) -> None:
@@ -128,13 +128,13 @@ class MapThread:
 
     def refine(self, progress: Progress | None = None) -> None:
         self._end()
-        if self._level() is Level.FULL:  # what fails here must not cost the map as it is
+        if self._level() is DegradationLevel.FULL:  # what fails here must not cost the map as it is
             self._do("refine", lambda maps: maps.refine(self._beating(progress)))
-        self._beats.retire(STAGE)
+        self._heartbeats.retire(STAGE)
 
     def close(self, keep: bool = False) -> None:
         self._end()
-        self._beats.retire(STAGE)
+        self._heartbeats.retire(STAGE)
         self._maps.close(keep)
 
     @property
@@ -153,7 +153,7 @@ class MapThread:
     # --- the thread -----------------------------------------------------------------------------
 
     def _refused(self, growth: Growth) -> str | None:
-        if self._level() >= Level.TRACKING_ONLY:
+        if self._level() >= DegradationLevel.TRACKING_ONLY:
             return "tracking only"
         backlog, waiting = self._config.backlog, self._growing
         if waiting >= backlog and growth.view.robust:
@@ -180,7 +180,7 @@ class MapThread:
         with contextlib.suppress(OSError):  # a sandbox may forbid it
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self._config.nice)
         while True:
-            self._beats.beat(STAGE)
+            self._heartbeats.beat(STAGE)
             job = self._next()
             if job is None and self._ending.is_set():
                 return
@@ -216,7 +216,7 @@ class MapThread:
 
     def _wanting(self) -> Mapper | None:
         """The map that is to have steps in idle time."""
-        if self._newest is None or self._level() is not Level.FULL:
+        if self._newest is None or self._level() is not DegradationLevel.FULL:
             return None
         mapper = self._maps.mappers.get(self._newest)
         if mapper is None or len(mapper.gaussians) == 0:
@@ -232,7 +232,7 @@ class MapThread:
 
     def _beating(self, progress: Progress | None) -> Progress:
         def beat(done: int, total: int) -> None:
-            self._beats.beat(STAGE)
+            self._heartbeats.beat(STAGE)
             if progress is not None:
                 progress(done, total)
 
@@ -243,7 +243,7 @@ class MapThread:
         with self._changed:
             self._ending.set()
             self._changed.notify()
-        while self._thread.is_alive():  # the guard ends the process if the thread hangs
+        while self._thread.is_alive():  # the watchdog ends the process if the thread hangs
             self._thread.join(JOIN_S)
 
 

@@ -20,7 +20,7 @@ CHANGES_TOLD = 10
 def report(parts: Parts, hang_s: float, now_s: float | None = None) -> dict[str, Any]:
     """Stable keys; may be asked for from any thread."""
     loop, now = parts.loop, time.monotonic() if now_s is None else now_s
-    health, hung = loop.health, loop.beats.hung(hang_s)
+    health, hung = loop.health, loop.heartbeats.hung(hang_s)
     return {
         "version": __version__,
         "state": health.state.value,

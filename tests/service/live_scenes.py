@@ -21,8 +21,8 @@ from aquaflow.mapping.maps import Growth, Insertion, Maps
 from aquaflow.messages import CameraModel, Dropped, Frame
 from aquaflow.service.dive_clock import Continued
 from aquaflow.service.feed import Heard
-from aquaflow.service.health.degradation import Ladder
-from aquaflow.service.health.heartbeats import Beats
+from aquaflow.service.health.degradation import Degradation
+from aquaflow.service.health.heartbeats import Heartbeats
 from aquaflow.service.health.pressure import Pressure
 from aquaflow.service.health.systemd import Notifier
 from aquaflow.service.live_dive import LiveDive
@@ -128,19 +128,19 @@ class Told:
     """A live loop of which the test holds every end."""
 
     def __init__(self, folder: Path, config: Config = SETTINGS, **service: object) -> None:
-        self.clock, self.feed, self.beats = Clock(), ToldFeed(), Beats()
+        self.clock, self.feed, self.heartbeats = Clock(), ToldFeed(), Heartbeats()
         self.pressure = CALM
         self.config = ServiceConfig.model_validate(service)
-        self.ladder = Ladder(self.config.limits, self.clock)
+        self.degradation = Degradation(self.config.limits, self.clock)
         self.maps = MapThread(
-            Maps(config), self.config.mapping, self.beats, lambda: self.ladder.level
+            Maps(config), self.config.mapping, self.heartbeats, lambda: self.degradation.level
         )
         self.dive = DiveFolder(folder, config)
         self.slam = Slam(config, live=True, maps=self.maps)
         self.run = ToldRun("told", self.dive, config, self.slam, None, self.feed.name_of)
         self.notifier = Notifier({})
         self.loop = LiveLoop(
-            self.run, self.feed, self.maps, self.config, self.beats, self.ladder,
+            self.run, self.feed, self.maps, self.config, self.heartbeats, self.degradation,
             lambda: self.pressure, self.notifier, self.clock,
         )  # fmt: skip
 

@@ -10,7 +10,7 @@ import pytest
 
 from aquaflow.errors import AquaFlowError
 from aquaflow.messages import Dropped
-from aquaflow.service.health.degradation import Level
+from aquaflow.service.health.degradation import DegradationLevel
 from aquaflow.service.health.state import State
 from tests.service.live_scenes import CALM, Told, frame_of, rows_of, visited
 
@@ -77,16 +77,16 @@ def test_memory_pressure_goes_down_the_stated_steps_and_climbs_back(told: Told) 
     levels = []
     for _ in range(5):
         told.idle(told.config.limits.look_s)
-        levels.append(told.ladder.level)
-    assert levels == [*list(Level)[1:], Level.RECORDING_ONLY]
+        levels.append(told.degradation.level)
+    assert levels == [*list(DegradationLevel)[1:], DegradationLevel.RECORDING_ONLY]
     told.frames("p", first=50)
     assert "2 % of the memory" in told.loop.health.reason
     assert "recording only" in list(rows_of(told.dive.path))[-1]
     told.pressure = CALM
     for _ in range(60):
         told.idle(told.config.limits.look_s)
-    assert told.ladder.level is Level.FULL
-    assert (told.ladder.steps_down, told.ladder.steps_up) == (4, 4)
+    assert told.degradation.level is DegradationLevel.FULL
+    assert (told.degradation.steps_down, told.degradation.steps_up) == (4, 4)
     told.frames("p", first=60)
     assert told.loop.health.state is State.TRACKING
 
@@ -103,18 +103,18 @@ def test_heat_and_a_full_gpu_are_pressure_too(
 ) -> None:
     told.pressure = replace(CALM, **short)
     told.idle(told.config.limits.look_s)
-    assert told.ladder.level is Level.FEWER_STEPS
-    assert says in told.ladder.reason
+    assert told.degradation.level is DegradationLevel.FEWER_STEPS
+    assert says in told.degradation.reason
 
 
-def test_a_full_disk_degrades_but_costs_no_step_of_the_ladder(told: Told) -> None:
+def test_a_full_disk_degrades_but_costs_no_degradation_level(told: Told) -> None:
     told.frames("pp")
     told.pressure = replace(CALM, disk_free_mb=3.0)
     told.idle(told.config.limits.look_s)
     told.frames("p", first=5)
     assert told.loop.health.state is State.DEGRADED
     assert "disk full: 3 MB" in told.loop.health.reason
-    assert told.ladder.level is Level.FULL
+    assert told.degradation.level is DegradationLevel.FULL
     told.pressure = CALM
     told.idle(told.config.limits.look_s)
     told.frames("p", first=6)

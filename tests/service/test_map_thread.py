@@ -14,8 +14,8 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
 from aquaflow.mapping.maps import Growth, Insertion
 from aquaflow.mapping.views import View
-from aquaflow.service.health.degradation import Level
-from aquaflow.service.health.heartbeats import Beats
+from aquaflow.service.health.degradation import DegradationLevel
+from aquaflow.service.health.heartbeats import Heartbeats
 from aquaflow.service.map_thread import LONGEST_REST_S, STAGE, MapThread
 from tests.service.live_scenes import HEIGHT, WIDTH, RecordedMaps
 
@@ -26,11 +26,11 @@ class Beside:
     """A mapping thread that can be held up."""
 
     def __init__(self) -> None:
-        self.maps, self.beats, self.level = RecordedMaps(), Beats(), Level.FULL
+        self.maps, self.heartbeats, self.level = RecordedMaps(), Heartbeats(), DegradationLevel.FULL
         self.rested_s: list[float] = []
         config = LiveMappingConfig(backlog=2, nice=0)
         self.thread = MapThread(
-            self.maps, config, self.beats, lambda: self.level, self.rested_s.append
+            self.maps, config, self.heartbeats, lambda: self.level, self.rested_s.append
         )
 
     def hold(self) -> threading.Event:
@@ -90,12 +90,14 @@ def test_a_keyframe_that_the_map_never_saw_does_not_retire_into_it(beside: Besid
 @pytest.mark.parametrize(
     ("level", "asked"),
     [
-        (Level.FEWER_STEPS, ["grow 0 64px 2"]),
-        (Level.SMALLER_IMAGES, ["grow 0 32px 2"]),
-        (Level.TRACKING_ONLY, []),
+        (DegradationLevel.FEWER_STEPS, ["grow 0 64px 2"]),
+        (DegradationLevel.SMALLER_IMAGES, ["grow 0 32px 2"]),
+        (DegradationLevel.TRACKING_ONLY, []),
     ],
 )
-def test_each_level_asks_for_less(beside: Beside, level: Level, asked: list[str]) -> None:
+def test_each_level_asks_for_less(
+    beside: Beside, level: DegradationLevel, asked: list[str]
+) -> None:
     beside.level = level
     beside.thread.grow(growth(0))
     beside.thread.close()
@@ -178,6 +180,6 @@ def test_an_idle_thread_shows_that_it_lives_and_a_closed_one_is_not_missed(
     beside: Beside,
 ) -> None:
     beside.hold().set()
-    assert beside.beats.ages_s()[STAGE] < 20.0
+    assert beside.heartbeats.ages_s()[STAGE] < 20.0
     beside.thread.close()
-    assert STAGE not in beside.beats.ages_s()
+    assert STAGE not in beside.heartbeats.ages_s()

@@ -46,8 +46,8 @@ class Counters:
         self._lags_ms.append(lag_ms)
         return lag_ms
 
-    def look(self) -> None:
-        """Work out rates and shares, now and then."""
+    def update(self) -> None:
+        """Compute rates and shares, once a window of ``WINDOW_S``."""
         now, (since, frames, totals) = self._now_s(), self._window
         if now - since < WINDOW_S:
             return

@@ -12,8 +12,8 @@ from aquaflow.config.service import LimitsConfig
 log = logging.getLogger(__name__)
 
 
-class Level(IntEnum):
-    """What is still done, from everything down."""
+class DegradationLevel(IntEnum):
+    """What the service still does; a higher level does less."""
 
     FULL = 0
     FEWER_STEPS = 1
@@ -31,37 +31,37 @@ class Level(IntEnum):
         return self.name.lower().replace("_", " ")
 
 
-class Ladder:
-    """One step down at each look that finds a need, one up after a calm while."""
+class Degradation:
+    """The level: one down at each check that finds a shortage, one up after a calm period."""
 
     def __init__(self, config: LimitsConfig, now_s: Callable[[], float] = time.monotonic) -> None:
-        self.level = Level.FULL
+        self.level = DegradationLevel.FULL
         self.reason = ""
-        """Why it is not the full level."""
+        """Why the level is not FULL."""
         self.steps_down = 0
         self.steps_up = 0
         self._config, self._now_s = config, now_s
-        self._looked_s = now_s()
+        self._updated_s = now_s()
         self._needed_s = now_s()
 
-    def look(self, need: Callable[[], str | None]) -> None:
-        """Ask ``need`` now and then: a clause that says what runs short, or None."""
+    def update(self, need: Callable[[], str | None]) -> None:
+        """Every ``look_s``: ask ``need`` which resource runs short (a clause), or None."""
         now = self._now_s()
-        if now - self._looked_s < self._config.look_s:
+        if now - self._updated_s < self._config.look_s:
             return
-        self._looked_s = now
+        self._updated_s = now
         short = need()
         if short is not None:
             self._needed_s, self.reason = now, short
-            if self.level < Level.RECORDING_ONLY:
+            if self.level < DegradationLevel.RECORDING_ONLY:
                 self.steps_down += 1
-                self._move(Level(self.level + 1), short)
-        elif self.level > Level.FULL and now - self._needed_s >= self._config.calm_s:
+                self._move(DegradationLevel(self.level + 1), short)
+        elif self.level > DegradationLevel.FULL and now - self._needed_s >= self._config.calm_s:
             self._needed_s = now
             self.steps_up += 1
-            self._move(Level(self.level - 1), "calm again")
-            self.reason = "" if self.level is Level.FULL else self.reason
+            self._move(DegradationLevel(self.level - 1), "calm again")
+            self.reason = "" if self.level is DegradationLevel.FULL else self.reason
 
-    def _move(self, level: Level, why: str) -> None:
+    def _move(self, level: DegradationLevel, why: str) -> None:
         log.warning("from '%s' to '%s': %s", self.level.words, level.words, why)
         self.level = level

@@ -15,7 +15,7 @@ COUNTERS = {
     "failures": "Frames that raised, each costing itself.",
     "overtaken": "Frames that a newer one overtook.",
     "mapping_failures": "Requests to the map that raised.",
-    "steps_down": "Steps down the ladder of degradation.",
+    "steps_down": "Steps down to a lower degradation level.",
     "steps_up": "Steps back up.",
     "telemetry_samples": "Telemetry samples received.",
 }

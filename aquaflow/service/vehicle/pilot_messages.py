@@ -46,7 +46,7 @@ class VehicleReport:
             lag = loop.counters.lag_ms()["p95"] or 0.0
             for name, value in (
                 ("AQ_STATE", float(state.number)),
-                ("AQ_LEVEL", float(loop.ladder.level)),
+                ("AQ_LEVEL", float(loop.degradation.level)),
                 ("AQ_LAG_MS", lag),
                 ("AQ_FPS", loop.counters.fps),
             ):

@@ -1,4 +1,4 @@
-"""Signs of life: what the guard and systemd hear, and what they do not."""
+"""Heartbeats: what the watchdog and systemd receive, and what they do not."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from aquaflow.service.health.heartbeats import Beats, Guard
+from aquaflow.service.health.heartbeats import Heartbeats, Watchdog
 from aquaflow.service.health.systemd import Notifier
 from tests.service.live_scenes import Clock, Told
 
@@ -66,31 +66,31 @@ def test_a_watchdog_of_another_process_is_not_fed(manager: socket.socket) -> Non
 
 def test_the_silent_stage_is_found_and_a_retired_one_is_not() -> None:
     clock = Clock()
-    beats = Beats(clock)
-    beats.beat("tracking")
-    beats.beat("mapping")
+    heartbeats = Heartbeats(clock)
+    heartbeats.beat("tracking")
+    heartbeats.beat("mapping")
     clock.pass_(50.0)
-    beats.beat("tracking")
-    assert beats.hung(60.0) is None
+    heartbeats.beat("tracking")
+    assert heartbeats.hung(60.0) is None
     clock.pass_(20.0)
-    assert beats.hung(60.0) == "mapping"
-    beats.retire("mapping")
-    assert beats.hung(60.0) is None
+    assert heartbeats.hung(60.0) == "mapping"
+    heartbeats.retire("mapping")
+    assert heartbeats.hung(60.0) is None
 
 
-def test_the_guard_ends_the_process_of_a_hung_stage() -> None:
+def test_the_watchdog_ends_the_process_of_a_hung_stage() -> None:
     clock, ended = Clock(), threading.Event()
-    beats, told = Beats(clock), []
+    heartbeats, told = Heartbeats(clock), []
 
     def end(stage: str, silent_s: float) -> None:
         told.append((stage, silent_s))
         ended.set()
 
-    beats.beat("mapping")
+    heartbeats.beat("mapping")
     clock.pass_(61.0)
-    guard = Guard(beats, 60.0, end, look_s=0.01)
+    watchdog = Watchdog(heartbeats, 60.0, end, look_s=0.01)
     assert ended.wait(20.0)
-    guard.close()
+    watchdog.close()
     assert told == [("mapping", 61.0)]
 
 
@@ -102,6 +102,6 @@ def test_the_loop_feeds_the_watchdog_only_while_mapping_lives(
     told.idle(1.0)
     assert "WATCHDOG=1" in heard(manager)
     told.close()  # the mapping thread has ended, so that nobody beats for it
-    told.beats._last_s["mapping"] = told.beats._now_s() - 2 * told.config.hang_s
+    told.heartbeats._last_s["mapping"] = told.heartbeats._now_s() - 2 * told.config.hang_s
     told.idle(1.0)
     assert "WATCHDOG=1" not in heard(manager)
