@@ -9,18 +9,18 @@ from dataclasses import dataclass
 log = logging.getLogger(__name__)
 
 JUMP_NS = 500_000_000
-"""NTP slews by 0.5 ms/s; more than this between two looks is a clock being set."""
+"""NTP slews by 0.5 ms/s; more than this between two readings is a clock being set."""
 
 
 @dataclass(frozen=True)
 class WallClockReading:
-    """One look at both clocks."""
+    """Both clocks, read at the same moment."""
 
     monotonic_ns: int
     offset_ns: int
     """CLOCK_REALTIME minus CLOCK_MONOTONIC."""
     jump_ns: int
-    """Change since the look before, if that is a jump; else 0."""
+    """Change since the previous reading, if that is a jump; else 0."""
 
 
 class WallClockWatch:
@@ -30,10 +30,10 @@ class WallClockWatch:
         self.jumps = 0
         self._last_offset_ns: int | None = None
 
-    def look(
+    def read(
         self, monotonic_ns: int | None = None, realtime_ns: int | None = None
     ) -> WallClockReading:
-        """Read both clocks, or take what a recording says they were."""
+        """Read both clocks; a recording passes its own values instead."""
         monotonic = time.monotonic_ns() if monotonic_ns is None else monotonic_ns
         realtime = time.time_ns() if realtime_ns is None else realtime_ns
         offset = realtime - monotonic

@@ -72,7 +72,7 @@ class DiveWriter:
 
     def flush(self) -> None:
         """Bring everything to the disk, with the clocks and the counts of this moment."""
-        now = self._watch.look()
+        now = self._watch.read()
         self._status.wall_clock_jumps = self._watch.jumps
         self._json("/clock", "WallClock", vars(now), now.monotonic_ns)
         self._json("/recorder", "Recorder", self._status.to_json(), now.monotonic_ns)
@@ -97,7 +97,7 @@ class DiveWriter:
         self._status.files.append(path)
         self._announced: set[str] = set()
         self._masks.clear()
-        clock = self._watch.look()
+        clock = self._watch.read()
         facts = {
             "format": FORMAT,
             "version": __version__,

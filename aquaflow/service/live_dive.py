@@ -127,7 +127,7 @@ class LiveDive:
         every_s = service.checkpoint.every_s
         checkpointer = Checkpointer(self.folder.path, run, slam, thread, every_s, feed.clocks)
         loop.watchers.append(
-            lambda live: checkpointer.look(live.pressure.disk_is_full(service.limits))
+            lambda live: checkpointer.take_if_due(live.pressure.disk_is_full(service.limits))
         )
         return Parts(loop, slam, run, thread, checkpointer, choice)
 

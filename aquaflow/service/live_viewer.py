@@ -25,11 +25,11 @@ log = logging.getLogger(__name__)
 LONGEST_PATH = 5000
 """Poses of the trajectory that are shown at most: thinned beyond."""
 LOOK_S = 0.1
-"""Wait for a new pose, until the thread looks whether it shall end."""
+"""Longest wait for a new pose; then the thread checks whether it shall end."""
 
 
 class LiveWindow:
-    """Takes what is new from the loop and the maps, and shows it from a thread of its own."""
+    """Takes new data from the loop and the maps, and shows them from its own thread."""
 
     def __init__(
         self, config: ViewerConfig, maps: MapThread, report: Callable[[], dict[str, Any]]
@@ -52,8 +52,8 @@ class LiveWindow:
         """Gaussians that a browser gets at the moment."""
         return self._window.splats_shown
 
-    def look(self, loop: LiveLoop) -> None:
-        """Called by the loop after every turn; hands over, and never waits."""
+    def update(self, loop: LiveLoop) -> None:
+        """Called after every turn of the loop; queues what is new for the browser, never waits."""
         now, latest, frame = time.monotonic(), loop.latest, loop.picture
         if latest is None or frame is None or latest.T_wc is None:
             return
@@ -63,7 +63,7 @@ class LiveWindow:
         if now - self._map_s >= self._config.refresh_s and not self._asked:
             self._map_s, self._asked = now, True
             sub_map = latest.sub_map
-            self._maps.look("show the map", lambda maps, _: self._copy(maps, sub_map))
+            self._maps.inspect("show the map", lambda maps, _: self._copy(maps, sub_map))
 
     def close(self) -> None:
         self._closing.set()

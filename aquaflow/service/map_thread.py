@@ -118,9 +118,9 @@ class MapThread:
     def correct(self, moves: Mapping[int, Sim3], merged: Mapping[int, int]) -> None:
         self._post("correct", Correction(moves, merged))
 
-    def look(self, name: str, job: Callable[[Maps, list[Correction]], None]) -> None:
-        """Let ``job`` see the maps before anything else is done to them; it is also told which
-        corrections they still lack to agree with tracking as it is now."""
+    def inspect(self, name: str, job: Callable[[Maps, list[Correction]], None]) -> None:
+        """Run ``job`` on the maps before all waiting requests; its second argument is the
+        corrections that tracking has made and the maps do not contain yet."""
         with self._changed:
             lacking = [job for _, job in self._jobs if isinstance(job, Correction)]
             self._jobs.appendleft((name, lambda maps: job(maps, lacking)))

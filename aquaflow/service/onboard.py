@@ -57,16 +57,16 @@ def map_live(
             server = HealthServer(service.health, lambda: report(dive.parts, service.hang_s))
             around.callback(partial(_closed, dive, server.close))
         watchers = dive.parts.loop.watchers
-        watchers.append(VehicleReport(service.report, feed).look)
+        watchers.append(VehicleReport(service.report, feed).update)
         if service.pose.enabled:
             scale = metric_scale(dive.parts.slam)
-            watchers.append(PoseOut(service.pose, feed, scale).look)
+            watchers.append(PoseOut(service.pose, feed, scale).update)
         if vehicle.viewer.enabled:
             window = LiveWindow(
                 vehicle.viewer, dive.parts.maps, lambda: report(dive.parts, service.hang_s)
             )
             around.callback(partial(_closed, dive, window.close))
-            watchers.append(window.look)
+            watchers.append(window.update)
         around.callback(_stop_after(seconds, dive).cancel)
         return dive.run(progress)
 

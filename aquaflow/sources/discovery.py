@@ -35,20 +35,20 @@ Discover: TypeAlias = Callable[[], list[FoundDevice]]
 
 @dataclass(frozen=True)
 class Found:
-    """Everything found, and the kinds that could not be looked for."""
+    """The devices found, and the errors of drivers that failed."""
 
     devices: list[FoundDevice]
     problems: list[str]
 
 
 def discover() -> Found:
-    """Ask every installed driver; one that fails costs only its own devices."""
+    """Ask every installed driver; a driver that fails is reported in ``problems``."""
     devices: list[FoundDevice] = []
     problems: list[str] = []
     for entry in sorted(entry_points(group=DISCOVERY), key=lambda each: each.name):
         try:
-            look: Discover = entry.load()
-            devices += look()
+            discover_devices: Discover = entry.load()
+            devices += discover_devices()
         except Exception as error:  # a broken driver of a site must not hide the others
             problems.append(f"{entry.name}: {error}")
     return Found(devices, problems)

@@ -227,7 +227,7 @@ def test_a_wall_clock_jump_of_three_hours_is_logged_and_changes_nothing(
     jump_ns = 3 * 3600 * SECOND
     for k, arrival_ns in enumerate(messages.arrival_ns.tolist()):
         wall_ns = 1_700_000_000 * SECOND + arrival_ns + (jump_ns if k >= 2000 else 0)
-        reading = watch.look(arrival_ns, wall_ns)
+        reading = watch.read(arrival_ns, wall_ns)
         assert reading.jump_ns == (jump_ns if k == 2000 else 0)
         watched.add(int(messages.device_ns[k]), arrival_ns)
     assert watched.report() == alone.report()
@@ -238,15 +238,15 @@ def test_a_wall_clock_jump_of_three_hours_is_logged_and_changes_nothing(
 def test_a_slewed_wall_clock_is_no_jump() -> None:
     watch = WallClockWatch()
     for k in range(100):
-        watch.look(k * SECOND, 10**18 + k * SECOND + k * MS // 2)
+        watch.read(k * SECOND, 10**18 + k * SECOND + k * MS // 2)
     assert watch.jumps == 0
 
 
 def test_the_watch_reads_the_systems_clocks() -> None:
     watch = WallClockWatch()
-    reading = watch.look()
+    reading = watch.read()
     assert reading.offset_ns > 0
-    assert watch.look().jump_ns == 0
+    assert watch.read().jump_ns == 0
 
 
 def test_a_restarted_process_goes_on_with_what_the_one_before_knew() -> None:

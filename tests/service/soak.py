@@ -128,7 +128,7 @@ class Sampler:
         self._file.write_text(",".join(field.name for field in fields(Sample)) + "\n")
         self._began_s = time.monotonic()
 
-    def look(self, loop: LiveLoop) -> None:
+    def update(self, loop: LiveLoop) -> None:
         due = self._every * (1 + len(self.samples))
         if loop.counters.frames >= due:
             assert not self._url or ask(self._url)["frames"] >= due
@@ -182,7 +182,7 @@ def soak(frames: int, folder: Path, vehicle: VehicleConfig = VEHICLE) -> list[Sa
         try:
             url = f"http://127.0.0.1:{server.port}"
             sampler = Sampler(dive, max(1, frames // SAMPLES), folder / "soak.csv", url)
-            dive.parts.loop.watchers.append(sampler.look)
+            dive.parts.loop.watchers.append(sampler.update)
             dive.run()
         finally:
             server.close()

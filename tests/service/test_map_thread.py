@@ -41,7 +41,7 @@ class Beside:
             going.set()
             held.wait(20.0)
 
-        self.thread.look("wait", wait)
+        self.thread.inspect("wait", wait)
         assert going.wait(20.0)
         return held
 
@@ -142,7 +142,7 @@ def test_idle_steps_go_on_until_the_views_that_are_kept_have_had_theirs(beside: 
 def test_mapping_rests_as_long_as_it_worked_while_tracking_is_late(beside: Beside) -> None:
     beside.hold().set()
     done = threading.Event()
-    beside.thread.look("see", lambda maps, lacking: done.set())
+    beside.thread.inspect("see", lambda maps, lacking: done.set())
     assert done.wait(20.0)
     assert beside.rested_s == []
     beside.thread.late = True
@@ -169,7 +169,7 @@ def test_a_refinement_that_fails_leaves_the_map_as_it_is(
 def test_a_look_is_told_the_corrections_that_still_wait(beside: Beside) -> None:
     held, told = beside.hold(), []
     beside.thread.correct({3: Sim3.identity()}, {1: 0})
-    beside.thread.look("look", lambda maps, lacking: told.append(lacking))
+    beside.thread.inspect("look", lambda maps, lacking: told.append(lacking))
     held.set()
     beside.thread.close()
     ((correction,),) = told

@@ -47,10 +47,10 @@ def test_views_files_threads_and_descriptors_of_a_live_dive_are_bounded(
         for frame in itertools.islice(Rounds(small_recording, 0).pictures(), ROUNDS * 24):
             dive.parts.loop.take(frame)
             caught_up(dive)
-            sampler.look(dive.parts.loop)
+            sampler.update(dive.parts.loop)
         dive.parts.checkpointer.take()
         caught_up(dive)
-        sampler.look(dive.parts.loop)
+        sampler.update(dive.parts.loop)
     last = sampler.samples[-1]
     assert last.posed > 0.8 * ROUNDS * 24
     assert last.keyframes < last.views <= 2 * MOST_VIEWS * last.keyframes

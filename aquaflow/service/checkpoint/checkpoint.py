@@ -62,7 +62,7 @@ class Checkpointer:
         self._due_s = now_s() + every_s
         self._writing = False
 
-    def look(self, disk_is_full: bool) -> None:
+    def take_if_due(self, disk_is_full: bool) -> None:
         """Take a checkpoint if it is time, the last one is done, and there is room."""
         if self._now_s() < self._due_s or self._writing or disk_is_full:
             return
@@ -89,7 +89,7 @@ class Checkpointer:
             self._write(maps, lacking, head, arrays, files)
 
         self._writing = True
-        self._maps.look("write a checkpoint", write)
+        self._maps.inspect("write a checkpoint", write)
 
     def _write(
         self,

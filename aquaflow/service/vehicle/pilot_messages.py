@@ -33,8 +33,8 @@ class VehicleReport:
         self._said: State | None = None
         self._said_s = self._told_s = -SPACING_S
 
-    def look(self, loop: LiveLoop, now_s: float | None = None) -> None:
-        """Called after every turn."""
+    def update(self, loop: LiveLoop, now_s: float | None = None) -> None:
+        """Called after every turn of the loop; sends what is new or due."""
         now = time.monotonic() if now_s is None else now_s
         state = loop.health.state
         if self._config.status_text and state is not self._said and now - self._said_s >= SPACING_S:

@@ -80,7 +80,7 @@ class PoseOut:
         self._way_m = 0.0
         self._times_s: deque[float] = deque(maxlen=WINDOW)
 
-    def look(self, loop: LiveLoop, now_s: float | None = None) -> None:
+    def update(self, loop: LiveLoop, now_s: float | None = None) -> None:
         """Called after every turn; sends a pose that is new."""
         latest = loop.latest
         if latest is None or latest.T_wc is None:

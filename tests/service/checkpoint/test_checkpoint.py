@@ -161,7 +161,7 @@ def test_a_dive_that_was_cut_off_before_its_first_checkpoint_may_begin_anew(
 def test_a_full_disk_writes_no_checkpoint(cut: Cut) -> None:
     checkpointer, taken = cut.dive.parts.checkpointer, cut.dive.parts.checkpointer.taken
     checkpointer._due_s = 0.0
-    checkpointer.look(disk_is_full=True)
+    checkpointer.take_if_due(disk_is_full=True)
     caught_up(cut.dive)
     assert checkpointer.taken == taken
 
@@ -224,7 +224,7 @@ def test_the_live_window_shows_map_path_and_health(cut: Cut) -> None:
     config = ViewerConfig(port=0, splats=300)
     window = LiveWindow(config, parts.maps, lambda: report(parts, hang_s=1e6))
     try:
-        window.look(parts.loop)
+        window.update(parts.loop)
         deadline = time.monotonic() + 60.0
         while window.splats_shown == 0:
             assert time.monotonic() < deadline, "no splats were shown"

@@ -41,7 +41,7 @@ def swim(told: Told, pose: PoseOut, xs: list[float], hz: float = 10.0, sub_map: 
         T = Sim3(np.eye(3), np.array([0.0, 0.0, x]))
         quality = Quality(inlier_share=0.8)
         told.loop.latest = Tracked(frame_of(index), FrameClass.COMMON, sub_map, 0, T, quality)
-        pose.look(told.loop, 1000.0 + index / hz)
+        pose.update(told.loop, 1000.0 + index / hz)
 
 
 def poses(told: Told) -> list[BodyPose]:
@@ -93,7 +93,7 @@ def test_the_pilot_hears_of_changes_and_numbers_come_once_a_second(told: Told) -
     report = VehicleReport(told.config.report, told.feed)
     told.frames("pp")
     for tenth in range(31):
-        report.look(told.loop, tenth / 10)
+        report.update(told.loop, tenth / 10)
     sentences = [word for word in told.feed.told if isinstance(word, Sentence)]
     assert [word.text for word in sentences] == ["AquaFlow tracking: every frame has a pose"]
     numbers = [word.name for word in told.feed.told if isinstance(word, Number)]
