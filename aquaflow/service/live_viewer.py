@@ -17,8 +17,8 @@ from aquaflow.service.loop import LiveLoop
 from aquaflow.service.map_thread import MapThread
 from aquaflow.sources.newest import Newest
 from aquaflow.tracking.frames import Tracked
+from aquaflow.viewer.page import ViewerPage
 from aquaflow.viewer.snapshot import MapCopy, Pose, copied, shown
-from aquaflow.viewer.window import Window
 
 log = logging.getLogger(__name__)
 
@@ -28,16 +28,16 @@ LOOK_S = 0.1
 """Longest wait for a new pose; then the thread checks whether it shall end."""
 
 
-class LiveWindow:
+class LiveViewer:
     """Takes new data from the loop and the maps, and shows them from its own thread."""
 
     def __init__(
         self, config: ViewerConfig, maps: MapThread, report: Callable[[], dict[str, Any]]
     ) -> None:
-        """Raises what :class:`Window` raises."""
+        """Raises what :class:`ViewerPage` raises."""
         self._config, self._maps, self._report = config, maps, report
-        self._window = Window(config, "AquaFlow")
-        self.address = self._window.address
+        self._page = ViewerPage(config, "AquaFlow")
+        self.address = self._page.address
         self._poses: Newest[Pose] = Newest()
         self._copies: Newest[MapCopy] = Newest()
         self._path: list[tuple[float, float, float, float]] = []
@@ -50,7 +50,7 @@ class LiveWindow:
     @property
     def splats_shown(self) -> int:
         """Gaussians that a browser gets at the moment."""
-        return self._window.splats_shown
+        return self._page.splats_shown
 
     def update(self, loop: LiveLoop) -> None:
         """Called after every turn of the loop; queues what is new for the browser, never waits."""
@@ -68,7 +68,7 @@ class LiveWindow:
     def close(self) -> None:
         self._closing.set()
         self._thread.join(5.0)
-        self._window.close()
+        self._page.close()
 
     def _hand_over(
         self,
@@ -103,12 +103,12 @@ class LiveWindow:
     def _show(self) -> None:
         pose = self._poses.take(LOOK_S)
         if pose is not None:
-            self._window.show_camera(pose.T_wc, pose.camera, pose.picture)
-            self._window.show_path(pose.path[:, :3], pose.path[:, 3])
+            self._page.show_camera(pose.T_wc, pose.camera, pose.picture)
+            self._page.show_path(pose.path[:, :3], pose.path[:, 3])
         copy = self._copies.take(0.0)
         if copy is not None:
-            self._window.show_splats(shown(copy, self._config.splats))
-        self._window.show_health(in_words(self._report()))
+            self._page.show_splats(shown(copy, self._config.splats))
+        self._page.show_health(in_words(self._report()))
 
 
 def in_words(report: dict[str, Any]) -> str:

@@ -19,7 +19,7 @@ from aquaflow.service.checkpoint.set_aside import SetAside
 from aquaflow.service.feed import Feed
 from aquaflow.service.health.http import HealthServer
 from aquaflow.service.live_dive import LiveDive
-from aquaflow.service.live_viewer import LiveWindow
+from aquaflow.service.live_viewer import LiveViewer
 from aquaflow.service.moment import Moment
 from aquaflow.service.report import report
 from aquaflow.service.vehicle.pilot_messages import VehicleReport
@@ -62,11 +62,11 @@ def map_live(
             scale = metric_scale(dive.parts.slam)
             watchers.append(PoseOut(service.pose, feed, scale).update)
         if vehicle.viewer.enabled:
-            window = LiveWindow(
+            viewer = LiveViewer(
                 vehicle.viewer, dive.parts.maps, lambda: report(dive.parts, service.hang_s)
             )
-            around.callback(partial(_closed, dive, window.close))
-            watchers.append(window.update)
+            around.callback(partial(_closed, dive, viewer.close))
+            watchers.append(viewer.update)
         around.callback(_stop_after(seconds, dive).cancel)
         return dive.run(progress)
 

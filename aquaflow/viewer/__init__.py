@@ -1,1 +1,1 @@
-"""The window into a dive: splats, trajectory, camera and health in a browser."""
+"""The viewer of a dive: splats, trajectory, camera and health in a browser."""

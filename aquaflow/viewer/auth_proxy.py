@@ -18,7 +18,7 @@ from aquaflow.errors import InputError
 log = logging.getLogger(__name__)
 
 PATIENCE_S = 10.0
-"""A client that does not come out with its request is let go."""
+"""A client that sends no request for so long is disconnected."""
 LONGEST_HEAD = 16_384
 """Bytes of a request until its empty line."""
 MOST_CONNECTIONS = 64
@@ -32,8 +32,8 @@ REFUSED = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 15\r\n" + CLOSING + b"Give
 """Answer to a request without the token."""
 
 
-class Door:
-    """Listens where the config says, and leads to ``port`` on this machine."""
+class AuthProxy:
+    """Listens at the configured address and forwards connections to ``port`` on this machine."""
 
     def __init__(self, config: ViewerConfig, port: int) -> None:
         """Listen at once.
@@ -54,11 +54,11 @@ class Door:
         self.port = int(self._listening.getsockname()[1])
         self._room = threading.BoundedSemaphore(MOST_CONNECTIONS)
         self._closing = False
-        self._thread = threading.Thread(target=self._run, name="viewer door", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="viewer proxy", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Let nobody in any more."""
+        """Stop listening."""
         self._closing = True
         with contextlib.suppress(OSError):
             self._listening.shutdown(socket.SHUT_RDWR)
@@ -80,13 +80,13 @@ class Door:
         try:
             with client:
                 client.settimeout(PATIENCE_S)
-                self._lead_in(client)
+                self._forward(client)
         except OSError:
             log.debug("a viewer's connection ended", exc_info=True)
         finally:
             self._room.release()
 
-    def _lead_in(self, client: socket.socket) -> None:
+    def _forward(self, client: socket.socket) -> None:
         request = _head(client)
         target, headers = _parsed(request)
         if not self._access.allows(target, headers):
@@ -101,9 +101,9 @@ class Door:
             for each in (client, inside):
                 each.settimeout(None)
             inside.sendall(request)
-            back = threading.Thread(target=_pass_on, args=(inside, client), daemon=True)
+            back = threading.Thread(target=_copy_bytes, args=(inside, client), daemon=True)
             back.start()
-            _pass_on(client, inside)
+            _copy_bytes(client, inside)
             back.join()
 
 
@@ -133,7 +133,7 @@ def _path(target: str) -> str:
     return path if safe else "/"
 
 
-def _pass_on(source: socket.socket, sink: socket.socket) -> None:
+def _copy_bytes(source: socket.socket, sink: socket.socket) -> None:
     """Bytes from one to the other until either ends; then both do."""
     with contextlib.suppress(OSError):
         while data := source.recv(BYTES):

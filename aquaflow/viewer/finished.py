@@ -1,4 +1,4 @@
-"""A finished dive in the window: ``aquaflow view DIVE``."""
+"""A finished dive in the viewer: ``aquaflow view DIVE``."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from aquaflow.errors import InputError, reason_of
 from aquaflow.export.ply import read_ply
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.geometry.similarity import Sim3, rotation_from_quaternion
+from aquaflow.viewer.page import ViewerPage
 from aquaflow.viewer.splats import Splats, splats
-from aquaflow.viewer.window import Window
 
 TUM_COLUMNS = 8
 """t_s tx ty tz qx qy qz qw"""
@@ -25,7 +25,7 @@ TUM_COLUMNS = 8
 
 @dataclass(frozen=True)
 class Dive:
-    """What the window shows of a dive folder."""
+    """What the viewer shows of a dive folder."""
 
     splats: Splats
     poses: list[Sim3]
@@ -53,26 +53,26 @@ def read_dive(folder: Path, budget: int) -> Dive:
     return Dive(shown, poses, quality, pictures, load_camera(folder / "camera.yaml"), summary)
 
 
-def show_dive(dive: Dive, config: ViewerConfig) -> Window:
-    """A window on ``dive``, with a slider along its path."""
-    window = Window(config, "AquaFlow")
-    window.show_health(dive.summary)
-    window.show_splats(dive.splats)
-    window.show_path(np.array([pose.t for pose in dive.poses]).reshape(-1, 3), dive.quality)
-    move = _mover(dive, window)
+def show_dive(dive: Dive, config: ViewerConfig) -> ViewerPage:
+    """The viewer's page of ``dive``, with a slider along its path."""
+    page = ViewerPage(config, "AquaFlow")
+    page.show_health(dive.summary)
+    page.show_splats(dive.splats)
+    page.show_path(np.array([pose.t for pose in dive.poses]).reshape(-1, 3), dive.quality)
+    move = _mover(dive, page)
     if dive.poses:
         with_picture = [i for i, picture in enumerate(dive.pictures) if picture is not None]
         first = with_picture[len(with_picture) // 2] if with_picture else 0
         move(first)
-        window.add_slider("Along the path", len(dive.poses), first, move)
-    return window
+        page.add_slider("Along the path", len(dive.poses), first, move)
+    return page
 
 
-def _mover(dive: Dive, window: Window) -> Callable[[int], None]:
+def _mover(dive: Dive, page: ViewerPage) -> Callable[[int], None]:
     def move(number: int) -> None:
         picture = dive.pictures[number]
         image = None if picture is None else _picture(picture)
-        window.show_camera(dive.poses[number], dive.camera, image)
+        page.show_camera(dive.poses[number], dive.camera, image)
 
     return move
 

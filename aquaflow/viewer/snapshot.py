@@ -1,4 +1,4 @@
-"""The live window's picture of a dive, made by threads that have no time for browsers.
+"""The live viewer's copy of a dive, made by threads that have no time for browsers.
 
 The loop and the mapping thread leave what is new in queues of one; a thread of the viewer's takes
 it from there, works out what a browser needs, and hands it to the server.

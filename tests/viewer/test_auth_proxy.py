@@ -13,7 +13,7 @@ import pytest
 
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.errors import ConfigError, InputError
-from aquaflow.viewer.auth_proxy import LONGEST_HEAD, Door
+from aquaflow.viewer.auth_proxy import LONGEST_HEAD, AuthProxy
 
 TOKEN = "correct-horse-battery"
 
@@ -41,24 +41,24 @@ def inside() -> Iterator[int]:
 
 
 @pytest.fixture
-def door(inside: int) -> Iterator[Door]:
-    door = Door(ViewerConfig(port=0), inside)
-    yield door
-    door.close()
+def proxy(inside: int) -> Iterator[AuthProxy]:
+    proxy = AuthProxy(ViewerConfig(port=0), inside)
+    yield proxy
+    proxy.close()
 
 
 @pytest.fixture
-def locked(inside: int, tmp_path: Path) -> Iterator[Door]:
+def locked(inside: int, tmp_path: Path) -> Iterator[AuthProxy]:
     file = tmp_path / "token"
     file.write_text(TOKEN)
     file.chmod(0o600)
-    door = Door(ViewerConfig(port=0, token_file=file), inside)
-    yield door
-    door.close()
+    proxy = AuthProxy(ViewerConfig(port=0, token_file=file), inside)
+    yield proxy
+    proxy.close()
 
 
-def get(door: Door, target: str, **headers: str) -> tuple[int, bytes, dict[str, str]]:
-    connection = http.client.HTTPConnection("127.0.0.1", door.port, timeout=20)
+def get(proxy: AuthProxy, target: str, **headers: str) -> tuple[int, bytes, dict[str, str]]:
+    connection = http.client.HTTPConnection("127.0.0.1", proxy.port, timeout=20)
     connection.request("GET", target, headers=headers)
     answer = connection.getresponse()
     found = answer.status, answer.read(), dict(answer.getheaders())
@@ -66,15 +66,15 @@ def get(door: Door, target: str, **headers: str) -> tuple[int, bytes, dict[str, 
     return found
 
 
-def test_on_this_machine_everybody_may_look(door: Door) -> None:
-    assert get(door, "/")[:2] == (200, b"inside")
+def test_on_this_machine_everybody_may_look(proxy: AuthProxy) -> None:
+    assert get(proxy, "/")[:2] == (200, b"inside")
 
 
-def test_a_page_of_elsewhere_may_not(door: Door) -> None:
-    assert get(door, "/", Host="evil.example")[0] == 403
+def test_a_page_of_elsewhere_may_not(proxy: AuthProxy) -> None:
+    assert get(proxy, "/", Host="evil.example")[0] == 403
 
 
-def test_the_token_goes_into_a_cookie_and_out_of_the_address(locked: Door) -> None:
+def test_the_token_goes_into_a_cookie_and_out_of_the_address(locked: AuthProxy) -> None:
     assert get(locked, "/")[0] == 403
     status, _, headers = get(locked, f"/?token={TOKEN}")
     assert (status, headers["Location"]) == (303, "/")
@@ -83,17 +83,17 @@ def test_the_token_goes_into_a_cookie_and_out_of_the_address(locked: Door) -> No
     assert get(locked, "/", Cookie=cookie + "x")[0] == 403
 
 
-def test_nobody_is_sent_to_another_server(locked: Door) -> None:
+def test_nobody_is_sent_to_another_server(locked: AuthProxy) -> None:
     _, _, headers = get(locked, f"//evil.example/?token={TOKEN}")
     assert headers["Location"] == "/"
 
 
-def test_one_who_sends_no_end_of_a_request_is_let_go_and_keeps_nobody_out(door: Door) -> None:
-    with socket.create_connection(("127.0.0.1", door.port), timeout=20) as flood:
+def test_one_who_sends_no_end_of_a_request_is_let_go_and_keeps_nobody_out(proxy: AuthProxy) -> None:
+    with socket.create_connection(("127.0.0.1", proxy.port), timeout=20) as flood:
         flood.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"x" * 100)
-        assert get(door, "/")[0] == 200
+        assert get(proxy, "/")[0] == 200
         flood.sendall(b"x" * LONGEST_HEAD)
-        assert get(door, "/")[0] == 200
+        assert get(proxy, "/")[0] == 200
 
 
 def test_an_address_beyond_loopback_needs_a_token() -> None:
@@ -101,9 +101,9 @@ def test_an_address_beyond_loopback_needs_a_token() -> None:
         ViewerConfig(enabled=True, host="0.0.0.0", port=0)
 
 
-def test_a_taken_address_is_one_sentence(door: Door, inside: int) -> None:
+def test_a_taken_address_is_one_sentence(proxy: AuthProxy, inside: int) -> None:
     with pytest.raises(InputError, match=r"viewer\.port"):
-        Door(ViewerConfig(port=door.port), inside)
+        AuthProxy(ViewerConfig(port=proxy.port), inside)
 
 
 def test_a_token_that_others_may_read_lets_nobody_in(inside: int, tmp_path: Path) -> None:
@@ -111,4 +111,4 @@ def test_a_token_that_others_may_read_lets_nobody_in(inside: int, tmp_path: Path
     file.write_text(TOKEN)
     file.chmod(0o644)
     with pytest.raises(ConfigError):
-        Door(ViewerConfig(port=0, token_file=file), inside)
+        AuthProxy(ViewerConfig(port=0, token_file=file), inside)

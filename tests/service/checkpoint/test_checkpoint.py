@@ -21,7 +21,7 @@ from aquaflow.service.checkpoint.resume import choose, is_begun, resumed
 from aquaflow.service.dive_clock import Continued
 from aquaflow.service.health.prometheus import exposition
 from aquaflow.service.live_dive import LiveDive
-from aquaflow.service.live_viewer import LiveWindow, in_words
+from aquaflow.service.live_viewer import LiveViewer, in_words
 from aquaflow.service.moment import Moment
 from aquaflow.service.report import report
 from aquaflow.sources import open_recording
@@ -222,7 +222,7 @@ def test_the_live_window_shows_map_path_and_health(cut: Cut) -> None:
     pytest.importorskip("viser", reason="viser is not installed")
     parts = cut.dive.parts
     config = ViewerConfig(port=0, splats=300)
-    window = LiveWindow(config, parts.maps, lambda: report(parts, hang_s=1e6))
+    window = LiveViewer(config, parts.maps, lambda: report(parts, hang_s=1e6))
     try:
         window.update(parts.loop)
         deadline = time.monotonic() + 60.0

@@ -71,7 +71,7 @@ def test_each_use_of_a_pair_has_another_water_and_window(clear: Pair) -> None:
     assert one.a.image.shape == (SHARD, 3, LOOKS.height, LOOKS.width)
 
 
-def test_windows_of_a_pair_see_the_same_place_mostly(clear: Pair) -> None:
+def test_pages_of_a_pair_see_the_same_place_mostly(clear: Pair) -> None:
     shares = torch.cat([overlap(training_pair(Draw(seed), clear, LOOKS)) for seed in range(8)])
     assert float(shares.median()) > 0.3
 

@@ -15,7 +15,7 @@ from aquaflow.config.viewer import ViewerConfig
 from aquaflow.errors import InputError
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.messages import CameraModel
-from aquaflow.viewer.auth_proxy import Door
+from aquaflow.viewer.auth_proxy import AuthProxy
 from aquaflow.viewer.splats import Splats, heat
 
 Float = npt.NDArray[np.floating[Any]]
@@ -34,7 +34,7 @@ VIEW_SHARE, RAISED_SHARE = 0.9, 0.25
 """How far from the map's middle a browser begins, and how far above that, likewise."""
 
 
-class Window:
+class ViewerPage:
     """A page at ``address``; everything shown replaces what was shown before."""
 
     def __init__(self, config: ViewerConfig, title: str) -> None:
@@ -50,8 +50,8 @@ class Window:
 
         with contextlib.redirect_stdout(io.StringIO()):
             self._server: Any = viser.ViserServer("127.0.0.1", _free_port(), title, verbose=False)
-        self._door = Door(config, self._server.get_port())
-        self.address = f"http://{config.host}:{self._door.port}/"
+        self._proxy = AuthProxy(config, self._server.get_port())
+        self.address = f"http://{config.host}:{self._proxy.port}/"
         self._splats: Splats | None = None
         self._size = 1.0
         self._path_middle: Float | None = None
@@ -63,12 +63,12 @@ class Window:
         self._shown.on_update(lambda _: self._draw_splats())
 
     def close(self) -> None:
-        self._door.close()
+        self._proxy.close()
         self._server.stop()
 
     @property
     def splats_shown(self) -> int:
-        """Number of Gaussians in the window."""
+        """Number of Gaussians on the page."""
         return 0 if self._splats is None else len(self._splats)
 
     def show_splats(self, splats: Splats) -> None:

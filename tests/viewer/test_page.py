@@ -1,4 +1,4 @@
-"""The window itself: a finished dive, a live one, browsers that hang, and one that is real."""
+"""The viewer: a finished dive, a live one, browsers that hang, and one that is real."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from aquaflow.errors import InputError
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.viewer.finished import read_dive, show_dive
+from aquaflow.viewer.page import ViewerPage
 from aquaflow.viewer.splats import splats
-from aquaflow.viewer.window import Window
 from tests.small_recording import HEIGHT, WIDTH
 
 pytest.importorskip("viser", reason="viser is not installed")
@@ -30,10 +30,10 @@ UPGRADE = (
 
 
 @pytest.fixture
-def window() -> Iterator[Window]:
-    window = Window(ViewerConfig(port=0), "test")
-    yield window
-    window.close()
+def page() -> Iterator[ViewerPage]:
+    page = ViewerPage(ViewerConfig(port=0), "test")
+    yield page
+    page.close()
 
 
 def many(count: int) -> dict[str, np.ndarray]:
@@ -46,19 +46,19 @@ def many(count: int) -> dict[str, np.ndarray]:
     }
 
 
-def test_a_browser_that_never_reads_does_not_hold_up_who_shows(window: Window) -> None:
-    port = int(window.address.rstrip("/").rpartition(":")[2])
+def test_a_browser_that_never_reads_does_not_hold_up_who_shows(page: ViewerPage) -> None:
+    port = int(page.address.rstrip("/").rpartition(":")[2])
     hung = socket.create_connection(("127.0.0.1", port), timeout=20)
     hung.sendall(UPGRADE)
     parts, camera = many(20_000), guess_camera(WIDTH, HEIGHT)
     picture = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     for turn in range(20):  # 20 x 640 kB: far beyond what a socket's buffers take
         colours = {"water": np.full((20_000, 3), turn / 20, np.float32)}
-        window.show_splats(splats(**parts, colours=colours, budget=20_000))
-        window.show_camera(Sim3.identity(), camera, picture)
-        window.show_path(parts["means"][: turn + 2], np.ones(turn + 2))
-        window.show_health(f"turn {turn}")
-    assert window.splats_shown == 20_000
+        page.show_splats(splats(**parts, colours=colours, budget=20_000))
+        page.show_camera(Sim3.identity(), camera, picture)
+        page.show_path(parts["means"][: turn + 2], np.ones(turn + 2))
+        page.show_health(f"turn {turn}")
+    assert page.splats_shown == 20_000
     hung.close()
 
 
@@ -105,11 +105,11 @@ def test_a_folder_without_a_dive_is_refused_in_one_sentence(tmp_path: Path) -> N
 def test_a_real_browser_shows_splats(small_dive: Path, tmp_path: Path) -> None:
     import cv2
 
-    window = show_dive(read_dive(small_dive, budget=20_000), ViewerConfig(port=0))
+    page = show_dive(read_dive(small_dive, budget=20_000), ViewerConfig(port=0))
     try:
-        picture = screenshot(window.address, tmp_path / "shot.png")
+        picture = screenshot(page.address, tmp_path / "shot.png")
     finally:
-        window.close()
+        page.close()
     scene = cv2.cvtColor(picture[:, : picture.shape[1] * 2 // 3], cv2.COLOR_BGR2HSV)
     coloured = (scene[..., 1] > 60).mean()
     assert coloured > 0.05, f"{100 * coloured:.1f} % of the page is coloured"
