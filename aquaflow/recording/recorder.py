@@ -20,7 +20,7 @@ from aquaflow.messages import Dropped, Frame, TelemetrySample
 from aquaflow.recording.disk import free_bytes
 from aquaflow.recording.dive_file import require_mcap
 from aquaflow.recording.status import RecorderStatus
-from aquaflow.recording.waiting import Item, LinkBytes, Picture, Sample, Waiting
+from aquaflow.recording.write_queue import Item, LinkBytes, QueuedPicture, QueuedSample, WriteQueue
 from aquaflow.recording.writing import DiveWriter
 
 log = logging.getLogger(__name__)
@@ -47,7 +47,7 @@ class Recorder:
         self.status = RecorderStatus()
         self._settings, self._folder, self._free = settings, folder, free
         self._prepare_folder()
-        self._waiting = Waiting(settings.queue_mb * MB)
+        self._queue = WriteQueue(settings.queue_mb * MB)
         self._writer = DiveWriter(folder, settings, self.status)
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
@@ -55,11 +55,11 @@ class Recorder:
 
     def frame(self, camera: str, frame: Frame | Dropped) -> None:
         """Record a picture; its ``image`` must not change afterwards."""
-        self._put(Picture(camera, frame))
+        self._put(QueuedPicture(camera, frame))
 
     def sample(self, sample: TelemetrySample) -> None:
         """Record a decoded sample."""
-        self._put(Sample(sample))
+        self._put(QueuedSample(sample))
 
     def raw(self, link: str, arrival_ns: int, data: bytes) -> None:
         """Record what one read of a link returned; a ``RawTap`` of ``aquaflow.sources``."""
@@ -68,9 +68,9 @@ class Recorder:
     def close(self) -> RecorderStatus:
         """Write what waits, end the last file, and return the status; may be called again."""
         self._closing.set()
-        self._waiting.wake()
+        self._queue.wake()
         self._thread.join()
-        self.status.dropped = self._waiting.dropped()
+        self.status.dropped = self._queue.dropped()
         return self.status
 
     def _prepare_folder(self) -> None:
@@ -88,7 +88,7 @@ class Recorder:
 
     def _put(self, item: Item) -> None:
         if self.status.stopped is None and not self._closing.is_set():
-            self._waiting.put(item)
+            self._queue.put(item)
 
     def _run(self) -> None:
         """The thread: write, flush every so often, until closed or the disk is full."""
@@ -106,13 +106,13 @@ class Recorder:
     def _write_until_closed(self) -> None:
         due = time.monotonic()
         while self.status.stopped is None:
-            item = self._waiting.take(due - time.monotonic())
+            item = self._queue.take(due - time.monotonic())
             if item is not None:
                 self._write(item)
             elif self._closing.is_set():
                 return
             if time.monotonic() >= due:
-                self.status.dropped = self._waiting.dropped()
+                self.status.dropped = self._queue.dropped()
                 self._writer.flush()
                 due = time.monotonic() + self._settings.flush_s
                 full = self._full()
@@ -125,7 +125,7 @@ class Recorder:
         except OSError:
             raise
         except Exception as error:  # a message that cannot be encoded is skipped and counted
-            self._waiting.refuse(item.topic)
+            self._queue.refuse(item.topic)
             log.warning("not recorded, of %s: %s", item.topic, error)
 
     def _stop(self, reason: str) -> None:

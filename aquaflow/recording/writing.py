@@ -23,7 +23,7 @@ from aquaflow.recording.pictures import (
 )
 from aquaflow.recording.status import RecorderStatus
 from aquaflow.recording.telemetry_json import KIND_OF, sample_to_json
-from aquaflow.recording.waiting import Item, LinkBytes, Picture
+from aquaflow.recording.write_queue import Item, LinkBytes, QueuedPicture
 
 FORMAT = "1"
 """Of topics and metadata."""
@@ -62,7 +62,7 @@ class DiveWriter:
         if isinstance(item, LinkBytes):
             self._file.raw(item.topic, item.data, item.arrival_ns)
             self._status.link_bytes += len(item.data)
-        elif not isinstance(item, Picture):
+        elif not isinstance(item, QueuedPicture):
             self._sample(item.topic, item.sample)
         elif isinstance(item.frame, Dropped):
             self._missing(item.topic, item.frame)
@@ -119,7 +119,7 @@ class DiveWriter:
         if not self._has_video:
             return True
         late = time.monotonic() - self._begun >= self._settings.file_s + LATE_KEY_S
-        frame = item.frame if isinstance(item, Picture) else None
+        frame = item.frame if isinstance(item, QueuedPicture) else None
         encoded = frame.encoded if isinstance(frame, Frame) else None
         return late or (encoded is not None and encoded.format == "h264" and encoded.key)
 

@@ -1,4 +1,4 @@
-"""What waits to be written: bounded in bytes, so that a slow disk costs data and not the dive."""
+"""The queue of what is to be written, bounded in bytes: a slow disk costs data, not the dive."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SAMPLE_BYTES = 400
 
 
 @dataclass(frozen=True)
-class Picture:
+class QueuedPicture:
     """A frame of a camera, or the note that one is missing."""
 
     camera: str
@@ -35,7 +35,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Sample:
+class QueuedSample:
     """A decoded telemetry sample."""
 
     sample: TelemetrySample
@@ -66,10 +66,10 @@ class LinkBytes:
         return SAMPLE_BYTES + len(self.data)
 
 
-Item: TypeAlias = Picture | Sample | LinkBytes
+Item: TypeAlias = QueuedPicture | QueuedSample | LinkBytes
 
 
-class Waiting:
+class WriteQueue:
     """A queue whose producers never wait: what does not fit is dropped and counted."""
 
     def __init__(self, limit_bytes: int) -> None:
