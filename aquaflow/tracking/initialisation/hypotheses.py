@@ -1,7 +1,7 @@
 """Hypotheses of the geometry of frames matched to one reference; the best explains them.
 
 Essential-matrix and homography poses, at each focal length that may be, are extended to some of the
-frames, bundle-adjusted, and judged by how well they explain them. The winner is adjusted to all.
+frames, bundle-adjusted, and judged by how well they explain them. The best one is adjusted to all.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Waiting:
+class MatchedFrame:
     """A frame matched to the reference, without a pose yet."""
 
     frame: Frame
@@ -37,39 +37,39 @@ class Waiting:
     pair: PairGeometry
 
 
-class Competition:
+class Hypotheses:
     """One reference view and the frames that wait for their poses against it."""
 
     def __init__(
         self,
         camera: CameraModel,
         pixels_reference: Array,  # [P, 2] px
-        waiting: list[Waiting],
+        waiting: list[MatchedFrame],
         config: InitialisationConfig,
     ) -> None:
         self._camera, self._config, self._waiting = camera, config, waiting
         self._pixels_reference = pixels_reference
 
-    def winner(self) -> BundleResult | None:
+    def best(self) -> BundleResult | None:
         """The best candidate, adjusted to all frames in their order; None without candidates."""
-        judges = self._judges()
+        test_frames = self._test_frames()
         best: BundleResult | None = None
         best_rank = (-1.0, 0.0)
-        for start in self._starts(judges):
-            result = self._adjust(start, judges)
-            # Over a plane two geometries explain every match; then the residual tells them apart.
-            rank = (round(self._explained(result.bundle, judges), 2), -result.residual_px)
+        for start in self._starts(test_frames):
+            result = self._adjust(start, test_frames)
+            # Over a plane two geometries explain every match; then the residual decides.
+            rank = (round(self._explained(result.bundle, test_frames), 2), -result.residual_px)
             if rank > best_rank:
                 best, best_rank = result, rank
         if best is None:
             return None
-        return self._adjust(self._completed(best, judges), self._waiting)
+        return self._adjust(self._completed(best, test_frames), self._waiting)
 
     def explained(self, bundle: Bundle) -> float:
         """Share of all observations in front of their camera and within a pixel of their match."""
         return self._explained(bundle, self._waiting)
 
-    def _judges(self) -> list[Waiting]:
+    def _test_frames(self) -> list[MatchedFrame]:
         """The pairs' frames, which have most parallax, and some of the others down to the least."""
         order = sorted(self._waiting, key=lambda frame: -frame.parallax_px)
         first, rest = order[: self._config.pairs], order[self._config.pairs :]
@@ -77,17 +77,17 @@ class Competition:
         others = np.linspace(len(rest) - 1, 0, max(count, 0)).round().astype(int)
         return first + [rest[i] for i in sorted(others)]
 
-    def _starts(self, judges: list[Waiting]) -> list[Bundle]:
+    def _starts(self, test_frames: list[MatchedFrame]) -> list[Bundle]:
         """Candidate geometries from the pairs with the most parallax, at each candidate focal."""
         starts = []
         for camera in self._cameras():
-            for second in judges[: self._config.pairs]:
+            for second in test_frames[: self._config.pairs]:
                 seen = second.observed
                 candidates = pose_candidates(
                     self._pixels_reference[seen], second.pixels[seen], camera, camera
                 )
                 for candidate in candidates[: self._config.candidates]:
-                    bundle = self._extend(camera, second, candidate.T_ba, judges)
+                    bundle = self._extend(camera, second, candidate.T_ba, test_frames)
                     if bundle is not None:
                         starts.append(bundle)
         return starts
@@ -99,9 +99,9 @@ class Competition:
         return [camera.with_focal_scaled(factor) for factor in self._config.focal_factors]
 
     def _extend(
-        self, camera: CameraModel, second: Waiting, T_ba: Sim3, judges: list[Waiting]
+        self, camera: CameraModel, second: MatchedFrame, T_ba: Sim3, test_frames: list[MatchedFrame]
     ) -> Bundle | None:
-        """Triangulate with one pair, then pose every other judge against the points."""
+        """Triangulate with one pair, then pose every other test frame against the points."""
         rays = camera.unproject(self._pixels_reference)
         points = triangulate(rays, second.pixels, T_ba, camera, self._config.sigma_px)
         good = points.good & second.observed
@@ -110,20 +110,20 @@ class Competition:
         rho = np.where(good, points.rho, np.median(points.rho[good]))
         variance = np.where(good, points.variance, (0.5 * rho) ** 2)
         T = []
-        for frame in judges:
+        for frame in test_frames:
             near = _on_the_way(T_ba, frame.parallax_px / max(second.parallax_px, 1e-6))
             known = frame is second
             T.append(T_ba if known else self._posed(frame, camera, rho, variance, good, near))
         return Bundle(T, rho, camera)
 
-    def _completed(self, best: BundleResult, judges: list[Waiting]) -> Bundle:
-        """The judges' geometry with the poses of all waiting frames."""
-        known = {id(frame): T for frame, T in zip(judges, best.bundle.T, strict=True)}
+    def _completed(self, best: BundleResult, test_frames: list[MatchedFrame]) -> Bundle:
+        """The test_frames' geometry with the poses of all waiting frames."""
+        known = {id(frame): T for frame, T in zip(test_frames, best.bundle.T, strict=True)}
         rho, camera = best.bundle.rho, best.bundle.camera
         sure = np.ones(len(rho), bool)
         T = []
         for frame in self._waiting:
-            near = min(judges, key=lambda judge: abs(judge.parallax_px - frame.parallax_px))
+            near = min(test_frames, key=lambda near: abs(near.parallax_px - frame.parallax_px))
             own = known.get(id(frame))
             if own is None:
                 own = self._posed(frame, camera, rho, best.rho_sigma**2, sure, known[id(near)])
@@ -132,7 +132,7 @@ class Competition:
 
     def _posed(
         self,
-        frame: Waiting,
+        frame: MatchedFrame,
         camera: CameraModel,
         rho: Array,  # [P]
         variance: Array,  # [P] of rho
@@ -154,13 +154,13 @@ class Competition:
         estimate = solve_pose(problem, guess)
         return estimate.T if estimate is not None else guess
 
-    def _adjust(self, start: Bundle, frames: list[Waiting]) -> BundleResult:
+    def _adjust(self, start: Bundle, frames: list[MatchedFrame]) -> BundleResult:
         pixels = np.stack([frame.pixels for frame in frames])
         observed = np.stack([frame.observed for frame in frames])
         solve_focal = not start.camera.calibrated and len(frames) >= 2
         return adjust(self._pixels_reference, pixels, observed, start, solve_focal)
 
-    def _explained(self, bundle: Bundle, frames: list[Waiting]) -> float:
+    def _explained(self, bundle: Bundle, frames: list[MatchedFrame]) -> float:
         rays = bundle.camera.unproject(self._pixels_reference)
         hits, total = 0, 0
         for frame, T in zip(frames, bundle.T, strict=True):

@@ -1,7 +1,7 @@
 """Two-view initialisation that waits for parallax (docs/measurements.md#initialisation).
 
 Frames are matched to one reference until the parallax decides the geometry. Essential-matrix and
-homography poses then compete; the waiting frames get their poses from the winner.
+homography poses are then compared; the best hypothesis gives the waiting frames their poses.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from aquaflow.keyframes import Pointmap
 from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, Prior
 from aquaflow.tracking.initialisation.bundle import BundleResult
-from aquaflow.tracking.initialisation.hypotheses import Competition, Waiting
+from aquaflow.tracking.initialisation.hypotheses import Hypotheses, MatchedFrame
 from aquaflow.tracking.pose.depth_fusion import fuse
 
 Array = npt.NDArray[np.float64]
@@ -30,9 +30,9 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Initialised:
-    """The winner: relative poses ``T_fk`` of the waiting frames, scale set by median depth 1."""
+    """The best hypothesis: poses ``T_fk`` of the waiting frames, scale set by median depth 1."""
 
-    waiting: list[Waiting]
+    waiting: list[MatchedFrame]
     T: list[Sim3]
     camera: CameraModel
     """With the refined focal length, where it was unknown."""
@@ -56,7 +56,7 @@ class Initialiser:
         config: InitialisationConfig,
     ) -> None:
         self.frame, self.reference = frame, reference
-        self.waiting: list[Waiting] = []
+        self.waiting: list[MatchedFrame] = []
         """Frames that see the reference, in their order."""
         self._prior, self._config = prior, config
         self._predicted: npt.NDArray[np.float32] | None = None
@@ -77,7 +77,7 @@ class Initialiser:
         )
         # What is not a number compares with nothing: one such frame would hold up every start.
         parallax = parallax if np.isfinite(parallax) else 0.0
-        self.waiting.append(Waiting(frame, pixels, observed, parallax, pair))
+        self.waiting.append(MatchedFrame(frame, pixels, observed, parallax, pair))
         self._predicted = pair.matches
         return True
 
@@ -106,9 +106,9 @@ class Initialiser:
     def solve(self) -> Initialised | None:
         """The best explanation of all waiting frames; None when none is good enough."""
         camera, pixels = self.reference.camera, self._pixels_reference
-        competition = Competition(camera, pixels, self.waiting, self._config)
-        result = competition.winner()
-        explained = 0.0 if result is None else competition.explained(result.bundle)
+        hypotheses = Hypotheses(camera, pixels, self.waiting, self._config)
+        result = hypotheses.best()
+        explained = 0.0 if result is None else hypotheses.explained(result.bundle)
         trusted = result is not None and self._trustworthy(explained, result)
         self._tried_px = self.parallax_px  # not where this raised: the next frame tries again
         if result is None or not trusted:

@@ -12,7 +12,7 @@ from aquaflow.config import InitialisationConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_log
 from aquaflow.tracking.initialisation import initialiser as initialiser_module
-from aquaflow.tracking.initialisation.hypotheses import Competition
+from aquaflow.tracking.initialisation.hypotheses import Hypotheses
 from aquaflow.tracking.initialisation.initialiser import Initialiser, calibrated
 from tests.tracking.tracking_scenes import KnownPrior, KnownView, depth_map, pose
 
@@ -168,7 +168,7 @@ def test_an_attempt_that_raised_is_made_again_with_the_next_frame(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     initialiser = started(prior_of(MOVING), CONFIG)
-    monkeypatch.setattr(Competition, "winner", raise_once)
+    monkeypatch.setattr(Hypotheses, "best", raise_once)
     with pytest.raises(np.linalg.LinAlgError):
         initialiser.solve()
     assert initialiser.ready
@@ -188,7 +188,7 @@ def test_a_parallax_that_is_no_number_does_not_hold_up_the_start(
     assert initialiser.ready
 
 
-def raise_once(_: Competition) -> None:
+def raise_once(_: Hypotheses) -> None:
     raise np.linalg.LinAlgError("planted")
 
 
