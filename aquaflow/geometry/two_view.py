@@ -27,7 +27,7 @@ MIN_MATCHES = 40
 
 
 @dataclass(frozen=True)
-class Candidate:
+class PoseCandidate:
     """A relative pose that may explain two views; the translation has unit length."""
 
     T_ba: Sim3
@@ -42,7 +42,7 @@ def pose_candidates(
     pixels_b: Array,  # [M, 2] px
     camera_a: CameraModel,
     camera_b: CameraModel,
-) -> list[Candidate]:
+) -> list[PoseCandidate]:
     """Poses from the essential matrix and from the homography, best supported first."""
     if len(pixels_a) < MIN_MATCHES:
         return []
@@ -55,7 +55,7 @@ def pose_candidates(
     candidates = []
     for T_ba, source in poses:
         points = triangulate(rays_a, pixels_b, T_ba, camera_b, sigma_px=0.5)
-        candidates.append(Candidate(T_ba, source, float(points.good.mean())))
+        candidates.append(PoseCandidate(T_ba, source, float(points.good.mean())))
     return sorted(candidates, key=lambda candidate: -candidate.support)
 
 

@@ -16,7 +16,7 @@ from aquaflow.tracking.pose.solver import PoseEstimate
 
 
 @dataclass(frozen=True)
-class Found:
+class Relocalised:
     """A keyframe that shows the same place, proven by geometry."""
 
     keyframe: Keyframe
@@ -35,7 +35,7 @@ class Places:
         """From here on this place can be found again."""
         self._retrieval.add(keyframe.number, keyframe.encoding)
 
-    def of_frame(self, encoding: Encoding, camera: CameraModel) -> Found | None:
+    def of_frame(self, encoding: Encoding, camera: CameraModel) -> Relocalised | None:
         """Where a lost frame is: the first keyframe, most similar first, that proves its pose."""
         for candidate in self._retrieval.candidates(encoding, lambda _: False):
             found = self._verified(candidate.number, encoding, camera)
@@ -43,7 +43,7 @@ class Places:
                 return found
         return None
 
-    def of_keyframe(self, keyframe: Keyframe, exclude: Callable[[int], bool]) -> list[Found]:
+    def of_keyframe(self, keyframe: Keyframe, exclude: Callable[[int], bool]) -> list[Relocalised]:
         """Earlier keyframes that show what ``keyframe`` shows, scales compared."""
         encoding, pointmap = keyframe.encoding, keyframe.pointmap
         numbers = [found.number for found in self._retrieval.candidates(encoding, exclude)]
@@ -56,10 +56,10 @@ class Places:
         encoding: Encoding,
         camera: CameraModel,
         pointmap: Pointmap | None = None,
-    ) -> Found | None:
+    ) -> Relocalised | None:
         past = self._keyframes[number]
         try:
             proof = verify(past, encoding, camera, self._config.verification, pointmap)
         except InputError:
             return None  # a keyframe that cannot be read back costs itself
-        return None if proof is None else Found(past, proof.estimate)
+        return None if proof is None else Relocalised(past, proof.estimate)

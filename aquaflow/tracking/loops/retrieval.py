@@ -48,7 +48,7 @@ Index = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Candidate:
+class SimilarKeyframe:
     """A keyframe that may show the same place."""
 
     number: int
@@ -91,7 +91,7 @@ class Retrieval:
 
     def candidates(
         self, encoding: Encoding, exclude: Callable[[int], bool], count: int | None = None
-    ) -> list[Candidate]:
+    ) -> list[SimilarKeyframe]:
         """At most ``count`` (default: the config's) plausible keyframes, most similar first."""
         if not self._numbers:
             return []
@@ -101,12 +101,12 @@ class Retrieval:
         similarity = self._file.similarities(signature)
         plausible = np.flatnonzero(similarity >= self.plausible)
         wanted = self._config.candidates if count is None else count
-        best: list[Candidate] = []
+        best: list[SimilarKeyframe] = []
         for i in plausible[np.argsort(-similarity[plausible], kind="stable")]:
             if len(best) == wanted:
                 break
             if not exclude(self._numbers[i]):
-                best.append(Candidate(self._numbers[i], float(similarity[i])))
+                best.append(SimilarKeyframe(self._numbers[i], float(similarity[i])))
         return best
 
     @property

@@ -21,7 +21,7 @@ from aquaflow.tracking.frames import Link
 from aquaflow.tracking.graph import keyframe_graph
 from aquaflow.tracking.graph.keyframe_graph import Correction, KeyframeGraph
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
-from aquaflow.tracking.loops.relocaliser import Found, Places
+from aquaflow.tracking.loops.relocaliser import Places, Relocalised
 from aquaflow.tracking.pose.solver import Degeneracy, PoseEstimate
 from tests.tracking.graph.graph_scenes import LOOP_SIGMA, SIGMA, circle
 
@@ -46,14 +46,14 @@ class KnownPlaces:
     def add(self, keyframe: Keyframe) -> None:
         pass
 
-    def of_keyframe(self, keyframe: Keyframe, exclude: Callable[[int], bool]) -> list[Found]:
+    def of_keyframe(self, keyframe: Keyframe, exclude: Callable[[int], bool]) -> list[Relocalised]:
         number = keyframe.number
         if number not in self.again:
             return []
         past = self.again[number]
         covariance = np.diag(LOOP_SIGMA**2)
         estimate = PoseEstimate(between(number, past), covariance, 1.0, 0.0, 1.0, KNOWN)
-        return [Found(self.store[past], estimate)]
+        return [Relocalised(self.store[past], estimate)]
 
 
 @dataclass
