@@ -11,7 +11,7 @@ import typer
 from aquaflow.cli.console import Json, table_console
 
 if TYPE_CHECKING:
-    from aquaflow.sources.discovery import Found
+    from aquaflow.sources.discovery import DiscoveryResult
 
 
 def register(app: typer.Typer) -> None:
@@ -30,7 +30,7 @@ def devices(as_json: Json = False) -> None:
         _print(found)
 
 
-def _print(found: Found) -> None:
+def _print(found: DiscoveryResult) -> None:
     from rich.markup import escape
     from rich.table import Table
 

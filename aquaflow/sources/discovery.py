@@ -34,14 +34,14 @@ Discover: TypeAlias = Callable[[], list[FoundDevice]]
 
 
 @dataclass(frozen=True)
-class Found:
+class DiscoveryResult:
     """The devices found, and the errors of drivers that failed."""
 
     devices: list[FoundDevice]
     problems: list[str]
 
 
-def discover() -> Found:
+def discover() -> DiscoveryResult:
     """Ask every installed driver; a driver that fails is reported in ``problems``."""
     devices: list[FoundDevice] = []
     problems: list[str] = []
@@ -51,4 +51,4 @@ def discover() -> Found:
             devices += discover_devices()
         except Exception as error:  # a broken driver of a site must not hide the others
             problems.append(f"{entry.name}: {error}")
-    return Found(devices, problems)
+    return DiscoveryResult(devices, problems)

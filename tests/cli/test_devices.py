@@ -12,7 +12,7 @@ from aquaflow.cli import devices
 from aquaflow.config.cameras import OakConfig, V4l2Config
 from aquaflow.config.link import CanConfig, SerialConfig
 from aquaflow.sources import discovery
-from aquaflow.sources.discovery import Found, FoundDevice, discover
+from aquaflow.sources.discovery import DiscoveryResult, FoundDevice, discover
 from drivers import discovery as drivers
 from sim_drivers.camera_feed import CameraFeed
 from sim_drivers.images import ImageFolder
@@ -86,13 +86,15 @@ def working() -> list[FoundDevice]:
 def test_a_driver_that_fails_hides_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
     entries = [EntryPoint(n, f"{__name__}:{n}", discovery.DISCOVERY) for n in ("working", "broken")]
     monkeypatch.setattr(discovery, "entry_points", lambda *, group: entries)
-    assert discover() == Found(working(), ["broken: the bus is on fire"])
+    assert discover() == DiscoveryResult(working(), ["broken: the bus is on fire"])
 
 
 def test_the_table_shows_ids_and_lines_for_the_config(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(discovery, "discover", lambda: Found(working(), ["oak: no library"]))
+    monkeypatch.setattr(
+        discovery, "discover", lambda: DiscoveryResult(working(), ["oak: no library"])
+    )
     devices.devices()
     printed = capsys.readouterr().out
     for part in ("Camera [1]", "abc", "kind: v4l2", "device: abc", "Not looked for: oak: no lib"):
@@ -102,7 +104,7 @@ def test_the_table_shows_ids_and_lines_for_the_config(
 def test_nothing_plugged_in_is_a_sentence(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(discovery, "discover", lambda: Found([], []))
+    monkeypatch.setattr(discovery, "discover", lambda: DiscoveryResult([], []))
     devices.devices()
     assert capsys.readouterr().out == "No camera, serial port or CAN interface is plugged in.\n"
 
