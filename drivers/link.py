@@ -57,7 +57,7 @@ class ByteLink(Protocol):
         ...
 
 
-class Decoder(Protocol):
+class LinkDecoder(Protocol):
     """Turns the bytes of one link into samples; resynchronises by itself, its buffer is bounded."""
 
     counters: LinkCounters

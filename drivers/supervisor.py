@@ -10,7 +10,7 @@ from typing import Protocol, TypeAlias, runtime_checkable
 
 from aquaflow.messages import TelemetrySample
 from aquaflow.sources import RawTap
-from drivers.link import ByteLink, Decoder, LinkCounters, LinkLostError
+from drivers.link import ByteLink, LinkCounters, LinkDecoder, LinkLostError
 from drivers.transport import OpenLink
 
 log = logging.getLogger(__name__)
@@ -24,7 +24,7 @@ Deliver: TypeAlias = Callable[[list[TelemetrySample]], None]
 """Gets the samples of one read. Must not block."""
 
 
-class SupervisedDecoder(Decoder, Protocol):
+class SupervisedDecoder(LinkDecoder, Protocol):
     """A decoder that is told when the stream starts anew."""
 
     def reset(self) -> None: ...

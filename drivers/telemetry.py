@@ -26,7 +26,7 @@ CLOSE_TIMEOUT_S = 5.0
 """A thread that is stuck in a system call longer is left behind; it can do no harm any more."""
 
 
-class _Waiting(NamedTuple):
+class _QueuedSample(NamedTuple):
     """A sample on its way to the consumer, and the link it came by."""
 
     sample: TelemetrySample
@@ -78,7 +78,7 @@ class LinkTelemetry:
         tap: RawTap | None = None,
         links: Mapping[str, OpenLink] | None = None,
     ) -> None:
-        self._queue: Newest[_Waiting] = Newest(config.queue_samples, _count_dropped)
+        self._queue: Newest[_QueuedSample] = Newest(config.queue_samples, _count_dropped)
         self._body = BodyFrame()
         self.decoders = {name: decoder_of(name, device) for name, device in config.devices.items()}
         self.links: dict[str, Supervisor] = {}
@@ -141,10 +141,10 @@ class LinkTelemetry:
 
     def _deliverer(self, mounting: Mounting, counters: LinkCounters) -> Deliver:
         def deliver(samples: list[TelemetrySample]) -> None:
-            self._queue.put_all([_Waiting(sample, mounting, counters) for sample in samples])
+            self._queue.put_all([_QueuedSample(sample, mounting, counters) for sample in samples])
 
         return deliver
 
 
-def _count_dropped(waiting: _Waiting) -> None:
+def _count_dropped(waiting: _QueuedSample) -> None:
     waiting.counters.dropped_samples += 1
