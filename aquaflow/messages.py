@@ -22,7 +22,7 @@ __all__ = [
     "CameraModel",
     "Depth",
     "Dropped",
-    "Encoded",
+    "EncodedPicture",
     "Frame",
     "Lights",
     "TelemetrySample",
@@ -31,7 +31,7 @@ __all__ = [
 
 
 @dataclass(frozen=True)
-class Encoded:
+class EncodedPicture:
     """A picture's bytes as the camera or the file had them, for the recorder."""
 
     format: Literal["jpeg", "png", "webp", "h264"]
@@ -56,7 +56,7 @@ class Frame:
     gain: float | None = None
     mask: npt.NDArray[np.bool_] | None = None
     """[H, W], True where the pixel shows the scene (False: vehicle frame, gripper)."""
-    encoded: Encoded | None = None
+    encoded: EncodedPicture | None = None
     """What ``image`` was decoded from, where the source keeps it."""
 
 

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.messages import CameraModel, Encoded
+from aquaflow.messages import CameraModel, EncodedPicture
 
 
 class UnusablePictureError(Exception):
@@ -42,7 +42,7 @@ class RawPicture:
     """The device's picture counter, which also counts pictures that were never delivered."""
     exposure_s: float | None = None
     gain: float | None = None
-    received: Callable[[], Encoded | None] = no_file
+    received: Callable[[], EncodedPicture | None] = no_file
     """The picture file that the device delivered, in memory of its own."""
     release: Callable[[], None] = nothing_to_release
     index: int = -1

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import CameraModel, Port, guess_camera
-from aquaflow.messages import Dropped, Encoded, Frame
+from aquaflow.messages import Dropped, EncodedPicture, Frame
 from aquaflow.sources import is_asked
 from sim_drivers.h264 import decode_units, is_key
 from sim_drivers.mcap_messages import McapMessage, McapMessages, mcap_files
@@ -172,7 +172,7 @@ class McapCamera:
                 continue
             yield self._frame(place, image, encoded)
 
-    def _decode(self, message: McapMessage) -> tuple[npt.NDArray[np.uint8], Encoded | None]:
+    def _decode(self, message: McapMessage) -> tuple[npt.NDArray[np.uint8], EncodedPicture | None]:
         fields = self._payloads.decode(message)
         if self._kind == COMPRESSED:
             data = bytes(fields.data)
@@ -183,13 +183,13 @@ class McapCamera:
     def _video(self) -> Iterator[Frame | Dropped]:
         gone: list[Dropped] = []
 
-        def units() -> Iterator[tuple[tuple[_Place, Encoded], bytes]]:
+        def units() -> Iterator[tuple[tuple[_Place, EncodedPicture], bytes]]:
             for place, found in self._placed():
                 if isinstance(found, str):
                     gone.append(Dropped(place.index, place.t_ns, found))
                     continue
                 data = bytes(self._payloads.decode(found).data)
-                yield (place, Encoded("h264", data, is_key(data))), data
+                yield (place, EncodedPicture("h264", data, is_key(data))), data
 
         for (place, encoded), image in decode_units(units()):
             while gone and gone[0].index < place.index:
@@ -205,7 +205,7 @@ class McapCamera:
         self,
         place: _Place,
         image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
-        encoded: Encoded | None,
+        encoded: EncodedPicture | None,
     ) -> Frame:
         height, width = image.shape[:2]
         camera = self._stated or guess_camera(width, height)

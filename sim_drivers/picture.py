@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.messages import Encoded
+from aquaflow.messages import EncodedPicture
 
 EXTENSIONS = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm"})
 """Of pictures that Pillow reads."""
@@ -81,14 +81,14 @@ def decode_picture(data: bytes) -> npt.NDArray[np.uint8 | np.int32]:
     raise UnreadablePictureError(f"has pixels of type {mode}; convert it to 8 bits per channel")
 
 
-def received_as(data: bytes) -> Encoded | None:
+def received_as(data: bytes) -> EncodedPicture | None:
     """``data`` for the recorder, if they are a file of a format that it keeps as it is."""
     if data.startswith(b"\xff\xd8"):
-        return Encoded("jpeg", data)
+        return EncodedPicture("jpeg", data)
     if data.startswith(b"\x89PNG"):
-        return Encoded("png", data)
+        return EncodedPicture("png", data)
     if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
-        return Encoded("webp", data)
+        return EncodedPicture("webp", data)
     return None
 
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import CameraModel, DistortionModel, guess_camera
-from aquaflow.messages import Dropped, Encoded, Frame
+from aquaflow.messages import Dropped, EncodedPicture, Frame
 from aquaflow.sources import is_asked
 from sim_drivers.picture import UnreadablePictureError, received_as
 from sim_drivers.picture_message import compressed_picture, raw_picture
@@ -108,7 +108,7 @@ class RosbagCamera:
         return Frame(index, t_ns, arrival_ns, image, camera, encoded=encoded)
 
 
-def _picture(message: Any, kind: str) -> tuple[npt.NDArray[np.uint8], Encoded | None]:
+def _picture(message: Any, kind: str) -> tuple[npt.NDArray[np.uint8], EncodedPicture | None]:
     if message is None:
         raise UnreadablePictureError("is damaged")
     data = bytes(message.data)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.recording import RecordingConfig
-from aquaflow.messages import CameraModel, Encoded, Frame
+from aquaflow.messages import CameraModel, EncodedPicture, Frame
 
 FOXGLOVE_DISTORTION = {"none": "", "radtan": "plumb_bob", "fisheye": "kannala_brandt"}
 """Distortion models by Foxglove's names."""
@@ -38,7 +38,7 @@ def picture_message(frame: Frame, name: str, settings: RecordingConfig) -> Any:
 def encode(
     image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
     settings: RecordingConfig,
-) -> Encoded:
+) -> EncodedPicture:
     """JPEG or PNG, as the settings say."""
     import cv2
 
@@ -48,9 +48,9 @@ def encode(
         # 24 ms for 0.55 MB.
         flags = [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
         flags += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
-        return Encoded("png", cv2.imencode(".png", bgr, flags)[1].tobytes())
+        return EncodedPicture("png", cv2.imencode(".png", bgr, flags)[1].tobytes())
     flags = [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality]
-    return Encoded("jpeg", cv2.imencode(".jpg", bgr, flags)[1].tobytes())
+    return EncodedPicture("jpeg", cv2.imencode(".jpg", bgr, flags)[1].tobytes())
 
 
 def mask_message(
@@ -62,7 +62,7 @@ def mask_message(
     import cv2
 
     png = cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes()
-    message = _empty(Encoded("png", png))
+    message = _empty(EncodedPicture("png", png))
     message.timestamp.FromNanoseconds(t_ns)
     message.frame_id, message.format, message.data = name, "png", png
     return message
@@ -93,7 +93,7 @@ def camera_to_json(camera: CameraModel) -> str:
     return json.dumps(asdict(camera))
 
 
-def _empty(encoded: Encoded | None) -> Any:
+def _empty(encoded: EncodedPicture | None) -> Any:
     if encoded is None:
         from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.cameras import V4l2Config
-from aquaflow.messages import CameraModel, Encoded
+from aquaflow.messages import CameraModel, EncodedPicture
 from drivers.capture import RawPicture, UnusablePictureError
 from drivers.v4l2 import abi
 from drivers.v4l2.controls import apply_controls
@@ -114,8 +114,8 @@ class V4l2Capture:
     def _file(
         self,
         data: npt.NDArray[np.uint8],  # [bytes used]
-    ) -> Encoded | None:
-        return Encoded("jpeg", data.tobytes()) if self.pixels in JPEG_PIXELS else None
+    ) -> EncodedPicture | None:
+        return EncodedPicture("jpeg", data.tobytes()) if self.pixels in JPEG_PIXELS else None
 
     def _queue(self, index: int) -> None:
         """Give a buffer back to the kernel; nothing if the device is closed or gone."""

@@ -21,7 +21,7 @@ from aquaflow.messages import (
     Attitude,
     Depth,
     Dropped,
-    Encoded,
+    EncodedPicture,
     Frame,
     Lights,
     TelemetrySample,
@@ -189,7 +189,7 @@ def test_a_video_goes_on_in_a_new_file_only_with_a_key_frame(
     settings = RecordingConfig(reserve_mb=0, file_s=0.02, flush_s=0.01)
     recorder = Recorder(tmp_path, settings)
     for index in range(60):
-        unit = Encoded("h264", bytes([index]), key=index % 10 == 0)
+        unit = EncodedPicture("h264", bytes([index]), key=index % 10 == 0)
         recorder.frame("c", picture(index, encoded=unit))
         written(recorder, index + 1)
         clock.now_s += 0.004

@@ -19,7 +19,7 @@ from aquaflow.config.recording import RecordingConfig
 from aquaflow.config.telemetry import NmeaConfig
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import guess_camera
-from aquaflow.messages import Attitude, Depth, Dropped, Encoded, Frame
+from aquaflow.messages import Attitude, Depth, Dropped, EncodedPicture, Frame
 from aquaflow.recording import Recorder
 from aquaflow.recording.pictures import encode
 from aquaflow.sources import camera_reader, open_recorded_telemetry, open_recording
@@ -174,7 +174,7 @@ def record_video(out: Path, units: list[bytes]) -> None:
     recorder = Recorder(out, RecordingConfig(reserve_mb=0))
     image = np.zeros((1080, 1920, 3), np.uint8)[:1, :1]
     for k, unit in enumerate(units):
-        received = Encoded("h264", unit, is_key(unit))
+        received = EncodedPicture("h264", unit, is_key(unit))
         camera = guess_camera(1920, 1080)
         recorder.frame("c", Frame(k, k * 10**7, k * 10**7, image, camera, encoded=received))
     assert recorder.close().dropped == {}
