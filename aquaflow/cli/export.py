@@ -12,7 +12,7 @@ import typer
 from aquaflow.cli.console import Json, progress_bars
 
 
-class Format(str, Enum):
+class ExportFormat(str, Enum):
     """What a dive can be written as."""
 
     restored = "restored"
@@ -25,7 +25,7 @@ def register(app: typer.Typer) -> None:
 
 def export(
     dive: Annotated[Path, typer.Argument(help="Dive folder.")],
-    format: Annotated[Format, typer.Option(help="restored: frames without their water.")],
+    format: Annotated[ExportFormat, typer.Option(help="restored: frames without their water.")],
     recording: Annotated[
         Path | None,
         typer.Option(help="What was mapped; without it, the map is drawn, not the pictures."),
