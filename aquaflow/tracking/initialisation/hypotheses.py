@@ -117,7 +117,7 @@ class Hypotheses:
         return Bundle(T, rho, camera)
 
     def _completed(self, best: BundleResult, test_frames: list[MatchedFrame]) -> Bundle:
-        """The test_frames' geometry with the poses of all waiting frames."""
+        """The test frames' geometry with the poses of all waiting frames."""
         known = {id(frame): T for frame, T in zip(test_frames, best.bundle.T, strict=True)}
         rho, camera = best.bundle.rho, best.bundle.camera
         sure = np.ones(len(rho), bool)
