@@ -14,7 +14,7 @@ from rich.table import Table
 from aquaflow.evaluation.bench import machine
 from aquaflow.evaluation.bench.job import Job
 from aquaflow.evaluation.bench.runner import Perform, Progress, Row, in_process, row_of
-from aquaflow.evaluation.bench.scene import Scene
+from aquaflow.evaluation.bench.scene import BenchmarkScene
 
 PRESET = "balanced"
 """The preset whose parts are left out, one at a time."""
@@ -103,7 +103,7 @@ PARTS = (
 
 
 def ablate(
-    scenes: Sequence[Scene],
+    scenes: Sequence[BenchmarkScene],
     out: Path,
     progress: Progress,
     parts: Sequence[Part] = PARTS,

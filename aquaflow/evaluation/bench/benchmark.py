@@ -20,7 +20,7 @@ from aquaflow.evaluation.bench.runner import (
     jobs_for,
     run_all,
 )
-from aquaflow.evaluation.bench.scene import Scene, scene_at
+from aquaflow.evaluation.bench.scene import BenchmarkScene, scene_at
 from aquaflow.storage.atomic import write_json
 
 JSON_FILE, PICTURE_FILE = "bench.json", "bench.png"
@@ -36,7 +36,7 @@ SUITES = ("ci", "real")
 
 def scenes_of(
     suite: str | None, data: Path | None, paths: Sequence[Path], out: Path, progress: Progress
-) -> list[Scene]:
+) -> list[BenchmarkScene]:
     """The scenes of a suite, and those the user names.
 
     Raises:
@@ -71,7 +71,7 @@ def contenders_of(presets: Sequence[str], peers: bool) -> list[Contender]:
 
 
 def benchmark(
-    scenes: Sequence[Scene],
+    scenes: Sequence[BenchmarkScene],
     contenders: Sequence[Contender],
     repeats: int,
     out: Path,

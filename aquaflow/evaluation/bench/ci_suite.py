@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from aquaflow.evaluation.bench.altered import dim_light, pause
-from aquaflow.evaluation.bench.scene import Scene
+from aquaflow.evaluation.bench.scene import BenchmarkScene
 from aquaflow.synthetic import SyntheticConfig, write_dive
 from aquaflow.synthetic.dive import FORMAT_VERSION
 
@@ -42,7 +42,7 @@ STAMP = "bench_scene.json"
 Progress = Callable[[str, int, int | None], None]
 
 
-def ci_scenes(cache: Path, progress: Progress) -> list[Scene]:
+def ci_scenes(cache: Path, progress: Progress) -> list[BenchmarkScene]:
     """The suite's scenes, written to ``cache`` where they are not there yet."""
     total, scenes = len(PLAIN) + 2, []
     for done, (name, kind) in enumerate(PLAIN.items()):
@@ -75,7 +75,7 @@ def _cached(
     name: str,
     settings: dict[str, object],
     make: Callable[[Path, dict[str, object]], None],
-) -> Scene:
+) -> BenchmarkScene:
     folder = cache / name.replace(", ", "_").replace(" ", "_")
     stamp = json.dumps({"format": FORMAT_VERSION, **settings}, sort_keys=True)
     marker = folder / STAMP
@@ -84,4 +84,6 @@ def _cached(
         make(folder, settings)
         marker.write_text(stamp)
     path = str(folder)
-    return Scene(name, path, truth=path, clean=path, overrides=BRIEF, refine_share=REFINE_SHARE)
+    return BenchmarkScene(
+        name, path, truth=path, clean=path, overrides=BRIEF, refine_share=REFINE_SHARE
+    )

@@ -8,14 +8,14 @@ from typing import Any
 
 from aquaflow.config import Config, parse_config
 from aquaflow.config.presets import merged, preset
-from aquaflow.evaluation.bench.scene import Scene
+from aquaflow.evaluation.bench.scene import BenchmarkScene
 
 
 @dataclass(frozen=True)
 class Job:
     """One contender on one scene."""
 
-    scene: Scene
+    scene: BenchmarkScene
     preset: str
     out: str
     """Dive folder to write."""
@@ -40,4 +40,4 @@ class Job:
     def from_text(text: str) -> Job:
         """The job that :meth:`to_text` wrote."""
         data = json.loads(text)
-        return Job(**{**data, "scene": Scene(**data["scene"])})
+        return Job(**{**data, "scene": BenchmarkScene(**data["scene"])})

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from aquaflow.errors import InputError
-from aquaflow.evaluation.bench.scene import Scene
+from aquaflow.evaluation.bench.scene import BenchmarkScene
 from aquaflow.evaluation.protocol import evaluate_dive
 from aquaflow.evaluation.restoration import evaluate_restoration
 
@@ -22,7 +22,7 @@ ERRORS = (
 """Copied from the evaluation."""
 
 
-def measured(scene: Scene, dive: Path) -> dict[str, Any]:
+def measured(scene: BenchmarkScene, dive: Path) -> dict[str, Any]:
     """Every error that the scene's truth allows; null where it does not.
 
     Raises:

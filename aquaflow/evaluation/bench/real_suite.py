@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from aquaflow.errors import AquaFlowError, InputError
-from aquaflow.evaluation.bench.scene import Scene, truth_in
+from aquaflow.evaluation.bench.scene import BenchmarkScene, truth_in
 from aquaflow.evaluation.trajectory import read_tum
 from aquaflow.messages import Frame
 from aquaflow.sources import open_recording
@@ -23,7 +23,7 @@ FEWEST_FRAMES = 40
 """A clip whose truth is sparse is thinned towards the truth's frames, but not below this."""
 
 
-def real_scenes(data: Path) -> list[Scene]:
+def real_scenes(data: Path) -> list[BenchmarkScene]:
     """One scene for every folder of ``data`` that holds a video or pictures.
 
     Raises:
@@ -38,7 +38,7 @@ def real_scenes(data: Path) -> list[Scene]:
     return scenes
 
 
-def _scene(folder: Path) -> Scene | None:
+def _scene(folder: Path) -> BenchmarkScene | None:
     videos = sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEOS)
     pictures = any(path.suffix.lower() in PICTURES for path in folder.iterdir())
     if not videos and not pictures:
@@ -49,7 +49,7 @@ def _scene(folder: Path) -> Scene | None:
     halves = SIDE_BY_SIDE in recording.name
     if halves:
         source["crop"] = "left"
-    return Scene(
+    return BenchmarkScene(
         folder.name,
         str(recording),
         None if truth is None else str(truth),

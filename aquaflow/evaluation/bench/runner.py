@@ -15,7 +15,7 @@ from typing import Any
 
 from aquaflow.evaluation.bench import machine
 from aquaflow.evaluation.bench.job import Job
-from aquaflow.evaluation.bench.scene import Scene
+from aquaflow.evaluation.bench.scene import BenchmarkScene
 
 WORKER = "aquaflow.evaluation.bench.worker"
 """A run has a process of its own, so that its peak memory is its own too."""
@@ -51,7 +51,7 @@ class Contender:
 
 
 def jobs_for(
-    scenes: Sequence[Scene], contenders: Sequence[Contender], repeats: int, out: Path
+    scenes: Sequence[BenchmarkScene], contenders: Sequence[Contender], repeats: int, out: Path
 ) -> list[Job]:
     """All runs in the order of running.
 

@@ -11,7 +11,7 @@ from aquaflow.evaluation.restoration import SYNTHETIC_MARK
 
 
 @dataclass(frozen=True)
-class Scene:
+class BenchmarkScene:
     """Paths are strings, so that a scene travels to the worker as JSON."""
 
     name: str
@@ -33,7 +33,7 @@ class Scene:
         return asdict(self)
 
 
-def scene_at(path: Path) -> Scene:
+def scene_at(path: Path) -> BenchmarkScene:
     """A recording or a synthetic dive that the user names.
 
     Raises:
@@ -42,10 +42,10 @@ def scene_at(path: Path) -> Scene:
     if not path.exists():
         raise InputError(f"there is no scene at {path}; give a recording or a synthetic dive")
     if (path / SYNTHETIC_MARK).is_file():
-        return Scene(path.name, str(path), truth=str(path), clean=str(path))
+        return BenchmarkScene(path.name, str(path), truth=str(path), clean=str(path))
     folder = path if path.is_dir() else path.parent
     calibration, truth = folder / "camera.yaml", truth_in(folder)
-    return Scene(
+    return BenchmarkScene(
         path.stem,
         str(path),
         None if truth is None else str(truth),

@@ -17,12 +17,12 @@ from aquaflow.evaluation.bench.job import Job
 from aquaflow.evaluation.bench.pareto import pareto_front
 from aquaflow.evaluation.bench.readme import BEGIN, END, write_readme
 from aquaflow.evaluation.bench.runner import KEYS, Contender, in_process, jobs_for
-from aquaflow.evaluation.bench.scene import Scene, scene_at
+from aquaflow.evaluation.bench.scene import BenchmarkScene, scene_at
 from aquaflow.evaluation.bench.summary import ATE_PCT, PSNR, lines_of
 from aquaflow.evaluation.bench.table import failures, markdown
 from tests.command_line import run_aquaflow
 
-REEF, WALL = Scene("reef", "/reef", refine_share=0.1), Scene("wall", "/wall")
+REEF, WALL = BenchmarkScene("reef", "/reef", refine_share=0.1), BenchmarkScene("wall", "/wall")
 GOOD = {
     "frames": 10, "tracked": 10, "psnr": 30.0, "ate_pct_sim3": 0.5, "restored_psnr": 20.0,
     "ms_per_frame": {"p50": 80.0, "p95": 120.0, "total": 200.0},
@@ -123,7 +123,7 @@ def test_a_page_gets_the_section_between_its_markers(tmp_path: Path, name: str) 
 
 @pytest.mark.ci
 def test_a_worker_that_fails_or_crashes_is_a_row(tmp_path: Path) -> None:
-    gone = Job(Scene("gone", str(tmp_path / "gone")), "fast", str(tmp_path / "dive"))
+    gone = Job(BenchmarkScene("gone", str(tmp_path / "gone")), "fast", str(tmp_path / "dive"))
     assert "there is nothing at" in in_process(gone)["failed"]
     broken = Job(REEF, "no such preset", str(tmp_path / "dive"))
     assert "no preset 'no such preset'" in in_process(broken)["failed"]

@@ -8,7 +8,7 @@ from typing import Any
 from aquaflow.config import Config
 from aquaflow.evaluation.bench.peers import sequential_sfm, two_view
 from aquaflow.evaluation.bench.peers.dive import prepared_frames, write_dive
-from aquaflow.evaluation.bench.scene import Scene
+from aquaflow.evaluation.bench.scene import BenchmarkScene
 
 __all__ = ["PEERS", "run_peer"]
 
@@ -16,7 +16,7 @@ PEERS = {"colmap": sequential_sfm.solve, "two-view": two_view.solve}
 """By the name that stands in the table."""
 
 
-def run_peer(name: str, scene: Scene, config: Config, out: Path) -> dict[str, Any]:
+def run_peer(name: str, scene: BenchmarkScene, config: Config, out: Path) -> dict[str, Any]:
     """Let a peer find the poses of the frames that AquaFlow would map; writes them as a dive.
 
     Raises:

@@ -12,7 +12,7 @@ import numpy as np
 
 from aquaflow.config import Config
 from aquaflow.errors import NotMappedError
-from aquaflow.evaluation.bench.scene import Scene
+from aquaflow.evaluation.bench.scene import BenchmarkScene
 from aquaflow.evaluation.dive_files import FRAME_COLUMNS
 from aquaflow.export.tum import write_tum
 from aquaflow.geometry.camera import load_camera
@@ -46,7 +46,7 @@ class PeerResult:
     """Empty for a peer that needs all frames before it places any."""
 
 
-def prepared_frames(scene: Scene, config: Config) -> Prepared:
+def prepared_frames(scene: BenchmarkScene, config: Config) -> Prepared:
     """Read and prepare the scene's frames as the pipeline does; that time is no peer's."""
     recording = open_recording(Path(scene.recording), fps=config.source.fps)
     calibration = None if scene.calibration is None else load_camera(Path(scene.calibration))
