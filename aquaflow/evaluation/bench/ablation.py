@@ -23,8 +23,8 @@ CI_SCENES = ("reef, loop", "wall, murky, slow")
 
 
 @dataclass(frozen=True)
-class Part:
-    """Something that can be switched off, and how."""
+class AblatedPart:
+    """A part of the method that the config can switch off, and the overrides that do it."""
 
     name: str
     overrides: dict[str, Any] = field(default_factory=dict)
@@ -55,46 +55,48 @@ NEVER_AGREES = 1e-9
 """Relative range difference: no map is this close, so no ray counts as explained."""
 
 PARTS = (
-    Part("full"),
-    Part("without medium", _medium(enabled=False)),
-    Part("without medium in insertion", _insertion(medium_reduced=False)),
-    Part("without camera shading", _medium(shading=False)),
-    Part("without water fit", _medium(fit=False)),
-    Part("without pose refinement", {"mapping": {"optimiser": {"poses": 0.0}}}),
-    Part("without depth loss", {"mapping": {"loss": {"depth": 0.0}}}),
-    Part("without loop closure", _tracking(graph={"enabled": False})),
-    Part("with neural Gaussians (LGPD)", _decoder()),
-    Part("with neural Gaussians, base held as inserted", _decoder(optimise_initial=False)),
-    Part("with neural Gaussians, without distance embedding", _decoder(distance=False)),
-    Part("with neural Gaussians, an MLP instead of LGPD", _decoder(variant="mlp")),
-    Part("without learned prior", built=False),
-    Part("skip off: insertion only where the map is wrong", _insertion(agreement=NEVER_AGREES)),
-    Part("skip off: duplicate and stationary frames", _gate(skip_duplicates=False)),
-    Part(
+    AblatedPart("full"),
+    AblatedPart("without medium", _medium(enabled=False)),
+    AblatedPart("without medium in insertion", _insertion(medium_reduced=False)),
+    AblatedPart("without camera shading", _medium(shading=False)),
+    AblatedPart("without water fit", _medium(fit=False)),
+    AblatedPart("without pose refinement", {"mapping": {"optimiser": {"poses": 0.0}}}),
+    AblatedPart("without depth loss", {"mapping": {"loss": {"depth": 0.0}}}),
+    AblatedPart("without loop closure", _tracking(graph={"enabled": False})),
+    AblatedPart("with neural Gaussians (LGPD)", _decoder()),
+    AblatedPart("with neural Gaussians, base held as inserted", _decoder(optimise_initial=False)),
+    AblatedPart("with neural Gaussians, without distance embedding", _decoder(distance=False)),
+    AblatedPart("with neural Gaussians, an MLP instead of LGPD", _decoder(variant="mlp")),
+    AblatedPart("without learned prior", built=False),
+    AblatedPart(
+        "skip off: insertion only where the map is wrong", _insertion(agreement=NEVER_AGREES)
+    ),
+    AblatedPart("skip off: duplicate and stationary frames", _gate(skip_duplicates=False)),
+    AblatedPart(
         "skip off: dark, blurred or blinded frames",
         _gate(skip_dark=False, skip_blurred=False, skip_blinded=False),
     ),
-    Part("skip off: encoder features reused", _tracking(reuse_encodings=False)),
-    Part("skip off: matching seeded by motion", _tracking(seed_matching=False)),
-    Part("skip off: solver stops when converged", _tracking(stop_converged=False)),
-    Part("skip off: retrieval only at keyframes", built=False),
-    Part("without exposure of each view", _medium(exposure=False)),
-    Part("without sunlight on each view", {"mapping": {"sunlight": {"enabled": False}}}),
-    Part("skip off: medium off in clear water", _medium(off_when_clear=False)),
-    Part("skip off: no Gaussians in open water", built=False),
-    Part(
+    AblatedPart("skip off: encoder features reused", _tracking(reuse_encodings=False)),
+    AblatedPart("skip off: matching seeded by motion", _tracking(seed_matching=False)),
+    AblatedPart("skip off: solver stops when converged", _tracking(stop_converged=False)),
+    AblatedPart("skip off: retrieval only at keyframes", built=False),
+    AblatedPart("without exposure of each view", _medium(exposure=False)),
+    AblatedPart("without sunlight on each view", {"mapping": {"sunlight": {"enabled": False}}}),
+    AblatedPart("skip off: medium off in clear water", _medium(off_when_clear=False)),
+    AblatedPart("skip off: no Gaussians in open water", built=False),
+    AblatedPart(
         "with neural Gaussians, skip off: only voxel groups in view",
         _decoder(visible_groups=False),
     ),
-    Part(
+    AblatedPart(
         "skip off: views already explained",
         {"mapping": {"optimiser": {"skip_explained": False}}},
     ),
-    Part(
+    AblatedPart(
         "skip off: tiles at the noise floor",
         {"mapping": {"optimiser": {"noise_floor": 0.0}}},
     ),
-    Part(
+    AblatedPart(
         "with neural Gaussians, skip off: trunk cached over several views",
         _decoder(views_per_trunk=1),
     ),
@@ -106,7 +108,7 @@ def ablate(
     scenes: Sequence[BenchmarkScene],
     out: Path,
     progress: Progress,
-    parts: Sequence[Part] = PARTS,
+    parts: Sequence[AblatedPart] = PARTS,
     perform: Perform = in_process,
 ) -> dict[str, Any]:
     """Run every part's scenes, interleaved; means over the scenes (docs/formats.md#json-output)."""
@@ -123,7 +125,7 @@ def ablate(
     return {"rows": [_row(part, found[part.name]) for part in parts]}
 
 
-def _row(part: Part, runs: list[Row]) -> dict[str, Any]:
+def _row(part: AblatedPart, runs: list[Row]) -> dict[str, Any]:
     """A failed run leaves no number: a mean over fewer scenes would compare other things."""
     failed = [f"{run['scene']}: {run['failed']}" for run in runs if run["failed"]]
     whole = runs if not failed else []

@@ -14,7 +14,7 @@ from aquaflow.config.stage import validated
 from aquaflow.errors import InputError
 from aquaflow.evaluation.bench import machine
 from aquaflow.evaluation.matching import LEVELS, Picture, homography_recall, matcher_of
-from aquaflow.evaluation.prior_bench.latency import Contender, latency_rows, sea_floor
+from aquaflow.evaluation.prior_bench.latency import BenchmarkedPrior, latency_rows, sea_floor
 from aquaflow.prior.compact.quantise import INT8_ENCODER
 from aquaflow.prior.factory import SHIPPED, make_prior
 from aquaflow.prior.folder import CARD, read_card
@@ -48,7 +48,9 @@ def bench_prior(
         AquaFlowError: the device is not there.
     """
     seen = _pictures(pictures)
-    contenders = [Contender("classical", "none", 1, make_prior(PriorConfig(kind="classical")))]
+    contenders = [
+        BenchmarkedPrior("classical", "none", 1, make_prior(PriorConfig(kind="classical")))
+    ]
     shipped = [SHIPPED] if (SHIPPED / CARD).is_file() else []
     for folder in (*shipped, *folders):
         for precision in _precisions(folder):
@@ -60,14 +62,14 @@ def bench_prior(
     }
 
 
-def _contender(folder: Path, precision: str, threads: int, device: str) -> Contender:
+def _contender(folder: Path, precision: str, threads: int, device: str) -> BenchmarkedPrior:
     config = {
         "kind": "folder", "folder": folder, "device": device, "precision": precision,
         "threads": threads,
     }  # fmt: skip
     prior = make_prior(validated(PriorConfig, config, "command line"))
     name = prior.name if folder == SHIPPED else f"{prior.name} in {folder}"
-    return Contender(name, precision, threads, prior)
+    return BenchmarkedPrior(name, precision, threads, prior)
 
 
 def _precisions(folder: Path) -> list[str]:
@@ -75,7 +77,7 @@ def _precisions(folder: Path) -> list[str]:
 
 
 def _recall(
-    contenders: Sequence[Contender],
+    contenders: Sequence[BenchmarkedPrior],
     pictures: Sequence[Picture],  # [H, W, 3] RGB each
     progress: Progress,
 ) -> dict[str, dict[str, dict[str, float]]]:

@@ -29,7 +29,7 @@ LEAST_RUNS = 3
 
 
 @dataclass(frozen=True)
-class Contender:
+class BenchmarkedPrior:
     """A prior as it is set up."""
 
     name: str
@@ -48,7 +48,7 @@ class Spent:
 
 
 def latency_rows(
-    contenders: Sequence[Contender],
+    contenders: Sequence[BenchmarkedPrior],
     sizes: Sequence[tuple[int, int]],  # width, height
     repeats: int,
     progress: Callable[[str, int, int], None],

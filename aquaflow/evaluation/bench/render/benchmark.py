@@ -11,13 +11,13 @@ from aquaflow.errors import AquaFlowError, InputError
 from aquaflow.evaluation.bench import machine
 from aquaflow.evaluation.bench.render.accuracy import gradient_errors
 from aquaflow.evaluation.bench.render.contenders import (
-    Contender,
+    BenchmarkedRenderer,
     Timed,
     contenders_here,
     thread_counts,
 )
 from aquaflow.evaluation.bench.render.interactions import count_interactions
-from aquaflow.evaluation.bench.render.parts import Part, parts_of, time_parts
+from aquaflow.evaluation.bench.render.parts import TimedPart, parts_of, time_parts
 from aquaflow.evaluation.bench.render.peak import Peak, measure_peak
 from aquaflow.evaluation.bench.render.picture import draw
 from aquaflow.evaluation.bench.render.rows import Row, row_of
@@ -74,7 +74,7 @@ def _make_folder(out: Path) -> None:
 
 
 def time_sizes(
-    contenders: Sequence[Contender],
+    contenders: Sequence[BenchmarkedRenderer],
     sizes: Sequence[Size],
     repeats: int,
     peak: Peak,
@@ -100,15 +100,15 @@ def time_sizes(
 
 
 def _that_run(
-    contenders: Sequence[Contender], scene: SplatScene, notes: list[str]
-) -> list[Contender]:
+    contenders: Sequence[BenchmarkedRenderer], scene: SplatScene, notes: list[str]
+) -> list[BenchmarkedRenderer]:
     """Those that get through the scene once: a run that is not counted."""
     return [c for c in contenders if _attempt(c, scene, notes) is not None]
 
 
 def _samples(
-    contenders: Sequence[Contender], scene: SplatScene, repeats: int, notes: list[str]
-) -> list[tuple[Contender, list[Sample]]]:
+    contenders: Sequence[BenchmarkedRenderer], scene: SplatScene, repeats: int, notes: list[str]
+) -> list[tuple[BenchmarkedRenderer, list[Sample]]]:
     """Interleaved; a contender that fails once has none."""
     jobs = [partial(_attempt, contender, scene, notes) for contender in contenders]
     found = []
@@ -119,7 +119,7 @@ def _samples(
     return found
 
 
-def _attempt(contender: Contender, scene: SplatScene, notes: list[str]) -> Sample | None:
+def _attempt(contender: BenchmarkedRenderer, scene: SplatScene, notes: list[str]) -> Sample | None:
     try:
         return contender.sample(scene)
     except FAILURES as error:
@@ -131,7 +131,9 @@ def _attempt(contender: Contender, scene: SplatScene, notes: list[str]) -> Sampl
         return None
 
 
-def _timed_parts(parts: Sequence[Part], repeats: int, progress: Progress) -> list[dict[str, Any]]:
+def _timed_parts(
+    parts: Sequence[TimedPart], repeats: int, progress: Progress
+) -> list[dict[str, Any]]:
     total, done = len(parts) * repeats, 0
 
     def tick() -> None:

@@ -23,8 +23,8 @@ REFERENCE_MOST = SMALL.n * SMALL.pixels
 """Gaussians times pixels: beyond, the torch fallback takes minutes and the reference memory."""
 
 
-class Contender(Protocol):
-    """Something that draws a scene and differentiates it, and says how long that took."""
+class BenchmarkedRenderer(Protocol):
+    """A renderer that draws a scene and its gradients, and reports the times."""
 
     @property
     def name(self) -> str:
@@ -47,7 +47,7 @@ class Contender(Protocol):
         ...
 
     def takes(self, size: Size) -> bool:
-        """Whether a scene of this size can be waited for."""
+        """Whether a scene of this size takes a reasonable time."""
         ...
 
     def sample(self, scene: SplatScene) -> Sample:
@@ -99,9 +99,9 @@ def thread_counts() -> tuple[int, ...]:
     return tuple(sorted({1, len(os.sched_getaffinity(0))}))
 
 
-def contenders_here(opensplat: str | None = None) -> tuple[list[Contender], list[str]]:
+def contenders_here(opensplat: str | None = None) -> tuple[list[BenchmarkedRenderer], list[str]]:
     """The contenders, and one sentence for each that is missing or needs a remark."""
-    found: list[Contender] = []
+    found: list[BenchmarkedRenderer] = []
     notes: list[str] = []
     for isa in supported_isas():
         try:

@@ -27,8 +27,8 @@ LEARNING_RATE = 1e-3
 
 
 @dataclass(frozen=True)
-class Part:
-    """One way of doing one thing, ready to be run again and again."""
+class TimedPart:
+    """One variant of one operation, to be timed repeatedly."""
 
     name: str
     work: str
@@ -50,9 +50,9 @@ def parts_of(
     threads: Iterable[int],
     pictures: Sequence[tuple[int, int]] = PICTURES,
     rows: Sequence[int] = ROWS,
-) -> list[Part]:
+) -> list[TimedPart]:
     """Loss with gradient on each picture, optimiser step for each number of Gaussians."""
-    found: list[Part] = []
+    found: list[TimedPart] = []
     for count in threads:
         found += [_loss(*picture, count) for picture in pictures]
         for n in rows:
@@ -60,7 +60,7 @@ def parts_of(
     return found
 
 
-def _loss(width: int, height: int, threads: int) -> Part:
+def _loss(width: int, height: int, threads: int) -> TimedPart:
     rng = torch.Generator().manual_seed(0)
     rendered, target = torch.rand(2, height, width, 3, generator=rng)
     weight = torch.rand(height, width, generator=rng)
@@ -71,10 +71,10 @@ def _loss(width: int, height: int, threads: int) -> Part:
         loss = photometric_loss(leaf, target, weight, mask, SSIM_WEIGHT, threads)
         return torch.autograd.grad(loss, leaf)
 
-    return Part("L1 + SSIM", f"{width} x {height}", "fused", threads, loss_and_gradient)
+    return TimedPart("L1 + SSIM", f"{width} x {height}", "fused", threads, loss_and_gradient)
 
 
-def _optimisers(n: int, threads: int) -> list[Part]:
+def _optimisers(n: int, threads: int) -> list[TimedPart]:
     rng = torch.Generator().manual_seed(0)
 
     def tensors() -> dict[str, Tensor]:
@@ -87,21 +87,21 @@ def _optimisers(n: int, threads: int) -> list[Part]:
     for parameter, gradient in zip(parameters, gradients.values(), strict=True):
         parameter.grad = gradient
     fused = torch.optim.Adam(parameters, lr=LEARNING_RATE, fused=True)
-    found = [Part("Adam", work, "torch, fused", threads, fused.step, True)]
+    found = [TimedPart("Adam", work, "torch, fused", threads, fused.step, True)]
     for share in SEEN_SHARES:
         seen = torch.rand(n, generator=rng) < share
         step = partial(ours.step, seen, gradients)
-        found.append(Part("Adam", work, f"selective, {share:.0%} seen", threads, step))
+        found.append(TimedPart("Adam", work, f"selective, {share:.0%} seen", threads, step))
     return found
 
 
 def time_parts(
-    parts: Sequence[Part], repeats: int, tick: Callable[[], None], clock: Clock | None = None
+    parts: Sequence[TimedPart], repeats: int, tick: Callable[[], None], clock: Clock | None = None
 ) -> list[dict[str, Any]]:
     """A row for each part, in their order; the first run of each is not counted."""
     clock = clock or Clock()
 
-    def job(part: Part) -> Callable[[], tuple[float, float]]:
+    def job(part: TimedPart) -> Callable[[], tuple[float, float]]:
         def timed() -> tuple[float, float]:
             sample = part.timed(clock)
             tick()
@@ -115,7 +115,7 @@ def time_parts(
     return [_row(part, samples) for part, samples in zip(parts, results, strict=True)]
 
 
-def _row(part: Part, samples: Sequence[tuple[float, float]]) -> dict[str, Any]:
+def _row(part: TimedPart, samples: Sequence[tuple[float, float]]) -> dict[str, Any]:
     wall = spread_of([ms for ms, _ in samples])
     return {
         "part": part.name,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from aquaflow.evaluation.bench.render.contenders import Contender
+from aquaflow.evaluation.bench.render.contenders import BenchmarkedRenderer
 from aquaflow.evaluation.bench.render.interactions import BACKWARD_FLOP, FORWARD_FLOP
 from aquaflow.evaluation.bench.render.peak import Peak
 from aquaflow.evaluation.bench.render.scene import Size
@@ -18,7 +18,7 @@ PASSES = (("fwd", FORWARD_FLOP), ("bwd", BACKWARD_FLOP))
 
 
 def row_of(
-    contender: Contender,
+    contender: BenchmarkedRenderer,
     size: Size,
     samples: Sequence[Sample],
     interactions: int,
@@ -55,7 +55,7 @@ def row_of(
 
 
 def _shares(
-    contender: Contender, busy_s: dict[str, float], interactions: int, peak: Peak
+    contender: BenchmarkedRenderer, busy_s: dict[str, float], interactions: int, peak: Peak
 ) -> dict[str, float] | None:
     """Useful operations/s over the peak's; None where no peak was measured for the device."""
     most = None if contender.isa == "cuda" else peak.flop_per_s.get(contender.threads)

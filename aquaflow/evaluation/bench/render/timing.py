@@ -39,7 +39,7 @@ class Sample:
 
 
 @runtime_checkable
-class TellsStages(Protocol):
+class ReportsStages(Protocol):
     """A renderer that knows where its last forward and backward pass spent their time."""
 
     def stage_ms(self) -> Mapping[str, float]:
@@ -69,7 +69,7 @@ def time_renderer(
     )
     alone = renderer.threads == 1 and device == "cpu"
     fwd_cpu, bwd_cpu = (fwd[1], bwd[1]) if alone else (None, None)
-    stages = dict(renderer.stage_ms()) if isinstance(renderer, TellsStages) else {}
+    stages = dict(renderer.stage_ms()) if isinstance(renderer, ReportsStages) else {}
     return Sample(fwd[0], bwd[0], fwd_cpu, bwd_cpu, stages)
 
 
