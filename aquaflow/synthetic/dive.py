@@ -58,7 +58,7 @@ def camera_of(config: SyntheticConfig) -> CameraModel:
     )
 
 
-def build(config: SyntheticConfig) -> tuple[render.Scene, paths.Path]:
+def build(config: SyntheticConfig) -> tuple[render.SyntheticScene, paths.Path]:
     """The scene and the way through it."""
     # One stream each: the scene does not change when the path's or the sensor's draws do.
     terrain_rng, things_rng, colour_rng, sway_rng = _streams(config)[:4]
@@ -73,7 +73,7 @@ def build(config: SyntheticConfig) -> tuple[render.Scene, paths.Path]:
     relief = build_relief(config.scene, area, loop, terrain_rng)
     shapes = place_objects(config.scene, relief, loop, things_rng)
     floor = radiance.bake(config.scene, relief, objects.casters(relief, shapes), colour_rng)
-    scene = render.Scene(
+    scene = render.SyntheticScene(
         area,
         HeightField(area, relief.height),
         MipAtlas(floor, MIP_LEVELS),
@@ -167,7 +167,7 @@ def _write_tables(out: Path, config: SyntheticConfig, path: paths.Path) -> None:
 def _write_pictures(
     out: Path,
     config: SyntheticConfig,
-    scene: render.Scene,
+    scene: render.SyntheticScene,
     path: paths.Path,
     progress: Callable[[int, int], None] | None,
 ) -> None:
@@ -200,7 +200,7 @@ def _save(
     out: Path,
     index: int,
     picture: npt.NDArray[np.uint8],  # [H, W, 3] RGB
-    view: render.View,
+    view: render.RenderedView,
 ) -> None:
     name = f"{index:06d}"
     _save_png(out / "images" / f"{name}.png", picture)

@@ -20,7 +20,7 @@ from aquaflow.synthetic.relief import Area
 from aquaflow.synthetic.texture import MipAtlas
 from aquaflow.synthetic.water import Medium
 
-__all__ = ["Scene", "View", "render"]
+__all__ = ["RenderedView", "SyntheticScene", "render"]
 
 Array: TypeAlias = npt.NDArray[np.float64]
 
@@ -31,7 +31,7 @@ CHUNK_RAYS = 60_000
 
 
 @dataclass(frozen=True)
-class Scene:
+class SyntheticScene:
     """Everything that a ray can meet."""
 
     area: Area
@@ -44,7 +44,7 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class View:
+class RenderedView:
     """What one pose sees."""
 
     range_m: npt.NDArray[np.float32]
@@ -56,18 +56,18 @@ class View:
 
 
 def render(
-    scene: Scene,
+    scene: SyntheticScene,
     camera: CameraModel,
     R_sc: Array,  # [3, 3] camera axes in the survey frame (z down)
     centre: Array,  # [3] m, survey frame (z down)
     medium: Medium,
     supersampling: int,
-) -> View:
+) -> RenderedView:
     """Render with ``supersampling`` x ``supersampling`` rays per pixel."""
     up = np.diag([1.0, 1.0, -1.0])
     rotation, origin = up @ R_sc, torch.tensor(up @ centre, dtype=torch.float32)
     height, width = camera.height, camera.width
-    view = View(
+    view = RenderedView(
         np.empty((height, width), np.float32),
         np.empty((height, width, 3), np.float32),
         np.empty((height, width, 3), np.float32),
@@ -122,7 +122,7 @@ def _rays(
 
 
 def _ranges(
-    scene: Scene,
+    scene: SyntheticScene,
     camera: CameraModel,
     rotation: Array,  # [3, 3]
     origin: torch.Tensor,  # [3] m
@@ -169,7 +169,7 @@ def _may_meet(
 
 
 def _trace(
-    scene: Scene,
+    scene: SyntheticScene,
     camera: CameraModel,
     rotation: Array,  # [3, 3]
     origin: torch.Tensor,  # [3] m
@@ -201,7 +201,7 @@ def _trace(
 
 
 def _grain(
-    scene: Scene,
+    scene: SyntheticScene,
     x: torch.Tensor,  # [N] m
     y: torch.Tensor,  # [N] m
     z: torch.Tensor,  # [N] m

@@ -26,7 +26,7 @@ from aquaflow.training.compact_recall import (
 from aquaflow.training.curve import NOT_FIGURES
 from aquaflow.training.pair_generator.cameras import WIDER
 from aquaflow.training.pair_generator.draw import Draw
-from aquaflow.training.pair_generator.drawing import Looks, through_water
+from aquaflow.training.pair_generator.drawing import WindowVariation, through_water
 from aquaflow.training.pair_generator.pool import SHARD, Pool
 from aquaflow.training.pairs import Pair
 from aquaflow.training.schedule import Schedule
@@ -52,7 +52,7 @@ class CompactRun:
     rate: float = 2e-3
     lowest_rate: float = 2e-5
     settings: CompactSettings = field(default_factory=CompactSettings)
-    looks: Looks = field(default_factory=Looks)
+    looks: WindowVariation = field(default_factory=WindowVariation)
 
     @property
     def schedule(self) -> Schedule:

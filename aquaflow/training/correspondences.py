@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from aquaflow.training.pairs import Pair, View, seen_from
+from aquaflow.training.pairs import Pair, ViewBatch, seen_from
 
 SAME_PLACE = 0.03
 """Distance of two points, as a share of their depth, below which they are one: a pixel's step on a
@@ -42,7 +42,7 @@ def correspondences(pair: Pair) -> Correspondences:
 
 def project(
     points: Tensor,  # [B, H, W, 3] in the view's frame
-    view: View,
+    view: ViewBatch,
 ) -> tuple[Tensor, Tensor]:
     """[B, H, W, 2] px and [B, H, W] bool: in front of the camera and on the picture."""
     z = points[..., 2]
@@ -56,7 +56,7 @@ def project(
 
 def nearest_pixels(
     pixels: Tensor,  # [B, H, W, 2]
-    view: View,
+    view: ViewBatch,
 ) -> tuple[Tensor, Tensor]:
     """Row and column, both [B, H, W] int64, held on the picture."""
     height, width = view.depth.shape[-2:]

@@ -17,7 +17,7 @@ from aquaflow.training.datasets.fitting import view_of
 from aquaflow.training.datasets.posed import Posed
 from aquaflow.training.datasets.posed import Sequence as Scene
 from aquaflow.training.datasets.validity import moved
-from aquaflow.training.pairs import Pair, View
+from aquaflow.training.pairs import Pair, ViewBatch
 
 LEAST_OVERLAP = 0.3
 """Of the valid pixels, seen by both (paper, Sec. 3.1)."""
@@ -79,12 +79,12 @@ class _Small:
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self._views: dict[int, View | None] = {}
+        self._views: dict[int, ViewBatch | None] = {}
 
     def __len__(self) -> int:
         return len(self._scene)
 
-    def __getitem__(self, index: int) -> View | None:
+    def __getitem__(self, index: int) -> ViewBatch | None:
         """None where it cannot be read, or shows too little."""
         if index not in self._views:
             try:
@@ -132,7 +132,7 @@ class MinedPairs:
         self,
         posed: Posed,
         T_rw: npt.NDArray[np.floating],  # [4, 4] world to reference
-    ) -> View:
+    ) -> ViewBatch:
         return view_of(posed, self.width, self.height, T_rw)
 
 
@@ -156,12 +156,12 @@ def load_index(path: Path) -> list[PairIndex]:
 
 
 def _without(
-    view: View,
+    view: ViewBatch,
     mask: torch.Tensor,  # [B, H, W] bool
-) -> View:
-    return View(view.image, view.depth, view.K, view.T_wc, view.valid & ~mask)
+) -> ViewBatch:
+    return ViewBatch(view.image, view.depth, view.K, view.T_wc, view.valid & ~mask)
 
 
-def _batch(views: Sequence[View]) -> View:
+def _batch(views: Sequence[ViewBatch]) -> ViewBatch:
     names = ("image", "depth", "K", "T_wc", "valid")
-    return View(*(torch.cat([getattr(view, name) for view in views]) for name in names))
+    return ViewBatch(*(torch.cat([getattr(view, name) for view in views]) for name in names))

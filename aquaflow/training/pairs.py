@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
-class View:
+class ViewBatch:
     """A batch of pictures with all that is known of them."""
 
     image: Tensor
@@ -39,17 +39,17 @@ class View:
         y = ((v[:, None] - cy) / fy).expand_as(self.depth)
         return torch.stack([x, y, torch.ones_like(x)], dim=-1)
 
-    def to(self, device: torch.device) -> View:
+    def to(self, device: torch.device) -> ViewBatch:
         """The same on another device."""
-        return View(*(getattr(self, field.name).to(device) for field in fields(self)))
+        return ViewBatch(*(getattr(self, field.name).to(device) for field in fields(self)))
 
 
 @dataclass(frozen=True)
 class Pair:
     """Two views of one scene; a is the reference."""
 
-    a: View
-    b: View
+    a: ViewBatch
+    b: ViewBatch
 
     def swapped(self) -> Pair:
         """The same pair, seen from b."""

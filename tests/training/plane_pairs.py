@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from aquaflow.training.pairs import Pair, View
+from aquaflow.training.pairs import Pair, ViewBatch
 
 FOCAL_PX = 20.0
 
@@ -19,12 +19,12 @@ def camera_at(x: float, turned: float = 0.0) -> torch.Tensor:
     return T
 
 
-def plane_view(x: float, z: float = 2.0, turned: float = 0.0, size: int = 20) -> View:
+def plane_view(x: float, z: float = 2.0, turned: float = 0.0, size: int = 20) -> ViewBatch:
     """A square picture of the plane at depth ``z``, seen by a camera shifted to ``x``."""
     K = torch.tensor([[FOCAL_PX, 0, size / 2], [0, FOCAL_PX, size / 2], [0, 0, 1]]).double()
     depth = torch.full((1, size, size), z, dtype=torch.float64)
     image = torch.zeros(1, 3, size, size, dtype=torch.float64)
-    return View(image, depth, K[None], camera_at(x, turned)[None], depth > 0)
+    return ViewBatch(image, depth, K[None], camera_at(x, turned)[None], depth > 0)
 
 
 def shifted_pair(x: float, z: float = 2.0) -> Pair:

@@ -18,7 +18,7 @@ from aquaflow.training.compact_recall import mean_recall
 from aquaflow.training.correspondences import Correspondences
 from aquaflow.training.pair_generator.cameras import TRAINING
 from aquaflow.training.pair_generator.draw import Draw
-from aquaflow.training.pair_generator.drawing import Looks, training_pair
+from aquaflow.training.pair_generator.drawing import WindowVariation, training_pair
 from aquaflow.training.pair_generator.pool import Pool
 from aquaflow.training.pair_generator.render import render_pairs
 from aquaflow.training.pair_generator.scene import Detail
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 SMALL = NetworkSize(levels=(8, 8, 12, 16), merged=(16, 12, 8), fine=8, coarse=16, head=4)
 DETAIL = Detail(terrain=64, texture=128)
-LOOKS = Looks(width=64, height=48, roll=0.2)
+LOOKS = WindowVariation(width=64, height=48, roll=0.2)
 SETTINGS = CompactSettings(batch=2, matches=64, first_scenes=8, steps_per_shard=2, scenes=24)
 PLAN = TrainingPlan(Schedule(4, 1, 1e-3, 1e-4), validate_every=2, save_every=2)
 

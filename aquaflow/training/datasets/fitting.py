@@ -9,7 +9,7 @@ import torch
 
 from aquaflow.training.datasets.posed import Posed
 from aquaflow.training.datasets.validity import valid_pixels
-from aquaflow.training.pairs import View
+from aquaflow.training.pairs import ViewBatch
 
 
 def view_of(
@@ -17,7 +17,7 @@ def view_of(
     width: int,
     height: int,
     T_rw: npt.NDArray[np.floating] | None = None,  # [4, 4] world to reference
-) -> View:
+) -> ViewBatch:
     """[1, ...] the picture's middle, as large as fits; poses are of the camera to ``r``.
 
     Depth is never averaged: between near and far there is nothing.
@@ -38,7 +38,7 @@ def view_of(
     T = posed.T_wc if T_rw is None else T_rw @ posed.T_wc
     # Unknown depths are 1: what is not a number would be one in every sum, masked or not.
     known = valid.astype(bool)
-    return View(
+    return ViewBatch(
         torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))[None]).float() / 255.0,
         torch.from_numpy(np.where(known, depth, 1.0)[None]).float(),
         torch.from_numpy(K[None]).float(),

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from aquaflow.training.correspondences import nearest_pixels, project
 from aquaflow.training.datasets.posed import Posed
-from aquaflow.training.pairs import View, seen_from
+from aquaflow.training.pairs import ViewBatch, seen_from
 
 Mask = npt.NDArray[np.bool_]
 
@@ -40,7 +40,7 @@ def valid_pixels(posed: Posed) -> Mask:
     return known & ~_highlights(posed.image) & ~_veiled(posed.image)
 
 
-def moved(a: View, b: View) -> Tensor:
+def moved(a: ViewBatch, b: ViewBatch) -> Tensor:
     """[B, H, W] bool: a's point would hide what b sees there, so it was elsewhere by then."""
     points = seen_from(b.T_wc, a.points(), a.T_wc)
     pixels, inside = project(points, b)

@@ -10,16 +10,16 @@ from torch.nn import functional as F
 
 from aquaflow.training.correspondences import project
 from aquaflow.training.pair_generator.draw import Draw
-from aquaflow.training.pair_generator.look import look_again
 from aquaflow.training.pair_generator.render import median_depth
 from aquaflow.training.pair_generator.scene import rotation
+from aquaflow.training.pair_generator.second_view import turned_view
 from aquaflow.training.pair_generator.sensor import taken
 from aquaflow.training.pair_generator.water import random_water
-from aquaflow.training.pairs import Pair, View, seen_from
+from aquaflow.training.pairs import Pair, ViewBatch, seen_from
 
 
 @dataclass(frozen=True)
-class Looks:
+class WindowVariation:
     """How the windows of a pair differ from the pictures that were rendered."""
 
     width: int = 128
@@ -45,7 +45,7 @@ def through_water(draw: Draw, pair: Pair) -> Pair:
     return Pair(a, b)
 
 
-def training_pair(draw: Draw, clear: Pair, looks: Looks) -> Pair:
+def training_pair(draw: Draw, clear: Pair, looks: WindowVariation) -> Pair:
     """One use of pairs without water: other windows, another water, another camera."""
     if bool(draw.chance(0.5)):
         clear = clear.swapped()
@@ -59,7 +59,7 @@ def training_pair(draw: Draw, clear: Pair, looks: Looks) -> Pair:
     return pair
 
 
-def windows(draw: Draw, pair: Pair, looks: Looks) -> Pair:
+def windows(draw: Draw, pair: Pair, looks: WindowVariation) -> Pair:
     """Both views turned and zoomed; the second one looks at about what the first one sees."""
     height, width = pair.a.depth.shape[-2:]
     batch = len(pair.a.K)
@@ -88,13 +88,13 @@ def _where_seen(
 
 def _window(
     draw: Draw,
-    view: View,
+    view: ViewBatch,
     middle: Tensor,  # [B, 2] px that the window is centred on
-    looks: Looks,
+    looks: WindowVariation,
     roll: float,
     tilt: float,
     jitter: float,
-) -> View:
+) -> ViewBatch:
     batch = len(view.K)
     turn = draw.normal(batch, 3, sigma=tilt)
     turn[:, 2] = draw.uniform(batch, low=-roll, high=roll)
@@ -107,20 +107,20 @@ def _window(
     at = (K[:, :2, :2] @ (R.mT @ ray)[:, :2])[..., 0] / (R.mT @ ray)[:, 2]
     size = torch.tensor([looks.width, looks.height], device=draw.device)
     K[:, :2, 2] = size * (0.5 + draw.uniform(batch, 2, low=-jitter, high=jitter)) - at
-    return look_again(view, K, R, looks.width, looks.height)
+    return turned_view(view, K, R, looks.width, looks.height)
 
 
 def _chosen(
     first: Tensor,  # [B] bool
-    a: View,
-    b: View,
-) -> View:
+    a: ViewBatch,
+    b: ViewBatch,
+) -> ViewBatch:
     """``a`` where ``first`` holds, ``b`` elsewhere."""
 
     def pick(x: Tensor, y: Tensor) -> Tensor:
         return torch.where(first.view(-1, *[1] * (x.dim() - 1)), x, y)
 
-    return View(
+    return ViewBatch(
         pick(a.image, b.image),
         pick(a.depth, b.depth),
         pick(a.K, b.K),

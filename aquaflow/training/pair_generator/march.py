@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from aquaflow.training.pair_generator.scene import Scene, Solids, Terrain
+from aquaflow.training.pair_generator.scene import SceneBatch, Solids, Terrain
 
 STEPS = 64
 """Along a ray, each a constant factor further than the last."""
@@ -31,7 +31,7 @@ class Hits:
     normal: Tensor
     """[B, N, 3] unit, outwards"""
     material: Tensor
-    """[B, N] int64, see Scene.materials"""
+    """[B, N] int64, see SceneBatch.materials"""
 
     @property
     def found(self) -> Tensor:
@@ -40,7 +40,7 @@ class Hits:
 
 
 def first_hits(
-    scene: Scene,
+    scene: SceneBatch,
     centre: Tensor,  # [B, 3] of the camera, metres
     rays: Tensor,  # [B, N, 3] in the world, of unit depth
 ) -> Hits:

@@ -17,7 +17,7 @@ from aquaflow.training.pair_generator.cameras import TRAINING, Motion
 from aquaflow.training.pair_generator.draw import Draw
 from aquaflow.training.pair_generator.render import BRIGHTEST, render_pairs
 from aquaflow.training.pair_generator.scene import Detail
-from aquaflow.training.pairs import Pair, View
+from aquaflow.training.pairs import Pair, ViewBatch
 
 SHARD = 8
 """Pairs of a file."""
@@ -75,7 +75,7 @@ class Pool:
         return self.folder / f"pairs_{size}_{self.seed}_{shard:05d}.pt"
 
 
-def _packed(view: View, name: str) -> dict[str, Tensor]:
+def _packed(view: ViewBatch, name: str) -> dict[str, Tensor]:
     """Radiance in 8 bits, depth in 16: a twentieth of a pixel at the widest parallax."""
     return {
         f"image_{name}": (view.image * (255.0 / BRIGHTEST)).round().byte(),
@@ -88,7 +88,7 @@ def _packed(view: View, name: str) -> dict[str, Tensor]:
 def _view(
     stacked: dict[str, Tensor],  # as from _packed
     name: str,
-) -> View:
+) -> ViewBatch:
     depth = stacked[f"depth_{name}"].float()
     image = stacked[f"image_{name}"].float() * (BRIGHTEST / 255.0)
-    return View(image, depth, stacked[f"K_{name}"], stacked[f"T_wc_{name}"], depth > 0)
+    return ViewBatch(image, depth, stacked[f"K_{name}"], stacked[f"T_wc_{name}"], depth > 0)

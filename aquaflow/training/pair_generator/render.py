@@ -10,8 +10,8 @@ from aquaflow.training.pair_generator.cameras import Motion, first_camera, intri
 from aquaflow.training.pair_generator.draw import Draw
 from aquaflow.training.pair_generator.march import FURTHEST, Hits, first_hits
 from aquaflow.training.pair_generator.noise import periodic
-from aquaflow.training.pair_generator.scene import Detail, Scene, random_scenes
-from aquaflow.training.pairs import Pair, View
+from aquaflow.training.pair_generator.scene import Detail, SceneBatch, random_scenes
+from aquaflow.training.pairs import Pair, ViewBatch
 
 BRIGHTEST = 1.5
 """Radiance that nothing exceeds; the pool stores radiances in 8 bits up to this."""
@@ -34,7 +34,7 @@ def render_pairs(
     return Pair(a, render_view(draw, scene, K, T_b, width, height))
 
 
-def median_depth(view: View) -> Tensor:
+def median_depth(view: ViewBatch) -> Tensor:
     """[B] metres over the valid pixels; 2 where there is none."""
     known = torch.where(view.valid, view.depth, torch.nan).flatten(1)
     return known.nanmedian(1).values.nan_to_num(2.0)
@@ -42,27 +42,27 @@ def median_depth(view: View) -> Tensor:
 
 def render_view(
     draw: Draw,
-    scene: Scene,
+    scene: SceneBatch,
     K: Tensor,  # [B, 3, 3]
     T_wc: Tensor,  # [B, 4, 4]
     width: int,
     height: int,
-) -> View:
+) -> ViewBatch:
     """What a camera sees; caustics are where they happen to be."""
     batch = len(K)
     empty = torch.zeros(batch, height, width, device=K.device)
-    blank = View(empty[:, None].expand(-1, 3, -1, -1), empty, K, T_wc, empty > 0)
+    blank = ViewBatch(empty[:, None].expand(-1, 3, -1, -1), empty, K, T_wc, empty > 0)
     rays = blank.rays(height, width).flatten(1, 2)
     in_world = rays @ T_wc[:, :3, :3].mT
     hits = first_hits(scene, T_wc[:, :3, 3], in_world)
     image = _radiance(draw, scene, hits, T_wc[:, :3, 3], in_world, rays, K)
     depth = torch.where(hits.found, hits.depth, 0.0).view_as(empty)
-    return View(image.view(batch, 3, height, width), depth, K, T_wc, depth > 0)
+    return ViewBatch(image.view(batch, 3, height, width), depth, K, T_wc, depth > 0)
 
 
 def _radiance(
     draw: Draw,
-    scene: Scene,
+    scene: SceneBatch,
     hits: Hits,
     centre: Tensor,  # [B, 3]
     in_world: Tensor,  # [B, N, 3] rays of unit depth
@@ -89,7 +89,7 @@ def _radiance(
 
 def _sunlight(
     draw: Draw,
-    scene: Scene,
+    scene: SceneBatch,
     hits: Hits,
     points: Tensor,  # [B, N, 3] world, m
 ) -> Tensor:
@@ -106,7 +106,7 @@ def _sunlight(
 
 def _lamplight(
     draw: Draw,
-    scene: Scene,
+    scene: SceneBatch,
     hits: Hits,
     rays: Tensor,  # [B, N, 3] camera, of unit depth
     facing: Tensor,  # [B, N] cosine

@@ -91,7 +91,7 @@ class Light:
 
 
 @dataclass(frozen=True)
-class Scene:
+class SceneBatch:
     """A batch of scenes."""
 
     terrain: Terrain
@@ -105,9 +105,9 @@ class Scene:
     light: Light
 
 
-def random_scenes(draw: Draw, batch: int, detail: Detail) -> Scene:
+def random_scenes(draw: Draw, batch: int, detail: Detail) -> SceneBatch:
     """``batch`` scenes, each unlike the others."""
-    return Scene(
+    return SceneBatch(
         _terrain(draw, batch, detail.terrain),
         _solids(draw, batch),
         atlas([albedo(draw, batch, detail.texture) for _ in range(3)]),

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from aquaflow.synthetic.water import WATER_TYPES
 from aquaflow.training.pair_generator.draw import Draw
-from aquaflow.training.pairs import View
+from aquaflow.training.pairs import ViewBatch
 
 MEDIAN_RANGE_M = (0.6, 6.0)
 """How far away the scene is taken to be: scenes are as large as one likes."""
@@ -20,7 +20,7 @@ FAR_M = 1e3
 
 
 @dataclass(frozen=True)
-class Water:
+class WaterBatch:
     """I = J exp(-beta_a z) + B_inf (1 - exp(-b z)) + B_res exp(-d z), z in the scene's metres."""
 
     beta_a: Tensor
@@ -34,7 +34,7 @@ class Water:
     d: Tensor
     """[B, 3] 1/m"""
 
-    def through(self, view: View) -> Tensor:
+    def through(self, view: ViewBatch) -> Tensor:
         """[B, 3, H, W] the radiance that reaches the camera."""
         height, width = view.depth.shape[-2:]
         z = (view.depth * view.rays(height, width).norm(dim=-1))[:, None]
@@ -49,7 +49,7 @@ class Water:
 def random_water(
     draw: Draw,
     median_range: Tensor,  # [B] of the scene, its metres
-) -> Water:
+) -> WaterBatch:
     """Between two neighbours of the table of Jerlov's types, and off it by a fifth or so."""
     batch = len(median_range)
     types = list(WATER_TYPES.values())[1:]
@@ -68,7 +68,7 @@ def random_water(
     scale = (torch.minimum(metres, most) / median_range)[:, None]
     # Under lamps in the dark the open water is nearly black.
     dark = torch.where(draw.chance(0.2, batch, 1), draw.uniform(batch, 1, high=0.3), 1.0)
-    return Water(
+    return WaterBatch(
         beta_a * scale,
         between("b", 0.25) * scale,
         between("B_inf", 0.25) * dark,

@@ -11,7 +11,7 @@ import torch
 from aquaflow.training.correspondences import overlap
 from aquaflow.training.pair_generator.cameras import TRAINING
 from aquaflow.training.pair_generator.draw import Draw
-from aquaflow.training.pair_generator.drawing import Looks, through_water, training_pair
+from aquaflow.training.pair_generator.drawing import WindowVariation, through_water, training_pair
 from aquaflow.training.pair_generator.pool import SHARD, STRIDE, Pool
 from aquaflow.training.pair_generator.render import BRIGHTEST, median_depth, render_pairs
 from aquaflow.training.pair_generator.scene import Detail
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 WIDTH, HEIGHT = 48, 36
 COARSE = Detail(terrain=64, texture=128)
-LOOKS = Looks(width=32, height=24)
+LOOKS = WindowVariation(width=32, height=24)
 
 
 @pytest.fixture(scope="module")

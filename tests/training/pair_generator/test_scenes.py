@@ -17,11 +17,11 @@ from aquaflow.training.pair_generator.cameras import (
     second_camera,
 )
 from aquaflow.training.pair_generator.draw import Draw
-from aquaflow.training.pair_generator.look import look_again
 from aquaflow.training.pair_generator.march import first_hits
 from aquaflow.training.pair_generator.render import median_depth, render_pairs, render_view
-from aquaflow.training.pair_generator.scene import Detail, Scene, random_scenes, rotation
-from aquaflow.training.pairs import Pair, View, seen_from
+from aquaflow.training.pair_generator.scene import Detail, SceneBatch, random_scenes, rotation
+from aquaflow.training.pair_generator.second_view import turned_view
+from aquaflow.training.pairs import Pair, ViewBatch, seen_from
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -29,19 +29,19 @@ WIDTH, HEIGHT, BATCH = 64, 48, 2
 COARSE = Detail(terrain=64, texture=128)
 
 
-def unlit(scene: Scene) -> Scene:
+def unlit(scene: SceneBatch) -> SceneBatch:
     """Without what changes from picture to picture: lamps and caustics."""
     nothing = torch.zeros(BATCH)
     return replace(scene, light=replace(scene.light, lamps=nothing, caustics=nothing))
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene() -> SceneBatch:
     return unlit(random_scenes(Draw(3), BATCH, COARSE))
 
 
 @pytest.fixture(scope="module")
-def pair(scene: Scene) -> Pair:
+def pair(scene: SceneBatch) -> Pair:
     draw = Draw(4)
     K = intrinsics(draw, BATCH, WIDTH, HEIGHT)
     T_a = first_camera(draw, scene.terrain)
@@ -58,7 +58,7 @@ def looked_up(
     return F.grid_sample(field, grid, align_corners=False)
 
 
-def test_what_is_hit_lies_on_the_floor_or_on_a_body(scene: Scene, pair: Pair) -> None:
+def test_what_is_hit_lies_on_the_floor_or_on_a_body(scene: SceneBatch, pair: Pair) -> None:
     view = pair.a
     rays = view.rays(HEIGHT, WIDTH).flatten(1, 2) @ view.T_wc[:, :3, :3].mT
     centre = view.T_wc[:, :3, 3]
@@ -96,9 +96,9 @@ def test_warped_by_its_depth_the_second_picture_is_the_first_to_sub_pixel(pair: 
         assert exact < 0.9 * difference(dx, dy)
 
 
-def test_a_second_look_is_what_a_turned_camera_sees(scene: Scene, pair: Pair) -> None:
+def test_a_second_look_is_what_a_turned_camera_sees(scene: SceneBatch, pair: Pair) -> None:
     R = rotation(torch.tensor([0.05, -0.08, 0.5]).expand(BATCH, 3))
-    turned = look_again(pair.a, pair.a.K, R, WIDTH, HEIGHT)
+    turned = turned_view(pair.a, pair.a.K, R, WIDTH, HEIGHT)
     fresh = render_view(Draw(0), scene, turned.K, turned.T_wc, WIDTH, HEIGHT)
     both = turned.valid & fresh.valid
     error = ((turned.depth - fresh.depth).abs() / fresh.depth)[both]
@@ -109,7 +109,7 @@ def test_a_second_look_is_what_a_turned_camera_sees(scene: Scene, pair: Pair) ->
 
 def test_a_view_and_its_second_look_match_exactly(pair: Pair) -> None:
     R = rotation(torch.tensor([0.0, 0.0, 0.4]).expand(BATCH, 3))
-    turned = look_again(pair.a, pair.a.K, R, WIDTH, HEIGHT)
+    turned = turned_view(pair.a, pair.a.K, R, WIDTH, HEIGHT)
     found = correspondences(Pair(turned, pair.a))
     rays = turned.rays(HEIGHT, WIDTH) @ R[:, None].mT
     focal = torch.stack([pair.a.K[:, 0, 0], pair.a.K[:, 1, 1]], -1)[:, None, None]
@@ -130,11 +130,11 @@ def test_the_same_seed_gives_the_same_pair_and_another_one_another() -> None:
 def test_a_view_without_any_depth_has_a_median_all_the_same() -> None:
     empty = torch.zeros(1, HEIGHT, WIDTH)
     K, T_wc = torch.eye(3)[None], torch.eye(4)[None]
-    view = View(torch.zeros(1, 3, HEIGHT, WIDTH), empty, K, T_wc, empty > 0)
+    view = ViewBatch(torch.zeros(1, 3, HEIGHT, WIDTH), empty, K, T_wc, empty > 0)
     assert median_depth(view).tolist() == [2.0]
 
 
-def test_distance_averages_texture_instead_of_aliasing_it(scene: Scene) -> None:
+def test_distance_averages_texture_instead_of_aliasing_it(scene: SceneBatch) -> None:
     places = Draw(1).uniform(BATCH, 4000, 2)
     material = torch.zeros(BATCH, 4000, dtype=torch.int64)
     spread = [

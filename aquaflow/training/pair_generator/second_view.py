@@ -10,24 +10,24 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from aquaflow.training.pairs import View
+from aquaflow.training.pairs import ViewBatch
 
 SMOOTH = 1.1
 """Ratio of neighbouring depths above which a depth between them is that of neither."""
 
 
-def look_again(
-    view: View,
+def turned_view(
+    view: ViewBatch,
     K: Tensor,  # [B, 3, 3] of the new picture
     R: Tensor,  # [B, 3, 3] new camera to old
     width: int,
     height: int,
-) -> View:
+) -> ViewBatch:
     """The view through another camera at the same place; beyond the picture it is mirrored."""
     T_wc = view.T_wc.clone()
     T_wc[:, :3, :3] = view.T_wc[:, :3, :3] @ R
     empty = torch.zeros(len(K), height, width, device=K.device)
-    rays = View(view.image, empty, K, T_wc, empty > 0).rays(height, width) @ R[:, None].mT
+    rays = ViewBatch(view.image, empty, K, T_wc, empty > 0).rays(height, width) @ R[:, None].mT
     old = rays[..., :2] / rays[..., 2:].clamp_min(1e-3)
     focal = torch.stack([view.K[:, 0, 0], view.K[:, 1, 1]], -1)[:, None, None]
     pixels = old * focal + view.K[:, None, None, :2, 2]
@@ -45,10 +45,10 @@ def look_again(
         view.depth[:, None], grid, mode="nearest", padding_mode="reflection", align_corners=False
     )[:, 0]
     valid = inside & (clear > 0.999)
-    return View(image, torch.where(valid, depth, mirrored), K, T_wc, valid)
+    return ViewBatch(image, torch.where(valid, depth, mirrored), K, T_wc, valid)
 
 
-def _edges(view: View) -> Tensor:
+def _edges(view: ViewBatch) -> Tensor:
     """[B, H, W] bool: one of the four neighbours differs in depth, or is not known."""
     across = _differ(view.depth[:, :, 1:], view.depth[:, :, :-1])
     down = _differ(view.depth[:, 1:], view.depth[:, :-1])
