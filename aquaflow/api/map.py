@@ -12,7 +12,7 @@ import torch
 
 from aquaflow.errors import InputError
 from aquaflow.export.map_file import SUFFIX, read_map_file
-from aquaflow.export.ply import Splats
+from aquaflow.export.ply import PlyGaussians
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.gaussians.gaussians import radiance
@@ -69,14 +69,14 @@ class Map:
         return len(self._mapper.gaussians)
 
     @property
-    def gaussians(self) -> Splats:
+    def gaussians(self) -> PlyGaussians:
         """Copies of all Gaussians: world frame, map units, colours without water.
 
         With a decoder, each Gaussian as the mapped view nearest to it sees it.
         """
         with torch.no_grad():
             plain = self._mapper.scene.baked(self._mapper.views)
-            return Splats(
+            return PlyGaussians(
                 means=plain["means"].numpy().copy(),
                 wxyz=torch.nn.functional.normalize(plain["quats"], dim=-1).numpy().copy(),
                 scales=torch.exp(plain["log_scales"]).numpy(),

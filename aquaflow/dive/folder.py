@@ -20,7 +20,7 @@ from aquaflow.dive.log import JsonLog
 from aquaflow.dive.results import HeldOut, WaterSummary, water_of
 from aquaflow.errors import InputError
 from aquaflow.export.map_file import write_map_file
-from aquaflow.export.ply import Splats, write_ply
+from aquaflow.export.ply import PlyGaussians, write_ply
 from aquaflow.export.png import write_png
 from aquaflow.export.report import ReportData, write_report
 from aquaflow.export.tum import write_tum
@@ -259,8 +259,8 @@ def _finite(value: Any) -> Any:
 def _splats(
     parameters: Mapping[str, torch.Tensor],  # of a GaussianMap
     colours: torch.Tensor,  # [N, 3]
-) -> Splats:
-    return Splats(
+) -> PlyGaussians:
+    return PlyGaussians(
         parameters["means"].numpy(),
         torch.nn.functional.normalize(parameters["quats"], dim=-1).numpy(),
         torch.exp(parameters["log_scales"]).numpy(),

@@ -48,8 +48,8 @@ PLY_TYPES = {
 
 
 @dataclass(frozen=True)
-class Splats:
-    """Gaussians in natural units."""
+class PlyGaussians:
+    """The Gaussians of a PLY file, in natural units (no logits, no logarithms)."""
 
     means: Array
     """[N, 3] world."""
@@ -63,7 +63,7 @@ class Splats:
     """[N, 3] RGB, usually in [0, 1]."""
 
 
-def write_ply(path: Path, splats: Splats) -> int:
+def write_ply(path: Path, splats: PlyGaussians) -> int:
     """Write a PLY file atomically; returns how many Gaussians were left out as not finite.
 
     Raises:
@@ -80,7 +80,7 @@ def write_ply(path: Path, splats: Splats) -> int:
     return int(len(table) - len(rows))
 
 
-def _encode(splats: Splats) -> npt.NDArray[np.float32]:
+def _encode(splats: PlyGaussians) -> npt.NDArray[np.float32]:
     """The PLY's columns [N, 17]; what has no finite value stays not finite."""
     opacity = np.clip(
         splats.opacities.astype(np.float64), OPACITY_MARGIN, 1.0 - OPACITY_MARGIN
@@ -97,7 +97,7 @@ def _encode(splats: Splats) -> npt.NDArray[np.float32]:
         return np.concatenate(columns, axis=1).astype(np.float32)
 
 
-def read_ply(path: Path) -> Splats:
+def read_ply(path: Path) -> PlyGaussians:
     """Read a 3DGS PLY; harmonics above the zeroth are ignored.
 
     Raises:
@@ -122,7 +122,7 @@ def read_ply(path: Path) -> Splats:
         return np.stack([table[name].astype(np.float32) for name in names], axis=-1)
 
     logit = columns("opacity")[:, 0].astype(np.float64)
-    return Splats(
+    return PlyGaussians(
         means=columns("x", "y", "z"),
         wxyz=columns("rot_0", "rot_1", "rot_2", "rot_3"),
         scales=np.exp(columns("scale_0", "scale_1", "scale_2")),

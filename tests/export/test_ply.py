@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aquaflow.errors import InputError
-from aquaflow.export.ply import PROPERTIES, Splats, read_ply, write_ply
+from aquaflow.export.ply import PROPERTIES, PlyGaussians, read_ply, write_ply
 
 
-def splats(seed: int = 0, count: int = 7) -> Splats:
+def splats(seed: int = 0, count: int = 7) -> PlyGaussians:
     rng = np.random.default_rng(seed)
     wxyz = rng.normal(size=(count, 4))
-    return Splats(
+    return PlyGaussians(
         means=rng.normal(size=(count, 3)),
         wxyz=wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True),
         scales=np.exp(rng.uniform(-8, 1, size=(count, 3))),
@@ -39,7 +39,7 @@ def test_round_trip_keeps_every_gaussian(tmp_path_factory, seed, count):
 
 def test_layout_is_that_of_the_reference_code(tmp_path):
     path = tmp_path / "map.ply"
-    one = Splats(
+    one = PlyGaussians(
         np.array([[1.0, 2.0, 3.0]]),
         np.array([[2.0, 0.0, 0.0, 0.0]]),
         np.array([[1.0, np.e, 1.0]]),
@@ -77,7 +77,9 @@ def test_opacities_of_zero_and_one_stay_finite(tmp_path):
 
 def test_float32_map_is_written_without_a_copy_in_another_type(tmp_path):
     single = splats()
-    single = Splats(*(getattr(single, f).astype(np.float32) for f in Splats.__dataclass_fields__))
+    single = PlyGaussians(
+        *(getattr(single, f).astype(np.float32) for f in PlyGaussians.__dataclass_fields__)
+    )
 
     assert write_ply(tmp_path / "map.ply", single) == 0
 
