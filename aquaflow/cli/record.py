@@ -15,7 +15,7 @@ from aquaflow.signals import until_told
 
 if TYPE_CHECKING:
     from aquaflow.config.vehicle import VehicleConfig
-    from aquaflow.recording.session import Session
+    from aquaflow.recording.session import RecordingSession
     from aquaflow.recording.status import RecorderStatus
 
 SOURCE_CAMERA = "camera"
@@ -43,7 +43,7 @@ def record(
     from aquaflow.config.vehicle import VehicleConfig, load_vehicle
     from aquaflow.errors import InputError
     from aquaflow.recording.recorder import Recorder
-    from aquaflow.recording.session import Session
+    from aquaflow.recording.session import RecordingSession
 
     vehicle = VehicleConfig() if config is None else load_vehicle(config)
     if picture is not None:
@@ -52,7 +52,7 @@ def record(
         raise InputError("nothing to record: give --config with cameras or telemetry, or --source")
     folder = out or Path("out") / time.strftime("recording-%Y%m%d-%H%M%S")
     add_sources = _devices(vehicle) if source is None else _recording(source)
-    session = Session(Recorder(folder, vehicle.recording))
+    session = RecordingSession(Recorder(folder, vehicle.recording))
     try:
         add_sources(session)
         with until_told(session.stopping), progress_bars(quiet=as_json) as progress:
@@ -73,7 +73,7 @@ def _with_picture(vehicle: VehicleConfig, picture: str) -> VehicleConfig:
     return vehicle.model_copy(update={"recording": recording})
 
 
-def _devices(vehicle: VehicleConfig) -> Callable[[Session], None]:
+def _devices(vehicle: VehicleConfig) -> Callable[[RecordingSession], None]:
     """Open the cameras; links are opened with the recorder, which gets their first byte."""
     from aquaflow.sources import open_camera, open_links
 
@@ -81,14 +81,14 @@ def _devices(vehicle: VehicleConfig) -> Callable[[Session], None]:
     for camera in cameras.values():
         camera.connect()
 
-    def add(session: Session) -> None:
+    def add(session: RecordingSession) -> None:
         tap, telemetry = session.recorder.raw, vehicle.telemetry
         session.add_live(cameras, [open_links(telemetry, tap)] if telemetry.devices else [])
 
     return add
 
 
-def _recording(path: Path) -> Callable[[Session], None]:
+def _recording(path: Path) -> Callable[[RecordingSession], None]:
     """Open what lies at ``path``, camera and telemetry."""
     from aquaflow.recording.playback import Playback
     from aquaflow.sources import camera_reader, open_recording, telemetry_reader
@@ -100,7 +100,7 @@ def _recording(path: Path) -> Callable[[Session], None]:
     return lambda session: session.add_playback(SOURCE_CAMERA, playback, telemetry)
 
 
-def _tell(session: Session, status: RecorderStatus, folder: Path, as_json: bool) -> None:
+def _tell(session: RecordingSession, status: RecorderStatus, folder: Path, as_json: bool) -> None:
     if as_json:
         typer.echo(
             json.dumps({"out": str(folder), **status.to_json(), "notes": list(session.notes)})

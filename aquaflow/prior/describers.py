@@ -21,7 +21,7 @@ from aquaflow.prior.contract import Float
 from aquaflow.prior.folder import DECODER, ENCODER, read_card
 from aquaflow.prior.hybrid import Describer, Half, Picture
 from aquaflow.prior.learned_range import MOST_LOG, LearnedRange
-from aquaflow.prior.runtime import RuntimeSettings, Session
+from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
 
 MULTIPLE_PX = 16
 """Sides of the pictures that the compact network takes."""
@@ -107,8 +107,8 @@ class CompactDescriber:
         return LearnedRange(found["log_range_ab"][0], variance, self.metric)
 
     @cached_property
-    def _decoder(self) -> Session:
-        return Session(self._folder / DECODER, self._settings)
+    def _decoder(self) -> NetworkSession:
+        return NetworkSession(self._folder / DECODER, self._settings)
 
 
 class Mast3rDescriber:
@@ -120,8 +120,8 @@ class Mast3rDescriber:
         """Load the exported ``folder``; raises as the compact one."""
         card = read_card(folder)
         self.name, self._size = card.name, (card.height, card.width)
-        self._encoder = Session(folder / ENCODER, settings)
-        self._decoder = Session(folder / DECODER, settings)
+        self._encoder = NetworkSession(folder / ENCODER, settings)
+        self._decoder = NetworkSession(folder / DECODER, settings)
 
     def fitted(
         self,
@@ -170,15 +170,15 @@ class Mast3rDescriber:
         return self._decoder(tokens)
 
 
-def _encoder(folder: Path, has_int8: bool, settings: RuntimeSettings) -> Session:
+def _encoder(folder: Path, has_int8: bool, settings: RuntimeSettings) -> NetworkSession:
     """In 8 bits where that was asked for, or nothing was and it runs on a processor."""
     if settings.precision == "int8" and not has_int8:
         raise InputError(f"{folder} has no {INT8_ENCODER}; use precision: fp32")
     if not has_int8 or settings.precision == "fp32":
-        return Session(folder / ENCODER, settings)
-    encoder = Session(folder / INT8_ENCODER, settings)
+        return NetworkSession(folder / ENCODER, settings)
+    encoder = NetworkSession(folder / INT8_ENCODER, settings)
     if settings.precision == "auto" and encoder.device != "cpu":
-        return Session(folder / ENCODER, settings)
+        return NetworkSession(folder / ENCODER, settings)
     return encoder
 
 

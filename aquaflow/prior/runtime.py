@@ -50,7 +50,7 @@ class RuntimeSettings:
     """Folder that TensorRT keeps its engines in: building one takes minutes."""
 
 
-class Session:
+class NetworkSession:
     """One network, ready to run."""
 
     def __init__(self, path: Path, settings: RuntimeSettings) -> None:

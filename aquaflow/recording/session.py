@@ -25,7 +25,7 @@ Pump: TypeAlias = Callable[[], None]
 Progress: TypeAlias = Callable[[str, int, int | None], None]
 
 
-class Session:
+class RecordingSession:
     """Pumps sources into a recorder until they end, time is up, or it is stopped."""
 
     def __init__(self, recorder: Recorder) -> None:

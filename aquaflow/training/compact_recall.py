@@ -14,7 +14,7 @@ from aquaflow.prior.candidates import reverse
 from aquaflow.prior.coarse import coarse_flow
 from aquaflow.prior.compact.matching import coarse_at, descriptors_at, fine_around
 from aquaflow.prior.compact.network import COARSE, FINE, Compared, Comparison, Encoded, cell_rays
-from aquaflow.prior.runtime import RuntimeSettings, Session
+from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
 from aquaflow.training.correspondences import Correspondences, correspondences, overlap
 from aquaflow.training.pair_generator.cameras import WIDE, Motion
 from aquaflow.training.pair_generator.draw import Draw
@@ -113,7 +113,7 @@ def tracked_recall(
 
 def onnx_encoder(path: Path) -> Callable[[Tensor], Encoded]:
     """An exported encoder in the place of the network's."""
-    session = Session(path, RuntimeSettings(device="cpu"))
+    session = NetworkSession(path, RuntimeSettings(device="cpu"))
 
     def encode(images: Tensor) -> Encoded:
         rows = [session({"image": image[None].numpy()}) for image in images]

@@ -89,7 +89,7 @@ def test_on_a_gpu_eight_bits_are_not_the_choice(
         def __init__(self, path: Path, settings: RuntimeSettings) -> None:
             opened.append(path.name)
 
-    monkeypatch.setattr(describers, "Session", OnGpu)
+    monkeypatch.setattr(describers, "NetworkSession", OnGpu)
     CompactDescriber(folder, RuntimeSettings(device="cuda"))
     assert opened[-1] == "encoder.onnx"
 

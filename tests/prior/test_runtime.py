@@ -15,7 +15,7 @@ import pytest
 
 from aquaflow.errors import AquaFlowError
 from aquaflow.prior import runtime
-from aquaflow.prior.runtime import PROVIDERS, RuntimeSettings, Session
+from aquaflow.prior.runtime import PROVIDERS, NetworkSession, RuntimeSettings
 
 GPU = [PROVIDERS[name] for name in ("tensorrt", "cuda", "cpu")]
 
@@ -90,9 +90,11 @@ class Pretended:
         return self.bindings[-1]
 
 
-def session(monkeypatch: pytest.MonkeyPatch, pretended: Pretended, **settings: Any) -> Session:
+def session(
+    monkeypatch: pytest.MonkeyPatch, pretended: Pretended, **settings: Any
+) -> NetworkSession:
     monkeypatch.setattr(runtime, "_onnxruntime", lambda: pretended)
-    return Session(Path("encoder.onnx"), RuntimeSettings(**settings))
+    return NetworkSession(Path("encoder.onnx"), RuntimeSettings(**settings))
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from aquaflow.geometry.camera import guess_camera
 from aquaflow.messages import Depth, Dropped, Frame, TelemetrySample
 from aquaflow.recording import Recorder
 from aquaflow.recording import session as session_module
-from aquaflow.recording.session import Session
+from aquaflow.recording.session import RecordingSession
 from aquaflow.sources import open_links
 from sim_drivers.mcap_camera import McapCamera
 from sim_drivers.mcap_messages import McapMessages, mcap_files
@@ -139,8 +139,8 @@ class CameraWithImu(LiveCamera):
             yield Depth(1, time.monotonic_ns(), "imu", 1.0)
 
 
-def session_of(out: Path) -> Session:
-    return Session(Recorder(out, RecordingConfig(picture="raw", reserve_mb=0)))
+def session_of(out: Path) -> RecordingSession:
+    return RecordingSession(Recorder(out, RecordingConfig(picture="raw", reserve_mb=0)))
 
 
 def hours_pass_when(so_far: Callable[[], bool], monkeypatch: pytest.MonkeyPatch) -> None:

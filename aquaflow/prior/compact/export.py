@@ -23,7 +23,7 @@ from aquaflow.prior.compact.network import COARSE, STRIDE, CompactPrior, Compare
 from aquaflow.prior.compact.quantise import INT8_ENCODER, quantise
 from aquaflow.prior.folder import CARD, DECODER, ENCODER, PriorCard, sha256_of, write_card
 from aquaflow.prior.onnx_file import OPSET, relative_difference, write_onnx
-from aquaflow.prior.runtime import RuntimeSettings, Session
+from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
 
 LICENCE = "Apache-2.0; trained on generated pictures only"
 """Of the exported network, as its card says."""
@@ -113,9 +113,9 @@ def parity_of(
     expected = dict(zip(Encoded._fields, a, strict=True))
     expected |= dict(zip(OUTPUTS, (*one, *other), strict=True))
     settings = RuntimeSettings(device="cpu")
-    found = Session(folder / ENCODER, settings)({"image": images[0].numpy()})
+    found = NetworkSession(folder / ENCODER, settings)({"image": images[0].numpy()})
     pair = dict(zip(INPUTS, (x.numpy() for x in (a.Dc, b.Dc, *rays)), strict=True))
-    found |= Session(folder / DECODER, settings)(pair)
+    found |= NetworkSession(folder / DECODER, settings)(pair)
     return {name: relative_difference(expected[name].numpy(), found[name]) for name in expected}
 
 

@@ -17,7 +17,7 @@ from aquaflow.prior.folder import DECODER, ENCODER, PriorCard, sha256_of, write_
 from aquaflow.prior.mast3r.network import Mast3r, ViewGeometry
 from aquaflow.prior.mast3r.settings import PATCH_PX, TINY
 from aquaflow.prior.onnx_file import OPSET, relative_difference, write_onnx
-from aquaflow.prior.runtime import RuntimeSettings, Session
+from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
 
 OUTPUTS = tuple(f"{symbol}_{view}" for view in "ab" for symbol in ViewGeometry._fields)
 """Outputs of the decoder, of each view."""
@@ -109,9 +109,9 @@ def parity_of(network: Mast3r, folder: Path, width: int, height: int) -> dict[st
     a, b = (encoder(image) for image in pair)
     expected = {"tokens": a} | dict(zip(OUTPUTS, decoder(a, b), strict=True))
     settings = RuntimeSettings(device="cpu")
-    found = Session(folder / ENCODER, settings)({"image": pair[0].numpy()})
+    found = NetworkSession(folder / ENCODER, settings)({"image": pair[0].numpy()})
     tokens = {"tokens_a": a.numpy(), "tokens_b": b.numpy()}
-    found |= Session(folder / DECODER, settings)(tokens)
+    found |= NetworkSession(folder / DECODER, settings)(tokens)
     return {name: relative_difference(expected[name].numpy(), found[name]) for name in expected}
 
 

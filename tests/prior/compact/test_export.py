@@ -25,7 +25,7 @@ from aquaflow.prior.compact.export import (
 from aquaflow.prior.compact.network import COARSE, CompactPrior, NetworkSize
 from aquaflow.prior.compact.quantise import INT8_ENCODER
 from aquaflow.prior.folder import DECODER, ENCODER, read_card
-from aquaflow.prior.runtime import RuntimeSettings, Session
+from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
 from tests.prior.textured_pictures import HEIGHT, WIDTH, moved_pair, shift
 
 pytest.importorskip("onnxruntime", reason="pip install 'aquaflow[prior]'")
@@ -81,7 +81,7 @@ def test_a_fresh_export_is_torchs_to_1e_4_at_every_size_and_close_in_8_bits(
     assert read_card(tmp_path) == card
     for width, height in ((96, 208), (176, 48)):
         assert max(parity_of(network, tmp_path, width, height).values()) <= 1e-4
-    exact, rounded = (Session(tmp_path / name, CPU) for name in (ENCODER, INT8_ENCODER))
+    exact, rounded = (NetworkSession(tmp_path / name, CPU) for name in (ENCODER, INT8_ENCODER))
     for name in ("D", "Dc"):
         one, other = (session({"image": pictures[0]})[name] for session in (exact, rounded))
         assert float((one * other).sum(1).mean()) > 0.98
@@ -127,13 +127,13 @@ def test_what_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", [ENCODER, INT8_ENCODER])
 def test_what_ships_finds_a_picture_that_moved_by_two_cells(name: str) -> None:
     a, b = (prepared(picture) for picture in moved_pair(shift(2.0 * COARSE, -COARSE)))
-    encoder = Session(SHIPPED / name, CPU)
+    encoder = NetworkSession(SHIPPED / name, CPU)
     Dc_a, Dc_b = (encoder({"image": picture})["Dc"] for picture in (a, b))
     rows, columns = Dc_a.shape[2:]
     assert (rows, columns) == (HEIGHT // 16 * 2, WIDTH // 16 * 2)
     rays = np.zeros((1, 2, rows, columns), np.float32)
     pair = dict(zip(INPUTS, (Dc_a, Dc_b, rays, rays), strict=True))
-    pixels = Session(SHIPPED / DECODER, CPU)(pair)["pixels_ab"][0]
+    pixels = NetworkSession(SHIPPED / DECODER, CPU)(pair)["pixels_ab"][0]
     v, u = (np.mgrid[:rows, :columns] + 0.5) * COARSE
     error = np.hypot(pixels[0] - u - 2.0 * COARSE, pixels[1] - v + COARSE)
     assert np.mean(error[1:, :-2] < 4.0) > 0.9

@@ -25,7 +25,7 @@ from aquaflow.prior.hybrid import HybridEncoding
 from aquaflow.prior.mast3r.export import OUTPUTS, export, parity_of, relative_difference
 from aquaflow.prior.mast3r.network import Mast3r
 from aquaflow.prior.mast3r.settings import TINY
-from aquaflow.prior.runtime import RuntimeSettings, Session
+from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
 
 pytestmark = pytest.mark.ci
 
@@ -60,7 +60,7 @@ def test_every_output_is_torchs_to_1e_4(folder: Path) -> None:
 
 def test_a_session_gives_what_the_network_gives(folder: Path) -> None:
     network, image = tiny().eval(), torch.rand(2, 1, 3, HEIGHT, WIDTH)
-    encoder, decoder = Session(folder / ENCODER, CPU), Session(folder / DECODER, CPU)
+    encoder, decoder = NetworkSession(folder / ENCODER, CPU), NetworkSession(folder / DECODER, CPU)
     a, b = (encoder({"image": x.numpy()})["tokens"] for x in image)
     found = decoder({"tokens_a": a, "tokens_b": b})
     with torch.no_grad():
@@ -109,8 +109,8 @@ def test_a_gpu_that_is_not_there_is_an_error_and_auto_takes_the_cpu(folder: Path
     if "CUDAExecutionProvider" in runtime._onnxruntime().get_available_providers():
         pytest.skip("this onnxruntime has CUDA")
     with pytest.raises(AquaFlowError, match="install onnxruntime-gpu"):
-        Session(folder / ENCODER, RuntimeSettings(device="cuda"))
-    assert Session(folder / ENCODER, RuntimeSettings(device="auto")).device == "cpu"
+        NetworkSession(folder / ENCODER, RuntimeSettings(device="cuda"))
+    assert NetworkSession(folder / ENCODER, RuntimeSettings(device="auto")).device == "cpu"
 
 
 class FallsBack:
@@ -133,7 +133,7 @@ def test_a_silent_fall_back_to_the_cpu_is_an_error(
     pretended = FallsBack(runtime._onnxruntime())
     monkeypatch.setattr(runtime, "_onnxruntime", lambda: pretended)
     with pytest.raises(AquaFlowError, match="fell back to CPUExecutionProvider"):
-        Session(folder / ENCODER, RuntimeSettings(device="cuda"))
+        NetworkSession(folder / ENCODER, RuntimeSettings(device="cuda"))
 
 
 def test_tensorrt_keeps_its_engines_and_slower_providers_follow(tmp_path: Path) -> None:
@@ -145,7 +145,7 @@ def test_tensorrt_keeps_its_engines_and_slower_providers_follow(tmp_path: Path) 
 def test_a_file_that_is_no_network_is_refused(tmp_path: Path) -> None:
     (tmp_path / "encoder.onnx").write_bytes(b"not a network")
     with pytest.raises(InputError, match="cannot be run"):
-        Session(tmp_path / "encoder.onnx", CPU)
+        NetworkSession(tmp_path / "encoder.onnx", CPU)
 
 
 def absent(name: str) -> Callable[..., Any]:
@@ -164,7 +164,7 @@ def test_without_onnxruntime_the_extra_is_named(
 ) -> None:
     monkeypatch.setattr(builtins, "__import__", absent("onnxruntime"))
     with pytest.raises(AquaFlowError, match=r"aquaflow\[prior\]"):
-        Session(folder / ENCODER, CPU)
+        NetworkSession(folder / ENCODER, CPU)
 
 
 def test_without_onnxscript_the_extra_is_named(
