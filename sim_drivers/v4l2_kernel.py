@@ -1,4 +1,4 @@
-"""A kernel with one V4L2 camera, as :class:`drivers.v4l2.system.System` sees it.
+"""A kernel with one V4L2 camera, as :class:`drivers.v4l2.system.KernelInterface` sees it.
 
 It reads and writes the bytes of the ioctls' structures by the offsets of linux/videodev2.h, knows
 nothing of the driver, and refuses what the real one refuses: pictures before STREAMON, a buffer

@@ -11,7 +11,7 @@ from aquaflow.sources.outbound import Sentence, Word
 from drivers.device_clock import DeviceClock
 from drivers.extra import load
 from drivers.protocol.mavlink_frames import MavlinkFraming, header_of
-from drivers.protocol.mavlink_samples import MavlinkSamples, Stamp
+from drivers.protocol.mavlink_samples import MavlinkSamples, MessageTime
 from drivers.protocol.mavlink_speech import message_of
 from drivers.protocol.packets import PacketDecoder
 
@@ -65,7 +65,7 @@ class MavlinkDecoder(PacketDecoder):
         t_ns = self._moment(name, message, arrival_ns)
         if name == "SYSTEM_TIME":
             return []  # only its time since boot matters: the wall clock jumps
-        return self._samples.of(message, Stamp(t_ns, arrival_ns, self.source(name)))
+        return self._samples.of(message, MessageTime(t_ns, arrival_ns, self.source(name)))
 
     def outgoing(self, now_ns: int) -> bytes:
         """What is to be written now: answers to TIMESYNC, and once a second our own request."""

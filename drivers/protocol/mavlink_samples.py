@@ -38,7 +38,7 @@ ATTITUDE_LIFE_NS = 500_000_000
 """An older attitude does not turn a velocity into body axes; autopilots send several a second."""
 
 
-class Stamp(NamedTuple):
+class MessageTime(NamedTuple):
     """The first three fields of every sample."""
 
     t_ns: int
@@ -55,7 +55,7 @@ class MavlinkSamples:
     def __init__(self, config: MavlinkConfig) -> None:
         self._config = config
         self._attitude: tuple[int, Quaternion] | None = None
-        known: dict[str, Callable[[Any, Stamp], Samples]] = {
+        known: dict[str, Callable[[Any, MessageTime], Samples]] = {
             "ATTITUDE": self._euler,
             "ATTITUDE_QUATERNION": self._quaternion,
             "RAW_IMU": _milli_imu,
@@ -76,30 +76,30 @@ class MavlinkSamples:
         """Names of the messages that make samples."""
         return frozenset(self._converters)
 
-    def of(self, message: Any, stamp: Stamp) -> Samples:
+    def of(self, message: Any, stamp: MessageTime) -> Samples:
         """Samples of a decoded pymavlink message; ValueError where it says itself it is invalid."""
         return self._converters[message.get_type()](message, stamp)
 
-    def _euler(self, message: Any, stamp: Stamp) -> Samples:
+    def _euler(self, message: Any, stamp: MessageTime) -> Samples:
         return self._orientation(
             from_euler(message.roll, message.pitch, message.yaw), message, stamp
         )
 
-    def _quaternion(self, message: Any, stamp: Stamp) -> Samples:
+    def _quaternion(self, message: Any, stamp: MessageTime) -> Samples:
         q = normalised((message.q1, message.q2, message.q3, message.q4))
         return self._orientation(q, message, stamp)
 
-    def _orientation(self, q: Quaternion, message: Any, stamp: Stamp) -> Samples:
+    def _orientation(self, q: Quaternion, message: Any, stamp: MessageTime) -> Samples:
         self._attitude = (stamp.t_ns, q)
         rate = (message.rollspeed, message.pitchspeed, message.yawspeed)
         return [Attitude(*stamp, q), AngularRate(*stamp, rate)]
 
-    def _pressure(self, message: Any, stamp: Stamp) -> Samples:
+    def _pressure(self, message: Any, stamp: MessageTime) -> Samples:
         over_surface_pa = message.press_abs * HPA - self._config.surface_pressure_pa
         depth_m = over_surface_pa / (self._config.water_density_kg_m3 * GRAVITY_M_S2)
         return [Depth(*stamp, depth_m)]
 
-    def _local_position(self, message: Any, stamp: Stamp) -> Samples:
+    def _local_position(self, message: Any, stamp: MessageTime) -> Samples:
         samples: Samples = [Depth(*stamp, message.z)]
         if self._attitude and abs(stamp.t_ns - self._attitude[0]) < ATTITUDE_LIFE_NS:
             v_ned = (message.vx, message.vy, message.vz)
@@ -107,7 +107,7 @@ class MavlinkSamples:
             samples.append(Velocity(*stamp, v_body, self._config.local_velocity_sigma_m_s))
         return samples
 
-    def _lights(self, message: Any, stamp: Stamp) -> Samples:
+    def _lights(self, message: Any, stamp: MessageTime) -> Samples:
         lights = self._config.lights
         assert lights is not None
         if lights.message == "RC_CHANNELS":
@@ -122,7 +122,7 @@ class MavlinkSamples:
         return [Lights(*stamp, min(max(level, 0.0), 1.0))]
 
 
-def _milli_imu(message: Any, stamp: Stamp) -> Samples:
+def _milli_imu(message: Any, stamp: MessageTime) -> Samples:
     acceleration = (message.xacc, message.yacc, message.zacc)
     gyro = (message.xgyro, message.ygyro, message.zgyro)
     samples: Samples = []
@@ -136,7 +136,7 @@ def _milli_imu(message: Any, stamp: Stamp) -> Samples:
     return samples
 
 
-def _highres_imu(message: Any, stamp: Stamp) -> Samples:
+def _highres_imu(message: Any, stamp: MessageTime) -> Samples:
     samples: Samples = []
     if message.fields_updated & HIGHRES_ACCELERATION == HIGHRES_ACCELERATION:
         samples.append(Acceleration(*stamp, (message.xacc, message.yacc, message.zacc)))
@@ -145,7 +145,7 @@ def _highres_imu(message: Any, stamp: Stamp) -> Samples:
     return samples
 
 
-def _distance(message: Any, stamp: Stamp) -> Samples:
+def _distance(message: Any, stamp: MessageTime) -> Samples:
     if message.orientation != DOWN:
         return []
     if message.signal_quality == INVALID_SIGNAL:

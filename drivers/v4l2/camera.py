@@ -8,7 +8,7 @@ from aquaflow.config.cameras import V4l2Config
 from drivers.live import LiveCamera
 from drivers.v4l2.capture import V4l2Capture
 from drivers.v4l2.discovery import explained, find_camera
-from drivers.v4l2.system import Kernel, System
+from drivers.v4l2.system import Kernel, KernelInterface
 
 
 class V4l2Camera(LiveCamera):
@@ -18,7 +18,7 @@ class V4l2Camera(LiveCamera):
         self,
         name: str,
         config: V4l2Config,
-        system: System | None = None,
+        system: KernelInterface | None = None,
         root: Path = Path("/"),
     ) -> None:
         self._system = system or Kernel()

@@ -19,7 +19,7 @@ from drivers.capture import RawPicture, UnusablePictureError
 from drivers.v4l2 import abi
 from drivers.v4l2.controls import apply_controls
 from drivers.v4l2.pixels import JPEG_PIXELS, to_rgb
-from drivers.v4l2.system import System, call, supported
+from drivers.v4l2.system import KernelInterface, call, supported
 
 
 class V4l2Capture:
@@ -29,7 +29,7 @@ class V4l2Capture:
 
     def __init__(
         self,
-        system: System,
+        system: KernelInterface,
         path: str,
         config: V4l2Config,
         now_ns: Callable[[], int] = time.monotonic_ns,

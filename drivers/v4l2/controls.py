@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from aquaflow.config.cameras import V4l2Config
 from drivers.v4l2 import abi
-from drivers.v4l2.system import System, call, supported
+from drivers.v4l2.system import KernelInterface, call, supported
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class FixedControls:
     notes: tuple[str, ...]
 
 
-def apply_controls(system: System, fd: int, config: V4l2Config) -> FixedControls:
+def apply_controls(system: KernelInterface, fd: int, config: V4l2Config) -> FixedControls:
     """Set what ``config`` fixes and read it back.
 
     Raises:
@@ -55,7 +55,7 @@ def apply_controls(system: System, fd: int, config: V4l2Config) -> FixedControls
     return FixedControls(exposure_s, None if gain is None else float(gain), tuple(notes))
 
 
-def _set(system: System, fd: int, control: int, wanted: int) -> int | None:
+def _set(system: KernelInterface, fd: int, control: int, wanted: int) -> int | None:
     """Set within the camera's range; what it then has, None if it has no such control."""
     limits = abi.QueryControl(id=control)
     if not supported(system, fd, abi.QUERYCTRL, limits):

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drivers.v4l2 import abi
-from drivers.v4l2.system import System, call, supported
+from drivers.v4l2.system import KernelInterface, call, supported
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class CameraNode:
     """What a config may call it, the most stable first."""
 
 
-def camera_nodes(system: System, root: Path = Path("/")) -> list[CameraNode]:
+def camera_nodes(system: KernelInterface, root: Path = Path("/")) -> list[CameraNode]:
     """Every camera below ``root``, by number; those that may not be opened are left out."""
     found = []
     for path in sorted(root.glob("dev/video*"), key=_number):
@@ -38,7 +38,7 @@ def camera_nodes(system: System, root: Path = Path("/")) -> list[CameraNode]:
     return found
 
 
-def find_camera(system: System, device: str | None, root: Path = Path("/")) -> CameraNode:
+def find_camera(system: KernelInterface, device: str | None, root: Path = Path("/")) -> CameraNode:
     """The first node of the camera with the id ``device``, or of the only camera.
 
     Raises:
@@ -57,7 +57,7 @@ def find_camera(system: System, device: str | None, root: Path = Path("/")) -> C
     return fitting[0]
 
 
-def modes(system: System, path: Path) -> list[str]:
+def modes(system: KernelInterface, path: Path) -> list[str]:
     """What the camera delivers, such as ``MJPG up to 1920 x 1080``."""
     fd = system.open(str(path))
     try:
@@ -73,7 +73,7 @@ def modes(system: System, path: Path) -> list[str]:
         system.close(fd)
 
 
-def _largest(system: System, fd: int, pixelformat: int) -> tuple[int, int] | None:
+def _largest(system: KernelInterface, fd: int, pixelformat: int) -> tuple[int, int] | None:
     sizes = []
     size = abi.FrameSize(pixelformat=pixelformat)
     while supported(system, fd, abi.ENUM_FRAMESIZES, size):
@@ -85,7 +85,7 @@ def _largest(system: System, fd: int, pixelformat: int) -> tuple[int, int] | Non
     return max(sizes, key=lambda each: each[0] * each[1], default=None)
 
 
-def _told(system: System, path: Path) -> abi.Capability | None:
+def _told(system: KernelInterface, path: Path) -> abi.Capability | None:
     """What a node says of itself; None if it is no camera, such as the one for metadata."""
     try:
         fd = system.open(str(path))

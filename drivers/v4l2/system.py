@@ -15,7 +15,7 @@ import numpy.typing as npt
 Argument: TypeAlias = ctypes.Structure | ctypes.c_int32
 
 
-class System(Protocol):
+class KernelInterface(Protocol):
     """What a driver asks of the kernel; every call raises OSError as the kernel does."""
 
     def open(self, path: str) -> int: ...
@@ -61,7 +61,7 @@ class Kernel:
         return bool(poll.poll(timeout_s * 1e3))
 
 
-def call(system: System, fd: int, request: int, argument: Argument) -> None:
+def call(system: KernelInterface, fd: int, request: int, argument: Argument) -> None:
     """An ioctl that no signal ends: repeated while interrupted."""
     while True:
         try:
@@ -71,7 +71,7 @@ def call(system: System, fd: int, request: int, argument: Argument) -> None:
             continue
 
 
-def supported(system: System, fd: int, request: int, argument: Argument) -> bool:
+def supported(system: KernelInterface, fd: int, request: int, argument: Argument) -> bool:
     """An ioctl that a driver may lack; False if it does.
 
     Raises:

@@ -22,7 +22,7 @@ from aquaflow.tracking.graph.equations import (
     Rows,
     wanted_moves,
 )
-from aquaflow.tracking.graph.linear_system import System
+from aquaflow.tracking.graph.linear_system import LinearSystem
 
 DAMPING_LIMIT = 1e3
 """At which no step leads down any more: the descent has ended."""
@@ -165,7 +165,7 @@ class Descent:
     ) -> tuple[Neighbourhood, Misfit]:
         around = Neighbourhood(self._edges, counts, self._may_move, active, asked)
         if around.active.any():
-            self._system = System(around.local, around.active[around.nodes])
+            self._system = LinearSystem(around.local, around.active[around.nodes])
         poses, allowed = self.poses[around.nodes], self._allowed[around.used]
         return around, Misfit(poses, around.local, allowed, self._config.huber_sigmas)
 

@@ -12,7 +12,7 @@ MEMORY = 10
 """Steps that BFGS looks back to."""
 
 
-class System:
+class LinearSystem:
     """Solves for the steps of the active poses; keeps its factor until told to make another.
 
     Steps after a factor's first are corrected by limited-memory BFGS (Nocedal, 1980), with the
