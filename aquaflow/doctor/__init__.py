@@ -6,17 +6,17 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from aquaflow.doctor import computer, devices
-from aquaflow.doctor.machine import Finding, Machine
+from aquaflow.doctor.machine import Finding, MachineProbes
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["Finding", "Machine", "examine", "print_findings", "to_json"]
+__all__ = ["Finding", "MachineProbes", "examine", "print_findings", "to_json"]
 
 
-def examine(machine: Machine | None = None) -> list[Finding]:
+def examine(machine: MachineProbes | None = None) -> list[Finding]:
     """Look at everything AquaFlow can make use of; never raises for something absent."""
-    machine = machine or Machine()
+    machine = machine or MachineProbes()
     probes = (
         *(
             computer.processor,

@@ -6,7 +6,7 @@ import os
 import shutil
 from collections.abc import Iterator
 
-from aquaflow.doctor.machine import Finding, Machine
+from aquaflow.doctor.machine import Finding, MachineProbes
 
 ISA_LEVELS = (
     ("x86-64-v4", {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}),
@@ -37,7 +37,7 @@ def isa_level(cpuinfo: str) -> str:
     return "unknown"
 
 
-def processor(machine: Machine) -> Finding:
+def processor(machine: MachineProbes) -> Finding:
     """Name, cores and vector instructions of the processor."""
     cpuinfo = machine.text("proc/cpuinfo")
     rows = [line.partition(":") for line in cpuinfo.splitlines()]
@@ -49,7 +49,7 @@ def processor(machine: Machine) -> Finding:
     return Finding("processor", found, "runs tracking and mapping")
 
 
-def memory(machine: Machine) -> Finding:
+def memory(machine: MachineProbes) -> Finding:
     """Memory in all and free, GB."""
     gigabytes = {
         key: float(value.split()[0]) * 1024.0 / 1e9
@@ -65,11 +65,11 @@ def memory(machine: Machine) -> Finding:
     return Finding("memory", f"{total:.1f} GB, {free:.1f} GB free", "holds the map", advice)
 
 
-def _lines(machine: Machine, path: str) -> Iterator[str]:
+def _lines(machine: MachineProbes, path: str) -> Iterator[str]:
     yield from machine.text(path).splitlines()
 
 
-def compiler(machine: Machine) -> Finding:
+def compiler(machine: MachineProbes) -> Finding:
     """The C++ compiler, if there is one."""
     for name in COMPILERS:
         if place := machine.which(name):
@@ -82,11 +82,11 @@ def compiler(machine: Machine) -> Finding:
     )
 
 
-def _variants(machine: Machine) -> list[str]:
+def _variants(machine: MachineProbes) -> list[str]:
     return sorted(path.name for path in machine.native.glob("*.so"))
 
 
-def renderer(machine: Machine) -> Finding:
+def renderer(machine: MachineProbes) -> Finding:
     """The renderer that maps are drawn with."""
     variants = ", ".join(_variants(machine)) or "no compiled variant"
     chosen = machine.renderer()
@@ -100,7 +100,7 @@ def renderer(machine: Machine) -> Finding:
     return Finding("renderer", f"{chosen} (of {variants})", f"maps are rendered with: {chosen}")
 
 
-def gpu(machine: Machine) -> Finding:
+def gpu(machine: MachineProbes) -> Finding:
     """Whether torch and gsplat can use a GPU."""
     usable = machine.gpu()
     gsplat = machine.module_present("gsplat")
@@ -124,7 +124,7 @@ def gpu(machine: Machine) -> Finding:
     return Finding("GPU", "none", "everything runs on the processor")
 
 
-def disk(machine: Machine) -> Finding:
+def disk(machine: MachineProbes) -> Finding:
     """Room where dives are written, GB."""
     free_gb = shutil.disk_usage(machine.disk).free / 1e9
     advice = "free some space or write dives elsewhere" if free_gb < LOW_DISK_GB else ""

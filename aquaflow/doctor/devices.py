@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from aquaflow.doctor.machine import Finding, Machine
+from aquaflow.doctor.machine import Finding, MachineProbes
 
 LUXONIS_USB_VENDOR = "03e7"
 """Vendor number of Luxonis' processor (Movidius) on USB, hexadecimal."""
@@ -13,7 +13,7 @@ ARPHRD_CAN = "280"
 """Value of ``/sys/class/net/*/type`` for a CAN interface (linux/if_arp.h)."""
 
 
-def video(machine: Machine) -> Finding:
+def video(machine: MachineProbes) -> Finding:
     """Whether OpenCV reads video files."""
     if not machine.module_present("cv2"):
         return Finding(
@@ -36,7 +36,7 @@ def video(machine: Machine) -> Finding:
     return Finding("video files", f"{found} with FFmpeg", "videos and images are read")
 
 
-def cameras(machine: Machine) -> Finding:
+def cameras(machine: MachineProbes) -> Finding:
     """Cameras that Video4Linux knows."""
     # A camera has several nodes; the first (index 0) is the one that captures.
     nodes = [
@@ -54,7 +54,7 @@ def cameras(machine: Machine) -> Finding:
     return Finding("USB and CSI cameras", found, used, _access(nodes, "video"))
 
 
-def oak(machine: Machine) -> Finding:
+def oak(machine: MachineProbes) -> Finding:
     """Luxonis cameras on USB, and whether their library is installed."""
     products = [
         machine.text(f"sys/bus/usb/devices/{vendor.parent.name}/product") or "unnamed"
@@ -69,7 +69,7 @@ def oak(machine: Machine) -> Finding:
     return Finding("OAK cameras", ", ".join(products), used, advice)
 
 
-def serial(machine: Machine) -> Finding:
+def serial(machine: MachineProbes) -> Finding:
     """Serial ports, and whether this user may open them."""
     ports = machine.paths(
         "dev/serial/by-id/*", "dev/ttyUSB*", "dev/ttyACM*", "dev/ttyAMA*", "dev/ttyTHS*"
@@ -91,7 +91,7 @@ def _access(nodes: list[Path], group: str) -> str:
     )
 
 
-def can(machine: Machine) -> Finding:
+def can(machine: MachineProbes) -> Finding:
     """CAN interfaces, and whether they are up."""
     found = [
         f"{kind.parent.name} ({machine.text(f'sys/class/net/{kind.parent.name}/operstate') or '?'})"

@@ -59,8 +59,8 @@ def _native_folder() -> Path:
 
 
 @dataclass(frozen=True)
-class Machine:
-    """The ways in which the machine is looked at; every one can be replaced by a test."""
+class MachineProbes:
+    """How the doctor examines the machine; a test can replace each probe."""
 
     root: Path = Path("/")
     disk: Path = field(default_factory=Path.cwd)

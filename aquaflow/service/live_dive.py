@@ -28,7 +28,7 @@ from aquaflow.service.dive_clock import Continued
 from aquaflow.service.feed import Feed
 from aquaflow.service.health.degradation import Degradation
 from aquaflow.service.health.heartbeats import Heartbeats, Watchdog
-from aquaflow.service.health.pressure import Machine
+from aquaflow.service.health.pressure import PressureReader
 from aquaflow.service.health.systemd import Notifier
 from aquaflow.service.loop import LiveLoop
 from aquaflow.service.map_thread import MapThread
@@ -122,7 +122,7 @@ class LiveDive:
         feed.go_on(continued)
         loop = LiveLoop(
             run, feed, thread, service, self._heartbeats, self._degradation,
-            Machine(self.folder.path), self._notifier,
+            PressureReader(self.folder.path), self._notifier,
         )  # fmt: skip
         every_s = service.checkpoint.every_s
         checkpointer = Checkpointer(self.folder.path, run, slam, thread, every_s, feed.clocks)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from aquaflow.doctor import Finding, Machine, examine, print_findings, to_json
+from aquaflow.doctor import Finding, MachineProbes, examine, print_findings, to_json
 from aquaflow.doctor.computer import isa_level
 from aquaflow.doctor.machine import renderer_name
 
@@ -35,7 +35,7 @@ def put(root: Path, path: str, content: str = "") -> None:
     (root / path).write_text(content)
 
 
-def bare(root: Path, **changes: object) -> Machine:
+def bare(root: Path, **changes: object) -> MachineProbes:
     parts = {
         "root": root,
         "disk": root,
@@ -45,10 +45,10 @@ def bare(root: Path, **changes: object) -> Machine:
         "module_present": lambda name: False,
         "renderer": lambda: "tiles, torch",
     }
-    return Machine(**{**parts, **changes})  # type: ignore[arg-type]
+    return MachineProbes(**{**parts, **changes})  # type: ignore[arg-type]
 
 
-def named(machine: Machine, name: str) -> Finding:
+def named(machine: MachineProbes, name: str) -> Finding:
     return next(finding for finding in examine(machine) if finding.name == name)
 
 

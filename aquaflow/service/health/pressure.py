@@ -42,7 +42,7 @@ class Pressure:
         return self.disk_free_mb is not None and self.disk_free_mb < limits.disk_mb
 
 
-class Machine:
+class PressureReader:
     """Reads the pressure from Linux: /proc, /sys, and the unit's own control group."""
 
     def __init__(self, disk: Path, root: Path = Path("/")) -> None:

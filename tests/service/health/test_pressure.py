@@ -7,17 +7,17 @@ from pathlib import Path
 import pytest
 
 from aquaflow.config.service import LimitsConfig
-from aquaflow.service.health.pressure import Machine, Pressure
+from aquaflow.service.health.pressure import Pressure, PressureReader
 
 LIMITS = LimitsConfig()
 
 
-def write(root: Path, files: dict[str, str]) -> Machine:
+def write(root: Path, files: dict[str, str]) -> PressureReader:
     for name, text in files.items():
         path = root / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
-    return Machine(root, root)
+    return PressureReader(root, root)
 
 
 def test_memory_is_that_of_the_machine_or_of_the_unit_whichever_is_shorter(
@@ -46,7 +46,7 @@ def test_the_hottest_zone_counts_and_zones_that_are_not_wired_up_do_not(tmp_path
 
 
 def test_a_machine_that_tells_nothing_needs_nothing(tmp_path: Path) -> None:
-    found = Machine(tmp_path / "nowhere", tmp_path)()
+    found = PressureReader(tmp_path / "nowhere", tmp_path)()
     assert (found.free_memory_share, found.disk_free_mb, found.temperature_c) == (None, None, None)
     assert found.need(LIMITS) is None
     assert not found.disk_is_full(LIMITS)
