@@ -34,7 +34,7 @@ WITHIN_PX = 2.0
 
 
 @dataclass(frozen=True)
-class Level:
+class Distortion:
     """How far apart two pictures are; each number is the most, drawn evenly from both signs."""
 
     name: str
@@ -45,12 +45,16 @@ class Level:
     """1/px"""
 
     @classmethod
-    def scaled(cls, name: str, by: float) -> Level:
+    def scaled(cls, name: str, by: float) -> Distortion:
         """``by`` times the medium level."""
         return cls(name, 20.0 * by, (45.0 * by, 35.0 * by), 0.2 * by, 4e-4 * by)
 
 
-LEVELS = (Level.scaled("mild", 0.3), Level.scaled("medium", 1.0), Level.scaled("hard", 1.6))
+LEVELS = (
+    Distortion.scaled("mild", 0.3),
+    Distortion.scaled("medium", 1.0),
+    Distortion.scaled("hard", 1.6),
+)
 """Easy to hard; shares of the same largest motion."""
 
 
@@ -68,7 +72,7 @@ class HomographyPair:
 
 def homography_pair(
     picture: Picture,  # [h, w, 3] of any size
-    level: Level,
+    level: Distortion,
     rng: np.random.Generator,
 ) -> HomographyPair:
     """``picture`` beside itself, as another camera in another light would have it."""
@@ -102,7 +106,7 @@ def relit(
 def homography_recall(
     matcher: Matcher,
     pictures: Sequence[Picture],  # [H, W, 3] RGB each
-    level: Level,
+    level: Distortion,
     pairs: int,
     seed: int = 0,
 ) -> dict[str, float]:
@@ -137,7 +141,7 @@ def matcher_of(prior: Prior) -> Matcher:
     return match
 
 
-def _homography(level: Level, rng: np.random.Generator) -> Matrix:
+def _homography(level: Distortion, rng: np.random.Generator) -> Matrix:
     """[3, 3] about the picture's middle, from pixels of a to pixels of b."""
     turn = np.radians(rng.uniform(-1.0, 1.0) * level.turn_deg)
     zoom = np.exp(rng.uniform(-1.0, 1.0) * level.log_zoom)

@@ -11,7 +11,7 @@ from aquaflow.evaluation.matching import (
     HEIGHT,
     LEVELS,
     WIDTH,
-    Level,
+    Distortion,
     homography_pair,
     homography_recall,
     matcher_of,
@@ -21,7 +21,7 @@ from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.flow import pixel_grid
 
 Picture = npt.NDArray[np.uint8]
-STILL = Level.scaled("still", 0.0)
+STILL = Distortion.scaled("still", 0.0)
 MILD = LEVELS[0]
 
 

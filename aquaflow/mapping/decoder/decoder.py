@@ -58,7 +58,9 @@ class Decoder(nn.Module):
         self.config, d = config, config.width
         self.local = _linear(config.local_width, d, generator)
         self.shared = _linear(config.global_width, d, generator, bias=False)
-        self.mixer = Attention(d, generator) if config.variant == "lgpd" else Mlp(d, generator)
+        self.mixer = (
+            GroupAttention(d, generator) if config.variant == "lgpd" else TokenMlp(d, generator)
+        )
         self.first = _linear(d, d, generator)
         self.view = _linear(encoded_width(config.distance), d, generator, bias=False)
         self.geometry = _zero_linear(d // 2, TURN + LOG_SCALE)
@@ -120,7 +122,7 @@ class Decoder(nn.Module):
         return residuals if bool(sound.all()) else residuals * sound[:, None]
 
 
-class Attention(nn.Module):
+class GroupAttention(nn.Module):
     """Masked self-attention within each group, one head, added to the tokens.
 
     The tokens are their own keys, and values are already projected for the output: with one head
@@ -144,7 +146,7 @@ class Attention(nn.Module):
         return torch.baddbmm(e, torch.softmax(scores, dim=-1), self.value(e))
 
 
-class Mlp(nn.Module):
+class TokenMlp(nn.Module):
     """What stands in for attention in the ablation: as many weights, each token on its own."""
 
     def __init__(self, width: int, generator: torch.Generator) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from aquaflow.prior.mast3r.settings import NetworkSize
+from aquaflow.prior.mast3r.settings import Mast3rSize
 
 POINT_AND_CONFIDENCE = 4
 """Channels: x, y, z and a confidence."""
@@ -67,7 +67,7 @@ class Doubled(nn.Module):
 class Scratch(nn.Module):
     """The layers that fuse the pyramid."""
 
-    def __init__(self, size: NetworkSize) -> None:
+    def __init__(self, size: Mast3rSize) -> None:
         super().__init__()
         fused = size.fused_width
         levels = [nn.Conv2d(n, fused, 3, padding=1, bias=False) for n in size.level_widths]
@@ -95,7 +95,7 @@ class Scratch(nn.Module):
 class DenseHead(nn.Module):
     """Tokens of four layers -> raw point and confidence of every pixel."""
 
-    def __init__(self, size: NetworkSize) -> None:
+    def __init__(self, size: Mast3rSize) -> None:
         super().__init__()
         n1, n2, n3, n4 = size.level_widths
         wide, narrow = size.encoder_width, size.decoder_width

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from aquaflow.prior.mast3r.blocks import NORM_EPS, DecoderBlock, EncoderBlock, Mlp
 from aquaflow.prior.mast3r.dense_head import DenseHead
 from aquaflow.prior.mast3r.rotary import RotaryTable, rotary_table
-from aquaflow.prior.mast3r.settings import FULL, PATCH_PX, NetworkSize
+from aquaflow.prior.mast3r.settings import FULL, PATCH_PX, Mast3rSize
 
 MEAN = STD = 0.5
 """Of the pixel values that the checkpoint was trained on."""
@@ -57,7 +57,7 @@ class PatchEmbed(nn.Module):
 class Head(nn.Module):
     """Dense head for the points, an MLP on the tokens for the descriptors."""
 
-    def __init__(self, size: NetworkSize) -> None:
+    def __init__(self, size: Mast3rSize) -> None:
         super().__init__()
         both = size.encoder_width + size.decoder_width
         values = (size.descriptor + 1) * PATCH_PX**2
@@ -90,7 +90,7 @@ class Head(nn.Module):
 class Mast3r(nn.Module):
     """Siamese encoder, two decoders that look at each other, a head each."""
 
-    def __init__(self, size: NetworkSize = FULL) -> None:
+    def __init__(self, size: Mast3rSize = FULL) -> None:
         super().__init__()
         self.size, wide, narrow = size, size.encoder_width, size.decoder_width
         heads, ratio = size.decoder_heads, size.mlp_ratio

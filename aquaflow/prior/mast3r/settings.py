@@ -9,7 +9,7 @@ PATCH_PX = 16
 
 
 @dataclass(frozen=True)
-class NetworkSize:
+class Mast3rSize:
     """Depths and widths; the defaults are those of ViT-L / ViT-B, catmlp + dpt, pts3d + desc24."""
 
     encoder_depth: int = 24
@@ -35,10 +35,10 @@ class NetworkSize:
         return 0, depth // 2, depth * 3 // 4, depth
 
 
-FULL = NetworkSize()
+FULL = Mast3rSize()
 """The public checkpoint: 1,017 tensors, 695 million numbers."""
 
-TINY = NetworkSize(
+TINY = Mast3rSize(
     encoder_depth=2,
     encoder_width=48,
     encoder_heads=3,

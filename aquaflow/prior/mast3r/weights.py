@@ -15,7 +15,7 @@ from torch import Tensor
 
 from aquaflow.errors import InputError, reason_of
 from aquaflow.prior.mast3r.network import Mast3r
-from aquaflow.prior.mast3r.settings import FULL, NetworkSize
+from aquaflow.prior.mast3r.settings import FULL, Mast3rSize
 
 LICENCE_NOTICE = (
     "The public MASt3R weights are under CC BY-NC-SA 4.0 and the terms of their training data: "
@@ -27,7 +27,7 @@ NAMED = 3
 """Tensors that an error names; the rest is counted."""
 
 
-def load_checkpoint(path: Path, size: NetworkSize = FULL) -> Mast3r:
+def load_checkpoint(path: Path, size: Mast3rSize = FULL) -> Mast3r:
     """The network with the weights of ``path``, in evaluation mode, on the CPU.
 
     Raises:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from aquaflow.geometry.similarity import rotation_from_quaternion
-from aquaflow.mapping.decoder.decoder import Attention, apply_residuals
+from aquaflow.mapping.decoder.decoder import GroupAttention, apply_residuals
 from aquaflow.mapping.decoder.observation import FURTHEST, encoded_observation, observation
 from aquaflow.mapping.decoder.tokens import BUCKET, Tokens, visible_tokens
 from aquaflow.mapping.decoder.voxel_groups import EMPTY
@@ -155,7 +155,7 @@ def test_the_order_within_a_group_does_not_matter() -> None:
 @given(st.integers(0, 999), st.integers(1, 8))
 def test_attention_is_permutation_equivariant(seed: int, count: int) -> None:
     random = torch.Generator().manual_seed(seed)
-    attention = Attention(6, random).double()
+    attention = GroupAttention(6, random).double()
     e = torch.randn(2, count, 6, generator=random, dtype=torch.float64)
     order = torch.randperm(count, generator=random)
     valid = torch.ones(2, count, dtype=torch.bool)
