@@ -13,7 +13,7 @@ from aquaflow.config.telemetry import AnyDevice, TelemetryConfig
 from aquaflow.messages import TelemetrySample
 from aquaflow.sources import RawTap
 from aquaflow.sources.newest import Newest
-from aquaflow.sources.outbound import Hears, Word
+from aquaflow.sources.outbound import AcceptsMessages, OutboundMessage
 from drivers.link import LinkCounters
 from drivers.mounting import BodyFrame, Mounting
 from drivers.protocol.packets import PacketDecoder
@@ -123,11 +123,13 @@ class LinkTelemetry:
             if decoder.clock is not None:
                 decoder.clock.mapping.resume(learned.get(name, ()))
 
-    def tell(self, word: Word) -> bool:
-        """Tell every device that understands it; see :class:`aquaflow.sources.outbound.Hears`."""
-        hearing = [decoder for decoder in self.decoders.values() if isinstance(decoder, Hears)]
-        told = [decoder.tell(word) for decoder in hearing]
-        return any(told)
+    def send(self, message: OutboundMessage) -> bool:
+        """Queue ``message`` for every device that understands it; False if none does."""
+        accepting = [
+            decoder for decoder in self.decoders.values() if isinstance(decoder, AcceptsMessages)
+        ]
+        queued = [decoder.send(message) for decoder in accepting]
+        return any(queued)
 
     def close(self) -> None:
         """Stop all links; samples that wait can still be fetched. May be called again."""

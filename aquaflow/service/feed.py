@@ -32,7 +32,7 @@ from aquaflow.recording.session import HasSamples
 from aquaflow.service.dive_clock import Continued
 from aquaflow.sources import CameraSource, TelemetrySource
 from aquaflow.sources.newest import Newest
-from aquaflow.sources.outbound import Hears, Word
+from aquaflow.sources.outbound import AcceptsMessages, OutboundMessage
 from aquaflow.sources.reading import read_on
 
 log = logging.getLogger(__name__)
@@ -103,8 +103,8 @@ class Feed(Protocol):
         """What is known of the devices' clocks, for the run that continues this one."""
         ...
 
-    def tell(self, word: Word) -> bool:
-        """Tell the vehicle; False if nobody there understands."""
+    def send(self, message: OutboundMessage) -> bool:
+        """Send ``message`` to the vehicle; False if no device there understands it."""
         ...
 
     def start(self) -> None:
@@ -201,8 +201,8 @@ class LiveFeed(_Pumps):
     def clocks(self) -> Mapping[str, Learned]:
         return self._telemetry.learned() if isinstance(self._telemetry, KnowsClocks) else {}
 
-    def tell(self, word: Word) -> bool:
-        return isinstance(self._telemetry, Hears) and self._telemetry.tell(word)
+    def send(self, message: OutboundMessage) -> bool:
+        return isinstance(self._telemetry, AcceptsMessages) and self._telemetry.send(message)
 
     def start(self) -> None:
         """Open cameras and telemetry, and read them in threads."""
@@ -269,7 +269,7 @@ class PlaybackFeed(_Pumps):
     def describe(self) -> dict[str, dict[str, object]]:
         return {}
 
-    def tell(self, word: Word) -> bool:
+    def send(self, message: OutboundMessage) -> bool:
         return False
 
     def start(self) -> None:

@@ -10,20 +10,20 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
-LONGEST_SENTENCE, LONGEST_NAME = 50, 10
+LONGEST_TEXT, LONGEST_NAME = 50, 10
 """Characters that MAVLink has room for."""
 
 
 @dataclass(frozen=True)
-class Sentence:
-    """For the pilot; longer ones are cut."""
+class StatusText:
+    """Text for the pilot; cut after ``LONGEST_TEXT`` characters."""
 
     severity: Literal["error", "warning", "notice", "info"]
     text: str
 
 
 @dataclass(frozen=True)
-class Number:
+class NamedValue:
     """A named number that a ground station can plot."""
 
     t_ns: int
@@ -64,13 +64,13 @@ class BodyMotion:
     """0 to 1."""
 
 
-Word: TypeAlias = Sentence | Number | BodyPose | BodyMotion
+OutboundMessage: TypeAlias = StatusText | NamedValue | BodyPose | BodyMotion
 
 
 @runtime_checkable
-class Hears(Protocol):
-    """A telemetry source whose devices can be told something."""
+class AcceptsMessages(Protocol):
+    """A telemetry source whose devices accept messages."""
 
-    def tell(self, word: Word) -> bool:
-        """Queue a word for every device that understands it; False if none does. Never waits."""
+    def send(self, message: OutboundMessage) -> bool:
+        """Queue a message for every device that understands it; False if none does. Never waits."""
         ...

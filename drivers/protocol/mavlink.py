@@ -7,12 +7,12 @@ from typing import Any
 
 from aquaflow.config.telemetry import MavlinkConfig
 from aquaflow.messages import TelemetrySample
-from aquaflow.sources.outbound import Sentence, Word
+from aquaflow.sources.outbound import OutboundMessage, StatusText
 from drivers.device_clock import DeviceClock
 from drivers.extra import load
 from drivers.protocol.mavlink_frames import MavlinkFraming, header_of
+from drivers.protocol.mavlink_outbound import message_of
 from drivers.protocol.mavlink_samples import MavlinkSamples, MessageTime
-from drivers.protocol.mavlink_speech import message_of
 from drivers.protocol.packets import PacketDecoder
 
 DIALECT = "pymavlink.dialects.v20.ardupilotmega"
@@ -25,8 +25,8 @@ OPEN_REQUESTS = 16
 """TIMESYNC requests that an answer may still come to."""
 MAX_OUTGOING_BYTES = 1024
 """A flood of TIMESYNC requests is answered as far as this goes, between two writes."""
-MOST_WORDS = 32
-"""Words that wait for a link that is away; older ones are of no interest by then."""
+MOST_WAITING = 32
+"""Messages that wait while a link is down; older ones are dropped."""
 SINCE_1970_US = 1_000_000_000_000_000
 """A time_usec above is not the time since boot: that would be 31 years."""
 
@@ -49,7 +49,7 @@ class MavlinkDecoder(PacketDecoder):
         self._wire = self._dialect.MAVLink(None, config.system_id, OUR_COMPONENT)
         self._requests: deque[int] = deque(maxlen=OPEN_REQUESTS)
         self._outgoing = b""
-        self._words: deque[Word] = deque(maxlen=MOST_WORDS)
+        self._outbound: deque[OutboundMessage] = deque(maxlen=MOST_WAITING)
         self._talk_at_ns: int | None = None
 
     def decode(self, packet: bytes, arrival_ns: int) -> list[TelemetrySample]:
@@ -72,8 +72,9 @@ class MavlinkDecoder(PacketDecoder):
         if not self._config.talk:
             return b""
         data, self._outgoing = self._outgoing, b""
-        while self._words:
-            message = message_of(self._dialect, word := self._words.popleft(), self._boot_ns(word))
+        while self._outbound:
+            outbound = self._outbound.popleft()
+            message = message_of(self._dialect, outbound, self._boot_ns(outbound))
             data += b"" if message is None else self._packed(message)
         if self._talk_at_ns is not None and now_ns < self._talk_at_ns:
             return data
@@ -90,18 +91,18 @@ class MavlinkDecoder(PacketDecoder):
         request = self._dialect.MAVLink_timesync_message(tc1=0, ts1=now_ns)
         return data + self._packed(heartbeat) + self._packed(request)
 
-    def tell(self, word: Word) -> bool:
-        """Say ``word`` with the next write; False where we only listen. For any thread."""
+    def send(self, outbound: OutboundMessage) -> bool:
+        """Queue ``outbound`` for the next write; False where we only listen. For any thread."""
         if self._config.talk:
-            self._words.append(word)
+            self._outbound.append(outbound)
         return self._config.talk
 
-    def _boot_ns(self, word: Word) -> int | None:
-        """A word's moment on the autopilot's clock."""
+    def _boot_ns(self, outbound: OutboundMessage) -> int | None:
+        """The message's moment on the autopilot's clock."""
         report = self.clock.mapping.report()
-        if report is None or isinstance(word, Sentence):
+        if report is None or isinstance(outbound, StatusText):
             return None
-        return max(word.t_ns - report.offset_ns, 0)
+        return max(outbound.t_ns - report.offset_ns, 0)
 
     def _unpacked(self, packet: bytes) -> Any:
         try:

@@ -30,7 +30,7 @@ from aquaflow.service.loop import LiveLoop
 from aquaflow.service.map_thread import MapThread
 from aquaflow.slam import Slam
 from aquaflow.sources.newest import Newest
-from aquaflow.sources.outbound import Word
+from aquaflow.sources.outbound import OutboundMessage
 from aquaflow.tracking.frames import FrameClass, Tracked
 
 WIDTH, HEIGHT = 64, 48
@@ -82,7 +82,7 @@ class ToldFeed:
         self.calibration: CameraModel | None = None
         self.devices: dict[str, dict[str, object]] = {}
         self.continued = Continued()
-        self.told: list[Word] = []
+        self.told: list[OutboundMessage] = []
         self.learned: dict[str, Learned] = {}
 
     def name_of(self, index: int) -> str:
@@ -97,8 +97,8 @@ class ToldFeed:
     def clocks(self) -> dict[str, Learned]:
         return self.learned
 
-    def tell(self, word: Word) -> bool:
-        self.told.append(word)
+    def send(self, message: OutboundMessage) -> bool:
+        self.told.append(message)
         return True
 
     def start(self) -> None: ...

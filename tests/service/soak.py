@@ -33,7 +33,7 @@ from aquaflow.service.live_dive import LiveDive
 from aquaflow.service.loop import LiveLoop
 from aquaflow.service.report import report
 from aquaflow.sources import open_recording
-from aquaflow.sources.outbound import Word
+from aquaflow.sources.outbound import OutboundMessage
 from aquaflow.synthetic import SyntheticConfig, write_dive
 
 ROUND = SyntheticConfig(frames=120, width=96, height=72)
@@ -70,7 +70,7 @@ class Rounds(_Pumps):
     def describe(self) -> dict[str, dict[str, object]]:
         return {}
 
-    def tell(self, word: Word) -> bool:
+    def send(self, message: OutboundMessage) -> bool:
         return False
 
     def start(self) -> None:

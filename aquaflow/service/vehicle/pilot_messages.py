@@ -9,7 +9,7 @@ from aquaflow.config.service import VehicleReportConfig
 from aquaflow.service.feed import Feed
 from aquaflow.service.health.state import State
 from aquaflow.service.loop import LiveLoop
-from aquaflow.sources.outbound import Number, Sentence
+from aquaflow.sources.outbound import NamedValue, StatusText
 
 EVERY_S = 1.0
 """Period of the numbers that the autopilot logs."""
@@ -40,7 +40,7 @@ class VehicleReport:
         if self._config.status_text and state is not self._said and now - self._said_s >= SPACING_S:
             self._said, self._said_s = state, now
             severity = SEVERITY.get(state, "info")
-            self._feed.tell(Sentence(severity, f"AquaFlow {state.value}: {loop.health.reason}"))
+            self._feed.send(StatusText(severity, f"AquaFlow {state.value}: {loop.health.reason}"))
         if self._config.values and now - self._told_s >= EVERY_S:
             self._told_s = now
             lag = loop.counters.lag_ms()["p95"] or 0.0
@@ -50,4 +50,4 @@ class VehicleReport:
                 ("AQ_LAG_MS", lag),
                 ("AQ_FPS", loop.counters.fps),
             ):
-                self._feed.tell(Number(time.monotonic_ns(), name, value))
+                self._feed.send(NamedValue(time.monotonic_ns(), name, value))

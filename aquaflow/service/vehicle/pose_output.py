@@ -114,9 +114,9 @@ class PoseOut:
         if self._config.message == "odometry":
             covariance = self._covariance(quality)
             word = BodyPose(latest.frame.t_ns, R, t_m, covariance, quality, self.jumps)
-            self.sent += self._feed.tell(word)
+            self.sent += self._feed.send(word)
         elif before is not None and not jumped:
-            self.sent += self._feed.tell(_motion(before, latest, R, t_m, quality))
+            self.sent += self._feed.send(_motion(before, latest, R, t_m, quality))
 
     def _jumped(self, before: Tracked, latest: Tracked, moved_m: float) -> bool:
         return before.sub_map != latest.sub_map or moved_m > self._config.jump_m

@@ -16,7 +16,7 @@ from aquaflow.errors import ConfigError
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.service.vehicle.pilot_messages import VehicleReport
 from aquaflow.service.vehicle.pose_output import MetricScale, PoseOut
-from aquaflow.sources.outbound import BodyMotion, BodyPose, Number, Sentence, Word
+from aquaflow.sources.outbound import BodyMotion, BodyPose, NamedValue, OutboundMessage, StatusText
 from aquaflow.tracking.frames import FrameClass, Quality, Tracked
 from drivers.protocol.mavlink import MavlinkDecoder
 from tests.service.live_scenes import Told, frame_of
@@ -94,23 +94,23 @@ def test_the_pilot_hears_of_changes_and_numbers_come_once_a_second(told: Told) -
     told.frames("pp")
     for tenth in range(31):
         report.update(told.loop, tenth / 10)
-    sentences = [word for word in told.feed.told if isinstance(word, Sentence)]
+    sentences = [word for word in told.feed.told if isinstance(word, StatusText)]
     assert [word.text for word in sentences] == ["AquaFlow tracking: every frame has a pose"]
-    numbers = [word.name for word in told.feed.told if isinstance(word, Number)]
+    numbers = [word.name for word in told.feed.told if isinstance(word, NamedValue)]
     assert numbers.count("AQ_STATE") == 4
 
 
 # --- on the wire ----------------------------------------------------------------------------------
 
 
-def heard(*words: Word, talk: bool = True) -> list[Any]:
+def heard(*words: OutboundMessage, talk: bool = True) -> list[Any]:
     """What an autopilot reads."""
     link = {"kind": "udp", "port": 14550}
     device = {"kind": "mavlink", "talk": talk, "link": link}
     config = parse_telemetry({"devices": {"autopilot": device}}, "test").devices["autopilot"]
     decoder = MavlinkDecoder("autopilot", config)  # type: ignore[arg-type]
     for word in words:
-        assert decoder.tell(word) is talk
+        assert decoder.send(word) is talk
     dialect: Any = import_module("pymavlink.dialects.v20.ardupilotmega")
     wire = dialect.MAVLink(None)
     messages = wire.parse_buffer(decoder.outgoing(5_000_000_000)) or []
@@ -124,7 +124,7 @@ def body(R: np.ndarray | None = None, x: float = 1.5) -> BodyPose:
 
 def test_every_word_arrives_as_its_message() -> None:
     motion = BodyMotion(7_000_000, 100_000_000, np.array([0, 0, 0.1]), np.array([1.0, 0, 0]), 0.5)
-    number, sentence = Number(7_000_000, "AQ_STATE", 3.0), Sentence("warning", "é" + "x" * 80)
+    number, sentence = NamedValue(7_000_000, "AQ_STATE", 3.0), StatusText("warning", "é" + "x" * 80)
     text, value, pose, delta = heard(sentence, number, body(), motion)
     assert (text.severity, text.text) == (4, "?" + "x" * 49)
     assert (value.name, value.value) == ("AQ_STATE", 3.0)
@@ -139,4 +139,4 @@ def test_a_pose_that_is_not_finite_is_not_sent() -> None:
 
 
 def test_a_link_that_only_listens_says_nothing() -> None:
-    assert heard(Sentence("info", "hello"), talk=False) == []
+    assert heard(StatusText("info", "hello"), talk=False) == []

@@ -1,4 +1,4 @@
-"""What AquaFlow tells an autopilot, as MAVLink messages (mavlink.io/en/messages/common.html)."""
+"""AquaFlow's messages to an autopilot in MAVLink (mavlink.io/en/messages/common.html)."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow.sources.outbound import (
     LONGEST_NAME,
-    LONGEST_SENTENCE,
+    LONGEST_TEXT,
     BodyMotion,
     BodyPose,
-    Number,
-    Sentence,
-    Word,
+    NamedValue,
+    OutboundMessage,
+    StatusText,
 )
 
 SEVERITIES = {"error": 3, "warning": 4, "notice": 5, "info": 6}
@@ -32,22 +32,22 @@ LARGEST = 1e6
 """Metres; beyond is no position."""
 
 
-def message_of(dialect: Any, word: Word, boot_ns: int | None) -> Any | None:
-    """The message that says ``word``; None for one that is not finite.
+def message_of(dialect: Any, outbound: OutboundMessage, boot_ns: int | None) -> Any | None:
+    """The MAVLink message of ``outbound``; None for one that is not finite.
 
     ``boot_ns``: the word's moment on the autopilot's own clock, if that is known.
     """
-    if isinstance(word, Sentence):
-        text = word.text.encode("ascii", "replace")[:LONGEST_SENTENCE]
-        return dialect.MAVLink_statustext_message(severity=SEVERITIES[word.severity], text=text)
-    t_ns = word.t_ns if boot_ns is None else boot_ns
-    if isinstance(word, Number):
-        name = word.name.encode("ascii", "replace")[:LONGEST_NAME]
+    if isinstance(outbound, StatusText):
+        text = outbound.text.encode("ascii", "replace")[:LONGEST_TEXT]
+        return dialect.MAVLink_statustext_message(severity=SEVERITIES[outbound.severity], text=text)
+    t_ns = outbound.t_ns if boot_ns is None else boot_ns
+    if isinstance(outbound, NamedValue):
+        name = outbound.name.encode("ascii", "replace")[:LONGEST_NAME]
         boot_ms = (t_ns // 1_000_000) % 2**32
-        return dialect.MAVLink_named_value_float_message(boot_ms, name, word.value)
-    if isinstance(word, BodyMotion):
-        return _delta(dialect, word, t_ns)
-    return _odometry(dialect, word, t_ns)
+        return dialect.MAVLink_named_value_float_message(boot_ms, name, outbound.value)
+    if isinstance(outbound, BodyMotion):
+        return _delta(dialect, outbound, t_ns)
+    return _odometry(dialect, outbound, t_ns)
 
 
 def _delta(dialect: Any, motion: BodyMotion, t_ns: int) -> Any | None:
