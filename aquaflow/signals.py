@@ -1,4 +1,4 @@
-"""Ending a long run by Ctrl-C, or by systemd's SIGTERM, instead of breaking it off."""
+"""Clean end of a long run on SIGINT (Ctrl-C) or SIGTERM (systemd)."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from threading import Event
 
 
 @contextlib.contextmanager
-def until_told(stopping: Event) -> Iterator[None]:
-    """Either signal sets ``stopping``; afterwards they mean what they did before."""
+def stop_on_signals(stopping: Event) -> Iterator[None]:
+    """Either signal sets ``stopping``; the previous handlers are restored at the end."""
     asked = (signal.SIGINT, signal.SIGTERM)
     before: list[Callable[..., object] | int | None] = []
-    with contextlib.suppress(ValueError):  # not in the main thread: somebody else listens
+    with contextlib.suppress(ValueError):  # only the main thread may set handlers
         before = [signal.signal(each, lambda *_: stopping.set()) for each in asked]
     try:
         yield

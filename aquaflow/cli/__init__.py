@@ -20,7 +20,7 @@ from aquaflow.cli.devices import register as register_devices
 from aquaflow.cli.export import register as register_export
 from aquaflow.cli.prior import register as register_prior
 from aquaflow.cli.record import register as register_record
-from aquaflow.cli.service import exit_code, map_realtime, tell_finished
+from aquaflow.cli.service import exit_code, map_realtime, print_finished
 from aquaflow.cli.service import register as register_service
 from aquaflow.cli.stress import register as register_stress
 from aquaflow.errors.crash_report import one_sentence, print_anything, refuse_unreadable
@@ -102,7 +102,9 @@ def map_command(
 
     calibration = None if calib is None else load_camera(calib)
     if realtime:
-        tell_finished(map_realtime(source, settings, calibration, out, overwrite, as_json), as_json)
+        print_finished(
+            map_realtime(source, settings, calibration, out, overwrite, as_json), as_json
+        )
         return
     recording = open_recording(source, fps=settings.source.fps)
 

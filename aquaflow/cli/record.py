@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from aquaflow.cli.console import Json, Seconds, progress_bars
-from aquaflow.signals import until_told
+from aquaflow.signals import stop_on_signals
 
 if TYPE_CHECKING:
     from aquaflow.config.vehicle import VehicleConfig
@@ -55,11 +55,11 @@ def record(
     session = RecordingSession(Recorder(folder, vehicle.recording))
     try:
         add_sources(session)
-        with until_told(session.stopping), progress_bars(quiet=as_json) as progress:
+        with stop_on_signals(session.stopping), progress_bars(quiet=as_json) as progress:
             session.run(seconds, progress)
     finally:
         status = session.recorder.close()
-    _tell(session, status, folder, as_json)
+    _print_status(session, status, folder, as_json)
     if status.stopped is not None:
         raise InputError(f"recording stopped: {status.stopped}")
 
@@ -100,7 +100,9 @@ def _recording(path: Path) -> Callable[[RecordingSession], None]:
     return lambda session: session.add_playback(SOURCE_CAMERA, playback, telemetry)
 
 
-def _tell(session: RecordingSession, status: RecorderStatus, folder: Path, as_json: bool) -> None:
+def _print_status(
+    session: RecordingSession, status: RecorderStatus, folder: Path, as_json: bool
+) -> None:
     if as_json:
         typer.echo(
             json.dumps({"out": str(folder), **status.to_json(), "notes": list(session.notes)})

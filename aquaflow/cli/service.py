@@ -78,7 +78,7 @@ def run(
         finished = map_live(
             feed, vehicle, out, new, seconds, lambda done, total: progress("refine", done, total)
         )
-    tell_finished(finished, as_json)
+    print_finished(finished, as_json)
 
 
 def status(
@@ -174,7 +174,7 @@ def map_realtime(
         )  # fmt: skip
 
 
-def tell_finished(finished: Finished | None, as_json: bool) -> None:
+def print_finished(finished: Finished | None, as_json: bool) -> None:
     """Print the summary of a live dive, and end the command with its exit code."""
     if finished is None:
         typer.echo("{}" if as_json else "Nothing was mapped; frames.csv says why.")

@@ -1,4 +1,4 @@
-"""Where frames and telemetry come from: threads pump, and none of them ever waits for mapping.
+"""Sources of frames and telemetry: each is read in its own thread, never waiting for mapping.
 
 Between a camera and tracking lie two queues in which the newest wins, and both are needed. The
 camera's own (drivers/live.py) holds a raw picture, in a buffer of the device, until it is decoded.
@@ -38,12 +38,12 @@ from aquaflow.sources.reading import read_on
 log = logging.getLogger(__name__)
 
 ASK_S = 0.5
-"""How often a pump that waits to be asked looks whether it shall end."""
+"""How often a waiting pump thread checks whether it shall end."""
 JOIN_S = 3.0
 """Longest wait for a pump; one that hangs in a device's library ends with the process."""
 
 
-class Heard:
+class LatestSamples:
     """The newest sample of every telemetry source; written by pumps, read by anyone."""
 
     def __init__(self) -> None:
@@ -61,28 +61,28 @@ class Heard:
 
 
 @runtime_checkable
-class KnowsClocks(Protocol):
+class HasDeviceClocks(Protocol):
     """A telemetry source whose devices have clocks of their own."""
 
     def learned(self) -> Mapping[str, Learned]:
-        """What is known of them, by device."""
+        """The clock mappings learned so far, by device."""
         ...
 
     def resume(self, learned: Mapping[str, Learned]) -> None:
-        """Go on with what an earlier process knew."""
+        """Continue with what an earlier process had learned."""
         ...
 
 
 class Feed(Protocol):
-    """One camera's newest frame, and telemetry beside it."""
+    """The newest frame of one camera, and telemetry."""
 
     newest: Newest[Frame | Dropped]
-    heard: Heard
+    latest_samples: LatestSamples
     notes: list[str]
     failure: str | None
-    """Why no more frames will come, if that was not their end."""
+    """Why the camera stopped, unless its recording ended."""
     failures: Failures
-    """What reading raised; the dive goes on counting in it."""
+    """Errors raised while reading; the dive adds its own."""
 
     @property
     def calibration(self) -> CameraModel | None: ...
@@ -95,12 +95,12 @@ class Feed(Protocol):
         """State and counters of each device, for health."""
         ...
 
-    def go_on(self, continued: Continued) -> None:
-        """Count frames and time on from an earlier run; before the start."""
+    def continue_from(self, continued: Continued) -> None:
+        """Continue frame indices and time of an earlier run; call it before ``start``."""
         ...
 
     def clocks(self) -> Mapping[str, Learned]:
-        """What is known of the devices' clocks, for the run that continues this one."""
+        """The learned clock mappings by device, for a run that continues this one."""
         ...
 
     def send(self, message: OutboundMessage) -> bool:
@@ -120,14 +120,14 @@ class _Pumps:
     def __init__(self, failures: Failures | None = None) -> None:
         self.failures = failures or Failures()
         self.newest: Newest[Frame | Dropped] = Newest()
-        self.heard = Heard()
+        self.latest_samples = LatestSamples()
         self.notes: list[str] = []
         self.failure: str | None = None
         self.continued = Continued()
         self.closing = threading.Event()
         self._threads: list[threading.Thread] = []
 
-    def go_on(self, continued: Continued) -> None:
+    def continue_from(self, continued: Continued) -> None:
         self.continued = continued
 
     def clocks(self) -> Mapping[str, Learned]:
@@ -193,13 +193,13 @@ class LiveFeed(_Pumps):
             devices["recorder"] = {"kind": "recorder", "state": status.stopped or "recording"}
         return devices
 
-    def go_on(self, continued: Continued) -> None:
-        super().go_on(continued)
-        if isinstance(self._telemetry, KnowsClocks):
+    def continue_from(self, continued: Continued) -> None:
+        super().continue_from(continued)
+        if isinstance(self._telemetry, HasDeviceClocks):
             self._telemetry.resume(continued.clocks)
 
     def clocks(self) -> Mapping[str, Learned]:
-        return self._telemetry.learned() if isinstance(self._telemetry, KnowsClocks) else {}
+        return self._telemetry.learned() if isinstance(self._telemetry, HasDeviceClocks) else {}
 
     def send(self, message: OutboundMessage) -> bool:
         return isinstance(self._telemetry, AcceptsMessages) and self._telemetry.send(message)
@@ -243,7 +243,7 @@ class LiveFeed(_Pumps):
 
     def _samples(self, source: HasSamples) -> None:
         for sample in source.samples():
-            self.heard.take(sample)
+            self.latest_samples.take(sample)
             if self._recorder is not None:
                 self._recorder.sample(sample)
 
@@ -293,7 +293,7 @@ class PlaybackFeed(_Pumps):
             if isinstance(now, (Frame, Dropped)):
                 self.newest.put(now)
             else:
-                self.heard.take(now)
+                self.latest_samples.take(now)
         self.notes += self._notes
 
     def _read(self, start: int) -> Iterator[Event]:

@@ -32,7 +32,7 @@ from aquaflow.service.health.pressure import PressureReader
 from aquaflow.service.health.systemd import Notifier
 from aquaflow.service.loop import LiveLoop
 from aquaflow.service.map_thread import MapThread
-from aquaflow.signals import until_told
+from aquaflow.signals import stop_on_signals
 from aquaflow.slam import Slam
 
 log = logging.getLogger(__name__)
@@ -119,7 +119,7 @@ class LiveDive:
         run.notes += [*choice.notes, *(self._salvaged.losses if self._salvaged else ())]
         for note in run.notes:
             log.warning("%s", note)
-        feed.go_on(continued)
+        feed.continue_from(continued)
         loop = LiveLoop(
             run, feed, thread, service, self._heartbeats, self._degradation,
             PressureReader(self.folder.path), self._notifier,
@@ -138,7 +138,7 @@ class LiveDive:
             AquaFlowError: the source or the loop failed; the checkpoint stays.
         """
         parts = self.parts
-        with until_told(parts.loop.stopping):
+        with stop_on_signals(parts.loop.stopping):
             parts.loop.run()
         source_ended = not parts.loop.stopping.is_set()
         parts.loop.stop("the recording ended" if source_ended else "told to stop")

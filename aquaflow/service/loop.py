@@ -105,7 +105,7 @@ class LiveLoop:
         self.health.set(State.STOPPING, reason)
         self.heartbeats.retire(STAGE)  # from here on systemd's timeout of stopping counts
         self.notifier.stopping()
-        self._tell()
+        self._notify_systemd()
 
     def status(self) -> dict[str, Any]:
         """Counts of all that was done by halves, for health and metrics.json."""
@@ -192,7 +192,7 @@ class LiveLoop:
             with contain(f"service: {getattr(watch, '__qualname__', type(watch).__name__)}"):
                 watch(self)
         with contain("notification of systemd"):
-            self._tell()
+            self._notify_systemd()
 
     def _need(self) -> str | None:
         self.pressure = self._read_pressure()
@@ -227,7 +227,7 @@ class LiveLoop:
                 troubles.append(f"not recording: {device['state']}")
         return troubles
 
-    def _tell(self) -> None:
+    def _notify_systemd(self) -> None:
         """Systemd hears READY once a sensor answered or its absence was declared; the watchdog is
         fed only from here, and only while mapping lives too."""
         state = self.health.state

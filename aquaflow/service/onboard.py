@@ -22,8 +22,8 @@ from aquaflow.service.live_dive import LiveDive
 from aquaflow.service.live_viewer import LiveViewer
 from aquaflow.service.moment import Moment
 from aquaflow.service.report import report
-from aquaflow.service.vehicle.pilot_messages import VehicleReport
-from aquaflow.service.vehicle.pose_output import PoseOut, metric_scale
+from aquaflow.service.vehicle.pilot_messages import PilotMessages
+from aquaflow.service.vehicle.pose_output import PoseOutput, metric_scale
 
 log = logging.getLogger(__name__)
 
@@ -57,10 +57,10 @@ def map_live(
             server = HealthServer(service.health, lambda: report(dive.parts, service.hang_s))
             around.callback(partial(_closed, dive, server.close))
         watchers = dive.parts.loop.watchers
-        watchers.append(VehicleReport(service.report, feed).update)
+        watchers.append(PilotMessages(service.report, feed).update)
         if service.pose.enabled:
             scale = metric_scale(dive.parts.slam)
-            watchers.append(PoseOut(service.pose, feed, scale).update)
+            watchers.append(PoseOutput(service.pose, feed, scale).update)
         if vehicle.viewer.enabled:
             viewer = LiveViewer(
                 vehicle.viewer, dive.parts.maps, lambda: report(dive.parts, service.hang_s)

@@ -50,7 +50,7 @@ def report(parts: Parts, hang_s: float, now_s: float | None = None) -> dict[str,
         },
         "machine": asdict(loop.pressure) | {"peak_rss_mb": _peak_rss_mb()},
         "devices": loop.feed.describe(),
-        "telemetry_samples": loop.feed.heard.samples,
+        "telemetry_samples": loop.feed.latest_samples.samples,
     }
 
 

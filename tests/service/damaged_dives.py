@@ -60,8 +60,8 @@ class ListedFeed(ToldFeed):
         self.listed = OneByOne(frames)
         self.newest = self.listed
 
-    def go_on(self, continued: Continued) -> None:
-        super().go_on(continued)
+    def continue_from(self, continued: Continued) -> None:
+        super().continue_from(continued)
         seen = continued.first_index
         self.listed.frames = deque(frame for frame in self.listed.frames if frame.index >= seen)
 

@@ -20,7 +20,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.maps import Growth, Insertion, Maps
 from aquaflow.messages import CameraModel, Dropped, Frame
 from aquaflow.service.dive_clock import Continued
-from aquaflow.service.feed import Heard
+from aquaflow.service.feed import LatestSamples
 from aquaflow.service.health.degradation import Degradation
 from aquaflow.service.health.heartbeats import Heartbeats
 from aquaflow.service.health.pressure import Pressure
@@ -76,7 +76,7 @@ class ToldFeed:
 
     def __init__(self) -> None:
         self.newest: Newest[Frame | Dropped] = Newest()
-        self.heard, self.notes = Heard(), []
+        self.latest_samples, self.notes = LatestSamples(), []
         self.failure: str | None = None
         self.failures = Failures()
         self.calibration: CameraModel | None = None
@@ -91,7 +91,7 @@ class ToldFeed:
     def describe(self) -> dict[str, dict[str, object]]:
         return self.devices
 
-    def go_on(self, continued: Continued) -> None:
+    def continue_from(self, continued: Continued) -> None:
         self.continued = continued
 
     def clocks(self) -> dict[str, Learned]:

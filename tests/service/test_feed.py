@@ -94,7 +94,7 @@ def test_only_pictures_that_are_asked_for_are_decoded(tmp_path: Path) -> None:
 
 def test_a_resumed_dive_counts_a_devices_pictures_on(tmp_path: Path) -> None:
     feed = LiveFeed("front", {"front": camera(tmp_path, CameraFaults())}, None, SourceConfig())
-    feed.go_on(Continued(first_index=1000, shift_ns=10**15))
+    feed.continue_from(Continued(first_index=1000, shift_ns=10**15))
     feed.start()
     try:
         frame = feed.newest.take(GIVE_UP_S)
@@ -119,12 +119,12 @@ def test_a_resumed_recording_goes_on_at_once_behind_what_was_seen() -> None:
     slept: list[float] = []
     playback = Playback(Pictures(), [Telemetry()], 1e-9, lambda: 0, slept.append)
     feed = PlaybackFeed(playback, SourceConfig(every=3), None, str, [])
-    feed.go_on(Continued(first_index=35))
+    feed.continue_from(Continued(first_index=35))
     feed.start()
     until(lambda: not any(thread.name == "recording" for thread in threading.enumerate()))
     feed.close()
     assert feed.failure is None
-    assert feed.heard.samples == 4  # those of the pictures 36 to 39
+    assert feed.latest_samples.samples == 4  # those of the pictures 36 to 39
     assert slept == pytest.approx([1.0, 2.0, 3.0, 3.0])  # samples 37, 38, picture and sample 39
 
 
@@ -154,7 +154,7 @@ def test_the_clocks_of_the_devices_are_told_and_taken_up_again() -> None:
     feed = LiveFeed("none", {}, LinkTelemetry(config), SourceConfig())
     try:
         assert feed.clocks() == {"autopilot": []}
-        feed.go_on(Continued(clocks=told))
+        feed.continue_from(Continued(clocks=told))
         decoder = feed._telemetry.decoders["autopilot"]  # type: ignore[union-attr]
         decoder.clock.mapping.add(13 * 10**9, 13 * 10**9 + 400)
         assert feed.clocks()["autopilot"][:1] == known["autopilot"]
@@ -176,11 +176,13 @@ def test_a_flood_of_garbage_costs_its_bytes_and_no_sample() -> None:
     feed = LiveFeed("none", {}, telemetry, SourceConfig())
     feed.start()
     try:
-        until(lambda: injected["flood"] > 3 and feed.heard.samples > 10)
+        until(lambda: injected["flood"] > 3 and feed.latest_samples.samples > 10)
         (described,) = feed.describe().values()
         assert described["state"] == "connected"
         assert int(str(described["garbage_bytes"])) > 100_000
-        assert all(abs(s.depth_m - 3.0) < 0.1 for s in feed.heard.latest() if isinstance(s, Depth))
+        assert all(
+            abs(s.depth_m - 3.0) < 0.1 for s in feed.latest_samples.latest() if isinstance(s, Depth)
+        )
     finally:
         device.close()
         feed.close()

@@ -25,7 +25,7 @@ SEVERITY: dict[State, Literal["error", "warning", "notice", "info"]] = {
 """How urgent each state is to the pilot."""
 
 
-class VehicleReport:
+class PilotMessages:
     """A watcher of the loop."""
 
     def __init__(self, config: VehicleReportConfig, feed: Feed) -> None:

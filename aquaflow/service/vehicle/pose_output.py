@@ -56,7 +56,7 @@ def metric_scale(slam: Slam) -> MetricScale | None:
     return MetricScale(1.0, "prior", PRIOR_SIGMA) if slam.prior.metric else None
 
 
-class PoseOut:
+class PoseOutput:
     """A watcher of the loop."""
 
     def __init__(self, config: PoseConfig, feed: Feed, scale: MetricScale | None) -> None:

@@ -14,8 +14,8 @@ from aquaflow.config.service import PoseConfig
 from aquaflow.config.telemetry import parse_telemetry
 from aquaflow.errors import ConfigError
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.service.vehicle.pilot_messages import VehicleReport
-from aquaflow.service.vehicle.pose_output import MetricScale, PoseOut
+from aquaflow.service.vehicle.pilot_messages import PilotMessages
+from aquaflow.service.vehicle.pose_output import MetricScale, PoseOutput
 from aquaflow.sources.outbound import BodyMotion, BodyPose, NamedValue, OutboundMessage, StatusText
 from aquaflow.tracking.frames import FrameClass, Quality, Tracked
 from drivers.protocol.mavlink import MavlinkDecoder
@@ -33,7 +33,7 @@ def told(tmp_path: Path) -> Iterator[Told]:
     told.close()
 
 
-def swim(told: Told, pose: PoseOut, xs: list[float], hz: float = 10.0, sub_map: int = 0) -> None:
+def swim(told: Told, pose: PoseOutput, xs: list[float], hz: float = 10.0, sub_map: int = 0) -> None:
     """Poses whose camera moves forward, from 1000 s on."""
     for x in xs:
         index = told.loop.counters.frames
@@ -50,39 +50,39 @@ def poses(told: Told) -> list[BodyPose]:
 
 def test_without_metres_no_pose_steers_a_vehicle(told: Told) -> None:
     with pytest.raises(ConfigError, match="metres"):
-        PoseOut(PoseConfig(enabled=True), told.feed, None)
+        PoseOutput(PoseConfig(enabled=True), told.feed, None)
 
 
 def test_poses_are_in_metres_forward_right_down(told: Told) -> None:
-    swim(told, PoseOut(PoseConfig(), told.feed, METRES), [0.0, 0.01, 0.02])
+    swim(told, PoseOutput(PoseConfig(), told.feed, METRES), [0.0, 0.01, 0.02])
     assert [list(word.t_m) for word in poses(told)] == [[0.02, 0, 0], [0.04, 0, 0]]
     assert np.allclose(poses(told)[0].R, np.eye(3))
     assert {word.quality for word in poses(told)} == {0.8}
 
 
 def test_the_covariance_grows_with_the_way(told: Told) -> None:
-    swim(told, PoseOut(PoseConfig(), told.feed, METRES), [0.05 * i for i in range(60)])
+    swim(told, PoseOutput(PoseConfig(), told.feed, METRES), [0.05 * i for i in range(60)])
     sigmas = [float(word.covariance[0, 0]) for word in poses(told)]
     assert sigmas == sorted(sigmas)
     assert sigmas[-1] > 5 * sigmas[0]
 
 
 def test_a_jump_bumps_the_reset_counter_and_so_does_another_sub_map(told: Told) -> None:
-    out = PoseOut(PoseConfig(), told.feed, METRES)
+    out = PoseOutput(PoseConfig(), told.feed, METRES)
     swim(told, out, [0.0, 0.01, 0.5, 0.51])
     swim(told, out, [0.52], sub_map=1)
     assert [word.reset_counter for word in poses(told)] == [0, 1, 1, 2]
 
 
 def test_poses_that_come_too_rarely_are_withheld(told: Told) -> None:
-    out = PoseOut(PoseConfig(), told.feed, METRES)
+    out = PoseOutput(PoseConfig(), told.feed, METRES)
     swim(told, out, [0.01 * i for i in range(5)], hz=2.0)
     assert poses(told) == []
     assert out.withheld == 5
 
 
 def test_motion_is_told_between_poses_and_never_over_a_jump(told: Told) -> None:
-    out = PoseOut(PoseConfig(message="vision_position_delta"), told.feed, METRES)
+    out = PoseOutput(PoseConfig(message="vision_position_delta"), told.feed, METRES)
     swim(told, out, [0.0, 0.01, 0.5, 0.51])
     motions = [word for word in told.feed.told if isinstance(word, BodyMotion)]
     assert [round(float(m.translation_m[0]), 3) for m in motions] == [0.02, 0.02]
@@ -90,7 +90,7 @@ def test_motion_is_told_between_poses_and_never_over_a_jump(told: Told) -> None:
 
 
 def test_the_pilot_hears_of_changes_and_numbers_come_once_a_second(told: Told) -> None:
-    report = VehicleReport(told.config.report, told.feed)
+    report = PilotMessages(told.config.report, told.feed)
     told.frames("pp")
     for tenth in range(31):
         report.update(told.loop, tenth / 10)
