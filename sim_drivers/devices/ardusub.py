@@ -53,7 +53,7 @@ class ArduSub:
         self.heartbeats = 0
         """Heartbeats heard."""
 
-    def say(self, sample: TelemetrySample, measured_ns: int, now_ns: int) -> list[bytes]:
+    def encode(self, sample: TelemetrySample, measured_ns: int, now_ns: int) -> list[bytes]:
         boot_ms = measured_ns // 1_000_000
         packets: list[bytes] = []
         match sample:
@@ -78,7 +78,7 @@ class ArduSub:
                 packets = [self._servos(1100 + round(800 * sample.level), measured_ns // 1000)]
         return packets
 
-    def hear(self, packet: bytes, now_ns: int) -> list[bytes]:
+    def answer(self, packet: bytes, now_ns: int) -> list[bytes]:
         answers = []
         for message in self._wire.parse_buffer(packet) or []:
             kind = message.get_type()
@@ -89,7 +89,7 @@ class ArduSub:
                 self.answers += 1
         return answers
 
-    def beat(self, now_ns: int) -> list[bytes]:
+    def unprompted(self, now_ns: int) -> list[bytes]:
         if self._beat_ns is not None and now_ns < self._beat_ns:
             return []
         self._beat_ns = now_ns + BEAT_NS

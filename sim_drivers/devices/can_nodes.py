@@ -17,7 +17,7 @@ from aquaflow.messages import (
     TelemetrySample,
     Velocity,
 )
-from sim_drivers.devices.device import Listener
+from sim_drivers.devices.device import OneWayDevice
 from sim_drivers.devices.waterlinked import euler_deg
 
 if TYPE_CHECKING:
@@ -27,11 +27,11 @@ PRIORITY, ADDRESS = 2, 35
 """Of the simulated node on the bus; the driver reads neither."""
 
 
-class Nmea2000Instruments(Listener["Message"]):
+class Nmea2000Instruments(OneWayDevice["Message"]):
     """Attitude as 127257 and 127250, yaw rate as 127251, forward speed as 128259, altitude as
     128267."""
 
-    def say(self, sample: TelemetrySample, measured_ns: int, now_ns: int) -> list[Message]:
+    def encode(self, sample: TelemetrySample, measured_ns: int, now_ns: int) -> list[Message]:
         match sample:
             case Attitude():
                 roll, pitch, yaw = (math.radians(angle) for angle in euler_deg(sample))
@@ -51,7 +51,7 @@ class Nmea2000Instruments(Listener["Message"]):
         return []
 
 
-class DbcNode(Listener["Message"]):
+class DbcNode(OneWayDevice["Message"]):
     """Sends samples in the messages that ``mappings`` name; their scale is undone."""
 
     def __init__(self, database: str, mappings: tuple[DbcSignal, ...]) -> None:
@@ -60,7 +60,7 @@ class DbcNode(Listener["Message"]):
         loaded: Any = cantools.database.load_file(database)
         self._messages = [(loaded.get_message_by_name(m.message), m) for m in mappings]
 
-    def say(self, sample: TelemetrySample, measured_ns: int, now_ns: int) -> list[Message]:
+    def encode(self, sample: TelemetrySample, measured_ns: int, now_ns: int) -> list[Message]:
         import can
 
         told = _told(sample)

@@ -1,4 +1,4 @@
-"""A simulated device: says the samples of a log in its own protocol, in time, and answers."""
+"""A simulated device: sends the samples of a log in its own protocol, in time, and answers."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ CLOSE_TIMEOUT_S = 5.0
 """The thread looks every POLL_S whether it shall end; one that is stuck is left behind."""
 
 
-class Speaker(Protocol[Packet]):
-    """What a device says; times are those of its own clock."""
+class DeviceProtocol(Protocol[Packet]):
+    """What a device sends; times are of its own clock."""
 
-    def say(self, sample: TelemetrySample, measured_ns: int, now_ns: int) -> list[Packet]:
-        """Packets that tell ``sample``; none where the protocol cannot."""
+    def encode(self, sample: TelemetrySample, measured_ns: int, now_ns: int) -> list[Packet]:
+        """Packets that carry ``sample``; none if the protocol has no message for it."""
         ...
 
-    def hear(self, packet: Packet, now_ns: int) -> list[Packet]:
+    def answer(self, packet: Packet, now_ns: int) -> list[Packet]:
         """Answers to what came in."""
         ...
 
-    def beat(self, now_ns: int) -> list[Packet]:
-        """What is to be said without being asked, by now."""
+    def unprompted(self, now_ns: int) -> list[Packet]:
+        """Packets that are due now without a request, such as heartbeats."""
         ...
 
 
@@ -41,7 +41,7 @@ class Wire(Protocol[Packet]):
     """The device's end of a link."""
 
     def send(self, packet: Packet) -> None:
-        """Loses the packet where nobody listens, as a wire does; never raises."""
+        """Send the packet; it is lost if the other end is closed. Never raises."""
         ...
 
     def receive(self) -> Packet | None:
@@ -60,24 +60,24 @@ class SimulatedDevice(Generic[Packet]):
     """Runs in a thread until closed.
 
     Args:
-        samples: in the order of arrival; the first is said at once.
+        samples: in the order of arrival; the first is sent at once.
         speed: of time, 1: as it was; None: as fast as the wire takes them.
         clock: the device's own clock.
     """
 
     def __init__(
         self,
-        speaker: Speaker[Packet],
+        protocol: DeviceProtocol[Packet],
         wire: Wire[Packet],
         samples: Iterable[TelemetrySample],
         speed: float | None = 1.0,
         clock: Clock = boot_clock,
     ) -> None:
-        self.said = 0
+        self.sent = 0
         """Packets sent."""
         self.finished = threading.Event()
-        """Set once all samples are said; requests are answered until it is closed."""
-        self._speaker, self._wire, self._samples = speaker, wire, samples
+        """Set once all samples are sent; requests are answered until it is closed."""
+        self._protocol, self._wire, self._samples = protocol, wire, samples
         self._speed, self._clock = speed, clock
         self._stopping = threading.Event()
         self._started_ns = time.monotonic_ns()
@@ -91,7 +91,7 @@ class SimulatedDevice(Generic[Packet]):
         return self
 
     def close(self) -> None:
-        """Stop speaking and leave the wire."""
+        """Stop sending and close the wire."""
         self._stopping.set()
         if self._thread.ident is not None:
             self._thread.join(CLOSE_TIMEOUT_S)
@@ -105,19 +105,19 @@ class SimulatedDevice(Generic[Packet]):
             if self._stopping.is_set():
                 return
             measured_ns = self._clock(sample.t_ns - first_ns)
-            self._send(self._speaker.say(sample, measured_ns, self._now_ns()))
+            self._send(self._protocol.encode(sample, measured_ns, self._now_ns()))
         self.finished.set()
         while not self._stopping.wait(POLL_S):
-            self._converse()
+            self._exchange()
 
     def _wait_until(self, elapsed_ns: int) -> None:
-        """Converse until the log has come so far."""
+        """Exchange packets until the log has reached ``elapsed_ns``."""
         if self._speed is None:
             self._elapsed_ns = elapsed_ns
-            self._converse()
+            self._exchange()
             return
         while not self._stopping.is_set():
-            self._converse()
+            self._exchange()
             left_s = (elapsed_ns - self._elapsed()) / self._speed * 1e-9
             if left_s <= 0:
                 return
@@ -131,22 +131,22 @@ class SimulatedDevice(Generic[Packet]):
     def _now_ns(self) -> int:
         return self._clock(self._elapsed())
 
-    def _converse(self) -> None:
-        self._send(self._speaker.beat(self._now_ns()))
-        while (heard := self._wire.receive()) is not None:
-            self._send(self._speaker.hear(heard, self._now_ns()))
+    def _exchange(self) -> None:
+        self._send(self._protocol.unprompted(self._now_ns()))
+        while (packet := self._wire.receive()) is not None:
+            self._send(self._protocol.answer(packet, self._now_ns()))
 
     def _send(self, packets: list[Packet]) -> None:
         for packet in packets:
             self._wire.send(packet)
-            self.said += 1
+            self.sent += 1
 
 
-class Listener(Generic[Packet]):
-    """A speaker that neither answers nor says anything unasked."""
+class OneWayDevice(Generic[Packet]):
+    """A device that only sends samples: no answers, nothing unprompted."""
 
-    def hear(self, packet: Packet, now_ns: int) -> list[Packet]:
+    def answer(self, packet: Packet, now_ns: int) -> list[Packet]:
         return []
 
-    def beat(self, now_ns: int) -> list[Packet]:
+    def unprompted(self, now_ns: int) -> list[Packet]:
         return []

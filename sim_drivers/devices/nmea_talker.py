@@ -6,7 +6,7 @@ import math
 from functools import reduce
 
 from aquaflow.messages import Altitude, AngularRate, Attitude, Depth, TelemetrySample, Velocity
-from sim_drivers.devices.device import Listener
+from sim_drivers.devices.device import OneWayDevice
 from sim_drivers.devices.waterlinked import euler_deg
 
 KNOT_M_S = 1852.0 / 3600.0
@@ -19,11 +19,11 @@ def sentence(body: str) -> bytes:
     return f"${body}*{checksum:02X}\r\n".encode()
 
 
-class NmeaTalker(Listener[bytes]):
+class NmeaTalker(OneWayDevice[bytes]):
     """Attitude as PRDID and HDT, altitude as DBT and DPT, depth as DBS, yaw rate as ROT, velocity
     as VBW."""
 
-    def say(self, sample: TelemetrySample, measured_ns: int, now_ns: int) -> list[bytes]:
+    def encode(self, sample: TelemetrySample, measured_ns: int, now_ns: int) -> list[bytes]:
         match sample:
             case Attitude():
                 roll, pitch, yaw = euler_deg(sample)

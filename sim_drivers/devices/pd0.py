@@ -6,7 +6,7 @@ import struct
 from datetime import datetime, timedelta, timezone
 
 from aquaflow.messages import Altitude, TelemetrySample, Velocity
-from sim_drivers.devices.device import Listener
+from sim_drivers.devices.device import OneWayDevice
 
 SHIP_COORDINATES = 2 << 3
 """Byte 25 of the fixed leader: bits 3 and 4 are 2 for ship axes."""
@@ -17,14 +17,14 @@ EPOCH = datetime(2026, 1, 1, tzinfo=timezone.utc)
 """Where the real time clock stood when the device was switched on."""
 
 
-class Pd0Dvl(Listener[bytes]):
+class Pd0Dvl(OneWayDevice[bytes]):
     """Velocity of the bottom past the instrument, with the last altitude in all four beams."""
 
     def __init__(self) -> None:
         self._altitude_m = 0.0
         self._ensemble = 0
 
-    def say(self, sample: TelemetrySample, measured_ns: int, now_ns: int) -> list[bytes]:
+    def encode(self, sample: TelemetrySample, measured_ns: int, now_ns: int) -> list[bytes]:
         match sample:
             case Altitude():
                 self._altitude_m = sample.altitude_m

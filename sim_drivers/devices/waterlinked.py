@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from aquaflow.messages import Altitude, Attitude, TelemetrySample, Velocity
-from sim_drivers.devices.device import Listener
+from sim_drivers.devices.device import OneWayDevice
 
 NO_BOTTOM_M = -1.0
 """What a DVL sends as altitude while it has none."""
@@ -24,13 +24,13 @@ def line(body: str) -> bytes:
     return f"{body}*{crc:02x}\r\n".encode()
 
 
-class WaterLinkedSerial(Listener[bytes]):
+class WaterLinkedSerial(OneWayDevice[bytes]):
     """Velocity as wrz with the last altitude, attitude as wrp."""
 
     def __init__(self) -> None:
         self._altitude_m = NO_BOTTOM_M
 
-    def say(self, sample: TelemetrySample, measured_ns: int, now_ns: int) -> list[bytes]:
+    def encode(self, sample: TelemetrySample, measured_ns: int, now_ns: int) -> list[bytes]:
         match sample:
             case Altitude():
                 self._altitude_m = sample.altitude_m
@@ -51,13 +51,13 @@ class WaterLinkedSerial(Listener[bytes]):
         return []
 
 
-class WaterLinkedJson(Listener[bytes]):
+class WaterLinkedJson(OneWayDevice[bytes]):
     """Velocity with the last altitude, attitude as position_local."""
 
     def __init__(self) -> None:
         self._altitude_m = NO_BOTTOM_M
 
-    def say(self, sample: TelemetrySample, measured_ns: int, now_ns: int) -> list[bytes]:
+    def encode(self, sample: TelemetrySample, measured_ns: int, now_ns: int) -> list[bytes]:
         match sample:
             case Altitude():
                 self._altitude_m = sample.altitude_m

@@ -101,7 +101,7 @@ def endless(log: list[TelemetrySample], enough: threading.Event) -> Iterator[Tel
 class Rig:
     """A device on its wire, and the config by which the driver finds it."""
 
-    speaker: Any
+    protocol: Any
     wire: Any
     config: dict[str, Any]
     kinds: frozenset[type]
@@ -180,7 +180,7 @@ def nmea2000_multicast(tmp_path: Path) -> Rig:
     rig = nmea2000_virtual(tmp_path)
     rig.wire.close()
     wire, link = _can("udp_multicast", "239.74.163.2", port=free_port())
-    return Rig(rig.speaker, wire, {**rig.config, "link": link}, rig.kinds)
+    return Rig(rig.protocol, wire, {**rig.config, "link": link}, rig.kinds)
 
 
 def dbc_virtual(tmp_path: Path) -> Rig:
@@ -215,7 +215,7 @@ class Running:
             links["device"], self.injected = faulty(opened, faults)
         self.telemetry = LinkTelemetry(config, links=links)
         self.rig = rig
-        self.device = SimulatedDevice(rig.speaker, rig.wire, samples, **{"speed": SPEED, **device})
+        self.device = SimulatedDevice(rig.protocol, rig.wire, samples, **{"speed": SPEED, **device})
 
     @property
     def counters(self) -> LinkCounters:

@@ -161,8 +161,8 @@ def test_what_is_no_json_costs_only_its_line(text):
 
 def said(**values) -> bytes:
     dvl = Pd0Dvl()
-    dvl.say(Altitude(0, 0, "log", values.get("altitude_m", 2.5)), 0, 0)
-    (data,) = dvl.say(Velocity(0, 0, "log", (0.4, 0.1, -0.05), 0.01), 0, 0)
+    dvl.encode(Altitude(0, 0, "log", values.get("altitude_m", 2.5)), 0, 0)
+    (data,) = dvl.encode(Velocity(0, 0, "log", (0.4, 0.1, -0.05), 0.01), 0, 0)
     return data
 
 
@@ -244,7 +244,7 @@ def test_an_ensemble_is_stamped_by_the_clock_of_the_dvl():
     for k in range(40):
         measured_ns = k * 250_000_000
         late_ns = 4_000_000 if k % 2 else 60_000_000
-        (data,) = dvl.say(Velocity(0, 0, "log", (0.1, 0, 0), 0.01), measured_ns, 0)
+        (data,) = dvl.encode(Velocity(0, 0, "log", (0.1, 0, 0), 0.01), measured_ns, 0)
         (velocity,) = receiver.feed(data, NOW + measured_ns + late_ns)
         stamps.append(velocity.t_ns - NOW - measured_ns)
 

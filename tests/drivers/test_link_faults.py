@@ -77,7 +77,7 @@ def test_on_udp_every_fault_costs_exactly_its_datagrams(fault, tmp_path):
         change = {"drop": -1, "corrupt": -1, "duplicate": 1}.get(fault, 0)
 
         def counted() -> bool:
-            said = session.device.said
+            said = session.device.sent
             return session.counters.messages == said + change * session.injected[fault]
 
         # A damaged length may wait for bytes behind the last packet; the heartbeats bring them.

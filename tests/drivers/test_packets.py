@@ -22,7 +22,7 @@ def reader() -> PacketReader:
 
 def stream_of(rig) -> bytes:
     """All that the device says of a motion, as the driver's link delivers it."""
-    said = [packet for sample in motion() for packet in rig.speaker.say(sample, 10**9, 10**9)]
+    said = [packet for sample in motion() for packet in rig.protocol.encode(sample, 10**9, 10**9)]
     return b"".join(p if isinstance(p, bytes) else b"".join(packed(p)) for p in said)
 
 

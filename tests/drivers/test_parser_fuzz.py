@@ -137,7 +137,7 @@ VALID: dict[str, Callable[[Rng], bytes]] = {
 def parser_and_packets(name: str, folder: Path) -> tuple[PacketDecoder, list[bytes]]:
     rig = RIGS[name](folder)
     rig.wire.close()
-    said = [packet for s in motion(10) for packet in rig.speaker.say(s, 10**9, 10**9)]
+    said = [packet for s in motion(10) for packet in rig.protocol.encode(s, 10**9, 10**9)]
     packets = [packed(p)[0] if isinstance(p, can.Message) else p for p in said]
     return decoder_of("device", telemetry_config(rig).devices["device"]), packets
 

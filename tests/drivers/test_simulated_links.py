@@ -34,7 +34,7 @@ def test_a_driver_tells_what_its_device_measured(name, tmp_path):
     log = motion()
     with running(rig, log) as session:
         session.play()
-        until(lambda: session.counters.messages >= session.device.said)
+        until(lambda: session.counters.messages >= session.device.sent)
         heard = session.fetched()
 
     counters = session.counters

@@ -39,7 +39,7 @@ def test_several_devices_are_heard_at_once_in_the_order_of_arrival(tmp_path):
         rigs[name] = RIGS[name](tmp_path / name)
     config = parse_telemetry({"devices": {k: rig.config for k, rig in rigs.items()}}, "test")
     telemetry = LinkTelemetry(config)
-    devices = [SimulatedDevice(rig.speaker, rig.wire, motion(), 4.0) for rig in rigs.values()]
+    devices = [SimulatedDevice(rig.protocol, rig.wire, motion(), 4.0) for rig in rigs.values()]
     until(lambda: all(link.is_open for link in telemetry.links.values()))
 
     for device in devices:
@@ -59,12 +59,12 @@ def test_several_devices_are_heard_at_once_in_the_order_of_arrival(tmp_path):
 def test_the_oldest_samples_give_way_and_are_counted(tmp_path):
     rig = RIGS["nmea_pty"](tmp_path)
     telemetry = LinkTelemetry(telemetry_config(rig, queue_samples=10))
-    device = SimulatedDevice(rig.speaker, rig.wire, motion(), None)
+    device = SimulatedDevice(rig.protocol, rig.wire, motion(), None)
     until(lambda: telemetry.links["device"].is_open)
 
     device.start()
     until(device.finished.is_set)
-    until(lambda: telemetry.counters()["device"].messages >= device.said > 100)
+    until(lambda: telemetry.counters()["device"].messages >= device.sent > 100)
     telemetry.close()
     heard = list(telemetry.samples())
     device.close()
@@ -125,7 +125,7 @@ def test_a_jump_of_the_devices_clock_moves_no_sample(name, jump_s, tmp_path):
     clock = jumping_clock(boot_clock, 400_000_000, jump_s * 1_000_000_000)
     with running(rig, motion(), clock=clock, speed=1.0) as session:
         session.play()
-        until(lambda: session.counters.messages >= session.device.said)
+        until(lambda: session.counters.messages >= session.device.sent)
         heard = session.fetched()
 
     assert len(heard) >= 20
@@ -138,7 +138,7 @@ def test_a_timesync_is_agreed_on_with_an_autopilot(tmp_path):
         assert session.telemetry.clocks() == {}
         session.play()
         until(lambda: session.telemetry.clocks()["device"].round_trips)
-        until(lambda: rig.speaker.answers > 0 and rig.speaker.heartbeats > 0)
+        until(lambda: rig.protocol.answers > 0 and rig.protocol.heartbeats > 0)
 
 
 def test_closing_ends_whoever_waits_and_may_be_done_again(tmp_path):

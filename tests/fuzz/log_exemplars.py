@@ -61,7 +61,7 @@ def _tlog() -> bytes:
             Attitude(*stamp, (1.0, 0.0, 0.0, 0.0)),
             Depth(*stamp, 2.0 + k),
         ):
-            for packet in autopilot.say(sample, t_ns, t_ns):
+            for packet in autopilot.encode(sample, t_ns, t_ns):
                 log += (BEGAN_NS // 1000 + t_ns // 1000).to_bytes(8, "big") + packet
     return log
 
