@@ -197,7 +197,7 @@ class KeyframeStore:
         """Write what is only in memory; the files that are new."""
         return self._contents.save()
 
-    def adopt(
+    def restore(
         self,
         frame_index: int,
         t_ns: int,
@@ -207,11 +207,11 @@ class KeyframeStore:
     ) -> Keyframe:
         """Append a keyframe that an earlier run saved; ``cameras`` of encoding and pointmap.
 
-        Without its file it is one of the ``lost``: the frames that hang on it keep their poses,
-        which follow it as before; nothing is tracked against it any more.
+        Without its file it is one of the ``lost``: frames whose pose is relative to it keep their
+        poses; no further frame is tracked against it.
         """
         number = len(self.keyframes)
-        if not self._contents.adopt(number):
+        if not self._contents.restore(number):
             self.lost.add(number)
         self._cameras.append(cameras)
         self.keyframes.append(Keyframe(number, frame_index, t_ns, T_wc, sub_map, self))

@@ -93,7 +93,7 @@ class LiveCamera:
         self._size: tuple[int, int] | None = None
         self._counts = CameraCounters()
         self._clock = ExposureClock()
-        self._newest: Newest[RawPicture] = Newest(let_go=lambda picture: picture.release())
+        self._newest: Newest[RawPicture] = Newest(discard=lambda picture: picture.release())
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self._failure: Exception | None = None

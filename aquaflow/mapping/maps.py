@@ -13,7 +13,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
 from aquaflow.mapping.gaussians.reanchoring import move_views
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.view_budget import alike, let_surplus_go
+from aquaflow.mapping.view_budget import drop_surplus, same_group
 from aquaflow.mapping.views import View, ViewStore
 from aquaflow.profiler import Profiler
 from aquaflow.render import select_renderer
@@ -116,8 +116,8 @@ class Maps:
             with self.failures.contain("view", view.frame_index):
                 self.views.keep(view)
                 mapper.add_view(view)  # now and then a view makes the water be fitted again
-                group = alike(view, mapper.views)
-                let_surplus_go(mapper.views, group, self.config.mapping.views_per_keyframe)
+                group = same_group(view, mapper.views)
+                drop_surplus(mapper.views, group, self.config.mapping.views_per_keyframe)
 
         # Sec. 3.3.3: medium-guided insertion, from this frame and from the keyframe it retires.
         for retired in growth.retired:
@@ -132,7 +132,7 @@ class Maps:
     def hold_out(self, view: View, sub_map: int) -> None:
         views = self.held_out.setdefault(sub_map, [])
         views.append(self.views.keep(view))
-        let_surplus_go(views, views, self.config.mapping.held_out_most)
+        drop_surplus(views, views, self.config.mapping.held_out_most)
 
     def insert(self, insertion: Insertion) -> None:
         mapper, frame = self.mapper(insertion.sub_map), insertion.view.frame_index
@@ -153,7 +153,7 @@ class Maps:
             self._merge(source, target)
             views = self.held_out.setdefault(target, [])
             views.extend(self.held_out.pop(source, []))
-            let_surplus_go(views, views, self.config.mapping.held_out_most)
+            drop_surplus(views, views, self.config.mapping.held_out_most)
 
     def _merge(self, source: int, target: int) -> None:
         """One map of two; a failure before the Gaussians came over leaves both as they are."""

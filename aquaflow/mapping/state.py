@@ -157,7 +157,7 @@ def _read_decoder(neural: NeuralGaussians, arrays: Mapping[str, Any]) -> None:
     neural.decoder.load_state_dict(_under("decoder", arrays))
     groups = {name: _tensor(arrays[f"groups.{name}"]) for name in (*GROUPS, "order")}
     neural.groups.restore(**groups)
-    neural.adopt(_tensor(arrays["local"]))
+    neural.restore(_tensor(arrays["local"]))
 
 
 # --- optimisers -----------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""How many views a long dive keeps: where it stays or comes again, only some of each place's."""
+"""Limits the number of views: a long dive keeps only some of the views of each place."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from aquaflow.mapping.views import View, in_time
 
 
-def alike(view: View, views: Sequence[View]) -> list[View]:
-    """Those of ``views`` that hang on the same keyframe and are as robust."""
+def same_group(view: View, views: Sequence[View]) -> list[View]:
+    """Those of ``views`` with the same keyframe and the same robustness as ``view``."""
     return [v for v in views if v.keyframe == view.keyframe and v.robust == view.robust]
 
 
-def let_surplus_go(
+def drop_surplus(
     views: list[View],
     group: Sequence[View],  # those of ``views`` that have a budget together
     most: int,
@@ -28,4 +28,4 @@ def let_surplus_go(
         gaps = [after - before for before, after in zip(index, index[2:])]  # noqa: B905
         dropped = kept.pop(1 + gaps.index(min(gaps)))
         views.remove(dropped)
-        dropped.let_go()
+        dropped.delete_pixels()

@@ -64,31 +64,31 @@ class View:
         """[rows, columns] bool, the tiles in which the last full look found nothing but noise."""
         self.moments = (np.zeros(6), np.zeros(6), 0)
         """Adam's first and second moments of the pose, and its step count."""
-        self._lies_in: dict[int, Pixels] | Spill[Pixels] = {frame_index: Pixels(image, mask)}
+        self._store: dict[int, Pixels] | Spill[Pixels] = {frame_index: Pixels(image, mask)}
 
     def move_pixels(self, store: Spill[Pixels]) -> None:
-        """Let the pixels lie in ``store``, under the frame's index."""
+        """Move the pixels into ``store``, under the frame's index."""
         store[self.frame_index] = self._pixels
-        self._lies_in = store
+        self._store = store
 
-    def lie_in(self, store: Spill[Pixels]) -> None:
-        """The pixels lie in ``store`` already, under the frame's index."""
-        self._lies_in = store
+    def use_store(self, store: Spill[Pixels]) -> None:
+        """Take the pixels from ``store``, which has them under the frame's index."""
+        self._store = store
 
-    def lies_in(self, store: Spill[Pixels]) -> bool:
+    def is_stored_in(self, store: Spill[Pixels]) -> bool:
         """True while its pixels are in ``store``."""
-        return self._lies_in is store and self.frame_index in store
+        return self._store is store and self.frame_index in store
 
-    def let_go(self) -> None:
+    def delete_pixels(self) -> None:
         """Delete the pixels; the view must not be used afterwards."""
-        del self._lies_in[self.frame_index]
+        del self._store[self.frame_index]
 
     @property
     def _pixels(self) -> Pixels:
-        return self._lies_in[self.frame_index]
+        return self._store[self.frame_index]
 
     def _change(self, **arrays: Any) -> None:
-        self._lies_in[self.frame_index] = replace(self._pixels, **arrays)
+        self._store[self.frame_index] = replace(self._pixels, **arrays)
 
     @property
     def image(self) -> npt.NDArray[np.uint8]:
@@ -173,7 +173,7 @@ class ViewStore:
         folder = None if work is None else work / "views"
         self._pixels = Spill(folder, resident, _pack, _unpack)
         self.lost: set[int] = set()
-        """Frame indices of the views that :meth:`adopt` found no file of."""
+        """Frame indices of the views that :meth:`restore` found no file of."""
 
     def keep(self, view: View) -> View:
         """Take over the view's pixels; no other view of the dive may have its frame index."""
@@ -184,20 +184,20 @@ class ViewStore:
         """Write what is only in memory; the files that are new."""
         return self._pixels.save()
 
-    def adopt(self, views: Sequence[View]) -> list[View]:
-        """Let views have the pixels that an earlier run saved of them, and say which have them:
-        not those that it let go of afterwards, and not those whose file was lost."""
-        known = [view for view in views if self._pixels.adopt(view.frame_index)]
+    def restore(self, views: Sequence[View]) -> list[View]:
+        """Give views the pixels that an earlier run saved; returns the views that have them, which
+        excludes views deleted later and views whose file is lost."""
+        known = [view for view in views if self._pixels.restore(view.frame_index)]
         for view in known:
-            view.lie_in(self._pixels)
-        let_go = self._pixels.let_go()
+            view.use_store(self._pixels)
+        removed = self._pixels.removed()
         there = {view.frame_index for view in known}
-        self.lost |= {view.frame_index for view in views} - there - let_go
+        self.lost |= {view.frame_index for view in views} - there - removed
         return known
 
     def holds(self, view: View) -> bool:
-        """True if the view's pixels lie here, and it was not let go of."""
-        return view.lies_in(self._pixels)
+        """True if this store has the view's pixels."""
+        return view.is_stored_in(self._pixels)
 
     @property
     def resident_bytes(self) -> int:

@@ -1,6 +1,6 @@
-"""What a long dive cannot keep in memory: the last used stay, the others wait in files.
+"""Bounds the memory of a long dive: the items used last stay in memory, the others in files.
 
-What comes back is what was written, bit for bit, so a map does not depend on what lay where.
+An item is read back bit for bit, so a map does not depend on which items were in memory.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ RESERVE_BYTES = 1 << 30
 """Left free on the disk: the maps of all sub-maps, the report and the log must still find room."""
 
 RELEASE_EVERY = 32
-"""Things let go of until the C library is told to give their memory back (about 4 ms). Left alone,
-glibc keeps the holes between what stays: measured at 480 x 270 px, beside 281 MB of pixels in use
-157 MB of holes after 200 keyframes and 390 MB after 500; so, under 10 MB."""
+"""Items released between two calls of ``malloc_trim`` (about 4 ms). Without it glibc keeps the free
+blocks between items in use: measured at 480 x 270 px with 281 MB of pixels in use, 157 MB of free
+blocks after 200 keyframes and 390 MB after 500; with it, under 10 MB."""
 
 SUFFIX = ".arrays"
-"""Of the things' files."""
+"""Suffix of the items' files."""
 
-LET_GO = "let_go.txt"
-"""File beside the things' files: a line for every number whose file was removed on purpose."""
+REMOVED = "let_go.txt"
+"""File in the same folder: a line for every number whose file was removed on purpose."""
 
 release_memory = getattr(ctypes.CDLL(None), "malloc_trim", lambda pad: 0)
 """``malloc_trim``, which only glibc has and only glibc needs."""
 
 
 class Spill(Generic[T]):
-    """Numbered things of which the last ``resident`` used are in memory, the others in files.
+    """Numbered items: the ``resident`` most recently used are in memory, the others in files.
 
-    A thing is changed by setting it again; only the pinned one, which stays in memory besides, may
-    be changed in place. Without a folder everything stays in memory. For one thread at a time.
+    To change an item, set it again; only the pinned item, which stays in memory in addition, may
+    be changed in place. Without a folder all items stay in memory. For one thread at a time.
     """
 
     def __init__(
@@ -54,24 +54,24 @@ class Spill(Generic[T]):
         pack: Callable[[T], Arrays],
         unpack: Callable[[int, Arrays], T],
     ) -> None:
-        """``pack`` names a thing's arrays without copying; ``unpack`` gets the number as well."""
+        """``pack`` names an item's arrays without copying; ``unpack`` gets the number as well."""
         self._folder, self._limit = folder, resident
         self._pack, self._unpack = pack, unpack
         self._resident: OrderedDict[int, T] = OrderedDict()
         """Least recently used first."""
         self._unsaved: set[int] = set()
-        """Resident things whose file, if there is one, is out of date."""
+        """Resident items whose file is missing or out of date."""
         self._saved: set[int] = set()
         self._pinned: int | None = None
-        self._gone = 0
+        self._released = 0
         self._full = False
 
-    def __setitem__(self, number: int, thing: T) -> None:
+    def __setitem__(self, number: int, item: T) -> None:
         self._unsaved.add(number)
-        self._use(number, thing)
+        self._use(number, item)
 
     def __getitem__(self, number: int) -> T:
-        """The thing, read back where it waits in its file.
+        """The item, read from its file if it is not in memory.
 
         Raises:
             KeyError: it was never set.
@@ -82,24 +82,24 @@ class Spill(Generic[T]):
             return self._resident[number]
         if number not in self._saved:
             raise KeyError(number)
-        thing = self._unpack(number, read_thing(self._file(number)))
-        self._use(number, thing)
-        return thing
+        item = self._unpack(number, read_item(self._file(number)))
+        self._use(number, item)
+        return item
 
     def __delitem__(self, number: int) -> None:
-        """Forget a thing that is not pinned, its file as well."""
+        """Remove an item that is not pinned, and its file."""
         self._unsaved.discard(number)
         if number in self._resident:
-            self._let_go(number)
+            self._release(number)
         if number in self._saved:
             self._saved.discard(number)
-            self._note_let_go(number)
+            self._note_removed(number)
             with contextlib.suppress(OSError):
                 self._file(number).unlink(missing_ok=True)
 
-    def _note_let_go(self, number: int) -> None:
+    def _note_removed(self, number: int) -> None:
         assert self._folder is not None
-        with contextlib.suppress(OSError), (self._folder / LET_GO).open("a") as stream:
+        with contextlib.suppress(OSError), (self._folder / REMOVED).open("a") as stream:
             stream.write(f"{number}\n")
 
     def __contains__(self, number: int) -> bool:
@@ -107,16 +107,16 @@ class Spill(Generic[T]):
 
     def pin(self, number: int) -> None:
         """Keep this one in memory, where it may be changed in place, until another is pinned."""
-        thing = self[number]
+        item = self[number]
         self._pinned = number
         self._unsaved.add(number)
-        self._use(number, thing)
+        self._use(number, item)
 
     @property
     def resident_bytes(self) -> int:
         """Size of the arrays in memory."""
-        things = self._resident.values()
-        return sum(array.nbytes for thing in things for array in self._pack(thing).values())
+        items = self._resident.values()
+        return sum(array.nbytes for item in items for array in self._pack(item).values())
 
     def save(self) -> list[Path]:
         """Write what is only in memory, where it stays too; the files that are new.
@@ -134,21 +134,21 @@ class Spill(Generic[T]):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._folder))
         return [self._file(number) for number in saved]
 
-    def adopt(self, number: int) -> bool:
-        """Take over a thing that an earlier run saved in the same folder; it is read back when it
-        is asked for. False if there is no file of it."""
+    def restore(self, number: int) -> bool:
+        """Make an item available that an earlier run saved in the same folder; it is read when it
+        is first used. False if it has no file."""
         found = self._folder is not None and self._file(number).is_file()
         if found:
             self._saved.add(number)
         return found
 
-    def let_go(self) -> set[int]:
+    def removed(self) -> set[int]:
         """Numbers whose files this run or an earlier one removed; without a file, any other one
         was lost."""
         if self._folder is None:
             return set()
         try:
-            lines = (self._folder / LET_GO).read_bytes().split()
+            lines = (self._folder / REMOVED).read_bytes().split()
         except OSError:
             return set()
         return {int(line) for line in lines if line.isdigit()}
@@ -165,17 +165,17 @@ class Spill(Generic[T]):
         with contextlib.suppress(OSError):
             for number in self._saved:
                 self._file(number).unlink(missing_ok=True)
-            (self._folder / LET_GO).unlink(missing_ok=True)
+            (self._folder / REMOVED).unlink(missing_ok=True)
             self._folder.rmdir()
 
-    def _use(self, number: int, thing: T) -> None:
-        self._resident[number] = thing
+    def _use(self, number: int, item: T) -> None:
+        self._resident[number] = item
         self._resident.move_to_end(number)
         if self._folder is not None:
             self._make_room(self._folder)
 
     def _make_room(self, folder: Path) -> None:
-        """Let go of the least recently used; what cannot be written stays."""
+        """Release the least recently used items; an item that cannot be written stays."""
         surplus = len(self._resident) - self._limit - (self._pinned is not None)
         if surplus <= 0:
             return
@@ -183,18 +183,18 @@ class Spill(Generic[T]):
             if surplus == 0:
                 return
             if number not in self._unsaved or self._save(number, folder):
-                self._let_go(number)
+                self._release(number)
                 surplus -= 1
 
-    def _let_go(self, number: int) -> None:
+    def _release(self, number: int) -> None:
         del self._resident[number]
-        self._gone += 1
-        if self._gone % RELEASE_EVERY == 0:
+        self._released += 1
+        if self._released % RELEASE_EVERY == 0:
             release_memory(0)
 
     def _save(self, number: int, folder: Path) -> bool:
-        """True once it is in its file; after a failure, which is told, there is no other try until
-        all is to be saved."""
+        """True once the item is in its file. A failure is logged; the next try is the next call of
+        :meth:`save` or :meth:`close`."""
         if self._full:
             return False
         try:
@@ -221,15 +221,15 @@ class Spill(Generic[T]):
         return self._folder / f"{number:06d}{SUFFIX}"
 
 
-def read_thing(path: Path) -> Arrays:
-    """The arrays of a file in a spill's folder, if it is whole and the one that its name says.
+def read_item(path: Path) -> Arrays:
+    """The arrays of a file in a spill's folder.
 
     Raises:
-        InputError: it is not.
+        InputError: it is damaged, or its name is not the one it was written under.
     """
     return read_arrays(path, _owner(path))
 
 
 def _owner(path: Path) -> str:
-    """Folder and number: what a file says that it belongs to."""
+    """Folder and number, which each file contains so that a misplaced file is detected."""
     return f"{path.parent.name}/{path.stem}"

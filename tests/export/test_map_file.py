@@ -53,7 +53,7 @@ def with_pictures(mapper: Mapper) -> Mapper:
     """The views of ``grown`` have their pixels again."""
     for view, original in zip(mapper.views, filmed(floor(), path(4)), strict=True):
         view.move_pixels({})  # type: ignore[arg-type]
-        view._lies_in = original._lies_in
+        view._store = original._store
         view.inverse_range = view.range_confidence = None
     return mapper
 

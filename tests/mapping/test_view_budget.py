@@ -9,7 +9,7 @@ import pytest
 
 from aquaflow.config import parse_config
 from aquaflow.mapping.maps import Growth, Maps
-from aquaflow.mapping.view_budget import alike, let_surplus_go
+from aquaflow.mapping.view_budget import drop_surplus, same_group
 from aquaflow.mapping.views import View, ViewStore
 from tests.mapping.mapping_scenes import CAMERA, view_of
 
@@ -41,7 +41,7 @@ def indices(views: list[View]) -> list[int]:
 
 def test_within_the_budget_nothing_goes() -> None:
     views = [view(i) for i in range(MOST)]
-    let_surplus_go(views, views, MOST)
+    drop_surplus(views, views, MOST)
     assert indices(views) == [0, 1, 2, 3]
 
 
@@ -49,7 +49,7 @@ def test_of_a_long_stay_first_last_and_an_even_spread_are_kept() -> None:
     views: list[View] = []
     for index in range(1000):
         views.append(view(index))
-        let_surplus_go(views, views, 16)
+        drop_surplus(views, views, 16)
     kept = np.array(indices(views))
     assert (kept[0], kept[-1], len(kept)) == (0, 999, 16)
     assert np.diff(kept)[:-1].max() <= 4 * 1000 / 16
@@ -57,13 +57,13 @@ def test_of_a_long_stay_first_last_and_an_even_spread_are_kept() -> None:
 
 def test_views_that_came_late_are_thinned_by_their_time_and_keep_their_places() -> None:
     views = [view(i) for i in (10, 11, 30, 20, 0)]
-    let_surplus_go(views, views, 4)
+    drop_surplus(views, views, 4)
     assert indices(views) == [10, 30, 20, 0]
 
 
 def test_only_views_of_the_same_keyframe_and_kind_share_a_budget() -> None:
     views = [view(i, keyframe=i % 2, robust=i % 3 > 0) for i in range(12)]
-    assert indices(alike(views[1], views)) == [1, 5, 7, 11]
+    assert indices(same_group(views[1], views)) == [1, 5, 7, 11]
 
 
 def grown(maps: Maps, views: list[View]) -> Maps:
@@ -98,7 +98,7 @@ def test_a_view_that_was_let_go_of_is_no_longer_held(tmp_path: Path) -> None:
     first, second, stranger = (view(i) for i in range(3))
     store.keep(first)
     store.keep(second)
-    first.let_go()
+    first.delete_pixels()
     assert [store.holds(each) for each in (first, second, stranger)] == [False, True, False]
     with pytest.raises(KeyError):
         _ = first.image
@@ -108,14 +108,14 @@ def test_a_restart_does_without_the_views_that_were_let_go_of_since(tmp_path: Pa
     before = ViewStore(tmp_path)
     views = [before.keep(view(i)) for i in range(3)]
     before.save()
-    views[1].let_go()
+    views[1].delete_pixels()
     again = [view(i) for i in range(3)]
     after = ViewStore(tmp_path)
-    assert indices(after.adopt(again)) == [0, 2]
+    assert indices(after.restore(again)) == [0, 2]
     assert after.lost == set()
 
 
 def test_views_whose_files_are_gone_are_left_out_and_known_as_lost(tmp_path: Path) -> None:
     store = ViewStore(tmp_path)
-    assert store.adopt([view(7), view(8)]) == []
+    assert store.restore([view(7), view(8)]) == []
     assert store.lost == {7, 8}

@@ -26,7 +26,7 @@ from aquaflow.service.live_dive import LiveDive
 from aquaflow.service.onboard import begun
 from aquaflow.sources import open_recording
 from aquaflow.sources.newest import Newest
-from aquaflow.storage.spill import read_thing
+from aquaflow.storage.spill import read_item
 from aquaflow.synthetic import SyntheticConfig, write_dive
 from tests.service.live_scenes import VEHICLE, ToldFeed, caught_up
 
@@ -166,7 +166,7 @@ def readable(dive: Path) -> Readable:
                 found.rows = {row.index: row for row in rows}
         for path in part.glob("work/*/*.arrays"):
             try:
-                read_thing(path)
+                read_item(path)
             except InputError:
                 continue
             found.things.add(f"{path.parent.name}/{path.name}")

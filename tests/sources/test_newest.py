@@ -11,13 +11,13 @@ from tests.small_recording import GIVE_UP_S
 
 
 def test_the_newest_wins_and_what_gives_way_is_let_go_and_counted() -> None:
-    let_go: list[int] = []
-    queue: Newest[int] = Newest(let_go=let_go.append)
+    discard: list[int] = []
+    queue: Newest[int] = Newest(discard=discard.append)
     for thing in range(4):
         queue.put(thing)
     assert queue.take(0.0) == 3
     assert queue.take(0.0) is None
-    assert let_go == [0, 1, 2]
+    assert discard == [0, 1, 2]
     assert queue.overtaken == 3
 
 
@@ -29,25 +29,25 @@ def test_a_longer_one_gives_the_oldest_first() -> None:
 
 
 def test_what_is_held_at_the_end_can_be_taken_and_what_comes_later_is_let_go() -> None:
-    let_go: list[int] = []
-    queue: Newest[int] = Newest(3, let_go.append)
+    discard: list[int] = []
+    queue: Newest[int] = Newest(3, discard.append)
     queue.put_all([1, 2])
     queue.end()
     queue.put(3)
     assert not queue.ended
     assert [queue.take() for _ in range(3)] == [1, 2, None]
     assert queue.ended
-    assert let_go == [3]
+    assert discard == [3]
 
 
 def test_an_end_that_discards_lets_go_what_is_held() -> None:
-    let_go: list[int] = []
-    queue: Newest[int] = Newest(let_go=let_go.append)
+    discard: list[int] = []
+    queue: Newest[int] = Newest(discard=discard.append)
     queue.put(1)
     queue.end(discard=True)
     assert queue.ended
     assert queue.take() is None
-    assert let_go == [1]
+    assert discard == [1]
 
 
 @pytest.mark.parametrize("end", [False, True], ids=["thing", "end"])

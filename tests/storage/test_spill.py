@@ -18,7 +18,7 @@ from hypothesis.extra import numpy as arrays_of
 from aquaflow.errors import InputError
 from aquaflow.storage import spill
 from aquaflow.storage.array_file import Arrays, read_arrays, write_arrays
-from aquaflow.storage.spill import Spill, read_thing
+from aquaflow.storage.spill import Spill, read_item
 
 Thing = npt.NDArray[np.int64]
 
@@ -151,7 +151,7 @@ def test_files_that_were_swapped_are_noticed(tmp_path: Path) -> None:
     one.replace(tmp_path / "spare")
     other.replace(one)
     with pytest.raises(InputError, match="it is damaged"):
-        read_thing(one)
+        read_item(one)
 
 
 # --- memory and files -----------------------------------------------------------------------------
@@ -260,7 +260,7 @@ def test_what_is_forgotten_leaves_its_number_and_no_file(tmp_path: Path) -> None
         del things[number]
     things.save()
     assert files(tmp_path / "work") == ["000004.arrays", "let_go.txt"]
-    assert spill_of(tmp_path / "work").let_go() == {0, 1, 2}  # 3 was in memory alone
+    assert spill_of(tmp_path / "work").removed() == {0, 1, 2}  # 3 was in memory alone
     with pytest.raises(KeyError):
         _ = things[0]
 
@@ -359,6 +359,6 @@ def test_on_request_everything_is_kept_in_files(tmp_path: Path) -> None:
     things = filled(tmp_path)
     things.close(keep=True)
     assert files(tmp_path) == [f"{number:06d}.arrays" for number in range(5)]
-    assert [int(read_thing(tmp_path / name)["thing"][0]) for name in files(tmp_path)] == [
+    assert [int(read_item(tmp_path / name)["thing"][0]) for name in files(tmp_path)] == [
         0, 1, 2, 3, 4,
     ]  # fmt: skip

@@ -264,7 +264,7 @@ class NeuralGaussians:
             self.groups.move(rows, self.gaussians.means)
             self._bind()
 
-    def adopt(
+    def restore(
         self,
         local: Tensor,  # [N, F_l]
     ) -> None:

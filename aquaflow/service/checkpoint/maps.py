@@ -44,11 +44,11 @@ def put_together(
         parts = under(f"map{number}", arrays)
         mapper = state.put_together(values, parts, maps.renderer)
         mapper.failures = maps.failures
-        mapper.views = maps.views.adopt(mapper.views)
+        mapper.views = maps.views.restore(mapper.views)
         maps.mappers[int(number)] = mapper
     for number, values in facts["held_out"].items():
         views = _read_held_out(values, under(f"held_out{number}", arrays))
-        maps.held_out[int(number)] = maps.views.adopt(views)
+        maps.held_out[int(number)] = maps.views.restore(views)
 
 
 def corrections_apart(lacking: Sequence[Correction]) -> tuple[list[dict[str, Any]], Arrays]:

@@ -26,7 +26,7 @@ from aquaflow.service.checkpoint.salvage_rows import SalvagedRows, salvaged_rows
 from aquaflow.service.checkpoint.set_aside import SetAside
 from aquaflow.service.checkpoint.tracking import lost_since
 from aquaflow.slam import Slam
-from aquaflow.storage.spill import SUFFIX, read_thing
+from aquaflow.storage.spill import SUFFIX, read_item
 
 MOST_NAMED = 5
 """Numbers that a sentence lists."""
@@ -97,7 +97,7 @@ def _look_at(path: Path, keyframes: int | None, aside: SetAside) -> None:
     """Set a file of ``work/`` aside if it is damaged, or would be written over: with an older
     checkpoint, the keyframes that it does not know."""
     try:
-        read_thing(path)
+        read_item(path)
     except InputError:
         aside.move(path, "it is damaged, or not the one that it is named after")
         return

@@ -76,7 +76,7 @@ def put_together(
     cameras = [to_camera(values) for values in facts["cameras"]]
     for row, pose in zip(arrays["keyframes"].tolist(), arrays["poses"], strict=True):
         frame_index, t_ns, sub_map, *pair = row
-        slam.keyframes.adopt(
+        slam.keyframes.restore(
             frame_index, t_ns, to_sim3(pose), sub_map, (cameras[pair[0]], cameras[pair[1]])
         )
     graph = PoseGraph.of_tables(under("graph", arrays), slam.config.tracking.graph)
