@@ -11,7 +11,7 @@ from pathlib import Path
 
 from aquaflow.errors import AquaFlowError, DamagedError, InputError, reason_of
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.state import put_together, take_apart
+from aquaflow.mapping.state import deserialise, serialise
 from aquaflow.render.contract import Renderer
 from aquaflow.storage.facts_file import UNREADABLE, read_facts_file, write_facts_file
 
@@ -29,7 +29,7 @@ def write_map_file(path: Path, mapper: Mapper, optimiser: bool = False) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    facts, arrays = take_apart(mapper, optimiser)
+    facts, arrays = serialise(mapper, optimiser)
     write_facts_file(path, {"kind": KIND, "format": FORMAT, **facts}, arrays)
 
 
@@ -51,7 +51,7 @@ def read_map_file(path: Path, renderer: Renderer) -> Mapper:
             "update AquaFlow"
         )
     try:
-        return put_together(facts, arrays, renderer)
+        return deserialise(facts, arrays, renderer)
     except (KeyError, ValueError, TypeError, RuntimeError, IndexError, AquaFlowError) as error:
         raise InputError(_unreadable(path, error)) from error
 

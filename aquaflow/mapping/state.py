@@ -33,7 +33,7 @@ GROUPS = ("group", "slot", "table", "fill", "voxel", "features")
 """Tables of the voxel groups, in the order of their names in the file."""
 
 
-def take_apart(mapper: Mapper, optimiser: bool = False) -> tuple[Facts, Arrays]:
+def serialise(mapper: Mapper, optimiser: bool = False) -> tuple[Facts, Arrays]:
     """Facts for JSON, and arrays, which are copies; ``optimiser``: its state too."""
     scene, cameras = mapper.scene, list(dict.fromkeys(view.camera for view in mapper.views))
     facts: Facts = {
@@ -66,7 +66,7 @@ def take_apart(mapper: Mapper, optimiser: bool = False) -> tuple[Facts, Arrays]:
     return facts, arrays
 
 
-def put_together(facts: Facts, arrays: Mapping[str, Any], renderer: Renderer) -> Mapper:
+def deserialise(facts: Facts, arrays: Mapping[str, Any], renderer: Renderer) -> Mapper:
     """The map that was taken apart; its views have poses, exposures and light, but no pixels.
 
     Raises:

@@ -46,7 +46,7 @@ Job = Callable[[Maps], None]
 
 
 @dataclass(frozen=True)
-class Correction:
+class MapCorrection:
     """Keyframes that moved, and sub-maps that became one."""
 
     moves: Mapping[int, Sim3]
@@ -116,13 +116,13 @@ class MapThread:
         self._post("insert", partial(_insert, _owned(insertion)))
 
     def correct(self, moves: Mapping[int, Sim3], merged: Mapping[int, int]) -> None:
-        self._post("correct", Correction(moves, merged))
+        self._post("correct", MapCorrection(moves, merged))
 
-    def inspect(self, name: str, job: Callable[[Maps, list[Correction]], None]) -> None:
+    def inspect(self, name: str, job: Callable[[Maps, list[MapCorrection]], None]) -> None:
         """Run ``job`` on the maps before all waiting requests; its second argument is the
         corrections that tracking has made and the maps do not contain yet."""
         with self._changed:
-            lacking = [job for _, job in self._jobs if isinstance(job, Correction)]
+            lacking = [job for _, job in self._jobs if isinstance(job, MapCorrection)]
             self._jobs.appendleft((name, lambda maps: job(maps, lacking)))
             self._changed.notify()
 

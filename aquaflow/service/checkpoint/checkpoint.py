@@ -27,7 +27,7 @@ from aquaflow.service.checkpoint.generations import (
     state_file,
     write_state,
 )
-from aquaflow.service.map_thread import Correction, MapThread
+from aquaflow.service.map_thread import MapCorrection, MapThread
 from aquaflow.service.moment import Moment
 from aquaflow.slam import Slam
 from aquaflow.storage.arrays import Arrays, prefixed, under
@@ -72,7 +72,7 @@ class Checkpointer:
     def take(self) -> None:
         """Take one now; what the map still waits for, but corrections, is not in it."""
         with self._run.profiler.stage("checkpoint"):
-            parts = tracking.take_apart(self._slam, self._run)
+            parts = tracking.serialise(self._slam, self._run)
             if parts is None:
                 return
             facts, arrays = parts
@@ -85,7 +85,7 @@ class Checkpointer:
         head |= {"tracking": facts, "clocks": self._clocks()}
         arrays = prefixed("tracking", arrays)
 
-        def write(maps: Maps, lacking: list[Correction]) -> None:
+        def write(maps: Maps, lacking: list[MapCorrection]) -> None:
             self._write(maps, lacking, head, arrays, files)
 
         self._writing = True
@@ -94,7 +94,7 @@ class Checkpointer:
     def _write(
         self,
         maps: Maps,
-        lacking: list[Correction],
+        lacking: list[MapCorrection],
         head: dict[str, Any],
         arrays: Arrays,  # of the tracking
         files: list[Path],
@@ -102,8 +102,8 @@ class Checkpointer:
         """In the mapping thread."""
         began = time.monotonic()
         try:
-            facts, own = map_state.take_apart(maps)
-            facts["lacking"], more = map_state.corrections_apart(lacking)
+            facts, own = map_state.serialise(maps)
+            facts["lacking"], more = map_state.serialise_corrections(lacking)
             own |= more
             bring_to_disk([*files, *maps.views.save()])
             write_state(self._dive, head | {"mapping": facts}, arrays | prefixed("mapping", own))
@@ -130,8 +130,8 @@ def restore(checkpoint: Checkpoint, slam: Slam, run: DiveRun, maps: Maps) -> Non
     """
     facts, arrays = checkpoint.facts, checkpoint.arrays
     try:
-        tracking.put_together(slam, run, facts["tracking"], under("tracking", arrays))
-        map_state.put_together(maps, facts["mapping"], under("mapping", arrays))
+        tracking.deserialise(slam, run, facts["tracking"], under("tracking", arrays))
+        map_state.deserialise(maps, facts["mapping"], under("mapping", arrays))
         map_state.catch_up(maps, facts["mapping"]["lacking"], under("mapping", arrays))
     except (KeyError, ValueError, TypeError, IndexError, RuntimeError, InputError) as error:
         raise UnusableStateError(f"{checkpoint.file} cannot be used: {error}") from error

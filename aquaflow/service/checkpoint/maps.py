@@ -11,16 +11,16 @@ from aquaflow.mapping import state
 from aquaflow.mapping.maps import Maps
 from aquaflow.mapping.state import NO_PIXELS
 from aquaflow.mapping.views import View
-from aquaflow.service.map_thread import Correction
+from aquaflow.service.map_thread import MapCorrection
 from aquaflow.storage.arrays import Arrays, of_camera, of_sim3, prefixed, to_camera, to_sim3, under
 
 
-def take_apart(maps: Maps) -> tuple[dict[str, Any], Arrays]:
+def serialise(maps: Maps) -> tuple[dict[str, Any], Arrays]:
     """Facts for JSON, and arrays, which are copies."""
     facts: dict[str, Any] = {"maps": {}, "held_out": {}}
     arrays: Arrays = {}
     for number, mapper in maps.mappers.items():
-        facts["maps"][str(number)], parts = state.take_apart(mapper, optimiser=True)
+        facts["maps"][str(number)], parts = state.serialise(mapper, optimiser=True)
         arrays |= prefixed(f"map{number}", parts)
     for number, views in maps.held_out.items():
         facts["held_out"][str(number)], parts = _held_out(views)
@@ -28,10 +28,10 @@ def take_apart(maps: Maps) -> tuple[dict[str, Any], Arrays]:
     return facts, arrays
 
 
-def put_together(
+def deserialise(
     maps: Maps,
     facts: dict[str, Any],
-    arrays: Arrays,  # as from take_apart
+    arrays: Arrays,  # as from serialise
 ) -> None:
     """Let fresh ``maps`` go on where those that were taken apart stood.
 
@@ -42,7 +42,7 @@ def put_together(
     """
     for number, values in facts["maps"].items():
         parts = under(f"map{number}", arrays)
-        mapper = state.put_together(values, parts, maps.renderer)
+        mapper = state.deserialise(values, parts, maps.renderer)
         mapper.failures = maps.failures
         mapper.views = maps.views.restore(mapper.views)
         maps.mappers[int(number)] = mapper
@@ -51,7 +51,7 @@ def put_together(
         maps.held_out[int(number)] = maps.views.restore(views)
 
 
-def corrections_apart(lacking: Sequence[Correction]) -> tuple[list[dict[str, Any]], Arrays]:
+def serialise_corrections(lacking: Sequence[MapCorrection]) -> tuple[list[dict[str, Any]], Arrays]:
     """Corrections that the maps have not followed yet: facts for JSON, and arrays."""
     facts: list[dict[str, Any]] = []
     arrays: Arrays = {}
@@ -66,9 +66,9 @@ def corrections_apart(lacking: Sequence[Correction]) -> tuple[list[dict[str, Any
 def catch_up(
     maps: Maps,
     lacking: list[dict[str, Any]],
-    arrays: Arrays,  # as from corrections_apart
+    arrays: Arrays,  # as from serialise_corrections
 ) -> None:
-    """Let the maps follow the corrections of :func:`corrections_apart`."""
+    """Let the maps follow the corrections of :func:`serialise_corrections`."""
     for i, facts in enumerate(lacking):
         numbers, moves = arrays[f"lacking{i}.keyframes"], arrays[f"lacking{i}.moves"]
         by_keyframe = {int(n): to_sim3(row) for n, row in zip(numbers, moves, strict=True)}

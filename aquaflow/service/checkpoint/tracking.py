@@ -25,7 +25,7 @@ from aquaflow.tracking.frame_table import FrameTable
 from aquaflow.tracking.graph.pose_graph import PoseGraph
 
 
-def take_apart(slam: Slam, run: DiveRun) -> tuple[dict[str, Any], Arrays] | None:
+def serialise(slam: Slam, run: DiveRun) -> tuple[dict[str, Any], Arrays] | None:
     """Facts for JSON, and arrays; None before the first keyframe, when there is nothing to keep.
 
     Quick: what is large is shared, and nothing of it changes later.
@@ -61,11 +61,11 @@ def take_apart(slam: Slam, run: DiveRun) -> tuple[dict[str, Any], Arrays] | None
     return facts, arrays
 
 
-def put_together(
+def deserialise(
     slam: Slam,
     run: DiveRun,
     facts: dict[str, Any],
-    arrays: Arrays,  # as from take_apart
+    arrays: Arrays,  # as from serialise
 ) -> None:
     """Let a fresh ``slam`` and ``run`` go on where those that were taken apart stood.
 
