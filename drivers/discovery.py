@@ -25,8 +25,8 @@ def v4l2_cameras(root: Path = Path("/")) -> list[FoundDevice]:
     found = {}
     for node in reversed(camera_nodes(kernel, root)):
         config = {"kind": "v4l2", "device": node.ids[0]}
-        told = "; ".join(modes(kernel, node.path)) or "tells no formats"
-        found[node.bus] = FoundDevice("v4l2", node.ids[0], node.name, told, config)
+        formats = "; ".join(modes(kernel, node.path)) or "reports no formats"
+        found[node.bus] = FoundDevice("v4l2", node.ids[0], node.name, formats, config)
     return list(reversed(found.values()))
 
 

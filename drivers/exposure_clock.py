@@ -37,14 +37,14 @@ class ExposureClock:
 
     def stamp(self, claimed_ns: int | None, device_ns: int | None, arrival_ns: int) -> int:
         """Moment of exposure of a picture that arrived at ``arrival_ns``."""
-        believed = claimed_ns if claimed_ns is not None else arrival_ns
-        t_ns = believed
+        source_ns = claimed_ns if claimed_ns is not None else arrival_ns
+        t_ns = source_ns
         if device_ns is not None and claimed_ns is not None:
             t_ns = self._bridged(claimed_ns, device_ns, arrival_ns)
         if not _plausible(t_ns, arrival_ns):
             t_ns = arrival_ns
         t_ns = max(t_ns, self._last_ns + 1)
-        self.repaired += abs(t_ns - believed) > REPAIR_NS
+        self.repaired += abs(t_ns - source_ns) > REPAIR_NS
         self._last_ns = t_ns
         return t_ns
 

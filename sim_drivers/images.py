@@ -58,8 +58,8 @@ class ImageFolder:
         self.frame_count: int | None = len(self.files)
         self._reasons: dict[int, str] = {}
         self.width, self.height = self._majority_size()
-        self._times_ns = _times_ns(_beside(folder, TIMESTAMPS), self.files, fps)
-        calibration = _beside(folder, CALIBRATION)
+        self._times_ns = _times_ns(_sidecar(folder, TIMESTAMPS), self.files, fps)
+        calibration = _sidecar(folder, CALIBRATION)
         self.camera: CameraModel | None = load_camera(calibration) if calibration else None
         self._white: int | None = None
         self.notes: list[str] = []
@@ -175,7 +175,7 @@ def _natural_key(file: Path) -> tuple[list[tuple[int, int, str]], str]:
     return key, file.name
 
 
-def _beside(folder: Path, name: str) -> Path | None:
+def _sidecar(folder: Path, name: str) -> Path | None:
     """``name`` in the folder or in its ``images`` folder, if it is there."""
     for place in (folder, folder / SUBFOLDER):
         if (place / name).is_file():

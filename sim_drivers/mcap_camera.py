@@ -122,8 +122,8 @@ class McapCamera:
             return None
         try:
             fields = json.loads(facts["model"])
-            beside = {"distortion": tuple(fields["distortion"]), "port": Port(**fields["port"])}
-            return CameraModel(**fields | beside)
+            extra = {"distortion": tuple(fields["distortion"]), "port": Port(**fields["port"])}
+            return CameraModel(**fields | extra)
         except (KeyError, TypeError, ValueError, RecursionError):
             self._damage.append(f"the calibration in {self.path.name} is damaged and was left out")
             return None
@@ -135,7 +135,7 @@ class McapCamera:
 
     def _placed(self) -> Iterator[tuple[_Place, McapMessage | str]]:
         """Pictures with what belongs to them; a sentence instead of one that is missing."""
-        beside: dict[str, Any] = {}
+        extra: dict[str, Any] = {}
         mask: npt.NDArray[np.bool_] | None = None
         topics = {self.topic: "picture"}
         if self._ours:  # elsewhere, topics of these names hold what their makers mean by them
@@ -145,16 +145,16 @@ class McapCamera:
             if kind == "mask":
                 mask = compressed_picture(self._payloads.decode(message).data)[..., 0] > 0
             elif kind == "exposure":
-                beside = json.loads(message.data)
+                extra = json.loads(message.data)
             else:
                 place = _Place(
                     message.number if self._ours else count,
                     message.publish_ns - self.origin_ns,
                     message.log_ns - self.origin_ns,
                     mask=mask,
-                    **beside if kind == "picture" else {},
+                    **extra if kind == "picture" else {},
                 )
-                beside = {} if kind == "picture" else beside
+                extra = {} if kind == "picture" else extra
                 gone = json.loads(message.data)["reason"] if kind == "dropped" else None
                 yield place, message if gone is None else gone
 

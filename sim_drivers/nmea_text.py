@@ -35,22 +35,22 @@ class NmeaText(ByteLog):
             for line in self.path.read_bytes().splitlines()
             if (match := SENTENCE.search(line)) is not None
         ]
-        told = [_stamp_ns(line[: match.start()]) for line, match in matches]
+        stamps = [_stamp_ns(line[: match.start()]) for line, match in matches]
         self.notes = []
-        if None in told:
-            self.notes.append(f"{told.count(None)} lines of {self.path.name} have no time")
+        if None in stamps:
+            self.notes.append(f"{stamps.count(None)} lines of {self.path.name} have no time")
         clock = LogTime(self.starts_s)
-        for (_, match), stamp_ns in zip(matches, _filled(told), strict=True):
+        for (_, match), stamp_ns in zip(matches, _filled(stamps), strict=True):
             yield Read(self.path.stem, clock.at(stamp_ns), match[0] + b"\r\n")
 
 
-def _filled(told: list[int | None]) -> list[int]:
+def _filled(stamps: list[int | None]) -> list[int]:
     """Lines without a time have that of the line before; evenly spread if no line has one."""
-    last = next((stamp for stamp in told if stamp is not None), None)
+    last = next((stamp for stamp in stamps if stamp is not None), None)
     if last is None:
-        return [number * 1_000_000_000 // LINES_HZ for number in range(len(told))]
+        return [number * 1_000_000_000 // LINES_HZ for number in range(len(stamps))]
     filled: list[int] = []
-    for stamp in told:
+    for stamp in stamps:
         last = last if stamp is None else stamp
         filled.append(last)
     return filled

@@ -121,8 +121,8 @@ def _calibration(reader: AnyReader, topic: str) -> CameraModel | None:
     """The first CameraInfo beside ``topic``; ROS counts pixel centres as integers, we do not."""
     base = topic.removesuffix("/compressed").rpartition("/")[0]
     infos = [connection for connection in reader.connections if connection.msgtype == CAMERA_INFO]
-    beside = [connection for connection in infos if connection.topic.startswith(base)]
-    for connection, _, data in messages_in(reader, beside, []):
+    siblings = [connection for connection in infos if connection.topic.startswith(base)]
+    for connection, _, data in messages_in(reader, siblings, []):
         info = decoded(reader, connection, data)
         if info is None:
             return None

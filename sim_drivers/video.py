@@ -59,7 +59,7 @@ class VideoFile:
         self.frame_count: int | None = count if count > 0 else None
         known = rate if rate > 0.0 else DEFAULT_FPS
         self._period_ns = NS_PER_S / (known if fps is None else fps)
-        self.camera = self._calibration_beside()
+        self.camera = self._sidecar_calibration()
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -116,7 +116,7 @@ class VideoFile:
         if self.frame_count is not None and read < self.frame_count - COUNT_TOLERANCE:
             self.notes.append(f"the video ends after {read} of {self.frame_count} frames")
 
-    def _calibration_beside(self) -> CameraModel | None:
+    def _sidecar_calibration(self) -> CameraModel | None:
         """The ``camera.yaml`` in the video's folder, if it is for pictures of this shape."""
         self._calibration_note = f"the calibration is {self.path.parent / CALIBRATION}"
         file = self.path.parent / CALIBRATION

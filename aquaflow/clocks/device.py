@@ -198,10 +198,10 @@ class ClockMapping:
         """Forget the old clock and learn the new one from the messages that revealed it."""
         self.resets += 1
         log.warning("the clock of %s began anew (%d times so far)", self.name, self.resets)
-        told, self._contradictions = self._contradictions, []
+        revealed, self._contradictions = self._contradictions, []
         self._buckets.clear()
         self._line = None
-        for device_ns, arrival_ns, round_trip_ns in told:
+        for device_ns, arrival_ns, round_trip_ns in revealed:
             self.add(device_ns, arrival_ns, round_trip_ns)
 
     def _learn(self, device_ns: int, arrival_ns: int, round_trip_ns: int | None) -> None:

@@ -163,8 +163,8 @@ def fine_losses(
     losses = []
     for side, points in ((scores, there), (scores.mT, here)):
         close = torch.cdist(points, points) < settings.apart_px
-        told = side.masked_fill(close & ~own, -torch.inf)
-        losses.append(torch.logsumexp(told, 2) - side.diagonal(dim1=1, dim2=2))
+        kept = side.masked_fill(close & ~own, -torch.inf)
+        losses.append(torch.logsumexp(kept, 2) - side.diagonal(dim1=1, dim2=2))
     among = (losses[0] + losses[1]) / 2.0
     around, at_most = _around(D_a, b.D, there, sharpness, settings.reach)
     best = scores.argmax(2)

@@ -67,8 +67,8 @@ class DbcDecoder(PacketDecoder):
             raise ValueError(str(error)) from error
         source = self.source(message.name)
         # A multiplexed message holds only some of its signals.
-        told = [mapping for mapping in mappings if all(name in values for name in mapping.signals)]
-        return [_sample(mapping, values, arrival_ns, source) for mapping in told]
+        known = [mapping for mapping in mappings if all(name in values for name in mapping.signals)]
+        return [_sample(mapping, values, arrival_ns, source) for mapping in known]
 
     def _opened(self, path: str) -> Any:
         try:
@@ -101,13 +101,15 @@ def _sample(
     mapping: DbcSignal, values: dict[str, float], t_ns: int, source: str
 ) -> TelemetrySample:
     scale = mapping.scale * (len(mapping.signals) // len(mapping.scale))
-    told = [factor * values[name] for factor, name in zip(scale, mapping.signals, strict=True)]
+    scaled = [factor * values[name] for factor, name in zip(scale, mapping.signals, strict=True)]
     if mapping.sample == "velocity":
-        return Velocity(t_ns, t_ns, source, (told[0], told[1], told[2]), mapping.sigma_m_s)
+        return Velocity(t_ns, t_ns, source, (scaled[0], scaled[1], scaled[2]), mapping.sigma_m_s)
     if mapping.sample == "euler":
-        return Attitude(t_ns, t_ns, source, from_euler(*told))
+        return Attitude(t_ns, t_ns, source, from_euler(*scaled))
     if mapping.sample == "attitude":
-        return Attitude(t_ns, t_ns, source, normalised((told[0], told[1], told[2], told[3])))
+        return Attitude(
+            t_ns, t_ns, source, normalised((scaled[0], scaled[1], scaled[2], scaled[3]))
+        )
     if mapping.sample in VECTORS:
-        return VECTORS[mapping.sample](t_ns, t_ns, source, (told[0], told[1], told[2]))
-    return SCALARS[mapping.sample](t_ns, t_ns, source, told[0])
+        return VECTORS[mapping.sample](t_ns, t_ns, source, (scaled[0], scaled[1], scaled[2]))
+    return SCALARS[mapping.sample](t_ns, t_ns, source, scaled[0])

@@ -109,10 +109,10 @@ def number(field: str) -> float:
 def _in_metres(fields: Fields) -> float:
     """``feet,f,metres,M,fathoms,F`` of which some may be empty."""
     units = {"f": FOOT_M, "M": 1.0, "F": FATHOM_M}
-    told = {unit: value for value, unit in zip(fields[::2], fields[1::2], strict=False) if value}
+    by_unit = {unit: value for value, unit in zip(fields[::2], fields[1::2], strict=False) if value}
     for unit in ("M", "f", "F"):
-        if unit in told:
-            return number(told[unit]) * units[unit]
+        if unit in by_unit:
+            return number(by_unit[unit]) * units[unit]
     raise ValueError("no depth in any unit")
 
 

@@ -30,11 +30,11 @@ def camera_nodes(system: KernelInterface, root: Path = Path("/")) -> list[Camera
     """Every camera below ``root``, by number; those that may not be opened are left out."""
     found = []
     for path in sorted(root.glob("dev/video*"), key=_number):
-        told = _told(system, path)
-        if told is not None:
-            bus = told.bus_info.decode(errors="replace")
+        capability = _capability(system, path)
+        if capability is not None:
+            bus = capability.bus_info.decode(errors="replace")
             ids = (*_links(root, path), *_usb_serial(root, path), bus)
-            found.append(CameraNode(path, told.card.decode(errors="replace"), bus, ids))
+            found.append(CameraNode(path, capability.card.decode(errors="replace"), bus, ids))
     return found
 
 
@@ -61,14 +61,14 @@ def modes(system: KernelInterface, path: Path) -> list[str]:
     """What the camera delivers, such as ``MJPG up to 1920 x 1080``."""
     fd = system.open(str(path))
     try:
-        told = []
+        formats = []
         form = abi.FormatDescription(type=abi.VIDEO_CAPTURE)
         while supported(system, fd, abi.ENUM_FMT, form):
             name = int(form.pixelformat).to_bytes(4, "little").decode("ascii", "replace")
             size = _largest(system, fd, form.pixelformat)
-            told.append(f"{name} up to {size[0]} x {size[1]}" if size else name)
+            formats.append(f"{name} up to {size[0]} x {size[1]}" if size else name)
             form.index += 1
-        return told
+        return formats
     finally:
         system.close(fd)
 
@@ -85,8 +85,8 @@ def _largest(system: KernelInterface, fd: int, pixelformat: int) -> tuple[int, i
     return max(sizes, key=lambda each: each[0] * each[1], default=None)
 
 
-def _told(system: KernelInterface, path: Path) -> abi.Capability | None:
-    """What a node says of itself; None if it is no camera, such as the one for metadata."""
+def _capability(system: KernelInterface, path: Path) -> abi.Capability | None:
+    """The capability of a node; None if it is no camera, such as a node for metadata."""
     try:
         fd = system.open(str(path))
     except OSError:

@@ -63,38 +63,38 @@ class DbcNode(OneWayDevice["Message"]):
     def encode(self, sample: TelemetrySample, measured_ns: int, now_ns: int) -> list[Message]:
         import can
 
-        told = _told(sample)
+        values = _values(sample)
         return [
             can.Message(
                 arbitration_id=message.frame_id,
                 is_extended_id=message.is_extended_frame,
-                data=message.encode(_signals(mapping, told[mapping.sample]), strict=False),
+                data=message.encode(_signals(mapping, values[mapping.sample]), strict=False),
             )
             for message, mapping in self._messages
-            if mapping.sample in told
+            if mapping.sample in values
         ]
 
 
-def _told(sample: TelemetrySample) -> dict[str, tuple[float, ...]]:
+def _values(sample: TelemetrySample) -> dict[str, tuple[float, ...]]:
     """The sample's values under each name that a mapping may have for it."""
-    told: dict[str, tuple[float, ...]]
+    values: dict[str, tuple[float, ...]]
     match sample:
         case Depth():
-            told = {"depth": (sample.depth_m,)}
+            values = {"depth": (sample.depth_m,)}
         case Altitude():
-            told = {"altitude": (sample.altitude_m,)}
+            values = {"altitude": (sample.altitude_m,)}
         case Lights():
-            told = {"lights": (sample.level,)}
+            values = {"lights": (sample.level,)}
         case Velocity():
-            told = {"velocity": sample.velocity_m_s}
+            values = {"velocity": sample.velocity_m_s}
         case AngularRate():
-            told = {"angular_rate": sample.rate_rad_s}
+            values = {"angular_rate": sample.rate_rad_s}
         case Acceleration():
-            told = {"acceleration": sample.acceleration_m_s2}
+            values = {"acceleration": sample.acceleration_m_s2}
         case Attitude():
             roll, pitch, yaw = (math.radians(angle) for angle in euler_deg(sample))
-            told = {"attitude": sample.wxyz, "euler": (roll, pitch, yaw)}
-    return told
+            values = {"attitude": sample.wxyz, "euler": (roll, pitch, yaw)}
+    return values
 
 
 def _signals(mapping: DbcSignal, values: tuple[float, ...]) -> dict[str, float]:

@@ -109,8 +109,8 @@ class Decoder(nn.Module):
 
         Zeros for a group with a feature that is no number, and for such an observation.
         """
-        told = self.view(encoded_observation(o, self.config.distance))
-        hidden = torch.relu(trunk.hidden.index_select(0, places) + told)
+        view_part = self.view(encoded_observation(o, self.config.distance))
+        hidden = torch.relu(trunk.hidden.index_select(0, places) + view_part)
         half = self.config.width // 2  # one product for both heads, each sees its own half
         heads = torch.cat(
             [F.pad(self.geometry.weight, (0, half)), F.pad(self.colour.weight, (half, 0))]

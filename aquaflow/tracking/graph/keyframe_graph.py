@@ -55,7 +55,7 @@ class KeyframeGraph:
         """Loop edges found."""
         self._known: list[Keyframe] = []
         """In the graph; the store may hold some that are not yet."""
-        self._beside = ThreadPoolExecutor(1, "keyframe graph")
+        self._executor = ThreadPoolExecutor(1, "keyframe graph")
         self._optimisation: Future[GraphResult] | None = None
         self._new_loops = False
 
@@ -116,13 +116,13 @@ class KeyframeGraph:
 
     def close(self) -> None:
         """End the thread beside; an optimisation at work is given up when it has ended."""
-        self._beside.shutdown()
+        self._executor.shutdown()
 
     def _optimise(self) -> None:
         """Start an optimisation if there are loops for it and none is at work."""
         if self._new_loops and self._optimisation is None:
             self._new_loops = False
-            self._optimisation = self._beside.submit(solve, self.graph.snapshot())
+            self._optimisation = self._executor.submit(solve, self.graph.snapshot())
 
     def _close_loops(self, keyframe: Keyframe) -> None:
         """Edges to all earlier keyframes that prove to show the same place."""

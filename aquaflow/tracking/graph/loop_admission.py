@@ -140,32 +140,32 @@ class Admission:
         span, quiet = np.zeros((2, len(self.poses)), dtype=bool)
         r, _ = residuals(self.poses, loops)
         allowed = np.full(len(loops), config.loop_chi2)
-        believed = np.array(
+        accepted = np.array(
             [_chi2(r[i], loops["covariance"][i]) <= config.loop_chi2 for i in range(len(loops))],
             dtype=bool,
         )
-        quiet[loops["a"][believed]] = quiet[loops["b"][believed]] = True
-        if believed.all():
+        quiet[loops["a"][accepted]] = quiet[loops["b"][accepted]] = True
+        if accepted.all():
             return Admitted(candidates, allowed, span, quiet)
         chains = Chains(self.poses, self.edges, np.flatnonzero(self.counts))
         claims = [Claim(loops[i], r[i], chains) for i in range(len(loops))]
-        doubtful = np.flatnonzero(~believed)
+        doubtful = np.flatnonzero(~accepted)
         # The surest first: what they close tells the others apart.
         for drift, alone in (
             (1.0, True),
             (config.corroborated_drift_factor, False),
             (config.drift_factor, True),
         ):
-            if drift > 1.0 and believed.any():
+            if drift > 1.0 and accepted.any():
                 break
             for i in doubtful:
                 if claims[i].stretch(drift) <= config.loop_chi2:
-                    believed[i] = alone or self._corroborated(loops, int(i), chains)
-        for i in doubtful[believed[doubtful]]:
+                    accepted[i] = alone or self._corroborated(loops, int(i), chains)
+        for i in doubtful[accepted[doubtful]]:
             # The chain's strain is what the loop may have to hold against, alone.
             allowed[i] = max(config.loop_chi2, claims[i].stretch(1.0))
             span[claims[i].path] = True
-        return Admitted(candidates[believed], allowed[believed], span, quiet)
+        return Admitted(candidates[accepted], allowed[accepted], span, quiet)
 
     def _corroborated(
         self,
