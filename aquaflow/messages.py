@@ -1,7 +1,7 @@
 """What every source yields: frames and telemetry samples.
 
 Times are CLOCK_MONOTONIC nanoseconds. ``t_ns`` is the moment of exposure or measurement where the
-device tells it; ``arrival_ns`` is when the sample reached this process.
+device reports it; ``arrival_ns`` is when the sample reached this process.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Install AquaFlow as a service. Safe to run again: what is there is brought up to date.
+# Install AquaFlow as a service. Safe to run again: an existing installation is updated.
 #
 #   sudo deploy/install.sh [options]
 #     --config FILE      the vehicle's YAML (default: keep /etc/aquaflow/aquaflow.yaml, or the example)

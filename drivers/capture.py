@@ -17,7 +17,7 @@ class UnusablePictureError(Exception):
 
 
 def nothing_to_release() -> None:
-    """For devices that hand their memory over for good."""
+    """For devices whose memory need not be returned."""
 
 
 def no_file() -> None:
@@ -28,14 +28,14 @@ def no_file() -> None:
 class RawPicture:
     """One picture as the device delivered it; not decoded, since most that are dropped need not be.
 
-    Whoever holds it calls ``release`` exactly once, after the last use of what ``decode`` reads.
+    Its holder calls ``release`` exactly once, after the last use of what ``decode`` reads.
     """
 
     arrival_ns: int
     decode: Callable[[], npt.NDArray[np.uint8]]
     """[H, W, 3] RGB in memory of its own; raises UnusablePictureError."""
     exposed_ns: int | None = None
-    """Moment of exposure that the device claims, CLOCK_MONOTONIC; None: it does not tell."""
+    """Moment of exposure that the device claims, CLOCK_MONOTONIC; None: it reports none."""
     device_ns: int | None = None
     """The same moment on the device's own clock, whose zero is anywhere."""
     sequence: int | None = None

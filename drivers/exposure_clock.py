@@ -10,11 +10,11 @@ MAX_FUTURE_NS = 50_000_000
 """A stamp may lie this far after the arrival: vivid's do by up to 30 ms."""
 
 MAX_LATENCY_NS = 2_000_000_000
-"""An older stamp is not believed; the slowest live path seen is an RTSP camera with 1 s."""
+"""An older stamp is rejected; the slowest live path seen is an RTSP camera with 1 s."""
 
 MAX_SLEW = 0.01
 """The offset between device and host follows what is claimed by at most this much per second of
-device time: drift is 1e-4 at worst, so a jump of synchronisation is told from it."""
+device time: drift is 1e-4 at worst, so a jump of synchronisation is recognised."""
 
 REPAIR_NS = 5_000_000
 """A time that differs by more than this from what was claimed counts as repaired; following the

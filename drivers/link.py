@@ -30,7 +30,7 @@ class LinkCounters:
     invalid_values: int = 0
     """Good packets whose values are impossible, or that the device itself calls invalid."""
     dropped_samples: int = 0
-    """Oldest samples dropped because nobody fetched them."""
+    """Oldest samples dropped because they were not fetched in time."""
     reconnects: int = 0
 
 

@@ -108,7 +108,7 @@ class LiveCamera:
         return self._counts
 
     def connect(self) -> None:
-        """Open the device now, so that a wrong id is told before the dive.
+        """Open the device now, so that a wrong id is reported before the dive.
 
         Without it, :meth:`frames` waits until the device is there.
 

@@ -35,9 +35,9 @@ class BodyFrame:
     """Refers every sample to the body's origin and axes, in the order of arrival.
 
     A sensor off the origin feels the body turn: a DVL measures v + omega x arm, a pressure sensor
-    sits deeper or shallower as the body leans. The last attitude and rate that any device told are
+    sits deeper or shallower as the body leans. The last attitude and rate of any device are
     used; without them the body counts as level and not turning. Specific force is turned, but its
-    lever arm is left in, since no device tells angular acceleration.
+    lever arm is left in, since no device measures angular acceleration.
     """
 
     def __init__(self) -> None:

@@ -49,7 +49,7 @@ class StreamCapture:
         """Connect.
 
         Raises:
-            ConnectionError: nobody answers, or what comes is no video.
+            ConnectionError: no server answers, or its data are no video.
         """
         self._latency_ns = round(config.latency_s * 1e9)
         # A wait that the time limit ended must not be taken for a quick failure.

@@ -25,14 +25,14 @@ Deliver: TypeAlias = Callable[[list[TelemetrySample]], None]
 
 
 class SupervisedDecoder(LinkDecoder, Protocol):
-    """A decoder that is told when the stream starts anew."""
+    """A decoder that is reset when the stream starts anew."""
 
     def reset(self) -> None: ...
 
 
 @runtime_checkable
 class Talker(Protocol):
-    """A decoder whose device wants to be spoken to."""
+    """A decoder that also sends to its device."""
 
     def outgoing(self, now_ns: int) -> bytes:
         """What is to be written now; often nothing."""
@@ -80,7 +80,7 @@ class Supervisor:
                 self._serve_one_link()
             except LinkLostError as error:
                 self._note(str(error), logging.WARNING)
-            # The thread has nobody to raise to, and the other links shall live on.
+            # The thread has no caller to raise to, and the other links continue.
             except Exception as error:
                 log.exception("%s: the driver failed; the link is opened anew", self.name)
                 self._note(f"the driver failed: {error}", logging.ERROR)
@@ -89,7 +89,7 @@ class Supervisor:
         self.state = "closed"
 
     def _serve_one_link(self) -> None:
-        """From opening the link to losing it, or to being told to stop."""
+        """Serve one link from opening it until it is lost, or until :meth:`stop`."""
         link = self._open_link()
         self._decoder.reset()
         self.is_open = True

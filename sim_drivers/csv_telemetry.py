@@ -41,7 +41,7 @@ class CsvTelemetry(TelemetryLog):
         return super().recognises(path) and _reader_of(path) is not None
 
     def samples(self) -> Iterator[TelemetrySample]:
-        """Samples in the order of the lines; a line that holds no numbers costs itself.
+        """Samples in the order of the lines; a line that holds no numbers is skipped.
 
         Raises:
             InputError: the table's header is not known.

@@ -1,4 +1,4 @@
-"""``replay.yaml``: a camera's recording and the telemetry logs that were made beside it.
+"""``replay.yaml``: a camera's recording and the telemetry logs that were recorded with it.
 
     camera: dive.mp4
     telemetry:
@@ -66,7 +66,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 class ManifestCamera:
-    """The camera that a manifest names, read by whoever reads it."""
+    """The camera that a manifest names, opened by the reader of its own format."""
 
     specificity = 3
 

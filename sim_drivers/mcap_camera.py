@@ -39,7 +39,7 @@ def picture_kind(message: McapMessage) -> str | None:
 
 @dataclass(frozen=True)
 class _Place:
-    """What the recorder wrote beside a picture."""
+    """Metadata that the recorder wrote with a picture."""
 
     index: int
     t_ns: int

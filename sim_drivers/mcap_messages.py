@@ -42,7 +42,7 @@ def mcap_files(path: Path) -> list[Path]:
 
 
 class McapMessages:
-    """Reads files one after the other; what is damaged costs itself and is told in ``notes``."""
+    """Reads files one after the other; damaged parts are skipped and reported in ``notes``."""
 
     def __init__(self, files: list[Path]) -> None:
         """Open nothing yet.

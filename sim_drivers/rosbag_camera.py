@@ -118,7 +118,8 @@ def _picture(message: Any, kind: str) -> tuple[npt.NDArray[np.uint8], EncodedPic
 
 
 def _calibration(reader: AnyReader, topic: str) -> CameraModel | None:
-    """The first CameraInfo beside ``topic``; ROS counts pixel centres as integers, we do not."""
+    """The first CameraInfo with the namespace of ``topic``; ROS counts pixel centres as integers,
+    we do not."""
     base = topic.removesuffix("/compressed").rpartition("/")[0]
     infos = [connection for connection in reader.connections if connection.msgtype == CAMERA_INFO]
     siblings = [connection for connection in infos if connection.topic.startswith(base)]

@@ -33,7 +33,7 @@ SURFACE_PA, WATER_KG_M3, GRAVITY_M_S2 = 101_325.0, 1029.0, 9.80665
 """As the defaults of the MAVLink driver: standard air, salt water."""
 
 NOT_MEASURED = -1.0
-"""First element of a covariance of what the sensor does not tell (sensor_msgs/Imu)."""
+"""First element of the covariance of a quantity that is not measured (sensor_msgs/Imu)."""
 
 
 class RosbagTelemetry:

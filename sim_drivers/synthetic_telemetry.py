@@ -20,7 +20,7 @@ class SyntheticTelemetry:
     specificity = 2
 
     def __init__(self, folder: Path, starts_s: float = 0.0) -> None:
-        """``starts_s`` is the time of the first picture on the clock of whoever asks."""
+        """``starts_s`` is the time of the first picture on the caller's clock."""
         self.folder = folder
         self.notes: list[str] = []
         self._shift_ns = round(starts_s * 1e9)

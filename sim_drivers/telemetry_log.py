@@ -45,7 +45,7 @@ class TelemetryLog(ABC):
     suffixes: ClassVar[frozenset[str]]
 
     def __init__(self, path: Path, starts_s: float = 0.0) -> None:
-        """``starts_s`` is when the log begins, on the clock of the video beside it."""
+        """``starts_s`` is when the log begins, on the clock of its video."""
         self.path = path
         self.starts_s = starts_s
         self.notes: list[str] = []

@@ -40,7 +40,7 @@ class VideoFile:
 
         Raises:
             InputError: the file is not a video, or no frame of it can be decoded.
-            ConfigError: the ``camera.yaml`` beside it is malformed.
+            ConfigError: the ``camera.yaml`` next to it is malformed.
         """
         self.path = path
         self.notes: list[str] = []

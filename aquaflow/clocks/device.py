@@ -147,8 +147,9 @@ class ClockMapping:
         return [astuple(bucket) for bucket in tuple(self._buckets)]
 
     def resume(self, earlier: Learned) -> None:
-        """Go on from what an earlier process learned since the same boot; likewise. If the device
-        began its time anew meanwhile, its messages tell. What is no such thing is not used."""
+        """Continue from what an earlier process learned since the same boot; likewise. If the
+        device's clock restarted meanwhile, its messages will show it. Malformed rows are
+        ignored."""
         try:
             self._earlier = [_Bucket.of(row) for row in earlier]
         except (TypeError, ValueError) as error:

@@ -10,7 +10,7 @@ from aquaflow.config.stage import Stage
 
 
 class WaterPriorsConfig(Stage):
-    """What the water's fit believes of scenes and waters; all weak, none in the paper.
+    """Priors of the water fit on scenes and waters; all weak, none in the paper.
 
     Measured on twelve fits of six known waters (mean error of beta_a), and on Curasao and IUI3
     (restored views against the raw ones): none 8.2 %, 1.1 and 2.9 dB; dark channel 7.6 %, 1.1 and
@@ -41,7 +41,7 @@ class MediumConfig(Stage):
     first_fit_views: int = Field(
         12,
         ge=2,
-        description="views after which water is first fitted to sightings; then at every "
+        description="views after which water is first fitted to observations; then at every "
         "doubling, and before refining",
     )
     fit: bool = Field(True, description="False: the water starts from the values below, no fit")

@@ -17,8 +17,8 @@ REMEDY = (
 
 
 def to_json(error: LensError, calibration: CameraModel) -> dict[str, Any]:
-    """For metrics.json; what the dive cannot tell is None. The noise of the matches is in px of the
-    calibration's own pictures."""
+    """For metrics.json; None where the dive does not determine it. The noise of the matches is in
+    px of the calibration's own pictures."""
     focal_known, radial_known = np.logical_or(error.known, error.named)
     focal, k1 = _fitting(error, calibration)
     return {

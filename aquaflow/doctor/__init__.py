@@ -37,7 +37,7 @@ def to_json(findings: list[Finding]) -> dict[str, Any]:
 
 
 def print_findings(findings: list[Finding], console: Console) -> None:
-    """A table for people: what is there, what it is used for, what to do."""
+    """A table for people: the finding, what it is used for, what to do."""
     from rich.markup import escape
     from rich.table import Table
 

@@ -57,7 +57,7 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def is_full_disk(error: BaseException | None) -> bool:
-    """True if the disk refused to hold more, also where our own sentence says so."""
+    """True if the disk was full, also where the error is one of our own sentences."""
     while error is not None:
         if isinstance(error, OSError) and error.errno in FULL_DISK:
             return True

@@ -1,7 +1,7 @@
 """The last net of the command line: every failure of a command is one sentence and an exit code.
 
-1: the input or the machine, and what to do about it. 70: our own mistake, which says so; its
-traceback is kept in a file for the developers.
+1: the input or the machine, and what to do about it. 70: a mistake in AquaFlow, reported as such;
+its traceback is kept in a file for the developers.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def _kept(error: Exception) -> str:
         path = folder / f"aquaflow-mistake-{os.getuid()}.txt"
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            path.unlink(missing_ok=True)  # also where it is a link that somebody put there
+            path.unlink(missing_ok=True)  # also where it is a link
             descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
             with os.fdopen(descriptor, "w", encoding="utf-8", errors="backslashreplace") as file:
                 file.write(text)

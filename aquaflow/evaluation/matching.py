@@ -1,7 +1,7 @@
 """How well a prior finds pixels again: pictures against themselves, turned, shifted and relit.
 
 A homography gives every pixel its true match, so that real pictures can be used, whose geometry
-nobody knows (docs/measurements.md#compact-prior has the figures of the prototypes).
+is unknown (docs/measurements.md#compact-prior has the figures of the prototypes).
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from aquaflow.prior.contract import Float, Mask, Prior
 Picture: TypeAlias = npt.NDArray[np.uint8]
 Matrix: TypeAlias = npt.NDArray[np.float64]
 Matcher: TypeAlias = Callable[[Picture, Picture], tuple[Float, Mask]]
-"""From two pictures [H, W, 3]: matches [H, W, 2] px of the first in the second, and which to
-believe, [H, W]."""
+"""From two pictures [H, W, 3]: matches [H, W, 2] px of the first in the second, and which are
+valid, [H, W]."""
 
 WIDTH, HEIGHT = 320, 240
 """px of the pictures that are matched."""
@@ -75,7 +75,7 @@ def homography_pair(
     level: Distortion,
     rng: np.random.Generator,
 ) -> HomographyPair:
-    """``picture`` beside itself, as another camera in another light would have it."""
+    """``picture`` and a copy of it as another camera in another light would record it."""
     size = (WIDTH + 2 * MARGIN_X, HEIGHT + 2 * MARGIN_Y)
     large = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     a = np.asarray(large[MARGIN_Y:-MARGIN_Y, MARGIN_X:-MARGIN_X], np.uint8).copy()

@@ -1,8 +1,8 @@
-"""``map.aqf``: the exact map. What comes back renders bit for bit as what was written.
+"""``map.aqf``: the exact map; a map that is read renders bit for bit like the one written.
 
 A file of arrays and facts (:mod:`aquaflow.storage.facts_file`), as :mod:`aquaflow.mapping.state`
-takes a map apart. PLY files, beside it, show one choice of range or viewpoint; this has the water,
-the light of every view and the decoder themselves.
+serialises a map. PLY files show one choice of range or viewpoint; this file has the water,
+the light of every view and the decoder itself.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ def align(
     """The similarity (``with_scale``) or rigid motion that maps ``source`` onto ``target`` best.
 
     Points on a line are aligned too: positions come out right, the turn about the line is
-    arbitrary, and :attr:`Alignment.collinear` says so.
+    arbitrary, and :attr:`Alignment.collinear` is True.
 
     Raises:
         InputError: fewer than three points, a point that is not finite, or all points in one place.

@@ -133,7 +133,7 @@ class Sim3:
         return bool(finite and np.isfinite(self.scale) and self.scale > 0.0)
 
     def if_finite(self) -> Sim3:
-        """Itself, before it is kept for good.
+        """Itself if finite; a check before a pose is stored.
 
         Raises:
             ArithmeticError: an entry is not a number, or the scale is not positive.

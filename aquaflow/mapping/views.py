@@ -234,7 +234,7 @@ BETAS = (0.8, 0.99)
 def is_usable(
     gradient: npt.NDArray[np.float64],  # [4, 4]
 ) -> bool:
-    """True if a pose may be moved by this gradient: one NaN would stay in it for good."""
+    """True if a pose may be moved by this gradient: one NaN would stay in it."""
     return bool(np.isfinite(gradient[:3]).all())
 
 

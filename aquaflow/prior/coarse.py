@@ -89,7 +89,7 @@ def _peak(
     length: int,
     step: int,
 ) -> npt.NDArray[np.float64]:
-    """[N] in [-0.5, 0.5]: top of the parabola through the best cell and those beside it."""
+    """[N] in [-0.5, 0.5]: top of the parabola through the best cell and its neighbours."""
     inside = (position > 0) & (position < length - 1)
     top = scores[own, best].astype(np.float64)
     before = scores[own, np.where(inside, best - step, best)]

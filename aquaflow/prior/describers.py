@@ -30,7 +30,7 @@ CELL_PX = 8
 """Pixels of a cell, across and down, in the pictures that the networks take."""
 
 MIDDLE = slice(CELL_PX // 2, None, CELL_PX)
-"""Pixels beside the cells' centres."""
+"""Pixels next to the cells' centres."""
 
 POINTS_ALPHA = 0.2
 """Metres: the reward of log Q in the loss that the paper's network was trained with."""

@@ -43,12 +43,12 @@ MIN_TEXTURE = 30.0
 """Smoothed squared Sobel gradient of the normalised grey image below which flow only guesses."""
 
 BORDER_PX = 2.0
-"""Matches this near to the rim of the picture are not believed."""
+"""Matches this near to the rim of the picture are rejected."""
 
 
 @dataclass(frozen=True)
 class Flow:
-    """Displacements in pixels, both ways, and which pixels of a to believe."""
+    """Displacements in pixels, both ways, and which pixels of a are valid."""
 
     forward: Float
     """[H, W, 2] from a to b."""

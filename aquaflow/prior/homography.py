@@ -14,7 +14,7 @@ SIFT_FEATURES = 2000
 SIFT_CONTRAST = 0.015
 """Below OpenCV's 0.04: water lowers contrast (docs/measurements.md#initialisation)."""
 LOWE_RATIO = 0.8
-"""Best over second-best distance of a match that is believed (D. Lowe, IJCV 2004: 0.8)."""
+"""Best over second-best distance of a match that is accepted (D. Lowe, IJCV 2004: 0.8)."""
 RANSAC_PX = 4.0
 """Loose on purpose: relief does not follow a homography, the flow takes care of the rest."""
 MIN_INLIERS = 12

@@ -1,8 +1,8 @@
-"""The learned prior that tracks: descriptors say where to look, flow says where exactly.
+"""The learned prior that tracks: descriptors give coarse matches, flow refines them.
 
-A network tells every cell of a picture from every other, whatever the water, the light and the
+A network distinguishes the cells of a picture, whatever the water, the light and the
 distance did to it; but cells are coarse. Dense flow is exact to a fifth of a pixel, but only finds
-what is near where it starts. So flow starts where the descriptors say
+what is near its start. So flow starts at the descriptors' matches
 (docs/measurements.md#compact-prior).
 """
 

@@ -44,7 +44,7 @@ def filled(
     """X and Q with the learned range where they were unknown, in one unit.
 
     The unit is the network's if that is the metre, else the triangulation's; without common pixels
-    there is no telling, and what the network says stands alone.
+    the two units cannot be compared, and the network's range is used alone.
     """
     height, width = Q.shape
     log_range = _spread(learned.log_range, height, width)

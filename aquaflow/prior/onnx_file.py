@@ -18,7 +18,8 @@ from aquaflow.errors import AquaFlowError
 OPSET = 18
 """ONNX operator set of exported files."""
 INLINE_BYTES = 1 << 30
-"""Weights up to this lie in the ONNX file itself, larger ones beside it: a file ends at 2 GiB."""
+"""Weights up to this lie in the ONNX file itself, larger ones in a file next to it: an ONNX file
+ends at 2 GiB."""
 
 
 def write_onnx(
@@ -29,7 +30,8 @@ def write_onnx(
     path: Path,
     dynamic_shapes: tuple[Any, ...] | None = None,
 ) -> None:
-    """Export ``graph`` as traced on ``example``; sizes are fixed unless ``dynamic_shapes`` says so.
+    """Export ``graph`` as traced on ``example``; sizes are fixed unless ``dynamic_shapes`` names
+    them.
 
     Raises:
         AquaFlowError: onnx or onnxscript is not installed.

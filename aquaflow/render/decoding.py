@@ -1,6 +1,6 @@
 """The decoder's part that knows the view, fused with its gradient (paper, Sec. 3.3.1).
 
-What a decoder knows before it is told the view comes in as a row of ``trunk`` for each Gaussian;
+The view-independent part of the decoder comes in as a row of ``trunk`` for each Gaussian;
 out come the attributes as they are seen from one camera. Readable definition, and fallback:
 ``Decoder.residuals`` and ``apply_residuals`` of :mod:`aquaflow.mapping.decoder.decoder`.
 """

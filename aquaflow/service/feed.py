@@ -159,8 +159,8 @@ class _Pumps:
 
 
 class LiveFeed(_Pumps):
-    """Devices. The newest picture wins in the camera's own queue, and is decoded when somebody
-    waits for it; with a recorder every picture is decoded, and the newest wins in this one."""
+    """Devices. The camera's own queue keeps the newest picture, which is decoded when the loop
+    waits for it; with a recorder every picture is decoded, and this queue keeps the newest."""
 
     def __init__(
         self,

@@ -132,7 +132,7 @@ class LiveDive:
         return Parts(loop, slam, run, thread, checkpointer, choice)
 
     def run(self, progress: Progress | None = None) -> Finished | None:
-        """Until the source ends or somebody says stop; None where nothing could be mapped.
+        """Run until the source ends or the dive is stopped; None where nothing could be mapped.
 
         Raises:
             AquaFlowError: the source or the loop failed; the checkpoint stays.

@@ -27,9 +27,9 @@ log = logging.getLogger(__name__)
 STAGE = "tracking"
 """Name of this thread among the heartbeats."""
 IDLE_S = 0.25
-"""Without a frame for so long, the loop says that it is idle and lives."""
+"""Longest wait for a frame; then the loop sends its heartbeat as idle."""
 BUSY_S = 0.01
-"""The same while frames of the past wait for their poses: one of them takes its turn."""
+"""The same while earlier frames wait for their poses: then one of them is processed."""
 LATE_MS = 150.0
 """A frame that took longer from its arrival on is late, and mapping gives way; at 10 frames/s one
 that found tracking idle is ready in 60 to 100 ms."""
@@ -42,7 +42,7 @@ MOST_FAILURES = 10
 
 
 class LiveLoop:
-    """Runs until told to stop, or until a recording ends."""
+    """Runs until it is stopped, or until a recording ends."""
 
     def __init__(
         self,
@@ -64,7 +64,7 @@ class LiveLoop:
         self.latest: Tracked | None = None
         """The newest frame that has a pose, without its picture."""
         self.picture: Frame | None = None
-        """The newest frame, prepared or not, for whoever looks on."""
+        """The newest frame, prepared or not, for the viewer."""
         self.pressure = pressure()
         self.watchers: list[Callable[[LiveLoop], None]] = []
         """Called after every frame and every idle moment; must not wait."""
@@ -101,14 +101,14 @@ class LiveLoop:
         self._tend()
 
     def stop(self, reason: str) -> None:
-        """Say that the end has come."""
+        """Set the state to stopping and notify systemd."""
         self.health.set(State.STOPPING, reason)
         self.heartbeats.retire(STAGE)  # from here on systemd's timeout of stopping counts
         self.notifier.stopping()
         self._notify_systemd()
 
     def status(self) -> dict[str, Any]:
-        """Counts of all that was done by halves, for health and metrics.json."""
+        """Dropped-work and degradation counters, for health and metrics.json."""
         return {
             **self.counters.to_json(),
             "overtaken": self.feed.newest.overtaken,
@@ -228,8 +228,8 @@ class LiveLoop:
         return troubles
 
     def _notify_systemd(self) -> None:
-        """Systemd hears READY once a sensor answered or its absence was declared; the watchdog is
-        fed only from here, and only while mapping lives too."""
+        """Send READY to systemd once a sensor answered or its absence was declared; the watchdog is
+        fed only here, and only while mapping is alive too."""
         state = self.health.state
         if state not in (State.STARTING, State.STOPPING):
             self.notifier.ready()

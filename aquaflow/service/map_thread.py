@@ -1,7 +1,7 @@
 """Mapping in parallel to tracking: one thread that runs tracking's requests in order.
 
-Tracking never waits for it. What is asked for and too much is left out and counted, common frames
-first; between requests the thread goes on optimising until every view has had its steps.
+Tracking never waits for it. Requests beyond the backlog limit are dropped and counted, common
+frames first; between requests the thread goes on optimising until every view has had its steps.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 STAGE = "mapping"
 """Name of this thread among the heartbeats."""
 IDLE_S = 0.2
-"""How often an idle thread says that it lives."""
+"""Period of the heartbeats of an idle thread."""
 STEPS_AT_ONCE = 4
 """Of idle time: a new request waits for no more, about 0.1 s at 480 px."""
 FEWER = 4
@@ -71,7 +71,7 @@ class MapThread:
         self.left_out: Counter[str] = Counter()
         """Frames that the map never saw, by reason."""
         self.failures = 0
-        """Requests that raised; each costs itself."""
+        """Requests that raised an error; each was skipped."""
         self.last_failure = ""
         self.failing = False
         """The last request raised."""
@@ -205,7 +205,7 @@ class MapThread:
 
     def _do(self, name: str, job: Job) -> None:
         # A request that fails (a GPU that is gone, a file that cannot be read) is skipped; so is
-        # one for which the memory or the disk is full: this thread has nobody to hand it to.
+        # one for which the memory or the disk is full: this thread has no caller to raise to.
         try:
             job(self._maps)
             self.failing = False
@@ -239,7 +239,7 @@ class MapThread:
         return beat
 
     def _end(self) -> None:
-        """Do what was asked for and end; nobody else may touch the maps before."""
+        """Run all waiting requests and end the thread, which owns the maps until then."""
         with self._changed:
             self._ending.set()
             self._changed.notify()

@@ -37,12 +37,12 @@ def map_live(
     progress: Progress | None = None,
     overwrite: bool = False,
 ) -> Finished | None:
-    """Map what ``feed`` brings until it ends, ``seconds`` have passed, or somebody says stop.
+    """Map what ``feed`` brings until it ends, ``seconds`` have passed, or it is stopped.
 
     Args:
-        out: the dive's folder, or one beside it if it holds another dive; None: the unfinished dive
-            in ``service.dives``, or a new one there.
-        new: begin anew, whatever could be resumed.
+        out: the dive's folder, or a new one next to it if it holds another dive; None: the
+            unfinished dive in ``service.dives``, or a new one there.
+        new: start a new dive even if one could be resumed.
         overwrite: a dive that is in ``out`` already, instead of going on with it.
 
     Returns None where nothing could be mapped.
@@ -74,9 +74,8 @@ def map_live(
 def begun(
     feed: Feed, vehicle: VehicleConfig, out: Path | None, new: bool, overwrite: bool
 ) -> LiveDive:
-    """The dive of :func:`map_live`, before its first frame. A checkpoint that cannot be gone on
-    from gives way to the one before, and that to a new dive; so does, where nobody is there to
-    help, one that the config does not fit.
+    """The dive of :func:`map_live`, before its first frame. If a checkpoint cannot be resumed, the
+    one before is used, and then a new dive; in an unattended run also if the config does not fit.
 
     Raises:
         AquaFlowError: the folder, or the config.

@@ -1,4 +1,4 @@
-"""Everything that is told of a running service, in one object: /health, /metrics, `status`."""
+"""The report of a running service as one object, for /health, /metrics and `status`."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from aquaflow.service.health.state import State
 from aquaflow.service.live_dive import Parts
 
 GOOD = (State.TRACKING, State.INITIALISING)
-"""States in which nothing is to be done about it."""
-CHANGES_TOLD = 10
+"""States that need no action."""
+CHANGES_LISTED = 10
 """Latest changes of state that the report lists."""
 
 
 def report(parts: Parts, hang_s: float, now_s: float | None = None) -> dict[str, Any]:
-    """Stable keys; may be asked for from any thread."""
+    """The report, with stable keys; may be called from any thread."""
     loop, now = parts.loop, time.monotonic() if now_s is None else now_s
     health, hung = loop.health, loop.heartbeats.hung(hang_s)
     return {
@@ -35,7 +35,7 @@ def report(parts: Parts, hang_s: float, now_s: float | None = None) -> dict[str,
                 "after": change.after.value,
                 "reason": change.reason,
             }
-            for change in list(health.changes)[-CHANGES_TOLD:]
+            for change in list(health.changes)[-CHANGES_LISTED:]
         ],
         "dive": parts.choice.folder.name,
         "resumed": parts.choice.checkpoint is not None,

@@ -16,7 +16,7 @@ from aquaflow.sources import open_camera, open_links, open_recording, telemetry_
 
 
 def devices(vehicle: VehicleConfig) -> LiveFeed:
-    """The vehicle's cameras and links, with a recorder if ``service.record`` says so. A camera that
+    """The vehicle's cameras and links, with a recorder if ``service.record`` is set. A camera that
     is not there yet is waited for.
 
     Raises:

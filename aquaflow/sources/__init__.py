@@ -121,7 +121,7 @@ class RecordedTelemetry(TelemetrySource, Protocol):
 
     @classmethod
     def open(cls, path: Path, starts_s: float = 0.0) -> RecordedTelemetry:
-        """Open ``path``, whose clock begins ``starts_s`` after that of whoever asks.
+        """Open ``path``, whose clock begins ``starts_s`` after the caller's.
 
         Raises:
             InputError: the recording cannot be read at all.

@@ -54,7 +54,8 @@ def read_arrays(path: Path, of: str = "") -> Arrays:
     """The arrays of ``write_arrays``, in memory of their own.
 
     Raises:
-        InputError: the file is gone, damaged, none of ours, or not that ``of`` this thing.
+        InputError: the file is gone, damaged, not an AquaFlow file, or written for another item
+        than ``of``.
     """
     try:
         with path.open("rb") as stream:

@@ -25,7 +25,7 @@ UNREADABLE = (
     *(OSError, zipfile.BadZipFile, ValueError, KeyError, TypeError, EOFError),
     *(NotImplementedError, RuntimeError, SyntaxError, MemoryError, RecursionError, struct.error),
 )
-"""What :func:`read_facts_file` raises where a file is not there, damaged, or none of ours."""
+"""What :func:`read_facts_file` raises where a file is missing, damaged, or not an AquaFlow file."""
 
 
 def write_facts_file(

@@ -218,7 +218,7 @@ def _tops(
     y: Array,  # [H, W] m
     down: torch.Tensor,  # [3] unit vector
 ) -> FloatMap:
-    """Height [H, W] of the shape's upper side; -inf beside it."""
+    """Height [H, W] of the shape's upper side; -inf outside it."""
     # All rays are parallel: a ray's own start is a shift of the shape.
     R = torch.tensor(shape.R.T, dtype=torch.float32)
     offset = torch.tensor(np.stack([x, y], 0).reshape(2, -1), dtype=torch.float32)

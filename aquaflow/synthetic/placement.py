@@ -25,7 +25,7 @@ def place_objects(
     loop: Array,  # [N, 2] m
     rng: np.random.Generator,
 ) -> list[Shape]:
-    """The things of a scene, beside the vehicle's way and in front of its camera."""
+    """The objects of a scene, next to the vehicle's path and in view of its camera."""
     low, high = loop.min(axis=0), loop.max(axis=0)
 
     def ground(x: float, y: float) -> float:

@@ -33,7 +33,7 @@ TOLERANCE = np.array([0.02, 0.02])
 SIGNIFICANCE = 1e-3
 """Chance that a good calibration is called wrong."""
 KNOWN_SIGMA = np.array([0.03, 0.03])
-"""Above, log focal length or k1 cannot be told from the dive."""
+"""Above, log focal length or k1 is not determined by the dive."""
 NAMED_SIGMAS = 3.0
 """An error that is larger by itself is named in the warning."""
 GRID = 41
@@ -42,7 +42,7 @@ GRID = 41
 
 @dataclass(frozen=True)
 class LensError:
-    """What the matches ask of a lens whose calibration was used for them."""
+    """Error of a lens calibration, estimated from the matches that used it."""
 
     log_focal: float
     """u: the focal length should be exp(u) times what it is."""
@@ -68,7 +68,7 @@ class LensError:
 
     @property
     def known(self) -> tuple[bool, bool]:
-        """Whether the dive's motion lets u, and k, be told at all."""
+        """Whether the dive's motion determines u, and k."""
         focal, radial = self.sigma < KNOWN_SIGMA
         return bool(focal), bool(radial)
 

@@ -1,9 +1,9 @@
 """Tracking against the current keyframe; keyframe selection.
 
-The paper makes a keyframe where matches fall below a share. That is right where the view has moved
-on, and only there: of a picture full of marine snow every match is missing too, and the frame
-should still show all of the keyframe. And where the vehicle is back at a keyframe that it left,
-that one is taken up again: hovering adds none.
+The paper makes a keyframe where the share of matches falls below a limit. That is right where the
+view has moved on, and only there: of a picture full of marine snow every match is missing too, and
+the frame should still show all of the keyframe. And where the vehicle is back at a keyframe that it
+left, that one is taken up again: hovering adds none.
 """
 
 from __future__ import annotations
@@ -64,13 +64,13 @@ class Attachment:
         pointmap: Pointmap | None = None,
         link: Link | None = None,
     ) -> Tracked:
-        """The last frame, as it is told to others."""
+        """The result for the last frame."""
         sub_map, number = self.keyframe.sub_map, self.keyframe.number
         return Tracked(frame, frame_class, sub_map, number, self.T_wc, quality, pointmap, link=link)
 
 
 class Follower:
-    """Places frames against keyframes, and says what each is good for."""
+    """Tracks frames against keyframes and classifies them."""
 
     def __init__(self, prior: Prior, keyframes: KeyframeStore, config: TrackingConfig) -> None:
         self._prior, self._keyframes, self._config = prior, keyframes, config
@@ -182,7 +182,7 @@ class Follower:
                     continue
                 self._keyframes.hold(keyframe.number)
             except InputError:
-                continue  # a keyframe that cannot be read back costs itself
+                continue  # a keyframe that cannot be read back is skipped
             back.moved_to(solved.estimate.T, solved.pair.matches)
             back.motion, back.mapped_parallax_px = at.motion, solved.parallax_px
             return back, solved

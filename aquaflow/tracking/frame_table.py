@@ -34,7 +34,7 @@ NO_PICTURE = np.empty((0, 0, 3), np.uint8)
 
 
 class FrameTable:
-    """Frames in the order in which their fate was decided; 165 bytes for each."""
+    """Finished frames, in completion order; 165 bytes for each."""
 
     def __init__(self) -> None:
         self._chunks: list[Array] = []

@@ -39,14 +39,14 @@ class CompactSettings:
     matches: int = 160
     """Fine matches drawn from a pair."""
     reach: int = 3
-    """Fine cells on either side of the truth that it is told from."""
+    """Fine cells on either side of the true cell that the loss separates it from."""
     apart_px: float = 4.0
     """Matches closer than this are not held against each other."""
     first_scenes: int = 160
     """Pairs that are rendered before the first step."""
     steps_per_shard: int = 10
     """Steps after which another shard of pairs joins; none is used before its step, so that a
-    run is the same whether its pool was there before or grows beside it."""
+    run is the same whether its pool existed before or is rendered during the run."""
     scenes: int = 1600
     """Pairs of the whole pool."""
     coarse_weight: float = 0.5

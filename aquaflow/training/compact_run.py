@@ -62,7 +62,7 @@ class CompactRun:
 
 
 def train_compact(run: CompactRun, out: Path, progress: Progress, device: str = "cpu") -> PriorCard:
-    """Train on ``device`` in ``out``, going on from what is there, and export to ``out``/prior.
+    """Train on ``device`` in ``out``, continuing an earlier run there; export to ``out``/prior.
 
     Raises:
         InputError: ``out`` holds the checkpoint of another network, or there is no such device.

@@ -97,7 +97,7 @@ def match_loss(
     losses = []
     for item in range(len(rows)):
         places = _drawn(found.visible[item], weights.matches, generator)
-        if len(places) < 2:  # nothing to tell apart
+        if len(places) < 2:  # nothing to distinguish
             continue
         v, u = places.unbind(1)
         v_b, u_b = rows[item, v, u], columns[item, v, u]

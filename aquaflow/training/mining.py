@@ -44,7 +44,7 @@ class PairIndex:
 
 
 def mine(scenes: Sequence[Scene], progress: Progress) -> list[PairIndex]:
-    """Every pair of the gaps that overlaps enough; what cannot be read costs itself.
+    """Every pair of the gaps that overlaps enough; a pair that cannot be read is skipped.
 
     Along a sequence a gap is not widened beyond the first at which the overlap is lost.
     """

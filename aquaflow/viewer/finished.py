@@ -121,7 +121,7 @@ def _of_frames(
 
 
 def _shown_by_microsecond(path: Path) -> dict[int, tuple[float, int]]:
-    """Quality and index of the frame at each time; a damaged line costs itself."""
+    """Quality and index of the frame at each time; a damaged line is skipped."""
     shown: dict[int, tuple[float, int]] = {}
     try:
         with path.open(newline="", encoding="utf-8", errors="replace") as stream:

@@ -1,4 +1,4 @@
-"""One page with a scene and a panel, made by viser; whoever looks on never slows who shows."""
+"""One page with a scene and a panel, made by viser; a slow browser never slows the caller."""
 
 from __future__ import annotations
 

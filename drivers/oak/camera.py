@@ -35,9 +35,9 @@ class OakCapture:
         self._backend = backend
         self.camera: CameraModel | None = backend.calibration()
         self._rotation = backend.imu_to_camera()
-        # Axes that nobody knows are worse than none.
+        # Samples in unknown axes are worse than none.
         self.notes: tuple[str, ...] = (
-            ("its IMU is not used: the camera does not tell the IMU's axes",)
+            ("its IMU is not used: the camera does not report the IMU's axes",)
             if self._rotation is None
             else ()
         )
@@ -78,7 +78,7 @@ class OakCamera(LiveCamera):
         self._mounting, self._body = Mounting(config.mounting), BodyFrame()
         self._samples: Newest[TelemetrySample] = Newest(MAX_SAMPLES, self._drop)
         self.dropped_samples = 0
-        """Oldest samples dropped because nobody fetched them."""
+        """Oldest samples dropped because they were not fetched in time."""
         self._last_imu_ns = -1
         super().__init__(name, config, self._open_device)
 

@@ -34,7 +34,7 @@ TIMESYNC_SAMPLES = 10
 
 
 def depthai() -> Any:
-    """The library, told to keep quiet and to search briefly."""
+    """The library, configured for little output and a short search."""
     os.environ.setdefault("DEPTHAI_LEVEL", "error")
     os.environ.setdefault("DEPTHAI_SEARCH_TIMEOUT", str(SEARCH_MS))
     return load("depthai", "an OAK camera", extra="oak")

@@ -42,7 +42,7 @@ class DaiImuReading:
 
 
 def picture_of(message: Any) -> DaiPicture:
-    """A ``dai.ImgFrame``; an exposure of 0 means that the device did not tell."""
+    """A ``dai.ImgFrame``; an exposure of 0 means that the device reported none."""
     exposure_s = message.getExposureTime().total_seconds()
     return DaiPicture(
         message,

@@ -23,7 +23,7 @@ class CanFrame(NamedTuple):
 
 
 class CanFraming(Framing):
-    """Records of 16 bytes, told from other bytes by what must be zero in them."""
+    """Records of 16 bytes, recognised by the bytes that must be zero."""
 
     longest = RECORD.size
 

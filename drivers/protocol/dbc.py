@@ -1,6 +1,6 @@
 """Any CAN bus that a DBC file describes; the config says which signals make which sample.
 
-CAN tells no time of measurement, so ``t_ns`` is the arrival.
+CAN carries no time of measurement, so ``t_ns`` is the arrival.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What each MAVLink message tells, in our units (docs/conventions.md).
+"""Samples of each MAVLink message, in our units (docs/conventions.md).
 
 MAVLink's body frame is forward-right-down and its world NED, so only units change; layouts are in
 mavlink.io/en/messages/common.html.
@@ -126,7 +126,7 @@ def _milli_imu(message: Any, stamp: MessageTime) -> Samples:
     acceleration = (message.xacc, message.yacc, message.zacc)
     gyro = (message.xgyro, message.ygyro, message.zgyro)
     samples: Samples = []
-    # Free fall for good is a sensor that is not there; SCALED_IMU2 is often only a compass.
+    # Permanent free fall means that there is no sensor; SCALED_IMU2 is often only a compass.
     if any(acceleration):
         x, y, z = (value * MILLI_G for value in acceleration)
         samples.append(Acceleration(*stamp, (x, y, z)))

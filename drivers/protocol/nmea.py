@@ -1,6 +1,6 @@
 """Echo sounders, compasses and AHRS that speak NMEA 0183.
 
-They tell no time of measurement, so ``t_ns`` is the arrival.
+They send no time of measurement, so ``t_ns`` is the arrival.
 """
 
 from __future__ import annotations

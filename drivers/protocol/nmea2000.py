@@ -1,7 +1,7 @@
 """Instruments on an NMEA 2000 bus.
 
 The five groups read here fit into one frame each, so no fast packet has to be put together. They
-tell no time of measurement, so ``t_ns`` is the arrival.
+send no time of measurement, so ``t_ns`` is the arrival.
 """
 
 from __future__ import annotations

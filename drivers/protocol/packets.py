@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 NO_PACKET = 0
 """Length of what cannot be a packet after all."""
 INCOMPLETE = -1
-"""Length of a packet of which too little is there to tell."""
+"""Length of a packet whose header has not arrived completely."""
 
 
 class Framing(ABC):

@@ -1,4 +1,4 @@
-"""Attitude and velocity from instruments that tell only a part of them."""
+"""Attitude and velocity from instruments that measure only a part of them."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from aquaflow.messages import AngularRate, Attitude, TelemetrySample, Velocity
 from drivers.rotation import from_euler
 
 TILT_LIFE_NS = 500_000_000
-"""Roll and pitch older than this say nothing of now: an ROV rocks within a second."""
+"""Roll and pitch older than this are not used: an ROV rocks within a second."""
 
 
 class PartialMotion:
-    """Completes what one instrument tells, from the others on its link or from ``assume``.
+    """Completes one instrument's values from the others on its link or from ``assume``.
 
     What stays unknown makes no sample: a heading that pretended to know roll and pitch would turn
     gravity.

@@ -18,7 +18,7 @@ MAX_LATENCY_US = 1_000_000
 
 
 def measured_ns(arrival_ns: int, validity_us: int, transmission_us: int) -> int:
-    """The DVL's clock is arbitrary, but the time from measurement to sending it tells is not."""
+    """The DVL's clock is arbitrary, but the time it reports from measurement to sending is not."""
     latency_us = transmission_us - validity_us
     return arrival_ns - latency_us * 1000 if 0 < latency_us <= MAX_LATENCY_US else arrival_ns
 

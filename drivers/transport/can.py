@@ -40,7 +40,7 @@ class CanLink:
         records: list[bytes] = []
         try:
             while len(records) < MAX_FRAMES:
-                # Once there is something, only what is there already is added to it.
+                # After the first record, only records that have already arrived are added.
                 wait_s = 0.0 if records else max(deadline - time.monotonic(), 0.0)
                 message = self._bus.recv(wait_s)
                 if message is not None:

@@ -16,7 +16,7 @@ WRITE_TIMEOUT_S = 1.0
 
 
 class UdpLink:
-    """Datagrams of one peer: the configured one, or whoever sent last."""
+    """Datagrams of one peer: the configured one, or the last sender."""
 
     def __init__(self, name: str, sock: socket.socket, peer: Any = None) -> None:
         self.name = name
@@ -39,7 +39,7 @@ class UdpLink:
 
     def write(self, data: bytes) -> None:
         if self._peer is None:
-            return  # nobody to answer yet
+            return  # no peer to answer yet
         try:
             self._socket.sendto(data, self._peer)
         except ConnectionError:
@@ -103,7 +103,7 @@ def open_tcp(name: str, config: TcpConfig) -> TcpLink:
     """Connect.
 
     Raises:
-        LinkLostError: nobody answers there.
+        LinkLostError: no peer answers there.
     """
     try:
         sock = socket.create_connection((config.host, config.port), CONNECT_TIMEOUT_S)

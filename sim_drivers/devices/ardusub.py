@@ -33,7 +33,7 @@ BEAT_NS = 1_000_000_000
 class ArduSub:
     """System 1, component 1.
 
-    Attitude is told by ATTITUDE with the last angular rate, angular rate by RAW_IMU with the last
+    Attitude is sent as ATTITUDE with the last angular rate, angular rate by RAW_IMU with the last
     specific force, depth by the external SCALED_PRESSURE2 and VFR_HUD, velocity by
     LOCAL_POSITION_NED, altitude by a DISTANCE_SENSOR that looks down, lights by servo 9.
     """

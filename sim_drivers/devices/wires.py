@@ -37,11 +37,11 @@ class PtyWire:
         fresh = self.path.with_name(self.path.name + ".new")
         fresh.symlink_to(os.ttyname(slave))
         fresh.replace(self.path)
-        # Our own end of the slave keeps the line up while nobody else has it open.
+        # Our own end of the slave keeps the line up while no other process has it open.
         self._fds = (master, slave)
 
     def unplug(self) -> None:
-        """Vanish; whoever has the port open gets an error."""
+        """Remove the port; a process that has it open gets an error."""
         if self._fds is not None:
             fds, self._fds = self._fds, None
             self.path.unlink(missing_ok=True)
@@ -72,7 +72,7 @@ class PtyWire:
 
 
 class UdpWire:
-    """Datagrams to ``peer``; without one, to whoever spoke last to ``port``."""
+    """Datagrams to ``peer``; without one, to the last sender to ``port``."""
 
     def __init__(self, peer: tuple[str, int] | None = None) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

@@ -105,7 +105,7 @@ def test_an_imu_whose_axes_are_unknown_is_left_out_and_told() -> None:
     with closing(camera):
         until(camera, 5)
         assert list(camera.samples()) == []
-    assert camera.notes == ["its IMU is not used: the camera does not tell the IMU's axes"]
+    assert camera.notes == ["its IMU is not used: the camera does not report the IMU's axes"]
 
 
 def test_readings_nobody_fetches_stay_bounded_and_are_counted() -> None:

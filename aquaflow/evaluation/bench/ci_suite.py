@@ -34,7 +34,7 @@ left."""
 REFINE_SHARE = 0.1
 """Of a preset's refining steps; the pictures have a ninth of the default's pixels."""
 BRIEF: dict[str, object] = {"mapping": {"medium": {"fit_views": 8}}}
-"""The water's fit takes half of a small run's time, and its sightings come from every view."""
+"""The water's fit takes half of a small run's time, and its observations come from every view."""
 
 STAMP = "bench_scene.json"
 """Says what a cached scene was made from."""

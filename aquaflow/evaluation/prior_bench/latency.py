@@ -1,7 +1,7 @@
 """What one frame costs a prior: matched from a prediction, and matched from nothing.
 
-Wall time is what a vehicle waits; processor time is what other work misses, and does not grow when
-somebody else uses the machine.
+Wall time is what a vehicle waits; processor time is what other work loses, and does not grow when
+other programs use the machine.
 """
 
 from __future__ import annotations

@@ -183,7 +183,7 @@ def one_gaussian(check: Check, seed: int) -> None:
 
 @case("gaussians", "render.reference.MIN_TRANSMITTANCE")
 def all_identical(check: Check, seed: int) -> None:
-    """Every Gaussian in the same place: order cannot be told, light runs out."""
+    """Every Gaussian in the same place: their order is undefined, transmittance reaches 0."""
     first = cloud(seed, 1)
     _drawn(check, Cloud(*(tensor.repeat(500, *[1] * (tensor.dim() - 1)) for tensor in
                           first.tensors())))  # fmt: skip

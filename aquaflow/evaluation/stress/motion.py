@@ -103,7 +103,7 @@ def planar_scene(check: Check, seed: int) -> None:
 
 @case("motion", "tracking.solver._summary")
 def scene_at_infinity(check: Check, seed: int) -> None:
-    """Points a million units away show a rotation and no translation, and quality says so."""
+    """Points a million units away show a rotation and no translation; the quality is low."""
     rays = _rays(seed)
     truth = pose((0.1, 0.0, 0.0), (0.01, -0.02, 0.03))
     points = rays * 1e6

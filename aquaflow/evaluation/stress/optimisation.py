@@ -75,7 +75,7 @@ def nan_in_range_input(check: Check, seed: int) -> None:
 
 @case("gaussians", "mapping.optimisation.map_optimiser.MapOptimiser.drop_unsound")
 def nan_in_the_map(check: Check, seed: int) -> None:
-    """One Gaussian gone wrong costs itself, not the optimisation."""
+    """One invalid Gaussian is dropped and does not stop the optimisation."""
     mapper, _ = _mapper(seed)
     mapper.gaussians.parameters["log_scales"][5, 1] = float("nan")
     mapper.gaussians.parameters["log_scales"][7] = 100.0

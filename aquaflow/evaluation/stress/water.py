@@ -60,7 +60,7 @@ def range_1_cm_to_1_km(check: Check, seed: int) -> None:
 
 @case("water", "mapping.image_formation.MIN_TRANSMISSION")
 def transmission_to_0(check: Check, seed: int) -> None:
-    """Where no light arrives nothing is restored, and the mask says so."""
+    """Where no light arrives nothing is restored, and the mask is False."""
     image = torch.rand(1, len(RANGES_M), 3, generator=torch.Generator().manual_seed(seed))
     restored, recoverable = _water(5.0).restore(image, _ranges())
     check.finite("restored", restored)

@@ -118,7 +118,7 @@ def _class_colour(name: str) -> str:
 
 
 def examples(data: ReportData) -> str:
-    """Held-out frames beside what the map shows from there."""
+    """Held-out frames next to the map's rendering of the same view."""
     if not data.examples:
         return ""
     return _section(

@@ -1,12 +1,13 @@
 """The Local Gaussian Parameter Decoder, LGPD (paper, Eq. 8 to 11).
 
 A token is made of a Gaussian's own feature and its group's; tokens of a group attend to each
-other; a geometry head and a colour head, told how the camera observes the Gaussian, give what is
+other; a geometry head and a colour head, conditioned on the camera's observation o, give what is
 added to its initial rotation, log-scale and colour. Place and opacity are not decoded.
 
-The paper tells the tokens gamma(o) before they attend, which costs the attention anew for every
-view. The first layer of the heads is linear in [z, gamma(o)], so here they are told: what does not
-depend on the view, :class:`Trunk`, is computed once for all views of a step, and is exact for each.
+The paper adds gamma(o) to the tokens before the attention, which then has to be computed for every
+view. The first layer of the heads is linear in [z, gamma(o)], so gamma(o) enters there: what does
+not depend on the view, :class:`Trunk`, is computed once for all views of a step, and is exact for
+each.
 """
 
 from __future__ import annotations

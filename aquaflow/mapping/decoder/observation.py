@@ -1,7 +1,7 @@
 """The observation condition o = [v, d]: from where, and how far, a Gaussian is seen.
 
 Paper, Eq. 5 and 6. Gradients stop here: through the highest octave a step of the optimiser would
-push places and cameras towards what the decoder would like to be told.
+move Gaussians and cameras only to change the decoder's input.
 """
 
 from __future__ import annotations

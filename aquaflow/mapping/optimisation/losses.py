@@ -1,4 +1,4 @@
-"""The paper's loss terms beside L1 and SSIM (Eq. 18, 21 and 23), which live with the renderer."""
+"""The paper's loss terms except L1 and SSIM, which are in the renderer (Eq. 18, 21 and 23)."""
 
 from __future__ import annotations
 

@@ -121,7 +121,7 @@ static int start_rows(const AdamStep& s, int begin, int rows, bool all_sound, fl
   return skipped;
 }
 
-// Each row's value once for each of its elements; what is there already, or in `buffer`.
+// Each row's value once for each of its elements: the existing array, or `buffer`.
 template <int Dim>
 AQ_INLINE const float* repeated(const float* per_row, int rows, float* buffer) {
   if (Dim == 1) return per_row;

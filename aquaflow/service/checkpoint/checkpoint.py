@@ -40,7 +40,8 @@ class UnusableStateError(InputError):
 
 
 class Checkpointer:
-    """Takes checkpoints: tracking's part in the loop, the map's part and the writing beside."""
+    """Takes checkpoints: tracking's part in the loop, the map's part and the writing in its
+    thread."""
 
     def __init__(
         self,

@@ -1,8 +1,7 @@
-"""The last two checkpoints of a dive on the disk: if the newer one is damaged, the older one is
-there.
+"""The last two checkpoints of a dive on the disk; the older replaces a newer that is damaged.
 
 ``checkpoint/state.npz`` is the newest, ``checkpoint/previous.npz`` the one before. Both are written
-whole and hold no pickle. The CRC-32 of every entry is compared before anything in it is believed.
+whole and hold no pickle. The CRC-32 of every entry is verified before it is used.
 """
 
 from __future__ import annotations
@@ -140,7 +139,7 @@ def read_state(path: Path) -> Checkpoint:
 
 
 UNEXPECTED = (NotImplementedError, RuntimeError, MemoryError, OverflowError, AttributeError)
-"""What zipfile raises besides, where bits of its directory are wrong."""
+"""Further errors that zipfile raises where bits of its directory are wrong."""
 
 
 def bring_to_disk(paths: Iterable[Path]) -> None:

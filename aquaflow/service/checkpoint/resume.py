@@ -1,6 +1,6 @@
-"""Which folder a dive goes into: the unfinished one of before, or a new one.
+"""Selects the folder of a dive: the unfinished one of an earlier run, or a new one.
 
-A new dive never goes into a folder that holds another's rows, but into one beside it.
+A new dive is never written into a folder that holds the rows of another; it gets a new folder.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Choice:
-    """Where to write, and from what to go on."""
+    """The folder to write to, and the checkpoint to resume from."""
 
     folder: Path
     checkpoint: Checkpoint | None = None
@@ -36,7 +36,7 @@ class Choice:
 def choose(dives: Path, config: CheckpointConfig, new: bool, now: Moment) -> Choice:
     """The newest dive in ``dives`` that can be resumed, unless ``new``; else a new folder.
 
-    A dive none of whose checkpoints can be used is left as it is: another begins beside it.
+    A dive without a usable checkpoint is left unchanged; a new folder is used.
     """
     for folder in [] if new else _unfinished(dives):
         checkpoint = newest_usable(folder)

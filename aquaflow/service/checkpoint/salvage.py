@@ -38,7 +38,7 @@ class Salvaged:
 
     rows: list[FrameRow]
     losses: list[str]
-    """A sentence for each loss, as far as the checkpoint's own files and the rows tell."""
+    """A sentence for each loss that the checkpoint's own files and the rows show."""
 
 
 def salvaged(checkpoint: Checkpoint, dive: Path, name_of: Callable[[int], str]) -> Salvaged:

@@ -23,7 +23,7 @@ def ask(url: str, token: str | None = None) -> dict[str, Any]:
     """The report of the service at ``url``, such as http://127.0.0.1:8230.
 
     Raises:
-        InputError: nobody answers there, or not with a report.
+        InputError: no service answers there, or not with a report.
     """
     host, port = _address(url)
     connection = http.client.HTTPConnection(host, port, timeout=PATIENCE_S)

@@ -1,4 +1,4 @@
-"""How fast the loop is, where its time goes, and what became of the frames."""
+"""Counters of the loop: its speed, the time of its stages, the results of the frames."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from aquaflow.profiler import Profiler
 LAGS = 600
 """Frames whose lag is remembered: a minute at ten a second."""
 WINDOW_S = 5.0
-"""Rates and shares are those of so long."""
+"""Window of the rates and shares."""
 AROUND = frozenset({"refine"})
 """Stages that are not part of the loop."""
 
@@ -24,16 +24,16 @@ class Counters:
 
     def __init__(self, profiler: Profiler, now_s: Callable[[], float] = time.monotonic) -> None:
         self.frames = 0
-        """Frames that were looked at."""
+        """Frames that were processed."""
         self.failures = 0
-        """Frames that raised; each cost itself."""
+        """Frames whose processing raised an error; each was dropped."""
         self.classes: Counter[str] = Counter()
-        """Frames by what became of them."""
+        """Frames by class."""
         self.fps = 0.0
         self.slowest = ""
-        """The stage that most time went to, lately."""
+        """The stage with the most time in the last window."""
         self.shares: dict[str, float] = {}
-        """Seconds per second in each stage, lately."""
+        """Seconds per second in each stage, in the last window."""
         self._lags_ms: deque[float] = deque(maxlen=LAGS)
         self._profiler, self._now_s = profiler, now_s
         self._window = (now_s(), 0, profiler.totals_ms())

@@ -42,7 +42,7 @@ REGISTRATION = {
 
 
 class HealthServer:
-    """Answers from threads of its own; what it tells comes from ``report``."""
+    """Answers requests in its own threads, with the object that ``report`` returns."""
 
     def __init__(self, config: ListenConfig, report: Callable[[], dict[str, Any]]) -> None:
         """Listen at once.
@@ -80,7 +80,7 @@ class _Server(ThreadingHTTPServer):
         super().__init__(address, handler)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A client that went away in the middle is none of ours."""
+        """A client that disconnects during an answer is no error of the service."""
         log.debug("a request failed", exc_info=True)
 
     def process_request(self, request: Any, client_address: Any) -> None:

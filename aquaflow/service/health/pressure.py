@@ -18,7 +18,7 @@ HOTTEST_C = 150.0
 
 @dataclass(frozen=True)
 class Pressure:
-    """One look at the machine; None where it does not tell."""
+    """One reading of the machine's pressure; None where it reports none."""
 
     free_memory_share: float | None
     disk_free_mb: float | None

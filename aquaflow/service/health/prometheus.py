@@ -51,7 +51,7 @@ def _lines(report: Mapping[str, Any]) -> Iterator[str]:
         lag = report["lag_ms"][key]
         if lag is not None:
             yield f'aquaflow_lag_seconds{{quantile="{quantile}"}} {lag / 1e3:g}'
-    yield from _labelled("frames_by_class_total", "class", report["classes"], "Frames by fate.")
+    yield from _labelled("frames_by_class_total", "class", report["classes"], "Frames by result.")
     yield from _labelled(
         "left_out_total", "reason", report["left_out_of_the_map"], "Frames that the map never saw."
     )

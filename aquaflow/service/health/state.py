@@ -72,7 +72,7 @@ class Health:
 
 @dataclass(frozen=True)
 class Facts:
-    """What the state is judged by."""
+    """The facts that determine the state."""
 
     frame_age_s: float
     """Since the last frame, or since the start."""
@@ -86,11 +86,11 @@ class Facts:
     """The newest frame has a pose."""
     ever_posed: bool
     troubles: list[str]
-    """Why things are done by halves."""
+    """Why the service works with less than everything."""
 
 
 def judged(facts: Facts) -> tuple[State, str]:
-    """The state that the facts make, and its reason."""
+    """The state that follows from the facts, and its reason."""
     if facts.frame_age_s > facts.patience_s:
         said = f": {facts.camera}" if facts.camera else ""
         return State.WAITING, f"no picture for {facts.frame_age_s:.0f} s{said}"

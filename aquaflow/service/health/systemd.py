@@ -32,7 +32,7 @@ class Notifier:
             self._send("READY=1")
 
     def stopping(self) -> None:
-        """The service ends because it was told to."""
+        """The service is being stopped."""
         self._send("STOPPING=1")
 
     def status(self, sentence: str) -> None:

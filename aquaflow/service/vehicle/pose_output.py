@@ -44,7 +44,7 @@ SIGMA_SHARE = 0.02
 
 @dataclass(frozen=True)
 class MetricScale:
-    """How many metres a map unit is, who says so, and how well it is known."""
+    """Metres per map unit, the source of that scale, and its uncertainty."""
 
     metres: float
     source: str
@@ -60,11 +60,11 @@ class PoseOutput:
     """A watcher of the loop."""
 
     def __init__(self, config: PoseConfig, feed: Feed, scale: MetricScale | None) -> None:
-        """Raises ConfigError where nobody knows the map's scale in metres."""
+        """Raises ConfigError where the map's scale in metres is unknown."""
         if scale is None:
             raise ConfigError(
                 "service.pose.enabled: the map's scale is not known in metres, so that no pose may "
-                "steer the vehicle; set it to false, or give telemetry or a prior that tells metres"
+                "steer the vehicle; set it to false, or give telemetry or a prior with metric scale"
             )
         self.sent = 0
         self.jumps = 0
@@ -122,7 +122,7 @@ class PoseOutput:
         return before.sub_map != latest.sub_map or moved_m > self._config.jump_m
 
     def _rate_hz(self) -> float:
-        """Of the last poses; 0 while there are too few to tell."""
+        """Rate of the last poses; 0 while there are too few."""
         if len(self._times_s) < 2:
             return 0.0
         span = self._times_s[-1] - self._times_s[0]

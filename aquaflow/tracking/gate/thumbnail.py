@@ -99,7 +99,7 @@ def motion_widths(reference: Thumbnail, thumbnail: Thumbnail, share: float) -> f
     """Displacement, in picture widths, that ``share`` of the textured tiles stay below.
 
     One Lucas-Kanade step for each tile. Infinite where the difference is no small motion, or where
-    nothing is textured enough to tell.
+    no tile has enough texture.
     """
     seen = reference.seen * thumbnail.seen
     old, new = _same_exposure(reference.grey, thumbnail.grey, seen)

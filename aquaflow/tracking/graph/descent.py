@@ -64,7 +64,7 @@ class Neighbourhood:
     local: Rows = field(init=False)
     """[m] edges with local ends."""
     rim: Mask = field(init=False)
-    """[n] poses beside the active ones that could move; all their edges are here."""
+    """[n] inactive poses that could move; all their edges are in ``local``."""
 
     def __post_init__(self) -> None:
         a, b = self.edges["a"], self.edges["b"]

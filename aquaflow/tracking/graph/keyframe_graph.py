@@ -1,7 +1,7 @@
-"""The keyframe graph: links along the path, loops across it, and what they correct (Eq. 4).
+"""The keyframe graph: edges along the path, loop closures, and their corrections (Eq. 4).
 
-A loop starts an optimisation in a thread beside tracking, on a snapshot of the graph; its result is
-taken over by ``correction``. A replay waits for it at the next keyframe, so that the same frames
+A loop starts an optimisation in another thread, on a snapshot of the graph; its result is
+applied by ``correction``. A replay waits for it at the next keyframe, so that the same frames
 give the same poses however long it took; a live run asks without waiting. Keyframes and links that
 came meanwhile are moved along, and loops that came meanwhile start the next optimisation.
 """
@@ -27,10 +27,10 @@ from aquaflow.tracking.loops.relocaliser import Places
 
 @dataclass(frozen=True)
 class Correction:
-    """What an optimisation changed of the map made before it."""
+    """The changes that an optimisation made to keyframes and sub-maps."""
 
     moves: Mapping[int, Sim3] = field(default_factory=dict)
-    """By keyframe number: the similarity from where its world was to where it is."""
+    """By keyframe number: the similarity from its old world frame to the new one."""
     merged: Mapping[int, int] = field(default_factory=dict)
     """Sub-maps that became part of another: from, into."""
 
@@ -65,9 +65,9 @@ class KeyframeGraph:
         return self._optimisation is not None
 
     def add(self, number: int, link: Link | None) -> None:
-        """A new keyframe and how it hangs on the one it was tracked against.
+        """Add a keyframe and its relative-pose edge to the keyframe it was tracked against.
 
-        If it closes a loop, an optimisation starts beside; after the one at work, if there is one.
+        If it closes a loop, an optimisation starts in another thread, after one that is running.
         """
         keyframe = self._keyframes[number]
         if link is not None:  # the earlier one may have been moved since they were linked
@@ -88,9 +88,9 @@ class KeyframeGraph:
         self._optimise()
 
     def resume(self, graph: PoseGraph, loops: int) -> None:
-        """Go on with an earlier run's graph; the store holds its keyframes again.
+        """Continue with an earlier run's graph; the store holds its keyframes again.
 
-        One whose content was lost moves with the others, and is no place to be found again.
+        A keyframe whose content was lost moves with the others and is not used for relocalisation.
         """
         self.graph, self.loops = graph, loops
         self._known = [known for known in self._keyframes.keyframes if known.number in graph]
@@ -99,9 +99,9 @@ class KeyframeGraph:
                 self._places.add(keyframe)
 
     def correction(self, wait: bool) -> Correction:
-        """What the optimisation found, once; nothing if there is none, or it is still at work.
+        """The optimisation's result, once; empty if there is none, or it is still running.
 
-        With ``wait`` its end is waited for. What was raised in its thread counts as a failure here.
+        ``wait``: block until it has ended. An error in its thread counts as a failure here.
         """
         if self._optimisation is None or not (wait or self._optimisation.done()):
             return Correction()
@@ -109,17 +109,17 @@ class KeyframeGraph:
         correction = Correction()
         with self._failures.contain("graph optimisation"):
             result = self.graph.apply(finished.result())
-            assert result is not None  # nobody else applies
+            assert result is not None  # only this method applies results
             correction = self._taken_over(result)
         self._optimise()
         return correction
 
     def close(self) -> None:
-        """End the thread beside; an optimisation at work is given up when it has ended."""
+        """End the thread; the result of a running optimisation is discarded."""
         self._executor.shutdown()
 
     def _optimise(self) -> None:
-        """Start an optimisation if there are loops for it and none is at work."""
+        """Start an optimisation if there are new loops and none is running."""
         if self._new_loops and self._optimisation is None:
             self._new_loops = False
             self._optimisation = self._executor.submit(solve, self.graph.snapshot())
@@ -142,7 +142,7 @@ class KeyframeGraph:
                 self._new_loops = True
 
     def _taken_over(self, result: GraphResult) -> Correction:
-        """Let the keyframes take over what came out."""
+        """Apply the result to the keyframes."""
         moves, merged = {}, {}
         if result.poses:  # all at once: one by one, 10^4 keyframes would take half a second
             keyframes = [self._keyframes[number] for number in result.poses]

@@ -13,7 +13,7 @@ MEMORY = 10
 
 
 class LinearSystem:
-    """Solves for the steps of the active poses; keeps its factor until told to make another.
+    """Solves for the steps of the active poses; keeps its factor until :meth:`factor` is called.
 
     Steps after a factor's first are corrected by limited-memory BFGS (Nocedal, 1980), with the
     factor as the first guess of the Hessian: Gauss-Newton leaves out what bends the long soft

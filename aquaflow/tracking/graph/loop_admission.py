@@ -1,11 +1,11 @@
-"""Which loop edges are believed: a claim is weighed against the chain it would bend.
+"""Admission of loop edges: each is tested against the chain of edges that it would bend.
 
-A robust weight alone cannot tell a false loop: a long soft chain bends to it until its residual
+A robust weight alone cannot detect a false loop: a long soft chain bends to it until its residual
 is small. So before an edge counts, its claim is compared with the present estimate in the metric of
 its own covariance plus that of the chain between its ends (individual compatibility, Neira and
 Tardos 2001), the chain's grown by how much worse than stated tracking may drift. Edges that make
 the same claim from other keyframes corroborate each other and are allowed more drift. What is not
-admitted waits at trust zero and is weighed again when the map around it has changed.
+admitted keeps trust zero and is tested again when the map around it has changed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.tracking.graph.equations import Array, Index, Mask, Rows, poses_of, residuals
 
 WITNESSES = 8
-"""Other loop edges, the nearest first, that are asked whether they agree with one."""
+"""Other loop edges, the nearest first, that are tested for agreement with one."""
 
 
 @dataclass
@@ -107,7 +107,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Admitted:
-    """The loops that are believed from now on."""
+    """The loops that count from now on."""
 
     edges: Index
     """[k]"""
@@ -135,7 +135,7 @@ class Admission:
         self,
         candidates: Index,  # [k] numbers of edges
     ) -> Admitted:
-        """The surest of the candidates that are believed; ask again when these have closed."""
+        """The most certain candidates; call again when these loops have closed."""
         config, loops = self.config, self.edges[candidates]
         span, quiet = np.zeros((2, len(self.poses)), dtype=bool)
         r, _ = residuals(self.poses, loops)
@@ -150,7 +150,7 @@ class Admission:
         chains = Chains(self.poses, self.edges, np.flatnonzero(self.counts))
         claims = [Claim(loops[i], r[i], chains) for i in range(len(loops))]
         doubtful = np.flatnonzero(~accepted)
-        # The surest first: what they close tells the others apart.
+        # The most certain first: closing them separates true from false among the others.
         for drift, alone in (
             (1.0, True),
             (config.corroborated_drift_factor, False),
@@ -162,7 +162,7 @@ class Admission:
                 if claims[i].stretch(drift) <= config.loop_chi2:
                     accepted[i] = alone or self._corroborated(loops, int(i), chains)
         for i in doubtful[accepted[doubtful]]:
-            # The chain's strain is what the loop may have to hold against, alone.
+            # The loop may have to balance the chain's strain alone.
             allowed[i] = max(config.loop_chi2, claims[i].stretch(1.0))
             span[claims[i].path] = True
         return Admitted(candidates[accepted], allowed[accepted], span, quiet)

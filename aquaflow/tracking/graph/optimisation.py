@@ -41,7 +41,7 @@ class Optimisation:
         """Optimise."""
         fresh = np.arange(0 if self.everything else self.snapshot.settled, len(self.edges))
         asked = self._ends(self._strained(fresh[self.counts[fresh]]))
-        candidates = self._beside(fresh)
+        candidates = self._candidates(fresh)
         for round_ in range(ROUNDS):
             admission = Admission(self.descent.poses, self.edges, self.counts, self.config)
             new = admission.admitted(candidates)
@@ -81,11 +81,11 @@ class Optimisation:
         ends[self.edges["a"][edges]] = ends[self.edges["b"][edges]] = True
         return ends
 
-    def _beside(
+    def _candidates(
         self,
         fresh: Index,  # [k] numbers of edges
     ) -> Index:
-        """Loops not yet believed that are new, or that new ones may corroborate."""
+        """Loops not yet admitted that are new, or that new ones may corroborate."""
         pending = np.flatnonzero(self._pending())
         new = np.intersect1d(pending, fresh)
         if len(new) == 0:

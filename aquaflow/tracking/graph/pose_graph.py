@@ -1,4 +1,4 @@
-"""The keyframe graph: Sim(3) edges between keyframes, optimised beside tracking.
+"""The keyframe graph: Sim(3) edges between keyframes, optimised in parallel to tracking.
 
 ``snapshot()`` -> ``solve(snapshot)`` -> ``apply(result)``: solving is a pure function, so the
 pipeline runs it in a thread, or inline where a replay must be the same each time. ``optimise``
@@ -30,9 +30,9 @@ from aquaflow.tracking.graph.table import (
 )
 
 UNKNOWN_SIGMA = 1e3
-"""Standard deviation of a direction of an edge that nothing is known about."""
+"""Standard deviation of an unknown direction of an edge."""
 LEAST_SIGMA = 1e-6
-"""Standard deviation below which no edge is believed: keeps the equations solvable."""
+"""Least standard deviation of an edge: keeps the equations solvable."""
 
 
 @dataclass(frozen=True)
@@ -258,7 +258,7 @@ class PoseGraph:
         join = Join(at_b, at_a, S) if at_a < at_b else Join(at_a, at_b, S.inverse())
         new = self._row[join.moved]
         alone = self._members[join.moved] == 1 and new >= self._seen
-        # A keyframe that nobody has seen yet, the usual case, is changed where it stands.
+        # A keyframe that no snapshot contains yet, the usual case, is changed in place.
         nodes = self._nodes.unseen(new) if alone else self._nodes.rows.copy()
         rows = join.apply(nodes)
         if not join.still:

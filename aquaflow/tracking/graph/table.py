@@ -31,7 +31,7 @@ EDGE = np.dtype(
 """An edge: rows of its two keyframes and T_ab."""
 
 TRUST = np.dtype([("trust", np.float64), ("allowed", np.float64)])
-"""Switch variable of an edge, 0 for a loop that is not (yet) believed; and its phi, the squared
+"""Switch variable of an edge, 0 for a loop that is not (yet) admitted; and its phi, the squared
 residual that a loop may keep at full trust."""
 
 ROUNDING = 1e-9
@@ -99,7 +99,7 @@ class Snapshot:
 
 @dataclass(frozen=True)
 class GraphResult:
-    """What an optimisation found."""
+    """The result of an optimisation."""
 
     poses: Mapping[int, Sim3]
     """New T_wc by keyframe number, of those that moved only."""
@@ -107,7 +107,7 @@ class GraphResult:
     """Switch variable in [0, 1] of every loop edge, by its place among all edges added."""
     iterations: int
     cost_before: float
-    """Robust cost of all edges it looked at; loops that are not believed add nothing."""
+    """Robust cost of all edges of the optimisation; loops not admitted add nothing."""
     cost_after: float
     snapshot: Snapshot
     rows: Index

@@ -1,4 +1,4 @@
-"""Places seen before: which keyframes may show this one, and which of them prove to."""
+"""Relocalisation and loop detection: retrieval of similar keyframes, then verification."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from aquaflow.tracking.pose.solver import PoseEstimate
 
 @dataclass(frozen=True)
 class Relocalised:
-    """A keyframe that shows the same place, proven by geometry."""
+    """A keyframe that shows the same place, verified by geometry."""
 
     keyframe: Keyframe
     estimate: PoseEstimate
@@ -25,18 +25,18 @@ class Relocalised:
 
 
 class Places:
-    """Retrieval, then verification of what is plausible; the store says what there is."""
+    """Retrieval of similar keyframes, then geometric verification of the plausible ones."""
 
     def __init__(self, keyframes: KeyframeStore, config: TrackingConfig) -> None:
         self._keyframes, self._config = keyframes, config
         self._retrieval = Retrieval(config.retrieval)
 
     def add(self, keyframe: Keyframe) -> None:
-        """From here on this place can be found again."""
+        """Index ``keyframe``, so that its place can be found again."""
         self._retrieval.add(keyframe.number, keyframe.encoding)
 
     def of_frame(self, encoding: Encoding, camera: CameraModel) -> Relocalised | None:
-        """Where a lost frame is: the first keyframe, most similar first, that proves its pose."""
+        """Pose of a lost frame, from the first keyframe, most similar first, that verifies."""
         for candidate in self._retrieval.candidates(encoding, lambda _: False):
             found = self._verified(candidate.number, encoding, camera)
             if found is not None:
@@ -44,7 +44,7 @@ class Places:
         return None
 
     def of_keyframe(self, keyframe: Keyframe, exclude: Callable[[int], bool]) -> list[Relocalised]:
-        """Earlier keyframes that show what ``keyframe`` shows, scales compared."""
+        """Earlier keyframes that show the same place as ``keyframe``, with relative scale."""
         encoding, pointmap = keyframe.encoding, keyframe.pointmap
         numbers = [found.number for found in self._retrieval.candidates(encoding, exclude)]
         found = [self._verified(n, encoding, encoding.camera, pointmap) for n in numbers]
@@ -61,5 +61,5 @@ class Places:
         try:
             proof = verify(past, encoding, camera, self._config.verification, pointmap)
         except InputError:
-            return None  # a keyframe that cannot be read back costs itself
+            return None  # a keyframe that cannot be read back is skipped
         return None if proof is None else Relocalised(past, proof.estimate)

@@ -87,7 +87,7 @@ def fuse(
 def transfer(
     pointmap: Pointmap,
     source_pixels: npt.NDArray[np.float32],  # [H, W, 2] px, where each pixel of b lies in a
-    reliable: npt.NDArray[np.bool_],  # [H, W] pixels of b whose source may be believed
+    reliable: npt.NDArray[np.bool_],  # [H, W] pixels of b whose source is valid
     T_ba: Sim3,
     camera_b: CameraModel,
 ) -> Pointmap:

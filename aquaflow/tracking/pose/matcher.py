@@ -1,4 +1,4 @@
-"""One frame against one keyframe: matches, pose, and whether both can be believed."""
+"""One frame against one keyframe: matches, pose, and whether both are reliable."""
 
 from __future__ import annotations
 

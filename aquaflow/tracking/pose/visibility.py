@@ -2,7 +2,7 @@
 
 Matches are lost for two reasons. Where the view has moved on, a new keyframe brings them back;
 where something hides the scene (marine snow, silt, fish, a flash) it does not, and a keyframe that
-shows flakes is worse than the clear one. The pose tells the two apart.
+shows flakes is worse than the clear one. The pose separates the two cases.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def sampled(
 
 def predicted_matches(
     pointmap: Pointmap,
-    known: Mask,  # [H, W] pixels whose depth may be believed
+    known: Mask,  # [H, W] pixels whose depth is valid
     T_fk: Sim3,
     camera: CameraModel,
     otherwise: npt.NDArray[np.float32],  # [H, W, 2] px

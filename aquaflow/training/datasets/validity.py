@@ -1,7 +1,7 @@
 """Which pixels teach: not the moving, the mirroring, the veiled, or those of unknown depth.
 
 Paper, Sec. 3.1: "joint geometric and semantic masking to remove dynamic objects, invalid depth
-regions, specular highlights, and scattering artifacts". What moved is told from geometry here: a
+regions, specular highlights, and scattering artifacts". What moved is found from geometry here: a
 point of one view in front of what the other view sees there was not there any more.
 """
 

@@ -111,7 +111,7 @@ def _lamplight(
     rays: Tensor,  # [B, N, 3] camera, of unit depth
     facing: Tensor,  # [B, N] cosine
 ) -> Tensor:
-    """[B, N] of lamps beside the camera: they fall off with range, and towards the beam's rim."""
+    """[B, N] of lamps next to the camera: they fall off with range, and towards the beam's rim."""
     batch = len(rays)
     at = hits.depth[..., None].clamp_max(FURTHEST) * rays - scene.light.lamp[:, None]
     distance = at.norm(dim=-1).clamp_min(0.2)

@@ -29,7 +29,7 @@ JSON_FILE, PICTURE_FILE = "render_bench.json", "render_bench.png"
 """What a benchmark writes."""
 
 FAILURES = (AquaFlowError, MemoryError, RuntimeError, ImportError)
-"""What costs a contender its row at a size, and nobody else anything; torch and gsplat raise
+"""Errors that drop one contender's row at a size and no other row; torch and gsplat raise
 RuntimeError when the device is full or a kernel does not compile."""
 
 Progress = Callable[[str, int, int | None], None]

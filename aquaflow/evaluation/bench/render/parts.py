@@ -36,7 +36,7 @@ class TimedPart:
     threads: int
     run: Callable[[], object]
     uses_torch_threads: bool = False
-    """Else the work brings its own, and torch's would only spin beside them."""
+    """False: the work has its own threads, and torch's would only spin in addition."""
 
     def timed(self, clock: Clock) -> tuple[float, float]:
         """Milliseconds on the wall, and of this thread's CPU time."""
