@@ -49,7 +49,7 @@ Learned = Sequence[Sequence[int | None]]
 
 @dataclass(frozen=True)
 class ClockReport:
-    """What is known of a device's clock."""
+    """State of a device's clock mapping."""
 
     offset_ns: int
     """CLOCK_MONOTONIC minus device clock, now."""

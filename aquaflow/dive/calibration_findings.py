@@ -48,7 +48,7 @@ def verdict(error: LensError) -> str:
 
 
 def warning(error: LensError, calibration: CameraModel) -> str:
-    """A sentence for a calibration that is wrong: what, how sure, what to do."""
+    """A sentence for a wrong calibration: the error, its certainty, the remedy."""
     focal, k1 = _fitting(error, calibration)
     focal_named, radial_named = error.named
     asked = []

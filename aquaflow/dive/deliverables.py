@@ -1,4 +1,4 @@
-"""What a dive delivers at its end: each part is made and written on its own.
+"""The deliverables at the end of a dive; each part is computed and written separately.
 
 A part that fails is counted and made once more; one that fails again is named in the notes and left
 out, and never costs another.

@@ -47,14 +47,14 @@ RESULTS = (
 """What a run writes at its end; of an earlier run in the same folder nothing must remain."""
 
 CHECKPOINT = "checkpoint"
-"""Folder of what a live run can be resumed from."""
+"""Folder of the checkpoints of a live run."""
 
 WORK = "work"
-"""Folder of what waits for a long dive's memory; gone when the run has ended."""
+"""Folder of data that does not fit into memory; removed at the end of the run."""
 
 
 class DiveFolder:
-    """Writes one dive; everything decided is on disk at once, final files are atomic."""
+    """Writes one dive; finished frames are on disk at once, final files are atomic."""
 
     def __init__(
         self,
@@ -106,7 +106,7 @@ class DiveFolder:
 
     @property
     def work(self) -> Path:
-        """Where a run may put what does not fit into memory."""
+        """Folder for data that does not fit into memory."""
         return self.path / WORK
 
     def close(self, keep_work: bool = False) -> None:
@@ -118,7 +118,7 @@ class DiveFolder:
 
     @property
     def rows(self) -> Sequence[FrameRow]:
-        """What was recorded so far."""
+        """The rows recorded so far."""
         return of_text(self._recorded.decode("utf-8"))
 
     # --- while the dive runs ------------------------------------------------------------------

@@ -32,7 +32,7 @@ class FrameRow:
     sub_map: int | None = None
     """Number of the sub-map; None without a pose."""
     keyframe: int | None = None
-    """Number of the keyframe that the pose hangs on."""
+    """Number of the keyframe that the pose is relative to."""
     quality: float | None = None
     """Inlier share of the pose's matches."""
     reason: str = ""

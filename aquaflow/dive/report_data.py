@@ -1,4 +1,4 @@
-"""From a finished run to the values that report.html shows."""
+"""The values of report.html, from a finished run."""
 
 from __future__ import annotations
 

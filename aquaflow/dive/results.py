@@ -1,4 +1,4 @@
-"""What a finished run amounts to: held-out quality, poses, water and metrics.json's numbers."""
+"""Results of a finished run: held-out quality, poses, water and metrics.json's numbers."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SCALE_SOURCE = "none: the median depth of the first keyframe is 1 map unit"
 """One camera knows no metres: every start is scaled to median depth 1 (see initialisation)."""
 
 RANGE_PERCENTILES = (5.0, 95.0)
-"""Percent; what lies outside are single pixels at edges of the map."""
+"""Percent; values outside are single pixels at edges of the map."""
 
 
 @dataclass(frozen=True)

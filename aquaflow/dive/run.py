@@ -38,11 +38,11 @@ class Finished:
     metrics: dict[str, Any]
     notes: list[str]
     warnings: list[str]
-    """Why the result is poor, and what to do; empty for a good one."""
+    """Why the result is poor, and the remedy; empty for a good one."""
 
 
 class DiveRun:
-    """Frames go through ``slam`` and into ``folder``; ``finish`` writes what came of them."""
+    """Passes frames through ``slam`` into ``folder``; ``finish`` writes the results."""
 
     def __init__(
         self,
@@ -64,9 +64,9 @@ class DiveRun:
         self.warnings: list[str] = []
         self.config = config
         self.lens_error: LensError | None = None
-        """What the dive says of the calibration, if one was given; known at the end."""
+        """Result of the calibration check, if a calibration was given; known at the end."""
         self.live: dict[str, Any] | None = None
-        """What a live run says of itself in metrics.json."""
+        """Counters of a live run for metrics.json."""
         self.started = time.monotonic()
         self.frame_ms = array("d")
         """Of every frame that was read: preparing, tracking and mapping it."""
@@ -107,7 +107,7 @@ class DiveRun:
         return None
 
     def catch_up(self) -> list[Tracked]:
-        """A pose for a frame of the past, if one waits; for a moment without a new one."""
+        """Compute the pose of an earlier frame that waits; called while no new frame is there."""
         decided = self.slam.catch_up()
         self.decide(decided)
         return decided

@@ -1,4 +1,4 @@
-"""What is poor about a finished dive, in words: said before anything else, with what to do."""
+"""Shortcomings of a finished dive as sentences with remedies; printed before the results."""
 
 from __future__ import annotations
 

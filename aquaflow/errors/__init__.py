@@ -28,8 +28,8 @@ MAX_QUOTED = 160
 
 
 def first_line(error: BaseException) -> str:
-    """What another library said while it computed, short enough for a sentence; its kind if it
-    said nothing. Of an error in reading a file, :func:`reason_of` is to be passed on instead."""
+    """The message of another library's error, short enough for a sentence; its kind if it
+    has no message. For an error while reading a file use :func:`reason_of` instead."""
     return (str(error).splitlines() or [type(error).__name__])[0][:MAX_QUOTED]
 
 

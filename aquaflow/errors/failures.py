@@ -35,7 +35,7 @@ REPEATED = 3
 """Failures of one stage within ``RECENT_S`` that make the service's state "degraded"; a single one
 is an odd picture, and is in the counts."""
 RECENT_S = 60.0
-"""A stage that has not failed for so long works again."""
+"""After so long without a failure a stage counts as working again."""
 REASONS_KEPT = 256
 """Frames whose failure is remembered until their row is written: more than ever wait for a pose."""
 

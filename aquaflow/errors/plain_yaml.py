@@ -2,7 +2,7 @@
 
 Every YAML file that AquaFlow reads comes through here. PyYAML's safe loader makes no objects of
 foreign classes, but it follows a document that contains itself, a number of any length, and
-aliases that multiply; validating or printing such a thing ends in a traceback or never.
+aliases that multiply; validating or printing such a file ends in a traceback or never.
 """
 
 from __future__ import annotations

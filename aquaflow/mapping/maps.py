@@ -1,4 +1,4 @@
-"""The maps of a dive, one for every sub-map: grown by what tracking hands over (Sec. 3.3, 3.4)."""
+"""The maps of a dive, one for every sub-map, grown from tracked frames (Sec. 3.3, 3.4)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Insertion:
 
 @dataclass(frozen=True)
 class Growth:
-    """What one posed frame brings to the map of its sub-map."""
+    """The contribution of one posed frame to the map of its sub-map."""
 
     view: View
     sub_map: int
@@ -49,7 +49,7 @@ class Growth:
 
 
 class MapWork(Protocol):
-    """What tracking asks of the maps; done at once, or in a thread."""
+    """Tracking's requests to the maps; done at once, or in a thread."""
 
     @property
     def mappers(self) -> dict[int, Mapper]:
@@ -66,7 +66,7 @@ class MapWork(Protocol):
         ...
 
     def hold_out(self, view: View, sub_map: int) -> None:
-        """Keep a view for judging the map, which never learns from it."""
+        """Keep a view for evaluation; the map is never optimised on it."""
         ...
 
     def insert(self, insertion: Insertion) -> None:
@@ -74,7 +74,7 @@ class MapWork(Protocol):
         ...
 
     def correct(self, moves: Mapping[int, Sim3], merged: Mapping[int, int]) -> None:
-        """Gaussians and views go where their keyframes went; merged sub-maps become one map."""
+        """Move Gaussians and views with their keyframes; merge the maps of merged sub-maps."""
         ...
 
     def refine(self, progress: Progress | None = None) -> None:
@@ -82,12 +82,12 @@ class MapWork(Protocol):
         ...
 
     def close(self, keep: bool = False) -> None:
-        """Remove what waits in the work folder; or, to ``keep`` it, write what does not yet."""
+        """Remove the files of the work folder; or, to ``keep`` them, write the missing ones."""
         ...
 
 
 class Maps:
-    """Does the work at once; to be used from one thread at a time."""
+    """Does the work in the caller's thread; for one thread at a time."""
 
     def __init__(
         self,
@@ -115,7 +115,7 @@ class Maps:
             mapper = self.mapper(growth.sub_map)
             with self.failures.contain("view", view.frame_index):
                 self.views.keep(view)
-                mapper.add_view(view)  # now and then a view makes the water be fitted again
+                mapper.add_view(view)  # some views trigger another fit of the water
                 group = same_group(view, mapper.views)
                 drop_surplus(mapper.views, group, self.config.mapping.views_per_keyframe)
 
@@ -156,7 +156,7 @@ class Maps:
             drop_surplus(views, views, self.config.mapping.held_out_most)
 
     def _merge(self, source: int, target: int) -> None:
-        """One map of two; a failure before the Gaussians came over leaves both as they are."""
+        """Merge two maps; a failure before the Gaussians were moved leaves both unchanged."""
         if source not in self.mappers:
             return
         mapper, other = self.mapper(target), self.mappers[source]

@@ -19,7 +19,7 @@ from aquaflow.storage.spill import Spill
 
 RESIDENT_VIEWS = 128
 """Views in memory while the others wait in files; at most 1.4 MB each at 480 x 270 px. Any view may
-be the next to be optimised against, so that more of them only save a reading now and then."""
+be the next to be optimised against, so that more of them save few reads."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class View:
     ) -> None:
         self.frame_index, self.camera, self.T_wc = frame_index, camera, T_wc
         self.keyframe = keyframe
-        """Number of the keyframe that the pose hangs on."""
+        """Number of the keyframe that the pose is relative to."""
         self.robust = robust
         """True for common frames, whose outliers are masked (paper, M)."""
         self.log_gain = np.zeros(3)

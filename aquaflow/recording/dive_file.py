@@ -19,7 +19,7 @@ JSON_OBJECT = b'{"type": "object"}'
 
 
 def require_mcap() -> None:
-    """Say what to install where the extra is missing.
+    """Check that the libraries of the extra ``recording`` are installed.
 
     Raises:
         InputError: mcap or foxglove's schemas are not installed.

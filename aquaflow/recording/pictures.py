@@ -39,7 +39,7 @@ def encode(
     image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
     settings: RecordingConfig,
 ) -> EncodedPicture:
-    """JPEG or PNG, as the settings say."""
+    """JPEG or PNG, by the settings."""
     import cv2
 
     bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)

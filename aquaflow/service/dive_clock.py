@@ -1,4 +1,4 @@
-"""How a run that resumes a dive counts its frames and its time: on from where it was."""
+"""Frame indices and time of a run that resumes a dive: they continue those of the run before."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ class Continued:
     """Nothing to continue, unless made by :meth:`after`."""
 
     first_index: int = 0
-    """Frames before this one were decided, or lost, in the run before."""
+    """Frames before this one were finished, or lost, in the run before."""
     shift_ns: int = 0
     """From this boot's clock to the dive's."""
     clocks: Mapping[str, Learned] = field(default_factory=dict)
-    """What was known of the devices' clocks, by device."""
+    """Learned clock mappings, by device."""
 
     @staticmethod
     def after(

@@ -249,7 +249,7 @@ class LiveFeed(_Pumps):
 
 
 class PlaybackFeed(_Pumps):
-    """A recording as if it happened now: moments keep their distances, arrivals are what they are
+    """A recording played back in real time: time differences are kept, arrivals are what they are
     here."""
 
     def __init__(
@@ -261,7 +261,7 @@ class PlaybackFeed(_Pumps):
         notes: list[str],
         failures: Failures | None = None,
     ) -> None:
-        """Goes on with the first frame that an earlier run did not see."""
+        """Continue with the first frame that an earlier run did not process."""
         super().__init__(failures)
         self.calibration, self.name_of, self._notes = calibration, name_of, notes
         self._playback, self._source = playback, source
@@ -304,7 +304,7 @@ class PlaybackFeed(_Pumps):
 
 
 def _state_of(device: object) -> dict[str, object]:
-    """What a driver says of itself, as far as it does."""
+    """A driver's state and counters, as far as it reports them."""
     state = getattr(device, "state", "")
     said: dict[str, object] = {"state": getattr(state, "value", state)}
     said["reason"] = getattr(device, "reason", "")

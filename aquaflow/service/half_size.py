@@ -13,7 +13,7 @@ from aquaflow.mapping.views import View
 
 
 def halved(growth: Growth) -> Growth:
-    """The same growth from half as wide a picture."""
+    """The same growth at half the picture width."""
     view = growth.view
     width, height = view.camera.width // 2, view.camera.height // 2
     small = View(

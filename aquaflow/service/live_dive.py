@@ -1,4 +1,4 @@
-"""One live dive from its folder to its report: everything is made, run, and ended here."""
+"""One live dive from its folder to its report: constructs, runs and closes all parts."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ from aquaflow.slam import Slam
 log = logging.getLogger(__name__)
 
 SWITCH_S = 0.0005
-"""Longest that a thread of Python's keeps the others waiting; with the usual 5 ms tracking, which
+"""Longest that one Python thread keeps the others waiting; with the usual 5 ms tracking, which
 gives way at every call of a kernel, would wait for mapping a dozen times a frame."""
 FINISHING_S = 300.0
-"""Asked of systemd when a dive ends: refining, evaluating, the report."""
+"""Time requested from systemd at the end of a dive: refining, evaluating, the report."""
 
 
 @dataclass(frozen=True)
 class Parts:
-    """What a live dive consists of, for those who look on."""
+    """The parts of a live dive, for the viewer and the report."""
 
     loop: LiveLoop
     slam: Slam
@@ -57,7 +57,7 @@ class Parts:
 
 
 class LiveDive:
-    """Made, then :meth:`run`, then :meth:`close`; a context manager does the last."""
+    """Construct, :meth:`run`, then :meth:`close`, which the context manager does."""
 
     def __init__(
         self,
@@ -67,11 +67,11 @@ class LiveDive:
         config: VehicleConfig,
         overwrite: bool = False,
     ) -> None:
-        """Make everything.
+        """Construct all parts.
 
         Raises:
             ConfigError: the checkpoint is of pictures of another size.
-            UnusableStateError: the checkpoint cannot be gone on from.
+            UnusableStateError: the dive cannot be resumed from the checkpoint.
             InputError: the folder cannot be used.
         """
         service = config.service
@@ -141,7 +141,7 @@ class LiveDive:
         with stop_on_signals(parts.loop.stopping):
             parts.loop.run()
         source_ended = not parts.loop.stopping.is_set()
-        parts.loop.stop("the recording ended" if source_ended else "told to stop")
+        parts.loop.stop("the recording ended" if source_ended else "stop requested")
         self._notifier.more_time(FINISHING_S)
         contain = parts.slam.failures.contain
         if not source_ended:
@@ -162,7 +162,7 @@ class LiveDive:
         return finished
 
     def close(self) -> None:
-        """Give everything back; an unfinished dive keeps what it can be resumed from."""
+        """Release everything; an unfinished dive keeps the files for a resumption."""
         keep = not self._finished
         for close in (
             self._watchdog.close,
@@ -176,7 +176,7 @@ class LiveDive:
                 close()
 
     def _remove_checkpoint(self) -> None:
-        """Where a recording came to its end, there is nothing to go on with."""
+        """A dive whose recording ended needs no checkpoint."""
         if self._finished:
             shutil.rmtree(self.folder.path / CHECKPOINT, ignore_errors=True)
 
@@ -188,7 +188,7 @@ class LiveDive:
 
 
 def _salvaged(choice: Choice, config: Config, feed: Feed) -> Salvaged | None:
-    """What there is to go on with, if the dive is gone on with."""
+    """The salvaged rows and losses if a dive is resumed, else None."""
     if choice.checkpoint is None:
         return None
     refuse_another_size(choice.folder, choice.checkpoint.facts["tracking"], config)
@@ -196,7 +196,7 @@ def _salvaged(choice: Choice, config: Config, feed: Feed) -> Salvaged | None:
 
 
 def plain(vehicle: VehicleConfig) -> Config:
-    """The settings of mapping alone, refining limited as the service says."""
+    """The settings of mapping alone, with the service's limit on refining."""
     settings = vehicle.model_dump(include=set(Config.model_fields))
     optimiser = settings["mapping"]["optimiser"]
     if optimiser["refine_seconds"] is None:

@@ -23,7 +23,7 @@ from aquaflow.viewer.snapshot import MapCopy, Pose, copied, shown
 log = logging.getLogger(__name__)
 
 LONGEST_PATH = 5000
-"""Poses of the trajectory that are shown at most: thinned beyond."""
+"""Most poses of the trajectory that are shown; a longer one is thinned."""
 LOOK_S = 0.1
 """Longest wait for a new pose; then the thread checks whether it shall end."""
 

@@ -34,11 +34,11 @@ LATE_MS = 150.0
 """A frame that took longer from its arrival on is late, and mapping gives way; at 10 frames/s one
 that found tracking idle is ready in 60 to 100 ms."""
 PATIENCE_S = 2.0
-"""So long may a camera be silent before it is said to be waited for."""
+"""Longest time without a frame before the state becomes WAITING."""
 LOST_AFTER = 3
-"""Frames in a row without a pose until tracking is said to be lost; one may be a flake of snow."""
+"""Frames in a row without a pose until the state is LOST; one may be a flake of marine snow."""
 MOST_FAILURES = 10
-"""Frames in a row that raise until the process gives up: it is not the pictures then."""
+"""Frames in a row that raise before the process exits: then the pictures are not the cause."""
 
 
 class LiveLoop:
@@ -77,7 +77,7 @@ class LiveLoop:
         self._failed_in_a_row = 0
 
     def run(self) -> None:
-        """The loop.
+        """Run the loop.
 
         Raises:
             AquaFlowError: the source failed, or frame after frame did.
@@ -149,7 +149,7 @@ class LiveLoop:
 
     @property
     def _past(self) -> Frame | None:
-        """A frame that waits for its pose until there is time."""
+        """An earlier frame that waits for its pose until there is time."""
         return self.run_.slam.tracker.past
 
     def _catch_up(self, past: Frame) -> None:
@@ -161,7 +161,7 @@ class LiveLoop:
         self.counters.classes.update(tracked.frame_class.value for tracked in decided)
 
     def _place(self, tracked: Tracked | None) -> None:
-        """Remember whether the newest frame has a pose; one that was skipped says nothing."""
+        """Record whether the newest frame has a pose; a skipped frame does not count."""
         if tracked is not None and tracked.T_wc is not None:
             self.latest = tracked.bare()
             self._ever_posed, self._unposed = True, 0

@@ -32,11 +32,11 @@ STAGE = "mapping"
 IDLE_S = 0.2
 """Period of the heartbeats of an idle thread."""
 STEPS_AT_ONCE = 4
-"""Of idle time: a new request waits for no more, about 0.1 s at 480 px."""
+"""Optimiser steps between two checks for a request in idle time: about 0.1 s at 480 px."""
 FEWER = 4
-"""At the level of fewer steps, one step of so many is done."""
+"""At the level FEWER_STEPS, one of this many steps is done."""
 LONGEST_REST_S = 1.0
-"""A fit of the water takes longer, and is rare."""
+"""Longest rest; a fit of the water works for longer, but is rare."""
 JOIN_S = 30.0
 """Longest wait for the thread at the end of a dive."""
 MAPPING_AT, KEYFRAME_AT = 3, 8
@@ -67,7 +67,8 @@ class MapThread:
         level: Callable[[], DegradationLevel] = lambda: DegradationLevel.FULL,
         rest: Callable[[float], object] | None = None,
     ) -> None:
-        """``rest`` for some seconds, from which ``refine`` and ``close`` wake the thread."""
+        """``rest``: sleeps for some seconds; by default ``refine`` and ``close`` wake the
+        thread."""
         self.left_out: Counter[str] = Counter()
         """Frames that the map never saw, by reason."""
         self.failures = 0
@@ -78,11 +79,11 @@ class MapThread:
         self.late = False
         """Set by tracking that is late: the thread then rests as long as it worked."""
         self.rests = 0
-        """Requests after which it did."""
+        """Requests after which the thread rested."""
         self._maps, self._config, self._heartbeats, self._level = maps, config, heartbeats, level
         self._jobs: deque[tuple[str, Job]] = deque()
         self._growing = 0
-        """Growths that wait."""
+        """Growth requests in the queue."""
         self._newest: int | None = None
         """The sub-map that grew last."""
         self._changed = threading.Condition()
@@ -147,7 +148,7 @@ class MapThread:
 
     @property
     def waiting(self) -> int:
-        """Requests that wait."""
+        """Requests in the queue."""
         return len(self._jobs)
 
     # --- the thread -----------------------------------------------------------------------------
@@ -186,17 +187,17 @@ class MapThread:
                 return
             began_s = time.monotonic()
             self._do(*job or ("optimise", self._optimise))
-            self._give_way(time.monotonic() - began_s)
+            self._rest_if_late(time.monotonic() - began_s)
 
-    def _give_way(self, worked_s: float) -> None:
-        """With few cores, mapping takes from tracking what tracking needs to keep up: Python's
+    def _rest_if_late(self, worked_s: float) -> None:
+        """Rest while tracking is late. With few cores, mapping competes with tracking for Python's
         lock, the memory, and on a busy machine the core itself."""
         if self.late and not self._ending.is_set():
             self.rests += 1
             self._rest(min(worked_s, LONGEST_REST_S))
 
     def _next(self) -> tuple[str, Job] | None:
-        """The next request; none if there is something better to do than to wait for it."""
+        """The next request; None at once if a map can be optimised meanwhile."""
         with self._changed:
             idle = self.failing or not self._wanting()
             if not self._jobs and not self._ending.is_set() and idle:
@@ -215,7 +216,7 @@ class MapThread:
             self.failures, self.failing = self.failures + 1, True
 
     def _wanting(self) -> Mapper | None:
-        """The map that is to have steps in idle time."""
+        """The map to optimise in idle time, if it still needs steps."""
         if self._newest is None or self._level() is not DegradationLevel.FULL:
             return None
         mapper = self._maps.mappers.get(self._newest)

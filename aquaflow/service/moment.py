@@ -1,4 +1,4 @@
-"""The dive's clock over a restart: CLOCK_MONOTONIC begins anew with every boot."""
+"""The dive's clock across a restart: CLOCK_MONOTONIC restarts with every boot."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 """Changes with every start of the kernel, and with it the zero of the monotonic clock."""
 LEAST_GAP_NS = 1_000_000_000
-"""From the last moment before another boot to the first after it, if the wall clock says less."""
+"""From the last moment before another boot to the first after it, if the wall clock gives less."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Moment:
         return Moment(time.monotonic_ns(), time.time_ns(), boot)
 
     def shift_ns(self, now: Moment) -> int:
-        """What to add to ``now``'s monotonic clock so that the dive's clock goes on from here.
+        """What to add to ``now``'s monotonic clock so that the dive's clock continues from here.
 
         Nothing after a restart of the process. After one of the machine, what the wall clock says
         has passed; if that was set back meanwhile, a second.

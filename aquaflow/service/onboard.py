@@ -1,4 +1,4 @@
-"""``aquaflow run``: a live dive with everything around it."""
+"""``aquaflow run``: a live dive with its viewer, health server and vehicle messages."""
 
 from __future__ import annotations
 

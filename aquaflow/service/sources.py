@@ -46,7 +46,7 @@ def recording(
     speed: float = 1.0,
     calibration: CameraModel | None = None,
 ) -> PlaybackFeed:
-    """What lies at ``path``, as if it happened now, ``speed`` times as fast.
+    """The recording at ``path``, played back in real time, ``speed`` times as fast.
 
     Raises:
         InputError: nothing is there, or no installed source reads it.

@@ -206,7 +206,7 @@ class Spill(Generic[T]):
         except OSError as error:
             self._full = True
             log.warning(
-                "cannot write to %s (%s): what is new stays in memory, which a long dive may fill; "
+                "cannot write to %s (%s): new items stay in memory, which a long dive may fill; "
                 "give it a folder with room",
                 folder,
                 error.strerror or error,

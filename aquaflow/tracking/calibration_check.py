@@ -1,7 +1,7 @@
 """Does the calibration fit the dive? Focal length and first radial distortion, from matches alone.
 
 Keypoint matches between neighbouring keyframes go through a bundle adjustment that also solves for
-the error of the lens. Nothing is said unless the error found is larger than a good calibration's
+the error of the lens. A warning is given only if the error is larger than a good calibration's
 own, beyond chance, and the same whether or not the lens may have further terms.
 """
 
@@ -21,9 +21,9 @@ from aquaflow.tracking.lens_equations import Array, Observations
 from aquaflow.tracking.loops.keypoints import match_keypoints
 
 MAX_VIEWS = 8
-"""Keyframes looked at: with the pairs below, ten pairs."""
+"""Keyframes used: with the pairs below, ten pairs."""
 MIN_VIEWS = 4
-"""With fewer, the scatter between the views says nothing."""
+"""With fewer, the scatter between the views is no estimate."""
 MATCHES_PER_PAIR = 200
 """At most; of more, an even choice: matches of one pair of views share errors."""
 MIN_MATCHES = 300
@@ -31,7 +31,7 @@ MIN_MATCHES = 300
 TOLERANCE = np.array([0.02, 0.02])
 """Error of log focal length and k1 that a good calibration in water may have."""
 SIGNIFICANCE = 1e-3
-"""Chance that a good calibration is called wrong."""
+"""Probability that a good calibration is reported as wrong."""
 KNOWN_SIGMA = np.array([0.03, 0.03])
 """Above, log focal length or k1 is not determined by the dive."""
 NAMED_SIGMAS = 3.0

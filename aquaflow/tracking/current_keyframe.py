@@ -29,11 +29,11 @@ from aquaflow.tracking.pose.visibility import agreeing, predicted_matches
 
 @dataclass
 class Attachment:
-    """A keyframe in use, and how the last frame was seen from it."""
+    """The current keyframe and the last frame's pose against it."""
 
     keyframe: Keyframe
     image: npt.NDArray[np.uint8] | None = None
-    """Its picture, as long as it may be encoded again."""
+    """Its picture, while it may still be encoded again."""
     T_fk: Sim3 = field(default_factory=Sim3.identity)
     motion: Sim3 = field(default_factory=Sim3.identity)
     """From the frame before to the last one."""
@@ -52,7 +52,7 @@ class Attachment:
         T_fk: Sim3,
         matches: Float,  # [H, W, 2] px
     ) -> None:
-        """A frame was placed."""
+        """Update after a frame got its pose."""
         self.motion = T_fk @ self.T_fk.inverse()
         self.T_fk, self.matches = T_fk, matches
 
@@ -83,7 +83,7 @@ class Follower:
         camera: CameraModel,
         pair: PairGeometry | None = None,
     ) -> Matched | None:
-        """The frame's pose at the keyframe in use; None where too little speaks for any."""
+        """The frame's pose against the current keyframe; None where too few matches support one."""
         predicted, seed = at.motion @ at.T_fk, None
         if pair is None:
             seed = at.matches if self._config.seed_matching else None
@@ -101,7 +101,7 @@ class Follower:
         return self._prior.encode(at.image, at.keyframe.pointmap.camera)
 
     def take(self, at: Attachment, solved: Matched, camera: CameraModel) -> None:
-        """What the frame says about the next one's place, and about the keyframe's depths."""
+        """Update the motion prediction and the keyframe's depths from the frame."""
         T_fk, pointmap = solved.estimate.T, at.keyframe.pointmap
         at.moved_to(T_fk, solved.pair.matches)
         if self.hidden(solved):  # flakes have matches, too; the scene is where the pose puts it
@@ -110,7 +110,7 @@ class Follower:
         fuse(pointmap, solved.pair, T_fk, camera, self._config.sigma_px)
 
     def hidden(self, solved: Matched) -> bool:
-        """True where something in front of the scene took the matches."""
+        """True if something in front of the scene hides the matches."""
         return solved.visibility.seen < self._config.min_seen
 
     def classify(self, at: Attachment, solved: Matched, camera: CameraModel) -> FrameClass:
@@ -140,7 +140,7 @@ class Follower:
     def without_hidden(
         self, frame: Frame, at: Attachment, solved: Matched, camera: CameraModel
     ) -> Frame:
-        """The map learns from the pixels that show what the keyframe shows."""
+        """The frame with its mask limited to pixels that the keyframe shows too."""
         shown = self.shown(at, solved, camera)
         return replace(frame, mask=shown if frame.mask is None else shown & frame.mask)
 
@@ -160,13 +160,13 @@ class Follower:
     # --- keyframes left behind ----------------------------------------------------------------
 
     def leave(self, at: Attachment) -> None:
-        """From here on this keyframe may be taken up again."""
+        """Register the keyframe, so that tracking may return to it."""
         self._neighbours.add(at.keyframe)
 
     def earlier(
         self, at: Attachment, encoding: Encoding, camera: CameraModel
     ) -> tuple[Attachment, Matched] | None:
-        """A keyframe that was left and shows the last frame well; it is held from here on.
+        """An earlier keyframe that shows the last frame well, to be held in memory from now on.
 
         Only one that agrees with the keyframe in use about where the frame is: of a place that the
         graph does not know to be the same, a new keyframe closes the loop.

@@ -20,7 +20,7 @@ CLASSES = list(FrameClass)
 NONE = -1
 """The keyframe of a frame that has no pose."""
 CHUNK = 1024
-"""Rows that are made room for at once."""
+"""Rows allocated at once."""
 
 FRAME = np.dtype(
     [
@@ -46,7 +46,7 @@ class FrameTable:
         rows: Array,  # [N] FRAME
         camera: CameraModel,
     ) -> FrameTable:
-        """The table that :meth:`rows` was asked of; ``camera`` took the frames."""
+        """The table whose :meth:`rows` are given; ``camera`` took the frames."""
         table = FrameTable()
         table._chunks = [np.zeros(CHUNK, FRAME) for _ in range(-(-len(rows) // CHUNK))]
         for i, chunk in enumerate(table._chunks):

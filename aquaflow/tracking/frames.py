@@ -1,4 +1,4 @@
-"""What tracking says about a frame: its class, its pose, and how well that is known."""
+"""Tracking's result for a frame: its class, its pose, and the pose's quality."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Quality:
 
 @dataclass(frozen=True)
 class Link:
-    """How a new keyframe hangs on the one that it was tracked against."""
+    """Relative-pose edge from a new keyframe to its parent."""
 
     keyframe: int
     """Number of the earlier keyframe."""
@@ -54,7 +54,7 @@ class Tracked:
     frame_class: FrameClass
     sub_map: int
     keyframe: int | None = None
-    """Number of the keyframe that the pose hangs on."""
+    """Number of the keyframe that the pose is relative to."""
     T_wc: Sim3 | None = None
     quality: Quality = Quality()
     pointmap: Pointmap | None = None

@@ -49,7 +49,7 @@ class MapStart:
         failures: Failures,
         live: bool,
     ) -> None:
-        """A ``live`` run goes on from the newest frame: the others wait for idle time."""
+        """A ``live`` run continues from the newest frame: the others wait for idle time."""
         self._prior, self._config = prior, config
         self._waiting, self._failures, self._live = waiting, failures, live
         self._initialiser: Initialiser | None = None

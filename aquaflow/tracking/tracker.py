@@ -79,7 +79,7 @@ class Tracker:
         return self._waiting.count(Wait.LOST) > 0
 
     def resume(self, camera: CameraModel, focal_sigma: float, sub_maps: int, T_wc: Sim3) -> None:
-        """Go on with keyframes of an earlier run: look for a known place, and until one is found
+        """Continue with keyframes of an earlier run: relocalise, and until a known place is found
         grow a new sub-map from ``T_wc``, the last pose."""
         self.camera, self.focal_sigma = camera, focal_sigma
         self.sub_map, self.sub_maps = sub_maps, sub_maps + 1

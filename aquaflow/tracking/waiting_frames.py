@@ -29,7 +29,7 @@ class Wait(Enum):
     INITIALISING = "initialising"
     """Enough parallax to initialisation's reference, or it is that reference."""
     IN_IDLE_TIME = "in idle time"
-    """A moment in which a live run has no newer frame: its keyframe is there."""
+    """Idle time of a live run; its keyframe exists."""
 
 
 class Bound(NamedTuple):

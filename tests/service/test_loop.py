@@ -148,7 +148,7 @@ def test_a_missing_picture_is_a_row_and_no_silence(told: Told) -> None:
 
 def test_after_the_end_there_is_no_other_state(told: Told) -> None:
     told.frames("pp")
-    told.loop.stop("told to stop")
+    told.loop.stop("stop requested")
     told.loop.take(frame_of(9))
     assert told.loop.health.state is State.STOPPING
 

@@ -12,7 +12,7 @@ def is_whole(
     groups: VoxelGroups,
     count: int,  # N Gaussians in the map
 ) -> bool:
-    """True if every Gaussian has one place in one group, and all tables say the same."""
+    """True if every Gaussian has one place in one group, and all tables agree."""
     group, slot, table = groups.group, groups.slot, groups.table
     if len(group) != count or len(slot) != count:
         return False

@@ -15,7 +15,7 @@ def sampled_views(
     newest_share: float,
     generator: torch.Generator,
 ) -> list[View]:
-    """One view a step while the dive goes on: the newest now and then, else any."""
+    """One view for each step during the dive: sometimes the newest, else a random one."""
     chosen = []
     for _ in range(steps if views else 0):
         newest = torch.rand((), generator=generator) < newest_share

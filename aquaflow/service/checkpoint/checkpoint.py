@@ -1,4 +1,4 @@
-"""Checkpoints: what a kill or a power cut leaves, and how the next start goes on from there.
+"""Checkpoints: the state that survives a kill or a power cut, from which the next start resumes.
 
 A checkpoint's size is that of the map and a row for every frame; the last two are kept (see
 generations.py). Pictures and depths lie in ``work/``, one file for each keyframe and view, and are
@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 
 
 class UnusableStateError(InputError):
-    """A checkpoint that was read, and that this program cannot go on from."""
+    """A readable checkpoint that this program cannot resume from."""
 
 
 class Checkpointer:
@@ -57,7 +57,7 @@ class Checkpointer:
         self.failures = 0
         self.size_bytes = 0
         self.wrote_s = 0.0
-        """How long the last writing took."""
+        """Duration of the last write."""
         self._dive, self._run, self._slam, self._maps = dive, run, slam, maps
         self._every_s, self._clocks, self._now_s = every_s, clocks, now_s
         self._due_s = now_s() + every_s
@@ -71,7 +71,8 @@ class Checkpointer:
         self.take()
 
     def take(self) -> None:
-        """Take one now; what the map still waits for, but corrections, is not in it."""
+        """Take a checkpoint now; requests that wait in the mapping thread are not in it, except
+        corrections."""
         with self._run.profiler.stage("checkpoint"):
             parts = tracking.serialise(self._slam, self._run)
             if parts is None:
@@ -117,13 +118,13 @@ class Checkpointer:
             self._writing = False
 
     def _failed(self, error: Exception) -> None:
-        """The checkpoint before stays, and can be resumed from."""
+        """Count a failed write; the previous checkpoint stays usable."""
         self.failures += 1
         log.warning("no checkpoint: %s", error)
 
 
 def restore(checkpoint: Checkpoint, slam: Slam, run: DiveRun, maps: Maps) -> None:
-    """Let fresh ``slam``, ``run`` and ``maps`` go on from ``checkpoint``.
+    """Restore new ``slam``, ``run`` and ``maps`` from ``checkpoint``.
 
     Raises:
         ConfigError: the config asks for pictures of another size.

@@ -23,20 +23,20 @@ from aquaflow.storage.facts_file import UNREADABLE, read_facts_file, write_facts
 STATE, PREVIOUS = "state.npz", "previous.npz"
 """The newest checkpoint, and the one before it."""
 FORMAT = 3
-"""Of the checkpoint; raised whenever an older one can no longer be resumed from."""
+"""Version of the checkpoint; raised when older checkpoints can no longer be resumed."""
 
 
 class OtherFormatError(InputError):
-    """A checkpoint of another version of AquaFlow: not damaged, and of no use to this one."""
+    """A checkpoint of another version of AquaFlow: not damaged, but not usable."""
 
 
 def state_file(dive: Path) -> Path:
-    """Where a dive's newest checkpoint lies."""
+    """Path of a dive's newest checkpoint."""
     return dive / CHECKPOINT / STATE
 
 
 def previous_file(dive: Path) -> Path:
-    """Where the one before lies."""
+    """Path of the checkpoint before."""
     return dive / CHECKPOINT / PREVIOUS
 
 
@@ -60,18 +60,18 @@ class Checkpoint:
 
     @property
     def clocks(self) -> dict[str, Learned]:
-        """What was known of the devices' clocks."""
+        """Learned clock mappings of the devices."""
         known: dict[str, Learned] = self.facts["clocks"]
         return known
 
     @property
     def frames(self) -> set[int]:
-        """Indices of the frames that it knows."""
+        """Indices of its finished frames."""
         return {int(index) for index in self.arrays["tracking.frames"]["index"]}
 
     @property
     def keyframes(self) -> int:
-        """How many keyframes it knows."""
+        """Number of its keyframes."""
         return len(self.arrays["tracking.keyframes"])
 
 
@@ -80,7 +80,7 @@ def write_state(
     facts: dict[str, Any],
     arrays: Arrays,  # by name, of any shape
 ) -> None:
-    """Let this be the newest checkpoint of ``dive``, and the newest one that before it.
+    """Write the newest checkpoint of ``dive``; the newest so far becomes the previous one.
 
     Raises:
         InputError, OSError: it cannot be written; those that there are stay.
@@ -143,7 +143,7 @@ UNEXPECTED = (NotImplementedError, RuntimeError, MemoryError, OverflowError, Att
 
 
 def bring_to_disk(paths: Iterable[Path]) -> None:
-    """What a power cut must not take (fsync); a file that is gone by now is none of it."""
+    """fsync files that must survive a power cut; missing files are ignored."""
     for path in paths:
         try:
             descriptor = os.open(path, os.O_RDONLY)

@@ -1,4 +1,4 @@
-"""The maps of a dive taken apart for a checkpoint, and put together again with their pictures."""
+"""Serialisation of a dive's maps for a checkpoint; restoring them with their pictures."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def deserialise(
     facts: dict[str, Any],
     arrays: Arrays,  # as from serialise
 ) -> None:
-    """Let fresh ``maps`` go on where those that were taken apart stood.
+    """Restore new ``maps`` to the state of the serialised ones.
 
     A view whose file was lost is left out; the Gaussians that it brought stay.
 
@@ -52,7 +52,7 @@ def deserialise(
 
 
 def serialise_corrections(lacking: Sequence[MapCorrection]) -> tuple[list[dict[str, Any]], Arrays]:
-    """Corrections that the maps have not followed yet: facts for JSON, and arrays."""
+    """Corrections that the maps do not contain yet: facts for JSON, and arrays."""
     facts: list[dict[str, Any]] = []
     arrays: Arrays = {}
     for i, correction in enumerate(lacking):
@@ -68,7 +68,7 @@ def catch_up(
     lacking: list[dict[str, Any]],
     arrays: Arrays,  # as from serialise_corrections
 ) -> None:
-    """Let the maps follow the corrections of :func:`serialise_corrections`."""
+    """Apply the corrections of :func:`serialise_corrections` to the maps."""
     for i, facts in enumerate(lacking):
         numbers, moves = arrays[f"lacking{i}.keyframes"], arrays[f"lacking{i}.moves"]
         by_keyframe = {int(n): to_sim3(row) for n, row in zip(numbers, moves, strict=True)}

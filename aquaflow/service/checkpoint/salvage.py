@@ -1,8 +1,7 @@
-"""What is left of a dive that is to be gone on with: damaged files are set aside, each costs
-itself, and what was lost is said.
+"""Salvage of a dive before it is resumed: damaged files are set aside, losses are reported.
 
-Every file of ``work/`` proves by its own checksum that it is whole. A keyframe without its file
-keeps its pose, and so do the frames that hang on it; a view without its file leaves the map.
+Every file of ``work/`` has a checksum of its own. A keyframe without its file
+keeps its pose, and so do the frames relative to it; a view without its file leaves the map.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ MOST_NAMED = 5
 
 @dataclass(frozen=True)
 class Salvaged:
-    """What there is to go on with."""
+    """The rows that a resumed dive continues, and what was lost."""
 
     rows: list[FrameRow]
     losses: list[str]
@@ -42,7 +41,7 @@ class Salvaged:
 
 
 def salvaged(checkpoint: Checkpoint, dive: Path, name_of: Callable[[int], str]) -> Salvaged:
-    """Make ``dive`` ready to be gone on with from ``checkpoint``; ``name_of`` a frame's index.
+    """Prepare ``dive`` for resuming from ``checkpoint``; ``name_of`` gives a frame index's name.
 
     Raises:
         InputError: a damaged file cannot be set aside.
@@ -52,7 +51,7 @@ def salvaged(checkpoint: Checkpoint, dive: Path, name_of: Callable[[int], str]) 
     older = checkpoint.file != state_file(dive)
     if older or not rows.whole:
         for name in (MARKER, "trajectory.tum"):
-            aside.copy(dive / name, "as it was before the dive was gone on with")
+            aside.copy(dive / name, "as it was before the dive was resumed")
     if older:
         losses.append(_newest_set_aside(dive, aside))
     elif previous_file(dive).is_file() and not _is_whole(previous_file(dive)):
@@ -66,8 +65,8 @@ def salvaged(checkpoint: Checkpoint, dive: Path, name_of: Callable[[int], str]) 
 
 
 def lost_with_their_files(checkpoint: Checkpoint, slam: Slam, maps: Maps) -> list[str]:
-    """A sentence for each kind of things whose files were missed when ``slam`` and ``maps`` were
-    put together again."""
+    """A sentence for keyframes, and one for views, whose files were missing when ``slam`` and
+    ``maps`` were restored."""
     said = []
     keyframes = lost_since(slam, checkpoint.facts["tracking"])
     if keyframes:
@@ -88,14 +87,14 @@ def _newest_set_aside(dive: Path, aside: SetAside) -> str:
     if state_file(dive).is_file():
         aside.move(state_file(dive), "it is damaged, or another version's")
     return (
-        "the newest checkpoint was damaged or gone: the dive went on from the one before, and "
+        "the newest checkpoint was damaged or gone: the dive was resumed from the one before, and "
         "frames that came between the two have no pose"
     )
 
 
 def _look_at(path: Path, keyframes: int | None, aside: SetAside) -> None:
-    """Set a file of ``work/`` aside if it is damaged, or would be written over: with an older
-    checkpoint, the keyframes that it does not know."""
+    """Set a file of ``work/`` aside if it is damaged, or would be overwritten: with an older
+    checkpoint, the keyframes that it does not contain."""
     try:
         read_item(path)
     except InputError:

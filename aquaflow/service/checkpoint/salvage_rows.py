@@ -19,7 +19,7 @@ class SalvagedRows:
 
     rows: list[FrameRow]
     unreadable: int = 0
-    """Lines that said nothing, or nothing that can be true."""
+    """Lines that cannot be parsed or hold impossible values."""
     rebuilt: int = 0
     """Rows that were made from the checkpoint."""
 

@@ -1,5 +1,4 @@
-"""Where damaged files of a dive go: nothing is deleted, and what is written anew is not mixed up
-with it.
+"""Sets damaged files of a dive aside: nothing is deleted or mixed with newly written files.
 
 ``set-aside-1/``, ``set-aside-2/``, ... in the dive's folder, one for each start that found damage,
 hold the files under the names that they had in the dive; ``why.txt`` says what is wrong with each.
@@ -13,18 +12,18 @@ from pathlib import Path
 from aquaflow.errors import InputError
 
 WHY = "why.txt"
-"""The file that says why a folder was set aside."""
+"""The file with the reason for each file set aside."""
 
 
 class SetAside:
-    """Makes its folder when the first file comes."""
+    """Makes its folder with the first file."""
 
     def __init__(self, dive: Path) -> None:
         self._dive = dive
         self._folder: Path | None = None
 
     def move(self, path: Path, why: str) -> None:
-        """Take a file of the dive away.
+        """Move a file out of the dive.
 
         Raises:
             InputError: it cannot be moved.

@@ -103,7 +103,7 @@ def lost_since(slam: Slam, facts: dict[str, Any]) -> set[int]:
 
 
 def refuse_another_size(dive: Path, facts: dict[str, Any], config: Config) -> None:
-    """Poses and maps are in pixels of one size.
+    """Check the picture size: poses and maps are in pixels of one size.
 
     Raises:
         ConfigError: ``config`` asks for pictures of another width, or cropped in another way.
@@ -113,11 +113,11 @@ def refuse_another_size(dive: Path, facts: dict[str, Any], config: Config) -> No
         if asked[name] != before:
             was, now = (value or "the default" for value in (before, asked[name]))
             raise ConfigError(
-                f"{dive} was begun with source.{name} {was} and cannot be gone on with at {now}; "
-                f"give the same {name}, or begin another dive"
+                f"{dive} was begun with source.{name} {was} and cannot be resumed with {now}; "
+                f"give the same {name}, or start another dive"
             )
 
 
 def _asked(config: Config) -> dict[str, Any]:
-    """What decides the size of the mapped pictures."""
+    """The settings that determine the size of the mapped pictures."""
     return {"width": config.source.width, "crop": config.source.crop}

@@ -19,7 +19,7 @@ from aquaflow.service.health.prometheus import TYPE, exposition
 log = logging.getLogger(__name__)
 
 PATIENCE_S = 10.0
-"""A client that sends or takes nothing for so long is let go."""
+"""A client that sends or takes nothing for so long is disconnected."""
 MOST_CLIENTS = 16
 """Requests at a time; more are turned away, so that threads stay bounded."""
 

@@ -99,7 +99,7 @@ def _degrees(zone: Path) -> float | None:
 
 
 def _inactive_file(stat: str) -> int:
-    """Bytes of the page cache that the kernel takes back first."""
+    """Bytes of the page cache that the kernel reclaims first."""
     for line in stat.splitlines():
         name, _, value = line.partition(" ")
         if name == "inactive_file":

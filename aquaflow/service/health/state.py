@@ -1,4 +1,4 @@
-"""How the service is: one state with its reason, every change of it with a reason too."""
+"""Health of the service: one state with its reason, and the list of its changes."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Health:
         self.since_s = now_s()
 
     def set(self, state: State, reason: str) -> bool:
-        """Be in ``state``; True if it was another before. A new reason alone is no change."""
+        """Set the state; True if it changed. A new reason alone is no change."""
         if self.state is State.STOPPING:  # nothing comes after the end
             return False
         before, self.reason = self.state, reason
@@ -77,11 +77,11 @@ class Facts:
     frame_age_s: float
     """Since the last frame, or since the start."""
     patience_s: float
-    """So long may a camera be silent."""
+    """Longest time without a frame before the state is WAITING."""
     pictured: bool
     """A frame came since the start."""
     camera: str
-    """What the driver says of a camera that is silent."""
+    """The driver's reason why the camera sends nothing."""
     posed: bool
     """The newest frame has a pose."""
     ever_posed: bool

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 
 
 class Notifier:
-    """Speaks to the socket in NOTIFY_SOCKET; silent where there is none."""
+    """Writes to the socket in NOTIFY_SOCKET; does nothing where there is none."""
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         self._address = environment.get("NOTIFY_SOCKET", "")
@@ -26,7 +26,7 @@ class Notifier:
         self._ready = False
 
     def ready(self) -> None:
-        """The service does what it is there for; said once."""
+        """The service works; sent once."""
         if not self._ready:
             self._ready = True
             self._send("READY=1")
@@ -49,7 +49,7 @@ class Notifier:
             self._send("WATCHDOG=1")
 
     def more_time(self, seconds: float) -> None:
-        """Starting or stopping takes so much longer."""
+        """Request more time for starting or stopping."""
         self._send(f"EXTEND_TIMEOUT_USEC={round(seconds * 1e6)}")
 
     def close(self) -> None:

@@ -52,7 +52,7 @@ class MetricScale:
 
 
 def metric_scale(slam: Slam) -> MetricScale | None:
-    """What is known of the map's scale; None while it is arbitrary."""
+    """The map's metric scale; None while it is arbitrary."""
     return MetricScale(1.0, "prior", PRIOR_SIGMA) if slam.prior.metric else None
 
 

@@ -93,7 +93,7 @@ class BackFill:
 
 
 class BackFills:
-    """Places frames that waited for a keyframe: at once or, in a live run, in its idle time."""
+    """Poses of frames that waited for a keyframe: at once or, in a live run, in its idle time."""
 
     def __init__(
         self,

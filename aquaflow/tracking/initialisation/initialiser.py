@@ -82,7 +82,7 @@ class Initialiser:
         return True
 
     def thin(self) -> list[Frame]:
-        """Go on without the frame that adds least parallax, if there are more than are kept; that
+        """Remove the frame that adds least parallax, if there are more than are kept; that
         frame, whose pose can be filled in later."""
         if len(self.waiting) <= self._config.max_waiting:
             return []

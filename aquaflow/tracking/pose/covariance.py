@@ -1,4 +1,4 @@
-"""How well a solved pose is known: covariance and degeneracy out of its normal equations.
+"""Uncertainty of a solved pose: covariance and degeneracy from its normal equations.
 
 Translation is counted in median depths here, so that it and rotation are both angles.
 """
@@ -17,7 +17,7 @@ Array = npt.NDArray[np.float64]
 Direction = Literal["translation", "rotation", "scale"]
 
 UNKNOWN_SIGMA = 1e3
-"""Standard deviation, in median depths or radians, of a direction that nothing was said about."""
+"""Standard deviation, in median depths or radians, of a direction without information."""
 ROUNDING = 1e-13
 """Share of the largest eigenvalue below which another is float64 noise, not information."""
 CELLS_ACROSS = 8
@@ -62,7 +62,8 @@ def certainty(
     than independent matches of the stated noise would make them: neighbouring matches err
     together, and five thousand of them are worth as few as the measured variance says
     (cluster-robust variance: Liang and Zeger, Biometrika 1986; as one factor for all directions,
-    because a few dozen cells do not say more). It never shrinks below what the noise allows.
+    because a few dozen cells give no better estimate). It never shrinks below what the noise
+    allows.
     """
     unit = np.ones(len(H))
     unit[:3] = depth

@@ -33,7 +33,8 @@ TRANSFER_INFLATION = 1.5
 MIN_KNOWN_NEIGHBOURS = 0.25
 """Bilinear weight of the known pixels from which a depth between pixels is known too."""
 FORGETTING_VARIANCE_SIGMAS = 0.5
-"""A depth whose relative sigma grew past this by disagreement is replaced by the newcomer."""
+"""A depth whose relative sigma grew past this by disagreement is replaced by the new
+measurement."""
 
 
 def fuse(

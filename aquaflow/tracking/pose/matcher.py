@@ -36,7 +36,7 @@ class Matched:
 
     @property
     def quality(self) -> Quality:
-        """How well the pose is known."""
+        """Quality of the pose."""
         estimate = self.estimate
         return Quality(
             estimate.inlier_share, estimate.residual_px, self.share, estimate.conditioning
@@ -58,7 +58,7 @@ class KeyframeMatcher:
         fallback: Sim3,
     ) -> Matched | None:
         """The pose from ``predicted``; from the matches alone, or from ``fallback``, where that
-        fails; None where too little speaks for any."""
+        fails; None where too few matches support one."""
         config = self._config
         known = keyframe.pointmap.known(config.known_sigma)
         problem, pixels_k = self._problem(keyframe, pair, camera, known)
@@ -102,7 +102,7 @@ class KeyframeMatcher:
 
 
 def matched_share(encoding: Encoding, pair: PairGeometry) -> float:
-    """min(valid matches, distinct matched pixels) over the pixels looked at (docs/paper.md)."""
+    """min(valid matches, distinct matched pixels) over the sampled pixels (docs/paper.md)."""
     looked_at = encoding.interesting
     matched = looked_at & pair.valid
     targets = np.floor(pair.matches[matched]).astype(np.int64)

@@ -9,7 +9,7 @@ from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.tracking.pose.solver import PoseProblem
 
 RANSAC_ITERATIONS = 200
-"""Samples that are tried at most."""
+"""Most samples that are tried."""
 RANSAC_PX = 3.0
 """Reprojection error up to which a match agrees with a pose."""
 MIN_INLIERS = 30

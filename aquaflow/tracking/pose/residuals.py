@@ -20,11 +20,11 @@ from aquaflow.geometry.similarity import Sim3
 Array = npt.NDArray[np.float64]
 
 BEHIND = 10.0
-"""Whitened residual of a point behind the camera: a bad match, with no way to go."""
+"""Whitened residual of a point behind the camera: a bad match, without a gradient."""
 MIN_DEPTH_SHARE = 1e-3
 """Of the median depth; a nearer point counts as behind the camera."""
 MIN_SIGMA = 1e-6
-"""Relative; no range of a frame is known better than float32 can say it."""
+"""Relative; no range of a frame is more precise than float32."""
 MAX_DEPTH_CHANGE = 0.5
 """Relative; further from the measured inverse depth the projection is no longer linear in it."""
 INLIER = 3.0

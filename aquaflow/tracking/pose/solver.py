@@ -28,26 +28,26 @@ MAX_ITERATIONS = 15
 """Limit of Levenberg-Marquardt for one pose."""
 STOP_SIGMAS = 0.1
 """A step of this many of the pose's own standard deviations is the last. Steps shrink at least
-threefold, also with a third of outliers: what is left is a twentieth of the noise."""
+threefold, also with a third of outliers: the remaining error is a twentieth of the noise."""
 SLACK = 1e-2
 """Relative growth of the cost that refuses no step. The whitening depends on the pose, and outliers
 gain from a pose that is less certain; the scores leave that out, so near the solution the cost
 does not follow them."""
 FIRST_DAMPING = 1e-6
-"""Damping to begin with, relative to the diagonal."""
+"""Initial damping, relative to the diagonal."""
 MAX_DAMPING = 1e6
-"""At which no step helps any more."""
+"""Damping at which the solver stops: no step reduces the cost."""
 
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """The pose that minimises the whitened Huber loss, and how well it is known."""
+    """The pose that minimises the whitened Huber loss, and its covariance."""
 
     T: Sim3
     """T_fk: keyframe to frame."""
     covariance: Array
     """[6, 6] of the left tangent [translation, rotation]; [7, 7] with log-scale if that is free.
-    Huge, never singular, along a direction that the matches say nothing about."""
+    Huge, never singular, along a direction without information from the matches."""
     inlier_share: float
     residual_px: float
     """Median reprojection error."""

@@ -25,7 +25,7 @@ pictures 20 degrees apart still match 98 % of what both show."""
 MAX_ZOOM = 1.5
 """Ratio of two ranges of a point beyond which it need not look the same."""
 POINTS = 4000
-"""Points looked at: 1 % of a share is known to better than a tenth of it."""
+"""Points sampled: a share of 1 % is known to better than a tenth of it."""
 AGREEMENT_WIDTHS = 3.0 / 480.0
 """Distance between a match and where the pose puts it, over width, up to which they agree; six
 sigmas of a checked DIS match at 480 px."""
@@ -39,7 +39,7 @@ class Visibility:
     """Share of the keyframe's known points that the frame should show, by the pose alone."""
     seen: float
     """Of these, the share that was matched, and to where the pose puts it: what is missing is
-    hidden. Large flakes take matches away, small ones lead them astray."""
+    hidden. Large flakes remove matches, small ones displace them."""
 
 
 def expected(

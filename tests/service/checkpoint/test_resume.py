@@ -113,19 +113,19 @@ def test_a_damaged_checkpoint_is_left_alone_and_the_next_dive_is_beside(
     assert choice.folder != tmp_path / "old"
 
 
-@pytest.mark.parametrize("told", ["the recording ended", "told to stop"])
+@pytest.mark.parametrize("told", ["the recording ended", "stop requested"])
 def test_only_a_dive_that_was_told_to_stop_can_be_resumed(tmp_path: Path, told: str) -> None:
     feed = ToldFeed()
     dive = LiveDive("dive", resumed(tmp_path / "dive", new=False), feed, VEHICLE)
     for name in ("work", "checkpoint"):
         (tmp_path / "dive" / name).mkdir()
-    if told == "told to stop":
+    if told == "stop requested":
         dive.parts.loop.stopping.set()
     feed.newest.end()
     with dive:
         assert dive.run() is None  # not one frame: nothing was mapped
     assert dive.parts.loop.health.reason == told
-    assert (tmp_path / "dive" / "checkpoint").exists() == (told == "told to stop")
+    assert (tmp_path / "dive" / "checkpoint").exists() == (told == "stop requested")
 
 
 def test_a_vehicle_whose_checkpoint_fits_nothing_begins_a_new_dive(tmp_path: Path) -> None:
