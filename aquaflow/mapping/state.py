@@ -1,4 +1,4 @@
-"""A map taken apart into facts and arrays, and put together again: it renders bit for bit the same.
+"""Serialisation of a map into facts and arrays; a restored map renders bit for bit the same.
 
 What there is to see: Gaussians and whose they are, water, shading, exposures and light, the
 decoder with its features and groups, and the posed cameras. With the optimiser's part, the map goes
@@ -67,7 +67,7 @@ def serialise(mapper: Mapper, optimiser: bool = False) -> tuple[Facts, Arrays]:
 
 
 def deserialise(facts: Facts, arrays: Mapping[str, Any], renderer: Renderer) -> Mapper:
-    """The map that was taken apart; its views have poses, exposures and light, but no pixels.
+    """The serialised map; its views have poses, exposures and light, but no pixels.
 
     Raises:
         KeyError, ValueError, TypeError, RuntimeError, AquaFlowError: these are no map's.

@@ -18,13 +18,13 @@ from aquaflow.storage.array_file import Arrays
 from aquaflow.storage.spill import Spill
 
 RESIDENT_VIEWS = 128
-"""Views in memory while the others wait in files; at most 1.4 MB each at 480 x 270 px. Any view may
+"""Views in memory while the others are in files; at most 1.4 MB each at 480 x 270 px. Any view may
 be the next to be optimised against, so that more of them save few reads."""
 
 
 @dataclass(frozen=True)
 class Pixels:
-    """What a view keeps of every pixel."""
+    """The per-pixel data of a view."""
 
     image: npt.NDArray[np.uint8]
     """[H, W, 3] RGB."""
@@ -37,7 +37,7 @@ class Pixels:
 
 
 class View:
-    """One posed picture; its pixels lie in a ``ViewStore`` once one keeps them."""
+    """One posed picture; its pixels are in a ``ViewStore`` once they were added to one."""
 
     def __init__(
         self,
@@ -59,7 +59,7 @@ class View:
         self.light: Tensor | None = None
         """[3, rows, columns] log-gain of the sunlight over the picture (see water/sunlight.py)."""
         self.looks = 0
-        """Steps of the optimiser that looked at this view."""
+        """Optimiser steps on this view."""
         self.explained: Tensor | None = None
         """[rows, columns] bool, the tiles in which the last full look found nothing but noise."""
         self.moments = (np.zeros(6), np.zeros(6), 0)
@@ -166,8 +166,8 @@ def in_time(views: Iterable[View]) -> list[View]:
 
 
 class ViewStore:
-    """Where the pixels of a dive's views lie: the last used in memory, the others, with a work
-    folder, in its ``views`` folder. They come back bit for bit."""
+    """Store of the pixels of a dive's views: the last used in memory, the others, with a work
+    folder, in its ``views`` folder. They are restored bit for bit."""
 
     def __init__(self, work: Path | None = None, resident: int = RESIDENT_VIEWS) -> None:
         folder = None if work is None else work / "views"

@@ -26,7 +26,7 @@ class FrameClass(str, Enum):
 
 @dataclass(frozen=True)
 class Quality:
-    """How well a pose is known."""
+    """Quality of a pose."""
 
     inlier_share: float = 1.0
     residual_px: float = 0.0
@@ -69,7 +69,7 @@ class Tracked:
         return Tracked(frame, FrameClass.LOST, sub_map, reason=reason)
 
     def bare(self) -> Tracked:
-        """Itself without picture and pointmap: what a long dive can keep of every frame."""
+        """A copy without picture and pointmap, small enough to keep for every frame."""
         return replace(self, frame=without_pictures(self.frame), pointmap=None)
 
 

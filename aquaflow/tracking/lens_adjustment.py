@@ -38,7 +38,7 @@ MIN_SIGMA = 1e-6
 
 @dataclass(frozen=True)
 class LensAdjustment:
-    """The solution, and how well it is known."""
+    """The solution and its uncertainty."""
 
     adjusted: Adjusted
     covariance: Array

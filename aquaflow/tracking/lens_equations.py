@@ -46,7 +46,7 @@ class Observations:
 
 @dataclass(frozen=True)
 class Adjusted:
-    """What is solved for; V views."""
+    """The unknowns; V views."""
 
     R_wc: Array
     """[V, 3, 3]"""

@@ -1,4 +1,5 @@
-"""The start of a map: frames wait for a geometry, with one reference after the other."""
+"""The start of a map: frames wait until a two-view geometry is found, for one reference at a
+time."""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
 
 @dataclass(frozen=True)
 class Posed:
-    """A frame of the start: its pose against the reference, and its matches to it."""
+    """A frame of the initialisation: its pose against the reference and its matches."""
 
     frame: Frame
     T_fk: Sim3
@@ -39,7 +40,7 @@ class Started:
 
 
 class MapStart:
-    """Collects frames against a reference until their geometry is decided."""
+    """Collects frames matched to a reference until their geometry is found."""
 
     def __init__(
         self,
@@ -72,7 +73,7 @@ class MapStart:
         return self._initialiser is not None and self._initialiser.ready
 
     def solve(self) -> Started | None:
-        """The start of a map by the frames that wait; None where no geometry is good enough."""
+        """Initialise a map from the waiting frames; None if no geometry is good enough."""
         initialiser, started = self._initialiser, None
         if initialiser is None or not initialiser.waiting:
             return None
@@ -99,7 +100,7 @@ class MapStart:
         return Started(reference, encoding, pointmap, camera, solution.focal_sigma, posed)
 
     def restart(self, frame: Frame, encoding: Encoding) -> None:
-        """``frame`` is the reference from here on."""
+        """Use ``frame`` as the reference from now on."""
         self.end()
         self._initialiser = Initialiser(frame, encoding, self._prior, self._config.initialisation)
         self._waiting.put([frame], Wait.INITIALISING)

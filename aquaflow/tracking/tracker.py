@@ -31,7 +31,7 @@ class Tracker:
         live: bool = False,
         failures: Failures | None = None,
     ) -> None:
-        """Without ``places``, what was lost is never found again, only begun anew.
+        """Without ``places`` there is no relocalisation: a lost camera starts a new sub-map.
 
         Frames that waited for a keyframe get their poses once it is there; in a ``live`` run
         whenever there is time, by :meth:`back_fill`. What raises is counted in ``failures``.
@@ -44,7 +44,7 @@ class Tracker:
         self._places, self._follower = places, Follower(prior, keyframes, config)
         self._failures = failures or Failures()
         self.sub_maps = 1
-        """Sub-maps that were begun so far."""
+        """Number of sub-maps started so far."""
         self._waiting = waiting = WaitingFrames()
         self._start = MapStart(prior, config, waiting, self._failures, live)
         self._back_fills = BackFills(waiting, prior, self._follower, self._failures, live)
@@ -52,7 +52,8 @@ class Tracker:
         self._origin = Sim3.identity()
 
     def track(self, frame: Frame) -> list[Tracked]:
-        """Frames that leave tracking with this one: none while it waits, several when that ends.
+        """Track a frame; returns the frames finished by it: none while it waits, several
+        afterwards.
 
         Every frame leaves once, here, in :meth:`back_fill` or in :meth:`finish`.
         """
@@ -61,21 +62,21 @@ class Tracker:
 
     @property
     def past(self) -> Frame | None:
-        """The frame whose turn it is at :meth:`back_fill`."""
+        """The frame that :meth:`back_fill` will process next."""
         return self._back_fills.next
 
     def back_fill(self) -> list[Tracked]:
-        """The pose of :attr:`past`, or that it has none; nothing if no frame waits."""
+        """Finish :attr:`past`, with or without a pose; returns nothing if no frame waits."""
         return self._leaving("back-filling", self.past, self._back_fills.step)
 
     def finish(self) -> list[Tracked]:
-        """Account for the frames that never got a pose; tries one last time with what there is."""
+        """Finish the waiting frames after a last attempt to pose them."""
         decided = self._leaving("tracking", None, lambda: self._begin() + self._back_fills.all())
         return decided + self._waiting.give_up(self._as_lost)
 
     @property
     def lost(self) -> bool:
-        """True while the latest frames found no place on the keyframe in use."""
+        """True while the latest frames have no pose against the current keyframe."""
         return self._waiting.count(Wait.LOST) > 0
 
     def resume(self, camera: CameraModel, focal_sigma: float, sub_maps: int, T_wc: Sim3) -> None:
@@ -86,7 +87,7 @@ class Tracker:
         self._origin = T_wc
 
     def recall(self, keyframe: Keyframe) -> None:
-        """An earlier run's keyframe may be taken up again."""
+        """Register a keyframe of an earlier run for relocalisation."""
         self._follower.leave(Attachment(keyframe))
 
     def _leaving(
@@ -139,7 +140,7 @@ class Tracker:
         return tracked if matched else tracked + self._track(frame)
 
     def _begin(self) -> list[Tracked]:
-        """Turn a decided geometry into the first keyframe, and pose the frames that waited."""
+        """Make the first keyframe from the initial geometry, and pose the frames that waited."""
         started = self._start.solve()
         if started is None:
             return []
@@ -161,7 +162,7 @@ class Tracker:
         return tracked
 
     def _back_fill(self) -> list[Tracked]:
-        """Poses of frames that waited for a keyframe, against the one in use."""
+        """Poses of frames that waited for a keyframe, against the current one."""
         assert self._at is not None
         assert self.camera is not None
         return self._back_fills.start(self._at, self.camera)
@@ -179,7 +180,7 @@ class Tracker:
         return [tracked for frame in lost for tracked in self._track(frame)]
 
     def _find_again(self, frame: Frame, encoding: Encoding) -> list[Tracked]:
-        """Go on at an earlier keyframe that shows the lost frame's place; nothing if none does.
+        """Continue at an earlier keyframe that shows the lost frame's place; nothing if none does.
 
         Frames that waited for a new sub-map get their poses there too, where they can.
         """
@@ -210,7 +211,7 @@ class Tracker:
     def _follow(
         self, frame: Frame, encoding: Encoding, pair: PairGeometry | None = None
     ) -> Tracked | None:
-        """Pose, fusion and class of one frame; None when it cannot be placed."""
+        """Pose, fusion and class of one frame; None if no pose is found."""
         with self._failures.contain("pose", frame.index):
             return self._placed(frame, encoding, pair)
         return None

@@ -1,4 +1,4 @@
-"""Frames that tracking was given and that have not left it: each is in one state, and leaves once.
+"""Unfinished frames of tracking: each is in one state, and leaves once.
 
 A state holds no more than a bound: ``initialising`` thins out beyond
 ``tracking.initialisation.max_waiting``, ``lost`` frames begin a new sub-map at
@@ -16,16 +16,16 @@ from aquaflow.tracking.frames import Tracked
 
 
 class Wait(Enum):
-    """What a frame waits for. Those that still do at a dive's end are given up in this order."""
+    """What a frame waits for. At a dive's end the remaining frames are finished in this order."""
 
     IN_HAND = "in hand"
-    """Nothing: this call of tracking decides about it."""
+    """Nothing: the current call of tracking finishes it."""
     FOR_A_KEYFRAME = "for a keyframe"
     """A keyframe that shows its place."""
     LOST = "lost"
-    """The next frame that is placed, or so many lost ones that a new sub-map is begun."""
+    """The next frame with a pose, or so many lost frames that a new sub-map is started."""
     THINNED = "thinned"
-    """A keyframe; initialisation goes on without it."""
+    """A keyframe; initialisation continues without this frame."""
     INITIALISING = "initialising"
     """Enough parallax to initialisation's reference, or it is that reference."""
     IN_IDLE_TIME = "in idle time"
@@ -49,13 +49,13 @@ of hovering at 10 frames/s, 0.4 GB of pictures at 640 x 360 px; a keyframe there
 
 
 class WaitingFrames:
-    """By state, the frames in the order in which they came into it."""
+    """The frames by state, in the order in which they entered it."""
 
     def __init__(self) -> None:
         self._frames: dict[Wait, dict[int, Frame]] = {state: {} for state in Wait}
 
     def enter(self, frame: Frame) -> None:
-        """A frame that tracking is given; it is in hand."""
+        """Add a frame that tracking starts to process."""
         self._frames[Wait.IN_HAND][frame.index] = frame
 
     def of(self, state: Wait) -> list[Frame]:
@@ -67,14 +67,14 @@ class WaitingFrames:
         return len(self._frames[state])
 
     def put(self, frames: Iterable[Frame], state: Wait) -> None:
-        """Into ``state``, behind those in it; frames that have left stay out."""
+        """Append frames to ``state``; frames that have left are ignored."""
         for frame in frames:
             held = [each.pop(frame.index, None) for each in self._frames.values()]
             if any(each is not None for each in held):
                 self._frames[state][frame.index] = frame
 
     def move(self, before: Wait, after: Wait) -> list[Frame]:
-        """All frames of one state into another; these frames."""
+        """Move all frames of one state into another; returns these frames."""
         frames = self.of(before)
         self.put(frames, after)
         return frames
@@ -99,7 +99,7 @@ class WaitingFrames:
         return leaving
 
     def give_up(self, as_lost: Callable[[Frame, str], Tracked]) -> list[Tracked]:
-        """All frames leave without a pose."""
+        """Remove all frames, without a pose."""
         for state in Wait:
             self.move(state, Wait.IN_HAND)
         return self.settle([], as_lost)

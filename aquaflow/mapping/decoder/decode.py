@@ -1,4 +1,4 @@
-"""The attributes of Gaussians as they are seen from somewhere: initial ones plus residuals.
+"""View-dependent attributes of Gaussians: initial attributes plus decoded residuals.
 
 One view at a time goes through the compiled kernel; :func:`decoded_torch` is its definition, the
 fallback, and what knows a camera for each Gaussian.
@@ -21,7 +21,7 @@ from aquaflow.render.decoding import ViewWeights, decode_view, takes
 from aquaflow.render.library import library_or_none
 
 DECODED = ("quats", "log_scales", "raw_colours")
-"""Names of what residuals are added to."""
+"""Names of the parameters that get residuals."""
 
 MARGIN = 0.3
 """Share of the picture's size by which a centre may lie outside and still be decoded."""
@@ -86,7 +86,7 @@ def decoded_torch(
     places: Tensor,  # [V] int64
     centre: Tensor,  # [3], or [V, 3]
 ) -> dict[str, Tensor]:
-    """What :func:`decoded` means."""
+    """Reference implementation of :func:`decoded` in torch."""
     rows = trunk.tokens.rows[places]
     o = observation(parameters["means"].detach()[rows], centre)
     return apply_residuals(parameters, rows, decoder.residuals(trunk, places, o))

@@ -148,7 +148,7 @@ class GroupAttention(nn.Module):
 
 
 class TokenMlp(nn.Module):
-    """What stands in for attention in the ablation: as many weights, each token on its own."""
+    """Replacement of attention in the ablation: as many weights, each token on its own."""
 
     def __init__(self, width: int, generator: torch.Generator) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Neural Gaussians: what a decoder adds to explicit ones, and how it learns (paper, Sec. 3.3.1).
+"""Neural Gaussians: decoded residuals on explicit Gaussians, and their training (Sec. 3.3.1).
 
 One pass over the voxel groups, the trunk, serves a window of several steps, each on its own view.
 The window's gradients meet in the trunk's output; when it ends they go through the trunk at once,
@@ -34,7 +34,7 @@ from aquaflow.render.adam import SelectiveAdam
 
 @dataclass
 class Window:
-    """A trunk, and the views that are yet to be decoded from it."""
+    """A trunk, and the views that still have to be decoded from it."""
 
     trunk: Trunk
     hidden: Tensor
@@ -106,7 +106,7 @@ class NeuralGaussians:
         return self._decoded(trunk, seen, parameters, viewmat)
 
     def settle(self) -> None:
-        """End the window: features and weights take the step that its views ask for."""
+        """End the window: one optimiser step of features and weights with its views' gradient."""
         self._looked, window, self._window = None, self._window, None
         if window is None:
             return
@@ -131,7 +131,7 @@ class NeuralGaussians:
         self._weights.zero_grad(set_to_none=True)
 
     def slow_down(self, factor: float) -> None:
-        """Let the rates be this share of the configured ones."""
+        """Set the learning rates to this share of the configured ones."""
         self._local.learning_rates["local"] = factor * self.config.feature_rate
         self._shared.learning_rates["shared"] = factor * self.config.feature_rate
         self._weights.param_groups[0]["lr"] = factor * self.config.rate
@@ -206,7 +206,7 @@ class NeuralGaussians:
         self,
         seen: Tensor,  # [N] bool
     ) -> Trunk:
-        """Of the groups in which a Gaussian is seen, as everything is now."""
+        """The trunk of the groups with a visible Gaussian, from the current state."""
         self.settle()
         tokens = visible_tokens(self.groups, seen)
         return self.decoder.trunk(tokens, self.gaussians.local_features, self.groups.features)
@@ -219,7 +219,8 @@ class NeuralGaussians:
         centres: Tensor,  # [3] or [M, 3] of the camera that the new Gaussians are seen from
         count: int,  # M
     ) -> None:
-        """Place the map's last ``count`` Gaussians; from there they look as they were given."""
+        """Group the map's last ``count`` Gaussians, and change their initial attributes so that
+        the decoded ones, seen from ``centres``, are those given."""
         if count == 0:
             return
         self.settle()
@@ -268,7 +269,7 @@ class NeuralGaussians:
         self,
         local: Tensor,  # [N, F_l]
     ) -> None:
-        """Take over local features, and groups that were restored, with optimisers at step 0."""
+        """Use restored local features and groups, with optimisers at step 0."""
         self.gaussians.local_features = local
         self._local.extend(len(local) - len(self._local.steps))
         self._bind()

@@ -169,7 +169,7 @@ class VoxelGroups:
         features: Tensor,  # [G, F]
         order: Tensor,  # [G]
     ) -> None:
-        """Be as the groups were that gave these tensors."""
+        """Restore the state that gave these tensors."""
         self._group, self._slot = GrowingRows(group), GrowingRows(slot)
         self._table, self._fill = GrowingRows(table), GrowingRows(fill)
         self._voxel, self._features = GrowingRows(voxel), GrowingRows(features)

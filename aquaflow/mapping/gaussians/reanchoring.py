@@ -45,7 +45,7 @@ def move_gaussians(gaussians: GaussianMap, moves: Mapping[int, Sim3]) -> torch.T
 
 
 def move_views(views: Iterable[View], moves: Mapping[int, Sim3]) -> None:
-    """Re-anchor the views that hang on the keyframes in ``moves``.
+    """Re-anchor the views of the keyframes in ``moves``.
 
     Raises:
         ArithmeticError: where they go is not finite; no view has moved then.

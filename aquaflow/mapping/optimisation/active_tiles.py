@@ -34,7 +34,7 @@ def look(
     image: Tensor,  # [H, W, 3] the map from this view
     config: OptimiserConfig,
 ) -> None:
-    """Count the step, and remember after a full look which tiles are explained."""
+    """Count the step; after a full drawing record which tiles are explained."""
     if view.looks % config.full_look_every == 0:
         error = (image - view.target()).abs().mean(dim=-1)
         if view.mask is not None:

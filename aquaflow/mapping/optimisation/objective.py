@@ -1,4 +1,4 @@
-"""L_total (paper, Eq. 19): what one view says about the map."""
+"""L_total of one view (paper, Eq. 19)."""
 
 from __future__ import annotations
 

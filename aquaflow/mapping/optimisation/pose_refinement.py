@@ -1,4 +1,4 @@
-"""Where a view that was never mapped lies: its pose against the frozen map."""
+"""Pose of a view that was never mapped, against the frozen map."""
 
 from __future__ import annotations
 

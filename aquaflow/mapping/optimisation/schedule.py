@@ -1,4 +1,4 @@
-"""Which view each step of the optimiser looks at (paper, Sec. 3.4)."""
+"""Selects the view of each optimiser step (paper, Sec. 3.4)."""
 
 from __future__ import annotations
 

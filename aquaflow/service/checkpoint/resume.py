@@ -30,7 +30,7 @@ class Choice:
     folder: Path
     checkpoint: Checkpoint | None = None
     notes: tuple[str, ...] = ()
-    """Why it is not the folder that was asked for."""
+    """Why it is not the requested folder."""
 
 
 def choose(dives: Path, config: CheckpointConfig, new: bool, now: Moment) -> Choice:
@@ -47,7 +47,7 @@ def choose(dives: Path, config: CheckpointConfig, new: bool, now: Moment) -> Cho
 
 
 def resumed(folder: Path, new: bool) -> Choice:
-    """A folder that was asked for by name: resumed if it can be.
+    """A folder given by name: resumed if possible.
 
     If not, and with ``new``, the dive goes into the first of ``folder``, ``folder-2``, ... that
     holds no rows of another; on the way, without ``new``, one that can be resumed is.
@@ -66,12 +66,12 @@ def resumed(folder: Path, new: bool) -> Choice:
 
 
 def is_begun(folder: Path) -> bool:
-    """True for a dive that was cut off before its first row: it may be begun anew."""
+    """True for a dive that was interrupted before its first row: it may be restarted."""
     return (folder / MARKER).is_file() and not holds_rows(folder)
 
 
 def holds_rows(folder: Path) -> bool:
-    """True if something was recorded there, be it damaged."""
+    """True if the folder holds recorded rows, even damaged ones."""
     frames = folder / MARKER
     recorded = frames.is_file() and frames.stat().st_size > len(header())
     return recorded or (folder / "metrics.json").is_file() or bool(_kept(folder))
@@ -98,13 +98,13 @@ def tidy(dives: Path, keep: Path) -> None:
 
 
 def _was_cut_off(folder: Path) -> bool:
-    """True if rows were recorded there, and it is no dive that was ended."""
+    """True if the folder holds recorded rows of a dive that was not finished."""
     ended = (folder / "metrics.json").is_file() and not _kept(folder)
     return holds_rows(folder) and not ended
 
 
 def _kept(folder: Path) -> list[Path]:
-    """What a run kept for a resumption."""
+    """The files that a run kept for a resumption."""
     return [path for name in (CHECKPOINT, WORK) for path in (folder / name).glob("**/*.*")]
 
 

@@ -15,7 +15,7 @@ from aquaflow.tracking.frame_table import FrameTable
 
 @dataclass(frozen=True)
 class SalvagedRows:
-    """What was made of a frames.csv."""
+    """The rows salvaged from a frames.csv."""
 
     rows: list[FrameRow]
     unreadable: int = 0

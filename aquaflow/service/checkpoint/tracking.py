@@ -1,4 +1,4 @@
-"""Tracking taken apart for a checkpoint, and put together again: graph, keyframes, every frame."""
+"""Serialisation of tracking for a checkpoint: graph, keyframes, every frame."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from aquaflow.tracking.graph.pose_graph import PoseGraph
 
 
 def serialise(slam: Slam, run: DiveRun) -> tuple[dict[str, Any], Arrays] | None:
-    """Facts for JSON, and arrays; None before the first keyframe, when there is nothing to keep.
+    """Facts for JSON, and arrays; None before the first keyframe, when the state is empty.
 
     Quick: what is large is shared, and nothing of it changes later.
     """
@@ -67,7 +67,7 @@ def deserialise(
     facts: dict[str, Any],
     arrays: Arrays,  # as from serialise
 ) -> None:
-    """Let a fresh ``slam`` and ``run`` go on where those that were taken apart stood.
+    """Restore a new ``slam`` and ``run`` to the state of the serialised ones.
 
     Raises:
         InputError: it holds no pose.
@@ -98,7 +98,7 @@ def deserialise(
 
 
 def lost_since(slam: Slam, facts: dict[str, Any]) -> set[int]:
-    """Keyframes that were whole when the checkpoint was taken, and are no more."""
+    """Keyframes that were intact when the checkpoint was taken and are lost now."""
     return slam.keyframes.lost - set(facts["lost_keyframes"])
 
 

@@ -1,4 +1,4 @@
-"""What the machine runs short of: memory, the GPU's memory, disk, or cold."""
+"""Pressure on the machine: memory, GPU memory, disk, temperature."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MB = 1_000_000
 MILLIDEGREES = 1000.0
 """In a degree: the unit of thermal zones in /sys."""
 HOTTEST_C = 150.0
-"""Zones that claim more are not wired up."""
+"""Thermal zones that report more are not connected."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Pressure:
         return None
 
     def disk_is_full(self, limits: LimitsConfig) -> bool:
-        """True where checkpoints and recordings must not take more."""
+        """True if checkpoints and recordings must not use more disk."""
         return self.disk_free_mb is not None and self.disk_free_mb < limits.disk_mb
 
 

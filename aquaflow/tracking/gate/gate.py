@@ -1,4 +1,4 @@
-"""The frame gate: pictures that cannot help are skipped before anything costly looks at them."""
+"""The frame gate: useless pictures are skipped before any costly processing."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FIRST_LEVELS = 3
 
 
 class GateKind(str, Enum):
-    """What the gate makes of a frame."""
+    """The gate's classes of frames."""
 
     PASS = "pass"
     DUPLICATE = "duplicate"
@@ -34,7 +34,7 @@ class GateKind(str, Enum):
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether a frame is worth tracking, and the number that decided."""
+    """Whether a frame is tracked, and the measure that decided it."""
 
     kind: GateKind
     reason: str = ""
@@ -46,7 +46,7 @@ class Verdict:
 
     @property
     def passed(self) -> bool:
-        """True if the frame goes on."""
+        """True if the frame is tracked."""
         return self.kind is GateKind.PASS
 
     @property
@@ -86,7 +86,7 @@ class FrameGate:
         return verdict
 
     def forget(self) -> None:
-        """Nothing is a duplicate of a frame that tracking lost: call this when it did."""
+        """Call when tracking lost the frame: later frames are no duplicates of it."""
         self._reference = None
 
     def _useless(self, thumbnail: Thumbnail) -> Verdict | None:

@@ -16,15 +16,15 @@ Float = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
 THUMBNAIL_WIDTH = 160
-"""px; texture that tracking holds on to is still there, most of the sensor's noise is not."""
+"""px; keeps the texture that tracking uses, removes most of the sensor's noise."""
 TILES = (12, 9)
-"""Across and down."""
+"""Columns and rows of tiles."""
 COARSE_CELLS = 20
 """Width of the picture in which blur over 5 % of the width leaves the gradients alone."""
 SATURATED = 250.0
-"""Grey level from which a pixel says nothing but "bright"."""
+"""Grey level from which a pixel counts as saturated."""
 LEVEL_NOISE = 12.0**-0.5
-"""Standard deviation of rounding to whole grey levels: no 8-bit picture is known better."""
+"""Standard deviation of rounding to whole grey levels: the least noise of an 8-bit picture."""
 NOISE_MASK = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 """Second difference both ways: blind to planes and straight edges (Immerkaer 1996); its response
 to white noise of sigma 1 has the standard deviation 6 and the mean size 6 sqrt(2 / pi)."""

@@ -1,4 +1,4 @@
-"""Sparse Levenberg-Marquardt over the poses of a keyframe graph that move, and over no others.
+"""Sparse Levenberg-Marquardt over only those poses of a keyframe graph that move.
 
 The active set starts at what is new and grows, in doubling reach, while a pose at its rim would
 move by more than a tolerance.
@@ -25,12 +25,12 @@ from aquaflow.tracking.graph.equations import (
 from aquaflow.tracking.graph.linear_system import LinearSystem
 
 DAMPING_LIMIT = 1e3
-"""At which no step leads down any more: the descent has ended."""
+"""Damping at which the descent ends: no step reduces the cost."""
 LARGEST_TURN = 1.0
 """Rotation (rad) and log-scale of one step; longer steps are shortened as a whole."""
 SHORTENINGS = 3
 SHORTER = 0.3
-"""A step that leads up is tried at this share of its length, so often in all."""
+"""A step that increases the cost is shortened to this share, and most tries."""
 ANNEALING = 0.5
 """phi over the phi of the step before."""
 SETTLING = 0.002
@@ -154,7 +154,7 @@ class Descent:
         return around.active
 
     def _level(self, strain: float) -> float:
-        """``strain``, or 0 where no loop edge would feel it."""
+        """``strain``, or 0 where no loop edge is affected."""
         return strain if strain > self._config.loop_chi2 else 0.0
 
     def _around(
@@ -172,7 +172,7 @@ class Descent:
     def _trial(
         self, around: Neighbourhood, at: Equations, level: float, damping: float | None
     ) -> tuple[Misfit | None, float]:
-        """Where a step leads, None if nowhere down, and the fall of the cost that it promised.
+        """The state after a step, None if no step reduces the cost, and the predicted reduction.
 
         Without ``damping`` the last factor serves again. The promise is the square of the step's
         length in the metric of the information: shared out over the poses, it says how many

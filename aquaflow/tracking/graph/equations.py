@@ -27,7 +27,7 @@ Rows = npt.NDArray[Any]
 """A structured array: NODE or EDGE rows of ``table.py``."""
 
 DAMPING = 1e-9
-"""First damping, over the diagonal: enough for a direction that no edge knows."""
+"""Initial damping, over the diagonal: enough for a direction that no edge constrains."""
 
 
 def poses_of(
@@ -78,7 +78,7 @@ def robust(
 
 
 class Misfit:
-    """What edges leave over at given poses, and what it costs."""
+    """Residuals of the edges at given poses, and their cost."""
 
     def __init__(
         self,
@@ -106,7 +106,7 @@ class Misfit:
 
     @property
     def strain(self) -> float:
-        """Largest chi2 of a loop edge that has more than it is allowed."""
+        """Largest chi2 of a loop edge above its allowed value."""
         beyond = self.edges["loop"] & (self.chi2 > self.allowed)
         return float(self.chi2[beyond].max(initial=0.0))
 

@@ -9,7 +9,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from aquaflow.tracking.graph.equations import Array, Equations, Index, Mask, Rows, damping_of
 
 MEMORY = 10
-"""Steps that BFGS looks back to."""
+"""Number of past steps in the BFGS update."""
 
 
 class LinearSystem:
@@ -66,7 +66,7 @@ class LinearSystem:
         return step if np.isfinite(step).all() else None
 
     def taken(self, share: float) -> None:
-        """The last step was taken, at a share of its length."""
+        """Record that the last step was taken, at a share of its length."""
         if self._last is not None:
             self._last = (share * self._last[0], self._last[1])
 
@@ -75,7 +75,7 @@ class LinearSystem:
         factor: SuperLU,
         gradient: Array,  # [n]
     ) -> Array:
-        """The two loops of BFGS around the factor."""
+        """The two-loop recursion of BFGS around the factor."""
         if self._last is not None:
             taken, before = self._last
             change = gradient - before

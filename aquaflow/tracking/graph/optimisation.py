@@ -1,4 +1,4 @@
-"""One optimisation of a snapshot: admit loops, descend, drop what the rest is against; repeat."""
+"""One optimisation of a snapshot: admit loops, descend, drop contradicted loops; repeat."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from aquaflow.tracking.graph.loop_admission import Admission
 from aquaflow.tracking.graph.table import GraphResult, Snapshot, write_poses
 
 ROUNDS = 20
-"""Loops that become plausible when others have closed are weighed again this often at most."""
+"""Most rounds in which loops that became plausible are tested again."""
 LEAST_TRUST = 0.5
-"""A loop that the rest of the map leaves with less is taken out: chi2 of 3 phi."""
+"""A loop with less trust than this after the descent is removed: chi2 of 3 phi."""
 
 
 class Optimisation:
@@ -101,7 +101,7 @@ class Optimisation:
         candidates: Index,  # [k] numbers of edges
         closed: bool,
     ) -> Index:
-        """Loops to weigh again: all if a loop closed, else the rest and those at moved poses."""
+        """Loops to test again: all if a loop closed, else the rest and those at moved poses."""
         pending = self._pending()
         if closed:
             return np.flatnonzero(pending)
@@ -110,7 +110,7 @@ class Optimisation:
         return np.flatnonzero(pending & stirred)
 
     def _out_of_favour(self) -> Index:
-        """Set the trust of the loops at active poses; take out those left with too little."""
+        """Set the trust of the loops at active poses; remove those with too little."""
         ends = self.active[self.edges["a"]] | self.active[self.edges["b"]]
         loops = np.flatnonzero(self.edges["loop"] & self.counts & ends)
         if len(loops) == 0:

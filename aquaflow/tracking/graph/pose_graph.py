@@ -46,7 +46,8 @@ class Edge:
     information: Array
     """[7, 7] of the right tangent, T_ab exp(d), in b's frame; see ``edge_information``."""
     loop: bool = False
-    """True: a claim that may be false and is switched off if the rest of the map is against it."""
+    """True for a loop edge, which may be false and is switched off if the other edges contradict
+    it."""
 
 
 def edge_information(
@@ -98,7 +99,7 @@ class PoseGraph:
         return number in self._row
 
     def tables(self) -> dict[str, Rows]:
-        """All that there is, for a file: read-only, and never changed later."""
+        """All keyframes and edges, for a file: read-only, and never changed later."""
         self._seen = len(self._nodes)
         return {"nodes": self._nodes.rows, "edges": self._edges.rows, "trust": self._trust.rows}
 
@@ -108,7 +109,7 @@ class PoseGraph:
         tables: Mapping[str, Rows],  # as from tables
         config: GraphConfig,
     ) -> PoseGraph:
-        """The graph that ``tables`` took apart; every edge counts as new to the next solving."""
+        """The graph of ``tables``; every edge counts as new for the next optimisation."""
         graph = cls(config)
         for table, rows in (
             (graph._nodes, tables["nodes"].astype(NODE)),
@@ -124,7 +125,8 @@ class PoseGraph:
         return graph
 
     def add_keyframe(self, number: int, T_wc: Sim3) -> bool:
-        """A keyframe, a component of its own until an edge joins it. False if it was refused."""
+        """Add a keyframe, a component of its own until an edge joins it. False if it was
+        refused."""
         if number in self._row:
             return self._refuse("keyframe is there already")
         if not T_wc.is_finite():
@@ -135,7 +137,7 @@ class PoseGraph:
         return True
 
     def add_edge(self, edge: Edge) -> bool:
-        """An edge between two keyframes that are there. False if it was refused.
+        """Add an edge between two known keyframes. False if it was refused.
 
         An edge between two components moves the later one, as a whole, to where it says.
         """
@@ -178,7 +180,7 @@ class PoseGraph:
         return int(self._nodes.rows["component"][self._row[number]])
 
     def snapshot(self) -> Snapshot:
-        """The graph as it is, to be solved anywhere; costs nothing."""
+        """The graph's current state, to be solved in any thread; no copy is made."""
         self._seen = len(self._nodes)
         return Snapshot(
             self._nodes.rows,
@@ -196,7 +198,7 @@ class PoseGraph:
         return self.apply(result) or result
 
     def apply(self, result: GraphResult) -> GraphResult | None:
-        """Take over a result; None, and nothing done, if another was applied since its snapshot.
+        """Apply a result; None, and no change, if another was applied since its snapshot.
 
         Keyframes added meanwhile go along with the keyframe before them, as one body. The answer's
         ``poses`` holds these too, and those that a join of components moved.
@@ -251,7 +253,7 @@ class PoseGraph:
         return carried
 
     def _join(self, edge: Edge) -> None:
-        """Move the later of the edge's two components to where the edge says."""
+        """Move the later of the edge's two components so that the edge is satisfied."""
         at_a, at_b = self.component_of(edge.a), self.component_of(edge.b)
         T_wa, T_wb = (self._poses(number) for number in (edge.a, edge.b))
         S = T_wa @ Sim3Batch.of([edge.T_ab]) @ T_wb.inverse()

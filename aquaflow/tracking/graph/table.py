@@ -35,7 +35,7 @@ TRUST = np.dtype([("trust", np.float64), ("allowed", np.float64)])
 residual that a loop may keep at full trust."""
 
 ROUNDING = 1e-9
-"""Move, in m, rad and log-scale, that is none."""
+"""Smallest move, in m, rad and log-scale, that counts as one."""
 
 
 class Table:
@@ -49,7 +49,7 @@ class Table:
         return self._count
 
     def append(self, **values: object) -> None:
-        """One row more, named by field."""
+        """Append one row, given by field."""
         if self._count == len(self._buffer):
             grown = np.zeros(2 * self._count, dtype=self._buffer.dtype)
             grown[: self._count] = self._buffer
@@ -73,7 +73,7 @@ class Table:
         self,
         rows: Rows,  # [n] of the table's dtype
     ) -> None:
-        """Other contents for the same rows; views handed out before keep the old."""
+        """Replace the contents of all rows; views returned before keep the old ones."""
         self._buffer = rows
         self._count = len(rows)
 
@@ -123,7 +123,7 @@ def write_poses(
     where: Index | Mask | slice,  # [k] numbers or [n] bool
     poses: Sim3Batch,
 ) -> None:
-    """Put similarities into NODE or EDGE rows, in place."""
+    """Write similarities into NODE or EDGE rows, in place."""
     rows["R"][where], rows["t"][where], rows["scale"][where] = poses.R, poses.t, poses.scale
 
 
@@ -138,7 +138,7 @@ class Join:
 
     @property
     def still(self) -> bool:
-        """True if the poses are where they should be already, but for rounding."""
+        """True if S is the identity, except for rounding."""
         return bool(np.abs(self.S.log()).max() < ROUNDING)
 
     def apply(

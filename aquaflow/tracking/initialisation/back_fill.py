@@ -1,4 +1,4 @@
-"""Poses of the past: frames from before a keyframe was there, placed against it one by one."""
+"""Back-fill: poses of frames from before a keyframe existed, one by one against that keyframe."""
 
 from __future__ import annotations
 
@@ -25,12 +25,13 @@ class _Placed:
     encoding: Encoding
     solved: Matched
     at: Attachment
-    """What it was placed against."""
+    """The keyframe or frame that the pose is relative to."""
     T_fk: Sim3
-    """From the keyframe that all poses refer to."""
+    """From the keyframe of all poses to this frame."""
 
     def as_keyframe(self, follower: Follower, camera: CameraModel) -> tuple[Attachment, Sim3]:
-        """Itself with the depths that it took along, for others to be placed against; T_fk."""
+        """The frame as a keyframe with the transferred depths, against which others are posed;
+        T_fk."""
         pointmap = follower.pointmap(self.at, self.solved, camera)
         frame, sub_map = self.frame, self.at.keyframe.sub_map
         # In a store of its own: the dive's keyframes are others.
@@ -41,7 +42,7 @@ class _Placed:
 
 
 class BackFill:
-    """Goes from the newest frame back; nothing that the keyframe knows changes."""
+    """Goes from the newest frame back; does not change the keyframe."""
 
     def __init__(
         self,
@@ -59,7 +60,7 @@ class BackFill:
         self._last: _Placed | None = None
 
     def left(self, waiting: Sequence[Frame]) -> list[Frame]:
-        """Its own frames among those that still wait."""
+        """Those of its frames that still wait."""
         return [frame for frame in waiting if frame.index in self._indices]
 
     def step(self, frame: Frame) -> Tracked:
@@ -106,7 +107,7 @@ class BackFills:
         self._waiting, self._prior, self._follower = waiting, prior, follower
         self._failures, self._live = failures, live
         self._left: list[BackFill] = []
-        """Those of the frames in idle time, in the order in which they are gone through."""
+        """The frames left for idle time, in processing order."""
 
     def start(self, at: Attachment, camera: CameraModel) -> list[Tracked]:
         """Against ``at``, all frames that wait for a keyframe; those that are placed at once."""
@@ -123,12 +124,12 @@ class BackFills:
 
     @property
     def next(self) -> Frame | None:
-        """The frame whose turn it is at :meth:`step`."""
+        """The frame that :meth:`step` will process next."""
         waiting = self._waiting.of(Wait.IN_IDLE_TIME)
         return next((left[-1] for fill in self._left if (left := fill.left(waiting))), None)
 
     def step(self) -> list[Tracked]:
-        """The pose of :attr:`next`, or that it has none; nothing if no frame waits."""
+        """Process :attr:`next`, which gets a pose or none; returns nothing if no frame waits."""
         waiting = self._waiting.of(Wait.IN_IDLE_TIME)
         self._left = [fill for fill in self._left if fill.left(waiting)]
         if not self._left:

@@ -39,7 +39,7 @@ class Bundle:
 
 @dataclass(frozen=True)
 class BundleResult:
-    """What an adjustment found, and how well."""
+    """The result of an adjustment and its uncertainty."""
 
     bundle: Bundle
     residual_px: float

@@ -173,5 +173,5 @@ class Hypotheses:
 
 
 def _on_the_way(T: Sim3, share: float) -> Sim3:
-    """A guess at a pose between the reference and ``T``, that far along."""
+    """An initial pose between the reference and ``T``, interpolated."""
     return Sim3(T.R, T.t * min(share, 1.0)) if share > 0.5 else Sim3.identity()

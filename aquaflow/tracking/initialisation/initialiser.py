@@ -46,7 +46,7 @@ attempt takes seconds, and the next frame alone changes little."""
 
 
 class Initialiser:
-    """Collects frames against one reference and says when the geometry is decided."""
+    """Collects frames matched to one reference and solves their geometry once it is determined."""
 
     def __init__(
         self,

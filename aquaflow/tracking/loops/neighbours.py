@@ -1,4 +1,4 @@
-"""Keyframes that should show what a frame shows, by the poses of the keyframe graph alone."""
+"""Keyframes that overlap with a frame, by the poses of the keyframe graph alone."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = npt.NDArray[np.float64]
 SKETCH_POINTS = 64
 """Points kept of a keyframe: an overlap is known to about a twentieth, for 1.5 kB."""
 NEAREST = 32
-"""Keyframes, by the distance of their centres, whose overlap is worked out."""
+"""Nearest keyframes, by the distance of their centres, whose overlap is computed."""
 
 
 class Neighbours:
@@ -28,7 +28,7 @@ class Neighbours:
         self._sketches: dict[int, tuple[Keyframe, Array]] = {}
 
     def add(self, keyframe: Keyframe) -> None:
-        """Remember what ``keyframe`` shows, or what it shows by now."""
+        """Store or update the points of ``keyframe``."""
         known = keyframe.pointmap.known(self._config.known_sigma)
         points = sampled(keyframe.pointmap, known, SKETCH_POINTS)[2]
         if len(points):
