@@ -28,7 +28,7 @@ from aquaflow.tracking.pose.visibility import agreeing, predicted_matches
 
 
 @dataclass
-class Attachment:
+class CurrentKeyframe:
     """The current keyframe and the last frame's pose against it."""
 
     keyframe: Keyframe
@@ -69,7 +69,7 @@ class Attachment:
         return Tracked(frame, frame_class, sub_map, number, self.T_wc, quality, pointmap, link=link)
 
 
-class Follower:
+class KeyframeTracker:
     """Tracks frames against keyframes and classifies them."""
 
     def __init__(self, prior: Prior, keyframes: KeyframeStore, config: TrackingConfig) -> None:
@@ -78,7 +78,7 @@ class Follower:
 
     def place(
         self,
-        at: Attachment,
+        at: CurrentKeyframe,
         encoding: Encoding,
         camera: CameraModel,
         pair: PairGeometry | None = None,
@@ -95,12 +95,12 @@ class Follower:
             solved = self._matcher.pose(at.keyframe, camera, pair, predicted, at.T_fk)
         return solved
 
-    def _reference(self, at: Attachment) -> Encoding:
+    def _reference(self, at: CurrentKeyframe) -> Encoding:
         if self._config.reuse_encodings or at.image is None:
             return at.keyframe.encoding
         return self._prior.encode(at.image, at.keyframe.pointmap.camera)
 
-    def take(self, at: Attachment, solved: Matched, camera: CameraModel) -> None:
+    def take(self, at: CurrentKeyframe, solved: Matched, camera: CameraModel) -> None:
         """Update the motion prediction and the keyframe's depths from the frame."""
         T_fk, pointmap = solved.estimate.T, at.keyframe.pointmap
         at.moved_to(T_fk, solved.pair.matches)
@@ -113,7 +113,7 @@ class Follower:
         """True if something in front of the scene hides the matches."""
         return solved.visibility.seen < self._config.min_seen
 
-    def classify(self, at: Attachment, solved: Matched, camera: CameraModel) -> FrameClass:
+    def classify(self, at: CurrentKeyframe, solved: Matched, camera: CameraModel) -> FrameClass:
         """The paper's rules, keyframe by matched share and mapping frame by parallax; but what is
         hidden is neither, unless the keyframe goes out of view."""
         config = self._config
@@ -126,19 +126,19 @@ class Follower:
             return FrameClass.MAPPING
         return FrameClass.COMMON
 
-    def pointmap(self, at: Attachment, solved: Matched, camera: CameraModel) -> Pointmap:
+    def pointmap(self, at: CurrentKeyframe, solved: Matched, camera: CameraModel) -> Pointmap:
         """The keyframe's depths in the frame's own pixels."""
         pair, T_fk, pointmap = solved.pair, solved.estimate.T, at.keyframe.pointmap
         reliable = self.shown(at, solved, camera) if self.hidden(solved) else pair.valid_back
         return transfer(pointmap, pair.matches_back, reliable, T_fk, camera)
 
-    def shown(self, at: Attachment, solved: Matched, camera: CameraModel) -> Mask:
+    def shown(self, at: CurrentKeyframe, solved: Matched, camera: CameraModel) -> Mask:
         """[H, W] pixels of the frame that show what the keyframe shows."""
         pair, pointmap = solved.pair, at.keyframe.pointmap
         return agreeing(pointmap, pair.matches_back, pair.valid_back, solved.estimate.T, camera)
 
     def without_hidden(
-        self, frame: Frame, at: Attachment, solved: Matched, camera: CameraModel
+        self, frame: Frame, at: CurrentKeyframe, solved: Matched, camera: CameraModel
     ) -> Frame:
         """The frame with its mask limited to pixels that the keyframe shows too."""
         shown = self.shown(at, solved, camera)
@@ -152,20 +152,20 @@ class Follower:
         pointmap: Pointmap,
         sub_map: int,
         motion: Sim3 | None = None,
-    ) -> Attachment:
+    ) -> CurrentKeyframe:
         """The frame as a keyframe; ``motion``: from the frame before it."""
         keyframe = self._keyframes.add(frame.index, frame.t_ns, encoding, T_wc, pointmap, sub_map)
-        return Attachment(keyframe, frame.image, motion=motion or Sim3.identity())
+        return CurrentKeyframe(keyframe, frame.image, motion=motion or Sim3.identity())
 
     # --- keyframes left behind ----------------------------------------------------------------
 
-    def leave(self, at: Attachment) -> None:
+    def leave(self, at: CurrentKeyframe) -> None:
         """Register the keyframe, so that tracking may return to it."""
         self._neighbours.add(at.keyframe)
 
     def earlier(
-        self, at: Attachment, encoding: Encoding, camera: CameraModel
-    ) -> tuple[Attachment, Matched] | None:
+        self, at: CurrentKeyframe, encoding: Encoding, camera: CameraModel
+    ) -> tuple[CurrentKeyframe, Matched] | None:
         """An earlier keyframe that shows the last frame well, to be held in memory from now on.
 
         Only one that agrees with the keyframe in use about where the frame is: of a place that the
@@ -175,7 +175,7 @@ class Follower:
         for keyframe, T_fk in nearest[: self._config.return_candidates]:
             if keyframe is at.keyframe:
                 continue
-            back = Attachment(keyframe, T_fk=T_fk)
+            back = CurrentKeyframe(keyframe, T_fk=T_fk)
             try:
                 solved = self.place(back, encoding, camera)
                 if solved is None or not self._returned(solved, T_fk, camera):

@@ -11,7 +11,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore
 from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, PairGeometry, Prior
-from aquaflow.tracking.current_keyframe import Attachment, Follower
+from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
 from aquaflow.tracking.frames import FrameClass, Link, Quality, Tracked
 from aquaflow.tracking.initialisation.back_fill import BackFills
 from aquaflow.tracking.loops.relocaliser import Places
@@ -41,14 +41,14 @@ class Tracker:
         """The camera as refined by initialisation, once known."""
         self.focal_sigma = 0.0
         self._prior, self._keyframes, self._config = prior, keyframes, config
-        self._places, self._follower = places, Follower(prior, keyframes, config)
+        self._places, self._keyframe_tracker = places, KeyframeTracker(prior, keyframes, config)
         self._failures = failures or Failures()
         self.sub_maps = 1
         """Number of sub-maps started so far."""
         self._waiting = waiting = WaitingFrames()
         self._start = MapStart(prior, config, waiting, self._failures, live)
-        self._back_fills = BackFills(waiting, prior, self._follower, self._failures, live)
-        self._at: Attachment | None = None
+        self._back_fills = BackFills(waiting, prior, self._keyframe_tracker, self._failures, live)
+        self._at: CurrentKeyframe | None = None
         self._origin = Sim3.identity()
 
     def track(self, frame: Frame) -> list[Tracked]:
@@ -88,7 +88,7 @@ class Tracker:
 
     def recall(self, keyframe: Keyframe) -> None:
         """Register a keyframe of an earlier run for relocalisation."""
-        self._follower.leave(Attachment(keyframe))
+        self._keyframe_tracker.leave(CurrentKeyframe(keyframe))
 
     def _leaving(
         self, stage: str, frame: Frame | None, decide: Callable[[], list[Tracked]]
@@ -147,7 +147,7 @@ class Tracker:
         if self.camera is None:
             self.camera, self.focal_sigma = started.camera, started.focal_sigma
         first, encoding, pointmap = started.reference, started.encoding, started.pointmap
-        new = self._follower.at_new_keyframe
+        new = self._keyframe_tracker.at_new_keyframe
         at = self._at = new(first, encoding, self._origin, pointmap, self.sub_map)
         tracked = [at.tracked(first, FrameClass.KEYFRAME, Quality(), pointmap.copy())]
         tracked += self._back_fill()
@@ -174,7 +174,7 @@ class Tracker:
         assert self._at is not None
         self._origin = self._at.T_wc
         self.sub_map, self.sub_maps = self.sub_maps, self.sub_maps + 1
-        self._follower.leave(self._at)
+        self._keyframe_tracker.leave(self._at)
         self._at = None
         lost = self._waiting.move(Wait.LOST, Wait.IN_HAND)
         return [tracked for frame in lost for tracked in self._track(frame)]
@@ -191,7 +191,7 @@ class Tracker:
             found = self._places.of_frame(encoding, self.camera)
             if found is not None:
                 keyframe = self._keyframes.hold(found.keyframe.number)
-                there = Attachment(keyframe, T_fk=found.estimate.T)
+                there = CurrentKeyframe(keyframe, T_fk=found.estimate.T)
         if there is None:
             return []
         self._at = there
@@ -202,7 +202,7 @@ class Tracker:
                 self._keyframes.hold(before.keyframe.number)
             return []
         if before is not None:
-            self._follower.leave(before)
+            self._keyframe_tracker.leave(before)
         self._start.end()
         return [*self._back_fill(), tracked]
 
@@ -221,29 +221,29 @@ class Tracker:
     ) -> Tracked | None:
         assert self._at is not None
         assert self.camera is not None
-        at, camera, follower = self._at, self.camera, self._follower
-        solved = follower.place(at, encoding, camera, pair)
+        at, camera, keyframe_tracker = self._at, self.camera, self._keyframe_tracker
+        solved = keyframe_tracker.place(at, encoding, camera, pair)
         if solved is None:
             return None
-        follower.take(at, solved, camera)
-        if follower.hidden(solved):
-            frame = follower.without_hidden(frame, at, solved, camera)
-        frame_class = follower.classify(at, solved, camera)
+        keyframe_tracker.take(at, solved, camera)
+        if keyframe_tracker.hidden(solved):
+            frame = keyframe_tracker.without_hidden(frame, at, solved, camera)
+        frame_class = keyframe_tracker.classify(at, solved, camera)
         if frame_class is FrameClass.KEYFRAME:
-            earlier = follower.earlier(at, encoding, camera)
+            earlier = keyframe_tracker.earlier(at, encoding, camera)
             if earlier is not None:
-                follower.leave(at)
+                keyframe_tracker.leave(at)
                 self._at, solved = earlier
                 frame_class = FrameClass.COMMON
         if frame_class is FrameClass.COMMON:
             return self._at.tracked(frame, frame_class, solved.quality)
-        pointmap = follower.pointmap(at, solved, camera)
+        pointmap = keyframe_tracker.pointmap(at, solved, camera)
         if frame_class is FrameClass.MAPPING:
             at.mapped_parallax_px = solved.parallax_px
             return at.tracked(frame, frame_class, solved.quality, pointmap.copy())
         link = Link(at.keyframe.number, solved.estimate.T, solved.estimate.covariance)
         self.sub_map = at.keyframe.sub_map
-        follower.leave(at)
-        new = follower.at_new_keyframe
+        keyframe_tracker.leave(at)
+        new = keyframe_tracker.at_new_keyframe
         self._at = new(frame, encoding, at.T_wc, pointmap, self.sub_map, at.motion)
         return self._at.tracked(frame, frame_class, solved.quality, pointmap.copy(), link)

@@ -26,7 +26,7 @@ from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.slam import Slam
 from aquaflow.sources import RecordedCamera, open_recording
 from aquaflow.sources.preprocessing import Preparation
-from aquaflow.tracking.current_keyframe import Follower
+from aquaflow.tracking.current_keyframe import KeyframeTracker
 from aquaflow.tracking.gate.gate import FrameGate
 from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph
 from aquaflow.tracking.initialisation.initialiser import Initialiser
@@ -53,7 +53,7 @@ STAGES: list[tuple[type, str, int, str]] = [
     (FrameGate, "judge", 4, "frame gate"),
     (ClassicalPrior, "encode", 7, "encoding"),
     (Initialiser, "solve", 1, "initialisation"),
-    (Follower, "place", 16, "pose"),
+    (KeyframeTracker, "place", 16, "pose"),
     (Places, "of_frame", 1, "relocalisation"),
     (KeyframeGraph, "_close_loops", 1, "loop search"),
     (Places, "add", 2, "place index"),

@@ -19,7 +19,7 @@ from aquaflow.keyframes import Pointmap
 from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, PairGeometry
 from aquaflow.tracking import map_start
-from aquaflow.tracking.current_keyframe import Attachment
+from aquaflow.tracking.current_keyframe import CurrentKeyframe
 from aquaflow.tracking.frames import FrameClass, Quality, Tracked
 from aquaflow.tracking.tracker import Tracker
 from aquaflow.tracking.waiting_frames import BOUNDS, Bound, Wait, WaitingFrames
@@ -130,10 +130,10 @@ class DrawnTracker(Tracker):
         failures = Failures(strict=False)
         super().__init__(prior, keyframes, TrackingConfig(lost_after=3), places, live, failures)
         self._drawn = drawn
-        follower: Any = self._follower
-        follower.place = lambda *_: (drawn.works(), None)[1]
-        follower.leave = lambda at: None
-        follower.at_new_keyframe = lambda *_: (drawn.works(), Attachment(at))[1]
+        keyframe_tracker: Any = self._keyframe_tracker
+        keyframe_tracker.place = lambda *_: (drawn.works(), None)[1]
+        keyframe_tracker.leave = lambda at: None
+        keyframe_tracker.at_new_keyframe = lambda *_: (drawn.works(), CurrentKeyframe(at))[1]
 
     def _placed(
         self, frame: Frame, encoding: Encoding, pair: PairGeometry | None

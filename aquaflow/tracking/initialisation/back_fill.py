@@ -11,7 +11,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, Prior
-from aquaflow.tracking.current_keyframe import Attachment, Follower
+from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.tracking.pose.matcher import Matched
 from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
@@ -24,21 +24,23 @@ class _Placed:
     frame: Frame
     encoding: Encoding
     solved: Matched
-    at: Attachment
+    at: CurrentKeyframe
     """The keyframe or frame that the pose is relative to."""
     T_fk: Sim3
     """From the keyframe of all poses to this frame."""
 
-    def as_keyframe(self, follower: Follower, camera: CameraModel) -> tuple[Attachment, Sim3]:
+    def as_keyframe(
+        self, keyframe_tracker: KeyframeTracker, camera: CameraModel
+    ) -> tuple[CurrentKeyframe, Sim3]:
         """The frame as a keyframe with the transferred depths, against which others are posed;
         T_fk."""
-        pointmap = follower.pointmap(self.at, self.solved, camera)
+        pointmap = keyframe_tracker.pointmap(self.at, self.solved, camera)
         frame, sub_map = self.frame, self.at.keyframe.sub_map
         # In a store of its own: the dive's keyframes are others.
         keyframe = KeyframeStore().add(
             frame.index, frame.t_ns, self.encoding, Sim3.identity(), pointmap, sub_map
         )
-        return Attachment(keyframe), self.T_fk
+        return CurrentKeyframe(keyframe), self.T_fk
 
 
 class BackFill:
@@ -47,16 +49,16 @@ class BackFill:
     def __init__(
         self,
         frames: Sequence[Frame],
-        at: Attachment,
+        at: CurrentKeyframe,
         camera: CameraModel,
         prior: Prior,
-        follower: Follower,
+        keyframe_tracker: KeyframeTracker,
         failures: Failures,
     ) -> None:
         """``at``: where the newest of the frames, which come oldest first, is looked for."""
         self._indices = frozenset(frame.index for frame in frames)
         self._at, self._camera = replace(at), camera
-        self._prior, self._follower, self._failures = prior, follower, failures
+        self._prior, self._keyframe_tracker, self._failures = prior, keyframe_tracker, failures
         self._last: _Placed | None = None
 
     def left(self, waiting: Sequence[Frame]) -> list[Frame]:
@@ -77,13 +79,13 @@ class BackFill:
     def _place(self, frame: Frame) -> _Placed | None:
         """At the keyframe; where the frame no longer shows that, at the frame placed before."""
         encoding = self._prior.encode(frame.image, self._camera)
-        solved = self._follower.place(self._at, encoding, self._camera)
+        solved = self._keyframe_tracker.place(self._at, encoding, self._camera)
         if solved is not None:
             return _Placed(frame, encoding, solved, self._at, solved.estimate.T)
         if self._last is None:
             return None
-        at, T_ak = self._last.as_keyframe(self._follower, self._camera)
-        solved = self._follower.place(at, encoding, self._camera)
+        at, T_ak = self._last.as_keyframe(self._keyframe_tracker, self._camera)
+        solved = self._keyframe_tracker.place(at, encoding, self._camera)
         if solved is None:
             return None
         return _Placed(frame, encoding, solved, at, solved.estimate.T @ T_ak)
@@ -100,22 +102,22 @@ class BackFills:
         self,
         waiting: WaitingFrames,
         prior: Prior,
-        follower: Follower,
+        keyframe_tracker: KeyframeTracker,
         failures: Failures,
         live: bool,
     ) -> None:
-        self._waiting, self._prior, self._follower = waiting, prior, follower
+        self._waiting, self._prior, self._keyframe_tracker = waiting, prior, keyframe_tracker
         self._failures, self._live = failures, live
         self._left: list[BackFill] = []
         """The frames left for idle time, in processing order."""
 
-    def start(self, at: Attachment, camera: CameraModel) -> list[Tracked]:
+    def start(self, at: CurrentKeyframe, camera: CameraModel) -> list[Tracked]:
         """Against ``at``, all frames that wait for a keyframe; those that are placed at once."""
         after = Wait.IN_IDLE_TIME if self._live else Wait.IN_HAND
         frames = self._waiting.move(Wait.FOR_A_KEYFRAME, after)
         if not frames:
             return []
-        fill = BackFill(frames, at, camera, self._prior, self._follower, self._failures)
+        fill = BackFill(frames, at, camera, self._prior, self._keyframe_tracker, self._failures)
         if not self._live:
             return fill.all(frames)
         waiting = self._waiting.of(Wait.IN_IDLE_TIME)

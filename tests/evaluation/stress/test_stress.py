@@ -119,7 +119,9 @@ GUARDS: list[tuple[str, list[tuple[object, str, object]]]] = [
         ],
     ),
     pytest.param(
-        "snow", [(current_keyframe.Follower, "hidden", lambda *_: False)], marks=pytest.mark.ci
+        "snow",
+        [(current_keyframe.KeyframeTracker, "hidden", lambda *_: False)],
+        marks=pytest.mark.ci,
     ),
 ]
 
