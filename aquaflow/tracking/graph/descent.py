@@ -30,7 +30,7 @@ LARGEST_TURN = 1.0
 """Rotation (rad) and log-scale of one step; longer steps are shortened as a whole."""
 SHORTENINGS = 3
 SHORTER = 0.3
-"""A step that increases the cost is shortened to this share, and most tries."""
+"""A step that increases the cost is shortened to this share, at most so many times."""
 ANNEALING = 0.5
 """phi over the phi of the step before."""
 SETTLING = 0.002

@@ -4,7 +4,7 @@ A robust weight alone cannot detect a false loop: a long soft chain bends to it 
 is small. So before an edge counts, its claim is compared with the present estimate in the metric of
 its own covariance plus that of the chain between its ends (individual compatibility, Neira and
 Tardos 2001), the chain's grown by how much worse than stated tracking may drift. Edges that make
-the same claim from other keyframes corroborate each other and are allowed more drift. What is not
+the same loop from other keyframes corroborate each other and are allowed more drift. What is not
 admitted keeps trust zero and is tested again when the map around it has changed.
 """
 
@@ -79,7 +79,7 @@ class Chains:
         return np.asarray(Ad @ self.world[along].sum(axis=0) @ Ad.T)
 
 
-class Claim:
+class LoopTest:
     """A loop edge against the chain between its ends."""
 
     def __init__(
@@ -148,7 +148,7 @@ class Admission:
         if accepted.all():
             return Admitted(candidates, allowed, span, quiet)
         chains = Chains(self.poses, self.edges, np.flatnonzero(self.counts))
-        claims = [Claim(loops[i], r[i], chains) for i in range(len(loops))]
+        tests = [LoopTest(loops[i], r[i], chains) for i in range(len(loops))]
         doubtful = np.flatnonzero(~accepted)
         # The most certain first: closing them separates true from false among the others.
         for drift, alone in (
@@ -159,12 +159,12 @@ class Admission:
             if drift > 1.0 and accepted.any():
                 break
             for i in doubtful:
-                if claims[i].stretch(drift) <= config.loop_chi2:
+                if tests[i].stretch(drift) <= config.loop_chi2:
                     accepted[i] = alone or self._corroborated(loops, int(i), chains)
         for i in doubtful[accepted[doubtful]]:
             # The loop may have to balance the chain's strain alone.
-            allowed[i] = max(config.loop_chi2, claims[i].stretch(1.0))
-            span[claims[i].path] = True
+            allowed[i] = max(config.loop_chi2, tests[i].stretch(1.0))
+            span[tests[i].path] = True
         return Admitted(candidates[accepted], allowed[accepted], span, quiet)
 
     def _corroborated(
@@ -173,7 +173,7 @@ class Admission:
         i: int,
         chains: Chains,
     ) -> bool:
-        """True if enough others make the same claim as loop ``i``, from other keyframes."""
+        """True if enough others agree with loop ``i``, from other keyframes."""
         config = self.config
         far_a, far_b = abs(loops["a"] - loops["a"][i]), abs(loops["b"] - loops["b"][i])
         near = (far_a <= config.corroboration_window) & (far_b <= config.corroboration_window)
@@ -191,7 +191,7 @@ class Admission:
         pair: Rows,  # [2] EDGE
         chains: Chains,
     ) -> float:
-        """chi2 of the difference between two claims, seen from the second loop's b."""
+        """chi2 of the difference between two loops, seen from the second loop's b."""
         claimed, seen = self.poses[pair["a"]] @ poses_of(pair), self.poses[pair["b"]]
         T_ji = seen[:1].inverse() @ seen[1:]
         gap = (claimed[1:].inverse() @ (claimed[:1] @ T_ji)).log()[0]

@@ -51,8 +51,8 @@ class Optimisation:
             if not (len(new.edges) or asked.any() or (self.everything and round_ == 0)):
                 break
             self.active = self.descent.run(self.counts, self.active | new.span, asked)
-            asked = self._ends(self._out_of_favour())
-            candidates = self._stirred(candidates, bool(new.span.any()))
+            asked = self._ends(self._update_trust())
+            candidates = self._to_retest(candidates, bool(new.span.any()))
         return self._result()
 
     def _strained(
@@ -96,7 +96,7 @@ class Optimisation:
             near &= np.abs(gap) <= self.config.corroboration_window
         return pending[near.any(axis=1)]
 
-    def _stirred(
+    def _to_retest(
         self,
         candidates: Index,  # [k] numbers of edges
         closed: bool,
@@ -109,7 +109,7 @@ class Optimisation:
         stirred[candidates] = True
         return np.flatnonzero(pending & stirred)
 
-    def _out_of_favour(self) -> Index:
+    def _update_trust(self) -> Index:
         """Set the trust of the loops at active poses; remove those with too little."""
         ends = self.active[self.edges["a"]] | self.active[self.edges["b"]]
         loops = np.flatnonzero(self.edges["loop"] & self.counts & ends)

@@ -50,7 +50,7 @@ class Degeneracy:
         return float(self.eigenvalues[0] / max(self.eigenvalues[-1], 1e-300))
 
 
-def certainty(
+def pose_covariance(
     H: Array,  # [n, n]
     scores: Array,  # [n, C], sum of weighted J' r in each cell of the picture
     T: Sim3,

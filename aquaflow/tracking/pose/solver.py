@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from aquaflow.config.tracking import PoseResidual
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.tracking.pose.covariance import Degeneracy, cell_sums, certainty
+from aquaflow.tracking.pose.covariance import Degeneracy, cell_sums, pose_covariance
 from aquaflow.tracking.pose.residuals import ROWS, Matches, PoseProblem, Rows
 
 __all__ = ["PoseEstimate", "PoseProblem", "solve_pose"]
@@ -163,7 +163,7 @@ def _summary(problem: PoseProblem, matches: Matches, T: Sim3, rows: Rows) -> Pos
     pull = _huber_weights(rows.residual) * rows.residual * matches.weights
     scores, camera = (rows.J * pull).sum(1), matches.camera
     cells = cell_sums(scores, matches.u, matches.v, camera.width, camera.height)
-    covariance, degeneracy = certainty(H, cells, T, depth)
+    covariance, degeneracy = pose_covariance(H, cells, T, depth)
 
     inlier = in_front & (np.abs(rows.residual) < INLIER).all(0)
     residual_px = float("inf")

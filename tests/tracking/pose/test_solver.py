@@ -10,7 +10,7 @@ import pytest
 
 from aquaflow.geometry.similarity import Sim3, so3_exp, so3_log
 from aquaflow.tracking.pose import solver
-from aquaflow.tracking.pose.covariance import UNKNOWN_SIGMA, certainty
+from aquaflow.tracking.pose.covariance import UNKNOWN_SIGMA, pose_covariance
 from aquaflow.tracking.pose.residuals import Matches, Rows
 from aquaflow.tracking.pose.solver import PoseProblem, solve_pose
 from tests.tracking.tracking_scenes import CAMERA, cloud, pose, problem_of
@@ -187,7 +187,7 @@ def test_the_weakest_direction_is_named(axis: int, kind: str) -> None:
     information[axis] = 0.0
     unit = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0])
     H = np.diag(information / unit**2)
-    covariance, report = certainty(H, np.zeros((6, 4)), TRUTH, 0.5)
+    covariance, report = pose_covariance(H, np.zeros((6, 4)), TRUTH, 0.5)
     assert report.kind == kind
     assert abs(report.weakest[axis]) == pytest.approx(1.0)
     np.testing.assert_allclose(report.eigenvalues, [0.0, *[100.0] * 5])
