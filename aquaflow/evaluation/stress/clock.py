@@ -47,25 +47,25 @@ def _written_in_order(check: Check, result: Tracking) -> None:
     check.below("quaternion length - 1", float(np.abs(length - 1.0).max()), 1e-6)
 
 
-@case("time", "dive.DiveFolder.write_trajectory")
+@case("time", "dive.folder.DiveFolder.write_trajectory")
 def duplicate_times(check: Check, seed: int) -> None:
     """Every two frames carry the same time."""
     _clocked(check, seed, lambda i: i // 2 * 100_000_000)
 
 
-@case("time", "dive.DiveFolder.write_trajectory")
+@case("time", "dive.folder.DiveFolder.write_trajectory")
 def reversed_times(check: Check, seed: int) -> None:
     """The clock runs backwards."""
     _clocked(check, seed, lambda i: (100 - i) * 100_000_000)
 
 
-@case("time", "dive.DiveFolder.write_trajectory")
+@case("time", "dive.folder.DiveFolder.write_trajectory")
 def jumping_times(check: Check, seed: int) -> None:
     """The clock is set while the vehicle dives."""
     _clocked(check, seed, lambda i: i * 100_000_000 + (HOUR_NS if i % 3 == 1 else 0))
 
 
-@case("time", "dive.DiveFolder.write_trajectory")
+@case("time", "dive.folder.DiveFolder.write_trajectory")
 def huge_gaps(check: Check, seed: int) -> None:
     """A year between frames."""
     _clocked(check, seed, lambda i: i * 24 * 365 * HOUR_NS)

@@ -145,7 +145,7 @@ def exposure_steps(check: Check, seed: int) -> None:
     _hard(check, seed, lambda p, i: np.clip(p * gains[i % 3], 0, 255).astype(np.uint8), share=0.7)
 
 
-@case("images", "tracking.attachment.Follower.classify")
+@case("images", "tracking.current_keyframe.KeyframeTracker.classify")
 def snow(check: Check, seed: int) -> None:
     """Two seconds of marine snow over two fifths of the picture: it makes no keyframe."""
     camera, poses, snowy = CAMERA.scaled(320, 240), path(34, step_m=0.015), range(8, 28)
@@ -159,7 +159,7 @@ def snow(check: Check, seed: int) -> None:
     check.true("no keyframe shows snow", not keyframes & set(snowy))
 
 
-@case("images", "preparation.check_picture")
+@case("images", "sources.preprocessing.check_picture")
 def nan_in_float_picture(check: Check, seed: int) -> None:
     """A source that hands over floats, some of them NaN, is refused in one sentence."""
     frame = clear_swim(seed)[0]
@@ -169,7 +169,7 @@ def nan_in_float_picture(check: Check, seed: int) -> None:
     check.true("a float picture is refused", _refused(wrong))
 
 
-@case("images", "preparation.check_picture")
+@case("images", "sources.preprocessing.check_picture")
 def one_by_one(check: Check, seed: int) -> None:
     """Pictures of one pixel are refused in one sentence."""
     camera = CameraModel(1, 1, 1.0, 1.0, 0.5, 0.5)
@@ -177,7 +177,7 @@ def one_by_one(check: Check, seed: int) -> None:
     check.true("a picture of one pixel is refused", _refused(Frame(0, 0, 0, image, camera)))
 
 
-@case("images", "preparation.Preparation")
+@case("images", "sources.preprocessing.Preparation")
 def width_8192(check: Check, seed: int) -> None:
     """Pictures 8192 pixels wide are made small, then tracked."""
     large = CAMERA.scaled(8192, 6144)

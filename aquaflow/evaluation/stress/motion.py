@@ -27,7 +27,7 @@ POINTS = 200
 """Of each problem, all over the picture."""
 
 
-@case("motion", "tracking.initialisation.Initialiser.ready")
+@case("motion", "tracking.initialisation.initialiser.Initialiser.ready")
 def none(check: Check, seed: int) -> None:
     """The vehicle stands still: nothing is posed, nothing breaks."""
     still = clear_swim(seed)[0]
@@ -46,7 +46,7 @@ def pure_rotation(check: Check, seed: int) -> None:
     check.true("a turn on the spot gives no map", not result.posed)
 
 
-@case("motion", "tracking.solver.solve_pose")
+@case("motion", "tracking.pose.solver.solve_pose")
 def rotation_after_start(check: Check, seed: int) -> None:
     """The vehicle swims, then turns on the spot: a map is there, so the turn is followed."""
     poses = path(8)
@@ -58,7 +58,7 @@ def rotation_after_start(check: Check, seed: int) -> None:
     on_path(check, result, poses)
 
 
-@case("motion", "tracking.initialisation.Initialiser.solve")
+@case("motion", "tracking.initialisation.initialiser.Initialiser.solve")
 def forward(check: Check, seed: int) -> None:
     """Along the optical axis: the epipole lies in the middle of the picture."""
     poses = [pose((1.0, 2.0, -1.0 + 0.08 * i)) for i in range(10)]
@@ -92,7 +92,7 @@ def teleport(check: Check, seed: int) -> None:
     check.true("they are in a sub-map of their own", all(t.sub_map > 0 for t in after))
 
 
-@case("motion", "tracking.initialisation.Initialiser._trustworthy")
+@case("motion", "tracking.initialisation.initialiser.Initialiser._trustworthy")
 def planar_scene(check: Check, seed: int) -> None:
     """A flat floor leaves the essential matrix ambiguous."""
     frames = film(Floor(seed, relief_m=0.0), path(10))
@@ -101,7 +101,7 @@ def planar_scene(check: Check, seed: int) -> None:
     on_path(check, result, path(10), bound=0.05)
 
 
-@case("motion", "tracking.solver._summary")
+@case("motion", "tracking.pose.solver._summary")
 def scene_at_infinity(check: Check, seed: int) -> None:
     """Points a million units away show a rotation and no translation; the quality is low."""
     rays = _rays(seed)
@@ -121,13 +121,13 @@ def scene_at_infinity(check: Check, seed: int) -> None:
         check.true("the translation is said to be unknown", bool((sigma > 100.0).all()))
 
 
-@case("motion", "tracking.bundle._normalised")
+@case("motion", "tracking.initialisation.bundle._normalised")
 def scale_of_a_tenth_millimetre(check: Check, seed: int) -> None:
     """The start is 0.1 mm large; the scale gauge makes it one."""
     _scaled_bundle(check, seed, 1e-4)
 
 
-@case("motion", "tracking.bundle._normalised")
+@case("motion", "tracking.initialisation.bundle._normalised")
 def scale_of_100_metres(check: Check, seed: int) -> None:
     """The start is 100 m large; the scale gauge makes it one."""
     _scaled_bundle(check, seed, 1e2)

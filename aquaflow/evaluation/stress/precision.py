@@ -100,7 +100,7 @@ def medium_in_float32(check: Check, seed: int) -> None:
     _gradients_agree(check, "medium", single, double, 1e-4)
 
 
-@case("precision", "tracking.solver.solve_pose")
+@case("precision", "tracking.pose.solver.solve_pose")
 def pose_solver_from_float32(check: Check, seed: int) -> None:
     """The pose from points and matches rounded to float32, as the prior hands them over."""
     rng = np.random.default_rng(seed)

@@ -45,7 +45,7 @@ def _problem(
     )
 
 
-@case("solvers", "tracking.solver._damped_step")
+@case("solvers", "tracking.pose.solver._damped_step")
 def rank_deficient(check: Check, seed: int) -> None:
     """Matches that are all one match, that lie on one ray, or that weigh nothing."""
     points = _points(seed)
@@ -58,7 +58,7 @@ def rank_deficient(check: Check, seed: int) -> None:
     _finite_or_none(check, weightless)
 
 
-@case("solvers", "tracking.solver._damped_step")
+@case("solvers", "tracking.pose.solver._damped_step")
 def contradictory_matches(check: Check, seed: int) -> None:
     """Every match points somewhere else."""
     _finite_or_none(check, _problem(_points(seed), _pixels(seed + 1)))
@@ -71,7 +71,7 @@ def _finite_or_none(check: Check, problem: PoseProblem) -> None:
         check.finite("estimate", estimate.covariance, estimate.inlier_share, estimate.conditioning)
 
 
-@case("solvers", "tracking.relocate.pose_from_scratch")
+@case("solvers", "tracking.pose.pnp.pose_from_scratch")
 def outliers_95_percent(check: Check, seed: int) -> None:
     """Nineteen matches of twenty are wrong: the pose is right, or there is none."""
     many = np.concatenate([_points(seed + i) for i in range(8)])
@@ -90,7 +90,7 @@ def outliers_95_percent(check: Check, seed: int) -> None:
         check.below("inlier share", estimate.inlier_share, 0.2)
 
 
-@case("solvers", "tracking.bundle.measured")
+@case("solvers", "tracking.initialisation.bundle.measured")
 def nan_matches_in_bundle(check: Check, seed: int) -> None:
     """One match that is no number costs that match."""
     points = _points(seed)

@@ -33,7 +33,7 @@ def _ranges() -> Tensor:
     return torch.tensor(RANGES_M)[None]
 
 
-@case("water", "mapping.image_formation.MAX_OPTICAL_DEPTH")
+@case("water", "mapping.water.image_formation.MAX_OPTICAL_DEPTH")
 def attenuation_0_to_50(check: Check, seed: int) -> None:
     """beta from 0 to 50 1/m over 1 cm to 1 km: transmission is never 0, its inverse never wild."""
     for beta in RATES:
@@ -48,7 +48,7 @@ def attenuation_0_to_50(check: Check, seed: int) -> None:
         check.finite(f"gradient at beta {beta}", gradient)
 
 
-@case("water", "mapping.image_formation.MAX_OPTICAL_DEPTH")
+@case("water", "mapping.water.image_formation.MAX_OPTICAL_DEPTH")
 def range_1_cm_to_1_km(check: Check, seed: int) -> None:
     """Ranges behind the camera, at 0 and beyond 1 km are no more transparent than clear water."""
     z = torch.tensor([[-1e3, -1.0, 0.0, *RANGES_M, 1e9]])
@@ -58,7 +58,7 @@ def range_1_cm_to_1_km(check: Check, seed: int) -> None:
         check.below("transmission", float(transmission.detach().max()), 1.0)
 
 
-@case("water", "mapping.image_formation.MIN_TRANSMISSION")
+@case("water", "mapping.water.image_formation.MIN_TRANSMISSION")
 def transmission_to_0(check: Check, seed: int) -> None:
     """Where no light arrives nothing is restored, and the mask is False."""
     image = torch.rand(1, len(RANGES_M), 3, generator=torch.Generator().manual_seed(seed))
@@ -70,7 +70,7 @@ def transmission_to_0(check: Check, seed: int) -> None:
     check.true("near pixels are recoverable", bool(recoverable[0][0]))
 
 
-@case("water", "mapping.medium.B_INF_RANGE")
+@case("water", "mapping.water.medium.B_INF_RANGE")
 def B_inf_at_0_and_1(check: Check, seed: int) -> None:
     """Water that scatters nothing, and water that is white: the learnable medium takes both."""
     for B_inf in (0.0, 1.0):
@@ -80,7 +80,7 @@ def B_inf_at_0_and_1(check: Check, seed: int) -> None:
         check.below("error of B_inf", _off(medium(torch.eye(3)).B_inf, B_inf), 0.02)
 
 
-@case("water", "mapping.medium.MIN_RATE")
+@case("water", "mapping.water.medium.MIN_RATE")
 def rates_at_0_and_50(check: Check, seed: int) -> None:
     """The learnable medium starts from clear water and from ink."""
     for rate in (0.0, 50.0):
@@ -90,7 +90,7 @@ def rates_at_0_and_50(check: Check, seed: int) -> None:
         check.below("error of beta_a", _off(medium(torch.eye(3)).beta_a, rate), 1e-3)
 
 
-@case("water", "mapping.gaussians.MIN_RADIANCE")
+@case("water", "mapping.gaussians.gaussians.MIN_RADIANCE")
 def black_and_glowing_radiance(check: Check, seed: int) -> None:
     """Radiance 0 and 100 become raw colours and back."""
     for value in (0.0, 1e-30, 1e-3, 1.0, 100.0):
@@ -121,7 +121,7 @@ def picture_through_bare_map(check: Check, seed: int) -> None:
             )
 
 
-@case("water", "mapping.losses.MIN_RANGE")
+@case("water", "mapping.optimisation.losses.MIN_RANGE")
 def depth_loss_at_range_0(check: Check, seed: int) -> None:
     """Pixels of range 0, drawn and not drawn, known and not known."""
     z = torch.tensor([[0.0, 0.0, 0.0, 1e-30, 1e9]], requires_grad=True)

@@ -1,11 +1,11 @@
 """Admission of loop edges: each is tested against the chain of edges that it would bend.
 
 A robust weight alone cannot detect a false loop: a long soft chain bends to it until its residual
-is small. So before an edge counts, its claim is compared with the present estimate in the metric of
-its own covariance plus that of the chain between its ends (individual compatibility, Neira and
-Tardos 2001), the chain's grown by how much worse than stated tracking may drift. Edges that make
-the same loop from other keyframes corroborate each other and are allowed more drift. What is not
-admitted keeps trust zero and is tested again when the map around it has changed.
+is small. So before an edge counts, its relative pose is compared with the present estimate in the
+metric of its own covariance plus that of the chain between its ends (individual compatibility,
+Neira and Tardos 2001), the chain's grown by how much worse than stated tracking may drift. Edges
+that close the same loop from other keyframes corroborate each other and are allowed more drift.
+What is not admitted keeps trust zero and is tested again when the map around it has changed.
 """
 
 from __future__ import annotations
