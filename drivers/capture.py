@@ -1,4 +1,4 @@
-"""What a live camera's driver gives to :class:`drivers.live.LiveCamera`: an open device."""
+"""The interface of a live camera's driver to :class:`drivers.live.LiveCamera`: an open device."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from aquaflow.messages import CameraModel, EncodedPicture
 
 
 class UnusablePictureError(Exception):
-    """The bytes of one picture make no picture; the message is a reason that follows its number."""
+    """The bytes of one picture cannot be decoded; the message is the reason, after its number."""
 
 
 def nothing_to_release() -> None:
@@ -37,7 +37,7 @@ class RawPicture:
     exposed_ns: int | None = None
     """Moment of exposure that the device claims, CLOCK_MONOTONIC; None: it reports none."""
     device_ns: int | None = None
-    """The same moment on the device's own clock, whose zero is anywhere."""
+    """The same moment on the device's own clock, whose zero is arbitrary."""
     sequence: int | None = None
     """The device's picture counter, which also counts pictures that were never delivered."""
     exposure_s: float | None = None
@@ -57,7 +57,7 @@ class Capture(Protocol):
     camera: CameraModel | None
     """Calibration that the device itself carries."""
     notes: tuple[str, ...]
-    """What was asked for and the device does not do; one sentence each."""
+    """Requested settings that the device does not support; one sentence each."""
 
     def read(self, timeout_s: float) -> RawPicture | None:
         """The next picture; None when ``timeout_s`` passed without one.
@@ -68,7 +68,7 @@ class Capture(Protocol):
         ...
 
     def close(self) -> None:
-        """Give the device back; may be called again, and while pictures are not yet released."""
+        """Close the device; may be called again, and while pictures are not yet released."""
         ...
 
 

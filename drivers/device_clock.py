@@ -5,7 +5,7 @@ from __future__ import annotations
 from aquaflow.clocks.device import ClockMapping
 
 MAX_AGE_NS = 2_000_000_000
-"""No link holds a message back longer; an older stamp means that a clock was set."""
+"""No link delays a message longer; an older stamp means that a clock was set."""
 
 
 class DeviceClock:

@@ -1,4 +1,4 @@
-"""The functions behind ``aquaflow.discovery``: what is plugged into this computer."""
+"""The functions of the entry points ``aquaflow.discovery``: devices of this computer."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def oak_cameras(root: Path = Path("/")) -> list[FoundDevice]:
 
 
 def serial_ports(root: Path = Path("/")) -> list[FoundDevice]:
-    """Serial ports by the name that stays; those without one by their number."""
+    """Serial ports by their persistent name; those without one by their number."""
     found = []
     named = set()
     for link in sorted((root / "dev/serial/by-id").glob("*")):

@@ -13,7 +13,7 @@ MAX_LATENCY_NS = 2_000_000_000
 """An older stamp is rejected; the slowest live path seen is an RTSP camera with 1 s."""
 
 MAX_SLEW = 0.01
-"""The offset between device and host follows what is claimed by at most this much per second of
+"""The offset between device and host follows the claimed offset by at most this much per second of
 device time: drift is 1e-4 at worst, so a jump of synchronisation is recognised."""
 
 REPAIR_NS = 5_000_000
@@ -22,7 +22,7 @@ drift of two clocks does not."""
 
 
 class ExposureClock:
-    """Turns claimed exposure times into CLOCK_MONOTONIC times that can be relied on.
+    """Turns claimed exposure times into reliable CLOCK_MONOTONIC times.
 
     Where the device also gives its own clock, time advances by that clock, and a jump of the
     host's idea of it is bridged. Otherwise an implausible claim is replaced by the arrival.

@@ -1,4 +1,4 @@
-"""Optional libraries: loaded where a driver is opened, and one sentence where they are absent."""
+"""Optional libraries: loaded when a driver is opened; an error of one sentence if missing."""
 
 from __future__ import annotations
 

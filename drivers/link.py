@@ -1,4 +1,4 @@
-"""Byte links to devices: what every transport offers, what is counted, what decodes the bytes."""
+"""Byte links to devices: the protocols of transports and decoders, and the counters."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MAX_READ_BYTES = 65_536
 
 
 class LinkLostError(Exception):
-    """The device or its peer went away; opening the link again may bring it back."""
+    """The device or its peer is gone; opening the link again may succeed."""
 
 
 @dataclass
@@ -41,7 +41,8 @@ class ByteLink(Protocol):
     """For logs and the recorder, stable over reconnects."""
 
     def read(self, timeout_s: float) -> bytes:
-        """What has arrived, at most MAX_READ_BYTES; empty when ``timeout_s`` passed without any.
+        """The bytes that have arrived, at most MAX_READ_BYTES; empty when ``timeout_s`` passed
+        without any.
 
         Raises:
             LinkLostError: the device or the peer is gone.

@@ -1,4 +1,4 @@
-"""A live camera as a CameraSource: its thread, its state, and how it comes back when it is lost.
+"""A live camera as a CameraSource: its thread, its state, and its reconnection.
 
 A driver brings a function that opens its device (:mod:`drivers.capture`); all else is here and
 the same for every kind of camera.
@@ -24,7 +24,7 @@ from drivers.exposure_clock import ExposureClock
 from drivers.sequence import SequenceGaps
 
 READ_S = 0.2
-"""Longest wait for a picture before the thread looks whether it shall end."""
+"""Longest wait for a picture before the thread checks whether it shall end."""
 
 JOIN_S = 2.0
 """Longest wait for the thread; one that hangs in a device's library ends with the process."""
@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 
 class CameraState(Enum):
-    """Where a camera is between unplugged and delivering pictures."""
+    """States of a camera from unplugged to delivering pictures."""
 
     CLOSED = "closed"
     CONNECTING = "connecting"
@@ -124,7 +124,7 @@ class LiveCamera:
     def frames(
         self, every: int = 1, start: int = 0, stop: int | None = None
     ) -> Iterator[Frame | Dropped]:
-        """The newest picture, again and again, until :meth:`close` or index ``stop``.
+        """Yield the newest picture repeatedly, until :meth:`close` or index ``stop``.
 
         An index counts what the device took, so it jumps where pictures were lost or overtaken.
 
@@ -151,7 +151,7 @@ class LiveCamera:
             raise self._failure
 
     def close(self) -> None:
-        """End iteration and give the device back; may be called from any thread, and again."""
+        """End iteration and close the device; may be called from any thread, and again."""
         self._closing.set()
         self._newest.end(discard=True)
         if self._thread is not None:

@@ -1,4 +1,4 @@
-"""From a sensor's own frame and place to the vehicle's body: rotation and lever arm."""
+"""From a sensor's frame and position to the vehicle's body: rotation and lever arm."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from aquaflow.messages import (
 from drivers.rotation import Vector, cross, from_euler, inverse, product, rotate
 
 STATE_LIFE_NS = 500_000_000
-"""An attitude or a rate older than this says nothing of now: an ROV turns at up to 90 deg/s."""
+"""An attitude or a rate older than this is not used: an ROV turns at up to 90 deg/s."""
 
 
 class Mounting:

@@ -1,4 +1,4 @@
-"""What no underwater vehicle can measure: such samples are counted and go no further."""
+"""Limits of plausible measurements: samples beyond are counted and dropped."""
 
 from __future__ import annotations
 

@@ -27,10 +27,10 @@ OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 """Environment variable from which OpenCV takes the options of FFmpeg."""
 
 OPEN_TIMEOUT_S = 5.0
-"""A camera on the tether answers within a second, and within this while it boots."""
+"""Timeout of a connection: a running camera answers within 1 s, a booting one within this."""
 
 PROBE = "fflags;nobuffer|flags;low_delay|analyzeduration;1000000"
-"""Show pictures as they come, and look no longer than 1 s (in us) for what is in the stream."""
+"""FFmpeg options: no buffering, and at most 1 s (in us) to analyse the stream."""
 
 MAX_DAMAGED = 30
 """Pictures in a row that fail to decode before the stream counts as broken: 1 s."""
@@ -61,7 +61,7 @@ class StreamCapture:
             raise ConnectionError(f"no video from {without_password(config.url)}")
 
     def read(self, timeout_s: float) -> RawPicture | None:
-        """The next picture; FFmpeg waits for it as long as the stream may stall."""
+        """The next picture; FFmpeg waits up to the configured stall time."""
         if not self._grabbed:
             self._grab()
         bgr = None
@@ -82,7 +82,7 @@ class StreamCapture:
         self._capture.release()
 
     def _grab(self) -> None:
-        """FFmpeg says the same of a damaged picture and of the end: only then nothing follows."""
+        """FFmpeg reports a damaged picture and the end alike; at the end no picture follows."""
         deadline_ns = time.monotonic_ns() + self._stall_ns
         while not self._capture.grab():
             self._damaged += 1

@@ -1,4 +1,4 @@
-"""Keeps the link of one device alive: opens, reads, decodes, answers, and opens anew when lost."""
+"""Runs the link of one device: opens, reads, decodes, answers, and reopens it when lost."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from drivers.transport import OpenLink
 log = logging.getLogger(__name__)
 
 READ_TIMEOUT_S = 0.1
-"""How soon a link notices that it shall close."""
+"""Read timeout, after which a link checks whether it shall close."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 5.0
 """Between attempts to open a link; doubled after each that brought no byte."""
 
@@ -35,12 +35,12 @@ class Talker(Protocol):
     """A decoder that also sends to its device."""
 
     def outgoing(self, now_ns: int) -> bytes:
-        """What is to be written now; often nothing."""
+        """The bytes to write now; often none."""
         ...
 
 
 class Supervisor:
-    """Runs in a thread of its own, :meth:`run`, until :meth:`stop`; nothing raises through it."""
+    """Runs :meth:`run` in its own thread until :meth:`stop`; no error leaves it."""
 
     def __init__(
         self,
@@ -134,7 +134,7 @@ class Supervisor:
         self._note("connected", logging.INFO)
 
     def _note(self, state: str, level: int) -> None:
-        """Say what changed; a device that stays away is not repeated."""
+        """Log a change of state; an unchanged state is not logged again."""
         if state != self.state:
             log.log(level, "%s: %s", self.name, state)
         self.state = state

@@ -23,7 +23,7 @@ from drivers.transport import OpenLink, opener
 log = logging.getLogger(__name__)
 
 CLOSE_TIMEOUT_S = 5.0
-"""A thread that is stuck in a system call longer is left behind; it can do no harm any more."""
+"""Longest wait for a thread at the end; one stuck in a system call is abandoned."""
 
 
 class _QueuedSample(NamedTuple):
@@ -100,11 +100,11 @@ class LinkTelemetry:
             yield self._body.refer(waiting.sample, waiting.mounting)
 
     def counters(self) -> dict[str, LinkCounters]:
-        """What happened on each link."""
+        """The counters of each link."""
         return {name: link.counters for name, link in self.links.items()}
 
     def clocks(self) -> dict[str, ClockReport]:
-        """What is known of the clocks of the devices that have one and have been heard."""
+        """Reports of the clocks of devices that have one and sent messages."""
         reports = {
             name: decoder.clock.mapping.report()
             for name, decoder in self.decoders.items()
@@ -118,7 +118,8 @@ class LinkTelemetry:
         return {name: clock.mapping.learned() for name, clock in clocks.items() if clock}
 
     def resume(self, learned: Mapping[str, Learned]) -> None:
-        """Go on with the devices' clocks as an earlier process since the same boot left them."""
+        """Continue with the devices' clocks as an earlier process since the same boot learned
+        them."""
         for name, decoder in self.decoders.items():
             if decoder.clock is not None:
                 decoder.clock.mapping.resume(learned.get(name, ()))

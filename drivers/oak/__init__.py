@@ -1,4 +1,4 @@
-"""Luxonis OAK cameras: policy here, the vendor's library behind a thin protocol."""
+"""Luxonis OAK cameras; the vendor's library is used through a small protocol."""
 
 from drivers.oak.camera import OakCamera
 

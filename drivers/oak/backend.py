@@ -1,4 +1,4 @@
-"""What an OAK camera can do, as little as :class:`drivers.oak.camera.OakCamera` needs.
+"""The functions of an OAK camera that :class:`drivers.oak.camera.OakCamera` needs.
 
 ``DaiBackend`` speaks to the device; the replay backend in sim_drivers needs none.
 """

@@ -21,7 +21,7 @@ from drivers.oak.calibration import camera_model, imu_rotation
 from drivers.oak.messages import DaiImuReading, DaiPicture, imu_readings, picture_of
 
 SEARCH_MS = 500
-"""The library's own 10 s would keep a user waiting who only forgot the cable."""
+"""Longest search; the library's own 10 s are long if only the cable is missing."""
 
 PICTURE_QUEUE = 4
 """Pictures; the queue drops the oldest, so a short one keeps what is read fresh."""
@@ -138,7 +138,7 @@ class DaiBackend:
         control.send(self._controls(config))
 
     def _imu_queue(self, rate_hz: int) -> Any:
-        """None if no readings are wanted, or the camera has no IMU (OAK-1, OAK-D Lite)."""
+        """The IMU's queue; None if not configured, or the camera has no IMU (OAK-1, OAK-D Lite)."""
         dai = self._dai
         if rate_hz == 0 or not self._device.getConnectedIMU():
             return None

@@ -22,9 +22,9 @@ OUR_COMPONENT = 197
 TALK_EVERY_NS = 1_000_000_000
 """Heartbeats at 1 Hz, as the standard has it; TIMESYNC requests go with them."""
 OPEN_REQUESTS = 16
-"""TIMESYNC requests that an answer may still come to."""
+"""Most open TIMESYNC requests."""
 MAX_OUTGOING_BYTES = 1024
-"""A flood of TIMESYNC requests is answered as far as this goes, between two writes."""
+"""Most bytes of TIMESYNC answers between two writes."""
 MOST_WAITING = 32
 """Messages that wait while a link is down; older ones are dropped."""
 SINCE_1970_US = 1_000_000_000_000_000
@@ -32,7 +32,7 @@ SINCE_1970_US = 1_000_000_000_000_000
 
 
 class MavlinkDecoder(PacketDecoder):
-    """The autopilot that ``config`` names; what others on the link say is counted, not used."""
+    """The autopilot that ``config`` names; messages of others on the link are counted, not used."""
 
     def __init__(self, name: str, config: MavlinkConfig) -> None:
         self._dialect = load(DIALECT, f"the MAVLink device '{name}'")
@@ -68,7 +68,7 @@ class MavlinkDecoder(PacketDecoder):
         return self._samples.of(message, MessageTime(t_ns, arrival_ns, self.source(name)))
 
     def outgoing(self, now_ns: int) -> bytes:
-        """What is to be written now: answers to TIMESYNC, and once a second our own request."""
+        """The bytes to write now: answers to TIMESYNC, and once a second our own request."""
         if not self._config.talk:
             return b""
         data, self._outgoing = self._outgoing, b""

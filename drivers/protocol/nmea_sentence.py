@@ -48,7 +48,7 @@ def framing(require_checksum: bool) -> LineFraming:
 
 
 def parse(packet: bytes) -> Sentence:
-    """An intact sentence, taken apart."""
+    """Parse an intact sentence."""
     match = BODY.fullmatch(packet)
     assert match is not None
     address, *fields = match.group(1).decode("ascii").split(",")

@@ -18,13 +18,13 @@ from drivers.plausible import plausible
 log = logging.getLogger(__name__)
 
 NO_PACKET = 0
-"""Length of what cannot be a packet after all."""
+"""Length returned where no packet starts."""
 INCOMPLETE = -1
 """Length of a packet whose header has not arrived completely."""
 
 
 class Framing(ABC):
-    """What a protocol's packets look like."""
+    """How a protocol's packets are delimited and checked."""
 
     longest: int
     """Bytes; what is kept while a packet is incomplete stays below."""
@@ -88,7 +88,7 @@ class PacketReader:
         self._damaged_until = 0
 
     def _take(self, buffer: bytes, at: int, length: int, packets: list[bytes]) -> int:
-        """How far to go on: behind a good packet, or one byte."""
+        """How far to advance: behind a good packet, or one byte."""
         if length != NO_PACKET:
             packet = buffer[at : at + length]
             if self.framing.intact(packet):
@@ -104,14 +104,14 @@ class PacketReader:
 
 
 class PacketDecoder(ABC):
-    """A decoder of :mod:`drivers.link` around a framing; a child says what packets mean."""
+    """A decoder of :mod:`drivers.link` with a framing; a subclass decodes the packets."""
 
     def __init__(self, name: str, framing: Framing) -> None:
         self.name = name
         self.counters = LinkCounters()
         self.reader = PacketReader(framing, self.counters)
         self.clock: DeviceClock | None = None
-        """Of a device that stamps what it sends with a clock of its own."""
+        """Clock of a device that stamps its messages with its own clock."""
 
     @abstractmethod
     def decode(self, packet: bytes, arrival_ns: int) -> list[TelemetrySample]:
@@ -143,5 +143,5 @@ class PacketDecoder(ABC):
         self.reader.reset()
 
     def source(self, what: str) -> str:
-        """Name that samples carry: device and message."""
+        """The samples' source name: device and message."""
         return f"{self.name}/{what}"

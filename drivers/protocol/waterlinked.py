@@ -1,4 +1,4 @@
-"""What Water Linked's two protocols have in common (github.com/waterlinked/docs, docs/dvl).
+"""Common parts of Water Linked's two protocols (github.com/waterlinked/docs, docs/dvl).
 
 Axes are x forward, y starboard, z down, as the body's; a bracket that points the DVL backwards is
 the mounting's business.
@@ -14,7 +14,7 @@ from drivers.rotation import from_euler
 NO_BOTTOM_M = -1.0
 """Altitude where the DVL sees no bottom."""
 MAX_LATENCY_US = 1_000_000
-"""A measurement is sent within 0.1 s; more says that one of its two times is wrong."""
+"""A measurement is sent within 0.1 s; a longer delay means that one of its two times is wrong."""
 
 
 def measured_ns(arrival_ns: int, validity_us: int, transmission_us: int) -> int:

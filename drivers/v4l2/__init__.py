@@ -1,4 +1,4 @@
-"""USB and CSI cameras through the kernel's V4L2 interface, with nothing between."""
+"""USB and CSI cameras through the kernel's V4L2 interface, without a library."""
 
 from drivers.v4l2.camera import V4l2Camera
 

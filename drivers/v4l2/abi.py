@@ -16,7 +16,7 @@ CAP_VIDEO_CAPTURE = 0x00000001
 CAP_STREAMING = 0x04000000
 """V4L2_CAP_*: the device takes pictures; it hands them over in such buffers."""
 CAP_DEVICE_CAPS = 0x80000000
-"""Set where ``device_caps`` speaks for this node alone."""
+"""Set where ``device_caps`` describes this node alone."""
 
 BUF_FLAG_ERROR = 0x0040
 """The picture may be damaged."""
