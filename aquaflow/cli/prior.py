@@ -140,18 +140,18 @@ def train_mast3r(
     """
     from aquaflow.prior.mast3r.weights import LICENCE_NOTICE, load_checkpoint
     from aquaflow.training import finetune
-    from aquaflow.training.peers import joined
+    from aquaflow.training.distributed import joined_processes
 
     settings = finetune.FineTuningSettings(
         width, height, epochs, max(1, epochs * 2 // 15), batch, accumulate, seed
     )
     sequences = finetune.read_data(data)
-    with joined() as peers, progress_bars(quiet=not peers.leads) as advance:
-        if peers.leads:
+    with joined_processes() as process, progress_bars(quiet=not process.leads) as advance:
+        if process.leads:
             typer.echo(LICENCE_NOTICE, err=True)
         network = load_checkpoint(checkpoint).requires_grad_(True)
-        pairs = finetune.mined(sequences, out, settings, peers, advance)
-        finetune.fine_tune(network, pairs, out, settings, peers, advance)
+        pairs = finetune.mined(sequences, out, settings, process, advance)
+        finetune.fine_tune(network, pairs, out, settings, process, advance)
     typer.echo(f"Export {out / finetune.WEIGHTS} with `aquaflow prior export mast3r`.")
 
 

@@ -21,9 +21,9 @@ from aquaflow.training.datasets.mimir import mimir
 from aquaflow.training.datasets.posed import Frames
 from aquaflow.training.datasets.tartanair import tartanair
 from aquaflow.training.datasets.uwstereo import uwstereo
+from aquaflow.training.distributed import TrainingProcess
 from aquaflow.training.losses import Losses, LossWeights, pair_loss
 from aquaflow.training.mining import MinedPairs, load_index, mine, save_index
-from aquaflow.training.peers import Peers
 from aquaflow.training.schedule import Schedule
 from aquaflow.training.trainer import Progress, TrainingPlan, train
 
@@ -65,26 +65,30 @@ class FineTuning:
     """The task for the trainer: batches of pairs, the paper's loss, held-out pairs."""
 
     def __init__(
-        self, network: Mast3r, pairs: MinedPairs, settings: FineTuningSettings, peers: Peers
+        self,
+        network: Mast3r,
+        pairs: MinedPairs,
+        settings: FineTuningSettings,
+        process: TrainingProcess,
     ) -> None:
         """Raises InputError where there are too few pairs for one batch of every process."""
-        self.network = network.to(peers.device)
-        self._pairs, self._settings, self._peers = pairs, settings, peers
+        self.network = network.to(process.device)
+        self._pairs, self._settings, self._process = pairs, settings, process
         numbers = range(len(pairs))
         held_out = [n for n in numbers if n % HELD_OUT_EVERY == HELD_OUT_EVERY - 1]
         self._held_out = held_out[:HELD_OUT]
         self._trained = [n for n in numbers if n % HELD_OUT_EVERY != HELD_OUT_EVERY - 1]
-        if len(self._trained) < settings.batch * peers.count:
+        if len(self._trained) < settings.batch * process.count:
             raise InputError(
-                f"{len(self._trained)} pairs are too few for {peers.count} processes with batches "
-                f"of {settings.batch}; give more --data"
+                f"{len(self._trained)} pairs are too few for {process.count} processes with "
+                f"batches of {settings.batch}; give more --data"
             )
         self._weights = LossWeights()
 
     @property
     def batches_per_epoch(self) -> int:
         """Of each process; the rest of an epoch is left out, another one each time."""
-        return len(self._trained) // (self._settings.batch * self._peers.count)
+        return len(self._trained) // (self._settings.batch * self._process.count)
 
     def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
         """Of this process's batch number ``step``."""
@@ -102,7 +106,7 @@ class FineTuning:
         }
 
     def _losses(self, numbers: Sequence[int], seed: int) -> Losses:
-        device = self._peers.device
+        device = self._process.device
         pair = self._pairs.pair(numbers).to(device)
         with torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"):
             a, b = self.network(pair.a.image, pair.b.image)
@@ -115,7 +119,7 @@ class FineTuning:
         epoch, batch = divmod(step, self.batches_per_epoch)
         generator = torch.Generator().manual_seed(self._settings.seed + epoch)
         order = torch.randperm(len(self._trained), generator=generator)
-        first = (batch * self._peers.count + self._peers.rank) * self._settings.batch
+        first = (batch * self._process.count + self._process.rank) * self._settings.batch
         return [self._trained[int(n)] for n in order[first : first + self._settings.batch]]
 
 
@@ -124,7 +128,7 @@ def fine_tune(
     pairs: MinedPairs,
     out: Path,
     settings: FineTuningSettings,
-    peers: Peers,
+    process: TrainingProcess,
     progress: Progress,
 ) -> list[dict[str, float]]:
     """Train, and write ``mast3r.pth``, which `aquaflow prior export mast3r` reads.
@@ -132,9 +136,9 @@ def fine_tune(
     Raises:
         InputError: too few pairs, or ``out`` holds the checkpoint of another network.
     """
-    task = FineTuning(network, pairs, settings, peers)
-    history = train(task, plan_of(task.batches_per_epoch, settings), out, progress, peers)
-    if peers.leads:
+    task = FineTuning(network, pairs, settings, process)
+    history = train(task, plan_of(task.batches_per_epoch, settings), out, progress, process)
+    if process.leads:
         torch.save({"model": network.state_dict()}, out / WEIGHTS)
     return history
 
@@ -169,7 +173,7 @@ def mined(
     sequences: Sequence[Frames],
     out: Path,
     settings: FineTuningSettings,
-    peers: Peers,
+    process: TrainingProcess,
     progress: Progress,
 ) -> MinedPairs:
     """The pairs of ``out``'s list, which the process that leads makes if it is not there.
@@ -178,10 +182,10 @@ def mined(
         InputError: no pair overlaps enough, or the list is damaged.
     """
     path = out / INDEX
-    if peers.leads and not path.is_file():
+    if process.leads and not path.is_file():
         out.mkdir(parents=True, exist_ok=True)
         save_index(mine(sequences, progress), path)
-    peers.wait()
+    process.wait()
     index = load_index(path)
     if not index:
         raise InputError("no two pictures of --data overlap by 30 %; are depths and poses right?")

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from aquaflow.errors import InputError, reason_of
 from aquaflow.training.curve import draw_curve
-from aquaflow.training.peers import Peers
+from aquaflow.training.distributed import TrainingProcess
 from aquaflow.training.schedule import Schedule
 
 log = logging.getLogger(__name__)
@@ -74,11 +74,15 @@ class _Run:
 
 
 def train(
-    task: Task, plan: TrainingPlan, out: Path, progress: Progress, peers: Peers | None = None
+    task: Task,
+    plan: TrainingPlan,
+    out: Path,
+    progress: Progress,
+    process: TrainingProcess | None = None,
 ) -> list[dict[str, float]]:
     """Train until the schedule ends, from ``out``'s checkpoint if there is one.
 
-    With ``peers``, gradients are averaged over them, and the one that leads writes files.
+    Gradients are averaged over all processes, and the one that leads writes files.
 
     Returns:
         One row per validation: step, cpu_s, rate, the mean training terms and the figures.
@@ -86,7 +90,7 @@ def train(
     Raises:
         InputError: the checkpoint is of another network.
     """
-    peers = peers or Peers()
+    process = process or TrainingProcess()
     out.mkdir(parents=True, exist_ok=True)
     optimiser = torch.optim.AdamW(
         task.network.parameters(), lr=0.0, betas=plan.betas, weight_decay=plan.weight_decay
@@ -95,18 +99,18 @@ def train(
     began, steps = time.process_time() - run.cpu_s, plan.schedule.steps
     sums: dict[str, list[float]] = {}
     while run.step < steps:
-        for name, value in _step(task, optimiser, plan, run.step, peers).items():
+        for name, value in _step(task, optimiser, plan, run.step, process).items():
             sums.setdefault(name, []).append(value)
         run.step += 1
         last = run.step == steps
-        if peers.leads and (last or run.step % plan.validate_every == 0):
+        if process.leads and (last or run.step % plan.validate_every == 0):
             run.cpu_s = time.process_time() - began
             run.history.append(_row(task, plan, run, sums))
             sums = {}
             (out / HISTORY).write_text(json.dumps(run.history, indent=1) + "\n")
             draw_curve(run.history, out / CURVE)
             log.info("%s", json.dumps(run.history[-1]))
-        if peers.leads and (last or run.step % plan.save_every == 0):
+        if process.leads and (last or run.step % plan.save_every == 0):
             run.cpu_s = time.process_time() - began
             _save(task.network, optimiser, run, out / CHECKPOINT)
         progress("train", run.step, steps)
@@ -114,7 +118,11 @@ def train(
 
 
 def _step(
-    task: Task, optimiser: torch.optim.Optimizer, plan: TrainingPlan, step: int, peers: Peers
+    task: Task,
+    optimiser: torch.optim.Optimizer,
+    plan: TrainingPlan,
+    step: int,
+    process: TrainingProcess,
 ) -> dict[str, float]:
     """One step of the optimiser; a loss that is no number moves nothing."""
     task.network.train()
@@ -127,7 +135,7 @@ def _step(
         (loss / plan.accumulate).backward()  # type: ignore[no-untyped-call]
         for name, value in terms.items():
             means[name] = means.get(name, 0.0) + value / plan.accumulate
-    peers.average(task.network.parameters())
+    process.average(task.network.parameters())
     norm = nn.utils.clip_grad_norm_(task.network.parameters(), plan.longest_gradient)
     if bool(torch.isfinite(norm)):
         optimiser.step()

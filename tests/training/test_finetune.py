@@ -17,10 +17,11 @@ from aquaflow.errors import InputError
 from aquaflow.prior.mast3r import weights
 from aquaflow.prior.mast3r.network import Mast3r
 from aquaflow.prior.mast3r.settings import TINY
-from aquaflow.training import finetune, peers
+from aquaflow.training import distributed as processes
+from aquaflow.training import finetune
+from aquaflow.training.distributed import DistributedProcess, TrainingProcess
 from aquaflow.training.finetune import FineTuning, FineTuningSettings, mined, plan_of, read_data
 from aquaflow.training.mining import MinedPairs
-from aquaflow.training.peers import Peers, Together
 from tests.small_recording import GIVE_UP_S
 from tests.training.data_trees import write_colmap, write_tartanair
 
@@ -48,7 +49,9 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def pairs(data: Path, tmp_path: Path) -> MinedPairs:
-    return mined(read_data([f"tartanair={data}"]), tmp_path / "index", SMALL, Peers(), silent)
+    return mined(
+        read_data([f"tartanair={data}"]), tmp_path / "index", SMALL, TrainingProcess(), silent
+    )
 
 
 def test_the_papers_schedule_follows_from_the_number_of_pairs() -> None:
@@ -64,14 +67,14 @@ def test_the_papers_schedule_follows_from_the_number_of_pairs() -> None:
 
 
 def test_the_loss_is_the_papers(pairs: MinedPairs) -> None:
-    task = FineTuning(tiny(), pairs, SMALL, Peers())
+    task = FineTuning(tiny(), pairs, SMALL, TrainingProcess())
     total, terms = task.loss(0)
     assert float(total.detach()) == pytest.approx(terms["points"] + 0.075 * terms["match"])
 
 
 def test_points_stay_metric(pairs: MinedPairs) -> None:
     """The same scene twice as large is another truth: no scale is normalised away."""
-    task = FineTuning(tiny(), pairs, SMALL, Peers())
+    task = FineTuning(tiny(), pairs, SMALL, TrainingProcess())
     pair = pairs.pair([0])
     X = torch.cat([pair.a.points(), 2.0 * pair.a.points()])
     assert float(X[1].norm()) == pytest.approx(2.0 * float(X[0].norm()))
@@ -82,7 +85,7 @@ def test_an_epoch_shows_every_pair_once_to_one_process(pairs: MinedPairs) -> Non
     def processes(count: int) -> list[FineTuning]:
         tasks = []
         for rank in range(count):
-            one = Peers()
+            one = TrainingProcess()
             one.rank, one.count = rank, count
             tasks.append(FineTuning(tiny(), pairs, SMALL, one))
         return tasks
@@ -98,14 +101,14 @@ def test_an_epoch_shows_every_pair_once_to_one_process(pairs: MinedPairs) -> Non
 def test_too_few_pairs_are_refused(pairs: MinedPairs) -> None:
     few = MinedPairs(pairs.scenes, pairs.index[:1], 32, 32)
     with pytest.raises(InputError, match="give more --data"):
-        FineTuning(tiny(), few, SMALL, Peers())
+        FineTuning(tiny(), few, SMALL, TrainingProcess())
 
 
 def test_pictures_that_never_overlap_are_refused(tmp_path: Path) -> None:
     write_colmap(tmp_path / "set", count=1)
     sequences = read_data([f"colmap={tmp_path / 'set'}"])
     with pytest.raises(InputError, match="overlap by 30 %"):
-        mined(sequences, tmp_path / "out", SMALL, Peers(), silent)
+        mined(sequences, tmp_path / "out", SMALL, TrainingProcess(), silent)
 
 
 @pytest.mark.parametrize("spec", ["tartanair", "kitti=/data", "=/data", ""])
@@ -146,8 +149,8 @@ from pathlib import Path
 import torch
 from aquaflow.prior.mast3r.network import Mast3r
 from aquaflow.prior.mast3r.settings import TINY
-from aquaflow.training import finetune, peers
-from aquaflow.training.peers import joined
+from aquaflow.training import finetune
+from aquaflow.training.distributed import joined_processes
 from aquaflow.training.schedule import Schedule
 from aquaflow.training.trainer import TrainingPlan
 
@@ -159,12 +162,12 @@ finetune.plan_of = lambda batches, settings: TrainingPlan(
 )
 torch.manual_seed(0)
 network = Mast3r(TINY)
-with joined() as peers:
+with joined_processes() as process:
     pairs = finetune.mined(
-        finetune.read_data([f"tartanair={data}"]), out, settings, peers, lambda *_: None
+        finetune.read_data([f"tartanair={data}"]), out, settings, process, lambda *_: None
     )
-    finetune.fine_tune(network, pairs, out, settings, peers, lambda *_: None)
-    torch.save(network.state_dict(), out / f"rank{peers.rank}.pt")
+    finetune.fine_tune(network, pairs, out, settings, process, lambda *_: None)
+    torch.save(network.state_dict(), out / f"rank{process.rank}.pt")
 """
 
 
@@ -199,13 +202,13 @@ def test_two_processes_train_one_network(data: Path, tmp_path: Path) -> None:
 
 def test_gradients_become_their_mean_over_the_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     """The other process has gradient 3 everywhere; no gradient here counts as zero."""
-    together = Together.__new__(Together)
-    together.count = 2
-    monkeypatch.setattr(peers.dist, "all_reduce", lambda tensor: tensor.add_(3.0))
+    one = DistributedProcess.__new__(DistributedProcess)
+    one.count = 2
+    monkeypatch.setattr(processes.dist, "all_reduce", lambda tensor: tensor.add_(3.0))
     known, unknown, fixed = (torch.nn.Parameter(torch.zeros(2)) for _ in range(3))
     known.grad = torch.ones(2)
     fixed.requires_grad_(False)
-    together.average([known, unknown, fixed])
+    one.average([known, unknown, fixed])
     torch.testing.assert_close(known.grad, torch.full((2,), 2.0))
     torch.testing.assert_close(unknown.grad, torch.full((2,), 1.5))
     assert fixed.grad is None

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch import distributed as dist
 
 
-class Peers:
+class TrainingProcess:
     """This process among those that train; alone unless torchrun started it."""
 
     rank = 0
@@ -37,7 +37,7 @@ class Peers:
         """Until every process is here."""
 
 
-class Together(Peers):
+class DistributedProcess(TrainingProcess):
     """A process that torchrun started, once its group is there."""
 
     def __init__(self) -> None:
@@ -64,16 +64,16 @@ class Together(Peers):
 
 
 @contextmanager
-def joined() -> Iterator[Peers]:
+def joined_processes() -> Iterator[TrainingProcess]:
     """The processes that torchrun started, or this one alone."""
     if "RANK" not in os.environ:
-        alone = Peers()
+        alone = TrainingProcess()
         if torch.cuda.is_available():
             alone.device = torch.device("cuda")
         yield alone
         return
     dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
     try:
-        yield Together()
+        yield DistributedProcess()
     finally:
         dist.destroy_process_group()
