@@ -209,4 +209,4 @@ def test_closing_ends_the_thread() -> None:
         dive.add(number)
     dive.graph.close()
     with pytest.raises(RuntimeError, match="shutdown"):
-        dive.graph._beside.submit(print)
+        dive.graph._executor.submit(print)
