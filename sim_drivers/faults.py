@@ -80,7 +80,7 @@ class FaultyLink:
             raise LinkLostError("disconnected by the fault injector")
 
     def _disturbed(self, data: bytes) -> list[bytes]:
-        """What is left of one read."""
+        """The bytes of one read after the faults."""
         if self._happens("drop", self._faults.drop):
             return []
         if self._happens("corrupt", self._faults.corrupt):

@@ -1,4 +1,4 @@
-"""An OAK camera made of a recording: the backend that stands in for the device."""
+"""An OAK camera made of a recording: a backend that replaces the device."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class CameraSpec:
 
 
 class V4l2Kernel:
-    """Shows a feed as a camera; when the feed unplugs it, it comes back as another number."""
+    """Shows a feed as a camera; when the feed unplugs it, it returns under another number."""
 
     def __init__(self, root: Path, feed: CameraFeed, spec: CameraSpec | None = None) -> None:
         self.root = root

@@ -197,7 +197,7 @@ def evaluate(
 
 @app.command()
 def doctor(as_json: Json = False) -> None:
-    """Say what this machine has, what AquaFlow will use, and what is missing for what."""
+    """Report what this machine has, what AquaFlow will use, and what is missing."""
     from rich.console import Console
 
     from aquaflow.doctor import examine, print_findings, to_json

@@ -1,4 +1,4 @@
-"""Settings of the wires that devices hang on: serial, UDP, TCP, CAN."""
+"""Settings of the links to devices: serial, UDP, TCP, CAN."""
 
 from __future__ import annotations
 

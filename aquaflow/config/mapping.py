@@ -113,7 +113,7 @@ class InsertionConfig(Stage):
         0.1,
         ge=0,
         lt=1,
-        description="share of a map at its hard cap that may give way to what is new, each time",
+        description="share of a map at its hard cap that new Gaussians may replace, each time",
     )
     known_sigma: float = Field(
         0.15, gt=0, description="relative range sigma of pixels that may get a Gaussian"
@@ -244,7 +244,7 @@ class MappingConfig(Stage):
     views_per_keyframe: int = Field(
         48,
         ge=2,
-        description="views that hang on a keyframe, common ones and others each, that are kept, "
+        description="views kept for each keyframe, common ones and others each, "
         "spread over its time; the reef clip has 40 common ones at its full 30 fps, 20 at 15",
     )
     insertion: InsertionConfig = InsertionConfig()

@@ -118,7 +118,7 @@ class ServiceConfig(Stage):
     camera: str | None = Field(None, description="name of the camera that maps; None: the first")
     record: bool = Field(False, description="also record cameras and telemetry, as `record` does")
     hang_s: float = Field(
-        60.0, gt=0, description="s without a sign of life of a stage until the process gives up; "
+        60.0, gt=0, description="s without a heartbeat of a stage until the process exits; "
         "one fit of the water may take 10 s on two cores",
     )  # fmt: skip
     health: ListenConfig = ListenConfig(port=8230)

@@ -19,7 +19,7 @@ class InitialisationConfig(Stage):
     min_share: float = Field(
         0.25, gt=0, lt=1, description="matched part of the samples below which the place is lost"
     )
-    min_views: int = Field(2, ge=1, description="frames besides the reference to decide by")
+    min_views: int = Field(2, ge=1, description="frames needed in addition to the reference")
     max_waiting: int = Field(24, ge=3, description="frames kept while waiting; bounds memory")
     parallax_widths: float = Field(
         0.04,
@@ -155,7 +155,7 @@ class GraphConfig(Stage):
     corroborated_drift_factor: float = Field(
         30.0,
         ge=1,
-        description="the same for loop edges that say the same thing; drift of monocular scale has "
+        description="the same for loop edges that corroborate it; drift of monocular scale has "
         "always the same sign, so it outgrows its covariance (docs/measurements.md)",
     )
     corroboration: int = Field(2, ge=1, description="others that must agree with a loop edge")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing looked for."""
+    """The result of one check."""
 
     name: str
     found: str

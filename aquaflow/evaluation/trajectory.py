@@ -95,7 +95,7 @@ def read_tum(path: Path) -> Trajectory:
 
 
 def _parse(text: str, path: Path, number: int) -> list[float]:
-    """Eight finite numbers with a unit quaternion, or the sentence that says what is wrong."""
+    """Eight finite numbers with a unit quaternion, or a sentence with the fault."""
     fields = text.replace(",", " ").split()
     if len(fields) != len(TUM_FIELDS.split()):
         raise InputError(

@@ -18,7 +18,7 @@ from aquaflow.storage.facts_file import UNREADABLE, read_facts_file, write_facts
 SUFFIX = ".aqf"
 """Of a map file."""
 KIND = "aquaflow map"
-"""What the facts say that the file is."""
+"""The kind of file, stated in its facts."""
 FORMAT = 1
 """Raised whenever an older AquaFlow could no longer read the file."""
 

@@ -1,1 +1,1 @@
-"""The two-view prior: what two pictures say about matches and geometry."""
+"""The two-view prior: matches and geometry from two pictures."""

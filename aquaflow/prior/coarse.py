@@ -1,7 +1,7 @@
 """Where a picture went, coarsely: mutual nearest neighbours among descriptors of its cells.
 
 Every cell votes alone, so many are wrong; those that follow the motion of most, or that of many
-neighbours, are seldom so. What they say is spread smoothly over the picture: good enough for dense
+neighbours, are seldom so. Their flow is spread smoothly over the picture: good enough for dense
 flow to start from.
 """
 
@@ -20,7 +20,7 @@ NEIGHBOUR_CELLS = 1.2
 MIN_SUPPORT = 2
 """Neighbours, of 8, that went the same way. By chance two do for one of 2,000 cells."""
 MIN_CELLS = 12
-"""Matched cells below which nothing is said."""
+"""Fewer matched cells than this give no flow."""
 MOTION_CELLS = 2.0
 """Distance from the motion of the whole picture up to which a cell follows it."""
 OWN_WAY_SUPPORT = 5

@@ -41,7 +41,7 @@ def refine(
 
     Gradients are the mean of both pictures' (Baker and Matthews, IJCV 2004, forwards and inverse
     step in one): noise and blur of either picture then shorten no step, and a to b errs like
-    b to a. The warp carries the slope and turn of the flow; a window moves only by what is left.
+    b to a. The warp carries the slope and turn of the flow; a window moves only by the remainder.
     """
     if min(a.shape) < LEAST_WINDOWS * WINDOW_PX:
         return flow

@@ -19,7 +19,7 @@ Event: TypeAlias = Frame | Dropped | TelemetrySample
 class Playback:
     """A camera and telemetry as one series of events, the same each time.
 
-    Step by step is ``next(events)``: nothing runs ahead of who asks, whatever the speed.
+    Step by step with ``next(events)``: nothing is read ahead of the caller, whatever the speed.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The recorder: takes from any thread without making it wait, writes from a thread of its own.
+"""The recorder: accepts data from any thread without blocking, writes in its own thread.
 
 Topics: ``/CAMERA/image`` or ``/CAMERA/video`` (foxglove schemas), ``/CAMERA/calibration``,
 ``/CAMERA/exposure``, ``/CAMERA/mask``, ``/CAMERA/dropped``, ``/telemetry/SOURCE/KIND`` (JSON),

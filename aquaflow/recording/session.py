@@ -1,4 +1,4 @@
-"""A recording from beginning to end: every source pumped by a thread of its own."""
+"""A recording from beginning to end: every source is read in its own thread."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ class Rendering:
     """[N] bool: sound, in front of the camera, and reaching 1/255 of alpha on the image.
 
     With an activity mask also: the box around its 1/255 ellipse touches an active tile. What
-    touches none has no say in the picture, so an optimiser must not move it by old moments.
+    touches none does not affect the picture, so an optimiser must not move it by old moments.
     """
 
     radius_px: Tensor

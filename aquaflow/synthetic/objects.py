@@ -1,4 +1,4 @@
-"""Man-made things on the sea floor: pipes, crates, mooring blocks, floats, ropes.
+"""Man-made objects on the sea floor: pipes, crates, mooring blocks, floats, ropes.
 
 Exact shapes (cylinder, box, sphere) met by rays in closed form. Coordinates here are the survey
 frame with z up.
@@ -46,7 +46,7 @@ class Shape:
     """Half sizes, m; a cylinder lies along its x and has radius size[1]; a sphere has size[0]."""
     paint: Rgb
     growth: Rgb
-    """Albedo of the bare thing, and of what grows on it."""
+    """Albedo of the bare object, and of the growth on it."""
     covered: float
     """How much is overgrown: 0.5 is half of it, 0 an eighth, -0.3 a thirtieth."""
     tile_m: float = 0.0

@@ -1,4 +1,4 @@
-"""Which man-made things a scene holds, and where they stand."""
+"""The man-made objects of a scene and their poses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""A tiled pool: floor and walls of equal tiles round the vehicle's way, and a few things in it."""
+"""A tiled pool: floor and walls of equal tiles round the vehicle's path, and a few objects in
+it."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ def bake(
     dy, dx = np.gradient(relief.height, relief.area.cell)
     steep = smoothstep(np.hypot(dx, dy).astype(np.float32), 0.7, 1.7)
     steep = np.clip(resized(steep, shape), 0.0, 1.0)[..., None]
-    # What is left of the map on a steep face would be drawn out to stripes.
+    # On a steep face the few pixels of the map would be stretched to stripes.
     colour += np.float32(0.8) * steep * (blur(colour, 0.02 / texel) - colour)
     return np.concatenate([colour, steep], axis=-1)
 

@@ -63,6 +63,6 @@ class Relief:
     height: FloatMap
     """[H, W] m, up."""
     tint: FloatMap
-    """[H, W, 3] albedo of stamped things."""
+    """[H, W, 3] albedo of stamped objects."""
     cover: FloatMap
     """[H, W] 0 (sediment) to 1 (rock, coral)."""

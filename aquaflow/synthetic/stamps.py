@@ -1,4 +1,4 @@
-"""Things that stand on the sea floor as part of its height map: stones, corals, sponges."""
+"""Objects on the sea floor as part of its height map: stones, corals, sponges."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ __all__ = [
 CLEARWAY_M = 1.0
 """Nothing taller than LOW_M stands nearer than this to the vehicle's way."""
 LOW_M = 0.22
-"""Height up to which things may stand under the vehicle."""
+"""Largest height of objects under the vehicle."""
 
 
 @dataclass(frozen=True)

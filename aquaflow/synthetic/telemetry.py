@@ -1,4 +1,4 @@
-"""Simulated instruments: what the vehicle's sensors say on the way, and the file they are in.
+"""Simulated instruments: samples of the vehicle's sensors along the path, and their file.
 
 ``telemetry.csv`` has the columns t_s, arrival_s, kind, source, v0, v1, v2, v3, in order of arrival:
 

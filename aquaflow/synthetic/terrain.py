@@ -19,7 +19,7 @@ __all__ = ["build_relief"]
 def build_relief(
     kind: SceneKind,
     area: Area,
-    loop: Array,  # [N, 2] m, the vehicle's way, kept clear of tall things
+    loop: Array,  # [N, 2] m, the vehicle's path, kept clear of tall objects
     rng: np.random.Generator,
 ) -> Relief:
     """The relief of one scene."""

@@ -1,6 +1,6 @@
 """L_total = L_conf + beta L_match (paper, Eq. 2): where the points are, and which pixels match.
 
-Both terms let the network say how far it trusts itself: an error counts by its confidence, and the
+Both terms let the network predict its confidence: an error counts by its confidence, and the
 logarithm of the confidence is rewarded.
 """
 

@@ -125,7 +125,7 @@ class ViewerPage:
             self._panel.content = markdown
 
     def add_slider(self, name: str, count: int, first: int, moved: Any) -> None:
-        """A slider over ``count`` things, at the ``first``; ``moved`` gets the number of one."""
+        """A slider over ``count`` items, at the ``first``; ``moved`` gets the number of one."""
         slider = self._server.gui.add_slider(name, 0, max(count - 1, 1), 1, first)
         slider.on_update(lambda _: moved(int(slider.value)))
 

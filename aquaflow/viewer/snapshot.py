@@ -1,7 +1,7 @@
 """The live viewer's copy of a dive, made by threads that have no time for browsers.
 
-The loop and the mapping thread leave what is new in queues of one; a thread of the viewer's takes
-it from there, works out what a browser needs, and hands it to the server.
+The loop and the mapping thread put new data into queues of one; a thread of the viewer takes
+it from there, computes what a browser needs, and hands it to the server.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class MapCopy:
-    """Copies of what is shown of a map: mapping goes on meanwhile."""
+    """Copies of the shown parts of a map, which mapping changes meanwhile."""
 
     parameters: dict[str, npt.NDArray[np.float32]]
     steps: npt.NDArray[np.int32]

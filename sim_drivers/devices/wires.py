@@ -30,7 +30,7 @@ class PtyWire:
         self.plug()
 
     def plug(self) -> None:
-        """Be there, as a device of its own."""
+        """Create the port, as a new device."""
         master, slave = os.openpty()
         tty.setraw(slave)
         os.set_blocking(master, False)

@@ -1,6 +1,7 @@
 """Runs every contender on every scene, interleaved, each in a process of its own.
 
-A run that fails is a row that says why: leaving it out would make the rest look better than it is.
+A run that fails is a row with the reason: leaving it out would make the rest look better than it
+is.
 """
 
 from __future__ import annotations

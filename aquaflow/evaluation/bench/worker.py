@@ -1,4 +1,4 @@
-"""One run in a process of its own: its peak memory is its own, and its crash is only its own.
+"""One run in its own process: its peak memory can be measured, and its crash stops no other run.
 
 ``python -m aquaflow.evaluation.bench.worker`` reads a job on stdin; the last line of its output is
 the row as JSON.
@@ -42,7 +42,7 @@ def perform(job: Job) -> dict[str, Any]:
 
 
 def peak_memory_mb() -> float | None:
-    """Of this program alone; None where the system does not say.
+    """Of this program alone; None where the system does not report it.
 
     getrusage's maximum is inherited: it holds the memory of the process that started this one.
     """

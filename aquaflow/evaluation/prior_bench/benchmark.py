@@ -1,4 +1,4 @@
-"""Which priors are timed here, and what is said about them."""
+"""Selects the priors to time, and assembles the result."""
 
 from __future__ import annotations
 

@@ -161,7 +161,7 @@ def degenerate_two_view(check: Check, seed: int) -> None:
 
 @case("solvers", "geometry.alignment._checked")
 def degenerate_alignment(check: Check, seed: int) -> None:
-    """Points in one place or not finite are refused; points on a line are said to be."""
+    """Points in one place or not finite are refused; points on a line are flagged as collinear."""
     points = _points(seed)
     broken = points.copy()
     broken[0, 0] = np.nan

@@ -118,7 +118,7 @@ def spoiled(
 
 @dataclass(frozen=True)
 class Tracking:
-    """All that the tracker said about one clip."""
+    """All results of the tracker for one clip."""
 
     tracked: list[Tracked]
     keyframes: KeyframeStore

@@ -40,7 +40,7 @@ class NetworkSize:
 
 
 class Encoded(NamedTuple):
-    """What is kept of a picture."""
+    """The encoder's output for a picture."""
 
     D: Tensor
     """[B, fine, H/2, W/2] unit descriptors"""

@@ -1,4 +1,4 @@
-"""Other programs on the same frames: they stand in the same table as AquaFlow's presets."""
+"""Other programs on the same frames, listed in the same table as AquaFlow's presets."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from aquaflow.evaluation.bench.scene import BenchmarkScene
 __all__ = ["PEERS", "run_peer"]
 
 PEERS = {"colmap": sequential_sfm.solve, "two-view": two_view.solve}
-"""By the name that stands in the table."""
+"""By the name in the table."""
 
 
 def run_peer(name: str, scene: BenchmarkScene, config: Config, out: Path) -> dict[str, Any]:

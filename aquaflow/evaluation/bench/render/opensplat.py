@@ -59,7 +59,7 @@ class OpenSplat:
         return True
 
     def sample(self, scene: SplatScene) -> Sample:
-        """Raises InputError when the program fails or does not say its times."""
+        """Raises InputError when the program fails or does not print its times."""
         with tempfile.TemporaryDirectory() as folder:
             write_scene(scene, Path(folder))
             printed = self._run(folder)

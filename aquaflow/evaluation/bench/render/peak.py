@@ -85,7 +85,7 @@ def _multiply_add(isa: str, folder: Path) -> Work:
     loop.argtypes, loop.restype = [ctypes.c_long], ctypes.c_float
 
     def work() -> float:
-        loop(STEPS)  # ctypes lets go of Python's lock meanwhile
+        loop(STEPS)  # ctypes releases Python's lock meanwhile
         return 2.0 * STEPS * CHAINS * width / 4.0
 
     return work
