@@ -81,8 +81,8 @@ class MavlinkConfig(DeviceConfig):
     talk: bool = Field(True, description="send heartbeats and TIMESYNC; False: only listen")
     messages: tuple[MavlinkSource, ...] = Field(
         ("ATTITUDE", "RAW_IMU", "HIGHRES_IMU", "DISTANCE_SENSOR"),
-        description="converted to samples, in addition to pressure and lights; of the default only "
-        "the angular rate arrives twice from an ArduSub",
+        description="converted to samples, in addition to pressure and lights; with the default "
+        "only the angular rate arrives twice from an ArduSub",
     )
     external_pressure: Literal["SCALED_PRESSURE", "SCALED_PRESSURE2", "SCALED_PRESSURE3"] | None = (
         Field(

@@ -149,14 +149,14 @@ class GraphConfig(Stage):
     drift_factor: float = Field(
         2.0,
         ge=1,
-        description="times worse than its covariance that the chain may have drifted for one loop "
-        "single edge to be accepted; false loops: tests/tracking/graph/test_loop_admission.py",
+        description="times worse than its covariance that the chain may have drifted for a single "
+        "loop edge to be accepted; false loops: tests/tracking/graph/test_loop_admission.py",
     )
     corroborated_drift_factor: float = Field(
         30.0,
         ge=1,
-        description="the same for loop edges that corroborate it; drift of monocular scale has "
-        "always the same sign, so it outgrows its covariance (docs/measurements.md)",
+        description="the same for loop edges that corroborate each other; drift of monocular scale "
+        "has always the same sign, so it outgrows its covariance (docs/measurements.md)",
     )
     corroboration: int = Field(2, ge=1, description="others that must agree with a loop edge")
     corroboration_window: int = Field(

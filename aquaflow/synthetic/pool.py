@@ -1,5 +1,4 @@
-"""A tiled pool: floor and walls of equal tiles round the vehicle's path, and a few objects in
-it."""
+"""A tiled pool: floor and walls of equal tiles round the vehicle's path, with a few objects."""
 
 from __future__ import annotations
 
