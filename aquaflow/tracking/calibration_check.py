@@ -17,7 +17,7 @@ from scipy.stats import f as f_distribution
 from aquaflow.geometry.lens_error import TERMS
 from aquaflow.keyframes import Keyframe
 from aquaflow.tracking.lens_adjustment import LensAdjustment, adjust_lens, clusters_of
-from aquaflow.tracking.lens_equations import Array, Observations
+from aquaflow.tracking.lens_equations import Array, LensObservations
 from aquaflow.tracking.loops.keypoints import match_keypoints
 
 MAX_VIEWS = 8
@@ -99,7 +99,7 @@ def lens_error(keyframes: Sequence[Keyframe]) -> LensError | None:
 
 
 def estimated(
-    observations: Observations,
+    observations: LensObservations,
     R_wc: Array,  # [V, 3, 3]
     centres: Array,  # [V, 3] world
 ) -> LensError:
@@ -174,7 +174,7 @@ def _angle(a: Keyframe, b: Keyframe) -> float:
     return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-def matched(keyframes: Sequence[Keyframe]) -> Observations | None:
+def matched(keyframes: Sequence[Keyframe]) -> LensObservations | None:
     """Keypoint matches of neighbours, and of every other keyframe; None for too few."""
     views = range(len(keyframes))
     pairs = [(i, i + 1) for i in views[:-1]] + [(i, i + 2) for i in views[:-2:2]]
@@ -192,7 +192,7 @@ def matched(keyframes: Sequence[Keyframe]) -> Observations | None:
     if len(point) < MIN_MATCHES:
         return None
     points = [encodings[i].camera.unproject(encodings[i].keypoints.pixels[a])[:2] for i, a in rows]
-    return Observations(
+    return LensObservations(
         np.array(points),
         np.array([i for i, _ in rows], dtype=np.int64),
         np.array(point, dtype=np.int64),

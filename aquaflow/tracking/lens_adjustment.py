@@ -14,9 +14,9 @@ from aquaflow.geometry.lens_error import LENS_PRIOR_SIGMA, TERMS
 from aquaflow.tracking.lens_equations import (
     Adjusted,
     Array,
-    Equations,
     Indices,
-    Observations,
+    LensEquations,
+    LensObservations,
     Weighting,
     residuals,
     triangulated,
@@ -50,7 +50,7 @@ class LensAdjustment:
 
 
 def adjust_lens(
-    observations: Observations,
+    observations: LensObservations,
     R_wc: Array,  # [V, 3, 3]
     centres: Array,  # [V, 3]
     terms: int,
@@ -77,12 +77,12 @@ def adjust_lens(
 
 
 def _solve(
-    observations: Observations, state: Adjusted, weighting: Weighting, terms: int
+    observations: LensObservations, state: Adjusted, weighting: Weighting, terms: int
 ) -> Adjusted:
     """Levenberg-Marquardt with the weighting's scale held."""
     damping, cost = 1e-4, _cost(observations, state, weighting)
     for _ in range(ITERATIONS):
-        equations = Equations(observations, state, weighting)
+        equations = LensEquations(observations, state, weighting)
         candidate = equations.stepped(damping, terms)
         new_cost = _cost(observations, candidate, weighting)
         if not np.isfinite(new_cost) or new_cost >= cost:
@@ -95,18 +95,18 @@ def _solve(
     return state
 
 
-def _cost(observations: Observations, state: Adjusted, weighting: Weighting) -> float:
+def _cost(observations: LensObservations, state: Adjusted, weighting: Weighting) -> float:
     prior = 0.5 * float(np.sum((state.lens / LENS_PRIOR_SIGMA) ** 2))
     return weighting.cost(residuals(observations, state)) + prior
 
 
 def _covariance(
-    observations: Observations, state: Adjusted, weighting: Weighting, terms: int
+    observations: LensObservations, state: Adjusted, weighting: Weighting, terms: int
 ) -> Array:
     """[2, 2] of the lens: the sandwich estimator over the clusters of the points."""
     clusters = clusters_of(observations)
     count = len(np.unique(clusters))
-    equations = Equations(observations, state, weighting)
+    equations = LensEquations(observations, state, weighting)
     H = equations.reduced(np.ones(len(state.rho), dtype=bool))[0]
     free = slice(0, len(H) - TERMS + terms)
     inverse: Array = np.asarray(np.linalg.inv(equations.held(H)[free, free]), dtype=np.float64)
@@ -120,7 +120,7 @@ def _covariance(
     return _larger(sandwich, inverse[lens, lens])
 
 
-def clusters_of(observations: Observations) -> Indices:
+def clusters_of(observations: LensObservations) -> Indices:
     """[P] number of the view and quarter of the picture that each point was sampled in."""
     right, lower = (observations.points > 0.0).T
     return np.asarray(4 * observations.reference + 2 * lower + right, dtype=np.int64)

@@ -29,7 +29,7 @@ MIN_Z = 1e-3
 
 
 @dataclass(frozen=True)
-class Observations:
+class LensObservations:
     """P points, each sampled in one view, and their M matches in other views; normalised plane."""
 
     points: Array
@@ -87,10 +87,12 @@ class Weighting:
         return float(np.where(size < HUBER_SIGMAS, 0.5 * size**2, tail).sum())
 
 
-class Equations:
+class LensEquations:
     """The normal equations at one state: 6 columns a view (centre, rotation), then the lens."""
 
-    def __init__(self, observations: Observations, state: Adjusted, weighting: Weighting) -> None:
+    def __init__(
+        self, observations: LensObservations, state: Adjusted, weighting: Weighting
+    ) -> None:
         self._observations, self._state = observations, state
         error, J, along = _derivatives(observations, state)
         weights = weighting.weights(error)
@@ -140,7 +142,9 @@ class Equations:
         return Adjusted(R, state.centres + moves[:, :3], rho, state.lens + step[-TERMS:])
 
 
-def _transformed(observations: Observations, state: Adjusted) -> tuple[Array, Array, Array, Array]:
+def _transformed(
+    observations: LensObservations, state: Adjusted
+) -> tuple[Array, Array, Array, Array]:
     """Of every match: its point's ray [M, 3], rotation into the view [M, 3, 3], the way between
     the views there [M, 3], and the point in the view [M, 3], scaled to depth 1 in the reference."""
     point, view = observations.point, observations.view
@@ -153,13 +157,13 @@ def _transformed(observations: Observations, state: Adjusted) -> tuple[Array, Ar
     return rays, R, way, _applied(R, rays) + state.rho[point, None] * way
 
 
-def residuals(observations: Observations, state: Adjusted) -> Array:
+def residuals(observations: LensObservations, state: Adjusted) -> Array:
     """[M, 2] of the normalised plane as it was seen."""
     Y = _transformed(observations, state)[-1]
     return seen_at(Y[:, :2] / np.maximum(Y[:, 2:], MIN_Z), state.lens) - observations.matches
 
 
-def _derivatives(observations: Observations, state: Adjusted) -> tuple[Array, Array, Array]:
+def _derivatives(observations: LensObservations, state: Adjusted) -> tuple[Array, Array, Array]:
     """Residuals [M, 2], their derivatives [M, 2, C] by views and lens, and [M, 2] by rho."""
     rays, R, way, Y = _transformed(observations, state)
     z = np.maximum(Y[:, 2], MIN_Z)
@@ -192,7 +196,7 @@ def _put(
         J[rows, :, 6 * view + 3 + axis] = by_rotation[:, :, axis]
 
 
-def triangulated(observations: Observations, state: Adjusted) -> Array:
+def triangulated(observations: LensObservations, state: Adjusted) -> Array:
     """[P] inverse depths, linear least squares."""
     rays, R, way, _ = _transformed(observations, state)
     at_infinity, match = _applied(R, rays), rays_of(observations.matches, state.lens)

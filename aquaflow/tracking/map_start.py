@@ -17,7 +17,7 @@ from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
 
 
 @dataclass(frozen=True)
-class Posed:
+class PosedFrame:
     """A frame of the initialisation: its pose against the reference and its matches."""
 
     frame: Frame
@@ -36,7 +36,7 @@ class Started:
     camera: CameraModel
     """With the refined focal length, where it was unknown."""
     focal_sigma: float
-    posed: list[Posed]
+    posed: list[PosedFrame]
 
 
 class MapStart:
@@ -93,7 +93,7 @@ class MapStart:
         encoding = self._prior.encode(reference.image, camera)
         pointmap = fused_pointmap(solution, camera, self._config.sigma_px)
         posed = [
-            Posed(waiting.frame, T, waiting.pair)
+            PosedFrame(waiting.frame, T, waiting.pair)
             for waiting, T in zip(solution.waiting, solution.T, strict=True)
         ]
         posed = posed[-1:] if self._live else posed

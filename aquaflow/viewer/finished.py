@@ -24,7 +24,7 @@ TUM_COLUMNS = 8
 
 
 @dataclass(frozen=True)
-class Dive:
+class FinishedDive:
     """What the viewer shows of a dive folder."""
 
     splats: Splats
@@ -37,7 +37,7 @@ class Dive:
     summary: str
 
 
-def read_dive(folder: Path, budget: int) -> Dive:
+def read_dive(folder: Path, budget: int) -> FinishedDive:
     """The finished dive in ``folder``.
 
     Raises:
@@ -50,10 +50,12 @@ def read_dive(folder: Path, budget: int) -> Dive:
     quality, pictures = _of_frames(folder, times)
     shown = _splats(folder, budget)
     summary = f"**{folder.name}**\n\n{len(poses)} poses, {len(shown)} of the map's Gaussians"
-    return Dive(shown, poses, quality, pictures, load_camera(folder / "camera.yaml"), summary)
+    return FinishedDive(
+        shown, poses, quality, pictures, load_camera(folder / "camera.yaml"), summary
+    )
 
 
-def show_dive(dive: Dive, config: ViewerConfig) -> ViewerPage:
+def show_dive(dive: FinishedDive, config: ViewerConfig) -> ViewerPage:
     """The viewer's page of ``dive``, with a slider along its path."""
     page = ViewerPage(config, "AquaFlow")
     page.show_health(dive.summary)
@@ -68,7 +70,7 @@ def show_dive(dive: Dive, config: ViewerConfig) -> ViewerPage:
     return page
 
 
-def _mover(dive: Dive, page: ViewerPage) -> Callable[[int], None]:
+def _mover(dive: FinishedDive, page: ViewerPage) -> Callable[[int], None]:
     def move(number: int) -> None:
         picture = dive.pictures[number]
         image = None if picture is None else _picture(picture)

@@ -25,7 +25,7 @@ from aquaflow.tracking.calibration_check import (
     matched,
     most_turning,
 )
-from aquaflow.tracking.lens_equations import Observations
+from aquaflow.tracking.lens_equations import LensObservations
 
 Array = npt.NDArray[np.float64]
 
@@ -42,7 +42,7 @@ def swim(
     relief: float = 0.3,
     views: int = 7,
     seed: int = 0,
-) -> tuple[Observations, Array, Array]:
+) -> tuple[LensObservations, Array, Array]:
     """Matches of a camera with an error of its lens that swims over a floor, and its poses."""
     rng = np.random.default_rng(seed)
     error = np.zeros(5)
@@ -68,7 +68,7 @@ def swim(
             point += list(first + np.flatnonzero(inside))
             view += [j] * int(inside.sum())
             matches += list(match[inside])
-    found = Observations(
+    found = LensObservations(
         np.array(points), np.array(reference), np.array(point), np.array(view), np.array(matches)
     )
     # What tracking made of it is near the truth, not the truth.
