@@ -17,7 +17,7 @@ from aquaflow.messages import CameraModel, Dropped, Frame
 from aquaflow.profiler import Profiler
 from aquaflow.slam import Slam
 from aquaflow.sources import RecordedCamera
-from aquaflow.sources.reading import read_on
+from aquaflow.sources.reading import read_past_failures
 
 Progress = Callable[[str, int, int | None], None]
 """Called with the stage, the steps done and, where known, the steps there are."""
@@ -98,7 +98,7 @@ def _frames(
         run.notes.append(f"{run.name} could not be read after frame {frame}; the dive ends there")
 
     count, failures = recording.frame_count, run.slam.failures
-    return read_on(read, source.start, source, count, failures, give_up)
+    return read_past_failures(read, source.start, source, count, failures, give_up)
 
 
 def fix_threads(threads: int) -> None:

@@ -1,16 +1,16 @@
 """Sources of frames and telemetry: each is read in its own thread, never waiting for mapping.
 
-Between a camera and tracking lie two queues in which the newest wins, and both are needed. The
-camera's own (drivers/live.py) holds a raw picture, in a buffer of the device, until it is decoded.
-The one here holds a frame until tracking takes it. Only one of them leaves frames out: without a
-recorder a picture is decoded when tracking waits for one, so that none is overtaken here; with a
-recorder every picture is decoded and recorded in the thread that reads, and the newest of these
-waits here.
+Two queues between a camera and tracking keep only the newest item, and both are needed. The queue
+of the camera (drivers/live.py) holds a raw picture, in a buffer of the device, until it is decoded.
+The queue in this module holds a frame until tracking takes it. Only one of them drops frames:
+without a recorder a picture is decoded when tracking waits for one, so that this queue drops none;
+with a recorder every picture is decoded and recorded in the reading thread, and this queue keeps
+the newest of them.
 
-With the camera's queue alone, recording would be as slow as tracking, and the loop, whose heartbeat
-needs a timeout, would wait inside a driver's iterator, which has none. With this one alone,
-pictures that nothing uses would be decoded, or would keep the device's buffers. A recording that is
-played back has only this one.
+With only the camera's queue, recording would be as slow as tracking, and the loop, whose heartbeat
+needs a timeout, would wait inside a driver's iterator, which has none. With only this queue, unused
+pictures would be decoded, or would occupy the device's buffers. Playback of a recording has only
+this queue.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from aquaflow.service.dive_clock import Continued
 from aquaflow.sources import CameraSource, TelemetrySource
 from aquaflow.sources.newest import Newest
 from aquaflow.sources.outbound import AcceptsMessages, OutboundMessage
-from aquaflow.sources.reading import read_on
+from aquaflow.sources.reading import read_past_failures
 
 log = logging.getLogger(__name__)
 
@@ -285,7 +285,9 @@ class PlaybackFeed(_Pumps):
         while start < self.continued.first_index:
             start += source.every
         count = self._playback.frame_count
-        for event in read_on(self._read, start, source, count, self.failures, self._give_up):
+        for event in read_past_failures(
+            self._read, start, source, count, self.failures, self._give_up
+        ):
             if self.closing.is_set():
                 break
             # Moments stay as recorded, so that frames.csv can be compared with a replay's.

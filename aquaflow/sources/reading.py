@@ -1,4 +1,4 @@
-"""A recording whose reader raises: that costs the frame it raised on, not the rest."""
+"""Reads a recording past frames on which its reader raises; only these frames are lost."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MOST_UNREADABLE = 5
 """Frames in a row that a recording fails on until the rest is given up."""
 
 
-def read_on(
+def read_past_failures(
     read: Callable[[int], Iterator[Event]],
     start: int,
     source: SourceConfig,
@@ -23,12 +23,12 @@ def read_on(
     failures: Failures,
     give_up: Callable[[int], object],
 ) -> Iterator[Event | Dropped]:
-    """What ``read(start)`` yields; after a frame that it raises on, reading goes on with the next.
+    """Events of ``read(start)``; after a frame on which it raises, reading continues with the next.
 
-    ``give_up`` is called with the frame at which one too many in a row could not be read.
+    ``give_up`` is called with the next frame after ``MOST_UNREADABLE`` failures in a row.
 
     Raises:
-        Exception: the recording fails before its first frame; whatever its reader raised.
+        Exception: the error of the reader, if the recording fails before its first frame.
     """
     ends = [end for end in (frame_count, source.stop) if end is not None]
     t_ns, failed_in_a_row, any_read = 0, 0, False

@@ -1,4 +1,4 @@
-"""Recordings whose reader raises: in the middle, at the end, at once, from somewhere on."""
+"""Recordings whose reader raises: in the middle, at the end, at once, or from one frame on."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from aquaflow.config import SourceConfig
 from aquaflow.errors.failures import Failures
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.messages import Depth, Dropped, Frame
-from aquaflow.sources.reading import MOST_UNREADABLE, read_on
+from aquaflow.sources.reading import MOST_UNREADABLE, read_past_failures
 
 COUNT = 20
 CAMERA = guess_camera(8, 6)
@@ -36,9 +36,11 @@ class Reader:
             raise OSError(5, "planted")
 
     def all(self, count: int | None = COUNT) -> list[Frame | Dropped]:
-        """The pictures, read or not."""
+        """The frames, read or dropped."""
         give_up = self.given_up.append
-        events = read_on(self, self.source.start, self.source, count, self.failures, give_up)
+        events = read_past_failures(
+            self, self.source.start, self.source, count, self.failures, give_up
+        )
         return [event for event in events if isinstance(event, (Frame, Dropped))]
 
 
@@ -73,6 +75,6 @@ def test_a_recording_that_fails_again_and_again_is_given_up() -> None:
     assert reader.given_up == [8 + MOST_UNREADABLE]
 
 
-def test_a_recording_that_fails_at_once_raises_what_its_reader_raised() -> None:
+def test_a_recording_that_fails_at_once_raises_the_error_of_its_reader() -> None:
     with pytest.raises(OSError, match="planted"):
         Reader({0}).all()
