@@ -141,7 +141,7 @@ class Slam:
         ]
 
     def close(self, keep: bool = False) -> None:
-        """End the work beside tracking; remove what waits in the work folder, or ``keep`` it."""
+        """End the background work; remove the files of the work folder, or ``keep`` them."""
         self.graph.close()
         self.keyframes.close(keep)
         self.maps.close(keep)

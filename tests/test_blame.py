@@ -1,4 +1,4 @@
-"""What `git blame` is to look past."""
+"""The commits that `git blame` ignores."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The version is the newest git tag; without tags, or without git, there is one all the same."""
+"""The version is the newest git tag; without tags or git there is a fallback."""
 
 from __future__ import annotations
 

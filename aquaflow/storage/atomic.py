@@ -50,7 +50,7 @@ def write_json(path: Path, data: dict[str, Any]) -> None:
 
 
 def write_yaml(path: Path, data: dict[str, Any]) -> None:
-    """A YAML file, whole or not there, with its keys in the order of ``data``.
+    """Write a YAML file atomically, with its keys in the order of ``data``.
 
     Raises:
         InputError: the file cannot be written.

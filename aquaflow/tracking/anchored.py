@@ -1,4 +1,4 @@
-"""Poses against keyframes: a frame follows its keyframe through every later correction."""
+"""Poses relative to keyframes: a frame moves with its keyframe in every later correction."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from aquaflow.tracking.frames import Tracked
 
 @dataclass(frozen=True)
 class Anchored:
-    """A tracked frame with its pose against its keyframe, which later corrections leave."""
+    """A tracked frame with its pose relative to its keyframe, unchanged by later corrections."""
 
     tracked: Tracked
     T_kf: Sim3 | None = None
@@ -20,16 +20,16 @@ class Anchored:
 
 
 class Anchors:
-    """Computes both poses, the one against the keyframe and the one in the world, from the other.
+    """Computes a frame's pose relative to its keyframe from its pose in the world, and back.
 
-    A frame for which that fails is lost, and counted in ``failures``.
+    A frame for which this fails is lost, and counted in ``failures``.
     """
 
     def __init__(self, keyframes: KeyframeStore, failures: Failures) -> None:
         self._keyframes, self._failures = keyframes, failures
 
     def anchored(self, tracked: Tracked) -> Anchored:
-        """The frame as tracking placed it, with its pose against its keyframe."""
+        """The frame as tracked, with its pose relative to its keyframe."""
         if tracked.keyframe is None or tracked.T_wc is None:
             return Anchored(tracked)
         with self._failures.contain("pose", tracked.frame.index):
@@ -38,7 +38,7 @@ class Anchors:
         return Anchored(self._lost(tracked))
 
     def settled(self, tracked: Tracked, T_kf: Sim3 | None) -> Tracked:
-        """The frame with pose and sub-map as its keyframe's are now; lost if that has no pose."""
+        """The frame with the pose and sub-map that its keyframe gives it now; lost if none."""
         if tracked.keyframe is None or T_kf is None:
             return tracked
         keyframe = self._keyframes[tracked.keyframe]

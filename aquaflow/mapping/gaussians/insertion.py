@@ -20,7 +20,7 @@ LOG_GAIN = 3.0
 
 @dataclass(frozen=True)
 class TrackedRange:
-    """How far away tracking sees the scene, along every pixel's ray."""
+    """Range of the scene along every pixel's ray, as tracked."""
 
     z: Tensor
     """[H, W], in the keyframe's unit; 0 where unknown."""
@@ -30,7 +30,7 @@ class TrackedRange:
     """[H, W] in [0, 1]: Q of the paper, saturating at a relative range sigma of 3 %."""
 
     def keep_in(self, view: View) -> None:
-        """Let the view's depth loss use it."""
+        """Store the range in the view, for its depth loss."""
         view.inverse_range = torch.where(self.known, 1.0 / self.z.clamp_min(1e-6), 0.0)
         view.range_confidence = self.confidence
 
@@ -56,8 +56,8 @@ def alpha_where_agreed(
 ) -> Tensor:
     """[H, W]: the map's alpha where its surface lies at the tracked range, elsewhere 0.
 
-    Where the map already explains the ray, only structure that it lacks asks for more Gaussians;
-    where it is bare or its surface lies elsewhere, any pixel may.
+    Where the map already explains the ray, only missing structure leads to more Gaussians; where
+    the map is empty or its surface is at another range, any pixel may.
     """
     agree = (z - tracked_z).abs() < config.agreement * tracked_z
     return torch.where(agree, alpha, 0.0)

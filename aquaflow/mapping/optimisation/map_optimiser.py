@@ -1,7 +1,7 @@
 """One step of the joint optimisation of Gaussians, medium and pose (paper, Sec. 3.4).
 
-It owns the optimisers' state, of which every Gaussian has a row: whatever adds or drops Gaussians
-does it here.
+It owns the optimisers' state, which has a row for every Gaussian; Gaussians are therefore added and
+dropped through it.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ log = logging.getLogger(__name__)
 def is_number(
     value: Tensor,  # []
 ) -> bool:
-    """True if a loss or a norm may be acted on."""
+    """True if a loss or a norm is finite, so that a step may use it."""
     return bool(torch.isfinite(value))
 
 
 class MapOptimiser:
-    """Steps a scene towards its views."""
+    """Optimises a scene against its views, one step at a time."""
 
     def __init__(self, config: MappingConfig, scene: Scene, objective: Objective) -> None:
-        """Rows for the Gaussians that the scene has by now, at step 0."""
+        """Start at step 0, with rows for the Gaussians that the scene has now."""
         self.config, self.scene = config, scene
         self._objective = objective
         self.adam = self._new_adam()
-        """Of the Gaussians' parameters."""
+        """Optimiser of the Gaussians' parameters."""
         self.medium_adam = torch.optim.Adam(scene.medium.parameters(), lr=config.medium.rate)
         self.steps = 0
         """Steps taken."""
@@ -88,7 +88,7 @@ class MapOptimiser:
             self._prune(shown, view)
 
     def _is_optimised(self, name: str) -> bool:
-        """Places and opacities always are; with residuals, the rest only if so configured."""
+        """Means and opacities always are; with residuals, the rest only if configured."""
         frozen = self.scene.neural is not None and not self.config.decoder.optimise_initial
         return not (frozen and name in DECODED)
 
@@ -114,15 +114,15 @@ class MapOptimiser:
         self.undone += 1
         log.warning("non-finite %s on frame %d: step undone", what, view.frame_index)
 
-    # --- Gaussians come and go ----------------------------------------------------------------
+    # --- adding and dropping Gaussians --------------------------------------------------------
 
     def extend(
         self,
         count: int,
         centres: Tensor | None,  # [3] or [count, 3]
     ) -> None:
-        """Rows for the map's last ``count`` Gaussians, which were seen from the cameras at
-        ``centres``; only a decoder needs to know these."""
+        """Add rows for the map's last ``count`` Gaussians, which were seen from the cameras at
+        ``centres``; only a decoder uses these."""
         self.adam.extend(count)
         if self.scene.neural is not None and centres is not None:
             self.scene.neural.insert(centres, count)
@@ -139,7 +139,7 @@ class MapOptimiser:
             self.adam.bind(self.scene.gaussians.parameters)
 
     def _prune(self, shown: Shown, view: View) -> None:
-        """Drop Gaussians that are all but transparent, or that fill the picture."""
+        """Drop Gaussians that are almost transparent, or that fill the picture."""
         opaque = self.scene.gaussians.opacities > self.config.optimiser.prune_opacity
         widest = self.config.optimiser.prune_radius_widths * view.camera.width
         self.keep(opaque & (shown.radius_px < widest))
@@ -152,8 +152,8 @@ class MapOptimiser:
         self.keep(sound)
 
     def make_whole(self) -> None:
-        """After a failure: every row of the optimisers and groups belongs to a Gaussian, and all
-        Gaussians are finite."""
+        """Repair after a failure: every row of the optimisers and groups belongs to a Gaussian, and
+        all Gaussians are finite."""
         if self.scene.neural is not None:
             self.scene.neural.make_whole()
         if len(self.adam.steps) != len(self.scene.gaussians):
