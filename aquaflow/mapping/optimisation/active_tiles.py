@@ -1,8 +1,8 @@
 """Active tiles of a view in a step: neither on the vehicle nor explained already.
 
 A tile whose error is no more than the camera's own noise can teach the map nothing; it is neither
-drawn nor differentiated until the next full look at its view, which may find that the map around it
-has changed.
+drawn nor differentiated until the next full drawing of its view, which may show that the map around
+it has changed.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def tiles_to_draw(view: View, config: OptimiserConfig) -> Tensor | None:
 
 
 @torch.no_grad()
-def look(
+def record_explained(
     view: View,
     image: Tensor,  # [H, W, 3] the map from this view
     config: OptimiserConfig,

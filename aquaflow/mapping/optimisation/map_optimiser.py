@@ -13,7 +13,7 @@ from torch import Tensor
 
 from aquaflow.config import MappingConfig
 from aquaflow.mapping.decoder.decode import DECODED
-from aquaflow.mapping.optimisation.active_tiles import look, tiles_to_draw
+from aquaflow.mapping.optimisation.active_tiles import record_explained, tiles_to_draw
 from aquaflow.mapping.optimisation.objective import Objective
 from aquaflow.mapping.rendering import Shown
 from aquaflow.mapping.scene import Scene
@@ -72,7 +72,7 @@ class MapOptimiser:
         neural = self.scene.neural
         seen = leaves if neural is None else neural.decode(view, leaves, viewmat)
         shown = self.scene.draw(view, seen, viewmat, learn=True, active=active)
-        look(view, shown.image, self.config.optimiser)
+        record_explained(view, shown.image, self.config.optimiser)
         loss = self._objective.total(view, shown, seen)
         if not is_number(loss):
             self._undo("loss", view)

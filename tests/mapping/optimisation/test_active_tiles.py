@@ -8,7 +8,7 @@ import torch
 
 from aquaflow.config import OptimiserConfig
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.optimisation.active_tiles import look, tiles_to_draw
+from aquaflow.mapping.optimisation.active_tiles import record_explained, tiles_to_draw
 from aquaflow.mapping.views import View
 from tests.mapping.mapping_scenes import (
     copied,
@@ -30,7 +30,7 @@ def looked_at(config: OptimiserConfig = CONFIG) -> View:
     view = view_of(np.full((48, 64, 3), 128, np.uint8))
     image = view.target() + 0.005
     image[:16, :16] += 0.05
-    look(view, image, config)
+    record_explained(view, image, config)
     return view
 
 
@@ -49,9 +49,9 @@ def test_now_and_then_everything_is_looked_at_and_remembered_anew() -> None:
     view = looked_at()
     for _ in range(2):
         assert tiles_to_draw(view, CONFIG) is not None
-        look(view, torch.zeros(48, 64, 3), CONFIG)  # what was not drawn is not judged
+        record_explained(view, torch.zeros(48, 64, 3), CONFIG)  # what was not drawn is not judged
     assert tiles_to_draw(view, CONFIG) is None
-    look(view, view.target(), CONFIG)
+    record_explained(view, view.target(), CONFIG)
     tiles = tiles_to_draw(view, CONFIG)
     assert tiles is not None
     assert not tiles.any()
@@ -71,7 +71,7 @@ def test_tiles_that_show_only_the_vehicle_are_never_drawn() -> None:
         assert tiles is not None
         assert tiles[:, :2].all()
         assert not tiles[:, 2:].any()
-        look(view, torch.ones(48, 64, 3), CONFIG)
+        record_explained(view, torch.ones(48, 64, 3), CONFIG)
 
 
 def test_a_step_leaves_alone_what_only_explained_tiles_show() -> None:
