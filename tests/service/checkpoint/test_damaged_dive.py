@@ -144,7 +144,7 @@ def test_a_checkpoint_that_is_whole_and_fits_nothing_gives_way_to_the_older_one(
 def test_pictures_of_another_width_are_refused_before_anything_is_changed(dive: Path) -> None:
     before = {path: path.read_bytes() for path in dive.rglob("*") if path.is_file()}
     wider = VehicleConfig.model_validate(VEHICLE.model_dump() | {"source": {"width": 64}})
-    with pytest.raises(ConfigError, match=r"begun with source.width the default .* at 64; give"):
+    with pytest.raises(ConfigError, match=r"begun with source.width the default .* with 64; give"):
         begun(ToldFeed(), wider, dive, new=False, overwrite=False)
     assert {path: path.read_bytes() for path in dive.rglob("*") if path.is_file()} == before
 
@@ -154,7 +154,7 @@ def test_map_refuses_another_width_in_one_sentence(
 ) -> None:
     recording = killed[0].with_name("recording")
     ran = aquaflow("map", recording, "--realtime", "--out", dive, "--width", 64)
-    refused(ran, dive, "source.width the default", "at 64; give the same width")
+    refused(ran, dive, "source.width the default", "with 64; give the same width")
 
 
 # --- keyframes and views --------------------------------------------------------------------------
