@@ -46,18 +46,31 @@ def write_onnx(
     size = sum(tensor.numel() * tensor.element_size() for tensor in graph.state_dict().values())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the exporter's remarks on itself are of no use here
-        torch.onnx.export(
-            graph,
-            example,
-            str(path),
-            input_names=inputs,
-            output_names=outputs,
-            opset_version=OPSET,
-            dynamo=True,
-            dynamic_shapes=dynamic_shapes,
-            external_data=size > INLINE_BYTES,
-            verbose=False,
-        )
+        try:
+            torch.onnx.export(
+                graph,
+                example,
+                str(path),
+                input_names=inputs,
+                output_names=outputs,
+                opset_version=OPSET,
+                dynamo=True,
+                dynamic_shapes=dynamic_shapes,
+                external_data=size > INLINE_BYTES,
+                verbose=False,
+            )
+        except Exception as error:
+            if _was_interrupted(error):
+                raise KeyboardInterrupt from error
+            raise
+
+
+def _was_interrupted(error: BaseException) -> bool:
+    """True for a Ctrl-C, which the exporter wraps into an error of its own."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, KeyboardInterrupt):
+        cause = cause.__cause__ or cause.__context__
+    return cause is not None
 
 
 def relative_difference(

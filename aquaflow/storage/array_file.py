@@ -50,6 +50,12 @@ def write_arrays(
         part.unlink(missing_ok=True)
 
 
+UNREADABLE = (
+    OSError, ValueError, TypeError, AttributeError, LookupError, SyntaxError, RecursionError,
+)  # fmt: skip
+"""What damage to a file may raise; NumPy reads the name of a type as Python's text."""
+
+
 def read_arrays(path: Path, of: str = "") -> Arrays:
     """The arrays of ``write_arrays``, in memory of their own.
 
@@ -60,7 +66,7 @@ def read_arrays(path: Path, of: str = "") -> Arrays:
     try:
         with path.open("rb") as stream:
             return _read(stream, of, path.stat().st_size)
-    except (OSError, ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
+    except UNREADABLE as error:
         reason = error.strerror if isinstance(error, OSError) else "it is damaged"
         raise InputError(
             f"cannot read back {path}: {reason}; leave the dive's work folder alone until the end"
