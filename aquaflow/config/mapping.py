@@ -20,6 +20,7 @@ class WaterPriorsConfig(Stage):
 
     dark_channel: bool = Field(True, description="shadows are nearly black (He et al. 2011)")
     saturation: bool = Field(True, description="few points are brighter than the camera's white")
+    regions: bool = Field(True, description="near and far have the same colours on the whole")
     grey_world: bool = Field(False, description="a scene is grey on the whole")
     white_backscatter: bool = Field(False, description="open water has little colour of its own")
 
@@ -57,6 +58,10 @@ class MediumConfig(Stage):
     )
     fit_views: int = Field(20, ge=4, description="views that a fit looks at, spread over the dive")
     priors: WaterPriorsConfig = WaterPriorsConfig()
+    open_water: Literal["kept", "black"] = Field(
+        "kept",
+        description="restored pictures where the map has nothing: as the camera saw it, or black",
+    )
     initial_attenuation: float = Field(
         0.1, gt=0, description="1 / map unit; the median range of the first keyframe is 1 unit"
     )

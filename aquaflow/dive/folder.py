@@ -189,6 +189,7 @@ class DiveFolder:
                 medium = water_of(water)
                 z = torch.full((len(clear),), water.range_median)
                 seen = clear * medium.transmission(z) + medium.backscatter(z)
+                clear = clear * torch.tensor(water.white_gain)
             for name, colours in (("map", seen), ("map_clear", clear)):
                 write_ply(self.path / f"{name}{suffix}.ply", _splats(plain, colours))
 
@@ -197,7 +198,7 @@ class DiveFolder:
     ) -> None:
         """medium.json: parameters, their units, and the range at which map.ply is shown.
 
-        ``evidence``: for water against none, units of the log likelihood; below -10 it is off.
+        ``evidence``: log odds of water against clear water or none, before the prior's 5 are added.
         """
         data: dict[str, Any] = {"active": water is not None, "scale_source": scale_source}
         data["evidence"] = evidence
@@ -210,6 +211,13 @@ class DiveFolder:
                 },
                 "attenuation_relative_sigma": water.beta_a_sigma,
                 "identifiable": water.beta_a_sigma is not None,
+                "restored": {
+                    "gain": water.white_gain,
+                    "white_balance": "as the camera saw what was at near_range",
+                    "near_range": water.near_range,
+                },
+                "colour_variance_over_range": water.range_variance
+                and dict(zip(("seen", "restored"), water.range_variance, strict=True)),
                 "shading_log_gain": water.shading,
                 "backscatter_log_gain": water.unevenness,
                 "log_gain_terms": ["x", "y", "x^2", "x y", "y^2"],

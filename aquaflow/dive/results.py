@@ -66,6 +66,12 @@ class WaterSummary:
     range_p5: float
     range_median: float
     range_p95: float
+    white_gain: list[float]
+    """Of the clean radiance in restored pictures and map_clear.ply."""
+    near_range: float | None
+    """Range whose colours restored pictures keep; None if there was no fit."""
+    range_variance: tuple[float, float] | None
+    """Relative variance of the points' colours that follows from their range: seen, restored."""
     beta_a_sigma: list[float] | None
     """Relative standard deviation of beta_a; None if the ranges seen never allowed a fit."""
     shading: list[float]
@@ -156,6 +162,9 @@ def summarise_water(mapper: Mapper) -> WaterSummary | None:
         float(low),
         float(z.median()),
         float(high),
+        mapper.scene.white_gain().tolist(),
+        None if mapper.scene.balance is None else mapper.scene.balance.near_range,
+        mapper.scene.range_variance,
         mapper.scene.beta_a_sigma,
         mapper.scene.shading.tolist(),
         mapper.medium.unevenness.tolist(),

@@ -52,7 +52,9 @@ def export_restored(
     views = {view.frame_index: view for view in in_time(mapper.views)}
     shown = list(views.values())[:: max(1, len(views) // LOOKS)]
     with torch.no_grad():
-        exposure = common_exposure(mapper.show(view).radiance for view in shown)
+        exposure = common_exposure(
+            mapper.scene.balanced(mapper.show(view).radiance) for view in shown
+        )
     out.mkdir(parents=True, exist_ok=True)
     count = 0
     for index, picture in _restored(dive, mapper, views, recording):
@@ -71,7 +73,7 @@ def _restored(
     """Frame index and restored picture [H, W, 3]."""
     if recording is None:
         for index, view in views.items():
-            yield index, mapper.show(view).radiance
+            yield index, mapper.scene.balanced(mapper.show(view).radiance)
         return
     for index, image in _pictures(dive, recording, views):
         view = _with_picture(views[index], image)

@@ -21,15 +21,22 @@ BRIGHT_QUANTILE, BRIGHT_LEVEL = 0.995, 0.95
 
 @torch.no_grad()
 def restored_picture(scene: Scene, view: View, shown: Shown) -> Tensor:
-    """J-hat [H, W, 3] of the picture, at the ranges that the map ``shown`` from the view has.
+    """The picture [H, W, 3] without water, at the ranges that the map ``shown`` from the view has,
+    in the white balance that the camera had for what was nearest (see water/white_balance.py).
 
-    The map's own radiance, where it knows no range, where too little light arrives, and where the
-    vehicle is in the picture. J-hat keeps the detail that the map has lost: on synthetic dives it
-    is 5 dB closer to the clean scene than the map's radiance everywhere.
+    Where the vehicle is in the picture, the map's own radiance. J-hat keeps the detail that the map
+    has lost: on synthetic dives it is 5 dB closer to the clean scene than the map's radiance
+    everywhere. Open water, where the map has nothing, is black, or as the camera saw it
+    (``medium.open_water``).
     """
-    picture, recoverable = scene.restore(view, shown.z)
-    usable = recoverable & (shown.alpha > SOLID) & view.scene_mask()
-    return torch.where(usable[..., None], picture, shown.radiance)
+    picture = scene.recovered(view, shown.z)
+    radiance = scene.balanced(shown.radiance)
+    usable = (shown.alpha > SOLID) & view.scene_mask()
+    restored = torch.where(usable[..., None], picture, radiance)
+    if scene.config.open_water == "kept":
+        through = ((1.0 - shown.alpha) * ~usable)[..., None]
+        restored = restored + through * scene.evenly_lit(view)
+    return restored
 
 
 def common_exposure(

@@ -24,6 +24,7 @@ from aquaflow.mapping.water.medium import Medium
 from aquaflow.mapping.water.shading import TERMS, gain_map
 from aquaflow.mapping.water.sightings import sight
 from aquaflow.mapping.water.sunlight import Sunlight
+from aquaflow.mapping.water.white_balance import WhiteBalance
 from aquaflow.render.contract import Renderer
 
 
@@ -48,9 +49,13 @@ class Scene:
         """True once the observations showed that some views are brighter than others."""
         self.sunlight = Sunlight(sunlight or SunlightConfig())
         self.water_evidence: float | None = None
-        """For water against none, in units of the log likelihood; None before the first fit."""
+        """Log odds of water against clear water or none; None before the first fit."""
         self.beta_a_sigma: list[float] | None = None
         """Relative standard deviation of beta_a in the last fit; None before it."""
+        self.balance: WhiteBalance | None = None
+        """What restored pictures are shown in; None before the first fit, and without water."""
+        self.range_variance: tuple[float, float] | None = None
+        """Of the points' colours in the last fit, with the water and without; None before it."""
         self._gains: dict[tuple[str, int, int], Tensor] = {}
 
     def water(self, view: View) -> Water | None:
@@ -173,15 +178,47 @@ class Scene:
         z: Tensor,  # [H, W] range
     ) -> tuple[Tensor, Tensor]:
         """J-hat [H, W, 3] of the view's picture, and where it can be believed [H, W]."""
-        image, gain, water = view.target(), self.gain(view), self.water(view)
+        image, water = self.evenly_lit(view), self.water(view)
+        if water is None:
+            return image, torch.ones(image.shape[:2], dtype=torch.bool)
+        return water.restore(image, z, self.uneven(view))
+
+    @torch.no_grad()
+    def evenly_lit(self, view: View) -> Tensor:
+        """[H, W, 3] the view's picture without shading, exposure and playing light."""
+        image, gain = view.target(), self.gain(view)
         if gain is not None:
             image = image / gain[..., None]
         if self.exposes:
             image = image / gain_of(view)
-        image = self.sunlight.evened(view, image)
-        if water is None:
-            return image, torch.ones(image.shape[:2], dtype=torch.bool)
-        return water.restore(image, z, self.uneven(view))
+        return self.sunlight.evened(view, image)
+
+    @torch.no_grad()
+    def recovered(
+        self,
+        view: View,
+        z: Tensor,  # [H, W] range
+    ) -> Tensor:
+        """[H, W, 3] the view's picture without water, in the white balance of what is nearest."""
+        image, water = self.evenly_lit(view), self.water(view)
+        if water is None or self.balance is None:
+            return self.balanced(image if water is None else self.restore(view, z)[0])
+        return self.balance.recover(image, z, water, self.uneven(view))
+
+    @torch.no_grad()
+    def balanced(
+        self,
+        radiance: Tensor,  # [..., 3] J
+    ) -> Tensor:
+        """[..., 3] J in the white balance of what is nearest."""
+        return radiance * self.white_gain()
+
+    @torch.no_grad()
+    def white_gain(self) -> Tensor:
+        """[3] of J, by which it has the white balance of what is nearest."""
+        if not self.medium.active or self.balance is None:
+            return torch.ones(3)
+        return self.balance.gain(self.medium(torch.eye(3)))
 
     def fit_water(
         self,
@@ -203,7 +240,6 @@ class Scene:
             sight(self._attributes, views, self.renderer, generator, beta_a),
             sea.B_res.double().numpy(),
             sea.d.double().numpy(),
-            float(sea.beta_a.mean()),
             models_for(self.config),
             self.config.priors,
         )
@@ -216,13 +252,13 @@ class Scene:
     def _unchanged_by_failure(self) -> Iterator[None]:
         """The water as it was, if the block raises: half of a new one fits no picture."""
         medium, active = copy.deepcopy(self.medium.state_dict()), self.medium.active
-        before = (self.shading, self.exposes, self.beta_a_sigma, self.water_evidence)
+        before = vars(self).copy()
         try:
             yield
         except Exception:
             self.medium.load_state_dict(medium)
             self.medium.active = active
-            self.shading, self.exposes, self.beta_a_sigma, self.water_evidence = before
+            vars(self).update(before)
             self._gains.clear()
             raise
 
@@ -240,6 +276,7 @@ class Scene:
             self.medium.set_water(*(torch.from_numpy(v).to(torch.float32) for v in found))
         self.shading, self.exposes = estimate.shading, estimate.model.exposure
         self.beta_a_sigma, self.water_evidence = estimate.beta_a_sigma, estimate.evidence
+        self.balance, self.range_variance = estimate.balance, estimate.range_variance
         self._gains.clear()
         set_log_gains(dive, fitted, estimate.exposure)
 

@@ -8,6 +8,7 @@ on being optimised as if it had never been away, once its views have their pictu
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.mapping.decoder.neural import NeuralGaussians
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.views import View
+from aquaflow.mapping.water.white_balance import WhiteBalance
 from aquaflow.render.adam import SelectiveAdam
 from aquaflow.render.contract import Renderer
 from aquaflow.storage.arrays import Arrays, of_camera, of_sim3, prefixed, to_camera, to_sim3, under
@@ -43,6 +45,8 @@ def serialise(mapper: Mapper, optimiser: bool = False) -> tuple[Facts, Arrays]:
         "sunlight_plays": scene.sunlight.plays,
         "water_evidence": scene.water_evidence,
         "beta_a_sigma": scene.beta_a_sigma,
+        "white_balance": None if scene.balance is None else asdict(scene.balance),
+        "range_variance": scene.range_variance,
         "decoder": mapper.neural is not None,
         "optimiser": optimiser,
         "steps": mapper.steps,
@@ -86,6 +90,11 @@ def deserialise(facts: Facts, arrays: Mapping[str, Any], renderer: Renderer) -> 
     mapper.medium.active, scene.exposes = bool(facts["medium_active"]), bool(facts["exposes"])
     scene.sunlight.plays = bool(facts["sunlight_plays"])
     scene.water_evidence, scene.beta_a_sigma = facts["water_evidence"], facts["beta_a_sigma"]
+    if facts.get("white_balance") is not None:  # maps written before 2026-11-22 have none
+        scene.balance = WhiteBalance(**facts["white_balance"])
+    if facts.get("range_variance") is not None:
+        raw, restored = facts["range_variance"]
+        scene.range_variance = (float(raw), float(restored))
     mapper.optimiser.steps, mapper.optimiser.undone = int(facts["steps"]), int(facts["undone"])
     if len(facts["cameras"]) > len(arrays["views.numbers"]):
         raise DamagedError("it has more cameras than views")

@@ -61,6 +61,7 @@ def copied(mapper: Mapper) -> MapCopy:
         z = torch.linalg.vector_norm(mapper.gaussians.means - centre, dim=-1)
         seen = clear * water.transmission(z) + water.backscatter(z)
     steps = mapper.optimiser.adam.steps.numpy().copy()
+    clear = mapper.scene.balanced(clear)
     return MapCopy(plain, steps, seen.numpy().copy(), clear.numpy().copy())
 
 

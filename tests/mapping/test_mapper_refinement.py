@@ -62,7 +62,7 @@ def test_poses_are_held_when_their_rate_is_zero() -> None:
 
 
 def test_no_refinement_steps_change_nothing() -> None:
-    mapper = grown(settings(optimiser={"refine_steps": 0}))
+    mapper = grown(settings(optimiser={"refine_steps": 0}, medium={"fit": False}))
     before = copied(mapper)
     mapper.refine()
     assert same(copied(mapper), before)

@@ -48,19 +48,26 @@ def test_uneven_backscatter_makes_one_side_of_the_picture_brighter() -> None:
     torch.testing.assert_close(uneven.show(blank).radiance, even.show(blank).radiance)
 
 
-def test_the_map_stands_in_where_range_light_or_scene_are_missing() -> None:
+def test_the_map_stands_in_where_range_or_scene_are_missing() -> None:
     scene, view = submerged()
+    scene.config = scene.config.model_copy(update={"open_water": "black"})
     shown = scene.show(view)
     shown.alpha[:10] = 0.2
     mask = np.ones((48, 64), bool)
     mask[20:30] = False
     view.mask = mask
-    z = shown.z.clone()
-    z[40:] = 60.0
-    shown.z.copy_(z)
     restored = restored_picture(scene, view, shown)
-    for rows in (slice(0, 10), slice(20, 30), slice(40, 48)):
+    for rows in (slice(0, 10), slice(20, 30)):
         assert torch.equal(restored[rows], shown.radiance[rows])
+
+
+def test_open_water_stays_as_the_camera_saw_it_unless_it_is_to_be_black() -> None:
+    scene, view = submerged()
+    shown = scene.show(view)
+    shown.alpha[:10], shown.radiance[:10] = 0.0, 0.0
+    torch.testing.assert_close(restored_picture(scene, view, shown)[:10], view.target()[:10])
+    scene.config = scene.config.model_copy(update={"open_water": "black"})
+    assert not restored_picture(scene, view, shown)[:10].any()
 
 
 def test_the_brightest_of_all_pictures_sets_the_exposure_of_all() -> None:

@@ -23,8 +23,8 @@ from tests.mapping.water.water_observations import B_RES, LAMP, D, sighted
 
 def test_without_shading_the_fit_knows_no_lamp() -> None:
     seen = sighted(shading=LAMP)
-    with_lamp = estimate_water(seen, B_RES, D, 0.1)
-    without = estimate_water(seen, B_RES, D, 0.1, models_for(MediumConfig(shading=False)))
+    with_lamp = estimate_water(seen, B_RES, D)
+    without = estimate_water(seen, B_RES, D, models_for(MediumConfig(shading=False)))
     assert with_lamp is not None
     assert without is not None
     assert np.abs(with_lamp.shading).max() > 0.1

@@ -81,6 +81,10 @@ def set_log_gains(
         view.log_gain = log_gain
 
 
-def _between(frame_index: int, views: Sequence[View], values: Sequence[Array]) -> Array:
+def _between(
+    frame_index: int,
+    views: Sequence[View],  # V, in the order of their frames
+    values: Sequence[Array],  # V times [3], log-gain of RGB
+) -> Array:
     at = [view.frame_index for view in views]
     return np.array([np.interp(frame_index, at, [v[c] for v in values]) for c in range(3)])

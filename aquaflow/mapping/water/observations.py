@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.mapping.water.regions import regions_of
+
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
-MIN_RANGE_RATIO = 1.25
-"""Points whose largest range over smallest is below this carry no information."""
+
+LEAST_COLOUR = 0.02
+"""Guards the division by a black point's colour."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +35,13 @@ class Observations:
     blend: Array
     """[M, 3] how much brighter than the point its footprint is, neighbours included, as it would
     look at the point's mean range."""
+    positions: Array
+    """[P, 3] world, map units."""
+
+    @cached_property
+    def region(self) -> Index:
+        """[P] number of the region of the scene that each point lies in."""
+        return regions_of(self.positions)
 
     @property
     def points(self) -> int:
@@ -47,20 +58,19 @@ def mean_by(
     return np.stack([np.bincount(point, column) / count for column in values.T], axis=-1)
 
 
-def informative(observations: Observations) -> Observations:
-    """Only the points that were seen at clearly different ranges, renumbered."""
-    count = observations.points
-    low, high = np.full(count, np.inf), np.zeros(count)
-    np.minimum.at(low, observations.point, observations.z)
-    np.maximum.at(high, observations.point, observations.z)
-    good = high > MIN_RANGE_RATIO * low
-    keep = good[observations.point]
-    number = np.cumsum(good) - 1
-    return Observations(
-        number[observations.point[keep]],
-        observations.view[keep],
-        observations.colour[keep],
-        observations.z[keep],
-        observations.xy[keep],
-        observations.blend[keep],
-    )
+def variance_over_range(
+    observations: Observations,
+    colours: Array,  # [M, 3] of the same observations
+) -> float:
+    """Relative variance of the points' colours that follows from the range they are seen at.
+
+    Of all points together, so that noise, which is worse from afar, has no part in it: 0 if points
+    look on the mean the same from near and far.
+    """
+    seen = observations
+    mean = np.maximum(mean_by(seen.point, colours), LEAST_COLOUR)[seen.point]
+    log_z = np.log(seen.z)
+    nearness = log_z - mean_by(seen.point, log_z[:, None])[seen.point, 0]
+    spread = float((nearness**2).mean())
+    slopes = (nearness[:, None] * (colours / mean - 1.0)).mean(axis=0) / max(spread, 1e-12)
+    return float((slopes**2).mean() * spread)

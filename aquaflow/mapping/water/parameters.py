@@ -16,10 +16,16 @@ from aquaflow.mapping.water.shading import TERMS
 
 Array = npt.NDArray[np.float64]
 
+OPTICAL_DEPTH, OPTICAL_DEPTH_SIGMA = 0.7, 0.9
+"""Prior: red light's optical depth at the median range, and its sigma in the log. An ROV works 1 to
+3 m from what it looks at, where Jerlov's waters take 0.3 to 2 (aquaflow/synthetic/water.py)."""
+RED_OVER_GREEN, RED_OVER_GREEN_SIGMA = 0.6, 0.6
+"""Prior: log of the ratio of the attenuations. Jerlov's oceanic IB to coastal 5C: 0.24 to 1.29,
+mean 0.8, deviation 0.4; wider and nearer to zero, as a camera's channels mix the colours."""
+BLUE_OVER_GREEN, BLUE_OVER_GREEN_SIGMA = 0.0, 0.5
+"""Prior: the same for blue; -0.46 to 0.24, mean -0.05, deviation 0.3."""
 RATE_RATIO_SIGMA = 0.5
 """Prior: log of b over beta_a; both come from the same absorption and scattering."""
-RATE_SIGMA = 1.5
-"""Prior: log of beta_a around the start value, weak: a factor of 4.5 either way."""
 B_INF_LOGIT, B_INF_SIGMA = -1.0, 1.5
 """Prior: logit of B_inf (0.27), weak."""
 WHITE_SIGMA = 0.5
@@ -30,12 +36,25 @@ bright looked at horizontally as from above."""
 TRUST, TRUST_SIGMA = 1.0, 1.0
 """Prior: how much of the neighbours' light that the map tells of is really there. What is uncertain
 in the map weakens it: 0.5 to 0.9 on dives with known water."""
-SHADING_SIGMA = 0.3
-"""Prior: log-gain at the edge of the picture; a third is a strong lamp fall-off."""
+BLUR, BLUR_SIGMA = 0.05, 1.2
+"""Prior: optical depth, at the median range, of which contrast to the surroundings is lost as much
+beyond what every map loses (blur.py), and its sigma in the log. None on rendered dives, 0.1 to 0.7
+on real clips of coral, which is fine."""
+SHADING_SIGMA = np.array([0.04, 0.04, 0.3, 0.04, 0.3])
+"""Prior: log-gain at the edge of the picture, by term; a third is a strong lamp fall-off, and both
+lamp and lens are on the whole alike on all sides."""
 EXPOSURE_SIGMA = 0.5
 """Prior: log-gain of a view against the mean of all; two stops span a dive's auto-exposure."""
 WATER = 9
 """log beta_a, log b and logit B_inf, RGB each."""
+RATE_ROWS = np.array(
+    [
+        [1.0 / OPTICAL_DEPTH_SIGMA, 0.0, 0.0],
+        [1.0 / RED_OVER_GREEN_SIGMA, -1.0 / RED_OVER_GREEN_SIGMA, 0.0],
+        [0.0, -1.0 / BLUE_OVER_GREEN_SIGMA, 1.0 / BLUE_OVER_GREEN_SIGMA],
+    ]
+)
+"""Whitens log beta_a: red by itself, then red over green and blue over green."""
 MAX_LOG_RATE = 5.0
 """Guards the exponential; such water is black at a hundredth of a map unit."""
 MAX_LOGIT = 10.0
@@ -67,6 +86,8 @@ class Trial:
     """[5] log-gain of the backscatter over the picture."""
     trust: float
     """Of the neighbours' light that the map tells of, how much is there."""
+    blur: float
+    """Loss of contrast per map unit."""
     shading: Array
     """[5] log-gain over the picture."""
     exposure: Array
@@ -77,32 +98,33 @@ class Trial:
 class Parameters:
     """Where each number of a ``Model`` lies in the vector, what it stands for, and its prior.
 
-    In the order log beta_a, log b, logit B_inf, unevenness, trust, shading, exposures.
+    In the order log beta_a, log b, logit B_inf, unevenness, trust, log blur, shading, exposures.
     """
 
     def __init__(
-        self, model: Model, views: int, start_beta: float, priors: WaterPriorsConfig
+        self, model: Model, views: int, median_range: float, priors: WaterPriorsConfig
     ) -> None:
+        """``median_range`` of what is seen, map units: rates are expected relative to it."""
         self.model, self.views, self.believed = model, views, priors
-        sizes = (WATER * model.water, TERMS * model.uneven, 1, TERMS * model.shading)
+        self.median_range = median_range
+        sizes = (WATER * model.water, TERMS * model.uneven, 1, 1, TERMS * model.shading)
         ends = np.cumsum((0, *sizes, 3 * views * model.exposure)).tolist()
         self.parts = [slice(*ends[k : k + 2]) for k in range(len(ends) - 1)]
-        self.water, self.uneven, self.trust, self.shading, self.exposure = self.parts
+        self.water, self.uneven, self.trust, self.blur, self.shading, self.exposure = self.parts
         self.size = ends[-1]
         self.start, self._sigma = np.zeros(self.size), np.empty(self.size)
         if model.water:
-            self.start[self.water] = [np.log(start_beta)] * 6 + [B_INF_LOGIT] * 3
-            rates = [RATE_SIGMA] * 3 + [RATE_RATIO_SIGMA] * 3
-            self._sigma[self.water] = rates + [B_INF_SIGMA] * 3
+            red = np.log(OPTICAL_DEPTH / median_range)
+            green = red - RED_OVER_GREEN
+            rates = [red, green, green + BLUE_OVER_GREEN]
+            self.start[self.water] = [*rates, *rates, *[B_INF_LOGIT] * 3]
+            self._sigma[self.water] = [1.0] * 3 + [RATE_RATIO_SIGMA] * 3 + [B_INF_SIGMA] * 3
         self.start[self.trust], self._sigma[self.trust] = TRUST, TRUST_SIGMA
+        self.start[self.blur] = np.log(BLUR / median_range)
+        self._sigma[self.blur] = BLUR_SIGMA
         self._sigma[self.uneven] = UNEVEN_SIGMA
-        self._sigma[self.shading] = SHADING_SIGMA
+        self._sigma[self.shading] = SHADING_SIGMA if model.shading else 0.0
         self._sigma[self.exposure] = EXPOSURE_SIGMA
-
-    @property
-    def free(self) -> int:
-        """Parameters that are estimated; excludes the mean exposure, a gauge freedom."""
-        return int(self.size) - 3 * self.model.exposure
 
     def adopt(
         self,
@@ -137,22 +159,22 @@ class Parameters:
         exposure = x[self.exposure] if model.exposure else np.zeros(3 * self.views)
         exposure = exposure.reshape(self.views, 3)
         trust = float(x[self.trust][0])
+        blur = float(np.exp(np.clip(x[self.blur][0], -MAX_LOG_RATE, MAX_LOG_RATE)))
         centred = exposure - exposure.mean(axis=0)
-        return Trial(wet[0], wet[1], wet[2], unevenness, trust, shading, centred)
+        return Trial(wet[0], wet[1], wet[2], unevenness, trust, blur, shading, centred)
 
     def priors(
         self,
         x: Array,  # [K] parameters
     ) -> tuple[Array, Array]:
         """Whitened residuals [R] of the linear priors, and their derivatives [R, K]."""
-        rows = np.diag(1.0 / self._sigma)
-        residuals = (x - self.start) / self._sigma
+        rows, off = np.diag(1.0 / self._sigma), x - self.start
         if self.model.water:
+            rows[:3, :3] = RATE_ROWS
             rates = np.arange(3)
             rows[3 + rates, rates] = -1.0 / RATE_RATIO_SIGMA
-            residuals[3:6] = (x[3:6] - x[:3]) / RATE_RATIO_SIGMA
         if self.model.water and self.believed.white_backscatter:
             tint = np.zeros((3, self.size))
             tint[:, 6:WATER] = (np.eye(3) - 1.0 / 3.0) / WHITE_SIGMA
-            rows, residuals = np.vstack([rows, tint]), np.concatenate([residuals, tint @ x])
-        return residuals, rows
+            rows = np.vstack([rows, tint])
+        return rows @ off, rows

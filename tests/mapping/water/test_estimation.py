@@ -10,21 +10,20 @@ import numpy as np
 import pytest
 
 from aquaflow.config import MediumConfig
+from aquaflow.mapping.water.blur import log_attenuation_variance
 from aquaflow.mapping.water.estimation import (
     EVERY_MODEL,
     MIN_POINTS,
     WaterEstimate,
-    _cost,
-    _Fit,
-    _normal_equations,
-    _solve,
     estimate_water,
+    fit_all,
     models_for,
 )
 from aquaflow.mapping.water.model import WaterModel
-from aquaflow.mapping.water.observations import Observations, informative, mean_by
+from aquaflow.mapping.water.observations import Observations, mean_by
 from aquaflow.mapping.water.parameters import Model
 from aquaflow.mapping.water.shading import TERMS, shading_basis
+from aquaflow.mapping.water.solver import cost, normal_equations
 from tests.mapping.water.water_observations import (
     B_INF,
     B_RES,
@@ -76,7 +75,8 @@ def test_shading_is_found_where_there_is_some() -> None:
 def test_the_reported_sigma_is_the_scatter_of_repeats_within_a_factor_of_three() -> None:
     scatter = np.std([np.log(repeat.beta_a) for repeat in repeats()], axis=0, ddof=1)
     reported = np.mean([repeat.beta_a_sigma for repeat in repeats()], axis=0)
-    assert (reported < 3.0 * scatter).all()
+    unknown = np.sqrt(np.diag(log_attenuation_variance(BETA, 1.75)))  # z is from 0.5 to 3
+    assert (reported < 3.0 * np.hypot(scatter, unknown)).all()
     assert (reported > scatter / 3.0).all()
 
 
@@ -99,43 +99,33 @@ def test_neighbours_light_is_weighed_by_how_much_of_it_the_sightings_show(trust:
 
 def test_no_simpler_model_explains_more_than_a_richer_one_that_contains_it() -> None:
     """A fit that stops before its minimum passes for one."""
-    seen = informative(sighted(sightings=5, shading=LAMP, log_gains=DIMMED, noise=0.02))
-    costs: dict[Model, float] = {}
-    fits: list[_Fit] = []
-    for model in EVERY_MODEL:
-        problem = WaterModel(seen, model, B_RES, D, 0.1)
-        fits.append(_solve(problem, fits))
-        costs[model] = _cost(problem, fits[-1].x, noise=0.03)
+    seen = sighted(sightings=5, shading=LAMP, log_gains=DIMMED, noise=0.02)
+    fits = fit_all([WaterModel(seen, model, B_RES, D) for model in EVERY_MODEL])
+    costs = {fit.problem.model: cost(fit.problem, fit.x, fit.noise) for fit in fits}
     for poor, rich in product(EVERY_MODEL, EVERY_MODEL):
         if all(has <= may for has, may in zip(astuple(poor), astuple(rich), strict=True)):
             assert costs[rich] <= costs[poor] + 1.0
 
 
-def test_the_normal_equations_hold_the_gradient_of_the_cost() -> None:
-    problem = WaterModel(informative(sighted(noise=0.02)), Model(True, True, True), B_RES, D, 0.3)
+def test_the_normal_equations_hold_the_gradient_of_thecost() -> None:
+    problem = WaterModel(sighted(noise=0.02), Model(True, True, True), B_RES, D)
     x, noise = problem.start + 0.1, 0.02
-    _, gradient = _normal_equations(problem, x, noise)
+    _, gradient = normal_equations(problem, x, noise)
     for k in range(problem.size):
         step = 1e-5 * (np.arange(problem.size) == k)
-        change = (_cost(problem, x + step, noise) - _cost(problem, x - step, noise)) / 2e-5
+        change = (cost(problem, x + step, noise) - cost(problem, x - step, noise)) / 2e-5
         assert 2.0 * gradient[k] == pytest.approx(change, rel=1e-3, abs=0.5)
 
 
 def test_too_few_points_give_no_estimate() -> None:
-    assert estimate_water(sighted(points=MIN_POINTS - 1), B_RES, D, 0.1) is None
-
-
-def test_points_that_are_all_at_one_range_give_no_estimate() -> None:
-    seen = sighted()
-    flat = replace(seen, z=np.full(len(seen.z), 1.5))
-    assert estimate_water(flat, B_RES, D, 0.1) is None
+    assert estimate_water(sighted(points=MIN_POINTS - 1), B_RES, D) is None
 
 
 def test_no_sightings_at_all_give_no_estimate() -> None:
     number, colour = np.zeros(0, np.int64), np.zeros((0, 3))
-    nothing = Observations(number, number, colour, np.zeros(0), np.zeros((0, 2)), colour)
+    nothing = Observations(number, number, colour, np.zeros(0), np.zeros((0, 2)), colour, colour)
     assert nothing.points == 0
-    assert estimate_water(nothing, B_RES, D, 0.1) is None
+    assert estimate_water(nothing, B_RES, D) is None
 
 
 def test_sightings_without_noise_fit_perfectly_and_stay_finite() -> None:
@@ -149,11 +139,11 @@ def test_black_pictures_give_finite_water() -> None:
     seen = sighted(points=140, sightings=3)
     black = replace(seen, colour=np.zeros_like(seen.colour))
     for models in (EVERY_MODEL, [Model(water=True)]):
-        estimate = estimate_water(black, B_RES, D, 0.1, models)
+        estimate = estimate_water(black, B_RES, D, models)
         assert estimate is not None
         for values in (estimate.beta_a, estimate.B_inf, estimate.b, estimate.exposure):
             assert np.isfinite(values).all()
-        assert (estimate.B_inf < 0.1).all()
+        assert (estimate.B_inf * -np.expm1(-1.75 * estimate.b) < 0.06).all()
 
 
 DIMMED = np.array([[0.0] * 3] * 3 + [[-0.6, -0.5, -0.4]] * 2)
@@ -194,12 +184,12 @@ def test_where_there_is_no_water_none_is_found(
 
 def test_the_evidence_speaks_for_water_where_there_is_some() -> None:
     evidence = [plain().evidence, shaded().evidence]
-    assert all(value is not None and value > 100.0 for value in evidence)
+    assert all(value is not None and value > 10.0 for value in evidence)
 
 
 def test_no_evidence_is_claimed_when_nothing_else_was_tried() -> None:
     seen = sighted(points=140, sightings=3)
-    estimate = estimate_water(seen, B_RES, D, 0.1, [Model(water=True)])
+    estimate = estimate_water(seen, B_RES, D, [Model(water=True)])
     assert estimate is not None
     assert estimate.evidence is None
 

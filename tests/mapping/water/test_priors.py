@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from aquaflow.config import WaterPriorsConfig
-from aquaflow.mapping.water.estimation import _cost, _normal_equations, estimate_water
+from aquaflow.mapping.water.estimation import estimate_water
 from aquaflow.mapping.water.model import WaterModel
-from aquaflow.mapping.water.observations import informative
 from aquaflow.mapping.water.parameters import Model
 from aquaflow.mapping.water.priors import BRIGHT_LEVEL, DARK_LEVEL, beliefs
+from aquaflow.mapping.water.solver import cost, normal_equations
 from tests.mapping.water.water_observations import B_INF, B_RES, D, sighted
 
-NOTHING = {"dark_channel": False, "saturation": False}
+NOTHING = {"dark_channel": False, "saturation": False, "regions": False}
 EACH = [
     WaterPriorsConfig(**{**NOTHING, name: True})
-    for name in ("dark_channel", "saturation", "grey_world", "white_backscatter")
+    for name in ("dark_channel", "saturation", "grey_world", "white_backscatter", "regions")
 ]
 
 
@@ -57,23 +57,24 @@ def test_a_channel_that_is_all_black_gives_finite_beliefs() -> None:
 
 @pytest.mark.parametrize("priors", EACH, ids=lambda p: str(p.model_dump()))
 def test_every_prior_has_its_part_in_the_gradient(priors: WaterPriorsConfig) -> None:
-    seen = informative(sighted(points=120, noise=0.02))
+    seen = sighted(points=120, noise=0.02)
     model, noise = Model(water=True), 2.0  # so noisy that the priors rule
-    problem = WaterModel(seen, model, B_RES, D, 0.6, priors)
-    without = WaterModel(seen, model, B_RES, D, 0.6, WaterPriorsConfig(**NOTHING))
+    problem = WaterModel(seen, model, B_RES, D, priors)
+    without = WaterModel(seen, model, B_RES, D, WaterPriorsConfig(**NOTHING))
     x = problem.start + 0.1 * np.arange(problem.size)
-    _, gradient = _normal_equations(problem, x, noise)
-    assert _cost(problem, x, noise) > _cost(without, x, noise)
+    x[:3] += 2.0  # water so thick that some points must be brighter than white
+    _, gradient = normal_equations(problem, x, noise)
+    assert cost(problem, x, noise) > cost(without, x, noise)
     for k in range(problem.size):
         step = 1e-5 * (np.arange(problem.size) == k)
-        change = (_cost(problem, x + step, noise) - _cost(problem, x - step, noise)) / 2e-5
+        change = (cost(problem, x + step, noise) - cost(problem, x - step, noise)) / 2e-5
         assert 2.0 * gradient[k] == pytest.approx(change, rel=1e-3, abs=1e-3)
 
 
 def test_believed_to_be_white_the_backscatter_has_less_colour() -> None:
     seen, wet = sighted(points=140, noise=0.02), [Model(water=True)]
     believed = WaterPriorsConfig(white_backscatter=True)
-    plain, white = (estimate_water(seen, B_RES, D, 0.1, wet, p) for p in (EACH[0], believed))
+    plain, white = (estimate_water(seen, B_RES, D, wet, p) for p in (EACH[0], believed))
     assert plain is not None
     assert white is not None
     assert np.ptp(white.B_inf) < np.ptp(plain.B_inf) < 2.0 * np.ptp(B_INF)

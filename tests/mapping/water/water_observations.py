@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.mapping.water.blur import LOSS, surroundings
 from aquaflow.mapping.water.estimation import (
     WaterEstimate,
     estimate_water,
@@ -46,11 +49,20 @@ def sighted(
         seen = seen * np.exp(log_gains)[view]
     if shading is not None:
         seen = seen * np.exp(shading_basis(xy) @ shading)[:, None]
-    noisy = seen + noise * rng.normal(size=seen.shape)
-    return Observations(point, view, noisy, z, xy, np.zeros_like(noisy))
+    # Colours and ranges have nothing to do with the place: near and far are alike.
+    positions = rng.uniform(-1.0, 1.0, (points, 3))
+    sharp = Observations(point, view, seen, z, xy, np.zeros_like(seen), positions)
+    shown = shown_by_a_map(sharp)
+    return replace(shown, colour=shown.colour + noise * rng.normal(size=seen.shape))
+
+
+def shown_by_a_map(sharp: Observations) -> Observations:
+    """With the loss of contrast that every map has."""
+    around, left = surroundings(sharp), np.exp(-LOSS * sharp.z / np.median(sharp.z))
+    return replace(sharp, colour=around + (sharp.colour - around) * left[:, None])
 
 
 def fitted(seen: Observations) -> WaterEstimate:
-    estimate = estimate_water(seen, B_RES, D, start_beta=0.1)
+    estimate = estimate_water(seen, B_RES, D)
     assert estimate is not None
     return estimate

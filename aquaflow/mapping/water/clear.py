@@ -1,0 +1,66 @@
+"""Clear water, or air: how likely it is beside water that dims and veils what is far.
+
+A map never shows every view exactly as sharp as the camera saw it. Contrast that is lost that way
+grows with range, as in water, but in all colours alike, and little: scenes without water look like
+one of a twentieth of an optical depth. So a fit that finds no more than this found clear water.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.mapping.water.blur import log_attenuation_variance
+from aquaflow.mapping.water.parameters import RATE_ROWS
+from aquaflow.mapping.water.solver import Fit
+
+Array = npt.NDArray[np.float64]
+
+OPTICAL_DEPTH, OPTICAL_DEPTH_SIGMA = 0.02, 1.0
+"""At the median range, and its sigma in the log. Found on rendered dives without water (reef, flat
+sand, pipe): 0.04 to 0.09, of which 0.045 are expected and taken out before (blur.py)."""
+RATIO_SIGMA = 0.15
+"""Log of red over green and of blue over green: 0.02 to 0.1 on the same dives."""
+ROWS = np.array(
+    [
+        [1.0 / OPTICAL_DEPTH_SIGMA, 0.0, 0.0],
+        [1.0 / RATIO_SIGMA, -1.0 / RATIO_SIGMA, 0.0],
+        [0.0, -1.0 / RATIO_SIGMA, 1.0 / RATIO_SIGMA],
+    ]
+)
+"""Whitens log beta_a of clear water."""
+LEAST_INFORMATION = 1e-6
+"""Guards the inverse where the observations say nothing of a direction."""
+
+
+def log_odds_clear(
+    fit: Fit,  # with water
+) -> float:
+    """Of clear water against the water of the fit's prior: what the observations say of log beta_a
+    under the prior of the one and of the other, all as normal distributions."""
+    found, start = fit.x[:3], fit.problem.start[:3]
+    wet = RATE_ROWS.T @ RATE_ROWS
+    posterior = np.linalg.inv(attenuation_covariance(fit))
+    values, vectors = np.linalg.eigh(posterior - wet)
+    seen = (vectors * np.maximum(values, LEAST_INFORMATION)) @ vectors.T
+    middle = np.linalg.solve(seen, posterior @ found - wet @ start)
+    clear = np.full(3, np.log(OPTICAL_DEPTH / fit.problem.median_range))
+    spread = np.linalg.inv(seen)
+    dry, water = np.linalg.inv(ROWS.T @ ROWS), np.linalg.inv(wet)
+    return _log_normal(middle - clear, spread + dry) - _log_normal(middle - start, spread + water)
+
+
+def attenuation_covariance(
+    fit: Fit,  # with water
+) -> Array:
+    """[3, 3] of log beta_a: by the observations' errors, and by what every map loses."""
+    blur = log_attenuation_variance(np.exp(fit.x[:3]), fit.problem.median_range)
+    return np.asarray(fit.repeated_covariance[:3, :3] + blur)
+
+
+def _log_normal(
+    off: Array,  # [K]
+    covariance: Array,  # [K, K]
+) -> float:
+    """Log density up to the constant that all normal distributions in K dimensions share."""
+    return float(-0.5 * (off @ np.linalg.solve(covariance, off) + np.linalg.slogdet(covariance)[1]))
