@@ -11,13 +11,16 @@ from aquaflow.errors import InputError
 from aquaflow.recording.dive_file import require_mcap
 
 if TYPE_CHECKING:
-    from mcap.records import Channel, McapRecord, Message, Schema
+    from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 
 SUFFIX = ".mcap"
 """Of an MCAP file."""
 
 RECORD_LIMIT = 1 << 28
 """bytes; a damaged length must not fill the memory."""
+
+ATTEMPTS = 2
+"""At a chunk, which may hold a second of pictures."""
 
 
 @dataclass(frozen=True)
@@ -60,13 +63,21 @@ class McapMessages:
         return self.of(lambda topic: True)
 
     def of(self, wanted: Callable[[str], bool]) -> Iterator[McapMessage]:
-        """Messages whose topic is ``wanted``."""
-        self.notes = []
+        """Messages whose topic is ``wanted``.
+
+        Raises:
+            InputError: none of the files can be opened, or one is no MCAP file.
+        """
+        self.notes, opened = [], 0
         for file in self.files:
             try:
                 yield from self._messages(file, wanted)
             except OSError as error:
                 self.notes.append(f"{file.name} cannot be read: {error.strerror}")
+                continue
+            opened += 1
+        if not opened and self.notes:
+            raise InputError(f"{self.notes[-1]}; check the path and the medium")
 
     def counts(self) -> dict[str, int] | None:
         """Messages by topic from the files' summaries; None if one was cut off before it."""
@@ -108,7 +119,7 @@ class McapMessages:
         """Records in file order, those of chunks among them, up to the first unreadable one."""
         from mcap.exceptions import EndOfFile, InvalidMagic, McapError
         from mcap.records import Chunk, DataEnd
-        from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+        from mcap.stream_reader import StreamReader
 
         damaged = 0
         with path.open("rb") as file:
@@ -127,14 +138,24 @@ class McapMessages:
                 if not isinstance(record, Chunk):
                     yield record
                     continue
-                try:
-                    inside = breakup_chunk(record, validate_crc=True)
-                except (CRCValidationError, McapError, EndOfFile, ValueError, RuntimeError):
-                    damaged += 1
-                    continue
-                yield from inside
+                inside = _unpacked(record)
+                damaged += inside is None
+                yield from inside or []
         if damaged:
             self.notes.append(f"{damaged} damaged chunks of {path.name} were left out")
+
+
+def _unpacked(chunk: Chunk) -> list[McapRecord] | None:
+    """The records in a chunk; None if it is damaged, at the second attempt too."""
+    from mcap.exceptions import EndOfFile, McapError
+    from mcap.stream_reader import CRCValidationError, breakup_chunk
+
+    for _ in range(ATTEMPTS):
+        try:
+            return breakup_chunk(chunk, validate_crc=True)
+        except (CRCValidationError, McapError, EndOfFile, ValueError, RuntimeError):
+            continue
+    return None
 
 
 class _Whole:
@@ -144,7 +165,12 @@ class _Whole:
         self._file = file
 
     def read(self, size: int = -1) -> bytes:
-        data = self._file.read(size)
+        at = self._file.tell()
+        try:
+            data = self._file.read(size)
+        except OSError:  # a worn medium often gives on the second attempt what it did not at first
+            self._file.seek(at)
+            data = self._file.read(size)
         return data if len(data) == size else b""
 
 

@@ -153,7 +153,7 @@ def summarise_water(mapper: Mapper) -> WaterSummary | None:
         return None
     low, high = np.percentile(z.numpy(), RANGE_PERCENTILES)
     first = waters[0]
-    return WaterSummary(
+    summary = WaterSummary(
         torch.stack([water.beta_a for water in waters]).mean(0).tolist(),
         first.b.tolist(),
         first.B_inf.tolist(),
@@ -169,6 +169,10 @@ def summarise_water(mapper: Mapper) -> WaterSummary | None:
         mapper.scene.shading.tolist(),
         mapper.medium.unevenness.tolist(),
     )
+    numbers = (low, high, summary.range_median, *summary.beta_a, *summary.B_inf, *summary.b)
+    if not np.isfinite(numbers).all():
+        raise ArithmeticError("the water's summary is not finite")
+    return summary
 
 
 def _solid_ranges(mapper: Mapper, view: View) -> torch.Tensor:

@@ -8,6 +8,10 @@ the light of every view and the decoder itself.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from aquaflow.errors import AquaFlowError, DamagedError, InputError, reason_of
 from aquaflow.mapping.mapper import Mapper
@@ -28,9 +32,19 @@ def write_map_file(path: Path, mapper: Mapper, optimiser: bool = False) -> None:
 
     Raises:
         InputError: the file cannot be written.
+        ArithmeticError: a number of the map is not finite.
     """
     facts, arrays = serialise(mapper, optimiser)
+    bad = [name for name, array in arrays.items() if not _is_finite(array)]
+    if bad:
+        raise ArithmeticError(f"{bad[0]} of the map is not finite")
     write_facts_file(path, {"kind": KIND, "format": FORMAT, **facts}, arrays)
+
+
+def _is_finite(
+    array: npt.NDArray[Any],  # [...]
+) -> bool:
+    return array.dtype.kind != "f" or bool(np.isfinite(array).all())
 
 
 def read_map_file(path: Path, renderer: Renderer) -> Mapper:

@@ -153,9 +153,10 @@ class SelectiveAdam:
     ) -> int:
         seen = visible.contiguous()
         plain = {name: g.detach().to(torch.float32).contiguous() for name, g in grads.items()}
+        params = {name: self.params[name].detach() for name in plain}  # alive during the call
         groups = (_NativeGroup * len(plain))()
         for group, (name, gradient) in zip(groups, plain.items(), strict=True):
-            group.param = pointer(self.params[name].detach())
+            group.param = pointer(params[name])
             group.gradient = pointer(gradient)
             group.first_moment = pointer(self.first_moments[name])
             group.second_moment = pointer(self.second_moments[name])

@@ -168,9 +168,9 @@ class LiveDive:
             self._watchdog.close,
             self.feed.close,
             partial(self.parts.slam.close, keep),
-            partial(self.folder.close, keep),
             self._remove_checkpoint,
             self._notifier.close,
+            partial(self.folder.close, keep),  # last: until then failures go to its log
         ):
             with self.parts.slam.failures.contain("closing"):
                 close()

@@ -184,3 +184,11 @@ def test_no_file_and_no_room_are_told(tmp_path: Path) -> None:
         read_map_file(tmp_path / "none.aqf", renderer())
     with pytest.raises(InputError, match="cannot write"):
         write_map_file(tmp_path / "no folder" / "map.aqf", learned())
+
+
+def test_a_map_that_is_not_finite_is_not_written(tmp_path: Path) -> None:
+    mapper = grown(settings())
+    mapper.gaussians.means[0, 0] = torch.nan
+    with pytest.raises(ArithmeticError, match="means of the map is not finite"):
+        write_map_file(tmp_path / "map.aqf", mapper)
+    assert not list(tmp_path.iterdir())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import json
 import socket
 import threading
@@ -93,7 +94,7 @@ def _ask(port: int) -> None:
         for page in ("health", "metrics", ""):
             try:
                 urllib.request.urlopen(f"http://127.0.0.1:{port}/{page}", timeout=5.0).read()
-            except OSError:
+            except (OSError, http.client.HTTPException):
                 continue
 
 

@@ -13,9 +13,9 @@ from .child import HUNG, Ended
 from .faults import Kind
 from .watch import Moment
 
-MOST_MISSING = 4
-"""Frames without a pose that one fault may cost: its own, and those whose pose hung on it, as while
-a map is started from few frames."""
+MOST_MISSING = 6
+"""Frames without a pose that one fault may cost: its own, and those that a start of a map waits
+for (``max_waiting`` in dives.py)."""
 ENDED = (0, 3)
 """Exit codes of a dive that ended; 3: with warnings, as where a busy machine kept a live dive from
 most frames."""

@@ -159,3 +159,16 @@ def test_every_header_compiles_alone(header: Path) -> None:
     command = [*compiler, *native.compile_flags(isa), "-fsyntax-only", "-xc++", str(header)]
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
+
+
+def test_a_library_whose_sources_cannot_be_read_is_taken_as_it_is(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def unreadable() -> str:
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(native, "source_hash", unreadable)
+    library = tmp_path / "libaquaflow_sse4.so"
+    assert not native.is_current(library)
+    library.write_bytes(b"kernels")
+    assert native.is_current(library)

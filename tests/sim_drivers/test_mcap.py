@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import base64
+import errno
+import io
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
+from mcap import stream_reader
 from mcap.writer import Writer
 
 from aquaflow.config.link import SerialConfig
@@ -23,8 +26,10 @@ from aquaflow.messages import Attitude, Depth, Dropped, EncodedPicture, Frame
 from aquaflow.recording import Recorder
 from aquaflow.recording.pictures import encode
 from aquaflow.sources import camera_reader, open_recorded_telemetry, open_recording
+from sim_drivers import mcap_messages
 from sim_drivers.h264 import is_key
 from sim_drivers.mcap_camera import McapCamera
+from sim_drivers.mcap_messages import McapMessages
 from sim_drivers.mcap_telemetry import McapTelemetry
 from sim_drivers.video import VideoFile
 
@@ -202,3 +207,60 @@ def test_video_before_its_first_key_frame_is_missing(shared_data: Path, tmp_path
     frames = list(McapCamera(tmp_path).frames())
     assert [type(frame) for frame in frames] == [Dropped, Dropped, Frame]
     assert [frame.index for frame in frames] == [0, 1, 2]
+
+
+class FailingOnce:
+    """A file of which one read raises."""
+
+    def __init__(self, file: BinaryIO, at: int) -> None:
+        self._file, self._at, self.reads = file, at, 0
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def seek(self, at: int) -> int:
+        return self._file.seek(at)
+
+    def read(self, size: int = -1) -> bytes:
+        self.reads += 1
+        if self.reads == self._at:
+            raise OSError(errno.EIO, "Input/output error")
+        return self._file.read(size)
+
+
+@pytest.mark.parametrize("at", [1, 4, 9])
+def test_a_read_that_fails_once_costs_nothing(at: int) -> None:
+    file = FailingOnce(io.BytesIO(bytes(range(100))), at)
+    whole = mcap_messages._Whole(cast("BinaryIO", file))
+    assert b"".join(whole.read(10) for _ in range(10)) == bytes(range(100))
+
+
+def test_a_chunk_that_cannot_be_unpacked_at_first_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    payload = json.dumps({"format": "png", "data": base64.b64encode(PNG).decode()}).encode()
+    write = with_messages("foxglove.CompressedImage", ("jsonschema", b"{}"), "json", [payload])
+    path = written(tmp_path / "a.mcap", write)
+    unpack, calls = stream_reader.breakup_chunk, []
+
+    def failing_once(*arguments: Any, **options: Any) -> Any:
+        calls.append(arguments)
+        if len(calls) == 1:
+            raise ValueError("planted")
+        return unpack(*arguments, **options)
+
+    monkeypatch.setattr(stream_reader, "breakup_chunk", failing_once)
+    assert len(list(McapMessages([path]))) == 1
+
+
+def test_files_of_which_none_can_be_opened_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = written(tmp_path / "a.mcap", lambda writer: None)
+
+    def refused(*_: object) -> BinaryIO:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(Path, "open", refused)
+    with pytest.raises(InputError, match=r"a\.mcap cannot be read: Input/output error"):
+        list(McapMessages([path]))

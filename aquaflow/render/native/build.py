@@ -129,7 +129,11 @@ def library_path(isa: str, directory: Path = NATIVE_DIR) -> Path:
 def is_current(library: Path) -> bool:
     """Whether ``library`` exists and was built from the sources in this folder."""
     try:
-        return f"aquaflow-source:{source_hash()}".encode() in library.read_bytes()
+        expected = f"aquaflow-source:{source_hash()}".encode()
+    except OSError:  # what cannot be read cannot be built again either
+        return library.exists()
+    try:
+        return expected in library.read_bytes()
     except OSError:
         return False
 

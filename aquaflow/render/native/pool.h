@@ -3,8 +3,8 @@
 // run(n, job) calls job(0) ... job(n - 1) once each. What a part computes depends on its number
 // only, never on the thread that ran it, so results repeat bit for bit at a given n. Part k is
 // offered to thread k, whose cache may still hold what it worked on before; the caller takes what
-// no thread has begun when its own part is done, so that a machine busy with other programs costs no
-// wait. When the pool is busy (another Python thread renders) the caller runs all parts itself,
+// no thread has begun when its own part is done, so that a machine busy with other programs costs
+// no wait. When the pool is busy (another Python thread renders) the caller runs all parts itself,
 // with the same result. A job whose parts draw their work from a counter must itself see to it that
 // the result does not depend on who drew.
 #pragma once

@@ -96,6 +96,8 @@ class _Server(ThreadingHTTPServer):
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         try:
             super().process_request_thread(request, client_address)
+        except Exception as error:  # a thread's own traceback would go to the terminal
+            log.warning("a request was not answered: %s", error)
         finally:
             self._room.release()
 

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import http.client
 import json
+import logging
 import re
 import socket
+import socketserver
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +25,7 @@ from aquaflow.service.health.http import MOST_CLIENTS, HealthServer
 from aquaflow.service.health.prometheus import exposition
 from aquaflow.service.health.state import State
 from tests.command_line import Cli
+from tests.small_recording import GIVE_UP_S
 
 TOKEN = "correct-horse-battery"
 REPORT: dict[str, Any] = {
@@ -154,3 +159,20 @@ def test_status_prints_the_report_and_its_exit_code_says_if_all_is_well(
     asked = aquaflow("status", "--url", "http://127.0.0.1:1")
     assert asked.code == 1
     assert "no service answers" in asked.err
+
+
+def test_a_request_whose_thread_fails_is_logged_and_the_next_is_answered(
+    server: HealthServer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def failing(*_: object) -> None:
+        raise OSError(errno.EIO, "planted")
+
+    with monkeypatch.context() as broken, caplog.at_level(logging.WARNING):
+        broken.setattr(socketserver.ThreadingMixIn, "process_request_thread", failing)
+        with socket.create_connection(("127.0.0.1", server.port), timeout=20) as client:
+            client.sendall(b"GET /health HTTP/1.0\r\n\r\n")
+            waited = time.monotonic()
+            while "planted" not in caplog.text and time.monotonic() - waited < GIVE_UP_S:
+                time.sleep(0.01)
+    assert "a request was not answered" in caplog.text
+    assert get(server.port, "/health")[0] == 200
