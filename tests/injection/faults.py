@@ -70,6 +70,8 @@ def without_numbers(result: Any) -> Any:
         return type(result)(np.nan)
     if isinstance(result, np.ndarray) and np.issubdtype(result.dtype, np.floating):
         return np.full_like(result, np.nan)
+    if isinstance(result, torch.nn.Parameter):
+        return torch.nn.Parameter(torch.full_like(result, float("nan")))
     if (
         isinstance(result, torch.Tensor)
         and result.is_floating_point()
