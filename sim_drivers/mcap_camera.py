@@ -90,14 +90,22 @@ class McapCamera:
     def frames(
         self, every: int = 1, start: int = 0, stop: int | None = None
     ) -> Iterator[Frame | Dropped]:
-        """The pictures whose index is ``start, start + every, ...`` below ``stop``."""
+        """The pictures whose index is ``start, start + every, ...`` below ``stop``.
+
+        Raises:
+            InputError: none could be read, though there was one when the recording was opened.
+        """
+        any_read = False
         pictures = self._video() if self._kind == VIDEO else self._pictures(every, start)
         for frame in pictures:
+            any_read = True
             if stop is not None and frame.index >= stop:
                 break
             if is_asked(frame.index, every, start):
                 yield frame
         self.notes = [*self._damage, *self._messages.notes]
+        if not any_read:
+            raise InputError(f"{self.path} holds no picture any more: {'; '.join(self.notes)}")
 
     def close(self) -> None:
         """Nothing stays open between passes."""

@@ -63,21 +63,17 @@ class McapMessages:
         return self.of(lambda topic: True)
 
     def of(self, wanted: Callable[[str], bool]) -> Iterator[McapMessage]:
-        """Messages whose topic is ``wanted``.
+        """Messages whose topic is ``wanted``; a file that cannot be opened is a note.
 
         Raises:
-            InputError: none of the files can be opened, or one is no MCAP file.
+            InputError: a file is no MCAP file.
         """
-        self.notes, opened = [], 0
+        self.notes = []
         for file in self.files:
             try:
                 yield from self._messages(file, wanted)
             except OSError as error:
                 self.notes.append(f"{file.name} cannot be read: {error.strerror}")
-                continue
-            opened += 1
-        if not opened and self.notes:
-            raise InputError(f"{self.notes[-1]}; check the path and the medium")
 
     def counts(self) -> dict[str, int] | None:
         """Messages by topic from the files' summaries; None if one was cut off before it."""

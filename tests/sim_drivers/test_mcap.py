@@ -253,14 +253,16 @@ def test_a_chunk_that_cannot_be_unpacked_at_first_is_tried_again(
     assert len(list(McapMessages([path]))) == 1
 
 
-def test_files_of_which_none_can_be_opened_are_refused(
+def test_a_recording_that_cannot_be_read_any_more_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = written(tmp_path / "a.mcap", lambda writer: None)
+    payload = json.dumps({"format": "png", "data": base64.b64encode(PNG).decode()}).encode()
+    write = with_messages("foxglove.CompressedImage", ("jsonschema", b"{}"), "json", [payload])
+    recording = McapCamera(written(tmp_path / "a.mcap", write))
 
     def refused(*_: object) -> BinaryIO:
         raise OSError(errno.EIO, "Input/output error")
 
     monkeypatch.setattr(Path, "open", refused)
-    with pytest.raises(InputError, match=r"a\.mcap cannot be read: Input/output error"):
-        list(McapMessages([path]))
+    with pytest.raises(InputError, match=r"no picture any more: a\.mcap cannot be read: Input"):
+        list(recording.frames())
