@@ -171,4 +171,5 @@ def log_odds_of_water(dry: Fit, wet: Fit) -> float:
 
 
 def _beta_a_sigma(fit: Fit) -> list[float]:
-    return list(np.sqrt(np.diag(attenuation_covariance(fit))).tolist())
+    variance = np.maximum(np.diag(attenuation_covariance(fit)), 0.0)
+    return list(np.sqrt(variance).tolist())

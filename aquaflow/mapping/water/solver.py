@@ -17,6 +17,8 @@ MAX_STEPS = 30
 """Limit of Levenberg-Marquardt in one fit."""
 LEAST_GAIN = 1e-5
 """Relative fall of the cost at which a fit has converged."""
+TINY = 1e-12
+"""Guards a division where the observations say nothing at all."""
 DAMPING = 1e-3, 1e6
 """Levenberg-Marquardt's first damping, and the one at which no step helps any more."""
 
@@ -87,7 +89,8 @@ class Fit:
             expected[np.ix_(own, own)] += weighed @ by_error.T
             found[np.ix_(own, own)] += by_region @ by_region.T
         covariance = self.covariance[:first, :first]
-        return float((covariance * found).sum() / (covariance * expected).sum())
+        alone = max(float((covariance * expected).sum()), TINY)
+        return float((covariance * found).sum()) / alone
 
 
 def descend(
