@@ -10,6 +10,7 @@ WORKERS ?= 2
 # Tests of one file run in one process: they share what the file's fixtures made.
 TESTS := $(BIN)/pytest -n $(WORKERS) --dist loadfile
 MKDOCS := NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+QUICK := -m 'not slow and not kernel and not ci'
 KERNELS := $(wildcard aquaflow/render/native/*.cpp aquaflow/render/native/*.h)
 
 OUT ?= out/dive
@@ -47,7 +48,7 @@ run: setup
 endif
 
 test: setup ## Run the tests that take seconds.
-	$(TESTS) -m 'not slow and not kernel and not ci'
+	$(TESTS) $(QUICK)
 
 test-ci: setup ## Run the tests that take tens of seconds: compilers, wheels, whole dives.
 	$(TESTS) -m ci
@@ -66,7 +67,7 @@ fuzz: setup ## Feed every command what nothing sane would, for FUZZ_SECONDS=120.
 	$(BIN)/python -m tests.fuzz --seconds $(FUZZ_SECONDS)
 
 coverage: setup ## Run the tests of `make test` and show how much of each file they reach.
-	$(TESTS) -m 'not slow and not kernel and not ci' --cov --cov-report=term --cov-report=html:out/coverage
+	$(TESTS) $(QUICK) --cov --cov-report=term --cov-report=html:out/coverage
 
 check: setup ## Lint, formatting, unused code, links of the documentation, types.
 	$(BIN)/ruff check

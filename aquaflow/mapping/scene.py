@@ -201,8 +201,10 @@ class Scene:
     ) -> Tensor:
         """[H, W, 3] the view's picture without water, in the white balance of what is nearest."""
         image, water = self.evenly_lit(view), self.water(view)
-        if water is None or self.balance is None:
-            return self.balanced(image if water is None else self.restore(view, z)[0])
+        if water is None:
+            return image
+        if self.balance is None:
+            return water.restore(image, z, self.uneven(view))[0]
         return self.balance.recover(image, z, water, self.uneven(view))
 
     @torch.no_grad()

@@ -22,24 +22,12 @@ Array = npt.NDArray[np.float64]
 LOSS, LOSS_SIGMA = 0.045, 0.02
 """Optical depth, at the median range, of which contrast is lost as much in every map; mean and
 deviation over eight rendered dives (reef, sand, wall and pipe in clear and in blue water)."""
-FEWEST = 4
-"""Points of one region in one view whose mean stands for a point's surroundings."""
-
-
-def surroundings(seen: Observations) -> Array:
-    """[M, 3] mean colour of each observation's region in the same view; where there are too few
-    points, the observation's own, which no blur changes."""
-    region, views = seen.region[seen.point], int(seen.view.max()) + 1
-    cell = region * views + seen.view
-    count = np.bincount(cell)[cell]
-    around = np.stack([np.bincount(cell, column)[cell] for column in seen.colour.T], axis=-1)
-    return np.where((count >= FEWEST)[:, None], around / count[:, None], seen.colour)
 
 
 def sharpened(seen: Observations) -> Observations:
     """The observations with the contrast to their surroundings that every map loses."""
-    around, lost = surroundings(seen), LOSS * seen.z / float(np.median(seen.z))
-    return replace(seen, colour=around + (seen.colour - around) * np.exp(lost)[:, None])
+    lost = LOSS * seen.z / float(np.median(seen.z))
+    return replace(seen, colour=seen.around + (seen.colour - seen.around) * np.exp(lost)[:, None])
 
 
 def log_attenuation_variance(

@@ -1,8 +1,8 @@
-"""Clear water, or air: how likely it is beside water that dims and veils what is far.
+"""Clear water, or air: its odds against water that dims and veils what is far.
 
 A map never shows every view exactly as sharp as the camera saw it. Contrast that is lost that way
 grows with range, as in water, but in all colours alike, and little: scenes without water look like
-one of a twentieth of an optical depth. So a fit that finds no more than this found clear water.
+one of a few hundredths of an optical depth. A fit that finds no more than this found clear water.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.mapping.water.blur import log_attenuation_variance
-from aquaflow.mapping.water.parameters import RATE_ROWS
+from aquaflow.mapping.water.parameters import RATE_ROWS, rate_rows
 from aquaflow.mapping.water.solver import Fit
 
 Array = npt.NDArray[np.float64]
@@ -21,13 +21,7 @@ OPTICAL_DEPTH, OPTICAL_DEPTH_SIGMA = 0.02, 1.0
 sand, pipe): 0.04 to 0.09, of which 0.045 are expected and taken out before (blur.py)."""
 RATIO_SIGMA = 0.15
 """Log of red over green and of blue over green: 0.02 to 0.1 on the same dives."""
-ROWS = np.array(
-    [
-        [1.0 / OPTICAL_DEPTH_SIGMA, 0.0, 0.0],
-        [1.0 / RATIO_SIGMA, -1.0 / RATIO_SIGMA, 0.0],
-        [0.0, -1.0 / RATIO_SIGMA, 1.0 / RATIO_SIGMA],
-    ]
-)
+ROWS = rate_rows(OPTICAL_DEPTH_SIGMA, RATIO_SIGMA, RATIO_SIGMA)
 """Whitens log beta_a of clear water."""
 LEAST_INFORMATION = 1e-6
 """Guards the inverse where the observations say nothing of a direction."""

@@ -2,10 +2,10 @@
 
 An observation of point p in view v is ``gain_v shade(x, y) (J_p T + trust blend T / T_p +
 uneven(x, y) B)``, with T_p the transmission at the point's mean range, drawn towards its
-surroundings (blur.py). The best J of every point is linear, so
-it is eliminated (variable projection); what remains lies in one vector (parameters.py). The
-derivatives are exact: the cost is robust, so that those of Kaufman, which leave out how J's factor
-changes, point in a wrong direction.
+surroundings (blur.py). The best J of every point is linear, so it is eliminated (variable
+projection); what remains lies in one vector (parameters.py). The derivatives are exact: the cost
+is robust, so that those of Kaufman, which leave out how J's factor changes, point in a wrong
+direction.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config import WaterPriorsConfig
-from aquaflow.mapping.water.blur import surroundings
-from aquaflow.mapping.water.observations import Observations, mean_by
+from aquaflow.mapping.water.grouping import mean_by
+from aquaflow.mapping.water.observations import Observations
 from aquaflow.mapping.water.parameters import Model, Parameters, Trial
 from aquaflow.mapping.water.priors import beliefs
 from aquaflow.mapping.water.regions import RegionalColours
@@ -56,7 +56,7 @@ class WaterModel(Parameters):
         self._near = B_res * np.exp(-d * seen.z[:, None])
         self._basis = shading_basis(seen.xy)
         self._beyond = seen.z - mean_by(seen.point, seen.z[:, None])[seen.point, 0]
-        self._around = surroundings(seen)
+        self._around = seen.around
         self._cell = seen.point * self.views + seen.view
 
     def predict(
@@ -92,10 +92,7 @@ class WaterModel(Parameters):
         share: Array = np.where(J > 0.0, -1.0 / power, 0.0)
         # What is drawn from the surroundings is a part that no gain and no water changes.
         own_light = predicted - self._drawn_in(trial, c)
-        changes = self._changes(trial, c, own_light, a * J[seen.point])
-        contrast = -trial.blur * seen.z
-        at = self.of_channel(c).tolist().index(self.blur.start)
-        changes.insert(at, (contrast * (predicted - self._around[:, c]), contrast))
+        changes = self._changes(trial, c, predicted, own_light, a * J[seen.point])
         direct = [of_errors for of_errors, _ in changes]
         by_J: list[Array] = [
             np.bincount(seen.point, a * (of_errors + of_log_a * errors), points) * share
@@ -116,10 +113,11 @@ class WaterModel(Parameters):
         self,
         trial: Trial,
         c: int,
-        predicted: Array,  # [M] but for what is drawn from the surroundings
-        light: Array,  # [M] of it, what comes from the points
+        predicted: Array,  # [M]
+        own_light: Array,  # [M] of it, what is not drawn from the surroundings
+        light: Array,  # [M] of that, what comes from the points
     ) -> list[Change]:
-        """By all parameters but blur and exposures."""
+        """By all parameters but exposures."""
         gain, seen = self._gain(trial, c), self.seen
         blended, basis = self._blended(trial, c, gain), list(self._basis.T)
         changes: list[Change] = []
@@ -133,9 +131,10 @@ class WaterModel(Parameters):
         if self.model.uneven:
             veil = gain * self._veil(trial, c)
             changes += [(veil * term, 0.0) for term in basis]
-        changes.append((blended, 0.0))
+        contrast = -trial.blur * seen.z
+        changes += [(blended, 0.0), (contrast * (predicted - self._around[:, c]), contrast)]
         if self.model.shading:
-            changes += [(predicted * term, term) for term in basis]
+            changes += [(own_light * term, term) for term in basis]
         return changes
 
     def of_scene(

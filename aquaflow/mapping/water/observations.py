@@ -8,12 +8,15 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.mapping.water.grouping import mean_by
 from aquaflow.mapping.water.regions import regions_of
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 
+FEWEST_AROUND = 4
+"""Points of one region in one view whose mean stands for a point's surroundings."""
 LEAST_COLOUR = 0.02
 """Guards the division by a black point's colour."""
 
@@ -43,19 +46,18 @@ class Observations:
         """[P] number of the region of the scene that each point lies in."""
         return regions_of(self.positions)
 
+    @cached_property
+    def around(self) -> Array:
+        """[M, 3] mean colour of each observation's region in the same view; where there are too few
+        points, the observation's own."""
+        cell = self.region[self.point] * (int(self.view.max()) + 1) + self.view
+        enough = np.bincount(cell)[cell] >= FEWEST_AROUND
+        return np.where(enough[:, None], mean_by(cell, self.colour)[cell], self.colour)
+
     @property
     def points(self) -> int:
         """Number P of points."""
         return int(self.point.max()) + 1 if len(self.point) else 0
-
-
-def mean_by(
-    point: Index,  # [M]
-    values: Array,  # [M, K]
-) -> Array:
-    """[P, K] mean over each point's observations."""
-    count = np.maximum(np.bincount(point), 1)
-    return np.stack([np.bincount(point, column) / count for column in values.T], axis=-1)
 
 
 def variance_over_range(

@@ -47,18 +47,21 @@ EXPOSURE_SIGMA = 0.5
 """Prior: log-gain of a view against the mean of all; two stops span a dive's auto-exposure."""
 WATER = 9
 """log beta_a, log b and logit B_inf, RGB each."""
-RATE_ROWS = np.array(
-    [
-        [1.0 / OPTICAL_DEPTH_SIGMA, 0.0, 0.0],
-        [1.0 / RED_OVER_GREEN_SIGMA, -1.0 / RED_OVER_GREEN_SIGMA, 0.0],
-        [0.0, -1.0 / BLUE_OVER_GREEN_SIGMA, 1.0 / BLUE_OVER_GREEN_SIGMA],
-    ]
-)
-"""Whitens log beta_a: red by itself, then red over green and blue over green."""
 MAX_LOG_RATE = 5.0
 """Guards the exponential; such water is black at a hundredth of a map unit."""
 MAX_LOGIT = 10.0
 """Guards the exponential; B_inf is black or white to 0.005 %."""
+
+
+def rate_rows(red: float, red_over_green: float, blue_over_green: float) -> Array:
+    """[3, 3] by which log beta_a is whitened: red by itself, red over green and blue over green,
+    each with its sigma."""
+    contrasts = np.array([[1.0, 0.0, 0.0], [1.0, -1.0, 0.0], [0.0, -1.0, 1.0]])
+    return np.asarray(contrasts / np.array([[red], [red_over_green], [blue_over_green]]))
+
+
+RATE_ROWS = rate_rows(OPTICAL_DEPTH_SIGMA, RED_OVER_GREEN_SIGMA, BLUE_OVER_GREEN_SIGMA)
+"""Of water that is not clear."""
 
 
 @dataclass(frozen=True)

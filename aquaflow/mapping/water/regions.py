@@ -13,6 +13,8 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.mapping.water.grouping import mean_by
+
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
@@ -59,7 +61,7 @@ class RegionalColours:
     ) -> None:
         count = np.bincount(region)
         self._kept = count >= FEWEST
-        self._region, self._count = region, np.maximum(count, 1)
+        self._region = region
         self.number = int(self._kept.sum())
         """Regions with enough points."""
 
@@ -104,14 +106,9 @@ class RegionalColours:
         self,
         J: Array,  # [P]
     ) -> tuple[Array, Array]:
-        mean = self._mean(J)
-        return mean, np.sqrt(self._mean((J - mean[self._region]) ** 2))
-
-    def _mean(
-        self,
-        values: Array,  # [P]
-    ) -> Array:
-        return np.asarray(np.bincount(self._region, values) / self._count)
+        mean = mean_by(self._region, J[:, None])[:, 0]
+        square = mean_by(self._region, (J - mean[self._region])[:, None] ** 2)[:, 0]
+        return mean, np.sqrt(square)
 
     def _slopes(
         self,
@@ -121,8 +118,8 @@ class RegionalColours:
         """[2, R, k] derivatives of the statistics."""
         mean, deviation = self._moments(J)
         centred = J - mean[self._region]
-        of_mean = np.stack([self._mean(row) for row in by_J], axis=-1)
-        of_square = np.stack([self._mean(centred * row) for row in by_J], axis=-1)
+        of_mean = mean_by(self._region, by_J.T)
+        of_square = mean_by(self._region, (centred * by_J).T)
         of_deviation = of_square / np.maximum(deviation, LEAST)[:, None]
         slopes = np.stack([of_mean, of_deviation])
         levels = np.stack([mean, deviation])[..., None] + LEAST

@@ -19,7 +19,8 @@ from torch import Tensor
 
 from aquaflow.mapping.gaussians.gaussians import radiance
 from aquaflow.mapping.views import View
-from aquaflow.mapping.water.observations import Observations, mean_by
+from aquaflow.mapping.water.grouping import mean_by
+from aquaflow.mapping.water.observations import Observations
 from aquaflow.render.contract import Renderer
 
 SeenFrom = Callable[[View], Mapping[str, Tensor]]

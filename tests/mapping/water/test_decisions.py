@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aquaflow.mapping.water.blur import sharpened, surroundings
+from aquaflow.mapping.water.blur import sharpened
 from aquaflow.mapping.water.regions import FEWEST, RegionalColours, regions_of
 from tests.mapping.water.decision_table import kinds, row
 from tests.mapping.water.simulated_dives import Kind, dive
@@ -45,7 +45,7 @@ def test_contrast_that_every_map_loses_is_given_back() -> None:
 
 def test_a_region_with_too_few_points_has_no_surroundings() -> None:
     alone = sighted(points=3, sightings=2)
-    np.testing.assert_array_equal(surroundings(alone), alone.colour)
+    np.testing.assert_array_equal(alone.around, alone.colour)
 
 
 def test_regions_have_as_many_points_each_and_lie_side_by_side() -> None:

@@ -19,8 +19,9 @@ from aquaflow.mapping.water.estimation import (
     fit_all,
     models_for,
 )
+from aquaflow.mapping.water.grouping import mean_by
 from aquaflow.mapping.water.model import WaterModel
-from aquaflow.mapping.water.observations import Observations, mean_by
+from aquaflow.mapping.water.observations import Observations
 from aquaflow.mapping.water.parameters import Model
 from aquaflow.mapping.water.shading import TERMS, shading_basis
 from aquaflow.mapping.water.solver import cost, normal_equations

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from aquaflow.mapping.water.grouping import mean_by
 from aquaflow.mapping.water.model import WaterModel
-from aquaflow.mapping.water.observations import Observations, mean_by
+from aquaflow.mapping.water.observations import Observations
 from aquaflow.mapping.water.parameters import MAX_LOG_RATE, Model
 from aquaflow.mapping.water.shading import TERMS
 from tests.mapping.water.water_observations import B_RES, D

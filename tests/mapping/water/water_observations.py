@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.mapping.water.blur import LOSS, surroundings
+from aquaflow.mapping.water.blur import LOSS
 from aquaflow.mapping.water.estimation import (
     WaterEstimate,
     estimate_water,
@@ -58,8 +58,8 @@ def sighted(
 
 def shown_by_a_map(sharp: Observations) -> Observations:
     """With the loss of contrast that every map has."""
-    around, left = surroundings(sharp), np.exp(-LOSS * sharp.z / np.median(sharp.z))
-    return replace(sharp, colour=around + (sharp.colour - around) * left[:, None])
+    left = np.exp(-LOSS * sharp.z / np.median(sharp.z))
+    return replace(sharp, colour=sharp.around + (sharp.colour - sharp.around) * left[:, None])
 
 
 def fitted(seen: Observations) -> WaterEstimate:
