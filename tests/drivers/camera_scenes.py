@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -104,12 +104,17 @@ def closing(camera: LiveCamera) -> Iterator[LiveCamera]:
         camera.close()
 
 
-def until(camera: LiveCamera, received: int) -> list[Frame | Dropped]:
-    """What came until the device had handed over ``received`` pictures, and nothing else will."""
+def until(
+    camera: LiveCamera,
+    received: int,
+    enough: Callable[[Frame | Dropped], bool] = lambda newest: True,
+) -> list[Frame | Dropped]:
+    """What came until the device had handed over ``received`` pictures and the newest is
+    ``enough``, and nothing else will."""
     seen = []
     for frame in camera.frames():
         seen.append(frame)
-        if camera.counters.received >= received:
+        if camera.counters.received >= received and enough(frame):
             break
     assert camera.counters.received >= received, f"gave up: {camera.state}, {camera.reason}"
     camera.close()
