@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -17,10 +17,12 @@ from aquaflow.mapping.decoder.neural import NeuralGaussians
 from aquaflow.mapping.gaussians.gaussians import GaussianMap, radiance, raw_colour
 from aquaflow.mapping.rendering import Shown, show
 from aquaflow.mapping.views import View
-from aquaflow.mapping.water.estimation import WaterEstimate, estimate_water, models_for
+from aquaflow.mapping.water.estimation import WaterEstimate, estimating, models_for
 from aquaflow.mapping.water.exposure import gain_of, learn_gain, set_log_gains
 from aquaflow.mapping.water.image_formation import Water
 from aquaflow.mapping.water.medium import Medium
+from aquaflow.mapping.water.posed_picture import PosedPicture
+from aquaflow.mapping.water.selection import finished
 from aquaflow.mapping.water.shading import TERMS, gain_map
 from aquaflow.mapping.water.sightings import sight
 from aquaflow.mapping.water.sunlight import Sunlight
@@ -122,9 +124,6 @@ class Scene:
         if self.neural is None:
             return self.gaussians.parameters
         return self.neural.seen_from(view, viewmat)
-
-    def _attributes(self, view: View) -> Mapping[str, Tensor]:
-        return self.seen_from(view, view.viewmat())
 
     def baked(self, views: list[View]) -> Mapping[str, Tensor]:
         """The parameters as plain Gaussians, each as seen from the nearest of ``views``."""
@@ -228,23 +227,35 @@ class Scene:
         generator: torch.Generator,
         dive: Sequence[View] | None = None,
     ) -> WaterEstimate | None:
+        """:meth:`fitting_water` at once."""
+        return finished(self.fitting_water(views, generator, dive))
+
+    def fitting_water(
+        self,
+        views: list[View],
+        generator: torch.Generator,
+        dive: Sequence[View] | None = None,
+    ) -> Generator[None, None, WaterEstimate | None]:
         """Estimate water, shading and exposure from what ``views`` saw; pictures stay as they are.
 
-        All views of the ``dive`` get an exposure. None, and nothing changes, while too few
-        Gaussians are seen over a span of ranges.
+        All views of the ``dive`` get an exposure. Pauses every few milliseconds; nothing changes
+        before the end, and nothing at all (None) while too little is seen from several ranges.
         """
         if not self.config.fit or not views or len(self.gaussians) == 0:
             return None
+        pictures = []
+        for view in views:
+            shown = self.show(view)
+            pictures.append(PosedPicture(view, shown.z, shown.alpha))
+            yield
+        seed = int(torch.randint(2**31, (1,), generator=generator))
+        seen = sight(pictures, np.random.default_rng(seed))
+        yield
         with torch.no_grad():
             sea = self.medium(torch.from_numpy(views[0].T_wc.R).to(torch.float32))
-        beta_a = sea.beta_a.double().numpy() if self.medium.active else np.zeros(3)
-        estimate = estimate_water(
-            sight(self._attributes, views, self.renderer, generator, beta_a),
-            sea.B_res.double().numpy(),
-            sea.d.double().numpy(),
-            models_for(self.config),
-            self.config.priors,
-        )
+        B_res, d = sea.B_res.double().numpy(), sea.d.double().numpy()
+        models, priors = models_for(self.config), self.config.priors
+        estimate = yield from estimating(seen, B_res, d, models, priors)
         if estimate is not None:
             with self._unchanged_by_failure():
                 self._adopt(estimate, views, views if dive is None else dive)

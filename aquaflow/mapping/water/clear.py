@@ -1,8 +1,8 @@
 """Clear water, or air: its odds against water that dims and veils what is far.
 
-A map never shows every view exactly as sharp as the camera saw it. Contrast that is lost that way
-grows with range, as in water, but in all colours alike, and little: scenes without water look like
-one of a few hundredths of an optical depth. A fit that finds no more than this found clear water.
+Contrast is never quite the same from near and from far, as ranges and poses are not exact; scenes
+without water look like one of a hundredth of an optical depth, in all colours alike. A fit that
+finds no more than this found clear water.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.mapping.water.blur import log_attenuation_variance
 from aquaflow.mapping.water.parameters import RATE_ROWS, rate_rows
 from aquaflow.mapping.water.solver import Fit
 
@@ -18,11 +17,16 @@ Array = npt.NDArray[np.float64]
 
 OPTICAL_DEPTH, OPTICAL_DEPTH_SIGMA = 0.02, 1.0
 """At the median range, and its sigma in the log. Found on rendered dives without water (reef, flat
-sand, pipe): 0.04 to 0.09, of which 0.045 are expected and taken out before (blur.py)."""
+sand, pipe): 0.01 to 0.05."""
 RATIO_SIGMA = 0.15
 """Log of red over green and of blue over green: 0.02 to 0.1 on the same dives."""
+CONTRAST_SIGMA = 0.01
+"""Optical depth, at the median range, by which a scene's contrast changes without water, alike in
+RGB; on the same dives."""
 ROWS = rate_rows(OPTICAL_DEPTH_SIGMA, RATIO_SIGMA, RATIO_SIGMA)
 """Whitens log beta_a of clear water."""
+LEAST_DEPTH = 1e-6
+"""Guards the division by the optical depth of water that is not there."""
 LEAST_INFORMATION = 1e-6
 """Guards the inverse where the observations say nothing of a direction."""
 
@@ -47,9 +51,10 @@ def log_odds_clear(
 def attenuation_covariance(
     fit: Fit,  # with water
 ) -> Array:
-    """[3, 3] of log beta_a: by the observations' errors, and by what every map loses."""
-    blur = log_attenuation_variance(np.exp(fit.x[:3]), fit.problem.median_range)
-    return np.asarray(fit.repeated_covariance[:3, :3] + blur)
+    """[3, 3] of log beta_a: by the observations' errors, and by CONTRAST_SIGMA."""
+    depth = np.maximum(np.exp(fit.x[:3]) * fit.problem.median_range, LEAST_DEPTH)
+    alike = CONTRAST_SIGMA / depth
+    return np.asarray(fit.repeated_covariance[:3, :3] + np.outer(alike, alike))
 
 
 def _log_normal(

@@ -17,7 +17,7 @@ A dive is in water unless there is evidence for clear water, and the likeliest w
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -25,12 +25,12 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config import MediumConfig, WaterPriorsConfig
-from aquaflow.mapping.water.blur import sharpened
 from aquaflow.mapping.water.clear import attenuation_covariance, log_odds_clear
-from aquaflow.mapping.water.model import BELIEVED, NOISE, WaterModel
+from aquaflow.mapping.water.model import BELIEVED, WaterModel
 from aquaflow.mapping.water.observations import Observations, variance_over_range
 from aquaflow.mapping.water.parameters import Model
-from aquaflow.mapping.water.solver import Fit, cost, descend
+from aquaflow.mapping.water.selection import finished, fit_likeliest
+from aquaflow.mapping.water.solver import Fit
 from aquaflow.mapping.water.white_balance import WhiteBalance, white_balance
 
 Array = npt.NDArray[np.float64]
@@ -44,17 +44,10 @@ NEGLIGIBLE_DEPTH = 0.06
 (blur.py)."""
 VISIBLE_DEPTH = 0.25
 """Optical depth at the median range from which water shows: a fifth of the light is gone."""
-SHARED = 3.0
-"""Factor on the least noise in the first fit, which is yet to find the noise."""
-FEWEST_REPEATS, MOST_REPEATS = 1.0, 100.0
-"""Bounds of how often the same error is counted (solver.py)."""
-EVERY_MODEL = (
-    *(Model(*parts) for parts in product((False, True), repeat=3)),
-    Model(water=True, uneven=True),
-    Model(water=True, exposure=True, uneven=True),
+EVERY_MODEL = tuple(
+    Model(*parts) for parts in product((False, True), repeat=4) if Model(*parts).is_possible
 )
-"""With and without water, shading and changing exposure; and the unevenness of the backscatter,
-which looks so much like shading that no dive tells of both."""
+"""With and without each part."""
 
 
 @dataclass(frozen=True)
@@ -108,11 +101,26 @@ def estimate_water(
     priors: WaterPriorsConfig = BELIEVED,
 ) -> WaterEstimate | None:
     """Fit ``models`` and keep the likeliest; None where too few points are seen several times."""
+    return finished(estimating(observations, B_res, d, models, priors))
+
+
+def estimating(
+    observations: Observations,
+    B_res: Array,  # [3]
+    d: Array,  # [3] 1 / map unit
+    models: Sequence[Model] = EVERY_MODEL,
+    priors: WaterPriorsConfig = BELIEVED,
+) -> Generator[None, None, WaterEstimate | None]:
+    """:func:`estimate_water`, with a pause every few milliseconds."""
     if observations.points < MIN_POINTS:
         return None
-    observations = sharpened(observations)
-    fits = fit_all([WaterModel(observations, model, B_res, d, priors) for model in models])
-    dry, wet = (_likeliest(fits, water) for water in (False, True))
+    fits = yield from fit_likeliest(
+        [WaterModel(observations, model, B_res, d, priors) for model in models]
+    )
+    dry, wet = (
+        next((fit for fit in fits if fit.problem.model.water is water), None)
+        for water in (False, True)
+    )
     odds = None if dry is None or wet is None else log_odds_of_water(dry, wet)
     best = dry if wet is None or (odds is not None and _is_clear(wet, odds)) else wet
     assert best is not None
@@ -134,28 +142,6 @@ def estimate_water(
         balance,
         (variance_over_range(observations, observations.colour), best.restored_variance()),
     )
-
-
-def fit_all(problems: Sequence[WaterModel]) -> list[Fit]:
-    """The richest model first: it says how large the errors are, and where the others start."""
-    richest = max(problems, key=lambda problem: problem.size)
-    first = descend(richest, richest.start, NOISE * SHARED)
-    noise = max(first.spread(), NOISE)
-    first = Fit(richest, first.x, noise)
-    repeats = min(max(first.repetition(), FEWEST_REPEATS), MOST_REPEATS)
-    noise *= float(np.sqrt(repeats))
-    fits: list[Fit] = []
-    for problem in problems:
-        starts = [problem.start, problem.adopt(richest, first.x)]
-        starts += [problem.adopt(fit.problem, fit.x) for fit in fits]
-        x = min(starts, key=lambda x: cost(problem, x, noise))
-        fits.append(descend(problem, x, noise))
-    return fits
-
-
-def _likeliest(fits: Sequence[Fit], water: bool) -> Fit | None:
-    some = [fit for fit in fits if fit.problem.model.water is water]
-    return max(some, key=lambda fit: fit.log_evidence, default=None)
 
 
 def _is_clear(wet: Fit, odds: float) -> bool:

@@ -1,22 +1,18 @@
 """What sightings of surface points look like through trial water, and how that changes with it.
 
-An observation of point p in view v is ``gain_v shade(x, y) (J_p T + trust blend T / T_p +
-uneven(x, y) B)``, with T_p the transmission at the point's mean range, drawn towards its
-surroundings (blur.py). The best J of every point is linear, so it is eliminated (variable
-projection); what remains lies in one vector (parameters.py). The derivatives are exact: the cost
-is robust, so that those of Kaufman, which leave out how J's factor changes, point in a wrong
-direction.
+An observation of point p in view v is ``gain_v shade(x, y) (J_p T(z) + uneven(x, y) B(z))`` (paper,
+Eq. 12). The best J of every point is linear, so it is eliminated (variable projection); what
+remains lies in one vector (parameters.py).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config import WaterPriorsConfig
-from aquaflow.mapping.water.grouping import mean_by
 from aquaflow.mapping.water.observations import Observations
 from aquaflow.mapping.water.parameters import Model, Parameters, Trial
 from aquaflow.mapping.water.priors import beliefs
@@ -24,19 +20,48 @@ from aquaflow.mapping.water.regions import RegionalColours
 from aquaflow.mapping.water.shading import shading_basis
 
 Array = npt.NDArray[np.float64]
-Change = tuple[Array, Array | float]
-"""By one parameter: of the errors, every J held, and of the log of J's factor; [M] each."""
+Index = npt.NDArray[np.int64]
 
 BELIEVED = WaterPriorsConfig()
 """The priors that pay."""
-NOISE = 0.01
-"""Least colour noise of one observation."""
 MAX_LOG_GAIN = 2.0
 """Guards the exponential of shading, exposure and unevenness."""
-MAX_DEPTH = 30.0
-"""Guards the exponential: optical depth between two sightings of a point."""
 TINY = 1e-12
 """Guards the division by the light that arrives of a point."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """All observations through one trial water."""
+
+    trial: Trial
+    gain: Array
+    """[3, M] of view and shading."""
+    a: Array
+    """[3, M] share of a point's colour J that is observed."""
+    backscatter: Array
+    """[3, M] as observed."""
+    J: Array
+    """[3, P] the points' colours without water that fit best; none is darker than black."""
+    errors: Array
+    """[3, M] predicted minus seen."""
+    power: Array
+    """[3, P] weighted sums of a^2."""
+
+
+@dataclass(frozen=True)
+class Derivatives:
+    """One channel's, by the parameters ``of_channel``: first those but exposures, k of them, then
+    each view's own gain."""
+
+    own: Index
+    """[k + V]"""
+    direct: Array
+    """[k, M] of the errors, every J held."""
+    lit: Array
+    """[M] of an observation's error by the gain of its view."""
+    by_J: Array
+    """[k + V, P] of the J; 0 where J is held at black."""
 
 
 class WaterModel(Parameters):
@@ -53,89 +78,70 @@ class WaterModel(Parameters):
         super().__init__(model, int(seen.view.max()) + 1, float(np.median(seen.z)), priors)
         self.seen = seen
         self._regions = RegionalColours(seen.region)
-        self._near = B_res * np.exp(-d * seen.z[:, None])
-        self._basis = shading_basis(seen.xy)
-        self._beyond = seen.z - mean_by(seen.point, seen.z[:, None])[seen.point, 0]
-        self._around = seen.around
-        self._cell = seen.point * self.views + seen.view
+        self._near = B_res[:, None] * np.exp(-d[:, None] * seen.z)
+        self._basis = np.ascontiguousarray(shading_basis(seen.xy).T)
+        self._colour = np.ascontiguousarray(seen.colour.T)
 
     def predict(
         self,
         x: Array,  # [K] parameters
-        c: int,
-    ) -> tuple[Array, Array]:
-        """Errors [M] of one channel, predicted minus seen, and the best J [P] of every point."""
-        predicted, J, _ = self._predict(self.trial(x), c)
-        return predicted - self.seen.colour[:, c], J
+        weight: Array | None = None,  # [3, M] of the observations; None: all alike
+    ) -> Prediction:
+        """The observations, with the J that fit them best at these weights."""
+        trial, seen = self.trial(x), self.seen
+        gain = _gain(trial.exposure.T[:, seen.view] + trial.shading @ self._basis)
+        a = gain * np.exp(-trial.beta_a[:, None] * seen.z)
+        backscatter = gain * self._backscatter(trial)
+        weighed = a if weight is None else weight * a
+        own = self._colour - backscatter
+        power = np.maximum(seen.sums_by_point(weighed * a), TINY)
+        J = np.maximum(seen.sums_by_point(weighed * own) / power, 0.0)
+        return Prediction(trial, gain, a, backscatter, J, a * J[:, seen.point] - own, power)
 
-    def without_water(
-        self,
-        x: Array,  # [K] parameters
-        c: int,
-    ) -> Array:
-        """[M] what each observation of one channel would be without what lies between."""
-        predicted, J, a = self._predict(self.trial(x), c)
-        light = a * J[self.seen.point]
-        return np.maximum((self.seen.colour[:, c] - (predicted - light)) / np.maximum(a, TINY), 0.0)
+    def _backscatter(self, trial: Trial) -> Array:
+        """[3, M] before the camera's gain."""
+        if not self.model.water:
+            return np.zeros_like(self._near)
+        grown = -np.expm1(-trial.b[:, None] * self.seen.z)
+        uneven = _gain(trial.unevenness @ self._basis)
+        return np.asarray(uneven * (trial.B_inf[:, None] * grown + self._near))
+
+    def without_water(self, now: Prediction) -> Array:
+        """[3, M] what each observation would be without what lies between."""
+        light = self._colour - now.backscatter
+        return np.maximum(light / np.maximum(now.a, TINY), 0.0)
 
     def derivatives(
         self,
-        x: Array,  # [K] parameters
+        now: Prediction,
+        weight: Array,  # [M] of the channel, that its J were found with
         c: int,
-    ) -> tuple[Array, Array]:
-        """Of :meth:`predict`'s errors [K, M] and J [K, P] by the parameters ``of_channel(c)``."""
-        trial, seen, points = self.trial(x), self.seen, self.seen.points
-        predicted, J, a = self._predict(trial, c)
-        errors = predicted - seen.colour[:, c]
-        # dJ = -(sum a d(errors) + sum da errors) / sum a^2; no point is darker than black.
-        power = np.maximum(np.bincount(seen.point, a * a, points), TINY)
-        share: Array = np.where(J > 0.0, -1.0 / power, 0.0)
-        # What is drawn from the surroundings is a part that no gain and no water changes.
-        own_light = predicted - self._drawn_in(trial, c)
-        changes = self._changes(trial, c, predicted, own_light, a * J[seen.point])
-        direct = [of_errors for of_errors, _ in changes]
-        by_J: list[Array] = [
-            np.bincount(seen.point, a * (of_errors + of_log_a * errors), points) * share
-            for of_errors, of_log_a in changes
-        ]
-        if self.model.exposure:
-            # A view's gain touches its own sightings alone, and what is left of it the mean's.
-            sums = np.bincount(self._cell, a * (own_light + errors), points * self.views)
-            of_gains = sums.reshape(points, self.views).T * share
-            by_J += list(of_gains - of_gains.mean(axis=0))
-            own = np.full((self.views, len(a)), -own_light / self.views)
-            own[seen.view, np.arange(len(a))] += own_light
-            direct += list(own)
-        stacked = np.stack(by_J)
-        return np.stack(direct) + a * stacked[:, seen.point], stacked
-
-    def _changes(
-        self,
-        trial: Trial,
-        c: int,
-        predicted: Array,  # [M]
-        own_light: Array,  # [M] of it, what is not drawn from the surroundings
-        light: Array,  # [M] of that, what comes from the points
-    ) -> list[Change]:
-        """By all parameters but exposures."""
-        gain, seen = self._gain(trial, c), self.seen
-        blended, basis = self._blended(trial, c, gain), list(self._basis.T)
-        changes: list[Change] = []
+    ) -> Derivatives:
+        """Of :meth:`predict`'s errors and J, the weights held."""
+        seen, a, trial = self.seen, now.a[c], now.trial
+        light = a * now.J[c, seen.point]
+        lit = light + now.backscatter[c]
+        direct: list[Array] = []
         if self.model.water:
             beta_a, b, B_inf = trial.beta_a[c], trial.b[c], trial.B_inf[c]
-            water_gain, passed = gain * self._uneven(trial), np.exp(-b * seen.z)
-            fading = -beta_a * (light * seen.z + trial.trust * blended * self._beyond)
-            growing = water_gain * B_inf * b * seen.z * passed
-            rising = water_gain * B_inf * (1.0 - B_inf) * (1.0 - passed)
-            changes += [(fading, -beta_a * seen.z), (growing, 0.0), (rising, 0.0)]
+            water_gain = now.gain[c] * _gain(trial.unevenness @ self._basis)
+            passed = np.exp(-b * seen.z)
+            direct += [-beta_a * seen.z * light, water_gain * B_inf * b * seen.z * passed]
+            direct += [water_gain * B_inf * (1.0 - B_inf) * (1.0 - passed)]
         if self.model.uneven:
-            veil = gain * self._veil(trial, c)
-            changes += [(veil * term, 0.0) for term in basis]
-        contrast = -trial.blur * seen.z
-        changes += [(blended, 0.0), (contrast * (predicted - self._around[:, c]), contrast)]
+            direct += list(now.backscatter[c] * self._basis)
         if self.model.shading:
-            changes += [(own_light * term, term) for term in basis]
-        return changes
+            direct += list(lit * self._basis)
+        rows = np.stack(direct) if direct else np.zeros((0, len(seen.z)))
+        by_J = seen.sums_by_point(weight * a * rows) if len(rows) else np.zeros((0, seen.points))
+        if self.model.exposure:
+            # A view's gain touches its own sightings alone, and what is left of it the mean's.
+            of_gains = np.zeros((self.views, seen.points))
+            of_gains[seen.view, seen.point] = weight * a * lit
+            by_J = np.vstack([by_J, of_gains - of_gains.mean(axis=0)])
+        # dJ = -(sum w a d(errors)) / sum w a^2; no point is darker than black.
+        by_J *= np.where(now.J[c] > 0.0, -1.0 / now.power[c], 0.0)
+        return Derivatives(self.of_channel(c), rows, lit, by_J)
 
     def of_scene(
         self,
@@ -150,7 +156,7 @@ class WaterModel(Parameters):
     def of_scene_rows(
         self,
         J: Array,  # [3, P]
-        changes: Sequence[tuple[npt.NDArray[np.int64], Array]],  # by channel: own, by_J [k, P]
+        changes: list[tuple[Index, Array]],  # by channel: own [k], by_J [k, P]
     ) -> Array:
         """[R, K] derivatives of :meth:`of_scene`."""
         single = np.zeros((0, self.size))
@@ -164,59 +170,8 @@ class WaterModel(Parameters):
             return single
         return np.vstack([single, self._regions.rows(J, changes, self.size)])
 
-    def sums_by_region(
-        self,
-        values: Array,  # [k, M]
-    ) -> Array:
-        """[k, R] sums of the observations of each region."""
-        region = self.seen.region[self.seen.point]
-        return np.stack([np.bincount(region, row) for row in values])
-
-    def _predict(self, trial: Trial, c: int) -> tuple[Array, Array, Array]:
-        """Predicted colours [M], J [P] (no point is darker than black), and J's factor [M]."""
-        seen, gain = self.seen, self._gain(trial, c)
-        a = gain * np.exp(-trial.beta_a[c] * seen.z)
-        beside = trial.trust * self._blended(trial, c, gain) + gain * self._veil(trial, c)
-        beside += self._drawn_in(trial, c)
-        top = np.bincount(seen.point, a * (seen.colour[:, c] - beside), seen.points)
-        bottom = np.maximum(np.bincount(seen.point, a * a, seen.points), TINY)
-        J = np.maximum(top / bottom, 0.0)
-        return a * J[seen.point] + beside, J, a
-
-    def _sharpness(self, trial: Trial) -> Array:
-        """[M] share of a point's contrast to its surroundings that is left."""
-        return np.asarray(np.exp(-np.minimum(trial.blur * self.seen.z, MAX_DEPTH)))
-
-    def _drawn_in(self, trial: Trial, c: int) -> Array:
-        """[M] what looks like the surroundings."""
-        return np.asarray((1.0 - self._sharpness(trial)) * self._around[:, c])
-
-    def _veil(self, trial: Trial, c: int) -> Array:
-        """[M] the backscatter."""
-        if not self.model.water:
-            return np.zeros_like(self.seen.z)
-        grown = -np.expm1(-trial.b[c] * self.seen.z)
-        return np.asarray(self._uneven(trial) * (trial.B_inf[c] * grown + self._near[:, c]))
-
-    def _blended(
-        self,
-        trial: Trial,
-        c: int,
-        gain: Array,  # [M]
-    ) -> Array:
-        """[M] what the neighbours add to a point's colour, if the map is right."""
-        depth = np.clip(trial.beta_a[c] * self._beyond, -MAX_DEPTH, MAX_DEPTH)
-        return np.asarray(gain * np.exp(-depth) * self.seen.blend[:, c])
-
-    def _uneven(self, trial: Trial) -> Array:
-        return _gain(self._basis @ trial.unevenness)
-
-    def _gain(self, trial: Trial, c: int) -> Array:
-        gain = _gain(trial.exposure[self.seen.view, c] + self._basis @ trial.shading)
-        return np.asarray(gain * self._sharpness(trial))
-
 
 def _gain(
-    log_gain: Array,  # [M]
+    log_gain: Array,  # [...]
 ) -> Array:
     return np.asarray(np.exp(np.clip(log_gain, -MAX_LOG_GAIN, MAX_LOG_GAIN)))

@@ -1,4 +1,4 @@
-"""Surface points as several pictures show them: what the water is estimated from."""
+"""Patches of the scene's surface in several pictures: what the water is estimated from."""
 
 from __future__ import annotations
 
@@ -14,30 +14,25 @@ from aquaflow.mapping.water.regions import regions_of
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
-
-FEWEST_AROUND = 4
-"""Points of one region in one view whose mean stands for a point's surroundings."""
 LEAST_COLOUR = 0.02
-"""Guards the division by a black point's colour."""
+"""Guards the division by a black patch's colour."""
 
 
 @dataclass(frozen=True)
 class Observations:
-    """Surface points in several pictures; one row per observation."""
+    """Patches of the surface ("points") in several pictures; one row per observation, those of a
+    point one after another, at most one in each view."""
 
     point: Index
-    """[M] number of the point, 0 to P - 1."""
+    """[M] number of the point, 0 to P - 1, rising."""
     view: Index
     """[M] number of the view, 0 to V - 1."""
     colour: Array
-    """[M, 3] as the camera saw it, at one and the same footprint per point."""
+    """[M, 3] as the camera saw it, mean over the same piece of surface in all views."""
     z: Array
     """[M] range, map units."""
     xy: Array
     """[M, 2] where in the picture, each axis from -1 to 1."""
-    blend: Array
-    """[M, 3] how much brighter than the point its footprint is, neighbours included, as it would
-    look at the point's mean range."""
     positions: Array
     """[P, 3] world, map units."""
 
@@ -47,17 +42,21 @@ class Observations:
         return regions_of(self.positions)
 
     @cached_property
-    def around(self) -> Array:
-        """[M, 3] mean colour of each observation's region in the same view; where there are too few
-        points, the observation's own."""
-        cell = self.region[self.point] * (int(self.view.max()) + 1) + self.view
-        enough = np.bincount(cell)[cell] >= FEWEST_AROUND
-        return np.where(enough[:, None], mean_by(cell, self.colour)[cell], self.colour)
+    def starts(self) -> Index:
+        """[P] row of each point's first observation."""
+        return np.searchsorted(self.point, np.arange(self.points))
 
     @property
     def points(self) -> int:
         """Number P of points."""
         return int(self.point.max()) + 1 if len(self.point) else 0
+
+    def sums_by_point(
+        self,
+        values: Array,  # [..., M]
+    ) -> Array:
+        """[..., P] sums over each point's observations."""
+        return np.asarray(np.add.reduceat(values, self.starts, axis=-1))
 
 
 def variance_over_range(

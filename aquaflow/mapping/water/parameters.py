@@ -1,15 +1,16 @@
 """What may lie between a surface point's colour and the picture's, as one vector of numbers.
 
-The water has nine, its unevenness and the camera's shading five each, every view's exposure three,
-and one says how far the map is trusted about a point's neighbours.
+The water has nine, its unevenness and the camera's shading five each, every view's exposure three.
 """
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from typing_extensions import Self
 
 from aquaflow.config import WaterPriorsConfig
 from aquaflow.mapping.water.shading import TERMS
@@ -30,21 +31,20 @@ B_INF_LOGIT, B_INF_SIGMA = -1.0, 1.5
 """Prior: logit of B_inf (0.27), weak."""
 WHITE_SIGMA = 0.5
 """Prior, if believed: logit of a channel's B_inf over the mean of all (white backscatter)."""
-UNEVEN_SIGMA = 0.5
-"""Prior: log-gain of the backscatter at the edge of the picture; sunlit water is several times as
-bright looked at horizontally as from above."""
-TRUST, TRUST_SIGMA = 1.0, 1.0
-"""Prior: how much of the neighbours' light that the map tells of is really there. What is uncertain
-in the map weakens it: 0.5 to 0.9 on dives with known water."""
-BLUR, BLUR_SIGMA = 0.05, 1.2
-"""Prior: optical depth, at the median range, of which contrast to the surroundings is lost as much
-beyond what every map loses (blur.py), and its sigma in the log. None on rendered dives, 0.1 to 0.7
-on real clips of coral, which is fine."""
+UNEVEN_SIGMA = np.array([0.2, 0.5, 0.15, 0.1, 0.15])
+"""Prior: log-gain of the backscatter at the edge of the picture, by term; sunlit water is several
+times as bright looked at horizontally as from above, a little brighter towards the sun, and changes
+evenly from one side to the other."""
 SHADING_SIGMA = np.array([0.04, 0.04, 0.3, 0.04, 0.3])
 """Prior: log-gain at the edge of the picture, by term; a third is a strong lamp fall-off, and both
 lamp and lens are on the whole alike on all sides."""
-EXPOSURE_SIGMA = 0.5
-"""Prior: log-gain of a view against the mean of all; two stops span a dive's auto-exposure."""
+EXPOSURE_SIGMA = 0.01, 0.5
+"""Prior: log-gain of a view against the mean of all, its least and its largest sigma; what it is
+between them, the views' own gains say (empirical Bayes). Two stops span a dive's auto-exposure. One
+wide sigma for all dives lets gains that follow the range of each view take the place of the water:
+beta_a of a rendered dive of even light doubled, and Curasao's."""
+TINT_SIGMA = 0.005, 0.1
+"""Prior: the same of how much a channel's log-gain differs from the mean of the three."""
 WATER = 9
 """log beta_a, log b and logit B_inf, RGB each."""
 MAX_LOG_RATE = 5.0
@@ -62,6 +62,8 @@ def rate_rows(red: float, red_over_green: float, blue_over_green: float) -> Arra
 
 RATE_ROWS = rate_rows(OPTICAL_DEPTH_SIGMA, RED_OVER_GREEN_SIGMA, BLUE_OVER_GREEN_SIGMA)
 """Of water that is not clear."""
+GREY = np.full((3, 3), 1.0 / 3.0)
+"""Takes RGB to the mean of the three."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,11 @@ class Model:
     exposure: bool = False
     uneven: bool = False
     """Backscatter brighter on one side of the picture than on the other; takes water."""
+
+    @property
+    def is_possible(self) -> bool:
+        """Unevenness takes water, and looks so much like shading that no dive tells of both."""
+        return not self.uneven or (self.water and not self.shading)
 
 
 @dataclass(frozen=True)
@@ -87,10 +94,6 @@ class Trial:
     """[3]"""
     unevenness: Array
     """[5] log-gain of the backscatter over the picture."""
-    trust: float
-    """Of the neighbours' light that the map tells of, how much is there."""
-    blur: float
-    """Loss of contrast per map unit."""
     shading: Array
     """[5] log-gain over the picture."""
     exposure: Array
@@ -101,7 +104,7 @@ class Trial:
 class Parameters:
     """Where each number of a ``Model`` lies in the vector, what it stands for, and its prior.
 
-    In the order log beta_a, log b, logit B_inf, unevenness, trust, log blur, shading, exposures.
+    In the order log beta_a, log b, logit B_inf, unevenness, shading, exposures.
     """
 
     def __init__(
@@ -110,24 +113,40 @@ class Parameters:
         """``median_range`` of what is seen, map units: rates are expected relative to it."""
         self.model, self.views, self.believed = model, views, priors
         self.median_range = median_range
-        sizes = (WATER * model.water, TERMS * model.uneven, 1, 1, TERMS * model.shading)
-        ends = np.cumsum((0, *sizes, 3 * views * model.exposure)).tolist()
+        sizes = (
+            WATER * model.water,
+            TERMS * model.uneven,
+            TERMS * model.shading,
+            3 * views * model.exposure,
+        )
+        ends = np.cumsum((0, *sizes)).tolist()
         self.parts = [slice(*ends[k : k + 2]) for k in range(len(ends) - 1)]
-        self.water, self.uneven, self.trust, self.blur, self.shading, self.exposure = self.parts
+        self.water, self.uneven, self.shading, self.exposure = self.parts
         self.size = ends[-1]
-        self.start, self._sigma = np.zeros(self.size), np.empty(self.size)
+        self.start = np.zeros(self.size)
         if model.water:
             red = np.log(OPTICAL_DEPTH / median_range)
             green = red - RED_OVER_GREEN
             rates = [red, green, green + BLUE_OVER_GREEN]
             self.start[self.water] = [*rates, *rates, *[B_INF_LOGIT] * 3]
-            self._sigma[self.water] = [1.0] * 3 + [RATE_RATIO_SIGMA] * 3 + [B_INF_SIGMA] * 3
-        self.start[self.trust], self._sigma[self.trust] = TRUST, TRUST_SIGMA
-        self.start[self.blur] = np.log(BLUR / median_range)
-        self._sigma[self.blur] = BLUR_SIGMA
-        self._sigma[self.uneven] = UNEVEN_SIGMA
-        self._sigma[self.shading] = SHADING_SIGMA if model.shading else 0.0
-        self._sigma[self.exposure] = EXPOSURE_SIGMA
+        self._rows = self._prior_rows(EXPOSURE_SIGMA[0], TINT_SIGMA[0])
+
+    def expecting(
+        self,
+        x: Array,  # [K] parameters
+    ) -> Self:
+        """The same, with the exposures expected to differ by as much as these do."""
+        if not self.model.exposure:
+            return self
+        exposure = x[self.exposure].reshape(self.views, 3)
+        grey = exposure.mean(axis=1, keepdims=True)
+        sigma, tint = (
+            float(np.clip(np.sqrt(np.mean(part**2)), *bounds))
+            for part, bounds in ((grey, EXPOSURE_SIGMA), (exposure - grey, TINT_SIGMA))
+        )
+        changed = copy.copy(self)
+        changed._rows = self._prior_rows(sigma, tint)
+        return changed
 
     def adopt(
         self,
@@ -161,23 +180,34 @@ class Parameters:
         shading = x[self.shading] if model.shading else np.zeros(TERMS)
         exposure = x[self.exposure] if model.exposure else np.zeros(3 * self.views)
         exposure = exposure.reshape(self.views, 3)
-        trust = float(x[self.trust][0])
-        blur = float(np.exp(np.clip(x[self.blur][0], -MAX_LOG_RATE, MAX_LOG_RATE)))
-        centred = exposure - exposure.mean(axis=0)
-        return Trial(wet[0], wet[1], wet[2], unevenness, trust, blur, shading, centred)
+        return Trial(wet[0], wet[1], wet[2], unevenness, shading, exposure - exposure.mean(axis=0))
 
     def priors(
         self,
         x: Array,  # [K] parameters
     ) -> tuple[Array, Array]:
         """Whitened residuals [R] of the linear priors, and their derivatives [R, K]."""
-        rows, off = np.diag(1.0 / self._sigma), x - self.start
+        return self._rows @ (x - self.start), self._rows
+
+    def _prior_rows(self, exposure: float, tint: float) -> Array:
+        """[R, K]; sigmas of the views' log-gains."""
+        rows = np.zeros((self.size, self.size))
         if self.model.water:
-            rows[:3, :3] = RATE_ROWS
             rates = np.arange(3)
+            rows[:3, :3] = RATE_ROWS
+            rows[3 + rates, 3 + rates] = 1.0 / RATE_RATIO_SIGMA
             rows[3 + rates, rates] = -1.0 / RATE_RATIO_SIGMA
+            rows[6 + rates, 6 + rates] = 1.0 / B_INF_SIGMA
+        if self.model.uneven:
+            rows[self.uneven, self.uneven] = np.diag(1.0 / UNEVEN_SIGMA)
+        if self.model.shading:
+            rows[self.shading, self.shading] = np.diag(1.0 / SHADING_SIGMA)
+        if self.model.exposure:
+            rows[self.exposure, self.exposure] = np.kron(
+                np.eye(self.views), GREY / (np.sqrt(3.0) * exposure) + (np.eye(3) - GREY) / tint
+            )
         if self.model.water and self.believed.white_backscatter:
-            tint = np.zeros((3, self.size))
-            tint[:, 6:WATER] = (np.eye(3) - 1.0 / 3.0) / WHITE_SIGMA
-            rows = np.vstack([rows, tint])
-        return rows @ off, rows
+            white = np.zeros((3, self.size))
+            white[:, 6:WATER] = (np.eye(3) - GREY) / WHITE_SIGMA
+            rows = np.vstack([rows, white])
+        return rows

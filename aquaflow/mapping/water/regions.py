@@ -13,8 +13,6 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.mapping.water.grouping import mean_by
-
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
@@ -59,10 +57,14 @@ class RegionalColours:
         self,
         region: Index,  # [P]
     ) -> None:
-        count = np.bincount(region)
-        self._kept = count >= FEWEST
-        self._region = region
-        self.number = int(self._kept.sum())
+        members = region == np.arange(int(region.max(initial=-1)) + 1)[:, None]
+        count = members.sum(axis=1)
+        kept = count >= FEWEST
+        self._average = (members / np.maximum(count, 1)[:, None])[kept]
+        """[R, P] takes values of points to their means over regions."""
+        self._region = np.where(kept[region], (np.cumsum(kept) - 1)[region], 0)
+        """[P] number among the kept; 0 for points of none, which no mean counts."""
+        self.number = len(self._average)
         """Regions with enough points."""
 
     def residuals(
@@ -70,8 +72,10 @@ class RegionalColours:
         J: Array,  # [3, P] colours without water
     ) -> Array:
         """[6 R]: of all regions brightness, red and blue, of means and then of contrasts."""
-        logs = np.stack([self._statistics(J[c]) for c in range(3)], axis=1)  # [2, 3, R]
-        return self._whitened(logs).reshape(-1)
+        if self.number == 0:
+            return np.zeros(0)
+        mean, deviation, _ = self._moments(J)
+        return self._whitened(np.log(np.stack([mean, deviation]) + LEAST)).reshape(-1)
 
     def rows(
         self,
@@ -80,10 +84,17 @@ class RegionalColours:
         size: int,
     ) -> Array:
         """[6 R, size] derivatives by all parameters."""
+        if self.number == 0:
+            return np.zeros((0, size))
+        mean, deviation, centred = self._moments(J)
         logs = np.zeros((2, 3, self.number, size))
         for c, (own, by_J) in enumerate(changes):
-            logs[:, c][:, :, own] = self._slopes(J[c], by_J)
-        return self._whitened(logs).reshape(-1, size)
+            of_mean = self._average @ by_J.T
+            of_deviation = self._average @ (centred[c] * by_J).T
+            of_deviation /= np.maximum(deviation[c], LEAST)[:, None]
+            logs[0, c][:, own] = of_mean / (mean[c] + LEAST)[:, None]
+            logs[1, c][:, own] = of_deviation / (deviation[c] + LEAST)[:, None]
+        return self._whitened(logs).reshape(6 * self.number, size)
 
     def _whitened(
         self,
@@ -94,33 +105,11 @@ class RegionalColours:
         sigmas = SIGMAS.reshape(2, 3, *[1] * (logs.ndim - 2))
         return np.asarray(apart / sigmas)
 
-    def _statistics(
-        self,
-        J: Array,  # [P]
-    ) -> Array:
-        """[2, R] log of mean and contrast."""
-        mean, deviation = self._moments(J)
-        return np.log(np.stack([mean, deviation])[:, self._kept] + LEAST)
-
     def _moments(
         self,
-        J: Array,  # [P]
-    ) -> tuple[Array, Array]:
-        mean = mean_by(self._region, J[:, None])[:, 0]
-        square = mean_by(self._region, (J - mean[self._region])[:, None] ** 2)[:, 0]
-        return mean, np.sqrt(square)
-
-    def _slopes(
-        self,
-        J: Array,  # [P]
-        by_J: Array,  # [k, P]
-    ) -> Array:
-        """[2, R, k] derivatives of the statistics."""
-        mean, deviation = self._moments(J)
-        centred = J - mean[self._region]
-        of_mean = mean_by(self._region, by_J.T)
-        of_square = mean_by(self._region, (centred * by_J).T)
-        of_deviation = of_square / np.maximum(deviation, LEAST)[:, None]
-        slopes = np.stack([of_mean, of_deviation])
-        levels = np.stack([mean, deviation])[..., None] + LEAST
-        return np.asarray((slopes / levels)[:, self._kept])
+        J: Array,  # [3, P]
+    ) -> tuple[Array, Array, Array]:
+        """Mean [3, R], deviation [3, R], and how far each point is from the mean [3, P]."""
+        mean = J @ self._average.T
+        centred = J - mean[:, self._region]
+        return mean, np.sqrt(centred**2 @ self._average.T), centred

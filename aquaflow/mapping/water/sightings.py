@@ -1,130 +1,152 @@
-"""What each Gaussian looks like in each picture: its colour as the camera saw it, and its range.
+"""The same patches of the scene's surface in all pictures that show them.
 
-The derivative of a rendered picture with respect to a Gaussian's colour is its blending weight at
-every pixel. Weighing the real picture with it gives the colour seen over the Gaussian's own
-footprint, occlusion included, in far views and near ones over the same piece of sea floor.
+Detail is lost with range: a far pixel covers more of the scene, and its light scatters more. What
+is lost that way looks like water if points are compared. So patches are, all of one size in the
+world in every view, and so large that the farthest view that shows one still resolves it: on
+rendered dives in clear water the contrast of patches changes with range by a hundredth of an
+optical depth or less, on real clips the water that is found does not depend on their size from 1 to
+8 pixels.
 
-A footprint takes in some of the neighbours, more of them from afar, and contrast that is lost to
-them looks like water. How the neighbours change the colour is known from the map itself.
+A patch is a grid of samples on the surface, lifted from the nearest view by the map's range. Each
+sample is looked up in the other views; what is hidden there, or in front of the map's surface, is
+no observation.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-import torch
-from torch import Tensor
 
-from aquaflow.mapping.gaussians.gaussians import radiance
-from aquaflow.mapping.views import View
-from aquaflow.mapping.water.grouping import mean_by
 from aquaflow.mapping.water.observations import Observations
-from aquaflow.render.contract import Renderer
+from aquaflow.mapping.water.posed_picture import PosedPicture
 
-SeenFrom = Callable[[View], Mapping[str, Tensor]]
-"""The parameters of a GaussianMap as a view sees them."""
+Array = npt.NDArray[np.float64]
+Seen = npt.NDArray[np.bool_]
 
 POINTS = 800
-"""Gaussians looked at, three times as many cost three times the time: on IUI3, the reef and Curasao
-2,500 give log beta_a within its sigma of what 800 give."""
+"""Patches looked at."""
+CANDIDATES = 4000
+"""Places on the surface that the patches are drawn from."""
 LEAST_SPAN = 0.1
-"""Added to the log of largest over smallest range, by which Gaussians are drawn: those seen from
-near and far say most, those seen from one range alone something of the scene's colours."""
-MIN_WEIGHT_PX = 3.0
-"""Sum of blending weights below which a Gaussian is hardly in the picture."""
-MIN_VIEWS = 4
-"""Views that must see a Gaussian for it to say anything about the water."""
-BORDER = 0.97
-"""Gaussians whose centre is further out than this share of the picture are cut by its edge."""
+"""Added to the log of largest over smallest range, by which patches are drawn: those seen from near
+and far say most, those seen from one range alone something of the scene's colours."""
+MIN_VIEWS, MOST_VIEWS = 4, 8
+"""Views that must see a patch for it to say anything about the water; and how many of them are
+used, from the nearest to the farthest: more say little that is new."""
+SIGMA_PX = 2.0
+"""Of a patch in the farthest of its views, standard deviation of the Gaussian that weighs it."""
+SIDE, REACH = 5, 2.0
+"""Samples along a side of the patch's grid, and how many sigmas it reaches to each side."""
+SEEN_SHARE = 0.85
+"""Of a patch's samples that a view must show."""
+LEAST_TEXTURE = 0.008
+"""Deviation of a patch's samples in the nearest of its views, two grey levels. Where there is less,
+nothing is known of the range: open water, which a map has anywhere."""
 
-HALF_SOLID = 0.5
-"""Alpha below which the map says little of what is there."""
 
-
-def sight(
-    seen_from: SeenFrom,
-    views: list[View],
-    renderer: Renderer,
-    generator: torch.Generator,
-    beta_a: npt.NDArray[np.float64],  # [3] per map unit, of the water that the map was made for
-) -> Observations:
-    """Sightings of a random choice of the Gaussians that several of ``views`` see well.
-
-    Raises:
-        ArithmeticError: a range is not a number.
-    """
-    seen = [_sighting(seen_from(view), view, renderer) for view in views]
-    weight = torch.stack([sighting[0] for sighting in seen])
-    good = weight > MIN_WEIGHT_PX
-    candidates = torch.nonzero(good.sum(0) >= MIN_VIEWS)[:, 0]
-    ranges = torch.stack([sighting[2] for sighting in seen])[:, candidates]
-    chosen = candidates[_drawn(ranges, good[:, candidates], generator)]
-    view_of, number = torch.nonzero(good[:, chosen], as_tuple=True)
-    row = chosen[number]
-    colour, z, xy, blend = (
-        torch.stack([sighting[k] for sighting in seen])[view_of, row].double().numpy()
-        for k in range(1, 5)
+def sight(pictures: Sequence[PosedPicture], random: np.random.Generator) -> Observations:
+    """Observations of a random choice of the surface that several of the pictures, at least one,
+    show."""
+    places, ranges = _drawn(pictures, random)
+    samples, sigma = _patches(pictures, places, ranges)
+    colour, z, xy = (np.zeros((*ranges.shape, size)) for size in (3, 1, 2))
+    whole_patches = np.asarray(np.isfinite(samples).all(axis=(1, 2)))
+    seen = np.isfinite(ranges) & whole_patches[:, None]
+    for number, picture in enumerate(pictures):
+        own = np.nonzero(seen[:, number])[0]
+        *found, whole = _observed(picture, samples[own], sigma[own])
+        for table, values in zip((colour, z, xy), found, strict=True):
+            table[own, number] = values
+        seen[own, number] = whole
+    seen[seen.sum(axis=1) < MIN_VIEWS] = False
+    place, view = np.nonzero(seen)
+    used, point = np.unique(place, return_inverse=True)
+    return Observations(
+        point, view, colour[place, view], z[place, view, 0], xy[place, view], places[used]
     )
-    point = number.numpy()
-    own_range = mean_by(point, z[:, None])[point]
-    # Other water would need another map to look the same, but what is seen is seen.
-    blend = (blend - mean_by(point, blend)[point]) * np.exp(-beta_a * own_range)
-    positions = seen_from(views[0])["means"][chosen].double().numpy()
-    return Observations(point, view_of.numpy(), colour, z, xy, blend, positions)
 
 
-def _drawn(
-    ranges: Tensor,  # [V, N] map units
-    good: Tensor,  # [V, N] bool
-    generator: torch.Generator,
-) -> Tensor:
-    """[P] which of N Gaussians are looked at, in their order: P = POINTS, or all."""
-    if ranges.shape[1] <= POINTS:
-        return torch.arange(ranges.shape[1])
-    low = torch.where(good, ranges, torch.inf).amin(0)
-    high = torch.where(good, ranges, 0.0).amax(0)
-    weight = LEAST_SPAN + torch.log(high / low)
-    if not bool(torch.isfinite(weight).all()):
-        raise ArithmeticError("a range is not a number")
-    return torch.multinomial(weight, POINTS, generator=generator).sort().values
-
-
-def _sighting(
-    parameters: Mapping[str, Tensor],  # of a GaussianMap
-    view: View,
-    renderer: Renderer,
-) -> tuple[Tensor, ...]:
-    """Of every Gaussian in one view: weight [N] px, colour [N, 3], range [N], picture position
-    [N, 2], and the map's clean colour over the same footprint [N, 3]."""
-    means = parameters["means"]
-    clean = radiance(parameters["raw_colours"])
-    colours = torch.cat([clean, torch.ones_like(clean[:, :1])], dim=-1).requires_grad_()
-    drawn = renderer(
-        means,
-        parameters["quats"],
-        torch.exp(parameters["log_scales"]),
-        torch.sigmoid(parameters["opacity_logits"][:, 0]),
-        colours,
-        view.viewmat(),
-        view.K(),
-        view.camera.width,
-        view.camera.height,
+def _drawn(pictures: Sequence[PosedPicture], random: np.random.Generator) -> tuple[Array, Array]:
+    """Places [P, 3] in the world, and their range [P, V] in the views that are used; inf in
+    others."""
+    each = -(-CANDIDATES // max(len(pictures), 1))
+    places = np.concatenate(
+        [np.zeros((0, 3)), *(picture.random_surface(each, random) for picture in pictures)]
     )
-    one = torch.ones_like(drawn.alpha[..., None])
-    weighed = [
-        torch.autograd.grad((drawn.image * picture).sum(), colours, retain_graph=True)[0]
-        for picture in (
-            torch.cat([view.target(), one], dim=-1),
-            drawn.image.detach() / drawn.alpha.detach().clamp_min(HALF_SOLID)[..., None],
-        )
-    ]
-    local = (means.double().numpy() - view.T_wc.t) @ view.T_wc.R
-    half = np.array([view.camera.width, view.camera.height]) / 2.0
-    xy = torch.from_numpy(view.camera.project(local) / half - 1.0)
-    inside = (xy.abs() < BORDER).all(dim=-1)
-    sums = weighed[0][:, 3]
-    seen, blend = (part[:, :3] / sums[:, None].clamp_min(1e-6) for part in weighed)
-    z = torch.from_numpy(np.linalg.norm(local, axis=1))
-    return torch.where(inside, sums, 0.0), seen, z, xy, blend
+    ranges = np.full((len(places), len(pictures)), np.inf)
+    for number, picture in enumerate(pictures):
+        _, z, seen = picture.located(places)
+        ranges[seen, number] = z[seen]
+    several = np.isfinite(ranges).sum(axis=1) >= MIN_VIEWS
+    places, ranges = places[several], ranges[several]
+    if len(places) > POINTS:
+        farthest = np.where(np.isfinite(ranges), ranges, 0.0).max(axis=1)
+        weight = LEAST_SPAN + np.log(farthest / ranges.min(axis=1))
+        chosen = random.choice(len(places), POINTS, replace=False, p=weight / weight.sum())
+        places, ranges = places[chosen], ranges[chosen]
+    return places, _over_all_ranges(ranges)
+
+
+def _over_all_ranges(
+    ranges: Array,  # [P, V], inf where not seen
+) -> Array:
+    """[P, V] with at most MOST_VIEWS of each place left: nearest, farthest, and evenly between."""
+    order = np.argsort(ranges, axis=1, kind="stable")
+    count = np.isfinite(ranges).sum(axis=1)
+    wanted = np.linspace(0.0, 1.0, MOST_VIEWS) * (count - 1)[:, None]
+    used = np.take_along_axis(order, np.rint(wanted).astype(np.int64), axis=1)
+    kept = np.full_like(ranges, np.inf)
+    np.put_along_axis(kept, used, np.take_along_axis(ranges, used, axis=1), axis=1)
+    return kept
+
+
+def _patches(
+    pictures: Sequence[PosedPicture],
+    places: Array,  # [P, 3] world
+    ranges: Array,  # [P, V], inf where not used
+) -> tuple[Array, Array]:
+    """Samples of each patch [P, K, 3], NaN where its nearest view does not show all of it; and its
+    sigma [P], map units."""
+    focal = np.array([picture.focal for picture in pictures])
+    sigma = np.where(np.isfinite(ranges), ranges / focal, 0.0).max(axis=1) * SIGMA_PX
+    nearest = ranges.argmin(axis=1) if len(places) else np.zeros(0, np.int64)
+    grid, _ = _grid()
+    samples = np.full((len(places), len(grid), 3), np.nan)
+    for number, picture in enumerate(pictures):
+        own = np.nonzero(nearest == number)[0]
+        pixels, z, _ = picture.located(places[own])
+        pixels = pixels[:, None] + (sigma[own] * picture.focal / z)[:, None, None] * grid
+        lifted = picture.lifted(pixels)
+        whole = picture.located(lifted)[2].all(axis=1)
+        spacing = 2.0 * REACH / (SIDE - 1) * sigma[own] * picture.focal / z
+        colours = picture.sampled(pixels, 0.5 * spacing)
+        whole &= colours.mean(axis=-1).std(axis=1) > LEAST_TEXTURE
+        samples[own[whole]] = lifted[whole]
+    return samples, sigma
+
+
+def _observed(
+    picture: PosedPicture,
+    samples: Array,  # [N, K, 3] world
+    sigma: Array,  # [N] map units
+) -> tuple[Array, Array, Array, Seen]:
+    """Of each patch colour [N, 3], range [N, 1], place in the picture [N, 2], and whether it is
+    seen [N]."""
+    _, weight = _grid()
+    pixels, z, seen = picture.located(samples)
+    z = z @ weight
+    spacing = 2.0 * REACH / (SIDE - 1) * sigma * picture.focal / z
+    colour = np.einsum("k,nkc->nc", weight, picture.sampled(pixels, 0.5 * spacing))
+    size = np.array([picture.camera.width, picture.camera.height])
+    xy = np.einsum("k,nkc->nc", weight, pixels) / (0.5 * size) - 1.0
+    return colour, z[:, None], xy, seen.mean(axis=1) > SEEN_SHARE
+
+
+def _grid() -> tuple[Array, Array]:
+    """[K, 2] in sigmas, and the weights [K] of a Gaussian."""
+    line = np.linspace(-REACH, REACH, SIDE)
+    grid = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    weight = np.exp(-0.5 * (grid**2).sum(axis=1))
+    return grid, weight / weight.sum()

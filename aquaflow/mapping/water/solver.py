@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.mapping.water.model import WaterModel
+from aquaflow.mapping.water.model import Derivatives, Prediction, WaterModel
 from aquaflow.mapping.water.observations import variance_over_range
 
 Array = npt.NDArray[np.float64]
@@ -31,11 +32,18 @@ class Fit:
     x: Array
     """[K]"""
     noise: float
+    weight: Array
+    """[3, M] of the observations, by their errors."""
+
+    @cached_property
+    def prediction(self) -> Prediction:
+        """The observations through the fitted water."""
+        return self.problem.predict(self.x, self.weight)
 
     @cached_property
     def information(self) -> Array:
         """[K, K] inverse covariance of the parameters; exact where the cost is a square."""
-        return normal_equations(self.problem, self.x, self.noise)[0]
+        return normal_equations(self.problem, self.x, self.prediction, self.weight)[0]
 
     @cached_property
     def covariance(self) -> Array:
@@ -48,112 +56,148 @@ class Fit:
         leaves; that one stated the noise."""
         return max(self.repetition(), 1.0) * self.covariance
 
-    @property
+    @cached_property
     def log_evidence(self) -> float:
         """Log of the model's marginal likelihood by Laplace's method, up to a constant that all
         models of the same observations share."""
         _, rows = self.problem.priors(self.x)
         prior, posterior = (np.linalg.slogdet(H)[1] for H in (rows.T @ rows, self.information))
-        return float(0.5 * (prior - posterior - cost(self.problem, self.x, self.noise)))
+        found = cost(self.problem, self.x, self.prediction, self.noise)
+        return float(0.5 * (prior - posterior - found))
 
     def colours(self) -> Array:
         """[3, P] the points' colours without water."""
-        return np.stack([self.problem.predict(self.x, c)[1] for c in range(3)])
+        return self.prediction.J
 
     def restored_variance(self) -> float:
         """Of the observations with the water taken out of each (``variance_over_range``)."""
-        restored = [self.problem.without_water(self.x, c) for c in range(3)]
-        return variance_over_range(self.problem.seen, np.stack(restored, axis=-1))
+        restored = self.problem.without_water(self.prediction)
+        return variance_over_range(self.problem.seen, restored.T)
 
     def spread(self) -> float:
         """Standard deviation of an observation's error, outliers left out."""
-        errors = [np.abs(self.problem.predict(self.x, c)[0]) for c in range(3)]
-        return float(np.median(errors)) / 0.6745
+        return float(np.median(np.abs(self.prediction.errors))) / 0.6745
 
     def repetition(self) -> float:
-        """How often the same error is counted: neighbouring points share the map's errors, and the
-        observations of a point its own.
+        """How often the same error is counted: neighbouring points share the light that plays on
+        them, the three channels too, and the observations of a point its own.
 
         The variance that the gradients of whole regions show over the one that they would have,
         if each observation's error were its own, in the directions that the fit leaves unknown.
         """
         first = self.problem.exposure.start
-        expected, found = np.zeros((2, first, first))
+        region = self.problem.seen.region[self.problem.seen.point]
+        expected, scores = np.zeros((first, first)), np.zeros((first, int(region.max()) + 1))
         for c in range(3):
-            own = self.problem.of_channel(c)
-            own = own[own < first]
-            errors = self.problem.predict(self.x, c)[0]
-            by_error = self.problem.derivatives(self.x, c)[0][: len(own)]
-            weighed = by_error * _weight(errors, self.noise)
-            by_region = self.problem.sums_by_region(weighed * errors)
-            expected[np.ix_(own, own)] += weighed @ by_error.T
-            found[np.ix_(own, own)] += by_region @ by_region.T
+            found = self.problem.derivatives(self.prediction, self.weight[c], c)
+            own = found.own[: len(found.direct)]
+            weighed = found.direct * self.weight[c]
+            by_J = found.by_J[: len(own)]
+            each = self.problem.seen.sums_by_point(weighed * self.prediction.a[c])
+            expected[np.ix_(own, own)] += weighed @ found.direct.T + by_J @ each.T
+            for k, row in zip(own, weighed * self.prediction.errors[c], strict=True):
+                scores[k] += np.bincount(region, row)
         covariance = self.covariance[:first, :first]
         alone = max(float((covariance * expected).sum()), TINY)
-        return float((covariance * found).sum()) / alone
+        return float((covariance * (scores @ scores.T)).sum()) / alone
 
 
 def descend(
     problem: WaterModel,
     x: Array,  # [K] parameters
     noise: float,
-) -> Fit:
-    """Levenberg-Marquardt on the robust cost."""
+) -> Generator[None, None, Fit]:
+    """Levenberg-Marquardt on the robust cost; pauses after every step."""
     damping, give_up = DAMPING
-    best = cost(problem, x, noise)
+    problem = problem.expecting(x)
+    weight = weights(problem.predict(x).errors, noise)
+    now = problem.predict(x, weight)
     for _ in range(MAX_STEPS if problem.size else 0):
-        H, g = normal_equations(problem, x, noise)
-        before = best
+        best = before = cost(problem, x, now, noise)
+        H, g = normal_equations(problem, x, now, weight)
         while damping < give_up:
             trial = x - np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
-            new = cost(problem, trial, noise)
-            if new < best:
-                x, best, damping = trial, new, damping / 10.0
+            new = problem.predict(trial, weight)
+            found = cost(problem, trial, new, noise)
+            if found < best:
+                x, now, best, damping = trial, new, found, damping / 10.0
                 break
             damping *= 10.0
+        problem, weight = problem.expecting(x), weights(now.errors, noise)
+        now = problem.predict(x, weight)
+        yield
         if before - best < LEAST_GAIN * before:
             break
-    return Fit(problem, x, noise)
+    return Fit(problem, x, noise, weight)
 
 
 def cost(
     problem: WaterModel,
     x: Array,  # [K] parameters
+    now: Prediction,
     noise: float,
 ) -> float:
     """Soft L1 of the observations' whitened errors and squares of the priors', together."""
     total = float((problem.priors(x)[0] ** 2).sum())
-    predicted = [problem.predict(x, c) for c in range(3)]
-    for errors, _ in predicted:
-        total += float(2.0 * (np.sqrt(1.0 + (errors / noise) ** 2) - 1.0).sum())
-    return total + float((problem.of_scene(np.stack([J for _, J in predicted])) ** 2).sum())
+    total += float(2.0 * (np.sqrt(1.0 + (now.errors / noise) ** 2) - 1.0).sum())
+    return total + float((problem.of_scene(now.J) ** 2).sum())
 
 
 def normal_equations(
     problem: WaterModel,
     x: Array,  # [K] parameters
-    noise: float,
+    now: Prediction,
+    weight: Array,  # [3, M]
 ) -> tuple[Array, Array]:
-    """J^T W J and J^T W r of the same cost, the weights those of soft L1."""
+    """J^T W J and J^T W r of the same cost, the points' colours eliminated."""
     residuals, rows = problem.priors(x)
     H, g = rows.T @ rows, rows.T @ residuals
-    colours, changes = [], []
+    changes = []
     for c in range(3):
-        own = problem.of_channel(c)
-        errors, J = problem.predict(x, c)
-        by_error, by_J = problem.derivatives(x, c)
-        weight = _weight(errors, noise)
-        H[np.ix_(own, own)] += (weight * by_error) @ by_error.T
-        g[own] += by_error @ (weight * errors)
-        colours.append(J)
-        changes.append((own, by_J))
-    J = np.stack(colours)
-    rows = problem.of_scene_rows(J, changes)
-    return H + rows.T @ rows, g + rows.T @ problem.of_scene(J)
+        found = problem.derivatives(now, weight[c], c)
+        block, slope = _of_channel(problem, found, now, weight[c], c)
+        H[np.ix_(found.own, found.own)] += block
+        g[found.own] += slope
+        changes.append((found.own, found.by_J))
+    scene = problem.of_scene_rows(now.J, changes)
+    return H + scene.T @ scene, g + scene.T @ problem.of_scene(now.J)
 
 
-def _weight(
-    errors: Array,  # [M]
+def _of_channel(
+    problem: WaterModel,
+    found: Derivatives,
+    now: Prediction,
+    w: Array,  # [M] weights
+    c: int,
+) -> tuple[Array, Array]:
+    """[k, k] and [k]: one channel's share of both, by its own parameters."""
+    seen, errors = problem.seen, now.errors[c]
+    weighed, k = found.direct * w, len(found.direct)
+    H = np.zeros((len(found.own), len(found.own)))
+    H[:k, :k] = weighed @ found.direct.T
+    g = np.concatenate([weighed @ errors, np.zeros(len(found.own) - k)])
+    if problem.model.exposure:
+        views = problem.views
+        by_view = [np.bincount(seen.view, row * found.lit, views) for row in weighed]
+        alone = np.diag(np.bincount(seen.view, w * found.lit**2, views))
+        slope = np.bincount(seen.view, w * found.lit * errors, views)
+        # Only what differs from the mean gain has an effect.
+        if k:
+            cross = np.stack(by_view)
+            H[:k, k:] = cross - cross.mean(axis=1, keepdims=True)
+            H[k:, :k] = H[:k, k:].T
+        alone = alone - alone.mean(axis=0)
+        H[k:, k:] = alone - alone.mean(axis=1, keepdims=True)
+        g[k:] = slope - slope.mean()
+    # sum w (d + a dJ)^2 = sum w d^2 - power dJ^2, as dJ is the best there is.
+    H -= (found.by_J * now.power[c]) @ found.by_J.T
+    g += found.by_J @ seen.sums_by_point(w * now.a[c] * errors)
+    return H, g
+
+
+def weights(
+    errors: Array,  # [3, M]
     noise: float,
 ) -> Array:
+    """[3, M] of the observations, those of soft L1."""
     return np.asarray(1.0 / (noise**2 * np.sqrt(1.0 + (errors / noise) ** 2)))

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aquaflow.mapping.water.blur import sharpened
 from aquaflow.mapping.water.regions import FEWEST, RegionalColours, regions_of
 from tests.mapping.water.decision_table import kinds, row
 from tests.mapping.water.simulated_dives import Kind, dive
-from tests.mapping.water.water_observations import fitted, shown_by_a_map, sighted
+from tests.mapping.water.water_observations import fitted, sighted
 
 
 @pytest.mark.parametrize("span", [1.5, 3.0])
@@ -35,17 +34,6 @@ def test_without_water_points_look_the_same_from_all_ranges() -> None:
     estimate = fitted(sighted(points=600))
     seen, restored = estimate.range_variance
     assert restored < 0.1 * seen
-
-
-def test_contrast_that_every_map_loses_is_given_back() -> None:
-    drawn = dive(Kind(2.0, 0.005, 0.0), seed=0).seen
-    flat = sharpened(shown_by_a_map(drawn)).colour
-    np.testing.assert_allclose(flat, drawn.colour, atol=0.004)
-
-
-def test_a_region_with_too_few_points_has_no_surroundings() -> None:
-    alone = sighted(points=3, sightings=2)
-    np.testing.assert_array_equal(alone.around, alone.colour)
 
 
 def test_regions_have_as_many_points_each_and_lie_side_by_side() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from aquaflow.mapping.water.estimation import estimate_water
 from aquaflow.mapping.water.model import WaterModel
 from aquaflow.mapping.water.parameters import Model
 from aquaflow.mapping.water.priors import BRIGHT_LEVEL, DARK_LEVEL, beliefs
-from aquaflow.mapping.water.solver import cost, normal_equations
+from aquaflow.mapping.water.solver import cost, normal_equations, weights
 from tests.mapping.water.water_observations import B_INF, B_RES, D, sighted
 
 NOTHING = {"dark_channel": False, "saturation": False, "regions": False}
@@ -57,18 +59,26 @@ def test_a_channel_that_is_all_black_gives_finite_beliefs() -> None:
 
 @pytest.mark.parametrize("priors", EACH, ids=lambda p: str(p.model_dump()))
 def test_every_prior_has_its_part_in_the_gradient(priors: WaterPriorsConfig) -> None:
-    seen = sighted(points=120, noise=0.02)
-    model, noise = Model(water=True), 2.0  # so noisy that the priors rule
+    seen, model, noise = sighted(points=120), Model(water=True), 2.0  # so noisy that priors rule
     problem = WaterModel(seen, model, B_RES, D, priors)
-    without = WaterModel(seen, model, B_RES, D, WaterPriorsConfig(**NOTHING))
     x = problem.start + 0.1 * np.arange(problem.size)
     x[:3] += 2.0  # water so thick that some points must be brighter than white
-    _, gradient = normal_equations(problem, x, noise)
-    assert cost(problem, x, noise) > cost(without, x, noise)
+    now = problem.predict(x)
+    no_black = np.maximum(now.J, 0.1) + 1e-3 * np.arange(seen.points)  # and none like another
+    no_black = now.a * no_black[:, seen.point] + now.backscatter
+    explained = replace(seen, colour=no_black.T)
+    problem = WaterModel(explained, model, B_RES, D, priors)
+    unbelieving = WaterModel(explained, model, B_RES, D, WaterPriorsConfig(**NOTHING))
+    weight = weights(problem.predict(x).errors, noise)
+    now = problem.predict(x, weight)
+    assert cost(problem, x, now, noise) > cost(unbelieving, x, now, noise)
+    _, gradient = normal_equations(problem, x, now, weight)
     for k in range(problem.size):
         step = 1e-5 * (np.arange(problem.size) == k)
-        change = (cost(problem, x + step, noise) - cost(problem, x - step, noise)) / 2e-5
-        assert 2.0 * gradient[k] == pytest.approx(change, rel=1e-3, abs=1e-3)
+        plus, minus = (
+            cost(problem, moved, problem.predict(moved), noise) for moved in (x + step, x - step)
+        )
+        assert 2.0 * gradient[k] == pytest.approx((plus - minus) / 2e-5, rel=1e-3, abs=1e-3)
 
 
 def test_believed_to_be_white_the_backscatter_has_less_colour() -> None:

@@ -1,131 +1,141 @@
-"""Sightings: colours that the camera saw over each Gaussian's own footprint."""
+"""Sightings: the same pieces of surface in all pictures that show them."""
 
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 import torch
 
-from aquaflow.mapping.gaussians.gaussians import GaussianMap
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.views import View
 from aquaflow.mapping.water import sightings
 from aquaflow.mapping.water.observations import Observations
-from aquaflow.mapping.water.sightings import MIN_VIEWS, sight
-from tests.mapping.mapping_scenes import CAMERA, gaussians_at, pose, renderer, view_of
+from aquaflow.mapping.water.posed_picture import PosedPicture
+from aquaflow.mapping.water.sightings import MIN_VIEWS, MOST_VIEWS, POINTS, sight
 
-STEPS = [pose((0.0, 0.0, -0.15 * i)) for i in range(MIN_VIEWS)]
-"""Cameras that back away from the points."""
+Array = npt.NDArray[np.float64]
 
-
-def isolated() -> GaussianMap:
-    """Twelve points of different colours and depths, far apart in the picture."""
-    x, y = torch.meshgrid(
-        torch.linspace(-0.36, 0.36, 4), torch.linspace(-0.24, 0.24, 3), indexing="ij"
-    )
-    rays = torch.stack([x.reshape(-1), y.reshape(-1), torch.ones(12)], 1)
-    depth = torch.linspace(1.8, 2.2, 12)[:, None]
-    colours = torch.rand(12, 3, generator=torch.Generator().manual_seed(0))
-    return gaussians_at(rays * depth, colours, 0.055)
+CAMERA = CameraModel(width=160, height=120, fx=140.0, fy=140.0, cx=80.0, cy=60.0)
+WALL_Z = 2.0
+BACKING = [np.array([0.05 * k, 0.0, -0.25 * k]) for k in range(6)]
+"""Camera centres that back away from a wall across the z axis."""
 
 
-def painted(gaussians: GaussianMap, colours: torch.Tensor) -> list[View]:
-    """Pictures in which every pixel has the colour of the nearest Gaussian."""
-    views = []
-    for i, T_wc in enumerate(STEPS):
-        at = CAMERA.project(T_wc.inverse().apply(gaussians.means.double().numpy()))
-        distance = np.linalg.norm(CAMERA.pixel_centres()[:, :, None] - at, axis=-1)
-        image = (colours.numpy()[distance.argmin(-1)] * 255.0).round().astype(np.uint8)
-        views.append(view_of(image, T_wc, i))
-    return views
+def ranges_of_the_wall(centre: Array) -> Array:
+    rays = CAMERA.unproject(CAMERA.pixel_centres())
+    return np.asarray((WALL_Z - centre[2]) * np.linalg.norm(rays / rays[..., 2:], axis=-1))
 
 
-def looked(gaussians: GaussianMap, views: list[View], beta_a: float = 0.0) -> Observations:
-    random, water = torch.Generator().manual_seed(0), np.full(3, beta_a)
-    return sight(lambda view: gaussians.parameters, views, renderer(), random, water)
+def wall_picture(
+    centre: Array,
+    colours: npt.NDArray[np.uint8] | None = None,  # [H, W, 3]
+    ranges: Array | None = None,  # [H, W] of the map; None: the wall's own
+    alpha: float = 1.0,
+) -> PosedPicture:
+    """The wall, painted with smooth waves, from ``centre``."""
+    z = ranges_of_the_wall(centre) if ranges is None else ranges
+    rays = CAMERA.unproject(CAMERA.pixel_centres())
+    at = centre + rays / rays[..., 2:] * (WALL_Z - centre[2])
+    waves = [0.5 + 0.3 * np.sin(k * at[..., 0]) * np.cos(k * at[..., 1]) for k in (5.0, 6.0, 7.0)]
+    painted = np.rint(255.0 * np.stack(waves, axis=-1)).astype(np.uint8)
+    image = painted if colours is None else colours
+    view = View(0, image, CAMERA, Sim3(np.eye(3), centre), keyframe=0, robust=False)
+    known = torch.from_numpy(z.astype(np.float32))
+    return PosedPicture(view, known, torch.full(known.shape, alpha))
 
 
-def test_the_sighted_colour_is_the_pictures_and_not_the_maps() -> None:
-    gaussians = isolated()
-    colours = torch.rand(12, 3, generator=torch.Generator().manual_seed(5))
-    seen = looked(gaussians, painted(gaussians, colours))
-    assert seen.points == 12
-    assert len(seen.point) == 12 * MIN_VIEWS
-    np.testing.assert_allclose(seen.colour, colours[seen.point], atol=0.01)
+def looked(pictures: list[PosedPicture]) -> Observations:
+    return sight(pictures, np.random.default_rng(0))
 
 
-def test_the_blend_is_what_neighbours_add_to_a_point_from_afar() -> None:
-    gaussians = isolated()
-    alone = looked(gaussians, painted(gaussians, gaussians.colours))
-    bright = gaussians_at(
-        gaussians.means + torch.tensor([0.08, 0.0, 0.0]), torch.ones(12, 3), 0.055
-    )
-    gaussians.extend(bright.parameters, keyframe=0)
-    crowded = looked(gaussians, painted(gaussians, gaussians.colours))
-    few, many = (float(np.abs(seen.blend).mean()) for seen in (alone, crowded))
-    assert many > 2.0 * few
-    sums = np.stack([np.bincount(crowded.point, crowded.blend[:, c]) for c in range(3)])
-    np.testing.assert_allclose(sums, 0.0, atol=1e-6)
+def test_a_patch_has_the_same_colour_from_near_and_far() -> None:
+    seen = looked([wall_picture(centre) for centre in BACKING])
+    assert seen.points > 400
+    mean = np.stack([np.bincount(seen.point, c) for c in seen.colour.T], axis=-1)
+    mean /= np.bincount(seen.point)[:, None]
+    assert np.abs(seen.colour - mean[seen.point]).max() < 0.02
+    # And no contrast is lost: the far colours rise and fall with the mean as the near ones do.
+    far = seen.z > np.median(seen.z)
+    for rows in (far, ~far):
+        slope = np.polyfit(mean[seen.point[rows], 0], seen.colour[rows, 0], 1)[0]
+        assert slope == pytest.approx(1.0, abs=0.01)
 
 
-def test_the_blend_is_as_it_looks_through_the_maps_own_water_at_the_mean_range() -> None:
-    gaussians = isolated()
-    views = painted(gaussians, gaussians.colours)
-    in_air, in_water = looked(gaussians, views), looked(gaussians, views, beta_a=0.7)
-    mean = np.bincount(in_air.point, in_air.z) / MIN_VIEWS
-    faded = in_air.blend * np.exp(-0.7 * mean[in_air.point])[:, None]
-    np.testing.assert_allclose(in_water.blend, faded, rtol=1e-9)
+def test_range_and_place_are_those_of_the_patch() -> None:
+    seen = looked([wall_picture(centre) for centre in BACKING])
+    for row in range(0, len(seen.z), 97):
+        local = seen.positions[seen.point[row]] - BACKING[seen.view[row]]
+        assert seen.z[row] == pytest.approx(np.linalg.norm(local), rel=0.01)
+        at = CAMERA.project(local) / (80.0, 60.0) - 1.0
+        np.testing.assert_allclose(seen.xy[row], at, atol=0.02)
 
 
-def test_range_and_place_are_those_of_the_gaussians_centre() -> None:
-    gaussians = isolated()
-    seen = looked(gaussians, painted(gaussians, gaussians.colours))
-    means = gaussians.means.double().numpy()
-    for i, T_wc in enumerate(STEPS):
-        rows = slice(12 * i, 12 * (i + 1))
-        assert seen.point[rows].tolist() == list(range(12))
-        np.testing.assert_allclose(seen.z[rows], np.linalg.norm(means - T_wc.t, axis=1), rtol=1e-6)
-        at = CAMERA.project(T_wc.inverse().apply(means)) / (32.0, 24.0) - 1.0
-        np.testing.assert_allclose(seen.xy[rows], at, atol=1e-6)
+def test_observations_come_by_point_and_a_point_is_seen_once_in_a_view() -> None:
+    seen = looked([wall_picture(centre) for centre in BACKING])
+    assert (np.diff(seen.point) >= 0).all()
+    assert len(np.unique(seen.point * 100 + seen.view)) == len(seen.point)
+    assert np.bincount(seen.point).min() >= MIN_VIEWS
 
 
-def test_a_gaussian_behind_others_is_not_sighted() -> None:
-    front = torch.tensor([[0.0, 0.0, 1.5 + 0.01 * i] for i in range(4)])
-    hidden = torch.tensor([[0.0, 0.0, 2.2]])
-    wall = gaussians_at(front, torch.full((4, 3), 0.5), 0.3, opacity=0.98)
-    behind = gaussians_at(hidden, torch.full((1, 3), 0.5), 0.055)
-    alone = [view_of(np.zeros((48, 64, 3), np.uint8), T) for T in STEPS]
-    assert looked(behind, alone).points == 1
-    behind.extend(wall.parameters, keyframe=0)
-    seen = looked(behind, alone)
-    assert seen.z.max() < 2.2
-    assert seen.points >= 1
+def test_of_many_views_the_nearest_and_the_farthest_are_among_those_used() -> None:
+    centres = [np.array([0.0, 0.0, -0.05 * k]) for k in range(16)]
+    seen = looked([wall_picture(centre) for centre in centres])
+    assert np.bincount(seen.point).max() == MOST_VIEWS
+    first = seen.view[seen.starts]
+    assert (first == 0).mean() > 0.9
 
 
-@pytest.mark.parametrize(
-    "mean",
-    [
-        (0.0, 0.0, -2.0),  # behind, on the axis: it projects to the centre
-        (5.0, 0.0, 2.0),
-        (32.0 / 55.0 * 2.0, 0.0, 2.0),  # cut in half by the picture's edge
-    ],
-)
-def test_what_is_not_wholly_in_the_picture_is_not_sighted(mean: tuple[float, ...]) -> None:
-    outside = gaussians_at(torch.tensor([mean]), torch.full((1, 3), 0.5), 0.055)
-    still = [view_of(np.zeros((48, 64, 3), np.uint8)) for _ in range(MIN_VIEWS)]
-    assert looked(outside, still).points == 0
+def test_what_is_hidden_in_a_view_is_no_observation() -> None:
+    pictures = [wall_picture(centre) for centre in BACKING]
+    near = np.full((120, 160), 0.5)
+    pictures[2] = wall_picture(BACKING[2], ranges=near)
+    seen = looked(pictures)
+    assert 2 not in seen.view
+    assert seen.points > 100
 
 
-def test_points_in_too_few_views_are_left_out() -> None:
-    gaussians = isolated()
-    views = painted(gaussians, gaussians.colours)[: MIN_VIEWS - 1]
-    seen = looked(gaussians, views)
+def test_where_the_map_has_nothing_there_are_no_patches() -> None:
+    assert looked([wall_picture(centre, alpha=0.2) for centre in BACKING]).points == 0
+
+
+def test_open_water_without_texture_is_no_surface() -> None:
+    blue = np.full((120, 160, 3), (20, 60, 120), np.uint8)
+    assert looked([wall_picture(centre, colours=blue) for centre in BACKING]).points == 0
+
+
+def test_a_masked_vehicle_is_not_sighted() -> None:
+    view_mask = np.zeros((120, 160), bool)
+    view_mask[:60] = True
+    pictures = []
+    for centre in BACKING:
+        whole = wall_picture(centre)
+        z = ranges_of_the_wall(centre).astype(np.float32)
+        image = np.rint(whole.sampled(CAMERA.pixel_centres(), np.full(120, 0.1)) * 255.0)
+        view = View(0, image.astype(np.uint8), CAMERA, Sim3(np.eye(3), centre), 0, False, view_mask)
+        pictures.append(PosedPicture(view, torch.from_numpy(z), torch.ones(120, 160)))
+    seen = looked(pictures)
+    assert seen.points > 0
+    assert seen.xy[:, 1].max() < 0.05
+
+
+def test_patches_in_too_few_views_are_left_out() -> None:
+    seen = looked([wall_picture(centre) for centre in BACKING[: MIN_VIEWS - 1]])
     assert seen.points == 0
     assert seen.colour.shape == (0, 3)
 
 
 def test_no_more_points_are_taken_than_needed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sightings, "POINTS", 5)
-    gaussians = isolated()
-    seen = looked(gaussians, painted(gaussians, gaussians.colours))
-    assert seen.points == 5
-    assert len(seen.point) == 5 * MIN_VIEWS
+    assert looked([wall_picture(centre) for centre in BACKING]).points <= POINTS
+    monkeypatch.setattr(sightings, "POINTS", 40)
+    assert looked([wall_picture(centre) for centre in BACKING]).points <= 40
+
+
+def test_ranges_that_are_not_numbers_show_nothing() -> None:
+    broken = np.full((120, 160), np.nan)
+    pictures = [wall_picture(centre) for centre in BACKING]
+    pictures[0] = wall_picture(BACKING[0], ranges=broken)
+    seen = looked(pictures)
+    assert 0 not in seen.view
+    assert np.isfinite(seen.z).all()

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.mapping.water.blur import LOSS
 from aquaflow.mapping.water.estimation import (
     WaterEstimate,
     estimate_water,
@@ -51,15 +48,8 @@ def sighted(
         seen = seen * np.exp(shading_basis(xy) @ shading)[:, None]
     # Colours and ranges have nothing to do with the place: near and far are alike.
     positions = rng.uniform(-1.0, 1.0, (points, 3))
-    sharp = Observations(point, view, seen, z, xy, np.zeros_like(seen), positions)
-    shown = shown_by_a_map(sharp)
-    return replace(shown, colour=shown.colour + noise * rng.normal(size=seen.shape))
-
-
-def shown_by_a_map(sharp: Observations) -> Observations:
-    """With the loss of contrast that every map has."""
-    left = np.exp(-LOSS * sharp.z / np.median(sharp.z))
-    return replace(sharp, colour=sharp.around + (sharp.colour - sharp.around) * left[:, None])
+    seen = seen + noise * rng.normal(size=seen.shape)
+    return Observations(point, view, seen, z, xy, positions)
 
 
 def fitted(seen: Observations) -> WaterEstimate:
