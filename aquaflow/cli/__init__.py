@@ -176,15 +176,19 @@ def evaluate(
     clean_crop: Annotated[str | None, typer.Option(help="Crop of --clean, such as right.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Measure a dive against the truth: trajectory, water, restored views."""
+    """Measure a dive: colours of restored views, and what the truth allows to compare."""
     from aquaflow.errors import InputError
+    from aquaflow.evaluation.naturalness import evaluate_naturalness
     from aquaflow.evaluation.protocol import evaluate_dive
     from aquaflow.evaluation.restoration import evaluate_restoration
     from aquaflow.evaluation.summary import in_words
 
-    if truth is None and clean is None:
-        raise InputError("nothing to compare with: give --truth, --clean, or both")
-    result: dict[str, Any] = {}
+    natural = evaluate_naturalness(dive)
+    if truth is None and clean is None and natural is None:
+        raise InputError(
+            f"{dive} has no restored held-out views to look at; give --truth, --clean, or both"
+        )
+    result: dict[str, Any] = {"naturalness": natural and natural.to_json()}
     if truth is not None:
         result |= evaluate_dive(dive, truth).to_json()
     if clean is not None:

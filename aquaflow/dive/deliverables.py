@@ -10,11 +10,10 @@ from functools import partial
 from typing import Any
 
 from aquaflow.dive.folder import DiveFolder
+from aquaflow.dive.held_out import HeldOut, examine_held_out, mean_amplification
 from aquaflow.dive.report_data import report_data
 from aquaflow.dive.results import (
-    HeldOut,
     WaterSummary,
-    examine_held_out,
     largest_sub_map,
     refined_poses,
     summarise_water,
@@ -83,7 +82,9 @@ class Deliverables:
     def _write_medium(self, scale_source: str) -> None:
         mapper = self.slam.mappers.get(self._main)
         evidence = None if mapper is None else mapper.scene.water_evidence
-        self.folder.write_medium(self._waters.get(self._main), scale_source, evidence)
+        amplification = mean_amplification(self.held_out)
+        water = self._waters.get(self._main)
+        self.folder.write_medium(water, scale_source, evidence, amplification)
 
     def _write_map(self, sub_map: int) -> None:
         suffix = "" if sub_map == self._main else f"_{sub_map}"

@@ -16,8 +16,9 @@ import torch
 
 from aquaflow.config import Config
 from aquaflow.dive.frames_csv import FrameRow, header, of_text, to_text
+from aquaflow.dive.held_out import HeldOut
 from aquaflow.dive.log import JsonLog
-from aquaflow.dive.results import HeldOut, WaterSummary, water_of
+from aquaflow.dive.results import WaterSummary, water_of
 from aquaflow.errors import InputError
 from aquaflow.export.map_file import write_map_file
 from aquaflow.export.ply import PlyGaussians, write_ply
@@ -194,11 +195,16 @@ class DiveFolder:
                 write_ply(self.path / f"{name}{suffix}.ply", _splats(plain, colours))
 
     def write_medium(
-        self, water: WaterSummary | None, scale_source: str, evidence: float | None = None
+        self,
+        water: WaterSummary | None,
+        scale_source: str,
+        evidence: float | None = None,
+        amplification: tuple[list[float], list[float]] | None = None,
     ) -> None:
         """medium.json: parameters, their units, and the range at which map.ply is shown.
 
         ``evidence``: log odds of water against clear water or none, before the prior's 5 are added.
+        ``amplification``: of held-out views, see :func:`aquaflow.dive.held_out.mean_amplification`.
         """
         data: dict[str, Any] = {"active": water is not None, "scale_source": scale_source}
         data["evidence"] = evidence
@@ -215,6 +221,8 @@ class DiveFolder:
                     "gain": water.white_gain,
                     "white_balance": "as the camera saw what was at near_range",
                     "near_range": water.near_range,
+                    "amplification": amplification
+                    and dict(zip(("applied", "allowed"), amplification, strict=True)),
                 },
                 "colour_variance_over_range": water.range_variance
                 and dict(zip(("seen", "restored"), water.range_variance, strict=True)),
@@ -233,7 +241,8 @@ class DiveFolder:
         self.write_json("medium.json", data)
 
     def write_held_out(self, examples: list[HeldOut]) -> None:
-        """heldout/: what the camera saw, also without its water, what the map shows, its range."""
+        """heldout/: what the camera saw, also without its water and how much of that is restored,
+        what the map shows, its range."""
         folder = self.path / "heldout"
         folder.mkdir(exist_ok=True)
         for example in examples:
@@ -243,6 +252,8 @@ class DiveFolder:
             pictures = {"real": example.real, "rendered": example.rendered}
             if example.restored is not None:
                 pictures["restored"] = example.restored
+            if example.confidence is not None:
+                pictures["confidence"] = example.confidence
             for name, picture in pictures.items():
                 write_png(folder / f"{example.frame_index:06d}_{name}.png", picture)
 

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from aquaflow.dive.results import HeldOut, WaterSummary
+from aquaflow.dive.held_out import HeldOut
+from aquaflow.dive.results import WaterSummary
 from aquaflow.export.report import (
     CameraSummary,
     HeldOutExample,
@@ -88,6 +89,7 @@ def _examples(held_out: list[HeldOut]) -> list[HeldOutExample]:
             held_out[i].restored,
             held_out[i].psnr,
             held_out[i].ssim,
+            held_out[i].confidence,
         )
         for i in chosen
     ]

@@ -1,4 +1,4 @@
-"""Results of a finished run: held-out quality, poses, water and metrics.json's numbers."""
+"""Results of a finished run: poses, water and metrics.json's numbers."""
 
 from __future__ import annotations
 
@@ -7,17 +7,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from aquaflow import __version__
+from aquaflow.dive.held_out import HeldOut
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.restoration import common_exposure, restored_picture, to_bytes
 from aquaflow.mapping.views import View
 from aquaflow.mapping.water.image_formation import Water
 from aquaflow.messages import Dropped
-from aquaflow.render.image_metrics import lpips, lpips_network, psnr, ssim
+from aquaflow.render.image_metrics import lpips_network
 from aquaflow.slam import Slam
 from aquaflow.tracking.frames import FrameClass, Tracked
 
@@ -37,21 +36,6 @@ SCALE_SOURCE = "none: the median depth of the first keyframe is 1 map unit"
 
 RANGE_PERCENTILES = (5.0, 95.0)
 """Percent; values outside are single pixels at edges of the map."""
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """One held-out frame after its pose was refined."""
-
-    frame_index: int
-    real: npt.NDArray[np.uint8]
-    rendered: npt.NDArray[np.uint8]
-    restored: npt.NDArray[np.uint8] | None
-    psnr: float
-    ssim: float
-    lpips: float | None
-    z: npt.NDArray[np.float32] | None = None
-    """[H, W] rendered range, map units; 0 where the map is not solid."""
 
 
 @dataclass(frozen=True)
@@ -98,47 +82,6 @@ def refined_poses(slam: Slam, results: list[Tracked]) -> dict[int, Sim3]:
         refined = {view.frame_index: view.T_wc for view in mapper.views}
         poses |= {index: T_wc for index, T_wc in refined.items() if T_wc.is_finite()}
     return poses
-
-
-def examine_held_out(slam: Slam, sub_map: int) -> list[HeldOut]:
-    """Render every held-out frame of a sub-map from its refined pose and compare."""
-    mapper = slam.mappers.get(sub_map)
-    if mapper is None or len(mapper.gaussians) == 0:
-        return []
-    views = sorted(slam.held_out.get(sub_map, []), key=lambda view: view.frame_index)
-    contain, exposure = slam.failures.contain, 1.0
-    for view in views:
-        with contain("held-out pose", view.frame_index):
-            mapper.register(view)
-    with contain("restored exposure"):
-        exposure = common_exposure(
-            restored_picture(mapper.scene, view, mapper.show(view)) for view in views
-        )
-    examined = []
-    for view in views:
-        with contain("evaluation", view.frame_index):
-            examined.append(_examine(mapper, view, exposure))
-    return examined
-
-
-def _examine(mapper: Mapper, view: View, exposure: float) -> HeldOut:
-    shown = mapper.show(view)
-    real = view.target().numpy()
-    rendered = shown.image.clamp(0.0, 1.0).numpy()
-    restored = None
-    if mapper.medium.active:
-        restored = to_bytes(exposure * restored_picture(mapper.scene, view, shown).numpy())
-    perceptual, _ = lpips(rendered, real)
-    return HeldOut(
-        view.frame_index,
-        view.image,
-        to_bytes(rendered),
-        restored,
-        psnr(rendered, real),
-        ssim(rendered, real),
-        perceptual,
-        torch.where(shown.alpha > 0.5, shown.z, 0.0).to(torch.float32).numpy(),
-    )
 
 
 @torch.no_grad()

@@ -16,7 +16,8 @@ from aquaflow.dive import calibration_findings
 from aquaflow.dive.deliverables import Deliverables
 from aquaflow.dive.folder import TRACE, DiveFolder
 from aquaflow.dive.frames_csv import FrameRow
-from aquaflow.dive.results import SCALE_SOURCE, HeldOut, metrics
+from aquaflow.dive.held_out import HeldOut
+from aquaflow.dive.results import SCALE_SOURCE, metrics
 from aquaflow.dive.shortcomings import shortcomings
 from aquaflow.errors import InputError, NotMappedError
 from aquaflow.mapping.maps import MIN_VIEWS, Progress

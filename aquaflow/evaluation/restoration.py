@@ -2,7 +2,7 @@
 
 The brightness and white balance of a scene without water are a convention, so one gain per channel,
 the same for all frames, is granted to the restored pictures, and to the raw ones that they must
-beat.
+beat. Where open water was removed, neither is compared.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from aquaflow.config import load_config
 from aquaflow.errors import InputError
+from aquaflow.evaluation.held_out import Kind, held_out_indices, read_picture
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.messages import Frame
 from aquaflow.render.image_metrics import channel_gain, psnr
@@ -61,7 +62,7 @@ def evaluate_restoration(dive: Path, clean: Path, crop: str | None) -> Restorati
         ConfigError: the crop does not fit the pictures.
     """
     indices = _held_out(dive)
-    reference = _clean_pictures(dive, clean, crop, indices)
+    reference = clean_pictures(dive, clean, crop, indices)
     raw, restored = _stored(dive, indices, "real"), _stored(dive, indices, "restored")
     if reference.shape != raw.shape:
         raise InputError(
@@ -69,46 +70,45 @@ def evaluate_restoration(dive: Path, clean: Path, crop: str | None) -> Restorati
             f"whose pictures are {raw.shape[2]} x {raw.shape[1]}; choose the --clean-crop that "
             "shows the same view"
         )
-    return Restoration(len(indices), _mean_psnr(restored, reference), _mean_psnr(raw, reference))
+    opaque = np.stack([read_picture(dive, index, "restored")[1] for index in indices])
+    if not opaque.any():
+        raise InputError(f"the restored pictures in {dive} show nothing but removed open water")
+    return Restoration(
+        len(indices),
+        _mean_psnr(restored, reference, opaque),
+        _mean_psnr(raw, reference, opaque),
+    )
 
 
 def _mean_psnr(
     pictures: Pictures,  # [N, H, W, 3] in [0, 1]
     reference: Pictures,  # [N, H, W, 3] in [0, 1]
+    opaque: npt.NDArray[np.bool_],  # [N, H, W], False where open water was removed
 ) -> float:
-    gain = channel_gain(pictures, reference)
+    gain = channel_gain(pictures, reference, opaque)
     matched = np.clip(pictures * gain, 0.0, 1.0)
-    return float(np.mean([psnr(ours, true) for ours, true in zip(matched, reference, strict=True)]))
+    views = zip(matched, reference, opaque, strict=True)
+    return float(np.mean([psnr(ours, true, shown) for ours, true, shown in views if shown.any()]))
 
 
 def _held_out(dive: Path) -> list[int]:
     """Recording indices of the held-out frames that have a restored picture."""
-    folder = dive / "heldout"
-    if not any(folder.glob("*_real.png")):
+    if not held_out_indices(dive, "real"):
         raise InputError(
             f"{dive} holds no held-out frames to compare; give a dive folder that was mapped with "
             "hold_out_every above 0 and more frames than that"
         )
-    names = sorted(path.name.split("_")[0] for path in folder.glob("*_restored.png"))
-    if not names:
+    indices = held_out_indices(dive, "restored")
+    if not indices:
         raise InputError(
             f"{dive} holds no restored pictures, because its map has no water to remove; map it "
             "with mapping.medium.enabled"
         )
-    return [int(name) for name in names]
+    return indices
 
 
-def _stored(dive: Path, indices: list[int], kind: str) -> Pictures:
-    import cv2
-
-    pictures = []
-    for index in indices:
-        path = dive / "heldout" / f"{index:06d}_{kind}.png"
-        bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
-        if bgr is None:
-            raise InputError(f"cannot read the picture {path}; map the dive again")
-        pictures.append(bgr[..., ::-1])
-    return _in_unit(pictures)
+def _stored(dive: Path, indices: list[int], kind: Kind) -> Pictures:
+    return _in_unit([read_picture(dive, index, kind)[0] for index in indices])
 
 
 def _in_unit(
@@ -117,8 +117,13 @@ def _in_unit(
     return np.stack(pictures).astype(np.float32) / np.float32(255.0)
 
 
-def _clean_pictures(dive: Path, clean: Path, crop: str | None, indices: list[int]) -> Pictures:
-    """The frames of ``clean``, cropped, resized and undistorted as the dive's were."""
+def clean_pictures(dive: Path, clean: Path, crop: str | None, indices: list[int]) -> Pictures:
+    """The frames of ``clean``, cropped, resized and undistorted as the dive's were.
+
+    Raises:
+        InputError: a frame is missing or cannot be read.
+        ConfigError: the crop does not fit the pictures.
+    """
     source = load_config(dive / "config.yaml").source.model_copy(update={"crop": crop})
     if (clean / SYNTHETIC_MARK).is_file():
         clean = clean / SYNTHETIC_CLEAN

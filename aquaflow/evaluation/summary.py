@@ -19,6 +19,8 @@ def in_words(result: Values) -> list[str]:
         lines += _views(result)
     if result.get("medium_error"):
         lines += _water(result["medium_error"])
+    if result.get("naturalness"):
+        lines += _naturalness(result["naturalness"])
     if "restoration" in result:
         lines += _restoration(result["restoration"])
     return lines + [f"Note: {note}." for note in result.get("notes", [])]
@@ -70,6 +72,21 @@ def _water(error: Values) -> list[str]:
         _row("true attenuation, 1/m", _rgb(error["true_attenuation_per_m"])),
         _row("recovered / true", _rgb(error["attenuation_ratio"])),
         _row("backscatter error", f"{error['backscatter_rmse']:.3g} from {low:g} to {high:g} m"),
+    ]
+
+
+def _naturalness(near: Values) -> list[str]:
+    hue = "the camera's picture is grey there"
+    if near["hue_shift_deg"] is not None:
+        hue = (
+            f"{near['hue_shift_deg']:.1f} degrees, at most {near['largest_hue_shift_deg']:.1f}, in "
+            f"{near['hue_views']} of {near['views']} views"
+        )
+    return [
+        "What is nearest, restored against the camera's picture (CIELAB)",
+        _row("hue shift", hue),
+        _row("chroma difference", f"{near['chroma_difference']:+.1f}"),
+        _row("lightness ratio", f"{near['lightness_ratio']:.2f}"),
     ]
 
 

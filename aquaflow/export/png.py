@@ -12,7 +12,7 @@ from aquaflow.storage.atomic import atomic_write
 
 def write_png(
     path: Path,
-    picture: npt.NDArray[np.uint8],  # [H, W, 3] RGB
+    picture: npt.NDArray[np.uint8],  # [H, W] grey, [H, W, 3] RGB or [H, W, 4] RGBA
 ) -> None:
     """Write ``picture``.
 
@@ -21,6 +21,9 @@ def write_png(
     """
     import cv2
 
-    _, encoded = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+    if picture.ndim == 3:
+        to_bgr = cv2.COLOR_RGB2BGR if picture.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
+        picture = np.asarray(cv2.cvtColor(picture, to_bgr), dtype=np.uint8)
+    _, encoded = cv2.imencode(".png", picture)
     with atomic_write(path) as stream:
         stream.write(encoded.tobytes())

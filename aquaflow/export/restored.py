@@ -9,14 +9,19 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor
 
 from aquaflow.config import load_config
 from aquaflow.errors import InputError
 from aquaflow.export.map_file import SUFFIX, read_map_file
+from aquaflow.export.png import write_png
 from aquaflow.geometry.camera import load_camera
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.restoration import common_exposure, restored_picture, to_bytes
+from aquaflow.mapping.restoration import (
+    RestoredPicture,
+    common_exposure,
+    drawn_without_water,
+    restored_picture,
+)
 from aquaflow.mapping.views import View, in_time
 from aquaflow.messages import Frame
 from aquaflow.render import select_renderer
@@ -34,15 +39,14 @@ def export_restored(
 ) -> int:
     """Write every mapped frame of the dive's largest sub-map to ``out``, as INDEX.png; how many.
 
-    With the ``recording``, its pictures with the water taken out (J-hat of the paper); without, the
-    map from where they were taken: no noise and no fish, but no finer detail than the map's either.
+    With the ``recording``, its pictures with the water taken out (J-hat of the paper), and as
+    INDEX_confidence.png what share of each pixel was restored from the picture; without, the map
+    from where they were taken: no noise and no fish, but no finer detail than the map's either.
 
     Raises:
         InputError: the dive has no map or no water, or the recording is another.
         ConfigError: the dive's settings cannot be read.
     """
-    import cv2
-
     renderer = select_renderer(load_config(dive / "config.yaml").mapping.renderer)
     mapper = read_map_file(dive / f"map{SUFFIX}", renderer)
     if not mapper.medium.active:
@@ -58,9 +62,9 @@ def export_restored(
     out.mkdir(parents=True, exist_ok=True)
     count = 0
     for index, picture in _restored(dive, mapper, views, recording):
-        bgr = to_bytes(exposure * picture.numpy())[..., ::-1]
-        if not cv2.imwrite(str(out / f"{index:06d}.png"), bgr):
-            raise InputError(f"cannot write to {out}; give another --out")
+        write_png(out / f"{index:06d}.png", picture.picture_bytes(exposure))
+        if recording is not None:
+            write_png(out / f"{index:06d}_confidence.png", picture.confidence_bytes())
         count += 1
         if progress is not None:
             progress(count, len(views))
@@ -69,11 +73,11 @@ def export_restored(
 
 def _restored(
     dive: Path, mapper: Mapper, views: Mapping[int, View], recording: Path | None
-) -> Iterator[tuple[int, Tensor]]:
-    """Frame index and restored picture [H, W, 3]."""
+) -> Iterator[tuple[int, RestoredPicture]]:
+    """Frame index and restored picture."""
     if recording is None:
         for index, view in views.items():
-            yield index, mapper.scene.balanced(mapper.show(view).radiance)
+            yield index, drawn_without_water(mapper.scene, mapper.show(view))
         return
     for index, image in _pictures(dive, recording, views):
         view = _with_picture(views[index], image)

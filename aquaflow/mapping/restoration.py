@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -19,24 +20,75 @@ BRIGHT_QUANTILE, BRIGHT_LEVEL = 0.995, 0.95
 """This share of the restored values is shown no brighter than this level."""
 
 
+@dataclass(frozen=True)
+class RestoredPicture:
+    """One view without its water."""
+
+    image: Tensor
+    """[H, W, 3]"""
+    confidence: Tensor
+    """[H, W] in [0, 1], the share of the colour that was restored from the picture; 0 in open water
+    and where the vehicle is, because nothing was restored there."""
+    opaque: Tensor | None
+    """[H, W] bool, False where open water was removed; None where it stays in the picture."""
+    amplification: Tensor | None
+    """[2, 3] RGB, mean over what was restored: as applied, and the most that the posterior allows
+    (see water/white_balance.py); None where nothing was, or without a posterior."""
+
+    def picture_bytes(self, exposure: float) -> npt.NDArray[np.uint8]:
+        """[H, W, 3], or [H, W, 4] with alpha where open water was removed."""
+        colours = to_bytes(exposure * self.image.numpy())
+        if self.opaque is None:
+            return colours
+        return np.dstack([colours, to_bytes(self.opaque.numpy().astype(np.float32))])
+
+    def confidence_bytes(self) -> npt.NDArray[np.uint8]:
+        """[H, W], 255 is 1."""
+        return to_bytes(self.confidence.numpy())
+
+
 @torch.no_grad()
-def restored_picture(scene: Scene, view: View, shown: Shown) -> Tensor:
-    """The picture [H, W, 3] without water, at the ranges that the map ``shown`` from the view has,
-    in the white balance that the camera had for what was nearest (see water/white_balance.py).
+def restored_picture(scene: Scene, view: View, shown: Shown) -> RestoredPicture:
+    """The picture without water, at the ranges that the map ``shown`` from the view has, in the
+    white balance that the camera had for what was nearest (see water/white_balance.py).
 
     Where the vehicle is in the picture, the map's own radiance. J-hat keeps the detail that the map
     has lost: on synthetic dives it is 5 dB closer to the clean scene than the map's radiance
-    everywhere. Open water, where the map has nothing, is black, or as the camera saw it
-    (``medium.open_water``).
+    everywhere. Open water, where the map has nothing, is as the camera saw it, removed (black, with
+    alpha 0), or black (``medium.open_water``).
     """
-    picture = scene.recovered(view, shown.z)
-    radiance = scene.balanced(shown.radiance)
-    usable = (shown.alpha > SOLID) & view.scene_mask()
-    restored = torch.where(usable[..., None], picture, radiance)
+    recovered, solid = scene.recovered(view, shown.z), shown.alpha > SOLID
+    usable = solid & view.scene_mask()
+    image = torch.where(usable[..., None], recovered.picture, scene.balanced(shown.radiance))
     if scene.config.open_water == "kept":
         through = ((1.0 - shown.alpha) * ~usable)[..., None]
-        restored = restored + through * scene.evenly_lit(view)
-    return restored
+        image = image + through * scene.evenly_lit(view)
+    amplification = None
+    if recovered.amplification is not None and recovered.allowed is not None and usable.any():
+        applied, allowed = recovered.amplification[usable], recovered.allowed[usable]
+        amplification = torch.stack([applied.mean(dim=0), allowed.mean(dim=0)])
+    confidence = torch.where(usable, recovered.confidence, 0.0)
+    restored = RestoredPicture(image, confidence, None, amplification)
+    return _without_open_water(scene, restored, solid)
+
+
+@torch.no_grad()
+def drawn_without_water(scene: Scene, shown: Shown) -> RestoredPicture:
+    """The map's own radiance in place of a picture; nothing of it was restored from one."""
+    drawn = RestoredPicture(
+        scene.balanced(shown.radiance), torch.zeros_like(shown.alpha), None, None
+    )
+    return _without_open_water(scene, drawn, shown.alpha > SOLID)
+
+
+def _without_open_water(
+    scene: Scene,
+    restored: RestoredPicture,
+    solid: Tensor,  # [H, W] bool
+) -> RestoredPicture:
+    if scene.config.open_water != "removed":
+        return restored
+    return replace(restored, image=restored.image * solid[..., None], opaque=solid)
 
 
 def common_exposure(
@@ -51,7 +103,7 @@ def common_exposure(
 
 
 def to_bytes(
-    image: npt.NDArray[np.floating],  # [H, W, 3]
+    image: npt.NDArray[np.floating],  # [...] in [0, 1]
 ) -> npt.NDArray[np.uint8]:
-    """[H, W, 3] in [0, 1] as 8-bit."""
+    """[...] as 8-bit."""
     return np.asarray(np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)

@@ -26,7 +26,7 @@ from aquaflow.mapping.water.selection import finished
 from aquaflow.mapping.water.shading import TERMS, gain_map
 from aquaflow.mapping.water.sightings import sight
 from aquaflow.mapping.water.sunlight import Sunlight
-from aquaflow.mapping.water.white_balance import WhiteBalance
+from aquaflow.mapping.water.white_balance import Recovered, WhiteBalance
 from aquaflow.render.contract import Renderer
 
 
@@ -197,14 +197,18 @@ class Scene:
         self,
         view: View,
         z: Tensor,  # [H, W] range
-    ) -> Tensor:
-        """[H, W, 3] the view's picture without water, in the white balance of what is nearest."""
-        image, water = self.evenly_lit(view), self.water(view)
+    ) -> Recovered:
+        """The view's picture without water, in the white balance of what is nearest.
+
+        Before the first fit there is no posterior: a pixel is believed wholly or not at all.
+        """
+        image, water, uneven = self.evenly_lit(view), self.water(view), self.uneven(view)
         if water is None:
-            return image
-        if self.balance is None:
-            return water.restore(image, z, self.uneven(view))[0]
-        return self.balance.recover(image, z, water, self.uneven(view))
+            return Recovered(image, torch.ones_like(z))
+        if self.balance is not None:
+            return self.balance.recover(image, z, water, uneven)
+        picture, recoverable = water.restore(image, z, uneven)
+        return Recovered(picture, recoverable.to(picture.dtype))
 
     @torch.no_grad()
     def balanced(

@@ -149,8 +149,10 @@ def test_a_dive_is_not_written_over_the_recording(aquaflow: Cli, small_recording
     refused(aquaflow("map", small_recording, "--out", small_recording), small_recording)
 
 
-def test_evaluate_needs_something_to_compare_with(aquaflow: Cli, small_dive: Path) -> None:
-    refused(aquaflow("evaluate", small_dive), "--truth")
+def test_evaluate_needs_restored_views_or_something_to_compare_with(
+    aquaflow: Cli, tmp_path: Path
+) -> None:
+    refused(aquaflow("evaluate", tmp_path), tmp_path, "--truth")
 
 
 def test_evaluate_refuses_a_folder_that_is_no_dive(

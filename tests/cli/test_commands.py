@@ -147,6 +147,15 @@ def test_evaluate_for_people_names_what_was_measured(
 ) -> None:
     ran = aquaflow("evaluate", small_dive, "--truth", small_recording, "--clean", small_recording)
     assert f"{FRAMES} of {FRAMES} frames" in ran.out
-    for part in ("Trajectory", "Held-out views", "Water", "Without water"):
+    for part in ("Trajectory", "Held-out views", "Water", "What is nearest", "Without water"):
         assert part in ran.out
     assert "{" not in ran.out
+
+
+def test_evaluate_needs_no_truth_for_the_colours_of_restored_views(
+    aquaflow: Cli, small_dive: Path
+) -> None:
+    result = json.loads(aquaflow("evaluate", small_dive, "--json").out)
+    assert list(result) == ["naturalness"]
+    assert result["naturalness"]["views"] == 2
+    assert "lightness ratio" in aquaflow("evaluate", small_dive).out

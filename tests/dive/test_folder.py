@@ -93,6 +93,15 @@ def test_water_has_its_rates_and_their_unit(small_dive: Path) -> None:
     assert medium["range_p5"] <= medium["map_ply_reference_range"] <= medium["range_p95"]
 
 
+def test_no_channel_is_amplified_more_than_the_posterior_allows(small_dive: Path) -> None:
+    medium = json.loads((small_dive / "medium.json").read_text())
+    found = medium["restored"]["amplification"]
+    applied, allowed = np.array(found["applied"]), np.array(found["allowed"])
+    assert applied.shape == allowed.shape == (3,)
+    assert (applied > 0.5).all()
+    assert (applied <= allowed).all()
+
+
 def test_config_cameras_log_and_report_can_be_read_again(small_dive: Path) -> None:
     assert load_config(small_dive / "config.yaml").mapping.optimiser.refine_steps == 60
     camera = load_camera(small_dive / "camera.yaml")
@@ -110,8 +119,13 @@ def test_held_out_pictures_lie_beside_what_the_map_shows(small_dive: Path) -> No
         for kind in ("real", "rendered", "restored"):
             picture = cv2.imread(str(small_dive / "heldout" / f"{index:06d}_{kind}.png"))
             assert picture.shape == (HEIGHT, WIDTH, 3)
+        confidence = cv2.imread(
+            str(small_dive / "heldout" / f"{index:06d}_confidence.png"), cv2.IMREAD_UNCHANGED
+        )
+        assert confidence.shape == (HEIGHT, WIDTH)
+        assert 0 < confidence.mean() < 255
         assert (small_dive / "heldout" / f"{index:06d}_range.npz").exists()
-    assert len(list((small_dive / "heldout").iterdir())) == 4 * len(HELD_OUT)
+    assert len(list((small_dive / "heldout").iterdir())) == 5 * len(HELD_OUT)
 
 
 def test_what_was_decided_is_on_disk_before_the_end(tmp_path: Path) -> None:

@@ -7,10 +7,9 @@ import pytest
 import torch
 
 from aquaflow.config import Config
+from aquaflow.dive.held_out import HeldOut
 from aquaflow.dive.results import (
-    HeldOut,
     WaterSummary,
-    examine_held_out,
     largest_sub_map,
     metrics,
     refined_poses,
@@ -97,10 +96,6 @@ def test_only_posed_frames_have_a_pose(slam: Slam) -> None:
     poses = refined_poses(slam, RESULTS)
     assert list(poses) == [0, 1, 4, 5, 6]
     assert poses[5].t[0] == 5.0
-
-
-def test_a_dive_without_a_map_has_nothing_to_examine(slam: Slam) -> None:
-    assert examine_held_out(slam, 0) == []
 
 
 def test_a_summary_becomes_the_water_it_describes() -> None:

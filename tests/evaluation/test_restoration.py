@@ -67,6 +67,32 @@ def test_a_scene_restored_up_to_white_balance_beats_the_raw_pictures(tmp_path: P
     assert result["gain_db"] == pytest.approx(result["psnr_restored"] - result["psnr_raw"])
 
 
+def test_removed_open_water_is_not_compared(tmp_path: Path) -> None:
+    """Neither in the restored pictures, where it is black, nor in the raw ones."""
+    dive, clean = write_dive(tmp_path / "dive", (0.8, 0.8, 0.8)), write_clean(tmp_path / "clean")
+    for index in INDICES:
+        for kind, colour in (("restored", 0), ("real", 255)):
+            path = dive / "heldout" / f"{index:06d}_{kind}.png"
+            picture = cv2.imread(str(path))
+            picture[:40] = colour
+            alpha = np.full((HEIGHT, WIDTH), 255, np.uint8)
+            alpha[:40] = 0
+            cv2.imwrite(str(path), np.dstack([picture, alpha]) if kind == "restored" else picture)
+    found = evaluate_restoration(dive, clean, None)
+    assert found.psnr_restored > 45.0
+    assert found.psnr_raw > 12.0
+
+
+def test_a_view_of_nothing_but_removed_open_water_is_left_out(tmp_path: Path) -> None:
+    dive, clean = write_dive(tmp_path / "dive", (0.8, 0.8, 0.8)), write_clean(tmp_path / "clean")
+    nothing = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
+    cv2.imwrite(str(dive / "heldout" / f"{INDICES[0]:06d}_restored.png"), nothing)
+    assert evaluate_restoration(dive, clean, None).psnr_restored > 45.0
+    cv2.imwrite(str(dive / "heldout" / f"{INDICES[1]:06d}_restored.png"), nothing)
+    with pytest.raises(InputError, match="nothing but removed open water"):
+        evaluate_restoration(dive, clean, None)
+
+
 def test_one_gain_serves_all_frames(tmp_path: Path) -> None:
     """A restoration whose brightness flickers is not forgiven."""
     dive = write_dive(tmp_path / "dive", (0.9, 0.9, 0.9))

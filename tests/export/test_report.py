@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from aquaflow.export.report import (
     CameraSummary,
@@ -154,6 +157,22 @@ def test_figures_take_the_page_s_colours(page):
     assert "currentColor" in page
     assert "#010203" not in page
     assert "#040506" not in page
+
+
+def test_a_transparent_restored_picture_and_its_confidence_are_shown():
+    image = np.full((36, 64, 3), 200, np.uint8)
+    clear = np.dstack([np.zeros_like(image), np.zeros((36, 64), np.uint8)])
+    grey = np.full((36, 64), 90, np.uint8)
+    example = HeldOutExample("frame 8", image, image, clear, 24.1, 0.8, grey)
+    page = render_report(report(examples=[example]))
+    shown = [
+        np.asarray(Image.open(io.BytesIO(base64.b64decode(data))))
+        for data in re.findall(r'src="data:image/jpeg;base64,([^"]*)"', page)
+    ]
+
+    assert [picture.shape for picture in shown] == [(36, 64, 3)] * 3 + [(36, 64)]
+    np.testing.assert_allclose(shown[2], 128, atol=2)
+    assert "restored from the picture" in page
 
 
 def test_date_is_shown_only_when_given(page):

@@ -62,12 +62,43 @@ def test_every_mapped_frame_is_written_as_it_would_look_without_water(
         folder, tmp_path / "out", recording if recorded else None, lambda *step: steps.append(step)
     )
     found = pictures(tmp_path / "out")
-    assert list(found) == ["000000.png", "000002.png", "000004.png"]
+    names = ["000000", "000002", "000004"]
+    kinds = (".png", "_confidence.png") if recorded else (".png",)
+    assert list(found) == [f"{name}{kind}" for name in names for kind in kinds]
     assert count == 3
     assert steps == [(1, 3), (2, 3), (3, 3)]
     first = found["000000.png"].astype(float)
     gain = np.median(first[first > 50] / clean[first > 50])
     assert np.abs(first / gain - clean).mean() < 3.0
+
+
+def test_the_confidence_is_grey_and_lies_beside_its_picture(dive: Dive, tmp_path: Path) -> None:
+    folder, recording, _ = dive
+    export_restored(folder, tmp_path / "out", recording)
+    path = tmp_path / "out" / "000002_confidence.png"
+    confidence = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert confidence.shape == (48, 64)
+    assert confidence.max() == 255
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_open_water_that_is_to_be_removed_is_transparent(
+    dive: Dive, tmp_path: Path, recorded: bool
+) -> None:
+    folder, recording, _ = dive
+    config = MappingConfig.model_validate({"medium": {"open_water": "removed"}})
+    mapper = Mapper(config, renderer(), seed=0)
+    mapper.scene.gaussians = floor(columns=10, rows=8, scale=0.06)  # leaves the edges open
+    mapper.medium.set_water(*(torch.full((3,), 0.2) for _ in range(3)))
+    mapper.views = [view_of(np.zeros((48, 64, 3), np.uint8), index=0)]
+    solid = mapper.show(mapper.views[0]).alpha.numpy() > 0.5
+    assert 0.1 < solid.mean() < 0.9
+    write_map_file(folder / "map.aqf", mapper)
+    export_restored(folder, tmp_path / "out", recording if recorded else None)
+    picture = cv2.imread(str(tmp_path / "out" / "000000.png"), cv2.IMREAD_UNCHANGED)
+    assert picture.shape == (48, 64, 4)
+    np.testing.assert_array_equal(picture[..., 3] == 255, solid)
+    assert not picture[~solid].any()
 
 
 def test_a_recording_without_the_frames_is_refused(dive: Dive, tmp_path: Path) -> None:

@@ -7,9 +7,16 @@ import pytest
 import torch
 
 from aquaflow.config import MediumConfig
-from aquaflow.mapping.restoration import common_exposure, restored_picture, to_bytes
+from aquaflow.mapping.rendering import Shown
+from aquaflow.mapping.restoration import (
+    common_exposure,
+    drawn_without_water,
+    restored_picture,
+    to_bytes,
+)
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.views import View
+from aquaflow.mapping.water.white_balance import WhiteBalance
 from tests.mapping.mapping_scenes import floor, renderer, view_of
 
 BRIGHTER_ABOVE = torch.tensor([0.1, -0.6, -0.1, 0.0, 0.2])
@@ -31,7 +38,7 @@ def submerged(uneven: bool = False) -> tuple[Scene, View]:
 def test_what_the_map_explains_is_restored_to_the_maps_radiance(uneven: bool) -> None:
     scene, view = submerged(uneven)
     shown = scene.show(view)
-    restored = restored_picture(scene, view, shown)
+    restored = restored_picture(scene, view, shown).image
     solid = shown.alpha > 0.99
     solid[:8, :8] = False
     assert float((restored - shown.radiance)[solid].abs().max()) < 0.03
@@ -56,18 +63,87 @@ def test_the_map_stands_in_where_range_or_scene_are_missing() -> None:
     mask = np.ones((48, 64), bool)
     mask[20:30] = False
     view.mask = mask
-    restored = restored_picture(scene, view, shown)
+    restored = restored_picture(scene, view, shown).image
     for rows in (slice(0, 10), slice(20, 30)):
         assert torch.equal(restored[rows], shown.radiance[rows])
 
 
-def test_open_water_stays_as_the_camera_saw_it_unless_it_is_to_be_black() -> None:
+def with_open_water(choice: str) -> tuple[Scene, View, Shown]:
+    """The floor, in a picture whose upper rows show open water."""
     scene, view = submerged()
+    scene.config = scene.config.model_copy(update={"open_water": choice})
     shown = scene.show(view)
     shown.alpha[:10], shown.radiance[:10] = 0.0, 0.0
-    torch.testing.assert_close(restored_picture(scene, view, shown)[:10], view.target()[:10])
-    scene.config = scene.config.model_copy(update={"open_water": "black"})
-    assert not restored_picture(scene, view, shown)[:10].any()
+    return scene, view, shown
+
+
+def test_open_water_is_kept_as_the_camera_saw_it() -> None:
+    scene, view, shown = with_open_water("kept")
+    restored = restored_picture(scene, view, shown)
+    torch.testing.assert_close(restored.image[:10], view.target()[:10])
+    assert restored.opaque is None
+    assert restored.picture_bytes(1.0).shape == (48, 64, 3)
+
+
+def test_open_water_is_black_where_it_is_to_be() -> None:
+    restored = restored_picture(*with_open_water("black"))
+    assert not restored.image[:10].any()
+    assert restored.opaque is None
+    assert restored.picture_bytes(1.0).shape == (48, 64, 3)
+
+
+def test_open_water_is_transparent_where_it_is_to_be_removed() -> None:
+    scene, view, shown = with_open_water("removed")
+    shown.radiance[:10] = 0.2  # a haze of Gaussians too thin to be the scene
+    solid = (shown.alpha > 0.5).numpy()
+    for restored in (restored_picture(scene, view, shown), drawn_without_water(scene, shown)):
+        picture = restored.picture_bytes(1.0)
+        assert picture.shape == (48, 64, 4)
+        np.testing.assert_array_equal(picture[..., 3], np.where(solid, 255, 0))
+        assert not picture[:10].any()
+        assert picture[solid].any()
+
+
+@pytest.mark.parametrize("choice", ["kept", "removed", "black"])
+def test_what_was_not_restored_from_the_picture_has_no_confidence(choice: str) -> None:
+    scene, view, shown = with_open_water(choice)
+    scene.balance = WhiteBalance(1.0, (0.4, 0.4, 0.4), 0.1)
+    mask = np.ones((48, 64), bool)
+    mask[20:30] = False
+    view.mask = mask
+    restored = restored_picture(scene, view, shown)
+    assert not restored.confidence[:10].any()
+    assert not restored.confidence[20:30].any()
+    rest = restored.confidence[32:][shown.alpha[32:] > 0.5]
+    assert float(rest.min()) > 0.3
+    assert restored.confidence_bytes().dtype == np.uint8
+    assert restored.confidence_bytes().shape == (48, 64)
+    assert restored.amplification is not None
+    assert restored.amplification.shape == (2, 3)
+    assert bool((restored.amplification[0] <= restored.amplification[1]).all())
+
+
+def test_before_the_first_fit_a_pixel_is_believed_or_not_and_nothing_is_amplified() -> None:
+    scene, view = submerged()
+    restored = restored_picture(scene, view, scene.show(view))
+    assert set(restored.confidence.unique().tolist()) <= {0.0, 1.0}
+    assert restored.amplification is None
+
+
+def test_a_picture_of_nothing_but_open_water_has_no_amplification() -> None:
+    scene, view, shown = with_open_water("kept")
+    scene.balance = WhiteBalance(1.0, (0.4, 0.4, 0.4), 0.1)
+    shown.alpha[:] = 0.0
+    assert restored_picture(scene, view, shown).amplification is None
+
+
+def test_the_map_s_own_radiance_is_restored_from_no_picture() -> None:
+    scene, view = submerged()
+    shown = scene.show(view)
+    drawn = drawn_without_water(scene, shown)
+    assert torch.equal(drawn.image, shown.radiance)
+    assert not drawn.confidence.any()
+    assert drawn.opaque is None
 
 
 def test_the_brightest_of_all_pictures_sets_the_exposure_of_all() -> None:

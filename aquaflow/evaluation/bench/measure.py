@@ -9,6 +9,7 @@ import numpy as np
 
 from aquaflow.errors import InputError
 from aquaflow.evaluation.bench.scene import BenchmarkScene
+from aquaflow.evaluation.naturalness import evaluate_naturalness
 from aquaflow.evaluation.protocol import evaluate_dive
 from aquaflow.evaluation.restoration import evaluate_restoration
 
@@ -20,6 +21,8 @@ ERRORS = (
     "rpe", "drift_pct", "medium_error",
 )  # fmt: skip
 """Copied from the evaluation."""
+COLOURS = ("hue_shift_deg", "chroma_difference", "lightness_ratio")
+"""Of what is nearest in restored held-out views, copied from the naturalness."""
 
 
 def measured(scene: BenchmarkScene, dive: Path) -> dict[str, Any]:
@@ -33,6 +36,9 @@ def measured(scene: BenchmarkScene, dive: Path) -> dict[str, Any]:
         result = evaluate_dive(dive, Path(scene.truth)).to_json()
         row |= {key: result[key] for key in ERRORS}
         row["depth_absrel"] = depth_error(dive, Path(scene.truth), result["alignment"]["scale"])
+    natural = evaluate_naturalness(dive)
+    found_colours = {} if natural is None else natural.to_json()
+    row |= {key: found_colours.get(key) for key in COLOURS}
     if scene.clean is not None and any((dive / "heldout").glob("*_restored.png")):
         try:
             found = evaluate_restoration(dive, Path(scene.clean), scene.clean_crop)

@@ -28,7 +28,8 @@ KEYS = (
     "frames", "tracked", "lost", "skipped", "keyframes", "mapping_frames", "common_frames",
     "gaussians", "wall_s", "cpu_s", "fps", "stage_ms", "peak_rss_mb", "psnr", "ssim", "lpips",
     "lpips_reason", "heldout_frames", "ate_rmse_m_se3", "ate_rmse_m_sim3", "ate_pct_se3",
-    "ate_pct_sim3", "rpe", "drift_pct", "depth_absrel", "medium_error", "restored_psnr",
+    "ate_pct_sim3", "rpe", "drift_pct", "depth_absrel", "medium_error", "hue_shift_deg",
+    "chroma_difference", "lightness_ratio", "restored_psnr",
     "raw_psnr", "ms_per_frame", "time_to_first_pose_s",
 )  # fmt: skip
 """In every row; null where the run has no such thing."""

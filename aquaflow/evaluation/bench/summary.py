@@ -112,6 +112,7 @@ COLUMNS = (
     Column("SSIM", lambda row: row["ssim"], ".3f"),
     Column("depth %", lambda row: _times_100(row["depth_absrel"]), ".1f"),
     Column("water %", attenuation_error_pct, ".0f"),
+    Column("hue °", lambda row: row["hue_shift_deg"], ".1f"),
     Column("restored dB", lambda row: row["restored_psnr"], ".1f"),
     Column("Gaussians", lambda row: row["gaussians"], ".0f"),
     Column("MB", lambda row: row["peak_rss_mb"], ".0f"),
@@ -122,6 +123,7 @@ NOTES = (
     "while frames come in. Peers find poses only; AquaFlow's time holds the map too.",
     "ATE is after Sim(3) alignment, in percent of the path; RPE in percent of a step; depth and "
     "water are the mean relative errors of held-out ranges and of the attenuation.",
+    "hue is how far restoring turns the hue of what is nearest, in degrees of CIELAB.",
     "restored is the PSNR of held-out views without water against the scene without water; - means "
     "that there is no truth, or no such thing.",
 )

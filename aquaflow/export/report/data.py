@@ -50,13 +50,15 @@ class HeldOutExample:
     caption: str
     """The frame's name."""
     real: npt.NDArray[np.uint8]
-    """[H, W, 3] RGB, as all three pictures."""
+    """[H, W, 3] RGB, as all three pictures; ``restored`` may have alpha."""
     rendered: npt.NDArray[np.uint8]
     restored: npt.NDArray[np.uint8] | None = None
     """Without water; None if the medium is off."""
     psnr: float | None = None
     """dB."""
     ssim: float | None = None
+    confidence: npt.NDArray[np.uint8] | None = None
+    """[H, W] grey, 255 where ``restored`` is wholly the picture's."""
 
 
 @dataclass(frozen=True)

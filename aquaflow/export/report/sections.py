@@ -20,6 +20,8 @@ from aquaflow.export.report.figures import medium_svg, path_svg
 IMAGE_WIDTH_PX = 720
 """Widest picture in the report; three stand side by side in 62 rem."""
 
+TRANSPARENT = "#808080"
+"""Shown where a picture is transparent: JPEG is not."""
 JPEG_QUALITY = 88
 """Of the pictures in the report."""
 
@@ -138,6 +140,8 @@ def _example(example: HeldOutExample) -> str:
     pictures = [("camera", example.real), ("rendered from the map", example.rendered)]
     if example.restored is not None:
         pictures.append(("the same without the water", example.restored))
+    if example.confidence is not None:
+        pictures.append(("white: restored from the picture", example.confidence))
     views = "".join(
         f'<figure><img alt="{label}" src="{_jpeg(image)}"><figcaption>{label}</figcaption></figure>'
         for label, image in pictures
@@ -149,12 +153,15 @@ def _example(example: HeldOutExample) -> str:
 
 
 def _jpeg(
-    image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
+    image: npt.NDArray[np.uint8],  # [H, W] grey, [H, W, 3] RGB or [H, W, 4] RGBA
 ) -> str:
-    """A data URI of the picture, no wider than the report shows it."""
+    """A data URI of the picture, no wider than the report shows it; its transparent parts grey."""
     from PIL import Image
 
     picture = Image.fromarray(image)
+    if picture.mode == "RGBA":
+        backed = Image.new("RGBA", picture.size, TRANSPARENT)
+        picture = Image.alpha_composite(backed, picture).convert("RGB")
     if picture.width > IMAGE_WIDTH_PX:
         height = max(1, round(picture.height * IMAGE_WIDTH_PX / picture.width))
         picture = picture.resize((IMAGE_WIDTH_PX, height), Image.Resampling.LANCZOS)

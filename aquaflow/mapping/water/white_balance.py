@@ -10,6 +10,24 @@ What returns little light is amplified, its noise and the water's own uncertaint
 is therefore the mean of what J may be (a linear minimum mean square error estimate): where light is
 lost in one channel that channel follows the others towards a grey scene; where it is lost in all,
 it fades to the scene's mean.
+
+With T and B the transmission and the backscatter, A = diag(T), noise covariance N (diagonal) and
+J ~ (m, S), a pixel I = A J + B + noise gives
+
+    J-hat = G (I - B) + (1 - G A) m,   G = S A (A S A + N)^-1
+
+G A is the share of J-hat that follows the pixel, 1 - G A the share that is the prior's (Rodgers,
+Inverse Methods for Atmospheric Sounding, 2000, calls G A the averaging kernel). Its eigenvalues lie
+in [0, 1), so the confidence of a pixel is tr(G A) / 3: 1 where all three channels were seen, 1/3
+where one was and the others follow it, 0 where the prior stands alone.
+
+How far a channel may be amplified: G_cc is the regression of J_c on its own channel's light given
+the others' light, T_c v / (T_c^2 v + N_c), with v <= S_cc the variance of J_c that the others
+leave. As T_c^2 v + N_c is at least T_c^2 v and at least 2 T_c sqrt(v N_c),
+
+    G_cc <= min(1 / T_c, sqrt(S_cc / N_c) / 2)
+
+whatever the pixel is: less light is amplified more only until it drowns in the noise.
 """
 
 from __future__ import annotations
@@ -39,6 +57,20 @@ GREY = 0.9
 
 
 @dataclass(frozen=True)
+class Recovered:
+    """A picture without its water, and how far it can be relied on."""
+
+    picture: Tensor
+    """[H, W, 3]"""
+    confidence: Tensor
+    """[H, W] in [0, 1], the share of the colour that is the picture's and not the prior's."""
+    amplification: Tensor | None = None
+    """[H, W, 3] restored per observed light of the same channel; None without a posterior."""
+    allowed: Tensor | None = None
+    """[H, W, 3] the most that the posterior lets it be at that range."""
+
+
+@dataclass(frozen=True)
 class WhiteBalance:
     """What restored pictures are shown in."""
 
@@ -59,21 +91,26 @@ class WhiteBalance:
         z: Tensor,  # [H, W] range, map units
         water: Water,
         uneven: Tensor | None = None,  # [H, W] gain of the backscatter
-    ) -> Tensor:
-        """[H, W, 3] the balanced picture without water."""
+    ) -> Recovered:
+        """The balanced picture without water; the module's text derives it."""
         T, veil = water.transmission(z), water.backscatter(z)
         veil = veil if uneven is None else veil * uneven[..., None]
-        mean = torch.tensor(self.mean)
+        mean, white = torch.tensor(self.mean), self.gain(water)
         depth = water.beta_a * (z[..., None] - self.near_range).clamp_min(0.0)
         noise = PICTURE_NOISE**2 + (VEIL_ERROR * veil).square()
         noise = noise + (self.attenuation_sigma * depth * mean * T).square()
         deviation = CONTRAST * mean
         spread = GREY * deviation[:, None] * deviation + (1.0 - GREY) * torch.diag(deviation**2)
-        # J = m + S A (A S A + N)^-1 (I - B - A m), A and N diagonal.
         seen = T[..., :, None] * spread * T[..., None, :] + torch.diag_embed(noise)
-        off = (image - veil - T * mean)[..., None]
-        J: Tensor = mean + (spread @ (T[..., None] * torch.linalg.solve(seen, off)))[..., 0]
-        return (J * self.gain(water)).clamp(0.0, MAX_RESTORED)
+        G = torch.linalg.solve(seen, T[..., :, None] * spread).mT
+        J = mean + (G @ (image - veil - T * mean)[..., None])[..., 0]
+        own = G.diagonal(dim1=-2, dim2=-1)
+        return Recovered(
+            (J * white).clamp(0.0, MAX_RESTORED),
+            (own * T).mean(dim=-1).clamp(0.0, 1.0),
+            own * white,
+            torch.minimum(1.0 / T, deviation / (2.0 * noise.sqrt())) * white,
+        )
 
 
 def white_balance(

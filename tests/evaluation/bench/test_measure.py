@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 
-from aquaflow.evaluation.bench.measure import depth_error
+from aquaflow.evaluation.bench.measure import COLOURS, depth_error, measured
+from aquaflow.evaluation.bench.runner import KEYS
+from aquaflow.evaluation.bench.scene import BenchmarkScene
 from aquaflow.evaluation.bench.summary import attenuation_error_pct
+from aquaflow.evaluation.bench.table import markdown
 from aquaflow.profiler import pace
+
+RUN = {"scene": "a", "preset": "fast", "peer": None, "repeat": 0, "failed": None}
 
 
 def test_the_pace_counts_the_whole_run_and_single_frames() -> None:
@@ -34,6 +40,18 @@ def test_the_depth_error_is_relative_and_over_what_both_know(tmp_path: Path) -> 
     assert found is not None
     assert np.isclose(found, 0.1)
     assert depth_error(tmp_path / "other", truth, 2.0) is None
+
+
+def test_the_colours_of_what_is_nearest_need_no_truth(tmp_path: Path) -> None:
+    scene, folder = BenchmarkScene("a", "a"), tmp_path / "heldout"
+    assert {measured(scene, tmp_path)[key] for key in COLOURS} == {None}
+    folder.mkdir()
+    for kind, bgr in (("real", (120, 130, 60)), ("restored", (60, 130, 120))):
+        cv2.imwrite(str(folder / f"000008_{kind}.png"), np.full((4, 6, 3), bgr, np.uint8))
+    np.savez(folder / "000008_range.npz", z=np.ones((4, 6), np.float32))
+    row = measured(scene, tmp_path)
+    assert row["hue_shift_deg"] > 45.0
+    assert markdown([{**dict.fromkeys(KEYS), **RUN, **row}]).count(f"{row['hue_shift_deg']:.1f}")
 
 
 def test_the_error_of_the_water_is_a_mean_over_known_channels() -> None:

@@ -27,20 +27,20 @@ def seen(J: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
 def test_what_is_nearest_keeps_the_camera_s_colours_but_for_the_veil() -> None:
     J, z = torch.rand(4, 5, 3, generator=torch.Generator().manual_seed(0)), torch.full((4, 5), 0.5)
     image = seen(J, z)
-    restored = BALANCE.recover(image, z, WATER)
+    restored = BALANCE.recover(image, z, WATER).picture
     torch.testing.assert_close(restored, image - WATER.backscatter(z), atol=0.03, rtol=0.0)
 
 
 def test_grey_things_stay_grey_at_any_range_that_light_comes_from() -> None:
     z = torch.linspace(0.5, 2.5, 40).reshape(4, 10)
     J = 0.4 / BALANCE.gain(WATER) * torch.ones(4, 10, 3)  # grey in the near white balance
-    restored = BALANCE.recover(seen(J, z), z, WATER)
+    restored = BALANCE.recover(seen(J, z), z, WATER).picture
     assert float((restored - restored.mean(dim=-1, keepdim=True)).abs().max()) < 0.06
 
 
 def test_where_no_light_comes_back_the_scene_s_mean_stands_in() -> None:
     z = torch.full((2, 2), 50.0)
-    restored = BALANCE.recover(WATER.B_inf.expand(2, 2, 3), z, WATER)
+    restored = BALANCE.recover(WATER.B_inf.expand(2, 2, 3), z, WATER).picture
     expected = torch.tensor(BALANCE.mean) * BALANCE.gain(WATER)
     torch.testing.assert_close(restored, expected.expand(2, 2, 3), atol=0.02, rtol=0.0)
 
@@ -51,13 +51,72 @@ def test_a_channel_without_light_follows_the_others() -> None:
     J = torch.tensor([[[0.1, 0.1, 0.1], [0.6, 0.6, 0.6]]])
     image = J * water.transmission(z) + water.backscatter(z)
     balance = WhiteBalance(near_range=0.0, mean=(0.3, 0.3, 0.3), attenuation_sigma=0.0)
-    restored = balance.recover(image, z, water)
+    restored = balance.recover(image, z, water).picture
     assert float(restored[0, 1, 0]) > float(restored[0, 0, 0]) + 0.2
+
+
+def test_the_confidence_falls_with_range_and_is_none_where_no_light_comes_back() -> None:
+    z = torch.tensor([[0.5, 1.0, 2.0, 4.0, 8.0, 50.0]])
+    confidence = BALANCE.recover(torch.full((1, 6, 3), 0.3), z, WATER).confidence[0]
+    assert bool((confidence.diff() < 0.0).all())
+    assert float(confidence[0]) > 0.85
+    assert float(confidence[-1]) < 0.01
+
+
+def test_the_confidence_counts_the_channels_that_were_seen() -> None:
+    balance = WhiteBalance(near_range=0.0, mean=(0.3, 0.3, 0.3), attenuation_sigma=0.0)
+    for seen_channels in range(4):
+        beta_a = torch.full((3,), 20.0)
+        beta_a[:seen_channels] = 0.0
+        clear = torch.zeros(3)
+        water = Water(beta_a, clear, clear, clear, clear)
+        found = balance.recover(torch.full((1, 1, 3), 0.3), torch.ones(1, 1), water)
+        assert float(found.confidence) == pytest.approx(seen_channels / 3.0, abs=0.03)
+
+
+def test_the_confidence_is_the_share_of_a_change_that_is_shown() -> None:
+    z = torch.full((1, 1), 2.0)
+    J, shown = torch.full((1, 1, 3), 0.3), []
+    for channel in range(3):
+        more = J.clone()
+        more[..., channel] += 0.01
+        change = [BALANCE.recover(seen(each, z), z, WATER) for each in (J, more)]
+        step = (change[1].picture - change[0].picture)[..., channel] / 0.01
+        shown.append(float(step / BALANCE.gain(WATER)[channel]))
+    confidence = float(BALANCE.recover(seen(J, z), z, WATER).confidence)
+    assert confidence == pytest.approx(sum(shown) / 3.0, abs=1e-3)
+
+
+def test_no_channel_is_amplified_more_than_the_posterior_allows() -> None:
+    z = torch.linspace(0.1, 12.0, 200).reshape(10, 20)
+    found = BALANCE.recover(torch.full((10, 20, 3), 0.3), z, WATER)
+    assert found.amplification is not None
+    assert found.allowed is not None
+    assert bool((found.amplification <= found.allowed * (1.0 + 1e-4)).all())
+    # The bound is near where a channel's light is all that there is to know, and finite far away.
+    assert float((found.amplification / found.allowed).max()) > 0.8
+    assert float(found.allowed.max()) < 20.0
+
+
+def test_the_amplification_is_that_of_the_picture_s_own_channel() -> None:
+    z, image = torch.full((1, 1), 2.0), torch.full((1, 1, 3), 0.3)
+    base = BALANCE.recover(image, z, WATER)
+    assert base.amplification is not None
+    for channel in range(3):
+        brighter = image.clone()
+        brighter[..., channel] += 0.01
+        step = BALANCE.recover(brighter, z, WATER).picture - base.picture
+        expected = float(base.amplification[..., channel])
+        assert float(step[..., channel]) / 0.01 == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("bad", [0.0, 1e9])
 def test_any_range_gives_a_picture(bad: float) -> None:
     z = torch.full((2, 2), bad)
-    restored = BALANCE.recover(torch.full((2, 2, 3), 0.9), z, WATER)
-    assert bool(torch.isfinite(restored).all())
-    assert float(restored.min()) >= 0.0
+    found = BALANCE.recover(torch.full((2, 2, 3), 0.9), z, WATER)
+    assert found.amplification is not None
+    assert found.allowed is not None
+    for part in (found.picture, found.confidence, found.amplification, found.allowed):
+        assert bool(torch.isfinite(part).all())
+        assert float(part.min()) >= 0.0
+    assert float(found.confidence.max()) <= 1.0
