@@ -1,5 +1,7 @@
 """How well the water was removed: restored held-out views against the scene without water.
 
+Published methods restore the same views, as a second opinion.
+
 The brightness and white balance of a scene without water are a convention, so one gain per channel,
 the same for all frames, is granted to the restored pictures, and to the raw ones that they must
 beat. Where open water was removed, neither is compared.
@@ -9,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +21,14 @@ import numpy.typing as npt
 from aquaflow.config import load_config
 from aquaflow.errors import InputError
 from aquaflow.evaluation.held_out import Kind, held_out_indices, read_picture
+from aquaflow.evaluation.water_peers.contract import NAMES, NotRestoredError, Pictures
+from aquaflow.evaluation.water_peers.held_out_ranges import held_out_ranges
+from aquaflow.evaluation.water_peers.methods import METHODS
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.messages import Frame
 from aquaflow.render.image_metrics import channel_gain, psnr
 from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation
-
-Pictures = npt.NDArray[np.float32]
-"""[N, H, W, 3] in [0, 1]."""
 
 SYNTHETIC_MARK = "synth.yaml"
 """The file by which a folder is known to be a synthetic dive."""
@@ -43,10 +45,21 @@ class Restoration:
     """dB, mean over the frames, after one gain per channel for all of them."""
     psnr_raw: float
     """dB, the same for what the camera saw."""
+    psnr_peers: dict[str, float]
+    """dB, the same for what published methods made of it, by the keys of ``water_peers``."""
+    peer_reasons: dict[str, str]
+    """Why a method is not among them."""
 
     def to_json(self) -> dict[str, Any]:
         """Stable keys."""
-        return {**asdict(self), "gain_db": self.psnr_restored - self.psnr_raw}
+        return {
+            "frames": self.frames,
+            "psnr_restored": self.psnr_restored,
+            "psnr_raw": self.psnr_raw,
+            "gain_db": self.psnr_restored - self.psnr_raw,
+            **{f"psnr_{name}": self.psnr_peers.get(name) for name in NAMES},
+            "peer_reasons": self.peer_reasons,
+        }
 
 
 def evaluate_restoration(dive: Path, clean: Path, crop: str | None) -> Restoration:
@@ -73,10 +86,19 @@ def evaluate_restoration(dive: Path, clean: Path, crop: str | None) -> Restorati
     opaque = np.stack([read_picture(dive, index, "restored")[1] for index in indices])
     if not opaque.any():
         raise InputError(f"the restored pictures in {dive} show nothing but removed open water")
+    ranges = held_out_ranges(dive, indices, (raw.shape[1], raw.shape[2]))
+    peers, reasons = {}, {}
+    for name, restore in METHODS.items():
+        try:
+            peers[name] = _mean_psnr(restore(raw, ranges), reference, opaque)
+        except NotRestoredError as error:
+            reasons[name] = str(error)
     return Restoration(
         len(indices),
         _mean_psnr(restored, reference, opaque),
         _mean_psnr(raw, reference, opaque),
+        peers,
+        reasons,
     )
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from aquaflow.evaluation.water_peers.contract import NAMES
+
 Values = Mapping[str, Any]
 
 LABEL_WIDTH = 26
@@ -96,7 +98,13 @@ def _restoration(restored: Values) -> list[str]:
         _row("restored", f"{restored['psnr_restored']:.2f} dB on {restored['frames']} frames"),
         _row("raw", f"{restored['psnr_raw']:.2f} dB"),
         _row("gain", f"{restored['gain_db']:+.2f} dB"),
+        *(_row(title, _peer(restored, name)) for name, title in NAMES.items()),
     ]
+
+
+def _peer(restored: Values, name: str) -> str:
+    found = restored[f"psnr_{name}"]
+    return f"{found:.2f} dB" if found is not None else f"- ({restored['peer_reasons'][name]})"
 
 
 def _rgb(values: Sequence[float | None]) -> str:

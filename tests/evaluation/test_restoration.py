@@ -12,11 +12,14 @@ import pytest
 from aquaflow.config import Config, parse_config
 from aquaflow.errors import InputError
 from aquaflow.evaluation.restoration import evaluate_restoration
+from aquaflow.evaluation.summary import in_words
+from aquaflow.evaluation.water_peers.contract import NAMES
 from aquaflow.storage.atomic import write_yaml
 
 WIDTH, HEIGHT = 96, 72
 INDICES = (8, 16)
 COUNT = 18
+RANGE = np.broadcast_to(np.linspace(2.0, 0.5, HEIGHT, dtype=np.float32)[:, None], (HEIGHT, WIDTH))
 
 Picture = npt.NDArray[np.uint8]
 
@@ -42,6 +45,7 @@ def write_dive(folder: Path, restored_gain: tuple[float, float, float] | None) -
     for index in INDICES:
         picture = scene(index)
         save(folder / "heldout" / f"{index:06d}_real.png", in_water(picture))
+        np.savez(folder / "heldout" / f"{index:06d}_range.npz", z=RANGE)
         if restored_gain is not None:
             restored = (picture * np.array(restored_gain)).astype(np.uint8)
             save(folder / "heldout" / f"{index:06d}_restored.png", restored)
@@ -91,6 +95,37 @@ def test_a_view_of_nothing_but_removed_open_water_is_left_out(tmp_path: Path) ->
     cv2.imwrite(str(dive / "heldout" / f"{INDICES[1]:06d}_restored.png"), nothing)
     with pytest.raises(InputError, match="nothing but removed open water"):
         evaluate_restoration(dive, clean, None)
+
+
+def test_published_methods_restore_the_same_views(tmp_path: Path) -> None:
+    dive = write_dive(tmp_path / "dive", (0.9, 0.5, 0.7))
+    result = evaluate_restoration(dive, write_clean(tmp_path / "clean"), None).to_json()
+    found = [result[f"psnr_{name}"] for name in NAMES]
+    assert result["peer_reasons"] == {}
+    assert len(set(found) | {result["psnr_raw"]}) == len(NAMES) + 1
+    assert all(5.0 < value < result["psnr_restored"] for value in found)
+
+
+def test_a_method_that_cannot_restore_is_null_with_its_reason(tmp_path: Path) -> None:
+    dive = write_dive(tmp_path / "dive", (0.9, 0.5, 0.7))
+    (dive / "heldout" / f"{INDICES[0]:06d}_range.npz").unlink()
+    result = evaluate_restoration(dive, write_clean(tmp_path / "clean"), None).to_json()
+    assert result["psnr_sea_thru"] is None
+    assert result["psnr_udcp"] is not None
+    assert list(result["peer_reasons"]) == ["sea_thru"]
+    [line] = [line for line in in_words({"restoration": result}) if "Sea-thru" in line]
+    assert line.endswith(f"- ({result['peer_reasons']['sea_thru']})")
+
+
+def test_black_pictures_cost_only_the_methods(tmp_path: Path) -> None:
+    dive = write_dive(tmp_path / "dive", (0.9, 0.5, 0.7))
+    for index in INDICES:
+        black = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+        save(dive / "heldout" / f"{index:06d}_real.png", black)
+    result = evaluate_restoration(dive, write_clean(tmp_path / "clean"), None)
+    assert result.psnr_restored > 45.0
+    assert result.psnr_peers == {}
+    assert set(result.peer_reasons) == set(NAMES)
 
 
 def test_one_gain_serves_all_frames(tmp_path: Path) -> None:

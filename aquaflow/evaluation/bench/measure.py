@@ -12,6 +12,7 @@ from aquaflow.evaluation.bench.scene import BenchmarkScene
 from aquaflow.evaluation.naturalness import evaluate_naturalness
 from aquaflow.evaluation.protocol import evaluate_dive
 from aquaflow.evaluation.restoration import evaluate_restoration
+from aquaflow.evaluation.water_peers.contract import NAMES
 
 TRUE_RANGE = "range"
 """A synthetic dive's folder of true ranges."""
@@ -23,6 +24,11 @@ ERRORS = (
 """Copied from the evaluation."""
 COLOURS = ("hue_shift_deg", "chroma_difference", "lightness_ratio")
 """Of what is nearest in restored held-out views, copied from the naturalness."""
+RESTORED = (
+    "restored_psnr", "raw_psnr", *(f"restored_psnr_{name}" for name in NAMES),
+    "restored_peer_reasons",
+)  # fmt: skip
+"""Of held-out views without water: ours, the camera's, those of published methods."""
 
 
 def measured(scene: BenchmarkScene, dive: Path) -> dict[str, Any]:
@@ -31,7 +37,7 @@ def measured(scene: BenchmarkScene, dive: Path) -> dict[str, Any]:
     Raises:
         InputError: the truth does not fit the run.
     """
-    row: dict[str, Any] = dict.fromkeys((*ERRORS, "depth_absrel", "restored_psnr", "raw_psnr"))
+    row: dict[str, Any] = dict.fromkeys((*ERRORS, "depth_absrel", *RESTORED))
     if scene.truth is not None:
         result = evaluate_dive(dive, Path(scene.truth)).to_json()
         row |= {key: result[key] for key in ERRORS}
@@ -45,6 +51,8 @@ def measured(scene: BenchmarkScene, dive: Path) -> dict[str, Any]:
         except InputError:
             return row  # the clean recording lacks a held-out frame: nothing to compare with
         row |= {"restored_psnr": found.psnr_restored, "raw_psnr": found.psnr_raw}
+        row |= {f"restored_psnr_{name}": found.psnr_peers.get(name) for name in NAMES}
+        row["restored_peer_reasons"] = found.peer_reasons
     return row
 
 

@@ -17,6 +17,7 @@ from typing import Any
 from aquaflow.evaluation.bench import machine
 from aquaflow.evaluation.bench.job import Job
 from aquaflow.evaluation.bench.scene import BenchmarkScene
+from aquaflow.evaluation.water_peers.contract import NAMES
 
 WORKER = "aquaflow.evaluation.bench.worker"
 """A run has a process of its own, so that its peak memory is its own too."""
@@ -29,8 +30,9 @@ KEYS = (
     "gaussians", "wall_s", "cpu_s", "fps", "stage_ms", "peak_rss_mb", "psnr", "ssim", "lpips",
     "lpips_reason", "heldout_frames", "ate_rmse_m_se3", "ate_rmse_m_sim3", "ate_pct_se3",
     "ate_pct_sim3", "rpe", "drift_pct", "depth_absrel", "medium_error", "hue_shift_deg",
-    "chroma_difference", "lightness_ratio", "restored_psnr",
-    "raw_psnr", "ms_per_frame", "time_to_first_pose_s",
+    "chroma_difference", "lightness_ratio", "restored_psnr", "raw_psnr",
+    *(f"restored_psnr_{name}" for name in NAMES), "restored_peer_reasons",
+    "ms_per_frame", "time_to_first_pose_s",
 )  # fmt: skip
 """In every row; null where the run has no such thing."""
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
+from aquaflow.evaluation.water_peers.contract import NAMES
+
 Row = dict[str, Any]
 
 
@@ -93,6 +95,10 @@ def _part(key: str, part: str) -> Callable[[Row], float | None]:
     return lambda row: None if row[key] is None else row[key][part]
 
 
+def _number(key: str) -> Callable[[Row], float | None]:
+    return lambda row: row[key]
+
+
 def _percent_posed(row: Row) -> float | None:
     return 100.0 * row["tracked"] / row["frames"] if row["frames"] else None
 
@@ -113,7 +119,12 @@ COLUMNS = (
     Column("depth %", lambda row: _times_100(row["depth_absrel"]), ".1f"),
     Column("water %", attenuation_error_pct, ".0f"),
     Column("hue °", lambda row: row["hue_shift_deg"], ".1f"),
-    Column("restored dB", lambda row: row["restored_psnr"], ".1f"),
+    Column("restored dB", _number("restored_psnr"), ".1f"),
+    Column("raw dB", _number("raw_psnr"), ".1f"),
+    *(
+        Column(f"{title} dB", _number(f"restored_psnr_{key}"), ".1f")
+        for key, title in NAMES.items()
+    ),
     Column("Gaussians", lambda row: row["gaussians"], ".0f"),
     Column("MB", lambda row: row["peak_rss_mb"], ".0f"),
 )
@@ -124,8 +135,9 @@ NOTES = (
     "ATE is after Sim(3) alignment, in percent of the path; RPE in percent of a step; depth and "
     "water are the mean relative errors of held-out ranges and of the attenuation.",
     "hue is how far restoring turns the hue of what is nearest, in degrees of CIELAB.",
-    "restored is the PSNR of held-out views without water against the scene without water; - means "
-    "that there is no truth, or no such thing.",
+    "restored is the PSNR of held-out views without water against the scene without water; raw, "
+    "Sea-thru, UDCP and grey world are the camera's pictures of the same views, as they are and "
+    "restored by published methods; - means that there is no truth, or no such thing.",
 )
 """Printed below the table: what its titles leave open."""
 

@@ -7,12 +7,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from aquaflow.evaluation.bench.measure import COLOURS, depth_error, measured
+from aquaflow.config import Config
+from aquaflow.evaluation.bench.measure import COLOURS, RESTORED, depth_error, measured
 from aquaflow.evaluation.bench.runner import KEYS
 from aquaflow.evaluation.bench.scene import BenchmarkScene
-from aquaflow.evaluation.bench.summary import attenuation_error_pct
+from aquaflow.evaluation.bench.summary import COLUMNS, attenuation_error_pct
 from aquaflow.evaluation.bench.table import markdown
 from aquaflow.profiler import pace
+from aquaflow.render.image_metrics import PSNR_LIMIT_DB
+from aquaflow.storage.atomic import write_yaml
 
 RUN = {"scene": "a", "preset": "fast", "peer": None, "repeat": 0, "failed": None}
 
@@ -52,6 +55,29 @@ def test_the_colours_of_what_is_nearest_need_no_truth(tmp_path: Path) -> None:
     row = measured(scene, tmp_path)
     assert row["hue_shift_deg"] > 45.0
     assert markdown([{**dict.fromkeys(KEYS), **RUN, **row}]).count(f"{row['hue_shift_deg']:.1f}")
+
+
+def test_restored_views_stand_next_to_what_published_methods_make_of_them(tmp_path: Path) -> None:
+    dive, clean = tmp_path / "dive", tmp_path / "clean"
+    (dive / "heldout").mkdir(parents=True)
+    clean.mkdir()
+    write_yaml(dive / "config.yaml", Config.model_validate({}).model_dump(mode="json"))
+    picture = np.random.default_rng(0).integers(60, 200, (48, 64, 3), np.uint8)
+    for path in (
+        clean / "0.png",
+        dive / "heldout" / "000000_real.png",
+        dive / "heldout" / "000000_restored.png",
+    ):
+        assert cv2.imwrite(str(path), picture)
+    row = measured(BenchmarkScene("tiles", "/tiles", clean=str(clean)), dive)
+    assert set(RESTORED) <= set(row)
+    assert row["restored_psnr"] == row["raw_psnr"] == PSNR_LIMIT_DB
+    assert list(row["restored_peer_reasons"]) == ["sea_thru"]
+    by_title = {column.title: column for column in COLUMNS}
+    for title, key in (("raw dB", "raw_psnr"), ("UDCP dB", "restored_psnr_udcp")):
+        assert by_title[title].value(row) == row[key]
+        assert row[key] is not None
+    assert by_title["Sea-thru dB"].value(row) is None
 
 
 def test_the_error_of_the_water_is_a_mean_over_known_channels() -> None:

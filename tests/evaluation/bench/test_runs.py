@@ -20,6 +20,7 @@ from aquaflow.evaluation.bench.runner import KEYS, Contender, in_process, jobs_f
 from aquaflow.evaluation.bench.scene import BenchmarkScene, scene_at
 from aquaflow.evaluation.bench.summary import ATE_PCT, PSNR, lines_of
 from aquaflow.evaluation.bench.table import failures, markdown
+from aquaflow.evaluation.water_peers.contract import NAMES
 from tests.command_line import run_aquaflow
 
 REEF, WALL = BenchmarkScene("reef", "/reef", refine_share=0.1), BenchmarkScene("wall", "/wall")
@@ -183,6 +184,10 @@ def test_bench_on_a_small_dive(small_recording: Path, tmp_path: Path) -> None:
     assert ours["ate_pct_sim3"] < 2.0
     assert 0.0 < ours["depth_absrel"] < 0.3
     assert ours["restored_psnr"] > 5.0
+    for name in NAMES:
+        known = ours[f"restored_psnr_{name}"] is not None
+        assert known != (name in ours["restored_peer_reasons"])
+        assert peer[f"restored_psnr_{name}"] is None
     assert ours["medium_error"]["attenuation_ratio"]
     assert ours["peak_rss_mb"] > 100.0
     assert ours["time_to_first_pose_s"] < ours["wall_s"]
