@@ -59,9 +59,9 @@ class MediumConfig(Stage):
     fit_views: int = Field(20, ge=4, description="views that a fit looks at, spread over the dive")
     priors: WaterPriorsConfig = WaterPriorsConfig()
     open_water: Literal["kept", "removed", "black"] = Field(
-        "kept",
-        description="restored pictures where the map has nothing: as the camera saw it, "
-        "transparent, or black",
+        "black",
+        description="what open water is in restored pictures: as the camera saw it, transparent, "
+        "or black",
     )
     initial_attenuation: float = Field(
         0.1, gt=0, description="1 / map unit; the median range of the first keyframe is 1 unit"

@@ -54,3 +54,21 @@ def read_range(dive: Path, index: int) -> npt.NDArray[np.float32] | None:
         raise InputError(
             f"cannot read the ranges {path}: {reason_of(error)}; map the dive again"
         ) from error
+
+
+def read_restored_area(dive: Path, index: int) -> npt.NDArray[np.bool_] | None:
+    """[H, W] where the restored picture was restored from the camera's, and is neither open water
+    nor the vehicle; None without such a file.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    import cv2
+
+    path = dive / "heldout" / f"{index:06d}_confidence.png"
+    if not path.is_file():
+        return None
+    stored = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if stored is None:
+        raise InputError(f"cannot read the picture {path}; map the dive again")
+    return np.asarray(stored > 0)

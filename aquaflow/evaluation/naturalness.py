@@ -19,10 +19,16 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.errors import InputError
-from aquaflow.evaluation.held_out import Picture, held_out_indices, read_picture, read_range
+from aquaflow.evaluation.held_out import (
+    Picture,
+    held_out_indices,
+    read_picture,
+    read_range,
+    read_restored_area,
+)
 
 NEAREST_SHARE = 0.1
-"""Share of a view's solid pixels that is compared."""
+"""Share of a view's restored pixels that is compared."""
 LEAST_CHROMA = 5.0
 """CIELAB units; what has less looks grey, and noise turns its hue."""
 
@@ -87,7 +93,9 @@ def _nearest_colours(dive: Path, index: int) -> npt.NDArray[np.float64] | None:
             f"the pictures and ranges of held-out frame {index} in {dive} differ in size; map the "
             "dive again"
         )
-    solid = (z > 0.0) & opaque
+    solid, area = (z > 0.0) & opaque, read_restored_area(dive, index)
+    if area is not None and area.shape == solid.shape:
+        solid &= area
     if not solid.any():
         return None
     nearest = solid & (z <= np.quantile(z[solid], NEAREST_SHARE))

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable, Mapping
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -34,9 +32,8 @@ from aquaflow.mapping.rendering import Shown
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.views import View, in_time
 from aquaflow.mapping.water.medium import Medium
+from aquaflow.mapping.water_fitting import WaterFitting
 from aquaflow.render.contract import Renderer
-
-log = logging.getLogger(__name__)
 
 MOST_FAILED_STEPS = 10
 """Steps in a row that raise until the final refinement gives up: the next would, too."""
@@ -67,7 +64,7 @@ class Mapper:
             )
         self._objective = Objective(config.loss, renderer.threads)
         self.optimiser = MapOptimiser(config, self.scene, self._objective)
-        self._next_water_fit = config.medium.first_fit_views
+        self.water_fitting = WaterFitting(config.medium, self.scene, self._random, self.failures)
 
     # --- growing ------------------------------------------------------------------------------
 
@@ -76,9 +73,7 @@ class Mapper:
         if self.views:
             view.log_gain, view.light = self.views[-1].log_gain, self.views[-1].light
         self.views.append(view)
-        if len(self.views) >= self._next_water_fit:
-            self._next_water_fit *= 2
-            self.fit_water()
+        if self.water_fitting.go_on(self.views):
             self.scene.sunlight.judge(in_time(self.views))
 
     @torch.no_grad()
@@ -154,21 +149,6 @@ class Mapper:
         self.optimiser.extend(count, torch.from_numpy(view.T_wc.t).to(torch.float32))
         return count
 
-    def fit_water(self) -> None:
-        """Estimate the water from views spread over the dive so far."""
-        count, views = self.config.medium.fit_views, in_time(self.views)
-        chosen = np.linspace(0, len(views) - 1, min(count, len(views))).astype(int)
-        estimate = None
-        with self.failures.contain("water fit"):
-            estimate = self.scene.fit_water([views[i] for i in chosen], self._random, views)
-        if estimate is not None:
-            log.info(
-                "water fitted: %s, beta_a %s per map unit (relative sigma %s)",
-                estimate.model,
-                estimate.beta_a.round(3).tolist(),
-                estimate.beta_a_sigma,
-            )
-
     # --- following the keyframes --------------------------------------------------------------
 
     def move(self, moves: Mapping[int, Sim3]) -> None:
@@ -177,6 +157,7 @@ class Mapper:
         if self.neural is not None:
             self.neural.move(moved)
         move_views(self.views, moves)
+        self.water_fitting.begin_again()
 
     def absorb(self, other: Mapper) -> None:
         """Take over another sub-map's Gaussians and views, already moved into this one's world.
@@ -188,6 +169,7 @@ class Mapper:
         # Only a decoder needs to know from where each is seen: cameras times Gaussians.
         centres = None if self.neural is None else other.scene.bake(other.views)
         self.gaussians.append(other.gaussians)
+        self.water_fitting.begin_again()
         self.views = views  # from here on make_whole mends what a failure leaves
         self.optimiser.extend(count, centres)
         self.optimiser.steps += other.steps
@@ -209,7 +191,7 @@ class Mapper:
         """The final refinement: all views in random order, rates falling, poses included."""
         steps, limit = self.config.optimiser.refine_steps, self.config.optimiser.refine_seconds
         started = time.monotonic()
-        self.fit_water()
+        self.water_fitting.at_once(self.views)
         order = shuffled_views(self.views, steps, self._random) if len(self.gaussians) else []
         with self.scene.learning_from(order):
             for step, view in enumerate(order):

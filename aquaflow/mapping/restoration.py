@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -16,6 +17,8 @@ from aquaflow.mapping.views import View
 
 SOLID = 0.5
 """Alpha above which the map's range is that of the picture."""
+EDGE_PX = 3.0
+"""Deviation of the Gaussian over which open water begins."""
 BRIGHT_QUANTILE, BRIGHT_LEVEL = 0.995, 0.95
 """This share of the restored values is shown no brighter than this level."""
 
@@ -27,8 +30,8 @@ class RestoredPicture:
     image: Tensor
     """[H, W, 3]"""
     confidence: Tensor
-    """[H, W] in [0, 1], the share of the colour that was restored from the picture; 0 in open water
-    and where the vehicle is, because nothing was restored there."""
+    """[H, W] in [0, 1], the share of the colour that was restored from the picture; 0 where nothing
+    was: in open water, where the vehicle is, and where nothing was mapped."""
     opaque: Tensor | None
     """[H, W] bool, False where open water was removed; None where it stays in the picture."""
     amplification: Tensor | None
@@ -54,41 +57,45 @@ def restored_picture(scene: Scene, view: View, shown: Shown) -> RestoredPicture:
 
     Where the vehicle is in the picture, the map's own radiance. J-hat keeps the detail that the map
     has lost: on synthetic dives it is 5 dB closer to the clean scene than the map's radiance
-    everywhere. Open water, where the map has nothing, is as the camera saw it, removed (black, with
-    alpha 0), or black (``medium.open_water``).
+    everywhere. What was not mapped stays as the camera saw it. Open water is black, as what was
+    removed ends nowhere; or as the camera saw it; or black with alpha 0 (``medium.open_water``).
     """
-    recovered, solid = scene.recovered(view, shown.z), shown.alpha > SOLID
+    recovered, camera = scene.recovered(view, shown.z), scene.evenly_lit(view)
+    open_water, solid = scene.open_water(view), shown.alpha > SOLID
     usable = solid & view.scene_mask()
     image = torch.where(usable[..., None], recovered.picture, scene.balanced(shown.radiance))
-    if scene.config.open_water == "kept":
-        through = ((1.0 - shown.alpha) * ~usable)[..., None]
-        image = image + through * scene.evenly_lit(view)
+    image = image + ((1.0 - shown.alpha) * ~usable)[..., None] * camera
+    usable = usable & ~open_water
     amplification = None
     if recovered.amplification is not None and recovered.allowed is not None and usable.any():
         applied, allowed = recovered.amplification[usable], recovered.allowed[usable]
         amplification = torch.stack([applied.mean(dim=0), allowed.mean(dim=0)])
     confidence = torch.where(usable, recovered.confidence, 0.0)
-    restored = RestoredPicture(image, confidence, None, amplification)
-    return _without_open_water(scene, restored, solid)
+    choice, opaque = scene.config.open_water, None
+    if choice == "removed":
+        image, opaque = image * ~open_water[..., None], ~open_water
+    elif bool(open_water.any()):
+        share = _with_soft_edge(open_water)[..., None]
+        image = image * (1.0 - share) + (share * camera if choice == "kept" else 0.0)
+    return RestoredPicture(image, confidence, opaque, amplification)
+
+
+def _with_soft_edge(
+    area: Tensor,  # [H, W] bool
+) -> Tensor:
+    """[H, W] 1 inside, falling to 0 over a few pixels."""
+    share = cv2.GaussianBlur(area.numpy().astype(np.float32), (0, 0), EDGE_PX)
+    return torch.from_numpy(np.asarray(share, np.float32))
 
 
 @torch.no_grad()
 def drawn_without_water(scene: Scene, shown: Shown) -> RestoredPicture:
     """The map's own radiance in place of a picture; nothing of it was restored from one."""
-    drawn = RestoredPicture(
-        scene.balanced(shown.radiance), torch.zeros_like(shown.alpha), None, None
-    )
-    return _without_open_water(scene, drawn, shown.alpha > SOLID)
-
-
-def _without_open_water(
-    scene: Scene,
-    restored: RestoredPicture,
-    solid: Tensor,  # [H, W] bool
-) -> RestoredPicture:
-    if scene.config.open_water != "removed":
-        return restored
-    return replace(restored, image=restored.image * solid[..., None], opaque=solid)
+    solid, image = shown.alpha > SOLID, scene.balanced(shown.radiance)
+    opaque = None
+    if scene.config.open_water == "removed":
+        image, opaque = image * solid[..., None], solid
+    return RestoredPicture(image, torch.zeros_like(shown.alpha), opaque, None)
 
 
 def common_exposure(

@@ -21,6 +21,7 @@ from aquaflow.mapping.water.estimation import WaterEstimate, estimating, models_
 from aquaflow.mapping.water.exposure import gain_of, learn_gain, set_log_gains
 from aquaflow.mapping.water.image_formation import Water
 from aquaflow.mapping.water.medium import Medium
+from aquaflow.mapping.water.open_water import open_water
 from aquaflow.mapping.water.posed_picture import PosedPicture
 from aquaflow.mapping.water.selection import finished
 from aquaflow.mapping.water.shading import TERMS, gain_map
@@ -211,6 +212,18 @@ class Scene:
         return Recovered(picture, recoverable.to(picture.dtype))
 
     @torch.no_grad()
+    def open_water(self, view: View) -> Tensor:
+        """[H, W] bool, True where the view's picture shows nothing but water."""
+        image, water = self.evenly_lit(view), self.water(view)
+        if water is None:
+            return torch.zeros(image.shape[:2], dtype=torch.bool)
+        uneven = self.uneven(view)
+        B_inf = water.B_inf.expand(image.shape)
+        B_inf = B_inf if uneven is None else B_inf * uneven[..., None]
+        found = torch.from_numpy(open_water(image.numpy(), B_inf.contiguous().numpy()))
+        return found & view.scene_mask()
+
+    @torch.no_grad()
     def balanced(
         self,
         radiance: Tensor,  # [..., 3] J
@@ -223,7 +236,7 @@ class Scene:
         """[3] of J, by which it has the white balance of what is nearest."""
         if not self.medium.active or self.balance is None:
             return torch.ones(3)
-        return self.balance.gain(self.medium(torch.eye(3)))
+        return torch.tensor(self.balance.gain)
 
     def fit_water(
         self,
@@ -231,39 +244,50 @@ class Scene:
         generator: torch.Generator,
         dive: Sequence[View] | None = None,
     ) -> WaterEstimate | None:
-        """:meth:`fitting_water` at once."""
-        return finished(self.fitting_water(views, generator, dive))
+        """:meth:`fitting_water` at once, and adopted for all views of the ``dive``."""
+        estimate, fitted = finished(self.fitting_water(views, generator))
+        if estimate is not None:
+            self.adopt_water(estimate, fitted, views if dive is None else dive)
+        return estimate
 
     def fitting_water(
-        self,
-        views: list[View],
-        generator: torch.Generator,
-        dive: Sequence[View] | None = None,
-    ) -> Generator[None, None, WaterEstimate | None]:
-        """Estimate water, shading and exposure from what ``views`` saw; pictures stay as they are.
+        self, views: Sequence[View], generator: torch.Generator
+    ) -> Generator[None, None, tuple[WaterEstimate | None, list[View]]]:
+        """Estimate water, shading and exposure from what ``views`` saw; the scene stays as it is.
 
-        All views of the ``dive`` get an exposure. Pauses every few milliseconds; nothing changes
-        before the end, and nothing at all (None) while too little is seen from several ranges.
+        Pauses every few milliseconds. Returns the estimate, None while too little is seen from
+        several ranges, and the views that it was fitted to: those that still have their pixels.
         """
-        if not self.config.fit or not views or len(self.gaussians) == 0:
-            return None
-        pictures = []
+        if not self.config.fit or len(self.gaussians) == 0:
+            return None, []
+        pictures, fitted = [], []
         for view in views:
-            shown = self.show(view)
-            pictures.append(PosedPicture(view, shown.z, shown.alpha))
-            yield
+            if view.has_pixels:
+                shown = self.show(view)
+                pictures.append(PosedPicture(view, shown.z, shown.alpha))
+                fitted.append(view)
+                yield
+        if not fitted:
+            return None, []
         seed = int(torch.randint(2**31, (1,), generator=generator))
         seen = sight(pictures, np.random.default_rng(seed))
         yield
         with torch.no_grad():
-            sea = self.medium(torch.from_numpy(views[0].T_wc.R).to(torch.float32))
+            sea = self.medium(torch.from_numpy(fitted[0].T_wc.R).to(torch.float32))
         B_res, d = sea.B_res.double().numpy(), sea.d.double().numpy()
         models, priors = models_for(self.config), self.config.priors
-        estimate = yield from estimating(seen, B_res, d, models, priors)
-        if estimate is not None:
-            with self._unchanged_by_failure():
-                self._adopt(estimate, views, views if dive is None else dive)
-        return estimate
+        steps = estimating(seen, B_res, d, models, priors, pictures)
+        return (yield from steps), fitted
+
+    def adopt_water(
+        self, estimate: WaterEstimate, fitted: Sequence[View], dive: Sequence[View]
+    ) -> None:
+        """Let the estimate hold; the pictures of the map stay as they are.
+
+        All views of the ``dive`` get an exposure.
+        """
+        with self._unchanged_by_failure():
+            self._adopt(estimate, fitted, dive)
 
     @contextmanager
     def _unchanged_by_failure(self) -> Iterator[None]:

@@ -61,7 +61,7 @@ def serialise(mapper: Mapper, optimiser: bool = False) -> tuple[Facts, Arrays]:
     if mapper.neural is not None:
         arrays |= _decoder(mapper.neural)
     if optimiser:
-        facts["next_water_fit"] = mapper._next_water_fit
+        facts["next_water_fit"] = mapper.water_fitting.next_fit
         facts["rates"] = {name: adam.learning_rates for name, adam in _adams(mapper).items()}
         facts["rates"] |= {
             name: each.param_groups[0]["lr"] for name, each in _torch(mapper).items()
@@ -90,7 +90,7 @@ def deserialise(facts: Facts, arrays: Mapping[str, Any], renderer: Renderer) -> 
     mapper.medium.active, scene.exposes = bool(facts["medium_active"]), bool(facts["exposes"])
     scene.sunlight.plays = bool(facts["sunlight_plays"])
     scene.water_evidence, scene.beta_a_sigma = facts["water_evidence"], facts["beta_a_sigma"]
-    if facts.get("white_balance") is not None:  # maps written before 2026-11-22 have none
+    if "gain" in (facts.get("white_balance") or {}):  # not in maps written before 2026-11-22
         scene.balance = WhiteBalance(**facts["white_balance"])
     if facts.get("range_variance") is not None:
         raw, restored = facts["range_variance"]
@@ -106,7 +106,7 @@ def deserialise(facts: Facts, arrays: Mapping[str, Any], renderer: Renderer) -> 
     elif mapper.neural is not None:
         _read_decoder(mapper.neural, arrays)
     if facts["optimiser"]:
-        mapper._next_water_fit = int(facts["next_water_fit"])
+        mapper.water_fitting.next_fit = int(facts["next_water_fit"])
         _read_optimisers(mapper, arrays, facts["rates"])
     return mapper
 

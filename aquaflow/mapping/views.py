@@ -79,6 +79,11 @@ class View:
         """True while its pixels are in ``store``."""
         return self._store is store and self.frame_index in store
 
+    @property
+    def has_pixels(self) -> bool:
+        """False once they were deleted."""
+        return self.frame_index in self._store
+
     def delete_pixels(self) -> None:
         """Delete the pixels; the view must not be used afterwards."""
         del self._store[self.frame_index]

@@ -61,7 +61,7 @@ STAGES: list[tuple[type, str, int, str]] = [
     (Mapper, "add_view", 3, "view"),
     (Mapper, "insert", 2, "insertion"),
     (MapOptimiser, "step", 5, "optimisation"),
-    (Scene, "fit_water", 1, "water fit"),
+    (Scene, "adopt_water", 1, "water fit"),
     (Mapper, "register", 1, "held-out pose"),
 ]
 """Of each stage: what raises, at which call, and the stage's name."""

@@ -93,6 +93,21 @@ def test_removed_open_water_and_what_has_no_range_are_left_out(tmp_path: Path) -
     assert evaluate_naturalness(tmp_path) is None
 
 
+def test_only_what_was_restored_from_the_camera_is_compared(tmp_path: Path) -> None:
+    write_view(tmp_path, 8, TEAL, (0, 0, 0))
+    path, near = tmp_path / "heldout" / "000008_confidence.png", np.zeros((20, 50), np.uint8)
+    assert cv2.imwrite(str(path), near)
+    assert evaluate_naturalness(tmp_path) is None
+    near[:, -5:] = 200
+    assert cv2.imwrite(str(path), near)
+    found = evaluate_naturalness(tmp_path)  # far away, and white in both
+    assert found is not None
+    assert found.lightness_ratio == pytest.approx(1.0)
+    path.write_bytes(b"no picture")
+    with pytest.raises(InputError, match="confidence"):
+        evaluate_naturalness(tmp_path)
+
+
 def test_a_dive_without_restored_views_or_ranges_has_no_naturalness(tmp_path: Path) -> None:
     assert evaluate_naturalness(tmp_path) is None
     write_view(tmp_path, 8, TEAL, TEAL)

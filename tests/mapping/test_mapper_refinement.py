@@ -16,14 +16,12 @@ from tests.mapping.mapping_scenes import (
     filmed,
     floor,
     grown,
-    path,
     picture,
     pose,
     renderer,
     same,
     settings,
     view_of,
-    water,
 )
 
 SHORT = {"refine_steps": 12}
@@ -85,41 +83,13 @@ def test_refinement_ends_when_its_time_is_up(monkeypatch: pytest.MonkeyPatch) ->
     assert mapper.steps == 3
 
 
-def test_water_is_fitted_at_its_view_count_at_every_doubling_and_before_refining(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    mapper = Mapper(settings(medium={"first_fit_views": 3}), renderer(), 0)
+def test_the_water_is_fitted_before_refining(monkeypatch: pytest.MonkeyPatch) -> None:
+    mapper = grown(settings(optimiser={"refine_steps": 1}))
     fits: list[int] = []
-    monkeypatch.setattr(mapper, "fit_water", lambda: fits.append(len(mapper.views)))
-    for view in filmed(floor(), path(1)) * 13:
-        mapper.add_view(view)
-    assert fits == [3, 6, 12]
+    monkeypatch.setattr(mapper.water_fitting, "at_once", lambda views: fits.append(mapper.steps))
+    before = mapper.steps
     mapper.refine()
-    assert fits == [3, 6, 12, 13]
-
-
-def test_a_fit_on_the_maps_own_views_is_told_in_the_log(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    mapper = Mapper(WET, renderer(), 0)
-    mapper.scene.gaussians = floor(columns=18, rows=14)
-    poses = [pose((0.02 * i, 0.0, -0.35 * i)) for i in range(5)]
-    mapper.views = filmed(mapper.gaussians, poses, water(beta=0.3, b=0.3))
-    with caplog.at_level("INFO", logger=module.__name__):
-        mapper.fit_water()
-    assert "water fitted" in caplog.text
-    assert mapper.scene.beta_a_sigma is not None
-
-
-def test_a_fit_looks_at_views_spread_over_the_whole_dive(monkeypatch: pytest.MonkeyPatch) -> None:
-    mapper = Mapper(settings(medium={"fit_views": 4}), renderer(), 0)
-    mapper.views = [view_of(np.zeros((2, 2, 3), np.uint8), index=i) for i in range(31)]
-    looked: list[int] = []
-    monkeypatch.setattr(
-        mapper.scene, "fit_water", lambda views, *_: looked.extend(v.frame_index for v in views)
-    )
-    mapper.fit_water()
-    assert looked == [0, 10, 20, 30]
+    assert fits == [before]
 
 
 # --- held-out views -------------------------------------------------------------------------------

@@ -35,7 +35,7 @@ def test_without_fit_the_water_stays_where_it_began() -> None:
     mapper = grown(settings(medium={"fit": False}))
     before = {name: value.clone() for name, value in mapper.medium.state_dict().items()}
     assert mapper.scene.fit_water(mapper.views, torch.Generator().manual_seed(0)) is None
-    mapper.fit_water()
+    mapper.water_fitting.at_once(mapper.views)
     after = mapper.medium.state_dict()
     assert all(torch.equal(after[name], value) for name, value in before.items())
 

@@ -28,7 +28,9 @@ from aquaflow.config import MediumConfig, WaterPriorsConfig
 from aquaflow.mapping.water.clear import attenuation_covariance, log_odds_clear
 from aquaflow.mapping.water.model import BELIEVED, WaterModel
 from aquaflow.mapping.water.observations import Observations, variance_over_range
+from aquaflow.mapping.water.open_sightings import with_open_water
 from aquaflow.mapping.water.parameters import Model
+from aquaflow.mapping.water.posed_picture import PosedPicture
 from aquaflow.mapping.water.selection import finished, fit_likeliest
 from aquaflow.mapping.water.solver import Fit
 from aquaflow.mapping.water.white_balance import WhiteBalance, white_balance
@@ -110,25 +112,45 @@ def estimating(
     d: Array,  # [3] 1 / map unit
     models: Sequence[Model] = EVERY_MODEL,
     priors: WaterPriorsConfig = BELIEVED,
+    pictures: Sequence[PosedPicture] = (),  # by the number of the view; may show open water
 ) -> Generator[None, None, WaterEstimate | None]:
     """:func:`estimate_water`, with a pause every few milliseconds."""
     if observations.points < MIN_POINTS:
         return None
-    fits = yield from fit_likeliest(
-        [WaterModel(observations, model, B_res, d, priors) for model in models]
-    )
+
+    def problems(seen: Observations, models: Sequence[Model]) -> list[WaterModel]:
+        return [WaterModel(seen, model, B_res, d, priors) for model in models]
+
+    fits = yield from fit_likeliest(problems(observations, models))
     dry, wet = (
         next((fit for fit in fits if fit.problem.model.water is water), None)
         for water in (False, True)
     )
     odds = None if dry is None or wet is None else log_odds_of_water(dry, wet)
-    best = dry if wet is None or (odds is not None and _is_clear(wet, odds)) else wet
-    assert best is not None
-    trial, sigma = best.problem.trial(best.x), None
-    balance = None
+    if wet is None or (odds is not None and _is_clear(wet, odds)):
+        assert dry is not None
+        return _estimate(observations, dry, odds)
+    yield
+    extended = with_open_water(observations, pictures, wet.prediction.trial)
+    if extended.points > observations.points:
+        wet_models = [model for model in models if model.water]
+        (wet,) = yield from fit_likeliest(problems(extended, wet_models))
+    return _estimate(observations, wet, odds)
+
+
+def _estimate(observations: Observations, best: Fit, odds: float | None) -> WaterEstimate:
+    """What the fit, perhaps to open water too, says of the observations of the surface."""
+    trial, rows = best.prediction.trial, len(observations.z)
+    J = best.prediction.J[:, : observations.points]
+    seen = variance_over_range(observations, observations.colour)
+    sigma = balance = None
+    restored = seen
     if best.problem.model.water:
+        lit = observations.colour.T / best.prediction.gain[:, :rows]
         sigma = _beta_a_sigma(best)
-        balance = white_balance(observations, best.colours(), sigma)
+        balance = white_balance(observations, lit, J, sigma)
+        without = best.problem.without_water(best.prediction)[:, :rows].T
+        restored = variance_over_range(observations, without)
     return WaterEstimate(
         best.problem.model,
         trial.beta_a,
@@ -140,7 +162,7 @@ def estimating(
         trial.exposure,
         odds,
         balance,
-        (variance_over_range(observations, observations.colour), best.restored_variance()),
+        (seen, restored),
     )
 
 

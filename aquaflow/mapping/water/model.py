@@ -75,7 +75,7 @@ class WaterModel(Parameters):
         d: Array,  # [3] 1 / map unit
         priors: WaterPriorsConfig = BELIEVED,
     ) -> None:
-        super().__init__(model, int(seen.view.max()) + 1, float(np.median(seen.z)), priors)
+        super().__init__(model, int(seen.view.max()) + 1, seen.median_range, priors)
         self.seen = seen
         self._regions = RegionalColours(seen.region)
         self._near = B_res[:, None] * np.exp(-d[:, None] * seen.z)
@@ -148,6 +148,7 @@ class WaterModel(Parameters):
         J: Array,  # [3, P]
     ) -> Array:
         """[R] how far the points' colours are from what scenes without water have, whitened."""
+        J = J[:, : self.seen.surface]
         single = [belief.residual for belief in beliefs(J, self.believed)]
         if not self.believed.regions:
             return np.array(single)
@@ -159,6 +160,8 @@ class WaterModel(Parameters):
         changes: list[tuple[Index, Array]],  # by channel: own [k], by_J [k, P]
     ) -> Array:
         """[R, K] derivatives of :meth:`of_scene`."""
+        J = J[:, : self.seen.surface]
+        changes = [(own, by_J[:, : self.seen.surface]) for own, by_J in changes]
         single = np.zeros((0, self.size))
         for belief in beliefs(J, self.believed):
             row = np.zeros((1, self.size))

@@ -21,7 +21,8 @@ LEAST_COLOUR = 0.02
 @dataclass(frozen=True)
 class Observations:
     """Patches of the surface ("points") in several pictures; one row per observation, those of a
-    point one after another, at most one in each view."""
+    point one after another, at most one in each view. Open water comes last, each row a point of
+    its own (open_sightings.py)."""
 
     point: Index
     """[M] number of the point, 0 to P - 1, rising."""
@@ -34,12 +35,30 @@ class Observations:
     xy: Array
     """[M, 2] where in the picture, each axis from -1 to 1."""
     positions: Array
-    """[P, 3] world, map units."""
+    """[S, 3] world, map units; points from S on are open water."""
 
     @cached_property
     def region(self) -> Index:
-        """[P] number of the region of the scene that each point lies in."""
+        """[S] number of the region of the scene that each point lies in."""
         return regions_of(self.positions)
+
+    @cached_property
+    def errors_shared(self) -> Index:
+        """[M] number of what observations share their errors with: all of a region, or of one
+        view's open water."""
+        on_surface = self.point < self.surface
+        region = self.region[np.where(on_surface, self.point, 0)]
+        return np.where(on_surface, region, int(self.region.max(initial=-1)) + 1 + self.view)
+
+    @cached_property
+    def median_range(self) -> float:
+        """Of the surface, map units."""
+        return float(np.median(self.z[self.point < self.surface]))
+
+    @property
+    def surface(self) -> int:
+        """Number S of points on the surface."""
+        return len(self.positions)
 
     @cached_property
     def starts(self) -> Index:

@@ -38,7 +38,8 @@ class PosedPicture:
         self.focal = float(np.sqrt(view.camera.fx * view.camera.fy))
         """px"""
         self._z = z.detach().numpy()
-        self._solid = ((alpha > SOLID) & view.scene_mask()).numpy()
+        self._shows_scene = view.scene_mask().numpy()
+        self._solid = (alpha > SOLID).numpy() & self._shows_scene
         self._levels = [np.asarray(view.image, np.float32) / np.float32(255.0)]
         while len(self._levels) < LEVELS and min(self._levels[-1].shape[:2]) > LEVELS:
             self._levels.append(np.asarray(cv2.pyrDown(self._levels[-1]), np.float32))
@@ -47,6 +48,14 @@ class PosedPicture:
         width = 4.0 ** np.arange(len(self._levels))
         filters = np.concatenate([[0.0], np.cumsum(width[:-1])])
         self._apertures = np.sqrt(1.0 / 12.0 + filters + width / 6.0)
+
+    def half_size(self) -> npt.NDArray[np.float32]:
+        """[ceil(H / 2), ceil(W / 2), 3] the picture."""
+        return self._levels[1]
+
+    def shows_scene(self) -> npt.NDArray[np.bool_]:
+        """[ceil(H / 2), ceil(W / 2)] False where the vehicle is."""
+        return self._shows_scene[::2, ::2]
 
     def random_surface(
         self,

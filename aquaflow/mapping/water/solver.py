@@ -10,12 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.mapping.water.model import Derivatives, Prediction, WaterModel
-from aquaflow.mapping.water.observations import variance_over_range
 
 Array = npt.NDArray[np.float64]
 
 MAX_STEPS = 30
 """Limit of Levenberg-Marquardt in one fit."""
+STEPS_AT_ONCE = 3
+"""Steps between two pauses, each takes 3 to 8 ms."""
 LEAST_GAIN = 1e-5
 """Relative fall of the cost at which a fit has converged."""
 TINY = 1e-12
@@ -65,15 +66,6 @@ class Fit:
         found = cost(self.problem, self.x, self.prediction, self.noise)
         return float(0.5 * (prior - posterior - found))
 
-    def colours(self) -> Array:
-        """[3, P] the points' colours without water."""
-        return self.prediction.J
-
-    def restored_variance(self) -> float:
-        """Of the observations with the water taken out of each (``variance_over_range``)."""
-        restored = self.problem.without_water(self.prediction)
-        return variance_over_range(self.problem.seen, restored.T)
-
     def spread(self) -> float:
         """Standard deviation of an observation's error, outliers left out."""
         return float(np.median(np.abs(self.prediction.errors))) / 0.6745
@@ -86,8 +78,8 @@ class Fit:
         if each observation's error were its own, in the directions that the fit leaves unknown.
         """
         first = self.problem.exposure.start
-        region = self.problem.seen.region[self.problem.seen.point]
-        expected, scores = np.zeros((first, first)), np.zeros((first, int(region.max()) + 1))
+        shared = self.problem.seen.errors_shared
+        expected, scores = np.zeros((first, first)), np.zeros((first, int(shared.max()) + 1))
         for c in range(3):
             found = self.problem.derivatives(self.prediction, self.weight[c], c)
             own = found.own[: len(found.direct)]
@@ -96,7 +88,7 @@ class Fit:
             each = self.problem.seen.sums_by_point(weighed * self.prediction.a[c])
             expected[np.ix_(own, own)] += weighed @ found.direct.T + by_J @ each.T
             for k, row in zip(own, weighed * self.prediction.errors[c], strict=True):
-                scores[k] += np.bincount(region, row)
+                scores[k] += np.bincount(shared, row, scores.shape[1])
         covariance = self.covariance[:first, :first]
         alone = max(float((covariance * expected).sum()), TINY)
         return float((covariance * (scores @ scores.T)).sum()) / alone
@@ -107,12 +99,12 @@ def descend(
     x: Array,  # [K] parameters
     noise: float,
 ) -> Generator[None, None, Fit]:
-    """Levenberg-Marquardt on the robust cost; pauses after every step."""
+    """Levenberg-Marquardt on the robust cost; pauses every few steps."""
     damping, give_up = DAMPING
     problem = problem.expecting(x)
     weight = weights(problem.predict(x).errors, noise)
     now = problem.predict(x, weight)
-    for _ in range(MAX_STEPS if problem.size else 0):
+    for step in range(MAX_STEPS if problem.size else 0):
         best = before = cost(problem, x, now, noise)
         H, g = normal_equations(problem, x, now, weight)
         while damping < give_up:
@@ -125,7 +117,8 @@ def descend(
             damping *= 10.0
         problem, weight = problem.expecting(x), weights(now.errors, noise)
         now = problem.predict(x, weight)
-        yield
+        if step % STEPS_AT_ONCE == 0:
+            yield
         if before - best < LEAST_GAIN * before:
             break
     return Fit(problem, x, noise, weight)

@@ -2,9 +2,9 @@
 
 The clean radiance J is the scene as it would look through no water at all. Nobody has seen it so:
 its white balance is the camera's, set for a scene in water, times what the fit makes of the water
-between, and an error in the attenuation becomes a cast of colour. So what is shown is J as it would
-look through the water of the nearest range that the dive has: what is nearest keeps the colours
-that the camera gave it, and what is further away gets the same.
+between, and an error in the attenuation becomes a cast of colour. So what is shown is J under one
+gain per channel, by which what was seen nearest has on the mean the colour that the camera saw,
+backscatter included: what is nearest keeps its colours, and what is further away gets the same.
 
 What returns little light is amplified, its noise and the water's own uncertainty with it. A picture
 is therefore the mean of what J may be (a linear minimum mean square error estimate): where light is
@@ -46,6 +46,10 @@ Array = npt.NDArray[np.float64]
 
 NEAR_QUANTILE = 0.05
 """Share of the observations that are nearer than the range whose colours are kept."""
+LEAST_MEAN = 1e-3
+"""Guards the division by a channel that is black."""
+GAINS = 0.05, 2.0
+"""Bounds of the gain of J; at 0.05 a third of the light is red's first metre in coastal water."""
 PICTURE_NOISE = 0.01
 """Deviation of a pixel's value: two grey levels and a half, as in compressed video."""
 VEIL_ERROR = 0.1
@@ -78,12 +82,10 @@ class WhiteBalance:
     """Map units; the range whose colours are kept."""
     mean: tuple[float, float, float]
     """Mean of J over what was seen, RGB."""
+    gain: tuple[float, float, float]
+    """Of J, RGB: by it what was seen nearest keeps the mean colour that the camera saw."""
     attenuation_sigma: float
     """Relative deviation of the attenuation, mean of RGB."""
-
-    def gain(self, water: Water) -> Tensor:
-        """[3] of J: what it looks like through the water of the near range."""
-        return water.transmission(torch.tensor(self.near_range))
 
     def recover(
         self,
@@ -95,7 +97,7 @@ class WhiteBalance:
         """The balanced picture without water; the module's text derives it."""
         T, veil = water.transmission(z), water.backscatter(z)
         veil = veil if uneven is None else veil * uneven[..., None]
-        mean, white = torch.tensor(self.mean), self.gain(water)
+        mean, white = torch.tensor(self.mean), torch.tensor(self.gain)
         depth = water.beta_a * (z[..., None] - self.near_range).clamp_min(0.0)
         noise = PICTURE_NOISE**2 + (VEIL_ERROR * veil).square()
         noise = noise + (self.attenuation_sigma * depth * mean * T).square()
@@ -114,11 +116,16 @@ class WhiteBalance:
 
 
 def white_balance(
-    seen: Observations,
+    seen: Observations,  # without open water
+    lit: Array,  # [3, M] their colours, evenly lit
     J: Array,  # [3, P] of the points
     relative_sigma: list[float],  # [3] of the attenuation
 ) -> WhiteBalance:
     """Of a dive whose water was fitted to these observations."""
-    red, green, blue = np.maximum(J.mean(axis=1), 1e-3).tolist()
-    near = float(np.quantile(seen.z, NEAR_QUANTILE))
-    return WhiteBalance(near, (red, green, blue), float(np.mean(relative_sigma)))
+    near_range = float(np.quantile(seen.z, NEAR_QUANTILE))
+    near = seen.z <= near_range
+    gains = lit[:, near].mean(axis=1) / np.maximum(J[:, seen.point[near]].mean(axis=1), LEAST_MEAN)
+    gain, mean = np.clip(gains, *GAINS), np.maximum(J.mean(axis=1), LEAST_MEAN)
+    return WhiteBalance(
+        near_range, tuple(mean.tolist()), tuple(gain.tolist()), float(np.mean(relative_sigma))
+    )

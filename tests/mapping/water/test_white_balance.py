@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from aquaflow.mapping.water.image_formation import Water
-from aquaflow.mapping.water.white_balance import WhiteBalance
+from aquaflow.mapping.water.white_balance import GAINS, WhiteBalance, white_balance
+from tests.mapping.water.water_observations import B_RES, D, fitted, sighted
 
 WATER = Water(
     torch.tensor([0.8, 0.3, 0.2]),
@@ -17,23 +19,28 @@ WATER = Water(
     torch.full((3,), 0.01),
     torch.ones(3),
 )
-BALANCE = WhiteBalance(near_range=0.5, mean=(0.3, 0.3, 0.3), attenuation_sigma=0.1)
+NEAR = torch.tensor(0.5)
+GAIN = WATER.transmission(NEAR) + WATER.backscatter(NEAR) / 0.3
+"""By which a colour of 0.3 looks as it does at the near range."""
+BALANCE = WhiteBalance(
+    near_range=0.5, mean=(0.3, 0.3, 0.3), gain=tuple(GAIN.tolist()), attenuation_sigma=0.1
+)
 
 
 def seen(J: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
     return J * WATER.transmission(z) + WATER.backscatter(z)
 
 
-def test_what_is_nearest_keeps_the_camera_s_colours_but_for_the_veil() -> None:
-    J, z = torch.rand(4, 5, 3, generator=torch.Generator().manual_seed(0)), torch.full((4, 5), 0.5)
-    image = seen(J, z)
+def test_what_is_nearest_keeps_the_camera_s_colours() -> None:
+    z = torch.full((4, 5), 0.5)
+    image = seen(torch.full((4, 5, 3), 0.3), z)
     restored = BALANCE.recover(image, z, WATER).picture
-    torch.testing.assert_close(restored, image - WATER.backscatter(z), atol=0.03, rtol=0.0)
+    torch.testing.assert_close(restored, image, atol=0.01, rtol=0.0)
 
 
 def test_grey_things_stay_grey_at_any_range_that_light_comes_from() -> None:
     z = torch.linspace(0.5, 2.5, 40).reshape(4, 10)
-    J = 0.4 / BALANCE.gain(WATER) * torch.ones(4, 10, 3)  # grey in the near white balance
+    J = 0.4 / GAIN * torch.ones(4, 10, 3)  # grey in the near white balance
     restored = BALANCE.recover(seen(J, z), z, WATER).picture
     assert float((restored - restored.mean(dim=-1, keepdim=True)).abs().max()) < 0.06
 
@@ -41,7 +48,7 @@ def test_grey_things_stay_grey_at_any_range_that_light_comes_from() -> None:
 def test_where_no_light_comes_back_the_scene_s_mean_stands_in() -> None:
     z = torch.full((2, 2), 50.0)
     restored = BALANCE.recover(WATER.B_inf.expand(2, 2, 3), z, WATER).picture
-    expected = torch.tensor(BALANCE.mean) * BALANCE.gain(WATER)
+    expected = torch.tensor(BALANCE.mean) * GAIN
     torch.testing.assert_close(restored, expected.expand(2, 2, 3), atol=0.02, rtol=0.0)
 
 
@@ -50,7 +57,7 @@ def test_a_channel_without_light_follows_the_others() -> None:
     z = torch.full((1, 2), 2.0)
     J = torch.tensor([[[0.1, 0.1, 0.1], [0.6, 0.6, 0.6]]])
     image = J * water.transmission(z) + water.backscatter(z)
-    balance = WhiteBalance(near_range=0.0, mean=(0.3, 0.3, 0.3), attenuation_sigma=0.0)
+    balance = WhiteBalance(0.0, (0.3, 0.3, 0.3), (1.0, 1.0, 1.0), 0.0)
     restored = balance.recover(image, z, water).picture
     assert float(restored[0, 1, 0]) > float(restored[0, 0, 0]) + 0.2
 
@@ -64,7 +71,7 @@ def test_the_confidence_falls_with_range_and_is_none_where_no_light_comes_back()
 
 
 def test_the_confidence_counts_the_channels_that_were_seen() -> None:
-    balance = WhiteBalance(near_range=0.0, mean=(0.3, 0.3, 0.3), attenuation_sigma=0.0)
+    balance = WhiteBalance(0.0, (0.3, 0.3, 0.3), (1.0, 1.0, 1.0), 0.0)
     for seen_channels in range(4):
         beta_a = torch.full((3,), 20.0)
         beta_a[:seen_channels] = 0.0
@@ -82,7 +89,7 @@ def test_the_confidence_is_the_share_of_a_change_that_is_shown() -> None:
         more[..., channel] += 0.01
         change = [BALANCE.recover(seen(each, z), z, WATER) for each in (J, more)]
         step = (change[1].picture - change[0].picture)[..., channel] / 0.01
-        shown.append(float(step / BALANCE.gain(WATER)[channel]))
+        shown.append(float(step / GAIN[channel]))
     confidence = float(BALANCE.recover(seen(J, z), z, WATER).confidence)
     assert confidence == pytest.approx(sum(shown) / 3.0, abs=1e-3)
 
@@ -120,3 +127,26 @@ def test_any_range_gives_a_picture(bad: float) -> None:
         assert bool(torch.isfinite(part).all())
         assert float(part.min()) >= 0.0
     assert float(found.confidence.max()) <= 1.0
+
+
+def test_what_was_seen_nearest_has_on_the_mean_the_colour_that_the_camera_saw() -> None:
+    seen = sighted(noise=0.0)
+    estimate = fitted(seen)
+    balance = estimate.balance
+    assert balance is not None
+    water = Water(
+        *(torch.from_numpy(v).float() for v in (estimate.beta_a, estimate.B_inf, estimate.b)),
+        torch.from_numpy(B_RES).float(),
+        torch.from_numpy(D).float(),
+    )
+    near = seen.z <= balance.near_range
+    colours, z = torch.from_numpy(seen.colour[near]).float(), torch.from_numpy(seen.z[near]).float()
+    restored = balance.recover(colours[None], z[None], water).picture
+    torch.testing.assert_close(restored.mean(dim=(0, 1)), colours.mean(dim=0), atol=0.02, rtol=0.0)
+
+
+def test_a_channel_that_is_black_has_a_bounded_gain() -> None:
+    seen = sighted(points=140, sightings=3)
+    balance = white_balance(seen, seen.colour.T, np.zeros((3, seen.points)), [0.1, 0.1, 0.1])
+    assert max(balance.gain) <= GAINS[1]
+    assert min(balance.mean) > 0.0

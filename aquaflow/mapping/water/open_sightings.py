@@ -1,0 +1,67 @@
+"""Open water in the pictures as observations: what backscatter looks like at infinity."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.mapping.water.observations import Observations
+from aquaflow.mapping.water.open_water import open_water
+from aquaflow.mapping.water.parameters import Trial
+from aquaflow.mapping.water.posed_picture import PosedPicture
+from aquaflow.mapping.water.shading import gain_map
+
+Array = npt.NDArray[np.float64]
+
+COLUMNS, ROWS = 8, 6
+"""Cells of a picture; one that is all open water gives an observation, its mean colour. Water is
+smooth: finer cells say the same again."""
+INFINITE = 1e3
+"""Range of open water over the median range of the surface: no light of a surface is left."""
+
+
+def with_open_water(
+    seen: Observations,
+    pictures: Sequence[PosedPicture],
+    trial: Trial,  # the water as found without
+) -> Observations:
+    """The observations, and those of what looks like open water by that trial; a point each."""
+    views, cells, colours = [], [], []
+    for view in range(min(len(pictures), len(trial.exposure))):
+        xy, colour = _open_cells(pictures[view], trial, view)
+        views.append(np.full(len(xy), view))
+        cells.append(xy)
+        colours.append(colour)
+    count = sum(len(each) for each in views)
+    if count == 0:
+        return seen
+    return replace(
+        seen,
+        point=np.concatenate([seen.point, seen.points + np.arange(count)]),
+        view=np.concatenate([seen.view, *views]),
+        colour=np.concatenate([seen.colour, *colours]),
+        z=np.concatenate([seen.z, np.full(count, INFINITE * seen.median_range)]),
+        xy=np.concatenate([seen.xy, *cells]),
+    )
+
+
+def _open_cells(picture: PosedPicture, trial: Trial, view: int) -> tuple[Array, Array]:
+    """Centres [Q, 2] of a view's open cells, each axis from -1 to 1, and mean colours [Q, 3]."""
+    image = picture.half_size()
+    height, width = image.shape[:2]
+    lit = gain_map(trial.shading, height, width)[..., None] * np.exp(trial.exposure[view])
+    B_inf = gain_map(trial.unevenness, height, width)[..., None] * trial.B_inf
+    is_open = open_water((image / lit).astype(np.float32), B_inf.astype(np.float32))
+    is_open &= picture.shows_scene()
+    xy, colours = [], []
+    for rows in np.array_split(np.arange(height), ROWS):
+        for columns in np.array_split(np.arange(width), COLUMNS):
+            cell = np.ix_(rows, columns)
+            if is_open[cell].all():
+                centre = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
+                xy.append(centre / (0.5 * width, 0.5 * height) - 1.0)
+                colours.append(image[cell].mean(axis=(0, 1)))
+    return np.array(xy).reshape(-1, 2), np.array(colours, np.float64).reshape(-1, 3)

@@ -1,0 +1,137 @@
+"""The water's fit: when it begins, a few steps at a time, and what interrupts it."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+
+import numpy as np
+import pytest
+import torch
+
+from aquaflow.config import MediumConfig
+from aquaflow.errors.failures import Failures
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.scene import Scene
+from aquaflow.mapping.views import View
+from aquaflow.mapping.water.estimation import WaterEstimate
+from aquaflow.mapping.water_fitting import STEPS, WaterFitting
+from tests.mapping.mapping_scenes import filmed, floor, pose, renderer, settings, view_of, water
+
+PAUSES = 5
+
+
+def views(count: int) -> list[View]:
+    return [view_of(np.zeros((2, 2, 3), np.uint8), index=index) for index in range(count)]
+
+
+class Looked:
+    """A scene whose fits take PAUSES pauses and find nothing; it notes what they looked at."""
+
+    def __init__(self, fails: bool = False) -> None:
+        self.fits: list[list[int]] = []
+        self.fails = fails
+
+    def fitting_water(
+        self, views: Sequence[View], _: torch.Generator
+    ) -> Generator[None, None, tuple[WaterEstimate | None, list[View]]]:
+        self.fits.append([view.frame_index for view in views])
+        for _ in range(PAUSES):
+            yield
+        if self.fails:
+            raise ArithmeticError("no water can be this")
+        return None, []
+
+
+def fitting(scene: Looked, **config: int) -> WaterFitting:
+    settings = MediumConfig.model_validate(config)
+    return WaterFitting(settings, scene, torch.Generator(), Failures())  # type: ignore[arg-type]
+
+
+def test_a_fit_begins_at_its_view_count_and_at_every_doubling() -> None:
+    scene = Looked()
+    paced = fitting(scene, first_fit_views=3)
+    dive = views(40)
+    began = []
+    for count in range(1, 41):
+        before = len(scene.fits)
+        paced.go_on(dive[:count])
+        began += [count] if len(scene.fits) > before else []
+    assert began == [3, 2 * 5, 2 * 12]  # each ends two views later
+
+
+def test_only_a_few_steps_are_made_with_each_view() -> None:
+    paced = fitting(Looked(), first_fit_views=2)
+    ended = [paced.go_on(views(2)) for _ in range(PAUSES // STEPS + 1)]
+    assert ended == [False] * (PAUSES // STEPS) + [True]
+
+
+def test_at_once_is_a_whole_fit() -> None:
+    scene = Looked()
+    paced = fitting(scene)
+    paced.at_once(views(7))
+    assert scene.fits == [list(range(7))]
+    assert not paced.go_on(views(8))
+
+
+def test_a_fit_looks_at_views_spread_over_the_whole_dive() -> None:
+    scene = Looked()
+    fitting(scene, fit_views=4).at_once(views(31))
+    assert scene.fits == [[0, 10, 20, 30]]
+
+
+def test_a_fit_whose_keyframes_have_moved_begins_again() -> None:
+    scene = Looked()
+    paced = fitting(scene, first_fit_views=2)
+    paced.go_on(views(2))
+    paced.begin_again()
+    paced.go_on(views(3))
+    assert scene.fits == [[0, 1], [0, 1, 2]]
+
+
+def test_a_fit_that_fails_is_counted_and_not_tried_again_at_once() -> None:
+    scene, failures = Looked(fails=True), Failures(strict=False)
+    config = MediumConfig.model_validate({"first_fit_views": 2})
+    paced = WaterFitting(config, scene, torch.Generator(), failures)  # type: ignore[arg-type]
+    for _ in range(PAUSES):
+        paced.go_on(views(3))
+    assert len(scene.fits) == 1
+    assert failures.total == 1
+
+
+def submerged() -> Mapper:
+    mapper = Mapper(settings(medium={"enabled": True}), renderer(), 0)
+    mapper.scene.gaussians = floor(columns=18, rows=14)
+    poses = [pose((0.02 * i, 0.0, -0.35 * i)) for i in range(5)]
+    mapper.views = filmed(mapper.gaussians, poses, water(beta=0.3, b=0.3))
+    return mapper
+
+
+def test_a_fit_to_the_maps_own_views_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    mapper = submerged()
+    with caplog.at_level("INFO", logger="aquaflow.mapping.water_fitting"):
+        mapper.water_fitting.at_once(mapper.views)
+    assert "water fitted" in caplog.text
+    assert mapper.scene.beta_a_sigma is not None
+
+
+def test_a_view_whose_pixels_were_deleted_meanwhile_is_left_out() -> None:
+    mapper = submerged()
+    steps = mapper.scene.fitting_water(mapper.views, torch.Generator().manual_seed(0))
+    next(steps)
+    mapper.views[2].delete_pixels()
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            _, fitted = end.value
+            break
+    assert mapper.views[2] not in fitted
+    assert len(fitted) == len(mapper.views) - 1
+
+
+def test_nothing_changes_before_the_end_of_a_fit() -> None:
+    mapper = submerged()
+    before = mapper.medium.state_dict()["b_raw"].clone()
+    for _ in mapper.scene.fitting_water(mapper.views, torch.Generator().manual_seed(0)):
+        assert torch.equal(mapper.medium.state_dict()["b_raw"], before)
+    assert isinstance(mapper.scene, Scene)
