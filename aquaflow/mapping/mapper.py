@@ -157,7 +157,7 @@ class Mapper:
         if self.neural is not None:
             self.neural.move(moved)
         move_views(self.views, moves)
-        self.water_fitting.begin_again()
+        self.water_fitting.moved(moves)
 
     def absorb(self, other: Mapper) -> None:
         """Take over another sub-map's Gaussians and views, already moved into this one's world.
@@ -208,6 +208,8 @@ class Mapper:
                     break
                 if progress is not None:
                     progress(step + 1, steps)
+        with self.failures.contain("white balance"):
+            self.scene.rebalance()
 
     def _contained_step(self, stage: str, view: View, refine_poses: bool) -> None:
         """The first view's pose is never refined: it fixes the map's frame."""

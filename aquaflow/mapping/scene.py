@@ -21,10 +21,11 @@ from aquaflow.mapping.water.estimation import WaterEstimate, estimating, models_
 from aquaflow.mapping.water.exposure import gain_of, learn_gain, set_log_gains
 from aquaflow.mapping.water.image_formation import Water
 from aquaflow.mapping.water.medium import Medium
+from aquaflow.mapping.water.nearest import Nearest, kept_by
 from aquaflow.mapping.water.open_water import open_water
 from aquaflow.mapping.water.posed_picture import PosedPicture
 from aquaflow.mapping.water.selection import finished
-from aquaflow.mapping.water.shading import TERMS, gain_map
+from aquaflow.mapping.water.shading import TERMS, gain_map, shading_basis
 from aquaflow.mapping.water.sightings import sight
 from aquaflow.mapping.water.sunlight import Sunlight
 from aquaflow.mapping.water.white_balance import Recovered, WhiteBalance
@@ -57,6 +58,8 @@ class Scene:
         """Relative standard deviation of beta_a in the last fit; None before it."""
         self.balance: WhiteBalance | None = None
         """What restored pictures are shown in; None before the first fit, and without water."""
+        self._seen_nearest: tuple[Nearest, list[View]] | None = None
+        """What the views of the last fit showed nearest."""
         self.range_variance: tuple[float, float] | None = None
         """Of the points' colours in the last fit, with the water and without; None before it."""
         self._gains: dict[tuple[str, int, int], Tensor] = {}
@@ -238,6 +241,22 @@ class Scene:
             return torch.ones(3)
         return torch.tensor(self.balance.gain)
 
+    @torch.no_grad()
+    def rebalance(self) -> None:
+        """After steps that changed medium and exposures: what is nearest keeps its colours."""
+        if self.balance is None or self._seen_nearest is None or not self.medium.active:
+            return
+        near, views = self._seen_nearest
+        basis, water = shading_basis(near.xy), self.medium(torch.eye(3))
+        log_gain = (basis @ self.shading)[:, None]
+        if self.exposes:
+            log_gain = log_gain + np.stack([view.log_gain for view in views])[near.view]
+        z = torch.from_numpy(near.z).to(torch.float32)
+        T, veil = (part.double().numpy() for part in (water.transmission(z), water.backscatter(z)))
+        veil = veil * np.exp(basis @ self.medium.unevenness.double().numpy())[:, None]
+        clean = np.maximum(near.colour / np.exp(log_gain) - veil, 0.0) / T
+        self.balance = replace(self.balance, gain=kept_by(near, clean.T))
+
     def fit_water(
         self,
         views: list[View],
@@ -318,6 +337,8 @@ class Scene:
         self.shading, self.exposes = estimate.shading, estimate.model.exposure
         self.beta_a_sigma, self.water_evidence = estimate.beta_a_sigma, estimate.evidence
         self.balance, self.range_variance = estimate.balance, estimate.range_variance
+        if estimate.nearest is not None:
+            self._seen_nearest = estimate.nearest, list(fitted)
         self._gains.clear()
         set_log_gains(dive, fitted, estimate.exposure)
 

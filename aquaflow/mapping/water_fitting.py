@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 
 import numpy as np
 import torch
 
 from aquaflow.config import MediumConfig
 from aquaflow.errors.failures import Failures
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.views import View, in_time
 from aquaflow.mapping.water.selection import finished
 
 log = logging.getLogger(__name__)
 
+OTHER_UNIT = 0.02
+"""Relative change of scale from which on ranges seen before and after do not belong together.
+Places that moved are left out one by one, where the map's range no longer agrees."""
 STEPS = 2
-"""Of a fit with each new view: at 480 px one of them, a picture of the map or three steps of the
+"""Of a fit with each new view: at 480 px one of them, a picture of the map or a few steps of the
 solver, takes 10 to 30 ms of two cores."""
 
 
@@ -56,6 +60,11 @@ class WaterFitting:
         with self.failures.contain("water fit"):
             finished(self._fitting(views))
         self._end(views)
+
+    def moved(self, moves: Mapping[int, Sim3]) -> None:
+        """Keyframes have moved: a fit under way begins again if the map's unit did."""
+        if any(abs(move.scale - 1.0) > OTHER_UNIT for move in moves.values()):
+            self.begin_again()
 
     def begin_again(self) -> None:
         """Drop a fit that is under way: what it has seen is no longer where it was. It begins again

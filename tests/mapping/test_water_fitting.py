@@ -10,6 +10,7 @@ import torch
 
 from aquaflow.config import MediumConfig
 from aquaflow.errors.failures import Failures
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.views import View
@@ -79,13 +80,16 @@ def test_a_fit_looks_at_views_spread_over_the_whole_dive() -> None:
     assert scene.fits == [[0, 10, 20, 30]]
 
 
-def test_a_fit_whose_keyframes_have_moved_begins_again() -> None:
+def test_a_fit_begins_again_when_the_maps_unit_has_changed() -> None:
     scene = Looked()
     paced = fitting(scene, first_fit_views=2)
     paced.go_on(views(2))
-    paced.begin_again()
+    paced.moved({0: Sim3(np.eye(3), np.array([0.1, 0.0, 0.0]), 1.001)})
     paced.go_on(views(3))
-    assert scene.fits == [[0, 1], [0, 1, 2]]
+    assert len(scene.fits) == 1
+    paced.moved({0: Sim3(np.eye(3), np.zeros(3), 1.1)})
+    paced.go_on(views(4))
+    assert scene.fits == [[0, 1], [0, 1, 2, 3]]
 
 
 def test_a_fit_that_fails_is_counted_and_not_tried_again_at_once() -> None:

@@ -27,13 +27,14 @@ import numpy.typing as npt
 from aquaflow.config import MediumConfig, WaterPriorsConfig
 from aquaflow.mapping.water.clear import attenuation_covariance, log_odds_clear
 from aquaflow.mapping.water.model import BELIEVED, WaterModel
+from aquaflow.mapping.water.nearest import Nearest, nearest_of, white_balance
 from aquaflow.mapping.water.observations import Observations, variance_over_range
 from aquaflow.mapping.water.open_sightings import with_open_water
 from aquaflow.mapping.water.parameters import Model
 from aquaflow.mapping.water.posed_picture import PosedPicture
 from aquaflow.mapping.water.selection import finished, fit_likeliest
 from aquaflow.mapping.water.solver import Fit
-from aquaflow.mapping.water.white_balance import WhiteBalance, white_balance
+from aquaflow.mapping.water.white_balance import WhiteBalance
 
 Array = npt.NDArray[np.float64]
 
@@ -44,8 +45,9 @@ WATER_IS_USUAL = 5.0
 NEGLIGIBLE_DEPTH = 0.06
 """Optical depth at the median range up to which no eye sees water: as much as maps lose anyway
 (blur.py)."""
-VISIBLE_DEPTH = 0.25
-"""Optical depth at the median range from which water shows: a fifth of the light is gone."""
+VISIBLE_DEPTH = 0.12
+"""Optical depth at the median range from which water shows: a ninth of the light is gone. Rendered
+scenes without water look like 0.02 to 0.05."""
 EVERY_MODEL = tuple(
     Model(*parts) for parts in product((False, True), repeat=4) if Model(*parts).is_possible
 )
@@ -75,6 +77,8 @@ class WaterEstimate:
     evidence: float | None
     """Log odds of water against clear water or none, WATER_IS_USUAL not counted; None: only one of
     the two was tried."""
+    nearest: Nearest | None
+    """What was seen nearest; None without water."""
     balance: WhiteBalance | None
     """What restored pictures are shown in; None without water."""
     range_variance: tuple[float, float]
@@ -135,24 +139,25 @@ def estimating(
     if extended.points > observations.points:
         wet_models = [model for model in models if model.water]
         (wet,) = yield from fit_likeliest(problems(extended, wet_models))
-    return _estimate(observations, wet, odds)
+    return _estimate(observations, wet, odds, pictures)
 
 
-def _estimate(observations: Observations, best: Fit, odds: float | None) -> WaterEstimate:
+def _estimate(
+    observations: Observations, best: Fit, odds: float | None, pictures: Sequence[PosedPicture] = ()
+) -> WaterEstimate:
     """What the fit, perhaps to open water too, says of the observations of the surface."""
-    trial, rows = best.prediction.trial, len(observations.z)
-    J = best.prediction.J[:, : observations.points]
-    seen = variance_over_range(observations, observations.colour)
-    sigma = balance = None
-    restored = seen
-    if best.problem.model.water:
-        lit = observations.colour.T / best.prediction.gain[:, :rows]
+    seen, trial, water = observations, best.prediction.trial, best.problem
+    range_variance = [variance_over_range(seen, seen.colour)] * 2
+    sigma = nearest = balance = None
+    if water.model.water:
         sigma = _beta_a_sigma(best)
-        balance = white_balance(observations, lit, J, sigma)
-        without = best.problem.without_water(best.prediction)[:, :rows].T
-        restored = variance_over_range(observations, without)
+        J = best.prediction.J[:, : seen.points]
+        nearest = nearest_of(seen, pictures, trial)
+        balance = white_balance(nearest, water, trial, J, sigma)
+        clean = water.without_water(trial, seen.view, seen.xy, seen.z, seen.colour)
+        range_variance[1] = variance_over_range(seen, clean.T)
     return WaterEstimate(
-        best.problem.model,
+        water.model,
         trial.beta_a,
         trial.B_inf,
         trial.b,
@@ -161,8 +166,9 @@ def _estimate(observations: Observations, best: Fit, odds: float | None) -> Wate
         trial.shading,
         trial.exposure,
         odds,
+        nearest,
         balance,
-        (seen, restored),
+        (range_variance[0], range_variance[1]),
     )
 
 

@@ -78,6 +78,7 @@ class WaterModel(Parameters):
         super().__init__(model, int(seen.view.max()) + 1, seen.median_range, priors)
         self.seen = seen
         self._regions = RegionalColours(seen.region)
+        self._B_res, self._d = B_res, d
         self._near = B_res[:, None] * np.exp(-d[:, None] * seen.z)
         self._basis = np.ascontiguousarray(shading_basis(seen.xy).T)
         self._colour = np.ascontiguousarray(seen.colour.T)
@@ -91,25 +92,41 @@ class WaterModel(Parameters):
         trial, seen = self.trial(x), self.seen
         gain = _gain(trial.exposure.T[:, seen.view] + trial.shading @ self._basis)
         a = gain * np.exp(-trial.beta_a[:, None] * seen.z)
-        backscatter = gain * self._backscatter(trial)
+        backscatter = gain * self._backscatter(trial, seen.z, self._basis, self._near)
         weighed = a if weight is None else weight * a
         own = self._colour - backscatter
         power = np.maximum(seen.sums_by_point(weighed * a), TINY)
         J = np.maximum(seen.sums_by_point(weighed * own) / power, 0.0)
         return Prediction(trial, gain, a, backscatter, J, a * J[:, seen.point] - own, power)
 
-    def _backscatter(self, trial: Trial) -> Array:
-        """[3, M] before the camera's gain."""
-        if not self.model.water:
-            return np.zeros_like(self._near)
-        grown = -np.expm1(-trial.b[:, None] * self.seen.z)
-        uneven = _gain(trial.unevenness @ self._basis)
-        return np.asarray(uneven * (trial.B_inf[:, None] * grown + self._near))
+    def without_water(
+        self,
+        trial: Trial,
+        view: Index,  # [N]
+        xy: Array,  # [N, 2] each axis from -1 to 1
+        z: Array,  # [N] map units
+        colour: Array,  # [N, 3] as the camera saw it
+    ) -> Array:
+        """[3, N] any pixels of the views without what lies between."""
+        basis = np.ascontiguousarray(shading_basis(xy).T)
+        lit = colour.T / _gain(trial.exposure.T[:, view] + trial.shading @ basis)
+        near = self._B_res[:, None] * np.exp(-self._d[:, None] * z)
+        veil = self._backscatter(trial, z, basis, near)
+        T = np.maximum(np.exp(-trial.beta_a[:, None] * z), TINY)
+        return np.maximum((lit - veil) / T, 0.0)
 
-    def without_water(self, now: Prediction) -> Array:
-        """[3, M] what each observation would be without what lies between."""
-        light = self._colour - now.backscatter
-        return np.maximum(light / np.maximum(now.a, TINY), 0.0)
+    def _backscatter(
+        self,
+        trial: Trial,
+        z: Array,  # [N]
+        basis: Array,  # [5, N]
+        near: Array,  # [3, N] its residual close by
+    ) -> Array:
+        """[3, N] before the camera's gain."""
+        if not self.model.water:
+            return np.zeros_like(near)
+        grown = -np.expm1(-trial.b[:, None] * z)
+        return np.asarray(_gain(trial.unevenness @ basis) * (trial.B_inf[:, None] * grown + near))
 
     def derivatives(
         self,

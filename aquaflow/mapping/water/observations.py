@@ -14,6 +14,9 @@ from aquaflow.mapping.water.regions import regions_of
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
+OPEN_WATER_ERROR = 2.0
+"""Standard deviation of open water's errors over that of a patch: what looks open may be ground
+that is dim and far. Taken at its word, beta_a of murky rendered dives was 5 to 10 % too small."""
 LEAST_COLOUR = 0.02
 """Guards the division by a black patch's colour."""
 
@@ -49,6 +52,11 @@ class Observations:
         on_surface = self.point < self.surface
         region = self.region[np.where(on_surface, self.point, 0)]
         return np.where(on_surface, region, int(self.region.max(initial=-1)) + 1 + self.view)
+
+    @cached_property
+    def error_scale(self) -> Array:
+        """[M] standard deviation of the error over that of a patch of surface."""
+        return np.where(self.point < self.surface, 1.0, OPEN_WATER_ERROR)
 
     @cached_property
     def median_range(self) -> float:

@@ -57,6 +57,10 @@ class PosedPicture:
         """[ceil(H / 2), ceil(W / 2)] False where the vehicle is."""
         return self._shows_scene[::2, ::2]
 
+    def surface_ranges(self) -> npt.NDArray[np.float32]:
+        """[ceil(H / 2), ceil(W / 2)] range of the surface, infinite where the map has none."""
+        return np.where(self._solid, self._z, np.float32(np.inf))[::2, ::2]
+
     def random_surface(
         self,
         count: int,

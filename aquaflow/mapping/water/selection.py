@@ -55,10 +55,8 @@ def _likeliest(
 ) -> Generator[None, None, Fit]:
     """The likeliest of the problems, fitted."""
     best: tuple[float, WaterModel, Array] | None = None
-    fits = []
     for rich in _richest(problems):
         fit = yield from descend(rich, rich.adopt(first.problem, first.x), noise)
-        fits.append(fit)
         for problem in problems:
             if _contains(rich, problem):
                 candidate = without(fit, problem)
@@ -66,8 +64,11 @@ def _likeliest(
         yield
     assert best is not None
     _, problem, x = best
-    same = [fit for fit in fits if fit.problem.model == problem.model]
-    return same[0] if same else (yield from descend(problem, x, noise))
+    # One channel may be stuck where its backscatter grows at once: tried from two sides.
+    last = []
+    for start in (x, problem.start):
+        last.append((yield from descend(problem, start, noise)))
+    return max(last, key=lambda fit: fit.log_evidence)
 
 
 def _richest(problems: Sequence[WaterModel]) -> Iterator[WaterModel]:

@@ -3,8 +3,8 @@
 Detail is lost with range: a far pixel covers more of the scene, and its light scatters more. What
 is lost that way looks like water if points are compared. So patches are, all of one size in the
 world in every view, and so large that the farthest view that shows one still resolves it: on
-rendered dives in clear water the contrast of patches changes with range by a hundredth of an
-optical depth or less, on real clips the water that is found does not depend on their size from 1 to
+rendered dives the contrast of patches changes with range by a hundredth of an optical depth or two,
+on real clips the water that is found does not depend on their size from 1 to
 8 pixels.
 
 A patch is a grid of samples on the surface, lifted from the nearest view by the map's range. Each

@@ -34,22 +34,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from aquaflow.mapping.water.image_formation import MAX_RESTORED, Water
-from aquaflow.mapping.water.observations import Observations
 
-Array = npt.NDArray[np.float64]
-
-NEAR_QUANTILE = 0.05
-"""Share of the observations that are nearer than the range whose colours are kept."""
-LEAST_MEAN = 1e-3
-"""Guards the division by a channel that is black."""
-GAINS = 0.05, 2.0
-"""Bounds of the gain of J; at 0.05 a third of the light is red's first metre in coastal water."""
 PICTURE_NOISE = 0.01
 """Deviation of a pixel's value: two grey levels and a half, as in compressed video."""
 VEIL_ERROR = 0.1
@@ -113,19 +102,3 @@ class WhiteBalance:
             own * white,
             torch.minimum(1.0 / T, deviation / (2.0 * noise.sqrt())) * white,
         )
-
-
-def white_balance(
-    seen: Observations,  # without open water
-    lit: Array,  # [3, M] their colours, evenly lit
-    J: Array,  # [3, P] of the points
-    relative_sigma: list[float],  # [3] of the attenuation
-) -> WhiteBalance:
-    """Of a dive whose water was fitted to these observations."""
-    near_range = float(np.quantile(seen.z, NEAR_QUANTILE))
-    near = seen.z <= near_range
-    gains = lit[:, near].mean(axis=1) / np.maximum(J[:, seen.point[near]].mean(axis=1), LEAST_MEAN)
-    gain, mean = np.clip(gains, *GAINS), np.maximum(J.mean(axis=1), LEAST_MEAN)
-    return WhiteBalance(
-        near_range, tuple(mean.tolist()), tuple(gain.tolist()), float(np.mean(relative_sigma))
-    )

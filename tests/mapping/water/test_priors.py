@@ -69,7 +69,7 @@ def test_every_prior_has_its_part_in_the_gradient(priors: WaterPriorsConfig) -> 
     explained = replace(seen, colour=no_black.T)
     problem = WaterModel(explained, model, B_RES, D, priors)
     unbelieving = WaterModel(explained, model, B_RES, D, WaterPriorsConfig(**NOTHING))
-    weight = weights(problem.predict(x).errors, noise)
+    weight = weights(problem, problem.predict(x), noise)
     now = problem.predict(x, weight)
     assert cost(problem, x, now, noise) > cost(unbelieving, x, now, noise)
     _, gradient = normal_equations(problem, x, now, weight)

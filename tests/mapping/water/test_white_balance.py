@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 import torch
 
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.mapping.views import View
 from aquaflow.mapping.water.image_formation import Water
-from aquaflow.mapping.water.white_balance import GAINS, WhiteBalance, white_balance
-from tests.mapping.water.water_observations import B_RES, D, fitted, sighted
+from aquaflow.mapping.water.nearest import GAINS, Nearest, kept_by, nearest_of
+from aquaflow.mapping.water.parameters import Trial
+from aquaflow.mapping.water.posed_picture import PosedPicture
+from aquaflow.mapping.water.white_balance import WhiteBalance
+from tests.mapping.water.water_observations import B_INF, B_RES, BETA, B, D, fitted, sighted
 
 WATER = Water(
     torch.tensor([0.8, 0.3, 0.2]),
@@ -139,14 +145,42 @@ def test_what_was_seen_nearest_has_on_the_mean_the_colour_that_the_camera_saw() 
         torch.from_numpy(B_RES).float(),
         torch.from_numpy(D).float(),
     )
-    near = seen.z <= balance.near_range
-    colours, z = torch.from_numpy(seen.colour[near]).float(), torch.from_numpy(seen.z[near]).float()
+    near = estimate.nearest
+    assert near is not None
+    colours, z = torch.from_numpy(near.colour).float(), torch.from_numpy(near.z).float()
     restored = balance.recover(colours[None], z[None], water).picture
     torch.testing.assert_close(restored.mean(dim=(0, 1)), colours.mean(dim=0), atol=0.02, rtol=0.0)
 
 
 def test_a_channel_that_is_black_has_a_bounded_gain() -> None:
-    seen = sighted(points=140, sightings=3)
-    balance = white_balance(seen, seen.colour.T, np.zeros((3, seen.points)), [0.1, 0.1, 0.1])
-    assert max(balance.gain) <= GAINS[1]
-    assert min(balance.mean) > 0.0
+    near = Nearest(np.zeros(4, np.int64), np.zeros((4, 2)), np.ones(4), np.full((4, 3), 0.5))
+    assert kept_by(near, np.zeros((3, 4))) == (GAINS[1],) * 3
+
+
+CAMERA = CameraModel(width=160, height=120, fx=140.0, fy=140.0, cx=80.0, cy=60.0)
+
+
+def test_the_nearest_tenth_of_the_surface_is_kept_and_open_water_is_no_surface() -> None:
+    """The map has Gaussians in open water, nearer than all else."""
+    image = np.random.default_rng(0).integers(20, 200, (120, 160, 3)).astype(np.uint8)
+    image[:60] = np.rint(255.0 * B_INF)
+    z = np.linspace(3.0, 1.0, 120, dtype=np.float32)[:, None].repeat(160, axis=1)
+    z[:60] = 0.2
+    view = View(0, image, CAMERA, Sim3(np.eye(3), np.zeros(3)), 0, robust=False)
+    picture = PosedPicture(view, torch.from_numpy(z), torch.ones(120, 160))
+    trial = Trial(BETA, B, B_INF, np.zeros(5), np.zeros(5), np.zeros((1, 3)))
+    near = nearest_of(sighted(points=120), [picture], trial)
+    assert near.z.min() == pytest.approx(1.0, abs=0.02)
+    assert near.z.max() < 1.2
+    assert near.xy[:, 1].min() > 0.8
+    assert set(near.view.tolist()) == {0}
+
+
+def test_without_pictures_the_nearest_observations_of_each_view_are_kept() -> None:
+    seen = sighted(points=200)
+    trial = Trial(BETA, B, B_INF, np.zeros(5), np.zeros(5), np.zeros((4, 3)))
+    near = nearest_of(seen, [], trial)
+    for view in range(4):
+        share = (near.view == view).sum() / (seen.view == view).sum()
+        assert share == pytest.approx(0.1, abs=0.02)
+        assert near.z[near.view == view].max() < np.quantile(seen.z[seen.view == view], 0.11)
