@@ -23,10 +23,10 @@ from aquaflow.mapping.water.image_formation import Water
 from aquaflow.mapping.water.medium import Medium
 from aquaflow.mapping.water.nearest import Nearest, kept_by
 from aquaflow.mapping.water.open_water import open_water
+from aquaflow.mapping.water.pauses import finished
 from aquaflow.mapping.water.posed_picture import PosedPicture
-from aquaflow.mapping.water.selection import finished
 from aquaflow.mapping.water.shading import TERMS, gain_map, shading_basis
-from aquaflow.mapping.water.sightings import sight
+from aquaflow.mapping.water.sightings import sighting
 from aquaflow.mapping.water.sunlight import Sunlight
 from aquaflow.mapping.water.white_balance import Recovered, WhiteBalance
 from aquaflow.render.contract import Renderer
@@ -289,7 +289,7 @@ class Scene:
         if not fitted:
             return None, []
         seed = int(torch.randint(2**31, (1,), generator=generator))
-        seen = sight(pictures, np.random.default_rng(seed))
+        seen = yield from sighting(pictures, np.random.default_rng(seed))
         yield
         with torch.no_grad():
             sea = self.medium(torch.from_numpy(fitted[0].T_wc.R).to(torch.float32))

@@ -14,7 +14,7 @@ from aquaflow.errors.failures import Failures
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.views import View, in_time
-from aquaflow.mapping.water.selection import finished
+from aquaflow.mapping.water.pauses import finished
 
 log = logging.getLogger(__name__)
 

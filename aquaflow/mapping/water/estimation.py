@@ -31,8 +31,9 @@ from aquaflow.mapping.water.nearest import Nearest, nearest_of, white_balance
 from aquaflow.mapping.water.observations import Observations, variance_over_range
 from aquaflow.mapping.water.open_sightings import with_open_water
 from aquaflow.mapping.water.parameters import Model
+from aquaflow.mapping.water.pauses import finished
 from aquaflow.mapping.water.posed_picture import PosedPicture
-from aquaflow.mapping.water.selection import finished, fit_likeliest
+from aquaflow.mapping.water.selection import fit_likeliest
 from aquaflow.mapping.water.solver import Fit
 from aquaflow.mapping.water.white_balance import WhiteBalance
 
@@ -133,18 +134,18 @@ def estimating(
     odds = None if dry is None or wet is None else log_odds_of_water(dry, wet)
     if wet is None or (odds is not None and _is_clear(wet, odds)):
         assert dry is not None
-        return _estimate(observations, dry, odds)
+        return (yield from _estimate(observations, dry, odds))
     yield
-    extended = with_open_water(observations, pictures, wet.prediction.trial)
+    extended = yield from with_open_water(observations, pictures, wet.prediction.trial)
     if extended.points > observations.points:
         wet_models = [model for model in models if model.water]
         (wet,) = yield from fit_likeliest(problems(extended, wet_models))
-    return _estimate(observations, wet, odds, pictures)
+    return (yield from _estimate(observations, wet, odds, pictures))
 
 
 def _estimate(
     observations: Observations, best: Fit, odds: float | None, pictures: Sequence[PosedPicture] = ()
-) -> WaterEstimate:
+) -> Generator[None, None, WaterEstimate]:
     """What the fit, perhaps to open water too, says of the observations of the surface."""
     seen, trial, water = observations, best.prediction.trial, best.problem
     range_variance = [variance_over_range(seen, seen.colour)] * 2
@@ -152,7 +153,7 @@ def _estimate(
     if water.model.water:
         sigma = _beta_a_sigma(best)
         J = best.prediction.J[:, : seen.points]
-        nearest = nearest_of(seen, pictures, trial)
+        nearest = yield from nearest_of(seen, pictures, trial)
         balance = white_balance(nearest, water, trial, J, sigma)
         clean = water.without_water(trial, seen.view, seen.xy, seen.z, seen.colour)
         range_variance[1] = variance_over_range(seen, clean.T)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -14,6 +14,7 @@ from aquaflow.mapping.water.observations import Observations
 from aquaflow.mapping.water.open_sightings import open_area
 from aquaflow.mapping.water.open_water import WINDOW_PX
 from aquaflow.mapping.water.parameters import Trial
+from aquaflow.mapping.water.pauses import PICTURES_AT_ONCE
 from aquaflow.mapping.water.posed_picture import PosedPicture
 from aquaflow.mapping.water.white_balance import WhiteBalance
 
@@ -41,12 +42,16 @@ class Nearest:
     """[N, 3] as the camera saw it."""
 
 
-def nearest_of(seen: Observations, pictures: Sequence[PosedPicture], trial: Trial) -> Nearest:
-    """In the pictures, open water left out; of the observations, where no picture shows any."""
-    found = [
-        _in_picture(pictures[view], trial, view)
-        for view in range(min(len(pictures), len(trial.exposure)))
-    ]
+def nearest_of(
+    seen: Observations, pictures: Sequence[PosedPicture], trial: Trial
+) -> Generator[None, None, Nearest]:
+    """In the pictures, open water left out; of the observations, where no picture shows any; with
+    pauses."""
+    found = []
+    for number in range(min(len(pictures), len(trial.exposure))):
+        found.append(_in_picture(pictures[number], trial, number))
+        if number % PICTURES_AT_ONCE == PICTURES_AT_ONCE - 1:
+            yield
     found = [near for near in found if len(near.z)] or [_of_observations(seen)]
     view, xy, z, colour = (
         np.concatenate([getattr(near, name) for near in found])

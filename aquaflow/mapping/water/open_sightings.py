@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import replace
 
 import cv2
@@ -12,6 +12,7 @@ import numpy.typing as npt
 from aquaflow.mapping.water.observations import Observations
 from aquaflow.mapping.water.open_water import open_water
 from aquaflow.mapping.water.parameters import Trial
+from aquaflow.mapping.water.pauses import PICTURES_AT_ONCE
 from aquaflow.mapping.water.posed_picture import PosedPicture
 from aquaflow.mapping.water.shading import gain_map
 
@@ -34,14 +35,17 @@ def with_open_water(
     seen: Observations,
     pictures: Sequence[PosedPicture],
     trial: Trial,  # the water as found without
-) -> Observations:
-    """The observations, and those of what looks like open water by that trial; a point each."""
+) -> Generator[None, None, Observations]:
+    """The observations, and those of what looks like open water by that trial, a point each; with
+    pauses."""
     views, cells, colours = [], [], []
     for view in range(min(len(pictures), len(trial.exposure))):
         xy, colour = _open_cells(pictures[view], trial, view)
         views.append(np.full(len(xy), view))
         cells.append(xy)
         colours.append(colour)
+        if view % PICTURES_AT_ONCE == PICTURES_AT_ONCE - 1:
+            yield
     count = sum(len(each) for each in views)
     if count == 0:
         return seen

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import astuple
-from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +18,6 @@ from aquaflow.mapping.water.model import WaterModel
 from aquaflow.mapping.water.solver import Fit, descend
 
 Array = npt.NDArray[np.float64]
-Result = TypeVar("Result")
 
 NOISE = 0.005
 """Least colour noise of one observation, the mean over a patch."""
@@ -101,13 +99,3 @@ def without(fit: Fit, problem: WaterModel) -> tuple[float, WaterModel, Array]:
     log_ratio = -0.5 * (off @ pull + np.linalg.slogdet(block)[1] + np.linalg.slogdet(prior)[1])
     x = fit.x[kept] - covariance[np.ix_(kept, left_out)] @ pull
     return fit.log_evidence + float(log_ratio), problem, x
-
-
-def finished(steps: Generator[None, None, Result]) -> Result:
-    """What a computation with pauses ends with, its pauses left out."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            result: Result = end.value
-            return result

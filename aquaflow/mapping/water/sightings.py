@@ -14,12 +14,13 @@ no observation.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.mapping.water.observations import Observations
+from aquaflow.mapping.water.pauses import PICTURES_AT_ONCE
 from aquaflow.mapping.water.posed_picture import PosedPicture
 
 Array = npt.NDArray[np.float64]
@@ -46,11 +47,15 @@ LEAST_TEXTURE = 0.008
 nothing is known of the range: open water, which a map has anywhere."""
 
 
-def sight(pictures: Sequence[PosedPicture], random: np.random.Generator) -> Observations:
+def sighting(
+    pictures: Sequence[PosedPicture], random: np.random.Generator
+) -> Generator[None, None, Observations]:
     """Observations of a random choice of the surface that several of the pictures, at least one,
-    show."""
+    show; with pauses."""
     places, ranges = _drawn(pictures, random)
+    yield
     samples, sigma = _patches(pictures, places, ranges)
+    yield
     colour, z, xy = (np.zeros((*ranges.shape, size)) for size in (3, 1, 2))
     whole_patches = np.asarray(np.isfinite(samples).all(axis=(1, 2)))
     seen = np.isfinite(ranges) & whole_patches[:, None]
@@ -60,6 +65,8 @@ def sight(pictures: Sequence[PosedPicture], random: np.random.Generator) -> Obse
         for table, values in zip((colour, z, xy), found, strict=True):
             table[own, number] = values
         seen[own, number] = whole
+        if number % PICTURES_AT_ONCE == PICTURES_AT_ONCE - 1:
+            yield
     seen[seen.sum(axis=1) < MIN_VIEWS] = False
     place, view = np.nonzero(seen)
     used, point = np.unique(place, return_inverse=True)

@@ -21,7 +21,8 @@ from aquaflow.mapping.water.estimation import (
 from aquaflow.mapping.water.model import WaterModel
 from aquaflow.mapping.water.observations import Observations
 from aquaflow.mapping.water.parameters import Model
-from aquaflow.mapping.water.selection import finished, without
+from aquaflow.mapping.water.pauses import finished
+from aquaflow.mapping.water.selection import without
 from aquaflow.mapping.water.shading import TERMS, shading_basis
 from aquaflow.mapping.water.solver import cost, descend
 from tests.mapping.water.water_observations import (

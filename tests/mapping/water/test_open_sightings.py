@@ -14,8 +14,8 @@ from aquaflow.mapping.views import View
 from aquaflow.mapping.water.estimation import estimating
 from aquaflow.mapping.water.open_sightings import COLUMNS, ROWS, with_open_water
 from aquaflow.mapping.water.parameters import Trial
+from aquaflow.mapping.water.pauses import finished
 from aquaflow.mapping.water.posed_picture import PosedPicture
-from aquaflow.mapping.water.selection import finished
 from tests.mapping.water.water_observations import B_INF, B_RES, BETA, B, D, fitted, sighted
 
 CAMERA = CameraModel(width=160, height=120, fx=140.0, fy=140.0, cx=80.0, cy=60.0)
@@ -40,7 +40,7 @@ def picture(
 
 def test_each_open_cell_is_an_observation_at_infinity() -> None:
     seen = sighted(points=120)
-    extended = with_open_water(seen, [picture(B_INF)] * 2, trial(2))
+    extended = finished(with_open_water(seen, [picture(B_INF)] * 2, trial(2)))
     rows = slice(len(seen.z), None)
     open_rows = COLUMNS * (ROWS // 2 - 1)  # the cells that touch the floor are not all open
     assert 2 * open_rows <= extended.points - seen.points <= 2 * COLUMNS * ROWS // 2
@@ -56,7 +56,7 @@ def test_each_open_cell_is_an_observation_at_infinity() -> None:
 
 def test_observations_of_one_views_open_water_share_their_errors() -> None:
     seen = sighted(points=120)
-    extended = with_open_water(seen, [picture(B_INF)] * 2, trial(2))
+    extended = finished(with_open_water(seen, [picture(B_INF)] * 2, trial(2)))
     shared = extended.errors_shared[len(seen.z) :]
     assert len(set(shared.tolist())) == 2
     assert min(shared) > max(extended.errors_shared[: len(seen.z)])
@@ -64,15 +64,15 @@ def test_observations_of_one_views_open_water_share_their_errors() -> None:
 
 def test_pictures_without_open_water_add_nothing() -> None:
     seen = sighted(points=120)
-    assert with_open_water(seen, [picture(np.array([0.9, 0.8, 0.1]))], trial(1)) is seen
-    assert with_open_water(seen, [], trial(1)) is seen
+    assert finished(with_open_water(seen, [picture(np.array([0.9, 0.8, 0.1]))], trial(1))) is seen
+    assert finished(with_open_water(seen, [], trial(1))) is seen
 
 
 def test_a_masked_vehicle_is_no_open_water() -> None:
     seen = sighted(points=120)
     mask = np.ones((120, 160), bool)
     mask[:60] = False
-    assert with_open_water(seen, [picture(B_INF, mask)], trial(1)) is seen
+    assert finished(with_open_water(seen, [picture(B_INF, mask)], trial(1))) is seen
 
 
 def test_open_water_pins_what_the_surface_leaves_open() -> None:

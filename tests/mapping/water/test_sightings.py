@@ -12,8 +12,9 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.views import View
 from aquaflow.mapping.water import sightings
 from aquaflow.mapping.water.observations import Observations
+from aquaflow.mapping.water.pauses import finished
 from aquaflow.mapping.water.posed_picture import PosedPicture
-from aquaflow.mapping.water.sightings import MIN_VIEWS, MOST_VIEWS, POINTS, sight
+from aquaflow.mapping.water.sightings import MIN_VIEWS, MOST_VIEWS, POINTS, sighting
 
 Array = npt.NDArray[np.float64]
 
@@ -47,7 +48,7 @@ def wall_picture(
 
 
 def looked(pictures: list[PosedPicture]) -> Observations:
-    return sight(pictures, np.random.default_rng(0))
+    return finished(sighting(pictures, np.random.default_rng(0)))
 
 
 def test_a_patch_has_the_same_colour_from_near_and_far() -> None:
