@@ -48,7 +48,7 @@ def test_a_fit_takes_on_the_water_keeps_the_near_picture_and_improves_the_far_on
     estimate = fitted.fit_water(views, random())
     assert estimate is not None
     after = [fitted.show(view) for view in views]
-    assert float((after[0].image - before[0].image).abs().mean()) < 0.01
+    assert float((after[0].image - before[0].image).abs().mean()) < 0.015
     assert float((after[0].radiance - before[0].radiance).abs().mean()) > 0.03
     wrong, right = (
         (shown[-1].image - views[-1].target()).abs().mean() for shown in (before, after)

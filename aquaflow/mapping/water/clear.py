@@ -20,7 +20,7 @@ OPTICAL_DEPTH, OPTICAL_DEPTH_SIGMA = 0.02, 1.0
 sand, pipe): 0.01 to 0.05."""
 RATIO_SIGMA = 0.15
 """Log of red over green and of blue over green: 0.02 to 0.1 on the same dives."""
-CONTRAST_SIGMA = 0.02
+CONTRAST_SIGMA = 0.03
 """Optical depth, at the median range, by which a scene's contrast changes without water, alike in
 RGB: of 50 rendered dives in water most change by less than 0.01, some by 0.05."""
 ROWS = rate_rows(OPTICAL_DEPTH_SIGMA, RATIO_SIGMA, RATIO_SIGMA)

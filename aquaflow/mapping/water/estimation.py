@@ -45,7 +45,7 @@ WATER_IS_USUAL = 5.0
 """Log odds for water before anything is seen: one dive in 150 is in air or in water as clear."""
 NEGLIGIBLE_DEPTH = 0.06
 """Optical depth at the median range up to which no eye sees water: as much as maps lose anyway
-(blur.py)."""
+(clear.py)."""
 VISIBLE_DEPTH = 0.12
 """Optical depth at the median range from which water shows: a ninth of the light is gone. Rendered
 scenes without water look like 0.02 to 0.05."""

@@ -78,8 +78,8 @@ class Model:
 
     @property
     def is_possible(self) -> bool:
-        """Unevenness takes water, and looks so much like shading that no dive tells of both."""
-        return not self.uneven or (self.water and not self.shading)
+        """Unevenness takes water."""
+        return self.water or not self.uneven
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ CANDIDATES = 4000
 LEAST_SPAN = 0.1
 """Added to the log of largest over smallest range, by which patches are drawn: those seen from near
 and far say most, those seen from one range alone something of the scene's colours."""
-MIN_VIEWS, MOST_VIEWS = 4, 8
+MIN_VIEWS, MOST_VIEWS = 3, 8
 """Views that must see a patch for it to say anything about the water; and how many of them are
 used, from the nearest to the farthest: more say little that is new."""
 SIGMA_PX = 2.0

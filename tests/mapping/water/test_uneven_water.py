@@ -38,10 +38,10 @@ def test_even_backscatter_and_a_lamp_are_not_taken_for_it() -> None:
         assert estimate.unevenness.tolist() == [0.0] * TERMS
 
 
-def test_unevenness_takes_water_and_is_never_told_beside_shading() -> None:
+def test_unevenness_takes_water() -> None:
     uneven = [model for model in EVERY_MODEL if model.uneven]
-    assert uneven
-    assert all(model.water and not model.shading for model in uneven)
+    assert len(uneven) == 4
+    assert all(model.water for model in uneven)
 
 
 def test_the_config_forbids_it() -> None:
