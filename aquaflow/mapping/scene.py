@@ -23,7 +23,6 @@ from aquaflow.mapping.water.image_formation import Water
 from aquaflow.mapping.water.medium import Medium
 from aquaflow.mapping.water.nearest import Nearest, kept_by
 from aquaflow.mapping.water.open_water import open_water
-from aquaflow.mapping.water.pauses import finished
 from aquaflow.mapping.water.posed_picture import PosedPicture
 from aquaflow.mapping.water.shading import TERMS, gain_map, shading_basis
 from aquaflow.mapping.water.sightings import sighting
@@ -256,18 +255,6 @@ class Scene:
         veil = veil * np.exp(basis @ self.medium.unevenness.double().numpy())[:, None]
         clean = np.maximum(near.colour / np.exp(log_gain) - veil, 0.0) / T
         self.balance = replace(self.balance, gain=kept_by(near, clean.T))
-
-    def fit_water(
-        self,
-        views: list[View],
-        generator: torch.Generator,
-        dive: Sequence[View] | None = None,
-    ) -> WaterEstimate | None:
-        """:meth:`fitting_water` at once, and adopted for all views of the ``dive``."""
-        estimate, fitted = finished(self.fitting_water(views, generator))
-        if estimate is not None:
-            self.adopt_water(estimate, fitted, views if dive is None else dive)
-        return estimate
 
     def fitting_water(
         self, views: Sequence[View], generator: torch.Generator

@@ -17,8 +17,11 @@ from aquaflow.keyframes import Pointmap
 from aquaflow.mapping.gaussians.gaussians import GaussianMap, raw_colour
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.rendering import show
+from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.views import View
+from aquaflow.mapping.water.estimation import WaterEstimate
 from aquaflow.mapping.water.image_formation import Water
+from aquaflow.mapping.water.pauses import finished
 from aquaflow.render import select_renderer
 from aquaflow.render.contract import Renderer
 
@@ -166,3 +169,13 @@ def copied(mapper: Mapper) -> dict[str, Tensor]:
 def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
     """Bit for bit."""
     return all(torch.equal(a[name], b[name]) for name in a)
+
+
+def fit_water(
+    scene: Scene, views: list[View], generator: torch.Generator, dive: list[View] | None = None
+) -> WaterEstimate | None:
+    """The whole fit, its pauses left out; adopted for all views of the dive."""
+    estimate, fitted = finished(scene.fitting_water(views, generator))
+    if estimate is not None:
+        scene.adopt_water(estimate, fitted, views if dive is None else dive)
+    return estimate

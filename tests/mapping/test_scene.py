@@ -10,7 +10,16 @@ from aquaflow.config import MediumConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.views import View
-from tests.mapping.mapping_scenes import filmed, floor, gaussians_at, pose, renderer, view_of, water
+from tests.mapping.mapping_scenes import (
+    filmed,
+    fit_water,
+    floor,
+    gaussians_at,
+    pose,
+    renderer,
+    view_of,
+    water,
+)
 
 NEAR_AND_FAR = [pose((0.02 * i, 0.0, -0.35 * i)) for i in range(5)]
 BLANK = view_of(np.zeros((48, 64, 3), np.uint8))
@@ -45,7 +54,7 @@ def submerged() -> tuple[Scene, list[View]]:
 def test_a_fit_takes_on_the_water_keeps_the_near_picture_and_improves_the_far_one() -> None:
     fitted, views = submerged()
     before = [fitted.show(view) for view in views]
-    estimate = fitted.fit_water(views, random())
+    estimate = fit_water(fitted, views, random())
     assert estimate is not None
     after = [fitted.show(view) for view in views]
     assert float((after[0].image - before[0].image).abs().mean()) < 0.015
@@ -64,12 +73,12 @@ def test_nothing_is_fitted_when_told_not_to_or_without_views_gaussians_or_points
     ready, views = submerged()
     told_not_to = Scene(MediumConfig(fit=False), renderer(), random())
     told_not_to.gaussians = ready.gaussians
-    assert told_not_to.fit_water(views, random()) is None
-    assert ready.fit_water([], random()) is None
-    assert scene().fit_water(views, random()) is None
+    assert fit_water(told_not_to, views, random()) is None
+    assert fit_water(ready, [], random()) is None
+    assert fit_water(scene(), views, random()) is None
     colours = ready.gaussians.parameters["raw_colours"].clone()
     ready.gaussians.keep(torch.arange(len(ready.gaussians)) < 50)
-    assert ready.fit_water(views, random()) is None
+    assert fit_water(ready, views, random()) is None
     assert torch.equal(ready.gaussians.parameters["raw_colours"], colours[:50])
     assert ready.beta_a_sigma is None
 
@@ -91,7 +100,7 @@ def in_clear_water(dimmed_from: int | None = None) -> tuple[Scene, list[View]]:
 def test_in_clear_water_the_medium_goes_off_and_the_pictures_stay() -> None:
     dry, views = in_clear_water()
     before = dry.show(views[0]).image
-    estimate = dry.fit_water(views, random())
+    estimate = fit_water(dry, views, random())
     assert estimate is not None
     assert not dry.medium.active
     assert dry.water(views[0]) is None
@@ -102,7 +111,7 @@ def test_in_clear_water_the_medium_goes_off_and_the_pictures_stay() -> None:
 def test_a_medium_that_went_off_comes_on_again_when_the_water_shows() -> None:
     fitted, views = submerged()
     fitted.medium.active = False
-    estimate = fitted.fit_water(views, random())
+    estimate = fit_water(fitted, views, random())
     assert estimate is not None
     found = fitted.water(views[0])
     assert found is not None
@@ -112,14 +121,14 @@ def test_a_medium_that_went_off_comes_on_again_when_the_water_shows() -> None:
 def test_a_medium_that_may_not_go_off_stays_on() -> None:
     dry, views = in_clear_water()
     dry.config = MediumConfig(off_when_clear=False)
-    assert dry.fit_water(views, random()) is not None
+    assert fit_water(dry, views, random()) is not None
     assert dry.medium.active
 
 
 def test_lamps_that_go_down_are_exposure_and_neither_water_nor_colour() -> None:
     dry, views = in_clear_water(dimmed_from=3)
     between = view_of(views[-1].image, views[-1].T_wc, 10)
-    assert dry.fit_water(views, random(), [*views, between]) is not None
+    assert fit_water(dry, views, random(), [*views, between]) is not None
     assert dry.exposes
     assert not dry.medium.active
     gains = [float(np.exp(view.log_gain).mean()) for view in views]
@@ -217,7 +226,7 @@ def test_an_empty_scene_shows_open_water_or_black(enabled: bool) -> None:
 
 def test_after_steps_that_changed_the_medium_what_is_nearest_keeps_its_colours() -> None:
     fitted, views = submerged()
-    fitted.fit_water(views, random())
+    fit_water(fitted, views, random())
     fitted.rebalance()
     assert fitted.balance is not None
     before = fitted.balance.gain
@@ -230,7 +239,7 @@ def test_after_steps_that_changed_the_medium_what_is_nearest_keeps_its_colours()
 
 def test_views_whose_red_gain_drifted_do_not_turn_what_is_nearest_red() -> None:
     fitted, views = submerged()
-    fitted.fit_water(views, random())
+    fit_water(fitted, views, random())
     fitted.rebalance()
     assert fitted.balance is not None
     before = fitted.balance.gain

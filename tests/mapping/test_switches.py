@@ -7,8 +7,9 @@ import torch
 
 from aquaflow.config import MediumConfig
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.water.estimation import estimate_water, models_for
+from aquaflow.mapping.water.estimation import models_for
 from tests.mapping.mapping_scenes import (
+    fit_water,
     flat_pointmap,
     floor,
     grown,
@@ -18,7 +19,7 @@ from tests.mapping.mapping_scenes import (
     settings,
     view_of,
 )
-from tests.mapping.water.water_observations import B_RES, LAMP, D, sighted
+from tests.mapping.water.water_observations import B_RES, LAMP, D, estimate_water, sighted
 
 
 def test_without_shading_the_fit_knows_no_lamp() -> None:
@@ -34,7 +35,7 @@ def test_without_shading_the_fit_knows_no_lamp() -> None:
 def test_without_fit_the_water_stays_where_it_began() -> None:
     mapper = grown(settings(medium={"fit": False}))
     before = {name: value.clone() for name, value in mapper.medium.state_dict().items()}
-    assert mapper.scene.fit_water(mapper.views, torch.Generator().manual_seed(0)) is None
+    assert fit_water(mapper.scene, mapper.views, torch.Generator().manual_seed(0)) is None
     mapper.water_fitting.at_once(mapper.views)
     after = mapper.medium.state_dict()
     assert all(torch.equal(after[name], value) for name, value in before.items())

@@ -31,7 +31,6 @@ from aquaflow.mapping.water.nearest import Nearest, nearest_of, white_balance
 from aquaflow.mapping.water.observations import Observations, variance_over_range
 from aquaflow.mapping.water.open_sightings import with_open_water
 from aquaflow.mapping.water.parameters import Model
-from aquaflow.mapping.water.pauses import finished
 from aquaflow.mapping.water.posed_picture import PosedPicture
 from aquaflow.mapping.water.selection import fit_likeliest
 from aquaflow.mapping.water.solver import Fit
@@ -100,17 +99,6 @@ def models_for(config: MediumConfig) -> list[Model]:
     ]
 
 
-def estimate_water(
-    observations: Observations,
-    B_res: Array,  # [3]
-    d: Array,  # [3] 1 / map unit
-    models: Sequence[Model] = EVERY_MODEL,
-    priors: WaterPriorsConfig = BELIEVED,
-) -> WaterEstimate | None:
-    """Fit ``models`` and keep the likeliest; None where too few points are seen several times."""
-    return finished(estimating(observations, B_res, d, models, priors))
-
-
 def estimating(
     observations: Observations,
     B_res: Array,  # [3]
@@ -119,7 +107,10 @@ def estimating(
     priors: WaterPriorsConfig = BELIEVED,
     pictures: Sequence[PosedPicture] = (),  # by the number of the view; may show open water
 ) -> Generator[None, None, WaterEstimate | None]:
-    """:func:`estimate_water`, with a pause every few milliseconds."""
+    """Fit ``models`` and keep the likeliest; None where too few points are seen several times.
+
+    Pauses every few milliseconds.
+    """
     if observations.points < MIN_POINTS:
         return None
 

@@ -14,7 +14,6 @@ from aquaflow.mapping.water.estimation import (
     EVERY_MODEL,
     MIN_POINTS,
     WaterEstimate,
-    estimate_water,
     estimating,
     models_for,
 )
@@ -33,6 +32,7 @@ from tests.mapping.water.water_observations import (
     Array,
     B,
     D,
+    estimate_water,
     fitted,
     sighted,
 )

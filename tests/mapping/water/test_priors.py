@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from aquaflow.config import WaterPriorsConfig
-from aquaflow.mapping.water.estimation import estimate_water
 from aquaflow.mapping.water.model import WaterModel
 from aquaflow.mapping.water.parameters import Model
 from aquaflow.mapping.water.priors import BRIGHT_LEVEL, DARK_LEVEL, beliefs
 from aquaflow.mapping.water.solver import cost, normal_equations, weights
-from tests.mapping.water.water_observations import B_INF, B_RES, D, sighted
+from tests.mapping.water.water_observations import B_INF, B_RES, D, estimate_water, sighted
 
 NOTHING = {"dark_channel": False, "saturation": False, "regions": False}
 EACH = [

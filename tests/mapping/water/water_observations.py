@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.mapping.water.estimation import (
-    WaterEstimate,
-    estimate_water,
-)
+from aquaflow.config import WaterPriorsConfig
+from aquaflow.mapping.water.estimation import EVERY_MODEL, WaterEstimate, estimating
+from aquaflow.mapping.water.model import BELIEVED
 from aquaflow.mapping.water.observations import Observations
+from aquaflow.mapping.water.parameters import Model
+from aquaflow.mapping.water.pauses import finished
 from aquaflow.mapping.water.shading import shading_basis
 
 Array = npt.NDArray[np.float64]
@@ -50,6 +53,17 @@ def sighted(
     positions = rng.uniform(-1.0, 1.0, (points, 3))
     seen = seen + noise * rng.normal(size=seen.shape)
     return Observations(point, view, seen, z, xy, positions)
+
+
+def estimate_water(
+    seen: Observations,
+    B_res: Array,  # [3]
+    d: Array,  # [3] 1 / map unit
+    models: Sequence[Model] = EVERY_MODEL,
+    priors: WaterPriorsConfig = BELIEVED,
+) -> WaterEstimate | None:
+    """The whole fit, its pauses left out."""
+    return finished(estimating(seen, B_res, d, models, priors))
 
 
 def fitted(seen: Observations) -> WaterEstimate:
