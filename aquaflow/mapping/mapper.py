@@ -30,6 +30,7 @@ from aquaflow.mapping.optimisation.pose_refinement import register
 from aquaflow.mapping.optimisation.schedule import sampled_views, shuffled_views
 from aquaflow.mapping.rendering import Shown
 from aquaflow.mapping.scene import Scene
+from aquaflow.mapping.scene_water import rebalance
 from aquaflow.mapping.views import View, in_time
 from aquaflow.mapping.water.medium import Medium
 from aquaflow.mapping.water_fitting import WaterFitting
@@ -209,7 +210,7 @@ class Mapper:
                 if progress is not None:
                     progress(step + 1, steps)
         with self.failures.contain("white balance"):
-            self.scene.rebalance()
+            rebalance(self.scene)
 
     def _contained_step(self, stage: str, view: View, refine_poses: bool) -> None:
         """The first view's pose is never refined: it fixes the map's frame."""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -14,18 +13,15 @@ from torch import Tensor
 
 from aquaflow.config import MediumConfig, SunlightConfig
 from aquaflow.mapping.decoder.neural import NeuralGaussians
-from aquaflow.mapping.gaussians.gaussians import GaussianMap, radiance, raw_colour
+from aquaflow.mapping.gaussians.gaussians import GaussianMap
 from aquaflow.mapping.rendering import Shown, show
 from aquaflow.mapping.views import View
-from aquaflow.mapping.water.estimation import WaterEstimate, estimating, models_for
-from aquaflow.mapping.water.exposure import gain_of, learn_gain, set_log_gains
+from aquaflow.mapping.water.exposure import gain_of, learn_gain
 from aquaflow.mapping.water.image_formation import Water
 from aquaflow.mapping.water.medium import Medium
-from aquaflow.mapping.water.nearest import Nearest, kept_by
+from aquaflow.mapping.water.nearest import Nearest
 from aquaflow.mapping.water.open_water import open_water
-from aquaflow.mapping.water.posed_picture import PosedPicture
-from aquaflow.mapping.water.shading import TERMS, gain_map, shading_basis
-from aquaflow.mapping.water.sightings import sighting
+from aquaflow.mapping.water.shading import TERMS, gain_map
 from aquaflow.mapping.water.sunlight import Sunlight
 from aquaflow.mapping.water.white_balance import Recovered, WhiteBalance
 from aquaflow.render.contract import Renderer
@@ -57,11 +53,11 @@ class Scene:
         """Relative standard deviation of beta_a in the last fit; None before it."""
         self.balance: WhiteBalance | None = None
         """What restored pictures are shown in; None before the first fit, and without water."""
-        self._seen_nearest: tuple[Nearest, list[View]] | None = None
+        self.seen_nearest: tuple[Nearest, list[View]] | None = None
         """What the views of the last fit showed nearest."""
         self.range_variance: tuple[float, float] | None = None
         """Of the points' colours in the last fit, with the water and without; None before it."""
-        self._gains: dict[tuple[str, int, int], Tensor] = {}
+        self.gain_maps: dict[tuple[str, int, int], Tensor] = {}
 
     def water(self, view: View) -> Water | None:
         """The medium for this view, or None while it is switched off."""
@@ -89,9 +85,9 @@ class Scene:
         if not coefficients.any():
             return None
         key = (name, view.camera.height, view.camera.width)
-        if key not in self._gains:
-            self._gains[key] = torch.from_numpy(gain_map(coefficients, *key[1:]))
-        return self._gains[key]
+        if key not in self.gain_maps:
+            self.gain_maps[key] = torch.from_numpy(gain_map(coefficients, *key[1:]))
+        return self.gain_maps[key]
 
     def draw(
         self,
@@ -132,7 +128,7 @@ class Scene:
         """The parameters as plain Gaussians, each as seen from the nearest of ``views``."""
         if self.neural is None or not views:
             return self.gaussians.parameters
-        return self.neural.baked(self._nearest(views)[0])
+        return self.neural.baked(self.nearest_cameras(views)[0])
 
     @torch.no_grad()
     def bake(self, views: list[View]) -> Tensor:
@@ -143,7 +139,7 @@ class Scene:
         if not views:
             self.neural = None
             return torch.zeros_like(self.gaussians.means)
-        centres = self._nearest(views)[0]
+        centres = self.nearest_cameras(views)[0]
         if self.neural is not None:
             baked = self.neural.baked(centres)
             for name, tensor in self.gaussians.parameters.items():
@@ -151,7 +147,7 @@ class Scene:
             self.neural = None
         return centres
 
-    def _nearest(self, views: Sequence[View]) -> tuple[Tensor, Tensor, Tensor]:
+    def nearest_cameras(self, views: Sequence[View]) -> tuple[Tensor, Tensor, Tensor]:
         """Of the camera nearest to each Gaussian: centre [N, 3], distance [N], number [N]."""
         centres = torch.from_numpy(np.stack([view.T_wc.t for view in views])).to(torch.float32)
         z, which = torch.cdist(self.gaussians.means, centres).min(dim=1)
@@ -239,102 +235,3 @@ class Scene:
         if not self.medium.active or self.balance is None:
             return torch.ones(3)
         return torch.tensor(self.balance.gain)
-
-    @torch.no_grad()
-    def rebalance(self) -> None:
-        """After steps that changed medium and exposures: what is nearest keeps its colours."""
-        if self.balance is None or self._seen_nearest is None or not self.medium.active:
-            return
-        near, views = self._seen_nearest
-        basis, water = shading_basis(near.xy), self.medium(torch.eye(3))
-        log_gain = (basis @ self.shading)[:, None]
-        if self.exposes:
-            log_gain = log_gain + np.stack([view.log_gain for view in views])[near.view]
-        z = torch.from_numpy(near.z).to(torch.float32)
-        T, veil = (part.double().numpy() for part in (water.transmission(z), water.backscatter(z)))
-        veil = veil * np.exp(basis @ self.medium.unevenness.double().numpy())[:, None]
-        clean = np.maximum(near.colour / np.exp(log_gain) - veil, 0.0) / T
-        self.balance = replace(self.balance, gain=kept_by(near, clean.T))
-
-    def fitting_water(
-        self, views: Sequence[View], generator: torch.Generator
-    ) -> Generator[None, None, tuple[WaterEstimate | None, list[View]]]:
-        """Estimate water, shading and exposure from what ``views`` saw; the scene stays as it is.
-
-        Pauses every few milliseconds. Returns the estimate, None while too little is seen from
-        several ranges, and the views that it was fitted to: those that still have their pixels.
-        """
-        if not self.config.fit or len(self.gaussians) == 0:
-            return None, []
-        pictures, fitted = [], []
-        for view in views:
-            if view.has_pixels:
-                shown = self.show(view)
-                pictures.append(PosedPicture(view, shown.z, shown.alpha))
-                fitted.append(view)
-                yield
-        if not fitted:
-            return None, []
-        seed = int(torch.randint(2**31, (1,), generator=generator))
-        seen = yield from sighting(pictures, np.random.default_rng(seed))
-        yield
-        with torch.no_grad():
-            sea = self.medium(torch.from_numpy(fitted[0].T_wc.R).to(torch.float32))
-        B_res, d = sea.B_res.double().numpy(), sea.d.double().numpy()
-        models, priors = models_for(self.config), self.config.priors
-        steps = estimating(seen, B_res, d, models, priors, pictures)
-        return (yield from steps), fitted
-
-    def adopt_water(
-        self, estimate: WaterEstimate, fitted: Sequence[View], dive: Sequence[View]
-    ) -> None:
-        """Let the estimate hold; the pictures of the map stay as they are.
-
-        All views of the ``dive`` get an exposure.
-        """
-        with self._unchanged_by_failure():
-            self._adopt(estimate, fitted, dive)
-
-    @contextmanager
-    def _unchanged_by_failure(self) -> Iterator[None]:
-        """The water as it was, if the block raises: half of a new one fits no picture."""
-        medium, active = copy.deepcopy(self.medium.state_dict()), self.medium.active
-        before = vars(self).copy()
-        try:
-            yield
-        except Exception:
-            self.medium.load_state_dict(medium)
-            self.medium.active = active
-            vars(self).update(before)
-            self._gains.clear()
-            raise
-
-    @torch.no_grad()
-    def _adopt(self, estimate: WaterEstimate, fitted: Sequence[View], dive: Sequence[View]) -> None:
-        """Let the estimate hold, and give every Gaussian the radiance that looks the same in it.
-
-        The same from the camera nearest to it: where it is seen best.
-        """
-        shown, (_, z, nearest) = self.baked(list(fitted))["raw_colours"], self._nearest(fitted)
-        old, old_gains = self.water(fitted[0]), torch.stack([gain_of(view) for view in fitted])
-        self.medium.active = estimate.model.water
-        if estimate.model.water:
-            found = (estimate.beta_a, estimate.B_inf, estimate.b, estimate.unevenness)
-            self.medium.set_water(*(torch.from_numpy(v).to(torch.float32) for v in found))
-        self.shading, self.exposes = estimate.shading, estimate.model.exposure
-        self.beta_a_sigma, self.water_evidence = estimate.beta_a_sigma, estimate.evidence
-        self.balance, self.range_variance = estimate.balance, estimate.range_variance
-        if estimate.nearest is not None:
-            self._seen_nearest = estimate.nearest, list(fitted)
-        self._gains.clear()
-        set_log_gains(dive, fitted, estimate.exposure)
-
-        seen, new = radiance(shown), self.water(fitted[0])
-        if old is not None:
-            seen = seen * old.transmission(z) + old.backscatter(z)
-        new_gains = torch.stack([gain_of(view) for view in fitted])
-        seen = seen * (old_gains / new_gains)[nearest]
-        wanted = raw_colour(seen if new is None else new.restore(seen, z)[0])
-        raw = self.gaussians.parameters["raw_colours"]
-        # A decoder's residuals come on top again.
-        raw.copy_(wanted if self.neural is None else wanted + (raw - shown))

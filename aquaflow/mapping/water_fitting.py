@@ -13,6 +13,7 @@ from aquaflow.config import MediumConfig
 from aquaflow.errors.failures import Failures
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.scene import Scene
+from aquaflow.mapping.scene_water import adopt_water, fitting_water
 from aquaflow.mapping.views import View, in_time
 from aquaflow.mapping.water.pauses import finished
 
@@ -80,11 +81,11 @@ class WaterFitting:
         ordered = in_time(views)
         count = min(self.config.fit_views, len(ordered))
         chosen = np.linspace(0, len(ordered) - 1, count).astype(int)
-        fit = self.scene.fitting_water([ordered[i] for i in chosen], self._random)
+        fit = fitting_water(self.scene, [ordered[i] for i in chosen], self._random)
         estimate, fitted = yield from fit
         if estimate is None:
             return
-        self.scene.adopt_water(estimate, fitted, in_time(views))
+        adopt_water(self.scene, estimate, fitted, in_time(views))
         log.info(
             "water fitted: %s, beta_a %s per map unit (relative sigma %s)",
             estimate.model,

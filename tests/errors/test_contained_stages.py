@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -18,9 +19,9 @@ from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import Finished
 from aquaflow.errors import InputError
 from aquaflow.errors.failures import Failures
+from aquaflow.mapping import water_fitting
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.optimisation.map_optimiser import MapOptimiser
-from aquaflow.mapping.scene import Scene
 from aquaflow.messages import Dropped, Frame
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.slam import Slam
@@ -48,7 +49,7 @@ SETTINGS = Config.model_validate(
     }
 )
 
-STAGES: list[tuple[type, str, int, str]] = [
+STAGES: list[tuple[type | ModuleType, str, int, str]] = [
     (Preparation, "__call__", 3, "preparation"),
     (FrameGate, "judge", 4, "frame gate"),
     (ClassicalPrior, "encode", 7, "encoding"),
@@ -61,17 +62,17 @@ STAGES: list[tuple[type, str, int, str]] = [
     (Mapper, "add_view", 3, "view"),
     (Mapper, "insert", 2, "insertion"),
     (MapOptimiser, "step", 5, "optimisation"),
-    (Scene, "adopt_water", 1, "water fit"),
+    (water_fitting, "adopt_water", 1, "water fit"),
     (Mapper, "register", 1, "held-out pose"),
 ]
 """Of each stage: what raises, at which call, and the stage's name."""
 
 
 @pytest.fixture
-def raise_once(monkeypatch: pytest.MonkeyPatch) -> Callable[[type, str, int], None]:
+def raise_once(monkeypatch: pytest.MonkeyPatch) -> Callable[[type | ModuleType, str, int], None]:
     """Let the n-th call of a method raise."""
 
-    def patch(owner: type, name: str, nth: int) -> None:
+    def patch(owner: type | ModuleType, name: str, nth: int) -> None:
         original, calls = getattr(owner, name), []
 
         def method(*args: Any, **keywords: Any) -> Any:
@@ -95,7 +96,7 @@ def rows(dive: Path) -> list[dict[str, str]]:
 
 
 def test_every_stage_may_fail_once_in_one_dive(
-    small_recording: Path, tmp_path: Path, raise_once: Callable[[type, str, int], None]
+    small_recording: Path, tmp_path: Path, raise_once: Callable[[type | ModuleType, str, int], None]
 ) -> None:
     for owner, name, nth, _ in STAGES:
         raise_once(owner, name, nth)

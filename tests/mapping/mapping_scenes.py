@@ -18,6 +18,7 @@ from aquaflow.mapping.gaussians.gaussians import GaussianMap, raw_colour
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.rendering import show
 from aquaflow.mapping.scene import Scene
+from aquaflow.mapping.scene_water import adopt_water, fitting_water
 from aquaflow.mapping.views import View
 from aquaflow.mapping.water.estimation import WaterEstimate
 from aquaflow.mapping.water.image_formation import Water
@@ -175,7 +176,7 @@ def fit_water(
     scene: Scene, views: list[View], generator: torch.Generator, dive: list[View] | None = None
 ) -> WaterEstimate | None:
     """The whole fit, its pauses left out; adopted for all views of the dive."""
-    estimate, fitted = finished(scene.fitting_water(views, generator))
+    estimate, fitted = finished(fitting_water(scene, views, generator))
     if estimate is not None:
-        scene.adopt_water(estimate, fitted, views if dive is None else dive)
+        adopt_water(scene, estimate, fitted, views if dive is None else dive)
     return estimate

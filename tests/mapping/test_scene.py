@@ -9,6 +9,7 @@ import torch
 from aquaflow.config import MediumConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.mapping.scene import Scene
+from aquaflow.mapping.scene_water import rebalance
 from aquaflow.mapping.views import View
 from tests.mapping.mapping_scenes import (
     filmed,
@@ -227,12 +228,12 @@ def test_an_empty_scene_shows_open_water_or_black(enabled: bool) -> None:
 def test_after_steps_that_changed_the_medium_what_is_nearest_keeps_its_colours() -> None:
     fitted, views = submerged()
     fit_water(fitted, views, random())
-    fitted.rebalance()
+    rebalance(fitted)
     assert fitted.balance is not None
     before = fitted.balance.gain
     with torch.no_grad():
         fitted.medium.output.bias[0] += 1.0  # red fades faster, so that J is redder
-    fitted.rebalance()
+    rebalance(fitted)
     assert fitted.balance.gain[0] < 0.9 * before[0]
     assert fitted.balance.gain[2] == pytest.approx(before[2])
 
@@ -240,17 +241,17 @@ def test_after_steps_that_changed_the_medium_what_is_nearest_keeps_its_colours()
 def test_views_whose_red_gain_drifted_do_not_turn_what_is_nearest_red() -> None:
     fitted, views = submerged()
     fit_water(fitted, views, random())
-    fitted.rebalance()
+    rebalance(fitted)
     assert fitted.balance is not None
     before = fitted.balance.gain
     fitted.exposes = True
     for view in views:
         view.log_gain = np.array([-0.2, 0.0, 0.0])
-    fitted.rebalance()
+    rebalance(fitted)
     assert fitted.balance.gain[0] < 0.95 * before[0]
 
 
 def test_a_scene_without_water_has_no_balance_to_mend() -> None:
     dry = scene()
-    dry.rebalance()
+    rebalance(dry)
     assert dry.balance is None

@@ -11,8 +11,10 @@ import torch
 from aquaflow.config import MediumConfig
 from aquaflow.errors.failures import Failures
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.mapping import water_fitting as module
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.scene import Scene
+from aquaflow.mapping.scene_water import fitting_water
 from aquaflow.mapping.views import View
 from aquaflow.mapping.water.estimation import WaterEstimate
 from aquaflow.mapping.water_fitting import STEPS, WaterFitting
@@ -25,17 +27,17 @@ def views(count: int) -> list[View]:
     return [view_of(np.zeros((2, 2, 3), np.uint8), index=index) for index in range(count)]
 
 
-class Looked:
-    """A scene whose fits take PAUSES pauses and find nothing; it notes what they looked at."""
+class Fits:
+    """In place of the fits: each takes PAUSES pauses, and notes what it looked at."""
 
-    def __init__(self, fails: bool = False) -> None:
-        self.fits: list[list[int]] = []
-        self.fails = fails
+    def __init__(self) -> None:
+        self.looked: list[list[int]] = []
+        self.fails = False
 
-    def fitting_water(
-        self, views: Sequence[View], _: torch.Generator
+    def __call__(
+        self, scene: Scene, views: Sequence[View], generator: torch.Generator
     ) -> Generator[None, None, tuple[WaterEstimate | None, list[View]]]:
-        self.fits.append([view.frame_index for view in views])
+        self.looked.append([view.frame_index for view in views])
         for _ in range(PAUSES):
             yield
         if self.fails:
@@ -43,62 +45,66 @@ class Looked:
         return None, []
 
 
-def fitting(scene: Looked, **config: int) -> WaterFitting:
+@pytest.fixture
+def fits(monkeypatch: pytest.MonkeyPatch) -> Fits:
+    made = Fits()
+    monkeypatch.setattr(module, "fitting_water", made)
+    return made
+
+
+def fitting(failures: Failures | None = None, **config: int) -> WaterFitting:
     settings = MediumConfig.model_validate(config)
-    return WaterFitting(settings, scene, torch.Generator(), Failures())  # type: ignore[arg-type]
+    generator = torch.Generator().manual_seed(0)
+    scene = Scene(settings, renderer(), generator)
+    return WaterFitting(settings, scene, generator, failures or Failures())
 
 
-def test_a_fit_begins_at_its_view_count_and_at_every_doubling() -> None:
-    scene = Looked()
-    paced = fitting(scene, first_fit_views=3)
+def test_a_fit_begins_at_its_view_count_and_at_every_doubling(fits: Fits) -> None:
+    paced = fitting(first_fit_views=3)
     dive = views(40)
     began = []
     for count in range(1, 41):
-        before = len(scene.fits)
+        before = len(fits.looked)
         paced.go_on(dive[:count])
-        began += [count] if len(scene.fits) > before else []
+        began += [count] if len(fits.looked) > before else []
     assert began == [3, 2 * 5, 2 * 12]  # each ends two views later
 
 
-def test_only_a_few_steps_are_made_with_each_view() -> None:
-    paced = fitting(Looked(), first_fit_views=2)
+def test_only_a_few_steps_are_made_with_each_view(fits: Fits) -> None:
+    paced = fitting(first_fit_views=2)
     ended = [paced.go_on(views(2)) for _ in range(PAUSES // STEPS + 1)]
     assert ended == [False] * (PAUSES // STEPS) + [True]
 
 
-def test_at_once_is_a_whole_fit() -> None:
-    scene = Looked()
-    paced = fitting(scene)
+def test_at_once_is_a_whole_fit(fits: Fits) -> None:
+    paced = fitting()
     paced.at_once(views(7))
-    assert scene.fits == [list(range(7))]
+    assert fits.looked == [list(range(7))]
     assert not paced.go_on(views(8))
 
 
-def test_a_fit_looks_at_views_spread_over_the_whole_dive() -> None:
-    scene = Looked()
-    fitting(scene, fit_views=4).at_once(views(31))
-    assert scene.fits == [[0, 10, 20, 30]]
+def test_a_fit_looks_at_views_spread_over_the_whole_dive(fits: Fits) -> None:
+    fitting(fit_views=4).at_once(views(31))
+    assert fits.looked == [[0, 10, 20, 30]]
 
 
-def test_a_fit_begins_again_when_the_maps_unit_has_changed() -> None:
-    scene = Looked()
-    paced = fitting(scene, first_fit_views=2)
+def test_a_fit_begins_again_when_the_maps_unit_has_changed(fits: Fits) -> None:
+    paced = fitting(first_fit_views=2)
     paced.go_on(views(2))
     paced.moved({0: Sim3(np.eye(3), np.array([0.1, 0.0, 0.0]), 1.001)})
     paced.go_on(views(3))
-    assert len(scene.fits) == 1
+    assert len(fits.looked) == 1
     paced.moved({0: Sim3(np.eye(3), np.zeros(3), 1.1)})
     paced.go_on(views(4))
-    assert scene.fits == [[0, 1], [0, 1, 2, 3]]
+    assert fits.looked == [[0, 1], [0, 1, 2, 3]]
 
 
-def test_a_fit_that_fails_is_counted_and_not_tried_again_at_once() -> None:
-    scene, failures = Looked(fails=True), Failures(strict=False)
-    config = MediumConfig.model_validate({"first_fit_views": 2})
-    paced = WaterFitting(config, scene, torch.Generator(), failures)  # type: ignore[arg-type]
+def test_a_fit_that_fails_is_counted_and_not_tried_again_at_once(fits: Fits) -> None:
+    fits.fails, failures = True, Failures(strict=False)
+    paced = fitting(failures, first_fit_views=2)
     for _ in range(PAUSES):
         paced.go_on(views(3))
-    assert len(scene.fits) == 1
+    assert len(fits.looked) == 1
     assert failures.total == 1
 
 
@@ -120,7 +126,7 @@ def test_a_fit_to_the_maps_own_views_is_logged(caplog: pytest.LogCaptureFixture)
 
 def test_a_view_whose_pixels_were_deleted_meanwhile_is_left_out() -> None:
     mapper = submerged()
-    steps = mapper.scene.fitting_water(mapper.views, torch.Generator().manual_seed(0))
+    steps = fitting_water(mapper.scene, mapper.views, torch.Generator().manual_seed(0))
     next(steps)
     mapper.views[2].delete_pixels()
     while True:
@@ -136,6 +142,6 @@ def test_a_view_whose_pixels_were_deleted_meanwhile_is_left_out() -> None:
 def test_nothing_changes_before_the_end_of_a_fit() -> None:
     mapper = submerged()
     before = mapper.medium.state_dict()["b_raw"].clone()
-    for _ in mapper.scene.fitting_water(mapper.views, torch.Generator().manual_seed(0)):
+    for _ in fitting_water(mapper.scene, mapper.views, torch.Generator().manual_seed(0)):
         assert torch.equal(mapper.medium.state_dict()["b_raw"], before)
     assert isinstance(mapper.scene, Scene)

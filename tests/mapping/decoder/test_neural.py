@@ -154,7 +154,7 @@ def test_a_sub_map_that_is_absorbed_keeps_its_looks() -> None:
     first.absorb(second)
     assert is_whole(first)
     assert second.neural is None
-    seen = first.scene.neural.baked(first.scene._nearest(views)[0])  # type: ignore[union-attr]
+    seen = first.scene.neural.baked(first.scene.nearest_cameras(views)[0])  # type: ignore[union-attr]
     for name in DECODED:
         torch.testing.assert_close(seen[name][-count:], baked[name], rtol=0, atol=1e-4)
 
