@@ -51,7 +51,7 @@ scenes without water look like 0.02 to 0.05."""
 EVERY_MODEL = tuple(
     Model(*parts) for parts in product((False, True), repeat=4) if Model(*parts).is_possible
 )
-"""With and without each part."""
+"""With and without each part. Shading and unevenness together only where open water is seen."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,8 @@ def estimating(
     def problems(seen: Observations, models: Sequence[Model]) -> list[WaterModel]:
         return [WaterModel(seen, model, B_res, d, priors) for model in models]
 
-    fits = yield from fit_likeliest(problems(observations, models))
+    some = [model for model in models if not model.takes_open_water]
+    fits = yield from fit_likeliest(problems(observations, some))
     dry, wet = (
         next((fit for fit in fits if fit.problem.model.water is water), None)
         for water in (False, True)

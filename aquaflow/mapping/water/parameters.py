@@ -81,6 +81,11 @@ class Model:
         """Unevenness takes water."""
         return self.water or not self.uneven
 
+    @property
+    def takes_open_water(self) -> bool:
+        """Shading and unevenness look alike, unless there is open water in view."""
+        return self.uneven and self.shading
+
 
 @dataclass(frozen=True)
 class Trial:

@@ -44,5 +44,10 @@ def test_unevenness_takes_water() -> None:
     assert all(model.water for model in uneven)
 
 
+def test_shading_and_unevenness_are_found_together_only_with_open_water_in_view() -> None:
+    assert Model(True, shading=True, uneven=True).takes_open_water
+    assert not fitted(sighted(shading=LAMP)).model.uneven
+
+
 def test_the_config_forbids_it() -> None:
     assert not any(model.uneven for model in models_for(MediumConfig(uneven=False)))
