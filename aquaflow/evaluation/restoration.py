@@ -76,14 +76,14 @@ def evaluate_restoration(dive: Path, clean: Path, crop: str | None) -> Restorati
     """
     indices = _held_out(dive)
     reference = clean_pictures(dive, clean, crop, indices)
-    raw, restored = _stored(dive, indices, "real"), _stored(dive, indices, "restored")
+    raw, _ = _stored(dive, indices, "real")
+    restored, opaque = _stored(dive, indices, "restored")
     if reference.shape != raw.shape:
         raise InputError(
             f"{clean} is {reference.shape[2]} x {reference.shape[1]} once prepared like the dive, "
             f"whose pictures are {raw.shape[2]} x {raw.shape[1]}; choose the --clean-crop that "
             "shows the same view"
         )
-    opaque = np.stack([read_picture(dive, index, "restored")[1] for index in indices])
     if not opaque.any():
         raise InputError(f"the restored pictures in {dive} show nothing but removed open water")
     ranges = held_out_ranges(dive, indices, (raw.shape[1], raw.shape[2]))
@@ -129,8 +129,10 @@ def _held_out(dive: Path) -> list[int]:
     return indices
 
 
-def _stored(dive: Path, indices: list[int], kind: Kind) -> Pictures:
-    return _in_unit([read_picture(dive, index, kind)[0] for index in indices])
+def _stored(dive: Path, indices: list[int], kind: Kind) -> tuple[Pictures, npt.NDArray[np.bool_]]:
+    """The pictures, and where they show something [N, H, W]."""
+    pictures, shown = zip(*(read_picture(dive, index, kind) for index in indices), strict=True)
+    return _in_unit(list(pictures)), np.stack(shown)
 
 
 def _in_unit(

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
+from aquaflow.errors import InputError
+from aquaflow.evaluation.held_out import read_range
 from aquaflow.evaluation.water_peers.contract import Ranges
-
-DAMAGE = (
-    *(OSError, EOFError, ValueError, TypeError, KeyError, IndexError),
-    *(BadZipFile, NotImplementedError, RuntimeError, zlib.error),
-)
-"""What numpy and zipfile raise for a file that is not the one that was written."""
 
 
 def held_out_ranges(dive: Path, indices: Sequence[int], size: tuple[int, int]) -> Ranges | None:
@@ -26,11 +20,10 @@ def held_out_ranges(dive: Path, indices: Sequence[int], size: tuple[int, int]) -
     found = []
     for index in indices:
         try:
-            with (dive / "heldout" / f"{index:06d}_range.npz").open("rb") as stream:
-                z = np.asarray(np.load(stream)["z"], np.float32)
-        except DAMAGE:
+            z = read_range(dive, index)
+        except InputError:
             return None
-        if z.shape != size:
+        if z is None or z.shape != size:
             return None
         found.append(z)
     return np.stack(found)
