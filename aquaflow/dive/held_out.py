@@ -17,6 +17,7 @@ from aquaflow.mapping.restoration import (
     to_bytes,
 )
 from aquaflow.mapping.views import View
+from aquaflow.mapping.water.posed_picture import SOLID
 from aquaflow.render.image_metrics import lpips, psnr, ssim
 from aquaflow.slam import Slam
 
@@ -81,7 +82,7 @@ def _examine(mapper: Mapper, view: View, exposure: float) -> HeldOut:
         psnr(rendered, real),
         ssim(rendered, real),
         perceptual,
-        torch.where(shown.alpha > 0.5, shown.z, 0.0).to(torch.float32).numpy(),
+        torch.where(shown.alpha > SOLID, shown.z, 0.0).to(torch.float32).numpy(),
         None if restored is None else restored.confidence_bytes(),
         None if amplification is None else amplification.numpy(),
     )

@@ -15,6 +15,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.views import View
 from aquaflow.mapping.water.image_formation import Water
+from aquaflow.mapping.water.posed_picture import SOLID
 from aquaflow.messages import Dropped
 from aquaflow.render.image_metrics import lpips_network
 from aquaflow.slam import Slam
@@ -120,7 +121,7 @@ def summarise_water(mapper: Mapper) -> WaterSummary | None:
 
 def _solid_ranges(mapper: Mapper, view: View) -> torch.Tensor:
     shown = mapper.show(view)
-    return shown.z[shown.alpha > 0.5]
+    return shown.z[shown.alpha > SOLID]
 
 
 def water_of(summary: WaterSummary) -> Water:

@@ -14,9 +14,8 @@ from torch import Tensor
 from aquaflow.mapping.rendering import Shown
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.views import View
+from aquaflow.mapping.water.posed_picture import SOLID
 
-SOLID = 0.5
-"""Alpha above which the map's range is that of the picture."""
 EDGE_PX = 3.0
 """Deviation of the Gaussian over which open water begins."""
 BRIGHT_QUANTILE, BRIGHT_LEVEL = 0.995, 0.95
@@ -60,8 +59,8 @@ def restored_picture(scene: Scene, view: View, shown: Shown) -> RestoredPicture:
     everywhere. What was not mapped stays as the camera saw it. Open water is black, as what was
     removed ends nowhere; or as the camera saw it; or black with alpha 0 (``medium.open_water``).
     """
-    recovered, camera = scene.recovered(view, shown.z), scene.evenly_lit(view)
-    open_water, solid = scene.open_water(view), shown.alpha > SOLID
+    camera, solid = scene.evenly_lit(view), shown.alpha > SOLID
+    recovered, open_water = scene.recovered(view, camera, shown.z), scene.open_water(view, camera)
     usable = solid & view.scene_mask()
     image = torch.where(usable[..., None], recovered.picture, scene.balanced(shown.radiance))
     image = image + ((1.0 - shown.alpha) * ~usable)[..., None] * camera

@@ -195,30 +195,35 @@ class Scene:
     def recovered(
         self,
         view: View,
+        lit: Tensor,  # [H, W, 3] its picture, evenly lit
         z: Tensor,  # [H, W] range
     ) -> Recovered:
         """The view's picture without water, in the white balance of what is nearest.
 
         Before the first fit there is no posterior: a pixel is believed wholly or not at all.
         """
-        image, water, uneven = self.evenly_lit(view), self.water(view), self.uneven(view)
+        water, uneven = self.water(view), self.uneven(view)
         if water is None:
-            return Recovered(image, torch.ones_like(z))
+            return Recovered(lit, torch.ones_like(z))
         if self.balance is not None:
-            return self.balance.recover(image, z, water, uneven)
-        picture, recoverable = water.restore(image, z, uneven)
+            return self.balance.recover(lit, z, water, uneven)
+        picture, recoverable = water.restore(lit, z, uneven)
         return Recovered(picture, recoverable.to(picture.dtype))
 
     @torch.no_grad()
-    def open_water(self, view: View) -> Tensor:
+    def open_water(
+        self,
+        view: View,
+        lit: Tensor,  # [H, W, 3] its picture, evenly lit
+    ) -> Tensor:
         """[H, W] bool, True where the view's picture shows nothing but water."""
-        image, water = self.evenly_lit(view), self.water(view)
+        water = self.water(view)
         if water is None:
-            return torch.zeros(image.shape[:2], dtype=torch.bool)
+            return torch.zeros(lit.shape[:2], dtype=torch.bool)
         uneven = self.uneven(view)
-        B_inf = water.B_inf.expand(image.shape)
+        B_inf = water.B_inf.expand(lit.shape)
         B_inf = B_inf if uneven is None else B_inf * uneven[..., None]
-        found = torch.from_numpy(open_water(image.numpy(), B_inf.contiguous().numpy()))
+        found = torch.from_numpy(open_water(lit.numpy(), B_inf.contiguous().numpy()))
         return found & view.scene_mask()
 
     @torch.no_grad()

@@ -4,8 +4,7 @@ Detail is lost with range: a far pixel covers more of the scene, and its light s
 is lost that way looks like water if points are compared. So patches are, all of one size in the
 world in every view, and so large that the farthest view that shows one still resolves it: on
 rendered dives the contrast of patches changes with range by a hundredth of an optical depth or two,
-on real clips the water that is found does not depend on their size from 1 to
-8 pixels.
+on real clips the water that is found does not depend on their size from 1 to 8 pixels.
 
 A patch is a grid of samples on the surface, lifted from the nearest view by the map's range. Each
 sample is looked up in the other views; what is hidden there, or in front of the map's surface, is
@@ -127,8 +126,7 @@ def _patches(
         pixels = pixels[:, None] + (sigma[own] * picture.focal / z)[:, None, None] * grid
         lifted = picture.lifted(pixels)
         whole = picture.located(lifted)[2].all(axis=1)
-        spacing = 2.0 * REACH / (SIDE - 1) * sigma[own] * picture.focal / z
-        colours = picture.sampled(pixels, 0.5 * spacing)
+        colours = picture.sampled(pixels, _aperture(picture, sigma[own], z))
         whole &= colours.mean(axis=-1).std(axis=1) > LEAST_TEXTURE
         samples[own[whole]] = lifted[whole]
     return samples, sigma
@@ -144,11 +142,21 @@ def _observed(
     _, weight = _grid()
     pixels, z, seen = picture.located(samples)
     z = z @ weight
-    spacing = 2.0 * REACH / (SIDE - 1) * sigma * picture.focal / z
-    colour = np.einsum("k,nkc->nc", weight, picture.sampled(pixels, 0.5 * spacing))
+    colours = picture.sampled(pixels, _aperture(picture, sigma, z))
+    colour = np.einsum("k,nkc->nc", weight, colours)
     size = np.array([picture.camera.width, picture.camera.height])
     xy = np.einsum("k,nkc->nc", weight, pixels) / (0.5 * size) - 1.0
     return colour, z[:, None], xy, seen.mean(axis=1) > SEEN_SHARE
+
+
+def _aperture(
+    picture: PosedPicture,
+    sigma: Array,  # [N] of patches, map units
+    z: Array,  # [N] their ranges
+) -> Array:
+    """[N] px that a sample averages: half of what lies between two samples."""
+    spacing = 2.0 * REACH / (SIDE - 1) * sigma * picture.focal / z
+    return 0.5 * spacing
 
 
 def _grid() -> tuple[Array, Array]:
