@@ -25,7 +25,9 @@ __all__ = [
     "EncodedPicture",
     "Frame",
     "Lights",
+    "Position",
     "TelemetrySample",
+    "UtcTime",
     "Velocity",
 ]
 
@@ -140,6 +142,38 @@ class Lights:
     level: float
 
 
+@dataclass(frozen=True)
+class Position:
+    """A fix on the earth (WGS 84): GNSS at the surface, or an acoustic one of the vehicle below."""
+
+    t_ns: int
+    arrival_ns: int
+    source: str
+    latitude_deg: float
+    longitude_deg: float
+    sigma_m: float
+    """1 sigma of each horizontal direction."""
+
+
+@dataclass(frozen=True)
+class UtcTime:
+    """UTC as a device states it: the moment ``t_ns`` was ``utc_ns``."""
+
+    t_ns: int
+    arrival_ns: int
+    source: str
+    utc_ns: int
+    """Nanoseconds since 1970-01-01 UTC."""
+
+
 TelemetrySample: TypeAlias = (
-    Depth | Attitude | AngularRate | Acceleration | Velocity | Altitude | Lights
+    Depth
+    | Attitude
+    | AngularRate
+    | Acceleration
+    | Velocity
+    | Altitude
+    | Lights
+    | Position
+    | UtcTime
 )

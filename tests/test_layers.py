@@ -17,7 +17,7 @@ FLOORS = (
     {"dive", "viewer"},
     {"slam", "export", "sim_drivers"},
     {"tracking", "mapping", "training", "recording", "drivers"},
-    {"keyframes", "sources", "synthetic"},
+    {"keyframes", "sources", "synthetic", "fusion"},
     {"prior", "messages", "storage", "access"},
     {"config", "geometry", "render"},
     {"errors", "clocks", "profiler", "signals", "cores"},

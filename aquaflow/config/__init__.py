@@ -11,6 +11,7 @@ from typing import Any
 
 from pydantic import Field
 
+from aquaflow.config.fusion import FusionConfig
 from aquaflow.config.mapping import (
     DecoderConfig,
     InsertionConfig,
@@ -38,6 +39,7 @@ from aquaflow.errors.plain_yaml import read_mapping
 __all__ = [
     "Config",
     "DecoderConfig",
+    "FusionConfig",
     "GateConfig",
     "GraphConfig",
     "InitialisationConfig",
@@ -69,6 +71,7 @@ class Config(Stage):
     source: SourceConfig = SourceConfig()
     tracking: TrackingConfig = TrackingConfig()
     mapping: MappingConfig = MappingConfig()
+    fusion: FusionConfig = FusionConfig()
 
 
 def parse_config(data: dict[str, Any], origin: str) -> Config:

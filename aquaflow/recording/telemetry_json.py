@@ -13,7 +13,9 @@ from aquaflow.messages import (
     Attitude,
     Depth,
     Lights,
+    Position,
     TelemetrySample,
+    UtcTime,
     Velocity,
 )
 
@@ -25,6 +27,8 @@ KINDS: dict[str, type[TelemetrySample]] = {
     "velocity": Velocity,
     "altitude": Altitude,
     "lights": Lights,
+    "position": Position,
+    "utc_time": UtcTime,
 }
 """Telemetry samples by the name that they are recorded under."""
 KIND_OF: dict[type[TelemetrySample], str] = {sample: kind for kind, sample in KINDS.items()}
@@ -42,7 +46,7 @@ def sample_schema(kind: str) -> bytes:
         "source": {"type": "string"},
     }
     for field in fields(KINDS[kind]):
-        number: dict[str, Any] = {"type": "number"}
+        number: dict[str, Any] = {"type": "integer" if field.name == "utc_ns" else "number"}
         length = LENGTHS.get(field.name)
         if length is not None:
             number = {"type": "array", "items": number, "minItems": length, "maxItems": length}

@@ -1,0 +1,1 @@
+"""Telemetry and camera together: metres, gravity, north, depth, time."""

@@ -1,0 +1,116 @@
+"""Where a sub-map lies in the world, and how well that is known.
+
+The world frame n is local north-east-down: x points north (or along the initial heading, where no
+compass is trusted), y to the right of it, z down. Its origin is the body at the dive's first pose,
+at the water surface where depth is measured. A map without telemetry stays as it is: T_nm is the
+identity and the unit is the map's own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.geometry.similarity import Sim3
+
+Array = npt.NDArray[np.float64]
+
+North: TypeAlias = Literal["true north", "magnetic north", "initial heading", "first keyframe"]
+"""What the x axis of n points to; the camera axes of the first keyframe where nothing is known."""
+
+LARGEST_SCALE_SIGMA = 0.1
+"""Relative 1 sigma of the scale up to which lengths are called metres: judgement, a ruler that may
+be 10 % off is still one for a pilot; beyond, the map keeps its own unit."""
+LARGEST_TILT_SIGMA = np.radians(5.0)
+"""1 sigma of gravity's direction, rad, up to which the world is turned level: judgement."""
+UNKNOWN_SIGMA = 1e3
+"""1 sigma, in m, rad and log-scale, of a direction that nothing has measured."""
+
+
+@dataclass(frozen=True)
+class SourceReport:
+    """What became of one source of telemetry."""
+
+    source: str
+    """The device's name."""
+    kind: str
+    """As in a recording: depth, attitude, velocity, altitude, position, ..."""
+    used: int = 0
+    rejected: int = 0
+    """Samples that contradicted the others, by chi-square."""
+    reason: str = ""
+    """Why nothing of it, or not all, was used; empty where there is nothing to say."""
+
+
+@dataclass(frozen=True)
+class Origin:
+    """The point of the earth where n has its origin (WGS 84)."""
+
+    latitude_deg: float
+    longitude_deg: float
+    source: str
+    sigma_m: float
+    """1 sigma of the horizontal position."""
+
+
+@dataclass(frozen=True)
+class MetricFrame:
+    """The similarity from a sub-map's world m to n, its covariance, and what is known of it."""
+
+    T_nm: Sim3
+    """Scale 1 and the map's unit where the scale is unknown."""
+    covariance: Array
+    """[7, 7] of the left tangent of ``T_nm``: translation (m), rotation (rad), log-scale."""
+    metric: bool = False
+    """True if lengths are metres."""
+    level: bool = False
+    """True if z points down."""
+    north: North = "first keyframe"
+    depth_known: bool = False
+    """True if z = 0 is the water surface."""
+    origin: Origin | None = None
+    T_bc: Sim3 | None = None
+    """Camera to body (forward, right, down), m, as corrected; None if the mounting is unknown."""
+    scale_source: str = ""
+    """Devices that the scale comes from, or why there is none."""
+    sources: tuple[SourceReport, ...] = ()
+
+    @staticmethod
+    def unknown(reason: str = "no telemetry was given", scale_source: str = "") -> MetricFrame:
+        """A map without telemetry: its own unit, the first keyframe's camera axes."""
+        covariance = np.diag(np.full(7, UNKNOWN_SIGMA**2))
+        said = scale_source or f"none: {reason}; 1 map unit is the median depth of the start"
+        return MetricFrame(Sim3.identity(), covariance, scale_source=said)
+
+    @property
+    def unit(self) -> str:
+        """Of lengths in n."""
+        return "m" if self.metric else "map units"
+
+    @property
+    def scale_sigma(self) -> float:
+        """Relative 1 sigma of the scale."""
+        return float(np.sqrt(self.covariance[6, 6]))
+
+    @property
+    def tilt_sigma_rad(self) -> float:
+        """1 sigma of gravity's direction, the larger of its two axes."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[3:5, 3:5])[-1]))
+
+    @property
+    def heading_sigma_rad(self) -> float:
+        """1 sigma of the turn about the vertical, against what ``north`` says."""
+        return float(np.sqrt(self.covariance[5, 5]))
+
+    def position_covariance(
+        self,
+        p_n: Array,  # [3] in n
+    ) -> Array:
+        """[3, 3] m^2 of a point in n that follows from the frame alone: first order."""
+        x, y, z = p_n
+        turn = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])  # d(w x p) / dw
+        J = np.hstack([np.eye(3), turn, np.asarray(p_n)[:, None]])
+        return np.asarray(J @ self.covariance @ J.T)
