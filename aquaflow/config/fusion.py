@@ -23,3 +23,18 @@ class FusionConfig(Stage):
         le=45,
         description="deg, 1 sigma of every stated mounting: set by eye (judgement)",
     )
+    heading: bool = Field(
+        True, description="trust the attitude's heading as magnetic north; False: x of the world "
+        "is the vehicle's first heading"
+    )  # fmt: skip
+    heading_sigma_deg: float = Field(
+        5.0, gt=0, le=90, description="deg, 1 sigma of the compass's constant error in a vehicle "
+        "(judgement: ArduSub's calibrated compass beside thrusters and lamps)"
+    )  # fmt: skip
+    dvl_scale_sigma: float = Field(
+        0.001, ge=0, le=0.1, description="relative, 1 sigma of a DVL's long-term accuracy: Water "
+        "Linked A50 Performance 0.1 %, Standard 1 %; speed of sound for a wrong salinity adds 1 %"
+    )  # fmt: skip
+    position_lag_sigma_s: float = Field(
+        0.3, ge=0, description="s, 1 sigma of how much older a position fix is than it states"
+    )

@@ -1,0 +1,59 @@
+"""The camera's path in one sub-map, at any moment between two of its poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation, Slerp
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+LONGEST_GAP_S = 1.5
+"""Between two poses, across which the path is interpolated; a survey camera takes one picture a
+second, and an ROV changes its speed within a few seconds."""
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Camera poses of one sub-map in its own world m, map units."""
+
+    t_s: Array
+    """[N] s, strictly increasing."""
+    R_mc: Array
+    """[N, 3, 3] camera to map."""
+    p_m: Array
+    """[N, 3] camera centre."""
+
+    def __len__(self) -> int:
+        return len(self.t_s)
+
+    def covers(
+        self,
+        t_s: Array,  # [M] s
+    ) -> Mask:
+        """[M] moments at which the path is known, by interpolation over short gaps only."""
+        if len(self) < 2:
+            return np.zeros(len(t_s), dtype=bool)
+        after = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self) - 1)
+        short = (self.t_s[after] - self.t_s[after - 1]) <= LONGEST_GAP_S
+        return np.asarray(short & (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1]))
+
+    def at(
+        self,
+        t_s: Array,  # [M] s, covered
+    ) -> tuple[Array, Array]:
+        """Rotations [M, 3, 3] and camera centres [M, 3]; between poses at constant rates."""
+        rotations = Slerp(self.t_s, Rotation.from_matrix(self.R_mc))(t_s).as_matrix()
+        centres = np.stack([np.interp(t_s, self.t_s, self.p_m[:, k]) for k in range(3)], axis=1)
+        return np.asarray(rotations), centres
+
+    def velocity(
+        self,
+        t_s: Array,  # [M] s, covered
+    ) -> Array:
+        """[M, 3] map units/s."""
+        slope = np.gradient(self.p_m, self.t_s, axis=0)
+        return np.stack([np.interp(t_s, self.t_s, slope[:, k]) for k in range(3)], axis=1)

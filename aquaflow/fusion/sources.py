@@ -1,0 +1,60 @@
+"""Which samples the estimator can use of a dive's telemetry, and why not the others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from aquaflow.fusion.camera_path import CameraPath
+from aquaflow.fusion.metric_frame import SourceReport
+from aquaflow.fusion.telemetry import Series, Telemetry
+from aquaflow.messages import Acceleration, Altitude, Attitude, Depth, Position, Velocity
+
+LEAST_SAMPLES = 5
+"""Of one source while the camera had poses; fewer cannot show their noise."""
+KINDS: dict[str, type] = {
+    "depth": Depth, "attitude": Attitude, "acceleration": Acceleration, "velocity": Velocity,
+    "altitude": Altitude, "position": Position,
+}  # fmt: skip
+"""Kinds of message that say something about the map's frame."""
+
+
+@dataclass(frozen=True)
+class UsableSeries:
+    """The samples of each kind at moments when the camera had a pose."""
+
+    depth: list[Series] = field(default_factory=list)
+    attitude: list[Series] = field(default_factory=list)
+    acceleration: list[Series] = field(default_factory=list)
+    velocity: list[Series] = field(default_factory=list)
+    altitude: list[Series] = field(default_factory=list)
+    position: list[Series] = field(default_factory=list)
+    left_out: list[SourceReport] = field(default_factory=list)
+
+    @staticmethod
+    def of(telemetry: Telemetry, path: CameraPath) -> UsableSeries:
+        """All sources with enough samples along the path."""
+        usable = UsableSeries()
+        for kind, message in KINDS.items():
+            for series in telemetry.of(message):
+                covered = path.covers(series.t_s)
+                if int(covered.sum()) < LEAST_SAMPLES:
+                    reason = _why_not(series, path)
+                    usable.left_out.append(SourceReport(series.source, kind, reason=reason))
+                    continue
+                chosen = Series(series.source, series.t_s[covered], series.values[covered])
+                getattr(usable, kind).append(chosen)
+        return usable
+
+
+def _why_not(series: Series, path: CameraPath) -> str:
+    if len(series) < LEAST_SAMPLES:
+        return f"only {len(series)} samples"
+    first, last = float(np.min(series.t_s)), float(np.max(series.t_s))
+    if last < path.t_s[0] or first > path.t_s[-1]:
+        return (
+            f"its samples are of {first:.0f} to {last:.0f} s, the camera's poses of "
+            f"{path.t_s[0]:.0f} to {path.t_s[-1]:.0f} s"
+        )
+    return "too few samples while the camera had a pose"
