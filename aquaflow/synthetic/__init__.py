@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from aquaflow.synthetic.config import SyntheticConfig
     from aquaflow.synthetic.dive import write_dive
+    from aquaflow.synthetic.simulation import SimulatedDive, simulate
     from aquaflow.synthetic.telemetry import read_telemetry
     from aquaflow.synthetic.truth import Truth, read_truth
     from aquaflow.synthetic.water import WATER_TYPES, Medium
@@ -18,20 +19,24 @@ if TYPE_CHECKING:
 __all__ = [
     "WATER_TYPES",
     "Medium",
+    "SimulatedDive",
     "SyntheticConfig",
     "Truth",
     "read_telemetry",
     "read_truth",
+    "simulate",
     "write_dive",
 ]
 
 _HOMES = {
     "Medium": "water",
+    "SimulatedDive": "simulation",
     "SyntheticConfig": "config",
     "Truth": "truth",
     "WATER_TYPES": "water",
     "read_telemetry": "telemetry",
     "read_truth": "truth",
+    "simulate": "simulation",
     "write_dive": "dive",
 }
 """Module of each public name, imported when it is first asked for."""

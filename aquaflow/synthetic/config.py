@@ -6,6 +6,8 @@ from typing import Any, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from aquaflow.synthetic.telemetry_noise import TelemetryNoise
+
 __all__ = ["Display", "SceneKind", "SyntheticConfig", "TelemetryNoise", "WaterType"]
 
 SceneKind: TypeAlias = Literal["reef", "flat_sand", "wall", "pipe", "pool", "survey"]
@@ -30,28 +32,6 @@ SCENE_DEFAULTS: dict[str, dict[str, object]] = {
     },
 }  # fmt: skip
 """What differs from the fields' defaults where nothing else is asked for."""
-
-
-class TelemetryNoise(BaseModel):
-    """Rates and one-sigma white noise of the simulated instruments."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    depth_hz: float = Field(10.0, gt=0, description="Hz; Bar30-class depth cell over MAVLink")
-    depth_sigma_m: float = Field(0.01, ge=0, description="m; Bar30 short-term noise is about 1 cm")
-    attitude_hz: float = Field(20.0, gt=0, description="Hz; ATTITUDE stream of an autopilot")
-    attitude_sigma_deg: float = Field(
-        0.5, ge=0, description="degrees per body axis; typical MEMS AHRS in motion"
-    )
-    rate_hz: float = Field(50.0, gt=0, description="Hz; raw gyro stream of an autopilot")
-    rate_sigma_rad_s: float = Field(
-        0.002, ge=0, description="rad/s; 0.01 deg/s/sqrt(Hz) MEMS gyro over 50 Hz, rounded up"
-    )
-    dvl_hz: float = Field(5.0, gt=0, description="Hz; DVL-A50-class, 4 to 15 Hz with altitude")
-    dvl_sigma_m_s: float = Field(
-        0.01, ge=0, description="m/s per axis, also reported as the figure of merit"
-    )
-    latency_s: float = Field(0.03, ge=0, description="s; mean delay from measurement to arrival")
 
 
 class SyntheticConfig(BaseModel):
@@ -92,6 +72,18 @@ class SyntheticConfig(BaseModel):
         ge=5,
         le=90,
         description="degrees below the horizon; oblique, so that ranges span 1:3 in a picture",
+    )
+    camera_position_m: tuple[float, float, float] = Field(
+        (0.2, 0.0, 0.05),
+        description="m forward, right, down of the body's origin; judgement: the front dome of a "
+        "BlueROV2, whose frame is 0.46 m long",
+    )
+    mounting_error_deg: float = Field(
+        0.0,
+        ge=0,
+        le=45,
+        description="degrees by which the true mounting of the camera, and that of the DVL, is "
+        "turned from the stated one, about a random axis; by eye about 3",
     )
     lane_spacing_m: float = Field(0.6, gt=0, description="m; half a footprint at 1.5 m altitude")
     lane_length_m: float = Field(4.0, gt=0, description="m, longest lane before one is added")

@@ -1,8 +1,6 @@
 """The vehicle's path: a way over the floor at an altitude, with sway.
 
-The survey frame has x along the lanes, y to the right and z down, with the mean floor at z = 0.
-World is NED-like (z down, 0 at the surface). For floors the two differ by the depth only; for the
-wall the survey's x points up and its z points into the wall.
+For the survey frame and the world see :mod:`aquaflow.synthetic.mounting`.
 """
 
 from __future__ import annotations
@@ -18,9 +16,10 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from aquaflow.synthetic.config import SyntheticConfig
+from aquaflow.synthetic.mounting import mountings_of, survey_to_world
 from aquaflow.synthetic.ways import DENSE, Way, way_of
 
-__all__ = ["Path", "mounting", "plan_path", "survey_to_world"]
+__all__ = ["Path", "plan_path"]
 
 Array: TypeAlias = npt.NDArray[np.float64]
 
@@ -30,26 +29,9 @@ MAX_CLIMB_M_S = 0.3
 """Fastest change of height with which the vehicle follows the floor."""
 
 
-def survey_to_world(config: SyntheticConfig) -> tuple[Array, Array]:
-    """R_ws [3, 3] and t_ws [3] (m)."""
-    offset = np.array([0.0, 0.0, config.floor_depth_m])
-    if config.scene == "wall":
-        # Columns: survey x is up, survey y is east, survey z (into the wall) is north.
-        return np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]), offset
-    return np.eye(3), offset
-
-
-def mounting(config: SyntheticConfig) -> Array:
-    """R_bc [3, 3], from camera axes to the body's forward, right, down."""
-    pitch = math.radians(config.camera_pitch_deg)
-    c, s = math.cos(pitch), math.sin(pitch)
-    survey = np.array([[0.0, -s, c], [1.0, 0.0, 0.0], [0.0, c, s]])
-    return np.asarray(survey_to_world(config)[0] @ survey)
-
-
 @dataclass(frozen=True)
 class Path:
-    """Pose as a smooth function of time; the body's origin is the camera's centre."""
+    """Pose of the camera and attitude of the body as smooth functions of time."""
 
     position: CubicSpline
     """t -> [3] m, survey frame."""
@@ -60,6 +42,7 @@ class Path:
     R_ws: Array
     t_ws: Array
     R_bc: Array
+    """[3, 3] camera axes in the body, in truth."""
 
     def centre_s(
         self,
@@ -134,8 +117,9 @@ def plan_path(
         limit = min(amplitude, MAX_TURN_RATE_DEG_S / omega)
         sway.append((math.radians(limit), omega, float(rng.uniform(-0.5, 0.5))))
     R_ws, t_ws = survey_to_world(config)
+    R_bc = mountings_of(config).R_bc
     spline = CubicSpline(at, points, bc_type="periodic" if way.closed else "not-a-knot")
-    return Path(spline, CubicSpline(at, way.heading), tuple(sway), R_ws, t_ws, mounting(config))
+    return Path(spline, CubicSpline(at, way.heading), tuple(sway), R_ws, t_ws, R_bc)
 
 
 def _followed(

@@ -8,14 +8,15 @@ The folder of a dive:
   nothing is hit) and ``hit`` bool [H, W];
 - ``camera.yaml``, ``timestamps.txt`` (s, a line per picture), ``poses.tum`` (t_s tx ty tz qx qy qz
   qw, camera to world), ``medium.yaml`` (the water), ``telemetry.csv``, ``synth.yaml`` (the config,
-  the version and how the camera is mounted).
+  the version, how the camera is mounted as a user believes it, and under ``truth`` the true
+  mountings and constant errors of the instruments).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -45,7 +46,13 @@ class Truth:
     T_wc: Array
     """[N, 4, 4], camera to world, metres."""
     R_bc: Array
-    """[3, 3], camera axes to the body's forward, right, down."""
+    """[3, 3], camera axes to the body's forward, right, down, in truth."""
+    T_bc: Array
+    """[4, 4], camera to body, metres, in truth."""
+    T_bc_stated: Array
+    """[4, 4], the same as a user believes it; without a mounting error it is the truth."""
+    errors: dict[str, Any]
+    """Section ``truth`` of synth.yaml by name; empty for dives of version 1."""
 
     def __len__(self) -> int:
         return len(self.timestamps_s)
@@ -96,7 +103,9 @@ def read_truth(out: Path) -> Truth:
     try:
         stated = read_mapping(out / "synth.yaml", "facts of the dive", "write the dive again")
         config = SyntheticConfig.model_validate(stated["config"])
-        R_bc = np.array(stated["mounting"]["R_body_camera"], np.float64).reshape(3, 3)
+        errors = dict(stated.get("truth", {}))
+        T_bc_stated = _mounting(stated["mounting"])
+        T_bc = _mounting(errors) if errors else T_bc_stated
         rows = np.loadtxt(out / "poses.tum", ndmin=2).reshape(-1, 8)
         times = np.loadtxt(out / "timestamps.txt", ndmin=1)
     except (AquaFlowError, OSError, KeyError, TypeError, ValueError) as error:
@@ -108,4 +117,13 @@ def read_truth(out: Path) -> Truth:
     T_wc[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
     T_wc[:, :3, 3] = rows[:, 1:4]
     camera = load_camera(out / "camera.yaml")
-    return Truth(out, config, camera, load_medium(out / "medium.yaml"), times, T_wc, R_bc)
+    medium = load_medium(out / "medium.yaml")
+    return Truth(out, config, camera, medium, times, T_wc, T_bc[:3, :3], T_bc, T_bc_stated, errors)
+
+
+def _mounting(section: dict[str, Any]) -> Array:
+    """[4, 4] camera to body of a section of synth.yaml."""
+    T = np.eye(4)
+    T[:3, :3] = np.array(section["R_body_camera"], np.float64).reshape(3, 3)
+    T[:3, 3] = section["t_body_camera_m"]
+    return T

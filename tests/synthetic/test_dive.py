@@ -13,7 +13,6 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from aquaflow.errors import InputError
-from aquaflow.messages import AngularRate, Attitude, Depth, Velocity
 from aquaflow.synthetic import (
     SyntheticConfig,
     Truth,
@@ -185,41 +184,6 @@ def test_a_slow_pan_changes_pixels_smoothly() -> None:
     # An aliased picture changes as much in a quarter of a pixel as in a whole one.
     assert max(steps) < 0.45 * whole
     assert max(steps) < 1.5 * min(steps)
-
-
-def test_telemetry_has_the_stated_noise_and_integrates_to_the_truth(long_path: Truth) -> None:
-    from aquaflow.synthetic.dive import build
-
-    noise = long_path.config.telemetry
-    path = build(long_path.config)[1]
-    samples = list(read_telemetry(long_path.folder / "telemetry.csv"))
-    assert all(s.arrival_ns >= s.t_ns for s in samples)
-    assert [s.arrival_ns for s in samples] == sorted(s.arrival_ns for s in samples)
-
-    depths = [s for s in samples if isinstance(s, Depth)]
-    t = np.array([s.t_ns for s in depths]) * 1e-9
-    error = np.array([s.depth_m for s in depths]) - path.centre_w(t)[:, 2]
-    assert np.std(error) == pytest.approx(noise.depth_sigma_m, rel=0.25)
-
-    attitudes = [s for s in samples if isinstance(s, Attitude)]
-    t = np.array([s.t_ns for s in attitudes]) * 1e-9
-    measured = Rotation.from_quat(np.roll([s.wxyz for s in attitudes], -1, axis=1))
-    turn = (Rotation.from_matrix(path.R_wb(t)).inv() * measured).as_rotvec(degrees=True)
-    assert np.std(turn) == pytest.approx(noise.attitude_sigma_deg, rel=0.1)
-
-    rates = [s for s in samples if isinstance(s, AngularRate)]
-    t = np.array([s.t_ns for s in rates]) * 1e-9
-    error = np.array([s.rate_rad_s for s in rates]) - path.rate_b(t)
-    assert np.std(error) == pytest.approx(noise.rate_sigma_rad_s, rel=0.1)
-
-    speeds = [s for s in samples if isinstance(s, Velocity)]
-    t = np.array([s.t_ns for s in speeds]) * 1e-9
-    in_world = np.einsum("nij,nj->ni", path.R_wb(t), [s.velocity_m_s for s in speeds])
-    travelled = (0.5 * (in_world[1:] + in_world[:-1]) * np.diff(t)[:, None]).sum(axis=0)
-    assert {s.figure_of_merit_m_s for s in speeds} == {noise.dvl_sigma_m_s}
-    np.testing.assert_allclose(
-        travelled, path.centre_w(t[-1:])[0] - path.centre_w(t[:1])[0], atol=0.05
-    )
 
 
 def test_camera_poses_follow_from_body_attitude_and_mounting(small: Path) -> None:

@@ -1,0 +1,94 @@
+"""Where a dive goes: its relief and objects, and the path over them. Nothing here is rendered."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.synthetic import objects, pool
+from aquaflow.synthetic import path as paths
+from aquaflow.synthetic.config import SyntheticConfig
+from aquaflow.synthetic.motion import BodyMotion
+from aquaflow.synthetic.mounting import mountings_of
+from aquaflow.synthetic.placement import place_objects
+from aquaflow.synthetic.radiance import TEXELS_PER_CELL
+from aquaflow.synthetic.relief import Area, Relief
+from aquaflow.synthetic.streams import stream
+from aquaflow.synthetic.terrain import build_relief
+from aquaflow.synthetic.ways import way_of
+
+__all__ = ["Site", "camera_of", "site_of"]
+
+Array: TypeAlias = npt.NDArray[np.float64]
+
+TEXEL_PX = 0.6
+"""Size of a texel of the floor in pixels at the nearest usual range: sharp there and beyond."""
+TEXELS_MOST = 14e6
+"""Keeps the memory that a dive is made in at about 1.5 GB."""
+
+
+@dataclass(frozen=True)
+class Site:
+    """What a dive passes over, and how it passes."""
+
+    relief: Relief
+    shapes: list[objects.Shape]
+    crests: npt.NDArray[np.float32]
+    """[rows, columns] m up, the relief with the tops of the shapes, at the relief's cells."""
+    path: paths.Path
+    motion: BodyMotion
+
+
+def camera_of(config: SyntheticConfig) -> CameraModel:
+    """The calibrated pinhole camera of a dive."""
+    focal = config.focal_px
+    return CameraModel(
+        config.width, config.height, focal, focal, config.width / 2.0, config.height / 2.0
+    )
+
+
+def site_of(config: SyntheticConfig, least_cell_m: float = 0.0) -> Site:
+    """The site of a dive.
+
+    Cells of ``least_cell_m`` that are larger than the pictures need make another relief with the
+    same statistics: the finest shapes are missing, and the objects lie elsewhere.
+    """
+    loop = way_of(config).points
+    flat = paths.plan_path(config, stream(config.seed, "sway"))
+    low, high = _seen(config, flat)
+    texel = max(
+        TEXEL_PX * (config.altitude_m - 0.2) / config.focal_px,
+        math.sqrt(float(np.prod(high - low)) / TEXELS_MOST),
+    )
+    area = Area.around(low, high, max(texel * TEXELS_PER_CELL, least_cell_m))
+    relief = build_relief(config.scene, area, loop, stream(config.seed, "terrain"))
+    shapes = place_objects(config.scene, relief, loop, stream(config.seed, "objects"))
+    below = area.sample(relief.height, loop)
+    path = paths.plan_path(config, stream(config.seed, "sway"), below)
+    motion = BodyMotion(path, mountings_of(config))
+    return Site(relief, shapes, objects.casters(relief, shapes), path, motion)
+
+
+def _seen(config: SyntheticConfig, flat: paths.Path) -> tuple[Array, Array]:
+    """Corners [2] (m, survey frame) of the floor that the dive sees."""
+    if config.scene == "pool":
+        return pool.corners(way_of(config).points)
+    t = np.linspace(0.0, config.duration_s, 65)
+    camera = camera_of(config)
+    corners = np.array([[x, y] for x in (0, camera.width) for y in (0, camera.height)], float)
+    rays = camera.unproject(corners)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    directions = np.einsum("nij,kj->nki", flat.R_ws.T @ flat.R_wc(t), rays)
+    centre = flat.centre_s(t)[:, None, :]
+    # Relief makes rays travel further than over a flat floor; a metre more than the camera's
+    # height covers hollows.
+    drop = np.maximum(directions[..., 2], 1e-3)
+    reach = np.minimum((1.0 - centre[..., 2]) / drop, config.max_range_m)
+    points = (centre + reach[..., None] * directions)[..., :2].reshape(-1, 2)
+    points = np.vstack([points, centre[:, 0, :2]])
+    return points.min(axis=0) - 0.5, points.max(axis=0) + 0.5

@@ -1,0 +1,66 @@
+"""All instruments along one dive: their samples in the order of arrival."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.messages import TelemetrySample
+from aquaflow.synthetic.config import SyntheticConfig
+from aquaflow.synthetic.motion import BodyMotion
+from aquaflow.synthetic.streams import Instrument, instrument_stream
+from aquaflow.synthetic.telemetry.altitude import altitude
+from aquaflow.synthetic.telemetry.constants import Constants
+from aquaflow.synthetic.telemetry.inertial import angular_rate, attitude
+from aquaflow.synthetic.telemetry.pressure import depth
+from aquaflow.synthetic.telemetry.sonar import Sonar
+from aquaflow.synthetic.telemetry.table import sample_of
+from aquaflow.synthetic.telemetry.velocity import velocity
+
+__all__ = ["SOURCE", "measure"]
+
+Array: TypeAlias = npt.NDArray[np.float64]
+Measure: TypeAlias = Callable[[Array, np.random.Generator], Array]
+"""Times [N] s and the instrument's stream to values [N, K]; nan where it is silent."""
+
+SOURCE = "synthetic"
+"""The instruments' name in samples."""
+
+
+def measure(
+    config: SyntheticConfig, motion: BodyMotion, sonar: Sonar, constants: Constants
+) -> list[TelemetrySample]:
+    """Samples of every instrument between the first picture and the last, by arrival.
+
+    Times are nanoseconds since the first picture.
+    """
+    samples: list[TelemetrySample] = []
+    for kind, (rate_hz, values_at) in _instruments(config, motion, sonar, constants).items():
+        last = (config.frames - 1) / config.fps
+        t = np.arange(int(last * rate_hz + 1e-9) + 1) / rate_hz
+        rng = instrument_stream(config.seed, kind)
+        late = rng.exponential(1.0, len(t)) * config.telemetry.latency_s
+        # One device's messages arrive in the order in which they were sent.
+        arrival = np.maximum.accumulate(t + late)
+        values = values_at(t, rng)
+        for k in np.flatnonzero(np.isfinite(values).all(axis=1)):
+            t_ns, arrival_ns = round(float(t[k]) * 1e9), round(float(arrival[k]) * 1e9)
+            samples.append(sample_of(kind, t_ns, arrival_ns, SOURCE, values[k].tolist()))
+    return sorted(samples, key=lambda sample: sample.arrival_ns)
+
+
+def _instruments(
+    config: SyntheticConfig, motion: BodyMotion, sonar: Sonar, constants: Constants
+) -> dict[Instrument, tuple[float, Measure]]:
+    """Rate (Hz) and measurement of each kind."""
+    noise = config.telemetry
+    return {
+        "depth": (noise.depth_hz, lambda t, rng: depth(t, motion, noise, rng)),
+        "attitude": (noise.attitude_hz, lambda t, rng: attitude(t, motion, noise, rng)),
+        "angular_rate": (noise.rate_hz, lambda t, rng: angular_rate(t, motion, noise, rng)),
+        "velocity": (noise.dvl_hz, lambda t, rng: velocity(t, motion, constants, noise, rng)),
+        "altitude": (noise.altitude_hz, lambda t, rng: altitude(t, motion, sonar, noise, rng)),
+    }

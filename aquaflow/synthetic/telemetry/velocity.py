@@ -1,0 +1,34 @@
+"""The Doppler velocity log (DVL)."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.synthetic.motion import BodyMotion
+from aquaflow.synthetic.telemetry.constants import Constants
+from aquaflow.synthetic.telemetry_noise import TelemetryNoise
+
+__all__ = ["velocity"]
+
+Array: TypeAlias = npt.NDArray[np.float64]
+
+
+def velocity(
+    t: Array,  # [N] s
+    motion: BodyMotion,
+    constants: Constants,
+    noise: TelemetryNoise,
+    rng: np.random.Generator,
+) -> Array:
+    """[N, 4] m/s over ground in the body's axes, and the figure of merit.
+
+    A driver turned the samples into the body by the stated mounting, and moved them to its
+    origin; the mounting's error is what remains.
+    """
+    sigma = noise.dvl_sigma_m_s
+    true_d = (1.0 + constants.dvl_scale) * motion.velocity_b(t) @ motion.mountings.R_bd
+    merit = np.full((len(t), 1), sigma)
+    return np.hstack([true_d + sigma * rng.standard_normal((len(t), 3)), merit])
