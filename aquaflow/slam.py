@@ -25,7 +25,12 @@ from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.tracking.gate.gate import FrameGate, GateKind, Verdict
 from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph
 from aquaflow.tracking.loops.relocaliser import Places
+from aquaflow.tracking.metric.metric_frames import MetricFrames
 from aquaflow.tracking.tracker import Tracker
+
+SETTLING_ROUNDS = 2
+"""Optimisations with telemetry at the end: the second starts from a path that the first pulled
+straight, whose metric frame is better."""
 
 
 class Slam:
@@ -67,7 +72,13 @@ class Slam:
         self.tracker = Tracker(
             self.prior, self.keyframes, config.tracking, places, live, self.failures
         )
-        self.graph = KeyframeGraph(self.keyframes, places, config.tracking, self.failures)
+        self.metric = MetricFrames(
+            self.keyframes, lambda: self.frames, config.fusion, self.failures
+        )
+        """Telemetry, and the frames in metres that it gives."""
+        self.graph = KeyframeGraph(
+            self.keyframes, places, config.tracking, self.failures, self.metric
+        )
         self.renderer = select_renderer(config.mapping.renderer, config.threads or os.cpu_count())
         self.maps: MapWork = maps or Maps(config, self.renderer, self.profiler, work, self.failures)
         self.skipped: Counter[str] = Counter()
@@ -127,8 +138,7 @@ class Slam:
         with self.profiler.stage("track"):
             tracked = self.tracker.finish()
         finished = self._link_map_publish(tracked)
-        while self.graph.optimising:
-            self._follow_graph(wait=True)
+        self._settle_graph()
         with self.failures.contain("insertion"):
             for insertion in self._retired_keyframes():
                 self.maps.insert(insertion)
@@ -139,6 +149,15 @@ class Slam:
             replace(each, T_wc=now.T_wc, sub_map=now.sub_map)
             for each, now in zip(finished, settled, strict=True)
         ]
+
+    def _settle_graph(self) -> None:
+        """The last optimisations, of loops and telemetry, and then the frames in metres."""
+        for _ in range(SETTLING_ROUNDS if self.metric.present else 1):
+            self.graph.straighten()
+            while self.graph.optimising:
+                self._follow_graph(wait=True)
+        with self.profiler.stage("metric"):
+            self.metric.update(self.graph.snapshot)
 
     def close(self, keep: bool = False) -> None:
         """End the background work; remove the files of the work folder, or ``keep`` them."""

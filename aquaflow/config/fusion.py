@@ -38,3 +38,6 @@ class FusionConfig(Stage):
     position_lag_sigma_s: float = Field(
         0.3, ge=0, description="s, 1 sigma of how much older a position fix is than it states"
     )
+    every_keyframes: int = Field(
+        20, ge=1, description="keyframes after which telemetry straightens the keyframe graph"
+    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +13,7 @@ from aquaflow.config.telemetry import MountingConfig
 from aquaflow.fusion.camera_path import CameraPath
 from aquaflow.fusion.factors.factor import Factor
 from aquaflow.fusion.metric_frame import MetricFrame, Origin
-from aquaflow.fusion.problem import problem_of
+from aquaflow.fusion.problem import Problem, problem_of
 from aquaflow.fusion.solution_frame import frame_of
 from aquaflow.fusion.solve import Solution, solve
 from aquaflow.fusion.telemetry import Telemetry
@@ -24,6 +24,16 @@ LEAST_POSES = 5
 """Of a sub-map; a shorter one gets no frame of its own."""
 
 
+@dataclass(frozen=True)
+class Estimate:
+    """The frame of a sub-map, and how it came about."""
+
+    frame: MetricFrame
+    problem: Problem | None = None
+    solution: Solution | None = None
+    """None where no telemetry could be used."""
+
+
 def estimate(
     telemetry: Telemetry,
     path: CameraPath,
@@ -32,7 +42,7 @@ def estimate(
     points: Callable[[], Array],
     extra: Sequence[Factor] = (),
     origin: Origin | None = None,
-) -> tuple[MetricFrame, Solution | None]:
+) -> Estimate:
     """The frame of the sub-map with ``path``.
 
     Args:
@@ -45,13 +55,13 @@ def estimate(
         ArithmeticError: the residuals are not finite.
     """
     if len(path) < LEAST_POSES:
-        return MetricFrame.unknown(f"the sub-map has only {len(path)} poses"), None
+        return Estimate(MetricFrame.unknown(f"the sub-map has only {len(path)} poses"))
     if not telemetry and not extra:
-        return MetricFrame.unknown(), None
+        return Estimate(MetricFrame.unknown())
     problem = problem_of(telemetry, path, config, mounting, points, origin)
     problem.factors += extra
     if not problem.factors:
         unused = MetricFrame.unknown("no telemetry could be used")
-        return replace(unused, sources=tuple(problem.reports)), None
+        return Estimate(replace(unused, sources=tuple(problem.reports)))
     solution = solve(problem.factors, problem.start, problem.prior)
-    return frame_of(problem, solution, path), solution
+    return Estimate(frame_of(problem, solution, path), problem, solution)

@@ -72,6 +72,13 @@ class Telemetry:
     def __bool__(self) -> bool:
         return bool(self._columns) or bool(self.utc)
 
+    def copy(self) -> Telemetry:
+        """What is there now, to be read by another thread."""
+        other = Telemetry()
+        other._columns = {key: column[:] for key, column in self._columns.items()}
+        other._width, other.utc = dict(self._width), list(self.utc)
+        return other
+
     def of(self, kind: type) -> list[Series]:
         """The series of all sources of one kind of message, by name."""
         keys = sorted((key for key in self._columns if key[0] is kind), key=lambda key: key[1])

@@ -54,6 +54,11 @@ class AltitudeFactor(Factor):
         """[N, 1] m."""
         return np.asarray((state.scale * self._range - self._altitude_m)[:, None])
 
+    def scale_misfit(self, state: State) -> tuple[Array, Array]:
+        """Logarithm of the scale that each range alone gives, over the state's; 1 sigma."""
+        ranges = state.scale * self._range
+        return -self.residuals(state)[:, 0] / ranges, self.sigma / ranges
+
 
 def _first_return(
     points: Array,  # [K, 3] map

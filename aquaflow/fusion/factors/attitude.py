@@ -58,6 +58,12 @@ class TiltFactor(Factor):
         axes = _across(self.down_b)
         return np.asarray(np.einsum("nij,nj->ni", axes, turn))
 
+    def turn_wanted(self, state: State) -> Array:
+        """[N, 3] rad, the turn in the axes of n after which down is where it was measured."""
+        R_nb, _ = state.body(self._R_mc, self._p_m)
+        measured = np.einsum("nij,nj->ni", R_nb, self.down_b)
+        return np.cross(measured, [0.0, 0.0, 1.0])
+
 
 class ForceFactor(TiltFactor):
     """The same from specific force, which is down only on average."""

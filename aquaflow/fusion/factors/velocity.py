@@ -55,6 +55,12 @@ class VelocityFactor(Factor):
         body = way[self._last] - way[self._first]
         return np.asarray(state.scale * self._moved_m - body - arm)
 
+    def scale_misfit(self, state: State) -> tuple[Array, Array]:
+        """Logarithm of the scale that each displacement alone gives, over the state's; 1 sigma."""
+        moved = state.scale * self._moved_m
+        square = np.maximum((moved**2).sum(axis=1), 1e-12)
+        return -(self.residuals(state) * moved).sum(axis=1) / square, self.sigma / np.sqrt(square)
+
 
 def _intervals(
     t_s: Array,  # [M] s

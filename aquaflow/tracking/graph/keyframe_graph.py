@@ -8,9 +8,11 @@ came meanwhile are moved along, and loops that came meanwhile start the next opt
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
+from typing import Protocol
 
 import numpy as np
 
@@ -21,7 +23,7 @@ from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.keyframes import Keyframe, KeyframeStore
 from aquaflow.tracking.frames import Link
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph, edge_information, solve
-from aquaflow.tracking.graph.table import GraphResult
+from aquaflow.tracking.graph.table import GraphResult, Snapshot
 from aquaflow.tracking.loops.relocaliser import Places
 
 
@@ -33,6 +35,23 @@ class Correction:
     """By keyframe number: the similarity from its old world frame to the new one."""
     merged: Mapping[int, int] = field(default_factory=dict)
     """Sub-maps that became part of another: from, into."""
+
+
+class Telemetry(Protocol):
+    """What else than links and loops takes part in an optimisation (``tracking/metric``)."""
+
+    @property
+    def present(self) -> bool:
+        """True once there is something."""
+        ...
+
+    def keyframe(self, number: int, parent: int | None) -> bool:
+        """A new keyframe; True if an optimisation is due."""
+        ...
+
+    def job(self, snapshot: Snapshot) -> Callable[[], GraphResult]:
+        """The optimisation of a snapshot, to be called in any thread."""
+        ...
 
 
 class KeyframeGraph:
@@ -47,8 +66,11 @@ class KeyframeGraph:
         places: Places,
         config: TrackingConfig,
         failures: Failures | None = None,
+        telemetry: Telemetry | None = None,
     ) -> None:
+        """``telemetry`` takes part in the optimisations, once there is some."""
         self.graph = PoseGraph(config.graph)
+        self._telemetry = telemetry
         self._failures = failures or Failures()
         self._keyframes, self._places, self._config = keyframes, places, config.graph
         self.loops = 0
@@ -57,7 +79,13 @@ class KeyframeGraph:
         """In the graph; the store may hold some that are not yet."""
         self._executor = ThreadPoolExecutor(1, "keyframe graph")
         self._optimisation: Future[GraphResult] | None = None
-        self._new_loops = False
+        self._due = False
+        """True if loops or telemetry came that no optimisation has seen."""
+
+    @property
+    def snapshot(self) -> Snapshot:
+        """The graph as it is now."""
+        return self.graph.snapshot()
 
     @property
     def optimising(self) -> bool:
@@ -85,6 +113,15 @@ class KeyframeGraph:
                 self._close_loops(keyframe)
         with self._failures.contain("place index", keyframe.frame_index):
             self._places.add(keyframe)
+        if self._telemetry is not None:
+            parent = None if link is None else link.keyframe
+            with self._failures.contain("metric frames", keyframe.frame_index):
+                self._due |= self._telemetry.keyframe(number, parent)
+        self._optimise()
+
+    def straighten(self) -> None:
+        """Start an optimisation together with telemetry, if there is some and none is running."""
+        self._due |= self._telemetry is not None and self._telemetry.present
         self._optimise()
 
     def resume(self, graph: PoseGraph, loops: int) -> None:
@@ -119,10 +156,14 @@ class KeyframeGraph:
         self._executor.shutdown()
 
     def _optimise(self) -> None:
-        """Start an optimisation if there are new loops and none is running."""
-        if self._new_loops and self._optimisation is None:
-            self._new_loops = False
-            self._optimisation = self._executor.submit(solve, self.graph.snapshot())
+        """Start an optimisation if there is something new and none is running."""
+        if self._due and self._optimisation is None:
+            self._due = False
+            snapshot = self.graph.snapshot()
+            job: Callable[[], GraphResult] = partial(solve, snapshot)
+            if self._telemetry is not None and self._telemetry.present:
+                job = self._telemetry.job(snapshot)
+            self._optimisation = self._executor.submit(job)
 
     def _close_loops(self, keyframe: Keyframe) -> None:
         """Edges to all earlier keyframes that prove to show the same place."""
@@ -139,7 +180,7 @@ class KeyframeGraph:
             edge = Edge(number, found.keyframe.number, T_fk, information, loop=True)
             if self.graph.add_edge(edge):
                 self.loops += 1
-                self._new_loops = True
+                self._due = True
 
     def _taken_over(self, result: GraphResult) -> Correction:
         """Apply the result to the keyframes."""

@@ -29,6 +29,9 @@ class Optimisation:
         self.snapshot, self.config = snapshot, snapshot.config
         nodes, self.edges = snapshot.nodes, snapshot.edges
         self.everything = everything
+        self.links: Mask = nodes["number"][self.edges["a"]] >= 0
+        """[M] edges between keyframes; the others come from a world, which all keyframes share: a
+        chain through it would tell a loop nothing (``tracking/metric``)."""
         self.trust: Array = snapshot.trust["trust"].copy()
         self.allowed: Array = snapshot.trust["allowed"].copy()
         self.counts: Mask = self.trust > 0.0
@@ -43,7 +46,8 @@ class Optimisation:
         asked = self._ends(self._strained(fresh[self.counts[fresh]]))
         candidates = self._candidates(fresh)
         for round_ in range(ROUNDS):
-            admission = Admission(self.descent.poses, self.edges, self.counts, self.config)
+            counts = self.counts & self.links
+            admission = Admission(self.descent.poses, self.edges, counts, self.config)
             new = admission.admitted(candidates)
             self.counts[new.edges], self.trust[new.edges] = True, 1.0
             self.allowed[new.edges] = new.allowed

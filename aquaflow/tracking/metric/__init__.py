@@ -1,0 +1,1 @@
+"""Metres, gravity and north for keyframes and sub-maps."""

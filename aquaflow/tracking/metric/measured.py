@@ -1,0 +1,136 @@
+"""What each source of telemetry says about single keyframes, given the estimator's frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.fusion.estimator import Estimate
+from aquaflow.fusion.factors.altitude import AltitudeFactor
+from aquaflow.fusion.factors.attitude import HeadingFactor, TiltFactor
+from aquaflow.fusion.factors.depth import DepthFactor
+from aquaflow.fusion.factors.factor import Factor
+from aquaflow.fusion.factors.position import PositionFactor
+from aquaflow.fusion.factors.velocity import VelocityFactor
+from aquaflow.fusion.state import State
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.tracking.metric.world_edges import Measured, WorldEdge, world_edge
+
+Array = npt.NDArray[np.float64]
+Wanted = Callable[[Factor, State], tuple[Array, Array]]
+
+NEAR_S = 0.5
+"""s; a measurement belongs to keyframes no further away in time. What it adds is the difference to
+the camera's own path at its own moment, which hardly changes in so short a time."""
+DIRECTION_TIME_S = 60.0
+"""s, correlation time of the errors of attitude filters and compasses."""
+LARGEST_SCALE_SIGMA = 0.2
+"""Relative; what says less of the scale is left out: a vehicle that hovers."""
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """What one kind of source wants changed along the dive, with the noise of its data sheet.
+
+    The estimator's own noise does not serve here: what the camera's path errs counts as noise
+    there, and is what shall be corrected here.
+    """
+
+    t_s: Array
+    """[N] s"""
+    wanted: Array
+    """[N, D]"""
+    sigma: Array
+    """[N] white, 1 sigma of each component."""
+    slow: float
+    """1 sigma of what the samples near a keyframe have in common."""
+
+    def at(self, t_s: float) -> tuple[Array, float] | None:
+        """Mean [D] of those near a moment, and its 1 sigma; None where none is near."""
+        low, high = np.searchsorted(self.t_s, (t_s - NEAR_S, t_s + NEAR_S))
+        if high <= low:
+            return None
+        weight = self.sigma[low:high] ** -2.0
+        mean = (weight[:, None] * self.wanted[low:high]).sum(axis=0) / weight.sum()
+        return mean, float(np.hypot(1.0 / np.sqrt(weight.sum()), self.slow))
+
+
+def world_edges(
+    estimate: Estimate,
+    numbers: npt.NDArray[np.int64],  # [K] keyframes
+    t_s: Array,  # [K] s
+    T_mk: Sim3Batch,  # [K]
+) -> list[WorldEdge]:
+    """Edges from the world to keyframes of one sub-map, where telemetry measured something."""
+    if not estimate.frame.level:
+        return []
+    spacing = float(np.ptp(t_s)) / max(len(t_s) - 1, 1)
+    # Errors that last longer than keyframes are apart: as much information as there is in them.
+    repeated = np.sqrt(1.0 + 2.0 * DIRECTION_TIME_S / max(spacing, 1e-3))
+    tilt = _of(estimate, TiltFactor, lambda f, at: (f.turn_wanted(at), f.sigma), repeated)
+    north = _of(estimate, HeadingFactor, lambda f, at: (-f.residuals(at), f.sigma), repeated)
+    depth = place = scale = None
+    if estimate.frame.metric:
+        depth = _of(estimate, DepthFactor, lambda f, at: (-f.residuals(at), f.sigma))
+        place = _of(estimate, PositionFactor, lambda f, at: (-f.residuals(at), f.sigma))
+        scale = _of(estimate, VelocityFactor, _scale) or _of(estimate, AltitudeFactor, _scale)
+    found = []
+    for i, number in enumerate(numbers.tolist()):
+        T_nk, t = estimate.frame.T_nm @ T_mk.element(i), float(t_s[i])
+        measured = _measured(T_nk, t, depth, place, scale, tilt, north)
+        edge = world_edge(number, T_nk, measured)
+        if edge is not None:
+            found.append(edge)
+    return found
+
+
+def _measured(
+    T_nk: Sim3,
+    t_s: float,
+    depth: Corrections | None,
+    place: Corrections | None,
+    scale: Corrections | None,
+    tilt: Corrections | None,
+    north: Corrections | None,
+) -> Measured:
+    measured = Measured()
+    if (deeper := depth and depth.at(t_s)) is not None:
+        measured = replace(measured, depth_m=(float(T_nk.t[2] + deeper[0][0]), deeper[1]))
+    if (moved := place and place.at(t_s)) is not None:
+        measured = replace(measured, place_m=(T_nk.t[:2] + moved[0], moved[1]))
+    if (larger := scale and scale.at(t_s)) is not None:
+        measured = replace(measured, scale=(T_nk.scale * float(np.exp(larger[0][0])), larger[1]))
+    if (turned := tilt and tilt.at(t_s)) is not None:
+        turn, sigma, north_sigma = turned[0].copy(), turned[1], np.inf
+        if (swung := north and north.at(t_s)) is not None:
+            turn[2], north_sigma = swung[0][0], swung[1]
+        measured = replace(measured, turn=turn, turn_sigma=(sigma, north_sigma))
+    return measured
+
+
+def _of(
+    estimate: Estimate, kind: type[Factor], wanted: Wanted, repeated: float = 1.0
+) -> Corrections | None:
+    """The corrections of the first factor of a kind; None if there is none."""
+    assert estimate.problem is not None
+    assert estimate.solution is not None
+    state = estimate.solution.state
+    for factor, kept in zip(estimate.problem.factors, estimate.solution.kept, strict=True):
+        if type(factor) is kind and kept.any():
+            values, sigma = wanted(factor, state)
+            slow = repeated * (
+                0.0 if kind in (VelocityFactor, AltitudeFactor) else factor.slow.least
+            )
+            chosen = kept & (sigma <= LARGEST_SCALE_SIGMA) if slow == 0.0 else kept
+            return Corrections(factor.t_s[chosen], values[chosen], sigma[chosen], slow)
+    return None
+
+
+def _scale(factor: Factor, state: State) -> tuple[Array, Array]:
+    assert isinstance(factor, (VelocityFactor, AltitudeFactor))
+    misfit, sigma = factor.scale_misfit(state)
+    return misfit[:, None], sigma

@@ -1,0 +1,96 @@
+"""Telemetry of a dive, and the metric frames that it gives the sub-maps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.config import FusionConfig
+from aquaflow.errors.failures import Failures
+from aquaflow.fusion.metric_frame import MetricFrame
+from aquaflow.fusion.telemetry import Telemetry
+from aquaflow.keyframes import KeyframeStore
+from aquaflow.messages import TelemetrySample
+from aquaflow.tracking.frame_table import FrameTable
+from aquaflow.tracking.graph.table import GraphResult, Snapshot
+from aquaflow.tracking.metric.straightening import estimates_of, straightened
+from aquaflow.tracking.metric.survey import Survey, sampled_points
+
+Array = npt.NDArray[np.float64]
+
+
+class MetricFrames:
+    """Collects samples and keyframes' points; the rest works on a :class:`Survey` of them."""
+
+    def __init__(
+        self, keyframes: KeyframeStore, frames: Callable[[], FrameTable], config: FusionConfig,
+        failures: Failures,
+    ) -> None:  # fmt: skip
+        self.telemetry = Telemetry()
+        self.mounting = config.camera
+        """Of the camera in the body; a recording that states it may set it."""
+        self.frames: dict[int, MetricFrame] = {}
+        """By sub-map, as last estimated."""
+        self._keyframes, self._frames, self._config = keyframes, frames, config
+        self._failures = failures
+        self._points: list[Array] = []
+        self._since = 0
+
+    @property
+    def present(self) -> bool:
+        """True once there is telemetry."""
+        return bool(self.telemetry)
+
+    def add(self, sample: TelemetrySample) -> None:
+        """A sample of telemetry, in the order of arrival."""
+        if self._config.enabled:
+            self.telemetry.add(sample)
+
+    def keyframe(self, number: int, parent: int | None) -> bool:
+        """A new keyframe; True if it is time to straighten the graph by telemetry."""
+        if not self.telemetry:
+            return False
+        if parent is not None:
+            self._keep_points(parent)
+        self._since += 1
+        if self._since < self._config.every_keyframes:
+            return False
+        self._since = 0
+        return True
+
+    def _keep_points(self, number: int) -> None:
+        """A keyframe's depths are as good as they get once another one takes its place."""
+        while len(self._points) <= number:
+            self._points.append(np.zeros((0, 3)))
+        with self._failures.contain("points for the altimeter"):
+            self._points[number] = sampled_points(self._keyframes[number].pointmap)
+
+    def survey(self, snapshot: Snapshot) -> Survey:
+        """All that is known now, for any thread."""
+        rows, telemetry = self._frames().rows(), self.telemetry.copy()
+        points = tuple(self._points)
+        return Survey(snapshot.nodes, rows, telemetry, points, self.mounting, self._config)
+
+    def job(self, snapshot: Snapshot) -> Callable[[], GraphResult]:
+        """The optimisation of a snapshot together with telemetry, to be called in any thread."""
+        survey = self.survey(snapshot)
+        t_s = {k.number: k.t_ns * 1e-9 for k in self._keyframes.keyframes}
+        return lambda: straightened(snapshot, survey, t_s)
+
+    def update(self, snapshot: Snapshot) -> dict[int, MetricFrame]:
+        """Estimate the frames of all sub-maps from their poses as they are now."""
+        if len(snapshot.nodes) and self.telemetry:
+            self._keep_points(len(self._keyframes) - 1)
+            with self._failures.contain("metric frames"):
+                found = estimates_of(self.survey(snapshot))
+                self.frames = {
+                    self._keyframes[component].sub_map: each.frame
+                    for component, each in found.items()
+                }
+        return self.frames
+
+    def of(self, sub_map: int) -> MetricFrame:
+        """The frame of a sub-map, as last estimated."""
+        return self.frames.get(sub_map, MetricFrame.unknown())

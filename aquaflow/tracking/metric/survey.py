@@ -1,0 +1,91 @@
+"""What the estimator needs of a dive at one moment, so that another thread may work on it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.config import FusionConfig
+from aquaflow.config.telemetry import MountingConfig
+from aquaflow.fusion.camera_path import CameraPath
+from aquaflow.fusion.telemetry import Telemetry
+from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.keyframes import Pointmap
+from aquaflow.tracking.graph.equations import Rows, poses_of
+
+Array = npt.NDArray[np.float64]
+
+POINTS_OF_KEYFRAME = 600
+"""Of each pointmap, for the altimeter's beam."""
+MOST_POINTS = 300_000
+"""Of a sub-map; a beam looks through all of them."""
+KNOWN_SIGMA = 0.1
+"""Relative 1 sigma of a pixel's depth that counts as ground."""
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Read-only: keyframes and frames as they are now, and all telemetry until now."""
+
+    nodes: Rows
+    """[K] NODE of the keyframe graph."""
+    frames: Rows
+    """[N] FRAME: finished frames."""
+    telemetry: Telemetry
+    points: Sequence[Array]
+    """[n, 3] of each keyframe by its number, in its own camera frame; empty for some."""
+    mounting: MountingConfig | None
+    config: FusionConfig
+
+    def components(self) -> list[int]:
+        """Sub-maps in the order of their first keyframe, by its number."""
+        return [int(number) for number in np.unique(self.nodes["component"])]
+
+    def path(self, component: int) -> CameraPath:
+        """The camera's path in a sub-map."""
+        row = np.full(int(self.nodes["number"].max(initial=-1)) + 1, -1)
+        inside = np.flatnonzero(self.nodes["component"] == component)
+        row[self.nodes["number"][inside]] = inside
+        posed = self.frames[self.frames["keyframe"] >= 0]
+        posed = posed[posed["keyframe"] < len(row)]
+        at = row[posed["keyframe"]]
+        posed, at = posed[at >= 0], at[at >= 0]
+        order = np.argsort(posed["t_ns"], kind="stable")
+        posed, at = posed[order], at[order]
+        if len(posed) == 0:
+            return CameraPath(np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 3)))
+        T_mc = poses_of(self.nodes[at]) @ _similarities(posed["T_kf"])
+        t_s, first = np.unique(posed["t_ns"] * 1e-9, return_index=True)
+        return CameraPath(t_s, T_mc.R[first], T_mc.t[first])
+
+    def ground(self, component: int) -> Array:
+        """[K, 3] points of a sub-map, in its world."""
+        inside = self.nodes[self.nodes["component"] == component]
+        T_mk = poses_of(inside)
+        clouds = [
+            T_mk.element(i).apply(self.points[number])
+            for i, number in enumerate(inside["number"].tolist())
+            if number < len(self.points) and len(self.points[number])
+        ]
+        cloud = np.concatenate([np.zeros((0, 3)), *clouds])
+        return cloud[:: max(1, -(-len(cloud) // MOST_POINTS))]
+
+
+def sampled_points(pointmap: Pointmap) -> Array:
+    """[n, 3] well-known points of a keyframe, evenly over its picture, in its camera frame."""
+    known = np.argwhere(pointmap.known(KNOWN_SIGMA))
+    chosen = known[:: max(1, -(-len(known) // POINTS_OF_KEYFRAME))]
+    if len(chosen) == 0:
+        return np.zeros((0, 3))
+    pixels = chosen[:, ::-1] + 0.5
+    rays = pointmap.camera.unproject(pixels)
+    return np.asarray(rays / pointmap.rho[chosen[:, 0], chosen[:, 1]][:, None])
+
+
+def _similarities(
+    rows: Array,  # [N, 13] as of storage.arrays.of_sim3
+) -> Sim3Batch:
+    return Sim3Batch(rows[:, :9].reshape(-1, 3, 3), rows[:, 9:12], rows[:, 12])
