@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import torch
@@ -15,8 +15,9 @@ from aquaflow.errors import NotMappedError
 from aquaflow.errors.failures import Failures
 from aquaflow.messages import CameraModel, Dropped, Frame
 from aquaflow.profiler import Profiler
+from aquaflow.recording.playback import Event, Playback
 from aquaflow.slam import Slam
-from aquaflow.sources import RecordedCamera
+from aquaflow.sources import RecordedCamera, RecordedTelemetry, StatesMounting
 from aquaflow.sources.reading import read_past_failures
 
 Progress = Callable[[str, int, int | None], None]
@@ -32,8 +33,11 @@ def map_recording(
     overwrite: bool = False,
     progress: Progress | None = None,
     trace: bool = False,
+    telemetry: Sequence[RecordedTelemetry] = (),
 ) -> Finished:
     """Map a recording into the dive folder ``out``; with ``trace`` it gets a ``trace.json`` too.
+
+    ``telemetry`` is on the recording's clock.
 
     Raises:
         InputError: the folder cannot be written.
@@ -47,7 +51,11 @@ def map_recording(
         calibration = calibration or recording.camera
         run = DiveRun(name, folder, config, slam, calibration, recording.name_of, trace)
         try:
-            return _replay(run, recording, config, progress or (lambda stage, done, total: None))
+            if slam.metric.mounting is None and isinstance(recording, StatesMounting):
+                slam.metric.mounting = recording.mounting
+            playback = Playback(recording, telemetry, failures=failures)
+            shown = progress or (lambda stage, done, total: None)
+            return _replay(run, recording, playback, config, shown)
         finally:
             with failures.contain("closing"):
                 slam.close()
@@ -58,19 +66,22 @@ def map_recording(
 
 
 def _replay(
-    run: DiveRun, recording: RecordedCamera, config: Config, progress: Progress
+    run: DiveRun, recording: RecordedCamera, playback: Playback, config: Config, progress: Progress
 ) -> Finished:
     source, count = config.source, recording.frame_count
     stop = count if source.stop is None else min(source.stop, count or source.stop)
     total = None if stop is None else len(range(source.start, stop, source.every))
     done = 0
     contain = run.slam.failures.contain
-    for frame in _frames(run, recording, source):
+    for event in _events(run, playback, source):
+        if not isinstance(event, (Frame, Dropped)):
+            run.sample(event)
+            continue
         done += 1
-        if isinstance(frame, Dropped):
-            run.drop(frame)
+        if isinstance(event, Dropped):
+            run.drop(event)
         else:
-            run.frame(frame)
+            run.frame(event)
         with run.profiler.stage("progress"), contain("progress"):
             progress("map", done, total)
     if done == 0:
@@ -82,22 +93,20 @@ def _replay(
     return run.finish(recording.notes, lambda done, total: progress("refine", done, total))
 
 
-def _frames(
-    run: DiveRun, recording: RecordedCamera, source: SourceConfig
-) -> Iterator[Frame | Dropped]:
-    def read(start: int) -> Iterator[Frame | Dropped]:
-        frames = recording.frames(source.every, start, source.stop)
+def _events(run: DiveRun, playback: Playback, source: SourceConfig) -> Iterator[Event]:
+    def read(start: int) -> Iterator[Event]:
+        events = playback.events(source.every, start, source.stop)
         while True:
             with run.profiler.stage("read"):
-                frame = next(frames, None)
-            if frame is None:
+                event = next(events, None)
+            if event is None:
                 return
-            yield frame
+            yield event
 
     def give_up(frame: int) -> None:
         run.notes.append(f"{run.name} could not be read after frame {frame}; the dive ends there")
 
-    count, failures = recording.frame_count, run.slam.failures
+    count, failures = playback.frame_count, run.slam.failures
     return read_past_failures(read, source.start, source, count, failures, give_up)
 
 

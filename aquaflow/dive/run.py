@@ -21,7 +21,7 @@ from aquaflow.dive.results import SCALE_SOURCE, metrics
 from aquaflow.dive.shortcomings import shortcomings
 from aquaflow.errors import InputError, NotMappedError
 from aquaflow.mapping.maps import MIN_VIEWS, Progress
-from aquaflow.messages import CameraModel, Dropped, Frame
+from aquaflow.messages import CameraModel, Dropped, Frame, TelemetrySample
 from aquaflow.profiler import pace
 from aquaflow.slam import Slam
 from aquaflow.sources.preprocessing import Preparation
@@ -94,6 +94,11 @@ class DiveRun:
         self.decide(decided)
         self._time_frame(begun, decided)
         return decided
+
+    def sample(self, sample: TelemetrySample) -> None:
+        """A sample of telemetry; it never costs a frame."""
+        with self.slam.failures.contain("telemetry"):
+            self.slam.metric.add(sample)
 
     def _prepared(self, frame: Frame) -> Frame | None:
         """None for a picture that cannot be prepared, which is dropped."""

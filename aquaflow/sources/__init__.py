@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 from aquaflow.config.cameras import CameraConfig
-from aquaflow.config.telemetry import TelemetryConfig
+from aquaflow.config.telemetry import MountingConfig, TelemetryConfig
 from aquaflow.errors import InputError
 from aquaflow.messages import CameraModel, Dropped, Frame, TelemetrySample
 
@@ -50,6 +50,16 @@ class CameraSource(Protocol):
 def is_asked(index: int, every: int, start: int) -> bool:
     """True for the indices ``start, start + every, ...`` of :meth:`CameraSource.frames`."""
     return index >= start and (index - start) % every == 0
+
+
+@runtime_checkable
+class StatesMounting(Protocol):
+    """A camera source that knows how its camera sits in the vehicle."""
+
+    @property
+    def mounting(self) -> MountingConfig | None:
+        """Of the camera in the body; None if it is not stated."""
+        ...
 
 
 class RecordedCamera(CameraSource, Protocol):
