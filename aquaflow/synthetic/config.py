@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, Self, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -87,6 +87,9 @@ class SyntheticConfig(BaseModel):
     )
     lane_spacing_m: float = Field(0.6, gt=0, description="m; half a footprint at 1.5 m altitude")
     lane_length_m: float = Field(4.0, gt=0, description="m, longest lane before one is added")
+    turns: bool = Field(
+        False, description="true: the vehicle points along its way; false: it holds its heading"
+    )
     roll_deg: float = Field(3.0, ge=0, le=20, description="degrees, sway amplitude of an ROV")
     pitch_deg: float = Field(3.0, ge=0, le=20, description="degrees, sway amplitude of an ROV")
     yaw_deg: float = Field(8.0, ge=0, le=60, description="degrees, heading-hold wander")
@@ -117,6 +120,12 @@ class SyntheticConfig(BaseModel):
         scene = data.get("scene") if isinstance(data, dict) else None
         own = SCENE_DEFAULTS.get(scene) if isinstance(scene, str) else None
         return data if own is None else {**own, **data}
+
+    @model_validator(mode="after")
+    def _wall_is_faced(self) -> Self:
+        if self.scene == "wall" and self.turns:
+            raise ValueError("a vehicle at a wall faces it; turns must be false for this scene")
+        return self
 
     @property
     def duration_s(self) -> float:

@@ -226,8 +226,7 @@ def _tops(
     start = start - torch.tensor(shape.centre, dtype=torch.float32)[:, None]
     o = torch.stack([(R[k][:, None] * start).sum(0) for k in range(3)])
     d = (R * down).sum(1)[:, None].expand_as(o)
-    near, _ = _slabs(o, d, _bounds(shape), (0, 1, 2))
-    _, far = _slabs(o, d, _bounds(shape), (0, 1, 2))
+    near, far = _slabs(o, d, _bounds(shape), (0, 1, 2))
     top = torch.where(near < far, 50.0 - near, -torch.inf)
     return np.asarray(top.numpy().reshape(x.shape), np.float32)
 

@@ -31,6 +31,9 @@ TEXEL_PX = 0.6
 TEXELS_MOST = 14e6
 """Keeps the memory that a dive is made in at about 1.5 GB."""
 
+LOOKS_PER_S = 4.0
+"""At 30 degrees/s, 8 degrees from one look at the floor to the next."""
+
 
 @dataclass(frozen=True)
 class Site:
@@ -78,7 +81,10 @@ def _seen(config: SyntheticConfig, flat: paths.Path) -> tuple[Array, Array]:
     """Corners [2] (m, survey frame) of the floor that the dive sees."""
     if config.scene == "pool":
         return pool.corners(way_of(config).points)
-    t = np.linspace(0.0, config.duration_s, 65)
+    looks = 65
+    if config.turns:  # the view sweeps over the corners of the way
+        looks = max(looks, math.ceil(LOOKS_PER_S * config.duration_s))
+    t = np.linspace(0.0, config.duration_s, looks)
     camera = camera_of(config)
     corners = np.array([[x, y] for x in (0, camera.width) for y in (0, camera.height)], float)
     rays = camera.unproject(corners)

@@ -55,10 +55,11 @@ def scatter(
     """Set ``count`` stamps at random places, merged by maximum so that they overlap like things."""
     area = relief.area
     extent = np.array(area.shape[::-1]) * area.cell
-    for place in rng.uniform(0.0, 1.0, (count, 2)) * extent:
+    places = rng.uniform(0.0, 1.0, (count, 2)) * extent
+    from_way = clear.query(places + (area.x0, area.y0))[0]
+    for place, distance in zip(places, from_way, strict=True):
         stamp = maker(rng)
-        world = (area.x0 + place[0], area.y0 + place[1])
-        near = clear.query(world)[0] < CLEARWAY_M + stamp.radius
+        near = distance < CLEARWAY_M + stamp.radius
         _set(relief, stamp, place, rough, LOW_M if near else math.inf)
 
 

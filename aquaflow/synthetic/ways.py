@@ -23,6 +23,10 @@ OVAL = 0.6
 WANDER_M = 0.08
 """Amplitude by which a survey leaves its line."""
 
+TURN_S = 2.4
+"""Standard deviation in time over which a turn is spread: half a turn from lane to lane then goes
+at up to 30 degrees/s."""
+
 
 @dataclass(frozen=True)
 class Way:
@@ -43,12 +47,40 @@ def way_of(config: SyntheticConfig) -> Way:
     held = np.zeros(DENSE + 1)
     if config.scene == "pool":
         points = _oval(config)
-        tangent = np.gradient(np.vstack([points[-2], points, points[1]]), axis=0)[1:-1]
-        return Way(points, np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0])), 1, True)
+        return Way(points, _ahead(points), 1, True)
     if config.scene == "survey":
-        return Way(_line(config), held, 1, False)
+        points = _line(config)
+        return Way(points, _along(points) if config.turns else held, 1, False)
     points, lanes = _lane_loop(config)
-    return Way(points, held, lanes // 2, True)
+    heading = _spread(_ahead(points), config) if config.turns else held
+    return Way(points, heading, lanes // 2, True)
+
+
+def _ahead(
+    points: Array,  # [DENSE + 1, 2] m, closed
+) -> Array:
+    """[DENSE + 1] rad, the direction of a closed way."""
+    tangent = np.gradient(np.vstack([points[-2], points, points[1]]), axis=0)[1:-1]
+    return np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
+
+
+def _along(
+    points: Array,  # [DENSE + 1, 2] m, open
+) -> Array:
+    """[DENSE + 1] rad, the direction of an open way."""
+    tangent = np.gradient(points, axis=0)
+    return np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
+
+
+def _spread(
+    heading: Array,  # [DENSE + 1] rad of a closed way
+    config: SyntheticConfig,
+) -> Array:
+    """[DENSE + 1] rad, with corners that take the vehicle some time."""
+    trend = np.linspace(0.0, heading[-1] - heading[0], DENSE + 1)
+    step_s = config.duration_s / DENSE
+    smooth = gaussian_filter1d((heading - trend)[:-1], TURN_S / step_s, mode="wrap")
+    return np.append(smooth, smooth[0]) + trend
 
 
 def _oval(config: SyntheticConfig) -> Array:

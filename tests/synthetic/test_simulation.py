@@ -8,6 +8,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 import pytest
+from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from aquaflow.messages import Altitude, AngularRate, Attitude, Depth, Velocity
@@ -19,26 +20,15 @@ from aquaflow.synthetic import (
     simulate,
     write_dive,
 )
+from tests.synthetic.without_errors import WITHOUT_ERRORS
 
 Array = npt.NDArray[np.float64]
 Kind = TypeVar("Kind")
 
-PERFECT = {
-    "depth_sigma_m": 0.0,
-    "attitude_sigma_deg": 0.0,
-    "rate_sigma_rad_s": 0.0,
-    "dvl_sigma_m_s": 0.0,
-    "dvl_scale_sigma": 0.0,
-    "altitude_sigma_m": 0.0,
-    "altitude_resolution_m": 0.0,
-    "altitude_multipath_share": 0.0,
-}
-"""Instruments without errors."""
-
 
 def dive(telemetry: dict[str, float] | None = None, **settings: object) -> SimulatedDive:
     """A dive with perfect instruments, but for ``telemetry``."""
-    noise = {**PERFECT, **(telemetry or {})}
+    noise = {**WITHOUT_ERRORS, **(telemetry or {})}
     return simulate(SyntheticConfig.model_validate({"telemetry": noise, **settings}))
 
 
@@ -128,6 +118,50 @@ def test_samples_come_in_order_of_arrival_and_never_before_they_were_measured() 
     assert 0.02 < late.mean() < 0.06
 
 
+def test_a_log_that_starts_late_lacks_its_beginning_and_nothing_else() -> None:
+    whole, late = dive(frames=50), dive({"starts_late_s": 2.0}, frames=50)
+    assert late.samples == [s for s in whole.samples if s.t_ns >= 2_000_000_000]
+    assert len(late.samples) < len(whole.samples)
+
+
+def test_instruments_that_are_not_aboard_are_silent() -> None:
+    bare = dive({"dvl_hz": 0.0, "altitude_hz": 0.0, "utc_hz": 0.0}, frames=30)
+    kinds = {type(sample).__name__ for sample in bare.samples}
+    assert kinds == {"Depth", "Attitude", "AngularRate", "Acceleration"}
+    equipped = dive({"position_hz": 1.0}, frames=30)
+    kinds |= {"Velocity", "Altitude", "Position", "UtcTime"}
+    assert {type(sample).__name__ for sample in equipped.samples} == kinds
+
+
+def test_a_vehicle_that_turns_points_along_its_way() -> None:
+    held, turning = dive(frames=600), dive(frames=600, turns=True)
+    for simulated, least, most in ((held, -0.5, 0.5), (turning, 0.75, 1.0)):
+        velocity = simulated.motion.velocity_b(simulated.times_s)
+        ahead = np.median(velocity[:, 0] / np.linalg.norm(velocity, axis=1))
+        assert least < ahead <= most
+    rate = np.degrees(turning.motion.rate_b(turning.times_s))[:, 2]
+    assert 20.0 < np.abs(rate).max() < 40.0
+    heading = np.unwrap(
+        Rotation.from_matrix(turning.motion.R_wb(turning.times_s)).as_euler("ZYX")[:, 0]
+    )
+    assert np.ptp(heading) > np.pi
+
+
+def test_a_vehicle_at_a_wall_cannot_be_asked_to_turn() -> None:
+    with pytest.raises(ValidationError, match="turns must be false"):
+        SyntheticConfig.model_validate({"scene": "wall", "turns": True})
+
+
+@pytest.mark.parametrize("seconds", [60, 120])
+@pytest.mark.parametrize("scene", ["reef", "flat_sand", "pipe", "wall", "survey"])
+def test_dives_of_a_minute_or_two_span_a_metre_of_depth(scene: str, seconds: int) -> None:
+    frames = 4 * seconds
+    motion = dive(scene=scene, frames=frames, fps=4.0, altitude_m=2.0, altitude_swing_m=0.7).motion
+    t = np.linspace(0.0, seconds - 1.0, 200)
+    assert np.ptp(motion.origin_w(t)[:, 2]) > 1.0
+    assert np.abs(motion.velocity_w(t)[:, 2]).max() < 1.0
+
+
 @pytest.mark.parametrize("scene", ["reef", "wall"])
 def test_mounting_errors_have_the_stated_size_and_turn_camera_and_dvl(scene: str) -> None:
     wrong = dive(frames=30, mounting_error_deg=3.0, scene=scene)
@@ -176,9 +210,10 @@ def test_a_written_dive_states_its_mounting_and_keeps_the_truth(tmp_path: Path) 
     np.testing.assert_allclose(truth.R_bc, truth.T_bc[:3, :3])
     np.testing.assert_allclose(truth.errors["R_body_dvl"], simulated.R_bd, atol=1e-12)
     assert truth.errors["dvl_scale"] == simulated.constants.dvl_scale
-    depths = [s.depth_m for s in read_telemetry(tmp_path / "telemetry.csv") if isinstance(s, Depth)]
+    first = next(s for s in read_telemetry(tmp_path / "telemetry.csv") if isinstance(s, Depth))
     T_wb = truth.T_wc @ np.linalg.inv(truth.T_bc)
-    assert depths[0] == pytest.approx(T_wb[0, 2, 3], abs=0.1)
+    offset = truth.errors["depth_offset_m"]
+    assert first.depth_m == pytest.approx(T_wb[0, 2, 3] + offset, abs=0.1)
 
 
 def test_dives_of_version_1_are_still_read(tmp_path: Path) -> None:
