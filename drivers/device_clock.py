@@ -17,6 +17,10 @@ class DeviceClock:
     def stamp(self, device_ns: int, arrival_ns: int) -> int:
         """When something stamped ``device_ns`` was measured; learns from the message as well."""
         self.mapping.add(device_ns, arrival_ns)
+        return self.moment(device_ns, arrival_ns)
+
+    def moment(self, device_ns: int, arrival_ns: int) -> int:
+        """The same of a stamp that may be old when it is sent, and so says nothing of the clock."""
         t_ns = self.mapping.to_monotonic(device_ns)
         if t_ns is None or not arrival_ns - MAX_AGE_NS <= t_ns <= arrival_ns:
             return arrival_ns

@@ -12,9 +12,11 @@ from aquaflow.messages import (
     AngularRate,
     Attitude,
     Depth,
+    Position,
     TelemetrySample,
     Velocity,
 )
+from drivers.fixes import moved
 from drivers.rotation import Vector, cross, from_euler, inverse, product, rotate
 
 STATE_LIFE_NS = 500_000_000
@@ -36,8 +38,9 @@ class BodyFrame:
 
     A sensor off the origin feels the body turn: a DVL measures v + omega x arm, a pressure sensor
     sits deeper or shallower as the body leans. The last attitude and rate of any device are
-    used; without them the body counts as level and not turning. Specific force is turned, but its
-    lever arm is left in, since no device measures angular acceleration.
+    used; without them the body counts as level and not turning, and a fix is as much less certain
+    as the arm is long. Specific force is turned, but its lever arm is left in, since no device
+    measures angular acceleration.
     """
 
     def __init__(self) -> None:
@@ -65,7 +68,16 @@ class BodyFrame:
             return replace(sample, depth_m=sample.depth_m - self._below(arm_b, sample))
         if isinstance(sample, Altitude):
             return replace(sample, altitude_m=sample.altitude_m + self._below(arm_b, sample))
+        if isinstance(sample, Position):
+            return self._origin(sample, arm_b)
         return sample
+
+    def _origin(self, antenna: Position, arm_b: Vector) -> Position:
+        if self._attitude is None or _stale(self._attitude, antenna):
+            arm_m = math.hypot(arm_b[0], arm_b[1]) / math.sqrt(2.0)
+            return replace(antenna, sigma_m=math.hypot(antenna.sigma_m, arm_m))
+        north_m, east_m, _ = rotate(self._attitude.wxyz, arm_b)
+        return moved(antenna, -north_m, -east_m)
 
     def _below(self, arm_b: Vector, sample: TelemetrySample) -> float:
         """How far the sensor lies below the body's origin, metres."""

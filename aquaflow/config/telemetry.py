@@ -30,6 +30,25 @@ class DeviceConfig(Stage):
     )
 
 
+class PositioningConfig(DeviceConfig):
+    """A device that may send fixes on the earth: GNSS, or an acoustic system of the vehicle."""
+
+    position_lag_s: float = Field(
+        0.0,
+        ge=0,
+        le=60,
+        description="s that a fix is older than its message says. GNSS receivers: 0.1 to 0.25 "
+        "(ArduPilot's GPS1_DELAY_MS ends at 250); acoustic systems more: 0.2 for the sound over "
+        "300 m at 1500 m/s, the wait between two pulses, and their filter",
+    )
+    position_sigma_m: float | None = Field(
+        None,
+        gt=0,
+        description="m, 1 sigma of each horizontal direction of every fix, such as an acoustic "
+        "system's data sheet has it; None: as the device states it, else from HDOP",
+    )
+
+
 class Assumptions(Stage):
     """What may be assumed where a device measures only part of a quantity.
 
@@ -68,10 +87,14 @@ MavlinkSource: TypeAlias = Literal[
     "LOCAL_POSITION_NED",
     "VFR_HUD",
     "DISTANCE_SENSOR",
+    "GPS_RAW_INT",
+    "GPS2_RAW",
+    "GLOBAL_POSITION_INT",
+    "SYSTEM_TIME",
 ]
 
 
-class MavlinkConfig(DeviceConfig):
+class MavlinkConfig(PositioningConfig):
     """An autopilot that speaks MAVLink 1 or 2 (ArduSub)."""
 
     kind: Literal["mavlink"] = "mavlink"
@@ -80,9 +103,14 @@ class MavlinkConfig(DeviceConfig):
     component_id: int = Field(1, ge=0, le=255)
     talk: bool = Field(True, description="send heartbeats and TIMESYNC; False: only listen")
     messages: tuple[MavlinkSource, ...] = Field(
-        ("ATTITUDE", "RAW_IMU", "HIGHRES_IMU", "DISTANCE_SENSOR"),
+        (
+            *("ATTITUDE", "RAW_IMU", "HIGHRES_IMU", "DISTANCE_SENSOR"),
+            *("GPS_RAW_INT", "SYSTEM_TIME"),
+        ),
         description="converted to samples, in addition to pressure and lights; with the default "
-        "only the angular rate arrives twice from an ArduSub",
+        "only the angular rate arrives twice from an ArduSub. GPS_RAW_INT is the receiver's fix, "
+        "also where an acoustic system sends GPS_INPUT; GLOBAL_POSITION_INT is the output of the "
+        "autopilot's filter, which holds the same fix once more",
     )
     external_pressure: Literal["SCALED_PRESSURE", "SCALED_PRESSURE2", "SCALED_PRESSURE3"] | None = (
         Field(
@@ -103,8 +131,9 @@ class MavlinkConfig(DeviceConfig):
     lights: LightsConfig | None = None
 
 
-class NmeaConfig(DeviceConfig):
-    """An echo sounder, compass or AHRS that speaks NMEA 0183."""
+class NmeaConfig(PositioningConfig):
+    """An echo sounder, compass, AHRS, or a receiver or acoustic system that sends positions, if it
+    speaks NMEA 0183."""
 
     kind: Literal["nmea0183"] = "nmea0183"
     link: ByteLinkConfig
@@ -152,7 +181,7 @@ class Pd0Config(DeviceConfig):
     )
 
 
-class Nmea2000Config(DeviceConfig):
+class Nmea2000Config(PositioningConfig):
     """Instruments on an NMEA 2000 bus."""
 
     kind: Literal["nmea2000"] = "nmea2000"
@@ -166,17 +195,23 @@ class DbcSignal(Stage):
     message: str
     sample: Literal[
         "depth", "attitude", "euler", "angular_rate", "acceleration", "velocity", "altitude",
-        "lights",
-    ] = Field(description="attitude: quaternion wxyz; euler: roll, pitch, yaw")  # fmt: skip
+        "lights", "position",
+    ] = Field(
+        description="attitude: quaternion wxyz; euler: roll, pitch, yaw; position: latitude, "
+        "longitude"
+    )  # fmt: skip
     signals: tuple[str, ...]
     scale: tuple[float, ...] = Field(
-        (1.0,), description="to metres, radians, seconds and the body's axes: one, or one each"
+        (1.0,),
+        description="to metres, radians, seconds and the body's axes, of a position to degrees: "
+        "one, or one each",
     )
     sigma_m_s: float = Field(0.1, gt=0, description="m/s, figure of merit of a velocity")
 
     @model_validator(mode="after")
     def _has_as_many_signals_as_the_sample_has_values(self) -> DbcSignal:
-        count = {"depth": 1, "altitude": 1, "lights": 1, "attitude": 4}.get(self.sample, 3)
+        counts = {"depth": 1, "altitude": 1, "lights": 1, "position": 2, "attitude": 4}
+        count = counts.get(self.sample, 3)
         if len(self.signals) != count:
             raise ValueError(f"a sample '{self.sample}' is made of {count} signals")
         if len(self.scale) not in (1, count):
@@ -184,7 +219,7 @@ class DbcSignal(Stage):
         return self
 
 
-class DbcConfig(DeviceConfig):
+class DbcConfig(PositioningConfig):
     """Any CAN bus that a DBC file describes."""
 
     kind: Literal["dbc"] = "dbc"

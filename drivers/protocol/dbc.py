@@ -21,6 +21,7 @@ from aquaflow.messages import (
     Velocity,
 )
 from drivers.extra import load
+from drivers.fixes import Fixes, sigma_of
 from drivers.protocol.can_records import CanFraming, frame_of
 from drivers.protocol.packets import PacketDecoder
 from drivers.rotation import Vector, from_euler, normalised
@@ -50,6 +51,7 @@ class DbcDecoder(PacketDecoder):
         super().__init__(name, CanFraming())
         self._cantools = load("cantools", f"the CAN device '{name}'")
         database = self._opened(config.database)
+        self._fixes = Fixes(config)
         self._mapped: dict[tuple[int, bool], tuple[Any, list[DbcSignal]]] = {}
         for mapping in config.samples:
             message = _message(database, mapping, config.database)
@@ -68,7 +70,18 @@ class DbcDecoder(PacketDecoder):
         source = self.source(message.name)
         # A multiplexed message holds only some of its signals.
         known = [mapping for mapping in mappings if all(name in values for name in mapping.signals)]
-        return [_sample(mapping, values, arrival_ns, source) for mapping in known]
+        return [self._sample(mapping, values, arrival_ns, source) for mapping in known]
+
+    def _sample(
+        self, mapping: DbcSignal, values: dict[str, float], t_ns: int, source: str
+    ) -> TelemetrySample:
+        scale = mapping.scale * (len(mapping.signals) // len(mapping.scale))
+        scaled = [
+            factor * values[name] for factor, name in zip(scale, mapping.signals, strict=True)
+        ]
+        if mapping.sample == "position":
+            return self._fixes.fix(t_ns, t_ns, source, scaled[0], scaled[1], sigma_of(None))
+        return _in_body(mapping, scaled, t_ns, source)
 
     def _opened(self, path: str) -> Any:
         try:
@@ -97,11 +110,7 @@ def _message(database: Any, mapping: DbcSignal, path: str) -> Any:
     return message
 
 
-def _sample(
-    mapping: DbcSignal, values: dict[str, float], t_ns: int, source: str
-) -> TelemetrySample:
-    scale = mapping.scale * (len(mapping.signals) // len(mapping.scale))
-    scaled = [factor * values[name] for factor, name in zip(scale, mapping.signals, strict=True)]
+def _in_body(mapping: DbcSignal, scaled: list[float], t_ns: int, source: str) -> TelemetrySample:
     if mapping.sample == "velocity":
         return Velocity(t_ns, t_ns, source, (scaled[0], scaled[1], scaled[2]), mapping.sigma_m_s)
     if mapping.sample == "euler":

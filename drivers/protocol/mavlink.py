@@ -12,7 +12,7 @@ from drivers.device_clock import DeviceClock
 from drivers.extra import load
 from drivers.protocol.mavlink_frames import MavlinkFraming, header_of
 from drivers.protocol.mavlink_outbound import message_of
-from drivers.protocol.mavlink_samples import MavlinkSamples, MessageTime
+from drivers.protocol.mavlink_samples import SINCE_1970_US, MavlinkSamples, MessageTime
 from drivers.protocol.packets import PacketDecoder
 
 DIALECT = "pymavlink.dialects.v20.ardupilotmega"
@@ -27,8 +27,8 @@ MAX_OUTGOING_BYTES = 1024
 """Most bytes of TIMESYNC answers between two writes."""
 MOST_WAITING = 32
 """Messages that wait while a link is down; older ones are dropped."""
-SINCE_1970_US = 1_000_000_000_000_000
-"""A time_usec above is not the time since boot: that would be 31 years."""
+FIXES = ("GPS_RAW_INT", "GPS2_RAW")
+"""Stamped with the time of the fix, which is sent again while there is no newer one."""
 
 
 class MavlinkDecoder(PacketDecoder):
@@ -63,8 +63,8 @@ class MavlinkDecoder(PacketDecoder):
             self._synchronise(message, arrival_ns)
             return []
         t_ns = self._moment(name, message, arrival_ns)
-        if name == "SYSTEM_TIME":
-            return []  # only its time since boot matters: the wall clock jumps
+        if name not in self._samples.wanted:
+            return []  # SYSTEM_TIME, for its time since boot
         return self._samples.of(message, MessageTime(t_ns, arrival_ns, self.source(name)))
 
     def outgoing(self, now_ns: int) -> bytes:
@@ -130,4 +130,7 @@ class MavlinkDecoder(PacketDecoder):
         # SERVO_OUTPUT_RAW's 32 bits of microseconds start again every 71 minutes.
         if name in ("RAW_IMU", "HIGHRES_IMU") and message.time_usec < SINCE_1970_US:
             boot_ns = message.time_usec * 1000
+        if name in FIXES:
+            known = 0 < message.time_usec < SINCE_1970_US
+            return self.clock.moment(message.time_usec * 1000, arrival_ns) if known else arrival_ns
         return self.clock.stamp(boot_ns, arrival_ns) if boot_ns > 0 else arrival_ns

@@ -17,9 +17,12 @@ from aquaflow.messages import (
     Attitude,
     Depth,
     Lights,
+    Position,
     TelemetrySample,
+    UtcTime,
     Velocity,
 )
+from drivers.fixes import Fixes, sigma_of
 from drivers.rotation import Quaternion, from_euler, inverse, normalised, rotate
 
 GRAVITY_M_S2 = 9.80665
@@ -36,6 +39,14 @@ HIGHRES_ACCELERATION, HIGHRES_GYRO = 0x07, 0x38
 """Bits of HIGHRES_IMU.fields_updated."""
 ATTITUDE_LIFE_NS = 500_000_000
 """An older attitude does not turn a velocity into body axes; autopilots send several a second."""
+FIX_3D = 3
+"""GPS_FIX_TYPE_3D_FIX: the least that places a vehicle; those above are better."""
+DEGREES = 1e-7
+"""Of one count of latitude and longitude."""
+UNKNOWN_EPH = 0xFFFF
+"""eph is HDOP times 100."""
+SINCE_1970_US = 1_000_000_000_000_000
+"""A time_usec above is not the time since boot: that would be 31 years."""
 
 
 class MessageTime(NamedTuple):
@@ -55,6 +66,8 @@ class MavlinkSamples:
     def __init__(self, config: MavlinkConfig) -> None:
         self._config = config
         self._attitude: tuple[int, Quaternion] | None = None
+        self._fixes = Fixes(config)
+        self._fixed_us: dict[str, int] = {}
         known: dict[str, Callable[[Any, MessageTime], Samples]] = {
             "ATTITUDE": self._euler,
             "ATTITUDE_QUATERNION": self._quaternion,
@@ -64,6 +77,10 @@ class MavlinkSamples:
             "LOCAL_POSITION_NED": self._local_position,
             "VFR_HUD": lambda message, stamp: [Depth(*stamp, -message.alt)],
             "DISTANCE_SENSOR": _distance,
+            "GPS_RAW_INT": self._fix,
+            "GPS2_RAW": self._fix,
+            "GLOBAL_POSITION_INT": self._filtered_position,
+            "SYSTEM_TIME": _utc,
         }
         self._converters = {str(name): known[name] for name in config.messages}
         if config.external_pressure is not None:
@@ -107,6 +124,26 @@ class MavlinkSamples:
             samples.append(Velocity(*stamp, v_body, self._config.local_velocity_sigma_m_s))
         return samples
 
+    def _fix(self, message: Any, stamp: MessageTime) -> Samples:
+        """A receiver's fix, each once: an autopilot repeats the last until the next is there."""
+        if message.fix_type < FIX_3D:
+            return []  # under water a receiver has none, and that is no fault
+        if message.time_usec and message.time_usec == self._fixed_us.get(stamp.source):
+            return []
+        self._fixed_us[stamp.source] = message.time_usec
+        hdop = None if message.eph == UNKNOWN_EPH else message.eph / 100.0
+        sigma_m = message.h_acc / 1000.0 or sigma_of(hdop)
+        degrees = message.lat * DEGREES, message.lon * DEGREES
+        fix = self._fixes.fix(*stamp, *degrees, sigma_m)
+        if message.time_usec <= SINCE_1970_US:
+            return [fix]
+        return [fix, UtcTime(fix.t_ns, fix.arrival_ns, fix.source, 1000 * message.time_usec)]
+
+    def _filtered_position(self, message: Any, stamp: MessageTime) -> Samples:
+        """The filter has the receiver's lag taken out, and states no accuracy."""
+        sigma_m = self._config.position_sigma_m or sigma_of(None)
+        return [Position(*stamp, message.lat * DEGREES, message.lon * DEGREES, sigma_m)]
+
     def _lights(self, message: Any, stamp: MessageTime) -> Samples:
         lights = self._config.lights
         assert lights is not None
@@ -120,6 +157,13 @@ class MavlinkSamples:
             return []  # the channel is not in use
         level = (pulse_us - lights.off_us) / (lights.full_us - lights.off_us)
         return [Lights(*stamp, min(max(level, 0.0), 1.0))]
+
+
+def _utc(message: Any, stamp: MessageTime) -> Samples:
+    """Zero until the autopilot has heard the time from a receiver or a ground station."""
+    if message.time_unix_usec == 0:
+        return []
+    return [UtcTime(*stamp, 1000 * message.time_unix_usec)]
 
 
 def _milli_imu(message: Any, stamp: MessageTime) -> Samples:

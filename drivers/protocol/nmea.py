@@ -1,4 +1,4 @@
-"""Echo sounders, compasses and AHRS that speak NMEA 0183.
+"""Echo sounders, compasses, AHRS and receivers that speak NMEA 0183.
 
 They send no time of measurement, so ``t_ns`` is the arrival.
 """
@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import TypeAlias
 
 from aquaflow.config.telemetry import NmeaConfig
 from aquaflow.messages import Altitude, Depth, TelemetrySample
-from drivers.protocol.nmea_sentence import framing, parse
+from drivers.protocol.nmea_gnss import NmeaGnss
+from drivers.protocol.nmea_sentence import framing, number, parse
 from drivers.protocol.packets import PacketDecoder
 from drivers.protocol.partial import PartialMotion
 
@@ -20,16 +22,19 @@ FOOT_M, FATHOM_M = 0.3048, 1.8288
 """International foot, and six of them."""
 
 Fields = list[str]
+Convert: TypeAlias = Callable[[Fields, int, str], list[TelemetrySample]]
 
 
 class NmeaDecoder(PacketDecoder):
-    """DBT DBS DBK DPT, HDT HDG, ROT, VBW, XDR, PRDID, PASHR; other sentences are counted."""
+    """DBT DBS DBK DPT, HDT HDG, ROT, VBW, XDR, PRDID, PASHR, GGA RMC GST ZDA; other sentences are
+    counted."""
 
     def __init__(self, name: str, config: NmeaConfig) -> None:
         super().__init__(name, framing(config.require_checksum))
         self._config = config
         self._motion = PartialMotion(config.assume)
-        self._sentences: dict[str, Callable[[Fields, int, str], list[TelemetrySample]]] = {
+        gnss = NmeaGnss(config)
+        self._sentences: dict[str, Convert] = {
             "DBT": self._below,
             "DBS": self._below,
             "DBK": self._below,
@@ -41,6 +46,10 @@ class NmeaDecoder(PacketDecoder):
             "XDR": self._transducers,
             "PRDID": self._rdi_attitude,
             "PASHR": self._ashtech_attitude,
+            "GGA": self._of_gnss(gnss.gga),
+            "RMC": self._of_gnss(gnss.rmc),
+            "GST": self._of_gnss(gnss.gst),
+            "ZDA": self._of_gnss(gnss.zda),
         }
 
     def decode(self, packet: bytes, arrival_ns: int) -> list[TelemetrySample]:
@@ -49,6 +58,9 @@ class NmeaDecoder(PacketDecoder):
         if convert is None:
             return []
         return convert(sentence.fields, arrival_ns, sentence.kind)
+
+    def _of_gnss(self, convert: Convert) -> Convert:
+        return lambda fields, t_ns, kind: convert(fields, t_ns, self.source(kind))
 
     def _below(self, fields: Fields, t_ns: int, kind: str) -> list[TelemetrySample]:
         metres = number(fields[0]) if kind == "DPT" else _in_metres(fields)
@@ -99,11 +111,6 @@ class NmeaDecoder(PacketDecoder):
         """PASHR: time, heading, T, roll, pitch, heave, three accuracies, quality."""
         yaw, roll, pitch = (math.radians(number(fields[k])) for k in (1, 3, 4))
         return self._motion.attitude(t_ns, self.source(kind), roll, pitch, yaw)
-
-
-def number(field: str) -> float:
-    """ValueError for an empty field, which is how NMEA says 'not available'."""
-    return float(field)
 
 
 def _in_metres(fields: Fields) -> float:

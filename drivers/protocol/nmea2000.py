@@ -1,7 +1,8 @@
 """Instruments on an NMEA 2000 bus.
 
-The five groups read here fit into one frame each, so no fast packet has to be put together. They
-send no time of measurement, so ``t_ns`` is the arrival.
+The groups read here fit into one frame each, so no fast packet has to be put together: of the
+position 129025 is read, with the accuracy from 129539, and not 129029. They send no time of
+measurement, so ``t_ns`` is the arrival.
 """
 
 from __future__ import annotations
@@ -10,12 +11,14 @@ import struct
 from collections.abc import Callable
 
 from aquaflow.config.telemetry import Nmea2000Config
-from aquaflow.messages import Altitude, TelemetrySample
+from aquaflow.messages import Altitude, TelemetrySample, UtcTime
+from drivers.fixes import Fixes, sigma_of
 from drivers.protocol.can_records import CanFraming, frame_of
 from drivers.protocol.packets import PacketDecoder
 from drivers.protocol.partial import PartialMotion
 
 HEADING, RATE_OF_TURN, ATTITUDE, SPEED, WATER_DEPTH = 127250, 127251, 127257, 128259, 128267
+SYSTEM_TIME, POSITION, DILUTION = 126992, 129025, 129539
 """Parameter group numbers."""
 
 NOT_AVAILABLE = {"H": 0xFFFF, "h": 0x7FFF, "I": 0xFFFF_FFFF, "i": 0x7FFF_FFFF}
@@ -25,7 +28,14 @@ RESERVED = 2
 TRUE, MAGNETIC = 0, 1
 """References of a heading; the others are 'error' and 'not available'."""
 ANGLE_RAD, RATE_RAD_S, SPEED_M_S, DEPTH_M = 1e-4, 3.125e-8, 0.01, 0.01
+PLACE_DEG, HDOP, DAY_NS, CLOCK_NS = 1e-7, 0.01, 86_400_000_000_000, 100_000
 """Value of one count of each field."""
+FIX_MODES = (1, 2)
+"""Modes of 129539 with a fix, 2D and 3D; not: 1D (0) and error."""
+LOCAL_CRYSTAL = 5
+"""Source of 126992 that no satellite or radio sets."""
+DILUTION_LIFE_NS = 5_000_000_000
+"""The standard has a 129539 every second."""
 
 
 def group_of(identifier: int) -> int:
@@ -36,17 +46,22 @@ def group_of(identifier: int) -> int:
 
 
 class Nmea2000Decoder(PacketDecoder):
-    """Attitude, heading, rate of turn, speed and altitude."""
+    """Attitude, heading, rate of turn, speed, altitude, position and UTC."""
 
     def __init__(self, name: str, config: Nmea2000Config) -> None:
         super().__init__(name, CanFraming())
         self._motion = PartialMotion(config.assume)
+        self._fixes = Fixes(config)
+        self._dilution: tuple[int, bool, float | None] | None = None
         self._groups: dict[int, Callable[[bytes, int], list[TelemetrySample]]] = {
             HEADING: self._heading,
             RATE_OF_TURN: self._rate_of_turn,
             ATTITUDE: self._attitude,
             SPEED: self._speed,
             WATER_DEPTH: self._depth,
+            SYSTEM_TIME: self._utc,
+            POSITION: self._position,
+            DILUTION: self._accuracy,
         }
 
     def decode(self, packet: bytes, arrival_ns: int) -> list[TelemetrySample]:
@@ -85,6 +100,32 @@ class Nmea2000Decoder(PacketDecoder):
         """Below the transducer; its offset to the waterline or the keel is the mounting's."""
         metres = _value("I", data, 1) * DEPTH_M
         return [Altitude(t_ns, t_ns, self.source(str(WATER_DEPTH)), metres)]
+
+    def _utc(self, data: bytes, t_ns: int) -> list[TelemetrySample]:
+        if data[1] & 0xF == LOCAL_CRYSTAL:
+            return []
+        days, clock = _value("H", data, 2), _value("I", data, 4)
+        return [
+            UtcTime(t_ns, t_ns, self.source(str(SYSTEM_TIME)), days * DAY_NS + clock * CLOCK_NS)
+        ]
+
+    def _accuracy(self, data: bytes, t_ns: int) -> list[TelemetrySample]:
+        """Bits 3 to 5 of the second byte are the mode that the receiver is in."""
+        hdop = None if _missing("h", data, 2) else _value("h", data, 2) * HDOP
+        self._dilution = (t_ns, data[1] >> 3 & 0b111 in FIX_MODES, hdop)
+        return []
+
+    def _position(self, data: bytes, t_ns: int) -> list[TelemetrySample]:
+        if _missing("i", data, 0) or _missing("i", data, 4):
+            return []  # no fix
+        fixed, hdop = True, None
+        if self._dilution is not None and t_ns - self._dilution[0] <= DILUTION_LIFE_NS:
+            _, fixed, hdop = self._dilution
+        if not fixed:
+            return []
+        degrees = [_value("i", data, at) * PLACE_DEG for at in (0, 4)]
+        source = self.source(str(POSITION))
+        return [self._fixes.fix(t_ns, t_ns, source, degrees[0], degrees[1], sigma_of(hdop))]
 
 
 def _missing(code: str, data: bytes, at: int) -> bool:

@@ -55,3 +55,8 @@ def parse(packet: bytes) -> Sentence:
     if address.startswith("P"):
         return Sentence("", address, fields)
     return Sentence(address[:-3], address[-3:], fields)
+
+
+def number(field: str) -> float:
+    """ValueError for an empty field, which is how NMEA says 'not available'."""
+    return float(field)

@@ -16,7 +16,9 @@ from aquaflow.messages import (
     Attitude,
     Depth,
     Lights,
+    Position,
     TelemetrySample,
+    UtcTime,
     Velocity,
 )
 
@@ -35,7 +37,8 @@ class ArduSub:
 
     Attitude is sent as ATTITUDE with the last angular rate, angular rate by RAW_IMU with the last
     specific force, depth by the external SCALED_PRESSURE2 and VFR_HUD, velocity by
-    LOCAL_POSITION_NED, altitude by a DISTANCE_SENSOR that looks down, lights by servo 9.
+    LOCAL_POSITION_NED, altitude by a DISTANCE_SENSOR that looks down, lights by servo 9, UTC by
+    SYSTEM_TIME, position by GPS_RAW_INT with an HDOP of 1.6 and, in MAVLink 2, its accuracy.
     """
 
     def __init__(self, mavlink_2: bool = True) -> None:
@@ -76,6 +79,10 @@ class ArduSub:
                 packets = [self._range(sample.altitude_m, boot_ms)]
             case Lights():
                 packets = [self._servos(1100 + round(800 * sample.level), measured_ns // 1000)]
+            case Position():
+                packets = [self._fix(sample, measured_ns // 1000)]
+            case UtcTime():
+                packets = [self._packed("system_time", sample.utc_ns // 1000, boot_ms)]
         return packets
 
     def answer(self, packet: bytes, now_ns: int) -> list[bytes]:
@@ -123,6 +130,14 @@ class ArduSub:
         down = self._dialect.MAV_SENSOR_ROTATION_PITCH_270
         return self._packed(
             "distance_sensor", boot_ms, 20, 5000, round(altitude_m * 100), 1, 0, down, 255
+        )
+
+    def _fix(self, sample: Position, time_us: int) -> bytes:
+        place = round(sample.latitude_deg * 1e7), round(sample.longitude_deg * 1e7)
+        eph, unknown, satellites = 160, 0xFFFF, 21
+        accuracy_mm = 0 if self._mavlink_1 else round(1000 * sample.sigma_m)
+        return self._packed(
+            "gps_raw_int", time_us, 3, *place, 0, eph, unknown, 0, 0, satellites, 0, accuracy_mm
         )
 
     def _servos(self, pulse_us: int, time_us: int) -> bytes:

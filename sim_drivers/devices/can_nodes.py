@@ -14,7 +14,9 @@ from aquaflow.messages import (
     Attitude,
     Depth,
     Lights,
+    Position,
     TelemetrySample,
+    UtcTime,
     Velocity,
 )
 from sim_drivers.devices.device import OneWayDevice
@@ -25,30 +27,45 @@ if TYPE_CHECKING:
 
 PRIORITY, ADDRESS = 2, 35
 """Of the simulated node on the bus; the driver reads neither."""
+THREE_D = 0b11_010_010
+"""Modes in 129539: 3D wanted and reached, and two bits that are not used."""
 
 
 class Nmea2000Instruments(OneWayDevice["Message"]):
     """Attitude as 127257 and 127250, yaw rate as 127251, forward speed as 128259, altitude as
-    128267."""
+    128267, position as 129539 and 129025, UTC as 126992."""
 
     def encode(self, sample: TelemetrySample, measured_ns: int, now_ns: int) -> list[Message]:
-        match sample:
-            case Attitude():
-                roll, pitch, yaw = (math.radians(angle) for angle in euler_deg(sample))
-                angles = struct.pack("<B3hx", 0xFF, *(round(v * 1e4) for v in (yaw, pitch, roll)))
-                heading = round(yaw % math.tau * 1e4)
-                true = struct.pack("<BHhhB", 0xFF, heading, 0x7FFF, 0x7FFF, 0xFC)
-                return [_group(127257, angles), _group(127250, true)]
-            case AngularRate():
-                rate = round(sample.rate_rad_s[2] / 3.125e-8)
-                return [_group(127251, struct.pack("<Bi3x", 0xFF, rate))]
-            case Velocity():
-                ground = max(0, round(sample.velocity_m_s[0] * 100))
-                return [_group(128259, struct.pack("<BHHBH", 0xFF, 0xFFFF, ground, 0, 0xFFFF))]
-            case Altitude():
-                metres = round(sample.altitude_m * 100)
-                return [_group(128267, struct.pack("<BIhB", 0xFF, metres, 0, 0xFF))]
-        return []
+        return [_group(number, data) for number, data in _groups(sample)]
+
+
+def _groups(sample: TelemetrySample) -> list[tuple[int, bytes]]:
+    """Parameter groups that state the sample."""
+    groups: list[tuple[int, bytes]] = []
+    match sample:
+        case Attitude():
+            roll, pitch, yaw = (math.radians(angle) for angle in euler_deg(sample))
+            angles = struct.pack("<B3hx", 0xFF, *(round(v * 1e4) for v in (yaw, pitch, roll)))
+            heading = round(yaw % math.tau * 1e4)
+            true = struct.pack("<BHhhB", 0xFF, heading, 0x7FFF, 0x7FFF, 0xFC)
+            groups = [(127257, angles), (127250, true)]
+        case AngularRate():
+            rate = round(sample.rate_rad_s[2] / 3.125e-8)
+            groups = [(127251, struct.pack("<Bi3x", 0xFF, rate))]
+        case Velocity():
+            ground = max(0, round(sample.velocity_m_s[0] * 100))
+            groups = [(128259, struct.pack("<BHHBH", 0xFF, 0xFFFF, ground, 0, 0xFFFF))]
+        case Altitude():
+            metres = round(sample.altitude_m * 100)
+            groups = [(128267, struct.pack("<BIhB", 0xFF, metres, 0, 0xFF))]
+        case Position():
+            place = round(sample.latitude_deg * 1e7), round(sample.longitude_deg * 1e7)
+            dilution = struct.pack("<BBhhh", 0xFF, THREE_D, 160, 0x7FFF, 0x7FFF)
+            groups = [(129539, dilution), (129025, struct.pack("<ii", *place))]
+        case UtcTime():
+            days, since = divmod(sample.utc_ns, 86_400_000_000_000)
+            groups = [(126992, struct.pack("<BBHI", 0xFF, 0xF0, days, since // 100_000))]
+    return groups
 
 
 class DbcNode(OneWayDevice["Message"]):
@@ -91,6 +108,10 @@ def _values(sample: TelemetrySample) -> dict[str, tuple[float, ...]]:
             values = {"angular_rate": sample.rate_rad_s}
         case Acceleration():
             values = {"acceleration": sample.acceleration_m_s2}
+        case Position():
+            values = {"position": (sample.latitude_deg, sample.longitude_deg)}
+        case UtcTime():
+            values = {}
         case Attitude():
             roll, pitch, yaw = (math.radians(angle) for angle in euler_deg(sample))
             values = {"attitude": sample.wxyz, "euler": (roll, pitch, yaw)}

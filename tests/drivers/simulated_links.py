@@ -25,7 +25,9 @@ from aquaflow.messages import (
     Attitude,
     Depth,
     Lights,
+    Position,
     TelemetrySample,
+    UtcTime,
     Velocity,
 )
 from drivers.link import LinkCounters
@@ -44,6 +46,9 @@ from tests.small_recording import GIVE_UP_S
 SPEED = 4.0
 STEPS = 20
 RATE_HZ = 20.0
+
+UTC_NS = 1_795_365_000_000_000_000
+"""2026-11-22."""
 
 ASSUME = {"level": True, "no_side_slip": True}
 
@@ -82,6 +87,8 @@ def motion(steps: int = STEPS) -> list[TelemetrySample]:
             Depth(*stamp, 10.0 + 0.5 * s),
             Velocity(*stamp, (0.4 + 0.01 * k, 0.1, -0.05), 0.02),
             Lights(*stamp, 0.5),
+            Position(*stamp, -41.25 + 1e-6 * k, 174.8 + 2e-6 * k, 2.5),
+            UtcTime(*stamp, UTC_NS + round(s * 1e9)),
         ]
     return samples
 
@@ -124,11 +131,15 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-AUTOPILOT = frozenset({Acceleration, AngularRate, Attitude, Altitude, Depth, Velocity, Lights})
+EARTH = frozenset({Position, UtcTime})
+AUTOPILOT = EARTH | {Acceleration, AngularRate, Attitude, Altitude, Depth, Velocity, Lights}
 DVL = frozenset({Velocity, Altitude})
 MAVLINK = {
     "kind": "mavlink",
-    "messages": ["ATTITUDE", "RAW_IMU", "DISTANCE_SENSOR", "LOCAL_POSITION_NED"],
+    "messages": [
+        *("ATTITUDE", "RAW_IMU", "DISTANCE_SENSOR", "LOCAL_POSITION_NED"),
+        *("GPS_RAW_INT", "SYSTEM_TIME"),
+    ],
     "lights": {"channel": 9},
 }
 
@@ -148,7 +159,7 @@ def mavlink_udp(tmp_path: Path) -> Rig:
 def nmea_pty(tmp_path: Path) -> Rig:
     wire, link = _pty(tmp_path)
     config = {"kind": "nmea0183", "link": link, "assume": ASSUME}
-    kinds = frozenset({Attitude, Altitude, Depth, AngularRate, Velocity})
+    kinds = EARTH | {Attitude, Altitude, Depth, AngularRate, Velocity}
     return Rig(NmeaTalker(), wire, config, kinds)
 
 
@@ -173,7 +184,7 @@ def pd0_pty(tmp_path: Path) -> Rig:
 def nmea2000_virtual(tmp_path: Path) -> Rig:
     wire, link = _can("virtual", str(tmp_path))
     config = {"kind": "nmea2000", "link": link, "assume": ASSUME}
-    return Rig(Nmea2000Instruments(), wire, config, DVL | {Attitude, AngularRate})
+    return Rig(Nmea2000Instruments(), wire, config, DVL | EARTH | {Attitude, AngularRate})
 
 
 def nmea2000_multicast(tmp_path: Path) -> Rig:
@@ -270,7 +281,9 @@ def values(sample: TelemetrySample) -> np.ndarray:
     told = [
         getattr(sample, field.name)
         for field in fields(sample)
-        if field.name not in ("t_ns", "arrival_ns", "source", "figure_of_merit_m_s")
+        if field.name not in ("t_ns", "arrival_ns", "source", "figure_of_merit_m_s", "sigma_m")
     ]
+    if isinstance(sample, UtcTime):
+        told = [1e-9 * (sample.utc_ns - UTC_NS)]
     vector = np.ravel(np.array(told, float))
     return vector * math.copysign(1.0, vector[0]) if isinstance(sample, Attitude) else vector

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow.config.telemetry import DbcConfig, Nmea2000Config
 from aquaflow.errors import ConfigError
-from aquaflow.messages import Altitude, Attitude, Depth, Velocity
+from aquaflow.messages import Altitude, Attitude, Depth, Position, UtcTime, Velocity
 from drivers.protocol.dbc import DbcDecoder
 from drivers.protocol.nmea2000 import Nmea2000Decoder, group_of
 from drivers.transport.can import EXTENDED, RECORD
@@ -96,6 +96,10 @@ def test_rate_of_turn_and_speed_need_assumptions():
         (127257, struct.pack("<B3hx", 0, 0, 0x7FFF, 0)),
         (127257, b"\x00\x01"),
         (127250, b""),
+        (126992, struct.pack("<BBHI", 0, 0, 0xFFFF, 0)),
+        (126992, struct.pack("<BBHI", 0, 0, 0, 0)),
+        (129025, bytes(8)),
+        (129025, struct.pack("<ii", 910_000_000, 0)),
     ],
 )
 def test_values_that_are_not_available_are_counted(number, data):
@@ -105,11 +109,52 @@ def test_values_that_are_not_available_are_counted(number, data):
     assert receiver.counters.invalid_values == 1
 
 
+HERE = group(129025, struct.pack("<ii", -412_500_000, 1_748_000_000))
+
+
+def dilution(modes: int, hdop: int) -> bytes:
+    return group(129539, struct.pack("<BBhhh", 0, modes, hdop, 0, 0))
+
+
+def test_a_position_is_as_accurate_as_the_dilution_says():
+    receiver = n2k(position_lag_s=0.4)
+
+    (usual,) = receiver.feed(HERE, NOW)
+    (fix,) = receiver.feed(dilution(0b010_010, 100) + HERE, NOW)
+    (unstated,) = receiver.feed(dilution(0b010_010, 0x7FFF) + HERE, NOW)
+    (later,) = receiver.feed(HERE, NOW + 6 * 10**9)
+
+    assert isinstance(fix, Position)
+    assert (fix.latitude_deg, fix.longitude_deg) == pytest.approx((-41.25, 174.8), abs=1e-9)
+    assert (fix.t_ns, fix.arrival_ns, fix.source) == (NOW - 400_000_000, NOW, "bus/129025")
+    assert fix.sigma_m == pytest.approx(5.1 / 2**0.5)
+    assert usual.sigma_m == unstated.sigma_m == later.sigma_m == pytest.approx(2 * fix.sigma_m)
+
+
+@pytest.mark.parametrize("mode", [0, 7])
+def test_a_position_without_a_fix_is_none(mode):
+    empty = group(129025, struct.pack("<ii", 0x7FFF_FFFF, 0x7FFF_FFFF))
+    receiver = n2k()
+
+    assert receiver.feed(dilution(mode << 3 | 2, 100) + HERE + empty, NOW) == []
+    assert receiver.counters.invalid_values == 0
+
+
+def test_system_time_is_utc_unless_only_a_crystal_keeps_it():
+    # 2026-11-22 is day 20779 since 1970.
+    clock = struct.pack("<HI", 20_779, 43_200_0000 + 5)
+    satellites, crystal = (group(126992, bytes([0, source]) + clock) for source in (0xF0, 0xF5))
+
+    (utc,) = n2k().feed(satellites + crystal, NOW)
+
+    assert utc == UtcTime(NOW, NOW, "bus/126992", (1_795_348_800 * 10_000 + 5) * 100_000)
+
+
 def test_other_groups_and_short_identifiers_are_counted():
     receiver = n2k()
     paddle_wheel = group(128259, struct.pack("<BHHBH", 0, 300, 0xFFFF, 0, 0xFFFF))
 
-    assert receiver.feed(group(129025, bytes(8)) + RECORD.pack(0x123, 8, bytes(8)), NOW) == []
+    assert receiver.feed(group(130306, bytes(8)) + RECORD.pack(0x123, 8, bytes(8)), NOW) == []
     assert receiver.feed(paddle_wheel, NOW) == []
     assert (receiver.counters.messages, receiver.counters.invalid_values) == (3, 0)
 
@@ -143,7 +188,7 @@ def test_mapped_signals_become_samples_in_si(tmp_path):
     ("sample", "count"),
     [
         ("attitude", 4), ("euler", 3), ("angular_rate", 3), ("acceleration", 3), ("altitude", 1),
-        ("lights", 1),
+        ("lights", 1), ("position", 2),
     ],
 )  # fmt: skip
 def test_every_kind_of_sample_can_be_mapped(tmp_path, sample, count):
@@ -163,6 +208,7 @@ def test_every_kind_of_sample_can_be_mapped(tmp_path, sample, count):
         "euler": (math.cos(0.25), math.sin(0.25), 0, 0),
         "altitude": 0.5,
         "lights": 0.5,
+        "position": 0.5,
     }.get(sample, (0.5, 0, 0))
     assert told == pytest.approx(expected)
 

@@ -17,6 +17,8 @@ from aquaflow.messages import (
     Attitude,
     Depth,
     Lights,
+    Position,
+    UtcTime,
     Velocity,
 )
 from drivers.protocol.mavlink import MavlinkDecoder
@@ -165,6 +167,119 @@ def test_a_range_that_saw_no_bottom_is_invalid(fields):
 
     assert receiver.feed(packet("distance_sensor", orientation=25, **RANGE, **fields), NOW) == []
     assert receiver.counters.invalid_values == 1
+
+
+FIX = {"fix_type": 3, "lat": -412_500_000, "lon": 1_748_000_000, "alt": 0, "eph": 160, "epv": 65535,
+       "vel": 0, "cog": 0, "satellites_visible": 9}  # fmt: skip
+FIX_2 = {**FIX, "dgps_numch": 0, "dgps_age": 0}
+
+
+def test_a_receivers_fix_is_as_accurate_as_it_says_or_as_its_dilution():
+    receiver = decoder()
+
+    fix, by_hdop, unknown = receiver.feed(
+        packet("gps_raw_int", time_usec=0, h_acc=700, **FIX)
+        + packet("gps_raw_int", time_usec=0, **FIX)
+        + packet("gps_raw_int", time_usec=0, **{**FIX, "eph": 65535}),
+        NOW,
+    )
+    (known,) = decoder(position_sigma_m=0.3).feed(packet("gps_raw_int", time_usec=0, **FIX), NOW)
+
+    assert isinstance(fix, Position)
+    assert (fix.latitude_deg, fix.longitude_deg) == pytest.approx((-41.25, 174.8), abs=1e-9)
+    assert (fix.t_ns, fix.arrival_ns, fix.source) == (NOW, NOW, "rov/GPS_RAW_INT")
+    assert fix.sigma_m == 0.7
+    assert by_hdop.sigma_m == pytest.approx(1.6 * 5.1 / 2**0.5)
+    assert unknown.sigma_m == pytest.approx(2.0 * 5.1 / 2**0.5)
+    assert known.sigma_m == 0.3
+
+
+@pytest.mark.parametrize("fix_type", [0, 1, 2])
+def test_a_receiver_without_a_fix_gives_nothing_and_is_not_at_fault(fix_type):
+    receiver = decoder()
+    data = packet("gps_raw_int", time_usec=0, **{**FIX, "fix_type": fix_type})
+
+    assert receiver.feed(data, NOW) == []
+    assert receiver.counters.invalid_values == 0
+
+
+@pytest.mark.parametrize("place", [{"lat": 0, "lon": 0}, {"lat": 910_000_000}])
+def test_a_fix_that_is_nowhere_is_invalid(place):
+    receiver = decoder()
+
+    assert receiver.feed(packet("gps_raw_int", time_usec=0, **{**FIX, **place}), NOW) == []
+    assert receiver.counters.invalid_values == 1
+
+
+def test_a_fix_that_is_sent_again_is_the_same_fix():
+    receiver = decoder(messages=["GPS_RAW_INT", "GPS2_RAW"])
+    first, second = (packet("gps_raw_int", time_usec=us, **FIX) for us in (5_000_000, 5_200_000))
+    other = packet("gps2_raw", time_usec=5_000_000, **FIX_2)
+
+    heard = receiver.feed(first + first + other + second, NOW)
+
+    assert [s.source for s in heard] == ["rov/GPS_RAW_INT", "rov/GPS2_RAW", "rov/GPS_RAW_INT"]
+
+
+def test_a_fix_is_as_old_as_it_says_and_by_the_stated_lag_older():
+    boot_ns = 7_000_000_000
+    receiver = decoder(position_lag_s=0.4)
+    for k in range(30):
+        attitude = {**ATTITUDE, "time_boot_ms": (NOW - boot_ns) // 10**6 + 100 * k}
+        receiver.feed(packet("attitude", **attitude), NOW + k * 10**8)
+    now = NOW + 30 * 10**8
+    fixed_us = (now - boot_ns) // 1000 - 900_000
+
+    (fix,) = receiver.feed(packet("gps_raw_int", time_usec=fixed_us, **FIX), now)
+    before = receiver.clock.mapping.report()
+    for k in range(1, 6):
+        again = {**FIX, "lat": FIX["lat"] + k}
+        receiver.feed(packet("gps_raw_int", time_usec=fixed_us + k, **again), now + k * 10**8)
+
+    assert fix.t_ns == pytest.approx(now - 900_000_000 - 400_000_000, abs=1000)
+    assert fix.arrival_ns == now
+    assert receiver.clock.mapping.report() == before, "an old fix says nothing of the clock"
+
+
+def test_a_fix_from_before_the_clock_is_known_is_dated_by_its_arrival():
+    (fix,) = decoder().feed(packet("gps_raw_int", time_usec=5_000_000, **FIX), NOW)
+
+    assert fix.t_ns == NOW
+
+
+def test_a_fix_that_is_stamped_with_utc_gives_it():
+    utc_us = 1_795_365_000_250_000
+    data = packet("gps_raw_int", time_usec=utc_us, **FIX)
+
+    fix, utc = decoder(position_lag_s=0.4).feed(data, NOW)
+
+    assert isinstance(fix, Position)
+    assert utc == UtcTime(NOW - 400_000_000, NOW, "rov/GPS_RAW_INT", 1000 * utc_us)
+
+
+def test_the_filters_position_is_read_where_it_is_asked_for_and_not_dated_back():
+    data = packet("global_position_int", time_boot_ms=0, lat=1, lon=2, alt=0, relative_alt=0, vx=0,
+                  vy=0, vz=0, hdg=0)  # fmt: skip
+
+    (position,) = decoder(messages=["GLOBAL_POSITION_INT"], position_lag_s=1).feed(data, NOW)
+
+    assert decoder().feed(data, NOW) == []
+    assert (position.latitude_deg, position.longitude_deg) == pytest.approx((1e-7, 2e-7))
+    assert position.t_ns == NOW
+    assert position.sigma_m == pytest.approx(2.0 * 5.1 / 2**0.5)
+
+
+def test_system_time_is_utc_once_the_autopilot_knows_it():
+    receiver = decoder()
+    utc_us = 1_795_365_000_250_000
+    data = [packet("system_time", time_unix_usec=us, time_boot_ms=9) for us in (0, utc_us, 9)]
+
+    assert receiver.feed(data[0], NOW) == []
+    assert receiver.counters.invalid_values == 0
+    assert receiver.feed(data[1], NOW) == [UtcTime(NOW, NOW, "rov/SYSTEM_TIME", 1000 * utc_us)]
+    assert receiver.feed(data[2], NOW) == []
+    assert receiver.counters.invalid_values == 1, "1970"
+    assert decoder(messages=["ATTITUDE"]).feed(data[1], NOW) == []
 
 
 SERVOS = {"time_usec": 1, **{f"servo{k}_raw": 0 for k in range(1, 9)}}

@@ -14,6 +14,8 @@ from aquaflow.messages import (
     Attitude,
     Depth,
     Lights,
+    Position,
+    UtcTime,
     Velocity,
 )
 from drivers import rotation
@@ -117,11 +119,59 @@ def test_depth_and_altitude_are_those_of_the_origin_as_the_body_leans():
     assert altitude.altitude_m == pytest.approx(3.0 + below)
 
 
+@pytest.mark.parametrize("latitude_deg", [-60.0, 0.5, 75.0])
+def test_a_fix_is_that_of_the_origin_where_the_attitude_is_known(latitude_deg):
+    body, arm = BodyFrame(), (2.0, -0.5, -1.0)
+    R_nb = Rotation.from_euler("ZYX", [0.7, -0.4, 0.2])
+    body.refer(attitude(R_nb), AT_ORIGIN)
+    antenna = Position(*STAMP, latitude_deg, 179.99999, 1.5)
+
+    fix = body.refer(antenna, mounted(position_m=arm))
+
+    north, east = earth_metres(fix, antenna)
+    assert (north, east) == pytest.approx(tuple(-R_nb.apply(arm)[:2]), abs=1e-3)
+    assert fix.sigma_m == 1.5
+    assert -180.0 <= fix.longitude_deg <= 180.0
+
+
+def earth_metres(there: Position, here: Position) -> tuple[float, float]:
+    """North and east from ``here``, by points of the ellipsoid in space."""
+    a, e2 = 6_378_137.0, 0.00669437999014
+    points = []
+    for fix in (there, here):
+        latitude, longitude = np.radians([fix.latitude_deg, fix.longitude_deg])
+        n = a / np.sqrt(1 - e2 * np.sin(latitude) ** 2)
+        x, y = n * np.cos(latitude) * np.array([np.cos(longitude), np.sin(longitude)])
+        points.append(np.array([x, y, n * (1 - e2) * np.sin(latitude)]))
+    up = Rotation.from_euler("ZY", [longitude, -latitude]).as_matrix()
+    _, east, north = up.T @ (points[0] - points[1])
+    return float(north), float(east)
+
+
+def test_a_fix_is_less_certain_by_the_arm_where_no_attitude_is_known():
+    body, antenna = BodyFrame(), Position(*STAMP, 10.0, 20.0, 3.0)
+    body.refer(attitude(Rotation.identity(), t_ns=3 * 10**9), AT_ORIGIN)
+
+    fix = body.refer(antenna, mounted(position_m=(4.0, 4.0, 7.0)))
+
+    assert (fix.latitude_deg, fix.longitude_deg) == (10.0, 20.0)
+    assert fix.sigma_m == pytest.approx(5.0)
+
+
+def test_at_a_pole_an_arm_is_left_in():
+    body, antenna = BodyFrame(), Position(*STAMP, 90.0, 20.0, 3.0)
+    body.refer(attitude(Rotation.identity()), AT_ORIGIN)
+
+    assert body.refer(antenna, mounted(position_m=(4.0, 4.0, 0.0))) == antenna
+
+
 def test_what_has_no_place_is_left_as_it_is():
     lights = Lights(*STAMP, 0.5)
     sensor = mounted(position_m=(1, 2, 3), **ANGLES)
 
+    utc = UtcTime(*STAMP, 10**18)
     assert BodyFrame().refer(lights, sensor) is lights
+    assert BodyFrame().refer(utc, sensor) is utc
     force = Acceleration(*STAMP, (0.0, 0.0, -9.8))
     assert BodyFrame().refer(force, mounted(position_m=(1, 2, 3))) == force
 
@@ -139,6 +189,8 @@ def test_no_vehicle_measures_this(bad):
         AngularRate(*STAMP, (0.0, 0.0, bad)),
         Acceleration(*STAMP, (bad, 0.0, 0.0)),
         Attitude(*STAMP, (1.0, bad, 0.0, 0.0)),
+        Position(*STAMP, bad, 20.0, 1.0),
+        Position(*STAMP, 10.0, bad, 1.0),
     ]
     assert not any(map(plausible, samples))
 
@@ -146,3 +198,16 @@ def test_no_vehicle_measures_this(bad):
 @pytest.mark.parametrize("merit", [NAN, INF, -0.1])
 def test_a_velocity_without_a_usable_figure_of_merit_is_not_plausible(merit):
     assert not plausible(Velocity(*STAMP, (0.0, 0.0, 0.0), merit))
+
+
+@pytest.mark.parametrize("sigma_m", [NAN, INF, 0.0, -1.0])
+def test_a_fix_without_a_usable_accuracy_is_not_plausible(sigma_m):
+    assert plausible(Position(*STAMP, 10.0, 20.0, 1.0))
+    assert not plausible(Position(*STAMP, 10.0, 20.0, sigma_m))
+    assert not plausible(Position(*STAMP, 0.0, 0.0, 1.0))
+
+
+@pytest.mark.parametrize("utc_s", [0, 315_964_800, 4_102_444_801])
+def test_a_receiver_that_does_not_know_the_year_is_not_believed(utc_s):
+    assert plausible(UtcTime(*STAMP, 1_795_365_000 * 10**9))
+    assert not plausible(UtcTime(*STAMP, utc_s * 10**9))

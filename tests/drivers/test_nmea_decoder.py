@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from aquaflow.config.telemetry import NmeaConfig
-from aquaflow.messages import Altitude, AngularRate, Attitude, Depth, Velocity
+from aquaflow.messages import Altitude, AngularRate, Attitude, Depth, Position, UtcTime, Velocity
 from drivers.protocol.nmea import NmeaDecoder
 from sim_drivers.devices.nmea_talker import sentence
 
@@ -145,6 +145,18 @@ def test_a_magnetic_heading_is_corrected_to_the_east(body, yaw):
         "PRDID,1,2",
         "SDDPT,-4.0,0.0",
         "SDDPT,1e300,0.0",
+        "GPGGA,120000,4807.038,X,01131.000,E,1,08,0.9,,M,,M,,",
+        "GPGGA,120000,4877.038,N,01131.000,E,1,08,0.9,,M,,M,,",
+        "GPGGA,120000,9107.038,N,01131.000,E,1,08,0.9,,M,,M,,",
+        "GPGGA,120000,,,,,1,08,0.9,,M,,M,,",
+        "GPGGA,120000,4807.038,N,01131.000,E,,08,0.9,,M,,M,,",
+        "GPGGA,120000",
+        "GPRMC,120000,A,4807.038,N,01131.000,E,,,321326,,",
+        "GPRMC,1200,A,4807.038,N,01131.000,E,,,221126,,",
+        "GPRMC,120000,A,4807.038,N,01131.000,E,,,,,",
+        "GPZDA,120099.00,22,11,2026,00,00",
+        "GPZDA,120000.00,06,01,1980,00,00",
+        "GPGST,120000,,,,,x,1.0,",
     ],
 )
 def test_what_is_invalid_is_counted_and_dropped(body):
@@ -153,6 +165,83 @@ def test_what_is_invalid_is_counted_and_dropped(body):
     assert receiver.feed(sentence(body), NOW) == []
     assert receiver.counters.messages == 1
     assert receiver.counters.invalid_values == 1
+
+
+GGA = "GPGGA,123519,4807.038,N,01131.000,W,1,08,0.9,545.4,M,46.9,M,,"
+RMC = "GPRMC,123519.250,A,4807.038,S,01131.000,E,022.4,084.4,230326,003.1,W"
+
+
+def test_a_fix_has_the_accuracy_of_its_dilution():
+    fix, unstated = hear(GGA, GGA.replace("0.9,", ","), position_lag_s=0.25)
+
+    assert isinstance(fix, Position)
+    assert (fix.latitude_deg, fix.longitude_deg) == pytest.approx((48.1173, -11.516666667))
+    assert (fix.t_ns, fix.arrival_ns, fix.source) == (NOW - 250_000_000, NOW, "box/GGA")
+    assert fix.sigma_m == pytest.approx(0.9 * 5.1 / 2**0.5)
+    assert unstated.sigma_m == pytest.approx(2.0 * 5.1 / 2**0.5)
+
+
+def test_a_published_fix_is_read():
+    line = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"
+
+    (fix,) = decoder().feed(line, NOW)
+
+    assert (fix.latitude_deg, fix.longitude_deg) == pytest.approx((48.1173, 11.516666667))
+
+
+def test_the_accuracy_that_a_receiver_states_is_used_while_it_is_new():
+    receiver = decoder()
+    accuracy, empty = sentence("GPGST,123519,2,,,,0.6,0.8,1"), sentence("GPGST,123519,,,,,,,")
+
+    (stated,) = receiver.feed(accuracy + sentence(GGA), NOW)
+    (old,) = receiver.feed(sentence(GGA), NOW + 6 * 10**9)
+    (withdrawn,) = receiver.feed(accuracy + empty + sentence(GGA), NOW)
+    (known,) = hear("GPGST,123519,2,,,,0.6,0.8,1", GGA, position_sigma_m=0.1)
+
+    assert stated.sigma_m == pytest.approx(0.5**0.5)
+    assert old.sigma_m == withdrawn.sigma_m == pytest.approx(0.9 * 5.1 / 2**0.5)
+    assert known.sigma_m == 0.1
+
+
+def test_rmc_gives_utc_and_a_fix_only_where_gga_does_not():
+    receiver = decoder(position_lag_s=0.25)
+
+    fix, utc = receiver.feed(sentence(RMC), NOW)
+    both = receiver.feed(sentence(GGA) + sentence(RMC), NOW)
+    later = receiver.feed(sentence(RMC), NOW + 6 * 10**9)
+
+    assert (fix.latitude_deg, fix.longitude_deg) == pytest.approx((-48.1173, 11.516666667))
+    # 2026-03-23 12:35:19.25, and the fix is of that moment.
+    assert utc == UtcTime(NOW - 250_000_000, NOW, "box/RMC", 1_774_269_319_250_000_000)
+    assert [s.source for s in both] == ["box/GGA", "box/RMC"]
+    assert [type(s) for s in later] == [Position, UtcTime]
+
+
+def test_zda_gives_utc():
+    (utc,) = hear("GPZDA,235959.50,31,12,2026,00,00")
+
+    assert utc == UtcTime(NOW, NOW, "box/ZDA", 1_798_761_599_500_000_000)
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "GPGGA,123519,,,,,0,00,,,M,,M,,",
+        GGA.replace("W,1,", "W,6,"),
+        GGA.replace("W,1,", "W,7,"),
+        GGA.replace("W,1,", "W,8,"),
+        "GPRMC,,V,,,,,,,,,,N",
+        RMC.replace(",A,", ",V,"),
+        RMC + ",E",
+        RMC + ",S",
+        "GPZDA,,,,,,",
+    ],
+)
+def test_a_receiver_without_a_fix_gives_nothing_and_is_not_at_fault(body):
+    receiver = decoder()
+
+    assert receiver.feed(sentence(body), NOW) == []
+    assert receiver.counters.invalid_values == 0
 
 
 def test_sentences_that_tell_nothing_of_motion_are_counted():

@@ -53,9 +53,13 @@ def text(rng: Rng) -> str:
     return "".join(rng.choices(FIELD_LETTERS, k=rng.randrange(60)))
 
 
+USED = (2, 24, 27, 30, 32, 36, 105, 111, 132, 137)
+"""Messages that the driver reads."""
+
+
 def mavlink_packet(rng: Rng) -> bytes:
     """Any message with any payload of any length, and the right checksum."""
-    number = rng.choice((2, 27, 30, 32, 36, 105, 111, 132, 137, rng.choice([*DIALECT.mavlink_map])))
+    number = rng.choice((*USED, rng.choice([*DIALECT.mavlink_map])))
     payload = rng.choice((bytes(40), b"\xff" * 40, rng.randbytes(255)))[: rng.randrange(256)]
     ids = bytes([rng.choice((1, 255)), rng.choice((1, 190))])
     if number < 256 and rng.random() < 0.3:
@@ -81,6 +85,10 @@ def nmea_packet(rng: Rng) -> bytes:
         "PRDID",
         "PASHR",
         "YXXDR",
+        "GPGGA",
+        "GPRMC",
+        "GPGST",
+        "GPZDA",
         "",
     )
     return sentence(f"{rng.choice(kinds)},{text(rng)}")
@@ -116,8 +124,12 @@ def pd0_packet(rng: Rng) -> bytes:
     return ensemble(*parts)
 
 
+GROUPS = (126992, 127250, 127251, 127257, 128259, 128267, 129025, 129539)
+"""Parameter groups that the driver reads."""
+
+
 def can_packet(rng: Rng) -> bytes:
-    group = rng.choice((127250, 127251, 127257, 128259, 128267, rng.randrange(1 << 18)))
+    group = rng.choice((*GROUPS, rng.randrange(1 << 18)))
     identifier = rng.choice((EXTENDED | 2 << 26 | group << 8 | 35, 2566834709, 291))
     data = rng.choice((b"\xff" * 8, rng.randbytes(8)))[: rng.randrange(9)]
     return RECORD.pack(identifier, len(data), data)

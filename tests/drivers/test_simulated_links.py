@@ -12,6 +12,8 @@ from aquaflow.messages import (
     Attitude,
     Depth,
     Lights,
+    Position,
+    UtcTime,
     Velocity,
 )
 from tests.drivers.simulated_links import RIGS, motion, running, until, values
@@ -24,8 +26,13 @@ TOLERANCE = {
     Depth: 0.006,
     Velocity: 0.006,
     Lights: 1e-3,
+    Position: 1e-7,
+    UtcTime: 0.011,  # ZDA has hundredths of a second
 }
 """Resolution of the coarsest protocol."""
+
+SIGMA_M = {"mavlink_udp": 1.6 * 5.1 / 2**0.5, "nmea2000": 1.6 * 5.1 / 2**0.5}
+"""Of the protocols that state only an HDOP; the others state the fix's own 2.5 m."""
 
 
 @pytest.mark.parametrize("name", RIGS)
@@ -46,6 +53,9 @@ def test_a_driver_tells_what_its_device_measured(name, tmp_path):
         distance = np.abs(told[:, None] - truth[None]).max(2)
         assert distance.min(1).max() <= TOLERANCE[kind], f"{kind.__name__} was never measured"
         assert distance.min(0).max() <= TOLERANCE[kind], f"{kind.__name__} was lost"
+    sigma_m = SIGMA_M.get(name if "mavlink" in name else name.split("_")[0], 2.5)
+    sigmas_m = [sample.sigma_m for sample in heard if isinstance(sample, Position)]
+    assert sigmas_m == pytest.approx([sigma_m] * len(sigmas_m))
     assert counters.samples == len(heard)
     assert (counters.bad_checksums, counters.garbage_bytes, counters.invalid_values) == (0, 0, 0)
     assert (counters.dropped_samples, counters.reconnects) == (0, 0)

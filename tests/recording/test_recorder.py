@@ -24,7 +24,9 @@ from aquaflow.messages import (
     EncodedPicture,
     Frame,
     Lights,
+    Position,
     TelemetrySample,
+    UtcTime,
     Velocity,
 )
 from aquaflow.recording import Recorder, RecorderStatus, dive_file
@@ -66,6 +68,8 @@ def samples() -> list[TelemetrySample]:
         Velocity(*stamp, (1.0, 2.0, third), 0.01),
         Altitude(*stamp, third),
         Lights(*stamp, 0.25),
+        Position(*stamp, -41.0 - third, 174.8, third),
+        UtcTime(*stamp, 1_795_365_000_123_456_789),
     ]
 
 
