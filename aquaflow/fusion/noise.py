@@ -1,10 +1,15 @@
-"""How wrong a source's residuals are: white noise, and a part that varies slowly.
+"""How wrong a source's residuals are: white noise, and parts that last.
 
 What limits telemetry is seldom its white noise: waves, the drift of an attitude filter, the drift
-of the camera's own path pass slowly, and averaging does not remove them. Residuals r [N] of a
-source are taken as r ~ N(0, diag((white sigma)^2) + slow^2 exp(-|dt| / time)), the stated sigma
-times a factor and a first-order Gauss-Markov process. Factor, size and time are the likeliest for
-the residuals, never better than the data sheet (Rasmussen and Williams, Gaussian Processes, 5.4).
+of the camera's own path pass slowly, and averaging does not remove them. The residuals r [N] of a
+source are taken as Gaussian with the covariance
+
+    white^2 (diag(sigma^2) + least^2 exp(-|dt| / long))
+        + size^2 exp(-|dt| / time) cos(2 pi dt / period)
+
+where sigma and the least slow part are the data sheet's, and what comes on top is the likeliest of
+some processes: Gauss-Markov of several times, and waves of several periods, which average out over
+a few of them (Rasmussen and Williams, Gaussian Processes for Machine Learning, 4.2 and 5.4).
 """
 
 from __future__ import annotations
@@ -13,44 +18,74 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import cholesky, solve_triangular
 
 Array = npt.NDArray[np.float64]
 
 WHITE = np.geomspace(1.0, 32.0, 16)
-"""Factors tried on the stated sigma; more than 32 is another instrument."""
-SLOW = np.geomspace(1.0, 300.0, 25)
-"""Sizes tried of the slow part, in units of its least."""
+"""Factors tried on the data sheet's noise; more than 32 is another instrument."""
+SIZES = np.concatenate([[0.0], np.geomspace(0.3, 300.0, 28)])
+"""Sizes tried of the process on top, in root mean squares of the data sheet's noise."""
+
+
+@dataclass(frozen=True)
+class Process:
+    """A kind of error that lasts."""
+
+    time_s: float
+    """Correlation time."""
+    period_s: float = np.inf
+    """Of a wave; infinite for a drift."""
+
+    def correlation(
+        self,
+        t_s: Array,  # [N] s
+    ) -> Array:
+        """[N, N]"""
+        dt = np.abs(np.subtract.outer(t_s, t_s))
+        return np.asarray(np.exp(-dt / self.time_s) * np.cos(2.0 * np.pi * dt / self.period_s))
 
 
 @dataclass(frozen=True)
 class SlowPart:
-    """What is known of a source's slow errors before any residual is seen."""
+    """What is known of a source's lasting errors before any residual is seen."""
 
     least: float
-    """1 sigma in the residual's unit, never taken to be smaller (data sheet)."""
-    times_s: tuple[float, ...]
-    """Correlation times that are possible, s."""
+    """1 sigma of a drift that is always there, in the residual's unit (data sheet)."""
+    time_s: float
+    """Its correlation time."""
+    processes: tuple[Process, ...]
+    """What may come on top."""
+
+    def base(
+        self,
+        t_s: Array,  # [N] s
+        sigma: Array,  # [N] white, in the residual's unit
+    ) -> Array:
+        """[N, N] covariance by the data sheet."""
+        drift = self.least**2 * Process(self.time_s).correlation(t_s)
+        return np.asarray(drift + np.diag(sigma**2))
 
 
 @dataclass(frozen=True)
 class Noise:
     """The errors of one source."""
 
-    white: float
-    """Factor on the stated sigma."""
-    slow: float
-    """1 sigma, in the residual's unit."""
-    time_s: float
-    """Correlation time of the slow part."""
+    white: float = 1.0
+    """Factor on the data sheet's noise."""
+    size: float = 0.0
+    """1 sigma of the process on top, in the residual's unit."""
+    process: Process = Process(1.0)
 
     def covariance(
         self,
         t_s: Array,  # [N] s
-        sigma: Array,  # [N] stated, in the residual's unit
+        sigma: Array,  # [N] white, in the residual's unit
+        part: SlowPart,
     ) -> Array:
         """[N, N] of one component of the residuals."""
-        slow = self.slow**2 * np.exp(-np.abs(np.subtract.outer(t_s, t_s)) / self.time_s)
-        return np.asarray(slow + np.diag((self.white * sigma) ** 2))
+        base = self.white**2 * part.base(t_s, sigma)
+        return base + self.size**2 * self.process.correlation(t_s)
 
 
 def likeliest(
@@ -60,18 +95,20 @@ def likeliest(
     part: SlowPart,
 ) -> Noise:
     """The noise under which the residuals are likeliest."""
-    best, found = -np.inf, Noise(1.0, part.least, part.times_s[0])
-    slow = part.least * SLOW
-    for time_s in part.times_s:
-        process = np.exp(-np.abs(np.subtract.outer(t_s, t_s)) / time_s)
-        values, vectors = np.linalg.eigh(process / np.outer(sigma, sigma))
-        power = ((vectors.T @ (r / sigma[:, None])) ** 2).sum(axis=1)
-        variance = (
-            WHITE[:, None, None] ** 2
-            + slow[None, :, None] ** 2 * np.maximum(values, 0.0)[None, None, :]
-        )
+    best, found = -np.inf, Noise()
+    base = part.base(t_s, sigma)
+    root = cholesky(base, lower=True)
+    unit = float(np.sqrt(np.trace(base) / max(len(base), 1)))
+    white_r = solve_triangular(root, r, lower=True)
+    for process in part.processes:
+        half = solve_triangular(root, process.correlation(t_s), lower=True)
+        values, vectors = np.linalg.eigh(solve_triangular(root, half.T, lower=True))
+        power = ((vectors.T @ white_r) ** 2).sum(axis=1)
+        sizes = (unit * SIZES) ** 2
+        variance = WHITE[:, None, None] ** 2 + sizes[None, :, None] * np.maximum(values, 0.0)
         fit = -0.5 * (r.shape[1] * np.log(variance) + power / variance).sum(axis=2)
         i, j = np.unravel_index(int(np.argmax(fit)), fit.shape)
         if fit[i, j] > best:
-            best, found = float(fit[i, j]), Noise(float(WHITE[i]), float(slow[j]), time_s)
+            best = float(fit[i, j])
+            found = Noise(float(WHITE[i]), unit * float(SIZES[j]), process)
     return found

@@ -116,7 +116,7 @@ class _Correlated:
         noise: Noise,
     ) -> None:
         self._kept = kept
-        covariance = noise.covariance(factor.t_s[kept], factor.sigma[kept])
+        covariance = noise.covariance(factor.t_s[kept], factor.sigma[kept], factor.slow)
         self._root = cholesky(covariance, lower=True)
 
     def __call__(

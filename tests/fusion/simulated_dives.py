@@ -82,6 +82,4 @@ def stated_mounting(dive: SimulatedDive) -> MountingConfig:
 def estimated(swum: Swum, points: Array = NOTHING, **settings: Any) -> Estimate:
     """What the estimator makes of it."""
     config = FusionConfig(**settings)
-    return estimate(
-        swum.telemetry, swum.path, config, stated_mounting(swum.dive), lambda: points
-    )
+    return estimate(swum.telemetry, swum.path, config, stated_mounting(swum.dive), lambda: points)

@@ -6,7 +6,7 @@ import numpy as np
 
 from aquaflow.fusion.camera_path import CameraPath
 from aquaflow.fusion.factors.factor import Array, Factor
-from aquaflow.fusion.noise import SlowPart
+from aquaflow.fusion.noise import Process, SlowPart
 from aquaflow.fusion.state import SCALE, State
 from aquaflow.fusion.telemetry import Series
 
@@ -27,7 +27,7 @@ class AltitudeFactor(Factor):
     """Range to the map along the beam minus the altitude, m."""
 
     kind = "altitude"
-    slow = SlowPart(0.01, (1.0, 5.0, 30.0))
+    slow = SlowPart(0.01, 5.0, tuple(Process(t) for t in (1.0, 5.0, 30.0)))
     """m: the same rock stays within the beam for seconds."""
     spans = (SCALE,)
 

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow.fusion.camera_path import CameraPath
 from aquaflow.fusion.factors.factor import MOST, Array, Factor
-from aquaflow.fusion.noise import SlowPart
+from aquaflow.fusion.noise import Process, SlowPart
 from aquaflow.fusion.state import CAMERA, HEADING, TURN, State
 from aquaflow.fusion.telemetry import Series
 from aquaflow.geometry.similarity import rotation_from_quaternion
@@ -26,8 +26,9 @@ class TiltFactor(Factor):
     """Measured down in the body x down of the state: the small angle between the two."""
 
     kind = "attitude"
-    slow = SlowPart(np.radians(0.3), (10.0, 60.0, 300.0))
-    """rad: a MEMS filter's roll and pitch wander by some tenths of a degree within minutes."""
+    slow = SlowPart(np.radians(0.3), 20.0, tuple(Process(t) for t in (5.0, 20.0, 100.0)))
+    """rad: roll and pitch of a MEMS filter wander by some tenths of a degree (Xsens MTi-30: 0.5
+    degrees RMS dynamic), as long as it averages accelerations."""
     spans = (TURN, CAMERA)
 
     def __init__(
@@ -69,7 +70,7 @@ class ForceFactor(TiltFactor):
     """The same from specific force, which is down only on average."""
 
     kind = "acceleration"
-    slow = SlowPart(0.02, (1.0, 4.0, 20.0))
+    slow = SlowPart(0.01, 4.0, tuple(Process(t) for t in (1.0, 4.0, 20.0)))
     """rad: accelerations of an ROV last as long as its manoeuvres."""
 
     @staticmethod
@@ -88,7 +89,7 @@ class HeadingFactor(Factor):
     """Turn about the vertical between the body of the state and the compass's."""
 
     kind = "heading"
-    slow = SlowPart(np.radians(1.0), (10.0, 60.0, 300.0))
+    slow = SlowPart(np.radians(1.0), 60.0, tuple(Process(t) for t in (10.0, 60.0, 300.0)))
     """rad: thrusters, tethers and wrecks bend the field as the vehicle goes."""
     spans = (TURN, CAMERA, HEADING)
 

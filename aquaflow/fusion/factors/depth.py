@@ -6,7 +6,7 @@ import numpy as np
 
 from aquaflow.fusion.camera_path import CameraPath
 from aquaflow.fusion.factors.factor import MOST, Array, Factor
-from aquaflow.fusion.noise import SlowPart
+from aquaflow.fusion.noise import Process, SlowPart
 from aquaflow.fusion.state import CAMERA, SCALE, SHIFT, TURN, State
 from aquaflow.fusion.telemetry import Series
 
@@ -18,8 +18,15 @@ class DepthFactor(Factor):
     """z of the body in n minus the depth."""
 
     kind = "depth"
-    slow = SlowPart(0.01, (2.0, 8.0, 60.0))
-    """m: waves of 1 to 10 s reach down to half their length; tide and temperature take minutes."""
+    slow = SlowPart(
+        0.005,
+        60.0,
+        (
+            *(Process(time_s) for time_s in (2.0, 8.0, 60.0)),
+            *(Process(20.0, period_s) for period_s in (2.5, 3.2, 4.0, 5.0, 6.5, 8.5, 11.0)),
+        ),
+    )
+    """m: tide, temperature and the camera's own drift; waves reach down to half their length."""
     spans = (SCALE, TURN, SHIFT, CAMERA)
 
     def __init__(self, depth: Series, path: CameraPath) -> None:

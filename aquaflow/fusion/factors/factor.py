@@ -13,7 +13,7 @@ from aquaflow.fusion.state import P, State
 
 Array = npt.NDArray[np.float64]
 
-MOST = 300
+MOST = 250
 """Samples of one source that the estimator takes, evenly chosen: what is slow in their errors
 limits the result, not how many there are."""
 STEP = 1e-6

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from aquaflow.fusion.factors.factor import Array, Factor
-from aquaflow.fusion.noise import SlowPart
+from aquaflow.fusion.noise import Process, SlowPart
 from aquaflow.fusion.state import SCALE, State
 
 
@@ -13,7 +13,7 @@ class LengthFactor(Factor):
     """Length in the map, in metres, minus the known one."""
 
     kind = "length"
-    slow = SlowPart(1e-4, (1.0,))
+    slow = SlowPart(1e-4, 1.0, (Process(1.0),))
     """m: what is printed and measured is right to a tenth of a millimetre at best."""
     spans = (SCALE,)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from aquaflow.fusion.camera_path import CameraPath
 from aquaflow.fusion.factors.factor import MOST, Array, Factor
-from aquaflow.fusion.noise import SlowPart
+from aquaflow.fusion.noise import Process, SlowPart
 from aquaflow.fusion.state import CAMERA, LAG, SCALE, SHIFT, TURN, State
 
 
@@ -14,7 +14,7 @@ class PositionFactor(Factor):
     """North and east of the body, at the moment that the fix is of, minus the fix, m."""
 
     kind = "position"
-    slow = SlowPart(0.001, (10.0, 60.0, 600.0))
+    slow = SlowPart(0.001, 60.0, tuple(Process(t) for t in (10.0, 60.0, 600.0)))
     """m: GNSS and acoustic fixes err for minutes; how much differs by system, their residuals say.
     """
     spans = (SCALE, TURN, SHIFT, CAMERA, LAG)

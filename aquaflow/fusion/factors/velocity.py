@@ -7,7 +7,7 @@ from scipy.integrate import cumulative_trapezoid
 
 from aquaflow.fusion.camera_path import CameraPath
 from aquaflow.fusion.factors.factor import MOST, Array, Factor
-from aquaflow.fusion.noise import SlowPart
+from aquaflow.fusion.noise import Process, SlowPart
 from aquaflow.fusion.state import CAMERA, DVL, DVL_SCALE, SCALE, State
 from aquaflow.fusion.telemetry import Series
 
@@ -24,7 +24,7 @@ class VelocityFactor(Factor):
     """Displacement of the camera between two poses minus the DVL's, in the axes of the map, m."""
 
     kind = "velocity"
-    slow = SlowPart(0.002, (3.0, 15.0, 60.0))
+    slow = SlowPart(0.002, 15.0, tuple(Process(t) for t in (3.0, 15.0, 60.0)))
     """m in an interval: the camera's own scale wanders along the path."""
     spans = (SCALE, CAMERA, DVL, DVL_SCALE)
 
