@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from aquaflow.config.known_lengths import BoardConfig, LasersConfig
 from aquaflow.config.stage import Stage
 from aquaflow.config.telemetry import MountingConfig
 
@@ -23,3 +24,7 @@ class FusionConfig(Stage):
         le=45,
         description="deg, 1 sigma of every stated mounting: set by eye (judgement)",
     )
+    boards: tuple[BoardConfig, ...] = Field(
+        (), description="markers and boards of known size that may come into view"
+    )
+    lasers: LasersConfig | None = Field(None, description="two dots of known spacing, if mounted")
