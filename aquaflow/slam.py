@@ -11,6 +11,7 @@ from pathlib import Path
 from aquaflow.config import Config
 from aquaflow.errors import ConfigError
 from aquaflow.errors.failures import Failures
+from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.maps import Growth, Insertion, Maps, MapWork
@@ -174,6 +175,10 @@ class Slam:
     def held_out(self) -> dict[int, list[View]]:
         """Per sub-map, the views that were tracked but never mapped."""
         return self.maps.held_out
+
+    def metric_frame(self, sub_map: int) -> MetricFrame:
+        """Where a sub-map lies in the world, as far as telemetry has shown it by now."""
+        return MetricFrame.unknown()
 
     # --- an earlier run -----------------------------------------------------------------------
 

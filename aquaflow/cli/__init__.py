@@ -20,6 +20,7 @@ from aquaflow.cli.devices import register as register_devices
 from aquaflow.cli.export import register as register_export
 from aquaflow.cli.prior import register as register_prior
 from aquaflow.cli.record import register as register_record
+from aquaflow.cli.scale import register as register_scale
 from aquaflow.cli.service import exit_code, map_realtime, print_finished
 from aquaflow.cli.service import register as register_service
 from aquaflow.cli.stress import register as register_stress
@@ -248,5 +249,6 @@ register_devices(app)
 register_export(app)
 register_prior(app)
 register_record(app)
+register_scale(app)
 register_service(app)
 register_stress(app)

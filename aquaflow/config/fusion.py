@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from aquaflow.config.known_lengths import BoardConfig, LasersConfig
 from aquaflow.config.stage import Stage
 from aquaflow.config.telemetry import MountingConfig
 
@@ -41,3 +42,7 @@ class FusionConfig(Stage):
     every_keyframes: int = Field(
         20, ge=1, description="keyframes after which telemetry straightens the keyframe graph"
     )
+    boards: tuple[BoardConfig, ...] = Field(
+        (), description="markers and boards of known size that may come into view"
+    )
+    lasers: LasersConfig | None = Field(None, description="two dots of known spacing, if mounted")

@@ -96,11 +96,20 @@ class PoseConfig(Stage):
 
     enabled: bool = False
     message: Literal["odometry", "vision_position_delta"] = "odometry"
-    mounting: MountingConfig = Field(
-        MountingConfig(), description="of the camera; without it, it looks forward"
+    mounting: MountingConfig | None = Field(
+        None, description="of the camera, where fusion.camera does not state it"
+    )
+    max_scale_sigma: float = Field(
+        0.05, gt=0, lt=1, description="relative 1 sigma of the map's scale; beyond, nothing is sent"
+    )
+    max_position_sigma_m: float = Field(
+        10.0, gt=0, description="m, 1 sigma of the position; beyond, no ODOMETRY is sent"
     )
     jump_m: float = Field(
         0.2, gt=0, description="m; a correction that moves the pose further bumps reset_counter"
+    )
+    jump_deg: float = Field(
+        5.0, gt=0, le=180, description="deg; so does one that turns the pose further"
     )
 
 

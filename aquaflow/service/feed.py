@@ -83,6 +83,8 @@ class Feed(Protocol):
     """Why the camera stopped, unless its recording ended."""
     failures: Failures
     """Errors raised while reading; the dive adds its own."""
+    continued: Continued
+    """Where frame indices and time of an earlier run go on."""
 
     @property
     def calibration(self) -> CameraModel | None: ...

@@ -23,7 +23,8 @@ from aquaflow.service.live_viewer import LiveViewer
 from aquaflow.service.moment import Moment
 from aquaflow.service.report import report
 from aquaflow.service.vehicle.pilot_messages import PilotMessages
-from aquaflow.service.vehicle.pose_output import PoseOutput, metric_scale
+from aquaflow.service.vehicle.pose_output import PoseOutput
+from aquaflow.service.vehicle.scale_sources import refuse_without_scale
 
 log = logging.getLogger(__name__)
 
@@ -51,20 +52,22 @@ def map_live(
         AquaFlowError: the folder, the config, the source or the loop; the checkpoint stays.
     """
     service = vehicle.service
+    if service.pose.enabled:
+        refuse_without_scale(vehicle)
     with contextlib.ExitStack() as around:
         dive = around.enter_context(begun(feed, vehicle, out, new, overwrite))
+        slam = dive.parts.slam
+        poses = PoseOutput(service.pose, feed, slam.metric_frame) if service.pose.enabled else None
+        say = partial(report, dive.parts, service.hang_s, poses)
         if service.health.enabled:
-            server = HealthServer(service.health, lambda: report(dive.parts, service.hang_s))
+            server = HealthServer(service.health, say)
             around.callback(partial(_closed, dive, server.close))
         watchers = dive.parts.loop.watchers
         watchers.append(PilotMessages(service.report, feed).update)
-        if service.pose.enabled:
-            scale = metric_scale(dive.parts.slam)
-            watchers.append(PoseOutput(service.pose, feed, scale).update)
+        if poses is not None:
+            watchers.append(poses.update)
         if vehicle.viewer.enabled:
-            viewer = LiveViewer(
-                vehicle.viewer, dive.parts.maps, lambda: report(dive.parts, service.hang_s)
-            )
+            viewer = LiveViewer(vehicle.viewer, dive.parts.maps, say)
             around.callback(partial(_closed, dive, viewer.close))
             watchers.append(viewer.update)
         around.callback(_stop_after(seconds, dive).cancel)

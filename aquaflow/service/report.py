@@ -10,6 +10,7 @@ from typing import Any
 from aquaflow import __version__
 from aquaflow.service.health.state import State
 from aquaflow.service.live_dive import Parts
+from aquaflow.service.vehicle.pose_output import PoseOutput
 
 GOOD = (State.TRACKING, State.INITIALISING)
 """States that need no action."""
@@ -17,7 +18,9 @@ CHANGES_LISTED = 10
 """Latest changes of state that the report lists."""
 
 
-def report(parts: Parts, hang_s: float, now_s: float | None = None) -> dict[str, Any]:
+def report(
+    parts: Parts, hang_s: float, poses: PoseOutput | None = None, now_s: float | None = None
+) -> dict[str, Any]:
     """The report, with stable keys; may be called from any thread."""
     loop, now = parts.loop, time.monotonic() if now_s is None else now_s
     health, hung = loop.health, loop.heartbeats.hung(hang_s)
@@ -51,6 +54,7 @@ def report(parts: Parts, hang_s: float, now_s: float | None = None) -> dict[str,
         "machine": asdict(loop.pressure) | {"peak_rss_mb": _peak_rss_mb()},
         "devices": loop.feed.describe(),
         "telemetry_samples": loop.feed.latest_samples.samples,
+        "pose_output": None if poses is None else poses.to_json(),
     }
 
 

@@ -33,31 +33,43 @@ class NamedValue:
 
 @dataclass(frozen=True)
 class BodyPose:
-    """Pose of the body (forward, right, down) in a local frame of the same axes, metres."""
+    """Pose and motion of the body (forward, right, down) in a level local frame, metres.
+
+    The local frame's z points down; its x points north, or along the initial heading.
+    """
 
     t_ns: int
     """CLOCK_MONOTONIC, moment of exposure."""
     R: Array
     """[3, 3] body to local."""
     t_m: Array
-    """[3]"""
+    """[3] of the body in the local frame."""
     covariance: Array
-    """[6, 6] position then rotation vector, m and rad."""
+    """[6, 6] of x, y, z in the local frame and of roll, pitch, yaw, m and rad."""
+    velocity_m_s: Array
+    """[3] along the body's axes."""
+    rate_rad_s: Array
+    """[3] about the body's axes."""
+    motion_covariance: Array
+    """[6, 6] of velocity and rate, m/s and rad/s."""
     quality: float
     """0 to 1."""
     reset_counter: int
     """Changes, modulo 256, whenever the pose jumped."""
+    north: bool
+    """True if x points north (true or magnetic)."""
 
 
 @dataclass(frozen=True)
 class BodyMotion:
-    """Change of the body's pose since the one before, in the axes of the earlier body."""
+    """Change of the body's pose since the one before, in the axes of the body as it is now."""
 
     t_ns: int
+    """CLOCK_MONOTONIC, moment of exposure."""
     since_ns: int
     """Time between the two poses."""
     rotation: Array
-    """[3] rotation vector, rad"""
+    """[3] rotation vector from the earlier body to this one, rad; the same in both bodies' axes."""
     translation_m: Array
     """[3]"""
     quality: float

@@ -11,7 +11,7 @@ from aquaflow.sources.outbound import OutboundMessage, StatusText
 from drivers.device_clock import DeviceClock
 from drivers.extra import load
 from drivers.protocol.mavlink_frames import MavlinkFraming, header_of
-from drivers.protocol.mavlink_outbound import message_of
+from drivers.protocol.mavlink_outbound import Receiver, message_of
 from drivers.protocol.mavlink_samples import SINCE_1970_US, MavlinkSamples, MessageTime
 from drivers.protocol.packets import PacketDecoder
 
@@ -44,13 +44,14 @@ class MavlinkDecoder(PacketDecoder):
         self._wanted = {
             number: message.msgname
             for number, message in self._dialect.mavlink_map.items()
-            if message.msgname in self._samples.wanted | {"TIMESYNC", "SYSTEM_TIME"}
+            if message.msgname in self._samples.wanted | {"HEARTBEAT", "TIMESYNC", "SYSTEM_TIME"}
         }
         self._wire = self._dialect.MAVLink(None, config.system_id, OUR_COMPONENT)
         self._requests: deque[int] = deque(maxlen=OPEN_REQUESTS)
         self._outgoing = b""
         self._outbound: deque[OutboundMessage] = deque(maxlen=MOST_WAITING)
         self._talk_at_ns: int | None = None
+        self._autopilot: int | None = None
 
     def decode(self, packet: bytes, arrival_ns: int) -> list[TelemetrySample]:
         header = header_of(packet)
@@ -59,6 +60,9 @@ class MavlinkDecoder(PacketDecoder):
             return []
         message = self._unpacked(packet)
         name = self._wanted[header.message_id]
+        if name == "HEARTBEAT":
+            self._autopilot = message.autopilot
+            return []
         if name == "TIMESYNC":
             self._synchronise(message, arrival_ns)
             return []
@@ -74,7 +78,7 @@ class MavlinkDecoder(PacketDecoder):
         data, self._outgoing = self._outgoing, b""
         while self._outbound:
             outbound = self._outbound.popleft()
-            message = message_of(self._dialect, outbound, self._boot_ns(outbound))
+            message = message_of(self._dialect, outbound, self._receiver(outbound))
             data += b"" if message is None else self._packed(message)
         if self._talk_at_ns is not None and now_ns < self._talk_at_ns:
             return data
@@ -97,12 +101,12 @@ class MavlinkDecoder(PacketDecoder):
             self._outbound.append(outbound)
         return self._config.talk
 
-    def _boot_ns(self, outbound: OutboundMessage) -> int | None:
-        """The message's moment on the autopilot's clock."""
+    def _receiver(self, outbound: OutboundMessage) -> Receiver:
+        """The autopilot, and the message's moment on its clock."""
         report = self.clock.mapping.report()
         if report is None or isinstance(outbound, StatusText):
-            return None
-        return max(outbound.t_ns - report.offset_ns, 0)
+            return Receiver(None, self._autopilot)
+        return Receiver(max(outbound.t_ns - report.offset_ns, 0), self._autopilot)
 
     def _unpacked(self, packet: bytes) -> Any:
         try:

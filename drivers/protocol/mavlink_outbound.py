@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from aquaflow.sources.outbound import (
@@ -17,68 +19,100 @@ from aquaflow.sources.outbound import (
     StatusText,
 )
 
+Array: TypeAlias = npt.NDArray[np.float64]
+
 SEVERITIES = {"error": 3, "warning": 4, "notice": 5, "info": 6}
 """MAV_SEVERITY."""
-LOCAL_FRD, BODY_FRD = 20, 12
-"""MAV_FRAME of the world and of the body."""
+LOCAL_NED, LOCAL_FRD, BODY_FRD = 1, 20, 12
+"""MAV_FRAME: of a world whose x points north, of one with any heading, and of the body."""
+ARDUPILOT = 3
+"""MAV_AUTOPILOT_ARDUPILOTMEGA. Its GCS_MAVLINK::handle_odometry reads LOCAL_FRD with BODY_FRD as
+north-east-down, and drops every other frame without a word."""
 ESTIMATOR_VISION = 2
 """MAV_ESTIMATOR_TYPE_VISION: a camera, without inertial sensors."""
-UNKNOWN = float("nan")
-"""As ODOMETRY wants it in velocities, and in the first number of a covariance, that are not
-known."""
 ROWS, COLUMNS = np.triu_indices(6)
 """The upper triangle row by row: 21 numbers of a 6 x 6 covariance."""
 LARGEST = 1e6
 """Metres; beyond is no position."""
 
 
-def message_of(dialect: Any, outbound: OutboundMessage, boot_ns: int | None) -> Any | None:
-    """The MAVLink message of ``outbound``; None for one that is not finite.
+@dataclass(frozen=True)
+class Receiver:
+    """What is known of the autopilot that a message goes to."""
 
-    ``boot_ns``: the word's moment on the autopilot's own clock, if that is known.
+    boot_ns: int | None = None
+    """The message's moment on its clock; None while that clock is unknown."""
+    autopilot: int | None = None
+    """MAV_AUTOPILOT of its heartbeats; None before the first."""
+
+
+def message_of(dialect: Any, outbound: OutboundMessage, receiver: Receiver) -> Any | None:
+    """The MAVLink message of ``outbound``.
+
+    None for a pose or a motion that is not finite, or while the receiver's clock is unknown: its
+    filter must not take a pose for one of another moment.
     """
     if isinstance(outbound, StatusText):
         text = outbound.text.encode("ascii", "replace")[:LONGEST_TEXT]
         return dialect.MAVLink_statustext_message(severity=SEVERITIES[outbound.severity], text=text)
-    t_ns = outbound.t_ns if boot_ns is None else boot_ns
+    boot_ns = receiver.boot_ns
     if isinstance(outbound, NamedValue):
         name = outbound.name.encode("ascii", "replace")[:LONGEST_NAME]
-        boot_ms = (t_ns // 1_000_000) % 2**32
+        boot_ms = ((outbound.t_ns if boot_ns is None else boot_ns) // 1_000_000) % 2**32
         return dialect.MAVLink_named_value_float_message(boot_ms, name, outbound.value)
+    if boot_ns is None:
+        return None
     if isinstance(outbound, BodyMotion):
-        return _delta(dialect, outbound, t_ns)
-    return _odometry(dialect, outbound, t_ns)
+        return _delta(dialect, outbound, boot_ns)
+    return _odometry(dialect, outbound, boot_ns, receiver.autopilot)
 
 
-def _delta(dialect: Any, motion: BodyMotion, t_ns: int) -> Any | None:
+def _delta(dialect: Any, motion: BodyMotion, boot_ns: int) -> Any | None:
     if not (np.isfinite(motion.rotation).all() and np.isfinite(motion.translation_m).all()):
         return None
     return dialect.MAVLink_vision_position_delta_message(
-        time_usec=t_ns // 1000,
+        time_usec=boot_ns // 1000,
         time_delta_usec=motion.since_ns // 1000,
-        angle_delta=[float(v) for v in motion.rotation],
-        position_delta=[float(v) for v in motion.translation_m],
+        angle_delta=_floats(motion.rotation),
+        position_delta=_floats(motion.translation_m),
         confidence=100.0 * min(max(motion.quality, 0.0), 1.0),
     )
 
 
-def _odometry(dialect: Any, pose: BodyPose, t_ns: int) -> Any | None:
-    finite = np.isfinite(pose.R).all() and np.isfinite(pose.covariance).all()
+def _odometry(dialect: Any, pose: BodyPose, boot_ns: int, autopilot: int | None) -> Any | None:
+    numbers = (
+        pose.R, pose.covariance, pose.velocity_m_s, pose.rate_rad_s, pose.motion_covariance
+    )  # fmt: skip
+    finite = all(bool(np.isfinite(each).all()) for each in numbers)
     if not finite or not bool(np.all(np.abs(pose.t_m) < LARGEST)):
         return None
-    x, y, z = (float(v) for v in pose.t_m)
-    q = Rotation.from_matrix(pose.R).as_quat(canonical=True, scalar_first=True)
+    x, y, z = _floats(pose.t_m)
+    vx, vy, vz = _floats(pose.velocity_m_s)
+    rollspeed, pitchspeed, yawspeed = _floats(pose.rate_rad_s)
     return dialect.MAVLink_odometry_message(
-        time_usec=t_ns // 1000,
-        frame_id=LOCAL_FRD,
+        time_usec=boot_ns // 1000,
+        frame_id=_local_frame(pose, autopilot),
         child_frame_id=BODY_FRD,
         x=x, y=y, z=z,
-        q=[float(v) for v in q],
-        vx=UNKNOWN, vy=UNKNOWN, vz=UNKNOWN,
-        rollspeed=UNKNOWN, pitchspeed=UNKNOWN, yawspeed=UNKNOWN,
-        pose_covariance=[float(v) for v in pose.covariance[ROWS, COLUMNS]],
-        velocity_covariance=[UNKNOWN] + [0.0] * 20,
+        q=_floats(Rotation.from_matrix(pose.R).as_quat(canonical=True, scalar_first=True)),
+        vx=vx, vy=vy, vz=vz,
+        rollspeed=rollspeed, pitchspeed=pitchspeed, yawspeed=yawspeed,
+        pose_covariance=_floats(pose.covariance[ROWS, COLUMNS]),
+        velocity_covariance=_floats(pose.motion_covariance[ROWS, COLUMNS]),
         reset_counter=pose.reset_counter % 256,
         estimator_type=ESTIMATOR_VISION,
-        quality=round(100.0 * min(max(pose.quality, 0.0), 1.0)),
+        # 0 would say that the quality is unknown.
+        quality=max(1, round(100.0 * min(pose.quality, 1.0))),
     )  # fmt: skip
+
+
+def _local_frame(pose: BodyPose, autopilot: int | None) -> int:
+    """LOCAL_FRD, which every autopilot reads; LOCAL_NED to others than ArduPilot, if x is north."""
+    known_other = autopilot is not None and autopilot != ARDUPILOT
+    return LOCAL_NED if pose.north and known_other else LOCAL_FRD
+
+
+def _floats(
+    values: Array,  # [N]
+) -> list[float]:
+    return [float(value) for value in values]

@@ -21,6 +21,7 @@ from aquaflow.messages import (
     UtcTime,
     Velocity,
 )
+from sim_drivers.devices.visual_odometry import VisualOdometry
 
 GRAVITY_M_S2 = 9.80665
 """Standard gravity: MAVLink sends accelerations in milli-g."""
@@ -55,6 +56,8 @@ class ArduSub:
         """TIMESYNC requests of ours that were answered."""
         self.heartbeats = 0
         """Heartbeats heard."""
+        self.vision = VisualOdometry()
+        """The poses that it was sent."""
 
     def encode(self, sample: TelemetrySample, measured_ns: int, now_ns: int) -> list[bytes]:
         boot_ms = measured_ns // 1_000_000
@@ -89,6 +92,7 @@ class ArduSub:
         answers = []
         for message in self._wire.parse_buffer(packet) or []:
             kind = message.get_type()
+            self.vision.take(message, now_ns)
             self.heartbeats += kind == "HEARTBEAT"
             if kind == "TIMESYNC" and message.tc1 == 0:
                 answers.append(self._packed("timesync", now_ns, message.ts1))

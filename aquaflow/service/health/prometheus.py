@@ -61,6 +61,13 @@ def _lines(report: Mapping[str, Any]) -> Iterator[str]:
         labels = f'stage="{_escaped(kind["stage"])}",error="{_escaped(kind["error"])}"'
         labels += f',place="{_escaped(kind["place"])}"'
         yield f"aquaflow_stage_failures_total{{{labels}}} {kind['count']}"
+    poses = report["pose_output"]
+    if poses is not None:
+        yield from _head("poses_sent_total", "counter", "Poses sent to the autopilot.")
+        yield f"aquaflow_poses_sent_total {poses['sent']}"
+        yield from _labelled(
+            "poses_withheld_total", "reason", poses["withheld"], "Poses not sent to the autopilot."
+        )
     yield from _labelled(
         "stage_share", "stage", report["stage_shares"], "Seconds per second in a stage.", "gauge"
     )

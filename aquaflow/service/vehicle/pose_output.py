@@ -1,125 +1,174 @@
 """The vehicle's pose back to its autopilot: only in metres, with how well it is known.
 
-The autopilot's filter wants at least four poses a second; where tracking gives fewer, nothing is
-sent, because a filter that starves is worse than one that knows it has no vision.
+The scale comes from telemetry and grows more certain during a dive; until it and the direction of
+gravity are known well enough, nothing is sent. The autopilot's filter wants at least four poses a
+second; where tracking gives fewer, nothing is sent, because a filter that starves is worse than one
+that knows it has no vision.
 """
 
 from __future__ import annotations
 
-import logging
 import time
-from collections import deque
-from dataclasses import dataclass
+from collections import Counter, deque
+from collections.abc import Callable
+from enum import Enum
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from aquaflow.config.service import PoseConfig
-from aquaflow.errors import ConfigError
+from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.service.feed import Feed
 from aquaflow.service.loop import LiveLoop
-from aquaflow.slam import Slam
-from aquaflow.sources.outbound import BodyMotion, BodyPose
+from aquaflow.service.vehicle.body_geometry import body_pose, camera_in_body, pose_covariance
+from aquaflow.service.vehicle.body_track import BodyTrack, Sighting
+from aquaflow.sources.outbound import BodyMotion, BodyPose, OutboundMessage
 from aquaflow.tracking.frames import Tracked
-
-log = logging.getLogger(__name__)
 
 Array = npt.NDArray[np.float64]
 
 LEAST_HZ = 4.0
 """What ArduPilot's filter needs (mavlink-nongps-position-estimation)."""
-WINDOW = 12
+RATE_WINDOW = 12
 """Poses over which the rate is judged."""
-AXES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""Camera (right, down, forward) to body (forward, right, down), for one that looks forward."""
-PRIOR_SIGMA = 0.1
-"""Relative 1 sigma of a learned prior's metres under water, where none was trained (judgement)."""
 LEAST_SIGMA_M, LEAST_SIGMA_RAD = 0.02, 0.01
 """1 sigma of a good pose against its keyframe: judgement, to be measured with a vehicle."""
 SIGMA_SHARE = 0.02
 """Growth of the position's sigma with the way since the last loop: drift of 2 % (judgement)."""
+LEAST_QUALITY = 0.05
+"""The share of inliers below which sigmas grow no further."""
+NORTH = ("true north", "magnetic north")
+"""What x must point to for a frame that is named after north."""
 
 
-@dataclass(frozen=True)
-class MetricScale:
-    """Metres per map unit, the source of that scale, and its uncertainty."""
+class Withheld(str, Enum):
+    """Why a pose was not sent."""
 
-    metres: float
-    source: str
-    relative_sigma: float
-
-
-def metric_scale(slam: Slam) -> MetricScale | None:
-    """The map's metric scale; None while it is arbitrary."""
-    return MetricScale(1.0, "prior", PRIOR_SIGMA) if slam.prior.metric else None
+    NO_SCALE = "the map's scale in metres is not known"
+    VAGUE_SCALE = "the map's scale is not known to service.pose.max_scale_sigma"
+    NOT_LEVEL = "the direction of gravity is not known"
+    NO_MOUNTING = "the camera's mounting is not known; set fusion.camera or service.pose.mounting"
+    VAGUE_POSITION = "the position is not known to service.pose.max_position_sigma_m"
+    TOO_RARE = f"poses come less than {LEAST_HZ:.0f} times a second"
+    NO_VELOCITY = "too few poses since the start, the last gap or jump"
+    NO_RECEIVER = "no connected device takes poses"
 
 
 class PoseOutput:
     """A watcher of the loop."""
 
-    def __init__(self, config: PoseConfig, feed: Feed, scale: MetricScale | None) -> None:
-        """Raises ConfigError where the map's scale in metres is unknown."""
-        if scale is None:
-            raise ConfigError(
-                "service.pose.enabled: the map's scale is not known in metres, so that no pose may "
-                "steer the vehicle; set it to false, or give telemetry or a prior with metric scale"
-            )
+    def __init__(
+        self, config: PoseConfig, feed: Feed, frame_of: Callable[[int], MetricFrame]
+    ) -> None:
+        """``frame_of`` gives a sub-map's place in the world, as it is known at that moment."""
         self.sent = 0
         self.jumps = 0
         """Times that the pose jumped: reset_counter."""
-        self.withheld = 0
-        """Poses that were not sent because they came too rarely."""
-        self._config, self._feed, self._scale = config, feed, scale
-        mounting = config.mounting
-        angles = (mounting.yaw_deg, mounting.pitch_deg, mounting.roll_deg)
-        self._R_bc = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix() @ AXES
-        self._camera_m = np.array(mounting.position_m, np.float64)
-        self._before: tuple[Tracked, Array, Array] | None = None
+        self.withheld: Counter[Withheld] = Counter()
+        """Poses that were not sent, by reason."""
+        self.reason: Withheld | None = None
+        """Why the newest pose was not sent."""
+        self.scale_source = ""
+        """Where the map's scale comes from, or why there is none."""
+        self._config, self._feed, self._frame_of = config, feed, frame_of
+        self._stated = None if config.mounting is None else camera_in_body(config.mounting)
+        self._track = BodyTrack(config.jump_m, np.radians(config.jump_deg))
+        self._index: int | None = None
+        self._place_m: Array | None = None
         self._way_m = 0.0
-        self._times_s: deque[float] = deque(maxlen=WINDOW)
+        self._times_s: deque[float] = deque(maxlen=RATE_WINDOW)
 
     def update(self, loop: LiveLoop, now_s: float | None = None) -> None:
         """Called after every turn; sends a pose that is new."""
         latest = loop.latest
-        if latest is None or latest.T_wc is None:
+        if latest is None or latest.T_wc is None or latest.frame.index == self._index:
             return
-        if self._before is not None and latest.frame.index == self._before[0].frame.index:
-            return
+        self._index = latest.frame.index
         self._times_s.append(time.monotonic() if now_s is None else now_s)
-        self._send(latest, *self._body(latest.T_wc))
+        self.reason = self._send(latest, latest.T_wc)
+        if self.reason is None:
+            self.sent += 1
+        else:
+            self.withheld[self.reason] += 1
 
-    def _body(self, T_wc: Sim3) -> tuple[Array, Array]:
-        """R [3, 3] and t [3] of the body, in forward-right-down axes of the first camera, m."""
-        R = AXES @ T_wc.R @ self._R_bc.T
-        camera_m = self._scale.metres * (AXES @ T_wc.t)
-        return R, camera_m - R @ self._camera_m
+    def to_json(self) -> dict[str, Any]:
+        """For /health."""
+        return {
+            "sent": self.sent,
+            "jumps": self.jumps,
+            "withheld": {reason.value: count for reason, count in dict(self.withheld).items()},
+            "reason": "" if self.reason is None else self.reason.value,
+            "scale": self.scale_source,
+        }
 
-    def _send(
-        self,
-        latest: Tracked,
-        R: Array,  # [3, 3]
-        t_m: Array,  # [3] m
-    ) -> None:
-        before, self._before = self._before, (latest, R, t_m)
-        moved_m = 0.0 if before is None else float(np.linalg.norm(t_m - before[2]))
-        jumped = before is not None and self._jumped(before[0], latest, moved_m)
-        self.jumps += jumped
-        self._way_m = 0.0 if jumped else self._way_m + moved_m
+    def _send(self, latest: Tracked, T_mc: Sim3) -> Withheld | None:
+        """Send the pose; or why it is not sent."""
+        frame = self._frame_of(latest.sub_map)
+        self.scale_source = frame.scale_source
+        T_bc = frame.T_bc or self._stated
+        reason = self._missing(frame)
+        if reason is not None or T_bc is None:
+            return reason or Withheld.NO_MOUNTING
+        t_ns = latest.frame.t_ns - self._feed.continued.shift_ns
+        sighting = Sighting(t_ns, latest.sub_map, T_mc)
+        self._follow(self._track.add(sighting, lambda T: body_pose(frame, T_bc, T)))
         if self._rate_hz() < LEAST_HZ:
-            self.withheld += 1
-            return
+            return Withheld.TOO_RARE
         quality = latest.quality.inlier_share
-        if self._config.message == "odometry":
-            covariance = self._covariance(quality)
-            word = BodyPose(latest.frame.t_ns, R, t_m, covariance, quality, self.jumps)
-            self.sent += self._feed.send(word)
-        elif before is not None and not jumped:
-            self.sent += self._feed.send(_motion(before, latest, R, t_m, quality))
+        message = (
+            self._pose(frame, t_ns, quality)
+            if self._config.message == "odometry"
+            else self._motion(t_ns, quality)
+        )
+        if isinstance(message, Withheld):
+            return message
+        return None if self._feed.send(message) else Withheld.NO_RECEIVER
 
-    def _jumped(self, before: Tracked, latest: Tracked, moved_m: float) -> bool:
-        return before.sub_map != latest.sub_map or moved_m > self._config.jump_m
+    def _missing(self, frame: MetricFrame) -> Withheld | None:
+        if not frame.metric:
+            return Withheld.NO_SCALE
+        if not frame.scale_sigma <= self._config.max_scale_sigma:
+            return Withheld.VAGUE_SCALE
+        if self._config.message == "odometry" and not frame.level:
+            return Withheld.NOT_LEVEL
+        return None
+
+    def _follow(self, jumped: bool) -> None:
+        """Count the jump, or the way since the last one."""
+        self.jumps += jumped
+        place, before = self._track.pose.t_m, self._place_m
+        self._place_m = place
+        moved = 0.0 if before is None or jumped else float(np.linalg.norm(place - before))
+        self._way_m = 0.0 if jumped else self._way_m + moved
+
+    def _pose(self, frame: MetricFrame, t_ns: int, quality: float) -> OutboundMessage | Withheld:
+        worse = 1.0 / max(quality, LEAST_QUALITY)
+        sigma_m, sigma_rad = worse * LEAST_SIGMA_M, worse * LEAST_SIGMA_RAD
+        motion = self._track.motion(sigma_m, sigma_rad)
+        if motion is None:
+            return Withheld.NO_VELOCITY
+        pose = self._track.pose
+        place_m = float(np.hypot(sigma_m, worse * SIGMA_SHARE * self._way_m))
+        own = np.diag(np.repeat([place_m, sigma_rad], 3)) ** 2
+        covariance = pose_covariance(frame, pose, own)
+        # Written so that a sigma that is not a number withholds the pose.
+        most = self._config.max_position_sigma_m
+        if not float(np.linalg.eigvalsh(covariance[:3, :3])[-1]) <= most**2:
+            return Withheld.VAGUE_POSITION
+        motion_covariance = motion.covariance.copy()
+        stretch = frame.scale_sigma * motion.velocity_m_s
+        motion_covariance[:3, :3] += np.outer(stretch, stretch)
+        return BodyPose(
+            t_ns, pose.R, pose.t_m, covariance,
+            motion.velocity_m_s, motion.rate_rad_s, motion_covariance,
+            quality, self.jumps, frame.north in NORTH,
+        )  # fmt: skip
+
+    def _motion(self, t_ns: int, quality: float) -> OutboundMessage | Withheld:
+        step = self._track.step()
+        return Withheld.NO_VELOCITY if step is None else BodyMotion(t_ns, *step, quality)
 
     def _rate_hz(self) -> float:
         """Rate of the last poses; 0 while there are too few."""
@@ -127,23 +176,3 @@ class PoseOutput:
             return 0.0
         span = self._times_s[-1] - self._times_s[0]
         return (len(self._times_s) - 1) / span if span > 0.0 else float("inf")
-
-    def _covariance(self, quality: float) -> Array:
-        worse = 1.0 / max(quality, 0.05)
-        drift = float(np.hypot(SIGMA_SHARE, self._scale.relative_sigma))
-        position = worse * float(np.hypot(LEAST_SIGMA_M, drift * self._way_m))
-        return np.diag([position**2] * 3 + [(worse * LEAST_SIGMA_RAD) ** 2] * 3)
-
-
-def _motion(
-    before: tuple[Tracked, Array, Array],  # with its R [3, 3] and t_m [3]
-    latest: Tracked,
-    R: Array,  # [3, 3]
-    t_m: Array,  # [3] m
-    quality: float,
-) -> BodyMotion:
-    tracked, R_before, t_before = before
-    rotation = Rotation.from_matrix(R_before.T @ R).as_rotvec()
-    since_ns = latest.frame.t_ns - tracked.frame.t_ns
-    translation = R_before.T @ (t_m - t_before)
-    return BodyMotion(latest.frame.t_ns, since_ns, rotation, translation, quality)

@@ -13,7 +13,6 @@ import socketserver
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -25,20 +24,10 @@ from aquaflow.service.health.http import MOST_CLIENTS, HealthServer
 from aquaflow.service.health.prometheus import exposition
 from aquaflow.service.health.state import State
 from tests.command_line import Cli
+from tests.service.health.reports import REPORT
 from tests.small_recording import GIVE_UP_S
 
 TOKEN = "correct-horse-battery"
-REPORT: dict[str, Any] = {
-    "state": "tracking", "reason": "every frame has a pose", "ok": True, "frames": 120,
-    "failures": 1, "overtaken": 3, "mapping_failures": 0, "steps_down": 1, "steps_up": 1,
-    "telemetry_samples": 9, "fps": 9.5, "mapping_waits": 2, "keyframes": 7, "gaussians": 1000,
-    "lag_ms": {"p50": 80.0, "p95": 120.0}, "classes": {"common": 100},
-    "left_out_of_the_map": {'said "so"\n': 2}, "visits": {"tracking": 1},
-    "stage_shares": {"track": 0.4}, "changes": [],
-    "stage_failures": [
-        {"stage": "pose", "error": "cv2.error", "place": 'a "b"', "defect": False, "count": 2}
-    ],
-}  # fmt: skip
 
 
 @pytest.fixture

@@ -1,0 +1,159 @@
+"""A length that a person marked in a finished dive: two points of a picture, or of the map.
+
+A finished dive keeps its Gaussians and the poses of the mapped views, but no keyframe's depths: a
+point of a picture is where its ray meets the map as the renderer draws it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.config import load_config
+from aquaflow.dive.frames_csv import read_rows
+from aquaflow.errors import InputError
+from aquaflow.export.map_file import SUFFIX, read_map_file
+from aquaflow.fusion.known_lengths.known_length import KnownLength
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.views import View
+from aquaflow.render import select_renderer
+
+Array = npt.NDArray[np.float64]
+
+RANGE_SIGMA = 0.02
+"""Relative 1 sigma of a rendered range: 1.1 to 2.8 % on held-out views (docs/benchmarks.md)."""
+CLICK_SIGMA_PX = 1.0
+"""1 sigma of a point that a person marked, and of the refined poses."""
+POINT_SIGMA = 0.01
+"""Of a point marked in the viewer, as a share of the marked length (judgement: a splat has a
+size)."""
+LEAST_ALPHA = 0.5
+"""Of the map at a point; less is mostly not there."""
+WINDOW_PX = 2
+"""Half the window that a range is the median of."""
+LEAST_LENGTH_PX = 10.0
+"""Between two points of a picture; nearer ones are the same, but for the click."""
+
+
+@dataclass(frozen=True)
+class _Point:
+    """A point of a picture in the map."""
+
+    place: Array
+    """[3] in the world."""
+    ray: Array
+    """[3] unit, from the camera."""
+    range: float
+
+
+def between_pixels(
+    dive: Path,
+    frame: int,
+    start: tuple[float, float],
+    end: tuple[float, float],
+    length_m: float,
+    sigma_m: float,
+) -> KnownLength:
+    """The length between two points, in px of the mapped picture of a frame.
+
+    Raises:
+        InputError: the dive has no map, did not map the frame, or the map is not there.
+        ConfigError: the dive's settings cannot be read.
+    """
+    mapper, view, sub_map = _mapped(dive, frame)
+    points = np.array([start, end], np.float64)
+    size = np.array([view.camera.width, view.camera.height])
+    for point in points:
+        if not bool(np.all((point >= 0.0) & (point < size))):
+            raise InputError(
+                f"the point {point[0]:g},{point[1]:g} is outside of the mapped picture of "
+                f"{size[0]} x {size[1]} pixels; give pixels of the pictures that `aquaflow export "
+                "--format restored` writes"
+            )
+    if np.linalg.norm(points[1] - points[0]) < LEAST_LENGTH_PX:
+        raise InputError(
+            f"the two points are less than {LEAST_LENGTH_PX:.0f} pixels apart; mark a longer length"
+        )
+    a, b = _seen(mapper, view, points)
+    length = float(np.linalg.norm(b.place - a.place))
+    along = (b.place - a.place) / length
+    click = CLICK_SIGMA_PX / view.camera.fx * float(np.hypot(a.range, b.range))
+    # The ranges of one picture may err together, or apart: the sum of both covers either.
+    apart = RANGE_SIGMA * float(np.hypot(along @ a.ray * a.range, along @ b.ray * b.range))
+    sigma = float(np.hypot(np.hypot(click, apart), RANGE_SIGMA * length))
+    source = "scale bar {:g},{:g} to {:g},{:g}".format(*points.ravel())
+    return KnownLength(frame, source, length, sigma, length_m, sigma_m, sub_map)
+
+
+def between_points(
+    dive: Path,
+    start: tuple[float, float, float],
+    end: tuple[float, float, float],
+    length_m: float,
+    sigma_m: float,
+) -> KnownLength:
+    """The length between two points of the map of the largest sub-map, in map units.
+
+    Raises:
+        InputError: the dive has no table of its frames, or the points are the same.
+    """
+    length = float(np.linalg.norm(np.subtract(end, start)))
+    if not np.isfinite(length) or length <= 0.0:
+        raise InputError("the two points are one and the same; mark both ends of a length")
+    source = "scale bar {:g},{:g},{:g} to {:g},{:g},{:g}".format(*start, *end)
+    sub_map = _largest(_sub_maps(dive))
+    return KnownLength(-1, source, length, POINT_SIGMA * length, length_m, sigma_m, sub_map)
+
+
+def _mapped(dive: Path, frame: int) -> tuple[Mapper, View, int]:
+    """The map that has a view of the frame, the view, and the sub-map's number."""
+    sub_maps = _sub_maps(dive)
+    if frame not in sub_maps:
+        raise InputError(f"frame {frame} of {dive} has no pose; choose another --frame")
+    number, largest = sub_maps[frame], _largest(sub_maps)
+    renderer = select_renderer(load_config(dive / "config.yaml").mapping.renderer)
+    name = "map" if number == largest else f"map_{number}"
+    mapper = read_map_file(dive / f"{name}{SUFFIX}", renderer)
+    views = {view.frame_index: view for view in mapper.views}
+    if frame not in views:
+        nearest = min(views, key=lambda index: abs(index - frame), default=None)
+        other = "" if nearest is None else f"; the nearest mapped one is {nearest}"
+        raise InputError(f"frame {frame} of {dive} was not mapped{other}")
+    return mapper, views[frame], number
+
+
+def _sub_maps(dive: Path) -> dict[int, int]:
+    """Sub-map by frame index, of the frames that have one."""
+    rows = read_rows(dive / "frames.csv")
+    return {row.index: row.sub_map for row in rows if row.sub_map is not None}
+
+
+def _largest(sub_maps: dict[int, int]) -> int:
+    counts = Counter(sub_maps.values())
+    return max(counts, key=lambda number: (counts[number], -number), default=0)
+
+
+def _seen(
+    mapper: Mapper,
+    view: View,
+    pixels: Array,  # [2, 2]
+) -> list[_Point]:
+    shown = mapper.show(view)
+    ranges, alpha = shown.z.detach().numpy(), shown.alpha.detach().numpy()
+    points = []
+    for u, v in pixels:
+        column, row = int(u), int(v)
+        rows = slice(max(0, row - WINDOW_PX), row + WINDOW_PX + 1)
+        columns = slice(max(0, column - WINDOW_PX), column + WINDOW_PX + 1)
+        solid = alpha[rows, columns] >= LEAST_ALPHA
+        if alpha[row, column] < LEAST_ALPHA or not solid.any():
+            raise InputError(f"the map shows nothing at {u:g},{v:g}; choose another point")
+        distance = float(np.median(ranges[rows, columns][solid]))
+        ray = view.T_wc.R @ view.camera.unproject(np.array([u, v]))
+        ray /= np.linalg.norm(ray)
+        points.append(_Point(view.T_wc.t + distance * ray, ray, distance))
+    return points

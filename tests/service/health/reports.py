@@ -1,0 +1,17 @@
+"""A report of a running service."""
+
+from __future__ import annotations
+
+from typing import Any
+
+REPORT: dict[str, Any] = {
+    "state": "tracking", "reason": "every frame has a pose", "ok": True, "frames": 120,
+    "failures": 1, "overtaken": 3, "mapping_failures": 0, "steps_down": 1, "steps_up": 1,
+    "telemetry_samples": 9, "fps": 9.5, "mapping_waits": 2, "keyframes": 7, "gaussians": 1000,
+    "lag_ms": {"p50": 80.0, "p95": 120.0}, "classes": {"common": 100},
+    "left_out_of_the_map": {'said "so"\n': 2}, "visits": {"tracking": 1},
+    "stage_shares": {"track": 0.4}, "changes": [], "pose_output": None,
+    "stage_failures": [
+        {"stage": "pose", "error": "cv2.error", "place": 'a "b"', "defect": False, "count": 2}
+    ],
+}  # fmt: skip
