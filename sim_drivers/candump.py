@@ -35,7 +35,7 @@ class Candump(ByteLog):
                 if record is None:
                     skipped += bool(line.strip())
                     continue
-                yield Read(self.path.stem, clock.at(record[0]), record[1])
+                yield Read(self.path.stem, clock.at(record[0]), record[1], record[0])
         self.notes = [f"{skipped} lines of {self.path.name} are no data frames"] if skipped else []
 
 

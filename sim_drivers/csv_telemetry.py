@@ -1,7 +1,9 @@
-"""Tables of telemetry: what ``aquaflow synth`` writes, ``rostopic echo -p``, and GoPro extracts."""
+"""Tables of telemetry: what ``aquaflow synth`` writes, ``rostopic echo -p``, GoPro extracts, and
+plain tables of a survey (:mod:`sim_drivers.survey_table`)."""
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import math
 from collections.abc import Callable, Iterator
@@ -18,7 +20,8 @@ from aquaflow.messages import (
     Velocity,
 )
 from aquaflow.synthetic.telemetry import HEADER, read_telemetry
-from sim_drivers.telemetry_log import LogTime, TelemetryLog
+from sim_drivers import survey_table
+from sim_drivers.telemetry_log import LoggedUtc, LogTime, TelemetryLog
 
 Line: TypeAlias = dict[str, str]
 Convert: TypeAlias = Callable[[Line, int, int, str], list[TelemetrySample]]
@@ -66,8 +69,50 @@ class CsvTelemetry(TelemetryLog):
                     bad += 1
                     continue
                 yield from found
-        if bad:
-            self.notes.append(f"{bad} lines of {self.path.name} were left out")
+        self._note_left_out(bad)
+
+    def survey(self) -> Samples:
+        """A plain table; times of ``t_s`` stay as they are, those of ``utc`` count from the first
+        row."""
+        source, bad = self.path.stem, 0
+        times = list(self._survey_times())
+        utc = LoggedUtc(source, iter([time for time in times if time is not None]))
+        with self.path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
+            rows = self._as_far_as_it_is_a_table(csv.DictReader(file))
+            for row, time in zip(rows, times, strict=False):
+                try:
+                    if time is None:
+                        raise ValueError("no time")
+                    found = survey_table.samples_of(row, time[0], source)
+                except (TypeError, ValueError):
+                    bad += 1
+                    continue
+                yield from utc.at(*time)
+                yield from found
+        self._note_left_out(bad)
+
+    def _survey_times(self) -> Iterator[tuple[int, int | None] | None]:
+        """Of every row: time in the dive and UTC, ns; None where it states none."""
+        clock, newest_ns = LogTime(self.starts_s), -(10**18)
+        with (
+            self.path.open(newline="", encoding="utf-8-sig", errors="replace") as file,
+            contextlib.suppress(csv.Error),
+        ):
+            for row in csv.DictReader(file):
+                try:
+                    if survey_table.UTC in row:
+                        wall_ns = survey_table.utc_ns(row[survey_table.UTC])
+                        yield clock.at(wall_ns), wall_ns
+                        continue
+                    t_s = self.starts_s + float(row[survey_table.SECONDS])
+                    newest_ns = max(newest_ns, round(t_s * 1e9))
+                    yield newest_ns, None
+                except (AttributeError, TypeError, ValueError, OverflowError):
+                    yield None
+
+    def _note_left_out(self, lines: int) -> None:
+        if lines:
+            self.notes.append(f"{lines} lines of {self.path.name} were left out")
 
     def _as_far_as_it_is_a_table(self, reader: csv.DictReader[str]) -> Iterator[Line]:
         """Lines before the first of more than 131,072 characters in a field, csv's limit."""
@@ -85,21 +130,24 @@ Reader: TypeAlias = Callable[[CsvTelemetry], Samples]
 def _reader_of(path: Path) -> Reader | None:
     """How to read the table, by its header."""
     try:
-        with path.open(encoding="utf-8", errors="replace") as file:
+        with path.open(encoding="utf-8-sig", errors="replace") as file:
             header = tuple(file.readline(10_000).strip().split(","))
     except OSError:
         return None
-    if header == HEADER:
-        return lambda table: read_telemetry(table.path)
-    if header[0] == TIME and "field.depth" in header:
-        return lambda table: table.lines(_ros_depth, _ros_stamps)
-    if header[0] == TIME and "field.velocityInst0" in header:
-        return lambda table: table.lines(_ros_dvl, _ros_stamps)
-    if header == ("t_s", "c0", "c1", "c2"):
-        convert = {"gyro": _gopro_rate, "accl": _gopro_force}.get(path.stem.rpartition("_")[2])
-        if convert is not None:
-            return lambda table: table.lines(convert, _gopro_stamps)
-    return None
+    ros, gopro = header[0] == TIME, header == ("t_s", "c0", "c1", "c2")
+    stream = path.stem.rpartition("_")[2]
+    known: list[tuple[bool, Reader]] = [
+        (header == HEADER, lambda table: read_telemetry(table.path)),
+        (survey_table.is_survey_table(header), CsvTelemetry.survey),
+        (ros and "field.depth" in header, lambda table: table.lines(_ros_depth, _ros_stamps)),
+        (
+            ros and "field.velocityInst0" in header,
+            lambda table: table.lines(_ros_dvl, _ros_stamps),
+        ),
+        (gopro and stream == "gyro", lambda table: table.lines(_gopro_rate, _gopro_stamps)),
+        (gopro and stream == "accl", lambda table: table.lines(_gopro_force, _gopro_stamps)),
+    ]
+    return next((reader for fits, reader in known if fits), None)
 
 
 def _ros_stamps(line: Line) -> tuple[int, int]:

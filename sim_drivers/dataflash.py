@@ -22,6 +22,7 @@ from aquaflow.messages import (
 )
 from drivers.plausible import plausible
 from drivers.rotation import from_euler
+from sim_drivers.dataflash_gnss import GnssRecords
 from sim_drivers.telemetry_log import TelemetryLog
 
 HEAD = b"\xa3\x95"
@@ -57,7 +58,7 @@ class _Layout:
 
 
 class Dataflash(TelemetryLog):
-    """ATT, IMU, CTUN and RFND as samples; times are the autopilot's TimeUS since the first."""
+    """ATT, IMU, CTUN, RFND and GPS as samples; times are the autopilot's TimeUS since the first."""
 
     suffixes = frozenset({".bin"})
 
@@ -88,13 +89,15 @@ class Dataflash(TelemetryLog):
     def samples(self) -> Iterator[TelemetrySample]:
         first_us: int | None = None
         bad = 0
+        gnss = GnssRecords()
+        conversions = CONVERSIONS | {"GPS": gnss.fix, "GPA": gnss.accuracy}
         for name, record in self.records():
-            if "TimeUS" not in record or name not in CONVERSIONS:
+            if "TimeUS" not in record or name not in conversions:
                 continue
             try:
                 first_us = int(record["TimeUS"]) if first_us is None else first_us
                 t_ns = round(self.starts_s * 1e9) + 1000 * (int(record["TimeUS"]) - first_us)
-                found = CONVERSIONS[name](record, t_ns, f"{self.path.stem}/{name}")
+                found = conversions[name](record, t_ns, f"{self.path.stem}/{name}")
             except (KeyError, TypeError, ValueError, OverflowError):  # its description is damaged
                 bad += 1
                 continue
@@ -148,4 +151,4 @@ def _range(record: dict[str, Any], t_ns: int, source: str) -> list[TelemetrySamp
 
 
 CONVERSIONS = {"ATT": _attitude, "IMU": _inertial, "CTUN": _height, "RFND": _range}
-"""The records that are read, by name."""
+"""The records that are read on their own, by name."""

@@ -40,8 +40,9 @@ class NmeaText(ByteLog):
         if None in stamps:
             self.notes.append(f"{stamps.count(None)} lines of {self.path.name} have no time")
         clock = LogTime(self.starts_s)
-        for (_, match), stamp_ns in zip(matches, _filled(stamps), strict=True):
-            yield Read(self.path.stem, clock.at(stamp_ns), match[0] + b"\r\n")
+        for (_, match), stated_ns, stamp_ns in zip(matches, stamps, _filled(stamps), strict=True):
+            sentence = match[0] + b"\r\n"
+            yield Read(self.path.stem, clock.at(stamp_ns), sentence, stated_ns)
 
 
 def _filled(stamps: list[int | None]) -> list[int]:

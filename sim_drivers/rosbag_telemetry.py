@@ -16,9 +16,12 @@ from aquaflow.messages import (
     AngularRate,
     Attitude,
     Depth,
+    Position,
     TelemetrySample,
     Velocity,
 )
+from drivers.fixes import sigma_of
+from drivers.plausible import plausible
 from drivers.rotation import Vector, normalised, product
 from sim_drivers.rosbag import decoded, is_bag, messages_in, opened, origin_of, stamp_of
 
@@ -34,10 +37,14 @@ SURFACE_PA, WATER_KG_M3, GRAVITY_M_S2 = 101_325.0, 1029.0, 9.80665
 
 NOT_MEASURED = -1.0
 """First element of the covariance of a quantity that is not measured (sensor_msgs/Imu)."""
+NO_FIX, UNKNOWN = -1, 0
+"""NavSatFix: the status of a receiver without a fix, and the type of a covariance that says
+nothing."""
 
 
 class RosbagTelemetry:
-    """Imu, FluidPressure, Range and TwistWithCovarianceStamped, on the clock of the pictures."""
+    """Imu, FluidPressure, Range, TwistWithCovarianceStamped and NavSatFix, on the clock of the
+    pictures."""
 
     specificity = 2
 
@@ -116,6 +123,18 @@ def _twist(message: Any, t_ns: int, arrival_ns: int, source: str) -> list[Teleme
     return [Velocity(t_ns, arrival_ns, source, velocity, sigma)]
 
 
+def _fix(message: Any, t_ns: int, arrival_ns: int, source: str) -> list[TelemetrySample]:
+    if message.status.status <= NO_FIX:
+        return []
+    sigma_m = sigma_of(None)
+    if message.position_covariance_type != UNKNOWN:
+        sigma_m = math.sqrt((message.position_covariance[0] + message.position_covariance[4]) / 2.0)
+    fix = Position(t_ns, arrival_ns, source, message.latitude, message.longitude, sigma_m)
+    if not plausible(fix):
+        raise ValueError("no place on the earth")
+    return [fix]
+
+
 def _body(vector: Any) -> Vector:
     """Forward-left-up to forward-right-down."""
     return _finite(vector.x), -_finite(vector.y), -_finite(vector.z)
@@ -137,5 +156,6 @@ CONVERSIONS: dict[str, Convert] = {
     "sensor_msgs/msg/FluidPressure": _pressure,
     "sensor_msgs/msg/Range": _range,
     "geometry_msgs/msg/TwistWithCovarianceStamped": _twist,
+    "sensor_msgs/msg/NavSatFix": _fix,
 }
 """Messages that are read."""

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
+from aquaflow.clocks.wall import JUMP_NS
 from aquaflow.config.telemetry import AnyDevice
-from aquaflow.messages import TelemetrySample
+from aquaflow.messages import TelemetrySample, UtcTime
 from aquaflow.sources import RawTap
 from drivers.link import LinkCounters
 from drivers.mounting import BodyFrame, Mounting
+from drivers.plausible import plausible
 from drivers.telemetry import decoder_of
 
 LONGEST_PAUSE_NS = 3600 * 1_000_000_000
 """Logs carry wall clock times; a longer step, or one back, is the clock being set."""
+UTC_EVERY_NS = 10 * 1_000_000_000
+"""How often the wall clock of a log becomes a sample: it says the same each time."""
 
 
 class LogTime:
@@ -72,6 +77,31 @@ class Read(NamedTuple):
     link: str
     arrival_ns: int
     data: bytes
+    wall_ns: int | None = None
+    """The wall clock of who wrote the log, ns since 1970, where it states one."""
+
+
+class LoggedUtc:
+    """UTC from the wall clock of a log; nothing of one that was set on the way: either could be
+    right."""
+
+    def __init__(self, source: str, times: Iterator[tuple[int, int | None]]) -> None:
+        """``times``: all arrivals with the wall clock, of a pass through the log before it is
+        read."""
+        least, most = math.inf, -math.inf
+        for arrival_ns, wall_ns in times:
+            if wall_ns is not None:
+                least, most = min(least, wall_ns - arrival_ns), max(most, wall_ns - arrival_ns)
+        self._usable = 0 <= most - least < JUMP_NS
+        self._source, self._due_ns = source, -math.inf
+
+    def at(self, arrival_ns: int, wall_ns: int | None) -> list[TelemetrySample]:
+        """The sample that is due at this record, if any."""
+        if not self._usable or wall_ns is None or arrival_ns < self._due_ns:
+            return []
+        self._due_ns = arrival_ns + UTC_EVERY_NS
+        utc = UtcTime(arrival_ns, arrival_ns, self._source, wall_ns)
+        return [utc] if plausible(utc) else []
 
 
 class ByteLog(TelemetryLog):
@@ -101,7 +131,11 @@ class ByteLog(TelemetryLog):
     def samples(self) -> Iterator[TelemetrySample]:
         decoded = DecodedReads({self.path.stem: self.device}, self._tap)
         self.counters = decoded.counters[self.path.stem]
-        yield from decoded.samples(self.reads())
+        times = ((read.arrival_ns, read.wall_ns) for read in self.reads())
+        utc = LoggedUtc(f"{self.path.stem}/log", times)
+        for read in self.reads():
+            yield from utc.at(read.arrival_ns, read.wall_ns)
+            yield from decoded.of(read)
 
 
 class DecodedReads:
@@ -116,11 +150,15 @@ class DecodedReads:
         self.counters = {name: decoder.counters for name, decoder in self._decoders.items()}
 
     def samples(self, reads: Iterator[Read]) -> Iterator[TelemetrySample]:
-        """Samples in the body frame; reads of links that no device is known for pass the tap."""
+        """Samples in the body frame."""
         for read in reads:
-            if self._tap is not None:
-                self._tap(*read)
-            decoder = self._decoders.get(read.link)
-            if decoder is not None:
-                for sample in decoder.feed(read.data, read.arrival_ns):
-                    yield self._body.refer(sample, self._mountings[read.link])
+            yield from self.of(read)
+
+    def of(self, read: Read) -> Iterator[TelemetrySample]:
+        """Of one read; one of a link that no device is known for passes the tap."""
+        if self._tap is not None:
+            self._tap(read.link, read.arrival_ns, read.data)
+        decoder = self._decoders.get(read.link)
+        if decoder is not None:
+            for sample in decoder.feed(read.data, read.arrival_ns):
+                yield self._body.refer(sample, self._mountings[read.link])

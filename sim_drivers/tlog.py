@@ -50,11 +50,14 @@ class Tlog(ByteLog):
                 continue
             stamp_us = found_us
             packet = data[at + STAMP_BYTES : at + STAMP_BYTES + length]
-            yield Read(link, clock.at(1000 * found_us), packet)
+            wall_ns = 1000 * found_us
+            yield Read(link, clock.at(wall_ns), packet, wall_ns)
             at += STAMP_BYTES + length
         self.notes = [f"{skipped} bytes of {self.path.name} belong to no record"] if skipped else []
         if clock.jumps:
-            self.notes.append(f"the clock of {self.path.name} was set {clock.jumps} times")
+            self.notes.append(
+                f"the clock of {self.path.name} was set {clock.jumps} times and gives no UTC"
+            )
 
 
 def _packet_bytes(data: bytes, at: int) -> int:

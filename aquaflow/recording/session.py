@@ -12,6 +12,7 @@ from aquaflow.messages import Dropped, Frame, TelemetrySample
 from aquaflow.recording.playback import Event, Playback, arrival_of, arrived
 from aquaflow.recording.recorder import Recorder
 from aquaflow.sources import CameraSource, RawTap, TelemetrySource
+from aquaflow.sources.wall_clock import WallClock
 
 log = logging.getLogger(__name__)
 
@@ -34,12 +35,14 @@ class RecordingSession:
         """Setting it ends the recording cleanly; may be done in a signal handler."""
         self.notes: list[str] = []
         self._pumps: list[tuple[str, Pump]] = []
+        self._endless: list[tuple[str, Pump]] = []
         self._closing: list[Callable[[], None]] = []
 
     def add_live(
         self, cameras: Mapping[str, CameraSource], telemetry: Sequence[TelemetrySource]
     ) -> None:
-        """Record devices; a camera that has an IMU is a telemetry source too."""
+        """Record devices; a camera that has an IMU is a telemetry source too. With them the
+        computer's clock is recorded."""
         for name, camera in cameras.items():
             self._pumps.append((f"camera '{name}'", self._camera_pump(name, camera)))
             if isinstance(camera, HasSamples):
@@ -48,6 +51,9 @@ class RecordingSession:
         for source in telemetry:
             self._pumps.append(("telemetry", self._telemetry_pump(source)))
             self._closing.append(source.close)
+        clock = WallClock()
+        self._endless.append(("wall clock", self._telemetry_pump(clock)))
+        self._closing.append(clock.close)
 
     def add_playback(
         self, name: str, playback: Playback, telemetry: Sequence[TelemetrySource]
@@ -78,12 +84,15 @@ class RecordingSession:
 
     def run(self, seconds: float | None = None, progress: Progress | None = None) -> None:
         """Record; returns when all is on the disk. Why it ended early is in the status."""
-        threads = [
-            threading.Thread(target=self._guarded, args=pump, name=pump[0], daemon=True)
-            for pump in self._pumps
-        ]
+        threads, endless = (
+            [
+                threading.Thread(target=self._guarded, args=pump, name=pump[0], daemon=True)
+                for pump in pumps
+            ]
+            for pumps in (self._pumps, self._endless)
+        )
         began = time.monotonic()
-        for thread in threads:
+        for thread in threads + endless:
             thread.start()
         while any(thread.is_alive() for thread in threads) and not self.stopping.wait(LOOK_S):
             elapsed = time.monotonic() - began
@@ -94,7 +103,7 @@ class RecordingSession:
         self.stopping.set()
         for close in self._closing:
             close()
-        for thread in threads:
+        for thread in threads + endless:
             thread.join(CLOSE_S)
         self.recorder.close()
 

@@ -34,6 +34,7 @@ from aquaflow.sources import CameraSource, TelemetrySource
 from aquaflow.sources.newest import Newest
 from aquaflow.sources.outbound import AcceptsMessages, OutboundMessage
 from aquaflow.sources.reading import read_past_failures
+from aquaflow.sources.wall_clock import WallClock
 
 log = logging.getLogger(__name__)
 
@@ -176,6 +177,7 @@ class LiveFeed(_Pumps):
         super().__init__()
         self.name, self._cameras, self._telemetry = name, cameras, telemetry
         self._source, self._recorder = source, recorder
+        self._clock = WallClock()
 
     @property
     def calibration(self) -> CameraModel | None:
@@ -216,9 +218,11 @@ class LiveFeed(_Pumps):
                 self.pump(f"IMU of '{name}'", partial(self._samples, camera))
         if self._telemetry is not None:
             self.pump("telemetry", partial(self._samples, self._telemetry))
+        self.pump("wall clock", partial(self._samples, self._clock))
 
     def close(self) -> None:
         self.closing.set()
+        self._clock.close()
         for camera in self._cameras.values():
             camera.close()
         if self._telemetry is not None:

@@ -19,7 +19,7 @@ from aquaflow.config.recording import RecordingConfig
 from aquaflow.config.telemetry import TelemetryConfig
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import guess_camera
-from aquaflow.messages import Depth, Dropped, Frame, TelemetrySample
+from aquaflow.messages import Depth, Dropped, Frame, TelemetrySample, UtcTime
 from aquaflow.recording import Recorder
 from aquaflow.recording import session as session_module
 from aquaflow.recording.session import RecordingSession
@@ -165,12 +165,12 @@ def test_live_sources_are_recorded_until_time_is_up_and_then_closed(
     session.add_live(cameras, [])
 
     def all_recorded() -> bool:
-        return session.recorder.status.samples > 0 and all(c.delivered for c in cameras.values())
+        return session.recorder.status.samples > 1 and all(c.delivered for c in cameras.values())
 
     hours_pass_when(all_recorded, monkeypatch)
     session.run(seconds=HOUR_S)
     assert all(camera.closed.is_set() for camera in cameras.values())
-    assert session.recorder.status.samples > 0
+    assert session.recorder.status.samples > 1  # one is of the computer's clock
     for name in cameras:
         assert list(McapCamera(tmp_path, camera=name).frames())
 
@@ -188,7 +188,7 @@ def test_live_links_are_recorded_with_their_bytes(tmp_path: Path) -> None:
 
         def talk() -> None:
             deadline = time.monotonic() + GIVE_UP_S
-            while session.recorder.status.samples < 3 and time.monotonic() < deadline:
+            while session.recorder.status.samples < 4 and time.monotonic() < deadline:
                 talker.sendto(f"{sentence(10.0)}\r\n".encode(), ("127.0.0.1", port))
                 time.sleep(0.02)
             session.stopping.set()
@@ -198,9 +198,14 @@ def test_live_links_are_recorded_with_their_bytes(tmp_path: Path) -> None:
         session.run()
         thread.join()
     telemetry = McapTelemetry(tmp_path)
-    assert len(list(telemetry.samples())) >= 3
+    heard = [s.source for s in telemetry.samples() if not isinstance(s, UtcTime)]
+    assert len(heard) >= 3
     again = list(telemetry.decoded_again(config.devices))
-    assert [s.source for s in again[:3]] == [s.source for s in telemetry.samples()][:3]
+    assert [s.source for s in again[:3]] == heard[:3]
+    clock = [s for s in telemetry.samples() if isinstance(s, UtcTime)]
+    assert [utc.source for utc in clock] == ["computer/clock"]
+    now_ns = time.time_ns() - time.monotonic_ns() + telemetry.origin_ns
+    assert clock[0].utc_ns - clock[0].t_ns == pytest.approx(now_ns, abs=10**9)
 
 
 def test_a_camera_that_fails_does_not_end_the_others(

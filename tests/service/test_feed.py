@@ -16,7 +16,7 @@ from aquaflow.config.cameras import V4l2Config
 from aquaflow.config.telemetry import parse_telemetry
 from aquaflow.errors.failures import Failures
 from aquaflow.geometry.camera import guess_camera
-from aquaflow.messages import CameraModel, Depth, Dropped, Frame, TelemetrySample
+from aquaflow.messages import CameraModel, Depth, Dropped, Frame, TelemetrySample, UtcTime
 from aquaflow.recording.playback import Playback
 from aquaflow.service.dive_clock import Continued
 from aquaflow.service.feed import LiveFeed, PlaybackFeed
@@ -76,6 +76,18 @@ def test_an_unplugged_camera_tells_why_and_its_pictures_come_again(tmp_path: Pat
         assert device["reconnects"] == 1
     finally:
         feed.close()
+
+
+def test_the_computers_clock_is_heard_as_a_recording_holds_it(tmp_path: Path) -> None:
+    feed = LiveFeed("front", {"front": camera(tmp_path, CameraFaults())}, None, SourceConfig())
+    feed.start()
+    try:
+        until(lambda: feed.latest_samples.samples > 0)
+        (utc,) = feed.latest_samples.latest()
+        assert (type(utc), utc.source) == (UtcTime, "computer/clock")
+    finally:
+        feed.close()
+    assert not any(thread.name == "wall clock" for thread in threading.enumerate())
 
 
 def test_only_pictures_that_are_asked_for_are_decoded(tmp_path: Path) -> None:

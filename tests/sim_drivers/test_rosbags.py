@@ -24,6 +24,7 @@ from aquaflow.messages import (
     Depth,
     Dropped,
     Frame,
+    Position,
     Velocity,
 )
 from aquaflow.recording.pictures import encode
@@ -92,6 +93,16 @@ def dive(messages: Messages) -> Iterator[tuple[str, int, Any]]:
     twist = make("geometry_msgs/msg/Twist", vector(0.5, 0.1, -0.2), vector(0.0, 0.0, 0.0))
     covariance = np.diag([0.01, 0.04, 0.01, 0, 0, 0]).ravel()
     told_twist = make("geometry_msgs/msg/TwistWithCovariance", twist, covariance)
+    place = (-41.25, 174.8, 0.0, np.diag([0.04, 0.08, 9.0]).ravel())
+    nowhere = (0.0, 0.0, *place[2:])
+    receivers = (
+        *(("/gnss", 0, place, 2), ("/gnss/rough", 0, place, 0)),
+        *(("/gnss/lost", -1, place, 2), ("/gnss/nowhere", 0, nowhere, 2)),
+    )
+    for topic, status, values, kind in receivers:
+        receiver = make("sensor_msgs/msg/NavSatStatus", status, 1)
+        fix = make("sensor_msgs/msg/NavSatFix", header, receiver, *values, kind)
+        yield topic, SECOND, fix
     yield "/dvl", SECOND, make("geometry_msgs/msg/TwistWithCovarianceStamped", header, told_twist)
 
 
@@ -129,7 +140,8 @@ def test_pictures_have_their_headers_times_and_the_calibration(bag: Path) -> Non
 
 
 def test_telemetry_is_turned_from_ros_axes_to_ours(bag: Path) -> None:
-    samples = list(open_recorded_telemetry(bag).samples())
+    everything = list(open_recorded_telemetry(bag).samples())
+    samples = [sample for sample in everything if not isinstance(sample, Position)]
     assert {sample.t_ns for sample in samples} == {SECOND}
     assert {sample.arrival_ns for sample in samples} == {SECOND + LATE_NS}
     by_kind = {type(sample): sample for sample in samples}
@@ -151,6 +163,16 @@ def test_telemetry_is_turned_from_ros_axes_to_ours(bag: Path) -> None:
     assert isinstance(altitude, Altitude)
     assert depth.depth_m == pytest.approx(12.0)
     assert altitude.altitude_m == pytest.approx(3.5)
+
+
+def test_a_fix_is_as_accurate_as_its_covariance_and_no_fix_is_none(bag: Path) -> None:
+    telemetry = open_recorded_telemetry(bag)
+    fix, rough = [s for s in telemetry.samples() if isinstance(s, Position)]
+    assert (fix.latitude_deg, fix.longitude_deg, fix.source) == (-41.25, 174.8, "gnss")
+    assert (fix.t_ns, fix.arrival_ns) == (SECOND, SECOND + LATE_NS)
+    assert fix.sigma_m == pytest.approx(0.06**0.5)
+    assert rough.sigma_m == pytest.approx(2.0 * 5.1 / 2**0.5)
+    assert telemetry.notes == ["1 messages of " + bag.name + " make no sense"]
 
 
 def test_a_damaged_bag_is_one_sentence(tmp_path: Path) -> None:

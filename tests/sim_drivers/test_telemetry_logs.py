@@ -19,7 +19,9 @@ from aquaflow.messages import (
     AngularRate,
     Attitude,
     Depth,
+    Position,
     TelemetrySample,
+    UtcTime,
     Velocity,
 )
 from aquaflow.sources import open_recorded_telemetry, open_recording, telemetry_reader
@@ -61,6 +63,46 @@ def test_a_tlogs_counts_are_those_of_pymavlinks_own_reader(shared_data: Path) ->
     assert len(of_kind(samples, Depth)) == theirs["SCALED_PRESSURE2"]
     assert len(of_kind(samples, Acceleration)) == theirs["RAW_IMU"]
     assert samples[-1].arrival_ns == pytest.approx(263 * SECOND, abs=SECOND)
+    # The vehicle's fix came from an acoustic system by GPS_INPUT, and its clock was never set.
+    fixes = of_kind(samples, Position)
+    assert len(fixes) == 487  # of 528 messages: the others repeat the fix before
+    assert {(round(fix.latitude_deg, 7), round(fix.longitude_deg, 7)) for fix in fixes} == {
+        (48.3861418, -124.6305732)
+    }
+    times = of_kind(samples, UtcTime)
+    assert {utc.source for utc in times} == {"ardusub_small/log"}
+    assert len(times) == 27
+    assert len({utc.utc_ns - utc.t_ns for utc in times}) == 1
+
+
+def tlog_of(path: Path, stamps_us: list[int]) -> Tlog:
+    packet = b"\xfe\x02" + bytes(8)
+    path.write_bytes(b"".join(us.to_bytes(8, "big") + packet for us in stamps_us))
+    return Tlog(path, starts_s=2.0)
+
+
+BEGAN_US = 1_795_365_000_000_000
+
+
+def test_a_tlogs_stamps_are_utc_every_ten_seconds(tmp_path: Path) -> None:
+    seconds = range(25)
+    log = tlog_of(tmp_path / "a.tlog", [BEGAN_US + 1_000_000 * s for s in seconds])
+    assert list(log.samples()) == [
+        UtcTime((2 + s) * SECOND, (2 + s) * SECOND, "a/log", 1000 * BEGAN_US + s * SECOND)
+        for s in (0, 10, 20)
+    ]
+
+
+@pytest.mark.parametrize("set_to_us", [BEGAN_US - 60_000_000, BEGAN_US + 7_200_000_000])
+def test_a_tlog_whose_clock_was_set_gives_no_utc(tmp_path: Path, set_to_us: int) -> None:
+    stamps = [BEGAN_US, BEGAN_US + 1_000_000, set_to_us, set_to_us + 1_000_000]
+    log = tlog_of(tmp_path / "a.tlog", stamps)
+    assert list(log.samples()) == []
+    assert log.notes == ["the clock of a.tlog was set 1 times and gives no UTC"]
+
+
+def test_a_tlog_from_a_computer_without_a_clock_gives_no_utc(tmp_path: Path) -> None:
+    assert list(tlog_of(tmp_path / "a.tlog", [1_000_000, 2_000_000]).samples()) == []
 
 
 def test_flipped_bytes_in_a_tlog_cost_the_packets_hit(shared_data: Path, tmp_path: Path) -> None:
@@ -108,7 +150,8 @@ def test_a_candump_log_is_decoded_as_the_bus_is(tmp_path: Path) -> None:
         "(1436509053.749713) can0 123#R\n"
         "(1436509054.249713) can0 0DF50B23#02D20400000000FF\n"
     )
-    first, second = Candump(log).samples()
+    utc, first, second = Candump(log).samples()
+    assert utc == UtcTime(0, 0, "bus/log", 1_436_509_053_249_713_000)
     assert isinstance(first, Altitude)
     assert first.altitude_m == pytest.approx(12.34)
     assert (first.arrival_ns, second.arrival_ns) == (0, SECOND)
@@ -128,9 +171,17 @@ def test_nmea_lines_have_the_times_that_the_logger_wrote(
 ) -> None:
     path = tmp_path / "a.nmea"
     path.write_text("".join(f"{line}{DEPTH_BELOW}\n" for line in lines))
-    samples = list(NmeaText(path, starts_s=7.0).samples())
+    samples = [s for s in NmeaText(path, starts_s=7.0).samples() if not isinstance(s, UtcTime)]
     assert [sample.arrival_ns * 1e-9 - 7.0 for sample in samples] == pytest.approx(arrivals_s)
     assert all(isinstance(s, Altitude) and s.altitude_m == 10.0 for s in samples)
+
+
+def test_nmea_lines_with_a_wall_clock_give_utc(tmp_path: Path) -> None:
+    path = tmp_path / "a.nmea"
+    path.write_text(f"2013-07-01T14:00:08Z,{DEPTH_BELOW}\n{DEPTH_BELOW}\n")
+    utc, *others = NmeaText(path).samples()
+    assert utc == UtcTime(0, 0, "a/log", 1_372_687_208 * SECOND)
+    assert {type(sample) for sample in others} == {Altitude}
 
 
 def test_a_logs_clock_that_was_set_does_not_move_the_dive() -> None:
