@@ -123,6 +123,7 @@ def _stated(config: SyntheticConfig, site: Site, constants: Constants) -> dict[s
         "mounting": {
             "R_body_camera": mountings.R_bc_stated.tolist(),
             "t_body_camera_m": place,
+            "camera": mountings.stated.model_dump(mode="json"),
         },
         "truth": {
             "R_body_camera": mountings.R_bc.tolist(),

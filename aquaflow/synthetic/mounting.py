@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from aquaflow.config.telemetry import MountingConfig
 from aquaflow.synthetic.config import SyntheticConfig
 from aquaflow.synthetic.streams import stream
 
@@ -36,8 +37,10 @@ def survey_to_world(config: SyntheticConfig) -> tuple[Array, Array]:
 class Mountings:
     """Rotations into the body (forward, right, down) of what is mounted on it, and places on it."""
 
+    stated: MountingConfig
+    """Of the camera, as the user believes it and would put it into a vehicle's configuration."""
     R_bc_stated: Array
-    """[3, 3] from camera axes, as the user believes the camera to be mounted."""
+    """[3, 3] from camera axes, the same."""
     R_bc: Array
     """[3, 3] from camera axes, in truth: ``R_bc_stated`` times the camera's mounting error."""
     p_bc: Array
@@ -61,14 +64,19 @@ def mountings_of(config: SyntheticConfig) -> Mountings:
     pitch = math.radians(config.camera_pitch_deg)
     c, s = math.cos(pitch), math.sin(pitch)
     survey = np.array([[0.0, -s, c], [1.0, 0.0, 0.0], [0.0, c, s]])
-    stated = np.asarray(survey_to_world(config)[0] @ survey)
+    R_bc = np.asarray(survey_to_world(config)[0] @ survey)
+    # Level is along the lanes; at a wall, whose lanes go up, it is into the wall.
+    level_deg = 90.0 if config.scene == "wall" else 0.0
+    stated = MountingConfig(
+        position_m=config.camera_position_m, pitch_deg=level_deg - config.camera_pitch_deg
+    )
     place = np.array(config.camera_position_m)
     if config.mounting_error_deg == 0.0:
-        return Mountings(stated, stated, place, np.eye(3))
+        return Mountings(stated, R_bc, R_bc, place, np.eye(3))
     axes = stream(config.seed, "mounting").standard_normal((2, 3))
     axes *= math.radians(config.mounting_error_deg) / np.linalg.norm(axes, axis=1, keepdims=True)
     of_camera, of_dvl = Rotation.from_rotvec(axes).as_matrix()
-    return Mountings(stated, stated @ of_camera, place, of_dvl)
+    return Mountings(stated, R_bc, R_bc @ of_camera, place, of_dvl)
 
 
 def _transform(

@@ -8,6 +8,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.config.telemetry import MountingConfig
 from aquaflow.messages import TelemetrySample
 from aquaflow.synthetic.config import SyntheticConfig
 from aquaflow.synthetic.motion import BodyMotion
@@ -37,6 +38,8 @@ class SimulatedDive:
     """[4, 4] camera to body (forward, right, down), m, in truth."""
     T_bc_stated: Array
     """[4, 4] the same as a user believes it: turned from the truth by ``mounting_error_deg``."""
+    mounting: MountingConfig
+    """``T_bc_stated`` as a vehicle's configuration has it."""
     R_bd: Array
     """[3, 3] axes of the DVL's samples to the body, in truth; the identity is stated."""
     constants: Constants
@@ -65,6 +68,7 @@ def simulate(config: SyntheticConfig) -> SimulatedDive:
         motion.T_wc(times_s),
         mountings.T_bc,
         mountings.T_bc_stated,
+        mountings.stated,
         mountings.R_bd,
         constants,
         motion,

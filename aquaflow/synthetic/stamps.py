@@ -56,7 +56,7 @@ def scatter(
     area = relief.area
     extent = np.array(area.shape[::-1]) * area.cell
     places = rng.uniform(0.0, 1.0, (count, 2)) * extent
-    from_way = clear.query(places + np.array([area.x0, area.y0]))[0]
+    from_way = np.asarray(clear.query(places + np.array([area.x0, area.y0]))[0])
     for place, distance in zip(places, from_way, strict=True):
         stamp = maker(rng)
         near = distance < CLEARWAY_M + stamp.radius

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
+from aquaflow.geometry.earth import north_east
 from aquaflow.synthetic import SyntheticConfig
 from aquaflow.synthetic.motion import BodyMotion
 from aquaflow.synthetic.mounting import mountings_of
@@ -229,10 +230,9 @@ def test_altimeter_hears_second_echoes_and_nothing_too_far(motion: BodyMotion, f
 
 
 def metres(fixes: Array, noise: TelemetryNoise) -> Array:
-    """[N, 2] m north and east of the origin, on a sphere of the earth's mean radius."""
-    turned = np.radians(fixes[:, :2] - [noise.origin_latitude_deg, noise.origin_longitude_deg])
-    turned[:, 1] *= np.cos(np.radians(noise.origin_latitude_deg))
-    return np.asarray(6_371_000.0 * turned)
+    """[N, 2] m north and east of the origin."""
+    origin = (noise.origin_latitude_deg, noise.origin_longitude_deg)
+    return north_east(fixes[:, 0], fixes[:, 1], origin)
 
 
 def test_fixes_have_their_sigma_their_lag_and_their_outliers(motion: BodyMotion) -> None:
@@ -250,6 +250,12 @@ def test_fixes_have_their_sigma_their_lag_and_their_outliers(motion: BodyMotion)
     fixes = position(t, motion, noise, np.random.default_rng(6))
     error = metres(fixes, noise) - motion.origin_w(t)[:, :2]
     assert (np.abs(error).max(axis=1) > 1.0).mean() == pytest.approx(0.1, rel=0.2)
+
+
+def test_fixes_without_noise_are_where_the_vehicle_is(motion: BodyMotion) -> None:
+    t, noise = times(0.1), only(position_lag_s=0.0)
+    fixes = position(t, motion, noise, np.random.default_rng(0))
+    np.testing.assert_allclose(metres(fixes, noise), motion.origin_w(t)[:, :2], atol=1e-6)
 
 
 def test_a_degree_is_as_long_as_on_the_earth(motion: BodyMotion) -> None:

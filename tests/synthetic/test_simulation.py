@@ -178,6 +178,18 @@ def test_mounting_errors_have_the_stated_size_and_turn_camera_and_dvl(scene: str
     )
 
 
+@pytest.mark.parametrize("scene", ["reef", "wall", "survey"])
+def test_the_stated_mounting_is_that_of_a_vehicles_configuration(scene: str) -> None:
+    simulated = dive(frames=12, scene=scene, mounting_error_deg=3.0)
+    stated = simulated.mounting
+    angles = (stated.yaw_deg, stated.pitch_deg, stated.roll_deg)
+    # Columns: a forward camera's right, down and forward in the body.
+    forward = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    R_bc = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix() @ forward
+    np.testing.assert_allclose(R_bc, simulated.T_bc_stated[:3, :3], atol=1e-12)
+    np.testing.assert_allclose(stated.position_m, simulated.T_bc_stated[:3, 3])
+
+
 def test_noise_of_one_instrument_changes_no_other_and_no_motion() -> None:
     config = SyntheticConfig(frames=40)
     noisy = config.model_copy(

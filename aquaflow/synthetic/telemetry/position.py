@@ -8,6 +8,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.geometry.earth import SEMI_MAJOR_M, north_east
 from aquaflow.synthetic.motion import BodyMotion
 from aquaflow.synthetic.telemetry.series import chosen
 from aquaflow.synthetic.telemetry_noise import TelemetryNoise
@@ -16,8 +17,8 @@ __all__ = ["position", "utc_time"]
 
 Array: TypeAlias = npt.NDArray[np.float64]
 
-EQUATOR_M, FLATTENING = 6_378_137.0, 1.0 / 298.257_223_563
-"""WGS 84: semi-major axis and flattening."""
+STEPS = 4
+"""Of the iteration from metres to degrees on a sphere: each leaves 0.5 % of the error."""
 
 
 def position(
@@ -55,11 +56,10 @@ def _on_earth(
     place: Array,  # [N, 2] m north and east of the origin
     noise: TelemetryNoise,
 ) -> Array:
-    """[N, 2] degrees, in the plane that touches the ellipsoid at the origin: 1 cm in 150 m."""
-    latitude = math.radians(noise.origin_latitude_deg)
-    squashed = FLATTENING * (2.0 - FLATTENING)
-    curved = 1.0 - squashed * math.sin(latitude) ** 2
-    along_meridian = EQUATOR_M * (1.0 - squashed) / curved**1.5
-    along_parallel = EQUATOR_M / math.sqrt(curved) * math.cos(latitude)
-    origin = np.array([noise.origin_latitude_deg, noise.origin_longitude_deg])
-    return np.asarray(origin + np.degrees(place / [along_meridian, along_parallel]))
+    """[N, 2] degrees (WGS 84)."""
+    origin = (noise.origin_latitude_deg, noise.origin_longitude_deg)
+    per_degree = math.radians(SEMI_MAJOR_M) * np.array([1.0, math.cos(math.radians(origin[0]))])
+    found = np.tile(origin, (len(place), 1))
+    for _ in range(STEPS):
+        found = found + (place - north_east(found[:, 0], found[:, 1], origin)) / per_degree
+    return found
