@@ -178,7 +178,7 @@ class Slam:
 
     def metric_frame(self, sub_map: int) -> MetricFrame:
         """Where a sub-map lies in the world, as far as telemetry has shown it by now."""
-        return MetricFrame.unknown()
+        return self.metric.of(sub_map)
 
     # --- an earlier run -----------------------------------------------------------------------
 

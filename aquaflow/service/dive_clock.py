@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from aquaflow.clocks.device import Learned
 from aquaflow.dive.frames_csv import FrameRow
-from aquaflow.messages import Dropped, Frame
+from aquaflow.messages import Dropped, Frame, TelemetrySample
 from aquaflow.service.moment import Moment
 
 
@@ -34,6 +34,13 @@ class Continued:
         first = 1 + max((row.index for row in rows), default=-1)
         shift_ns = moment.shift_ns(now or Moment.now())
         return Continued(first, shift_ns, clocks if shift_ns == 0 else {})
+
+    def shifted(self, sample: TelemetrySample) -> TelemetrySample:
+        """A sample on the dive's clock."""
+        if self.shift_ns == 0:
+            return sample
+        t_ns, arrival_ns = sample.t_ns + self.shift_ns, sample.arrival_ns + self.shift_ns
+        return replace(sample, t_ns=t_ns, arrival_ns=arrival_ns)
 
     def counted(self, frame: Frame | Dropped) -> Frame | Dropped:
         """A frame of a device that began to count anew."""

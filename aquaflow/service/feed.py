@@ -18,6 +18,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Protocol, runtime_checkable
@@ -40,6 +41,8 @@ log = logging.getLogger(__name__)
 
 ASK_S = 0.5
 """How often a waiting pump thread checks whether it shall end."""
+MOST_SAMPLES = 100_000
+"""Samples that wait for the loop: ten minutes at 160 a second; it takes them with every frame."""
 JOIN_S = 3.0
 """Longest wait for a pump; one that hangs in a device's library ends with the process."""
 
@@ -50,11 +53,17 @@ class LatestSamples:
     def __init__(self) -> None:
         self.samples = 0
         self._latest: dict[tuple[str, str], TelemetrySample] = {}
+        self._new: deque[TelemetrySample] = deque(maxlen=MOST_SAMPLES)
 
     def take(self, sample: TelemetrySample) -> None:
         """Count the sample and keep it as the latest of its source and kind."""
         self.samples += 1
         self._latest[sample.source, type(sample).__name__] = sample
+        self._new.append(sample)
+
+    def taken(self) -> list[TelemetrySample]:
+        """Those that came since the last call, in the order of arrival."""
+        return [self._new.popleft() for _ in range(len(self._new))]
 
     def latest(self) -> list[TelemetrySample]:
         """The newest of each source and kind."""
@@ -249,7 +258,7 @@ class LiveFeed(_Pumps):
 
     def _samples(self, source: HasSamples) -> None:
         for sample in source.samples():
-            self.latest_samples.take(sample)
+            self.latest_samples.take(self.continued.shifted(sample))
             if self._recorder is not None:
                 self._recorder.sample(sample)
 

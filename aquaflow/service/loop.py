@@ -90,6 +90,8 @@ class LiveLoop:
 
     def take(self, frame: Frame | Dropped | None) -> None:
         """One turn: a frame, the note that one is missing, or an idle moment."""
+        for sample in self.feed.latest_samples.taken():
+            self.run_.sample(sample)
         if frame is not None:
             self._frame_s, self._pictured = self._now_s(), True
         if isinstance(frame, Dropped):

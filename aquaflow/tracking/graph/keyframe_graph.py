@@ -53,6 +53,10 @@ class Telemetry(Protocol):
         """The optimisation of a snapshot, to be called in any thread."""
         ...
 
+    def applied(self) -> None:
+        """The last job's result has been taken over."""
+        ...
+
 
 class KeyframeGraph:
     """Grows with the keyframes; sets their poses and sub-maps when the graph was optimised.
@@ -148,6 +152,8 @@ class KeyframeGraph:
             result = self.graph.apply(finished.result())
             assert result is not None  # only this method applies results
             correction = self._taken_over(result)
+            if self._telemetry is not None:
+                self._telemetry.applied()
         self._optimise()
         return correction
 

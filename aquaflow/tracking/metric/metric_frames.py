@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -37,6 +37,8 @@ class MetricFrames:
         self._failures = failures
         self._points: list[Array] = []
         self._since = 0
+        self._solved: dict[int, MetricFrame] = {}
+        """By component; set in the thread of the last job."""
 
     @property
     def present(self) -> bool:
@@ -77,7 +79,17 @@ class MetricFrames:
         """The optimisation of a snapshot together with telemetry, to be called in any thread."""
         survey = self.survey(snapshot)
         t_s = {k.number: k.t_ns * 1e-9 for k in self._keyframes.keyframes}
-        return lambda: straightened(snapshot, survey, t_s)
+
+        def solve() -> GraphResult:
+            solved = straightened(snapshot, survey, t_s)
+            self._solved = solved.frames
+            return solved.result
+
+        return solve
+
+    def applied(self) -> None:
+        """The last job's result has been taken over by the keyframes."""
+        self._take(self._solved)
 
     def update(self, snapshot: Snapshot) -> dict[int, MetricFrame]:
         """Estimate the frames of all sub-maps from their poses as they are now."""
@@ -85,11 +97,13 @@ class MetricFrames:
             self._keep_points(len(self._keyframes) - 1)
             with self._failures.contain("metric frames"):
                 found = estimates_of(self.survey(snapshot))
-                self.frames = {
-                    self._keyframes[component].sub_map: each.frame
-                    for component, each in found.items()
-                }
+                self._take({component: each.frame for component, each in found.items()})
         return self.frames
+
+    def _take(self, frames: Mapping[int, MetricFrame]) -> None:
+        self.frames = {
+            self._keyframes[component].sub_map: frame for component, frame in frames.items()
+        }
 
     def of(self, sub_map: int) -> MetricFrame:
         """The frame of a sub-map, as last estimated."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from aquaflow.fusion.estimator import Estimate, estimate
+from aquaflow.fusion.metric_frame import MetricFrame
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.tracking.graph.equations import Rows, poses_of
 from aquaflow.tracking.graph.optimisation import Optimisation
 from aquaflow.tracking.graph.table import EDGE, NODE, TRUST, GraphResult, Snapshot
@@ -28,29 +30,47 @@ def estimates_of(survey: Survey) -> dict[int, Estimate]:
     return found
 
 
-def straightened(snapshot: Snapshot, survey: Survey, t_s: Mapping[int, float]) -> GraphResult:
+@dataclass(frozen=True)
+class Straightened:
+    """Keyframes as loops and telemetry want them, and the worlds that they lie in then."""
+
+    result: GraphResult
+    frames: dict[int, MetricFrame]
+    """By component."""
+
+
+def straightened(snapshot: Snapshot, survey: Survey, t_s: Mapping[int, float]) -> Straightened:
     """Optimise a snapshot together with what telemetry says of its keyframes.
 
     ``t_s``: moment of each keyframe, by number. Reads nothing else, and changes nothing.
     """
     nodes, worlds = snapshot.nodes, []
-    for component, found in estimates_of(survey).items():
+    estimates = estimates_of(survey)
+    for component, found in estimates.items():
         inside = nodes[nodes["component"] == component]
         numbers = inside["number"]
         moments = np.array([t_s[number] for number in numbers.tolist()])
         edges = world_edges(found, numbers, moments, poses_of(inside))
         if edges:
             worlds.append(World.at(component, found.frame, edges))
-    return solve_with_worlds(snapshot, worlds)
+    result, T_mn = solve_with_worlds(snapshot, worlds)
+    frames = {component: found.frame for component, found in estimates.items()}
+    for component, T in T_mn.items():
+        if frames[component].metric:
+            frames[component] = replace(frames[component], T_nm=T.inverse())
+    return Straightened(result, frames)
 
 
-def solve_with_worlds(snapshot: Snapshot, worlds: list[World]) -> GraphResult:
-    """Optimise keyframes and worlds; the result is of the keyframes alone."""
+def solve_with_worlds(
+    snapshot: Snapshot, worlds: list[World]
+) -> tuple[GraphResult, dict[int, Sim3]]:
+    """Optimise keyframes and worlds: the result of the keyframes alone, and T_mn by component."""
     edges, count = len(snapshot.edges), len(snapshot.nodes)
     result = Optimisation(_with_worlds(snapshot, worlds), everything=False).run()
     own = result.rows < count
+    T_mn = {world.component: result.poses.get(-1 - world.component, world.T_mn) for world in worlds}
     poses = {number: T for number, T in result.poses.items() if number >= 0}
-    return replace(
+    keyframes = replace(
         result,
         poses=poses,
         trust={edge: trust for edge, trust in result.trust.items() if edge < edges},
@@ -59,6 +79,7 @@ def solve_with_worlds(snapshot: Snapshot, worlds: list[World]) -> GraphResult:
         solved=result.solved[own],
         edge_trust=result.edge_trust[:edges],
     )
+    return keyframes, T_mn
 
 
 def _with_worlds(snapshot: Snapshot, worlds: list[World]) -> Snapshot:
