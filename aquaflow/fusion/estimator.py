@@ -12,8 +12,8 @@ from aquaflow.config import FusionConfig
 from aquaflow.config.telemetry import MountingConfig
 from aquaflow.fusion.camera_path import CameraPath
 from aquaflow.fusion.factors.factor import Factor
-from aquaflow.fusion.metric_frame import MetricFrame, Origin
-from aquaflow.fusion.problem import Problem, problem_of
+from aquaflow.fusion.metric_frame import MetricFrame
+from aquaflow.fusion.problem import Carried, Problem, problem_of
 from aquaflow.fusion.solution_frame import frame_of
 from aquaflow.fusion.solve import Solution, solve
 from aquaflow.fusion.telemetry import Telemetry
@@ -41,15 +41,15 @@ def estimate(
     mounting: MountingConfig | None,
     points: Callable[[], Array],
     extra: Sequence[Factor] = (),
-    origin: Origin | None = None,
+    carried: Carried | None = None,
 ) -> Estimate:
     """The frame of the sub-map with ``path``.
 
     Args:
         mounting: of the camera in the body, as stated; None if nobody stated it.
         points: makes the map's points [K, 3] m, for the altimeter's beam.
-        extra: factors that do not come from telemetry: known lengths, a dead-reckoned start.
-        origin: of n, where another sub-map already has one.
+        extra: factors that do not come from telemetry: known lengths.
+        carried: what an earlier sub-map of the dive has shown.
 
     Raises:
         ArithmeticError: the residuals are not finite.
@@ -58,7 +58,7 @@ def estimate(
         return Estimate(MetricFrame.unknown(f"the sub-map has only {len(path)} poses"))
     if not telemetry and not extra:
         return Estimate(MetricFrame.unknown())
-    problem = problem_of(telemetry, path, config, mounting, points, origin)
+    problem = problem_of(telemetry, path, config, mounting, points, carried)
     problem.factors += extra
     if not problem.factors:
         unused = MetricFrame.unknown("no telemetry could be used")

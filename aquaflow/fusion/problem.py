@@ -16,7 +16,7 @@ from aquaflow.fusion.factors.altitude import AltitudeFactor
 from aquaflow.fusion.factors.attitude import ForceFactor, HeadingFactor, TiltFactor
 from aquaflow.fusion.factors.depth import DepthFactor
 from aquaflow.fusion.factors.factor import Factor
-from aquaflow.fusion.factors.position import PositionFactor
+from aquaflow.fusion.factors.position import PlaceFactor, PositionFactor
 from aquaflow.fusion.factors.velocity import VelocityFactor
 from aquaflow.fusion.metric_frame import Origin, SourceReport
 from aquaflow.fusion.sources import LEAST_SAMPLES, UsableSeries
@@ -32,6 +32,19 @@ OPEN_M, FIXED = 1e4, 1e-3
 """1 sigma of what only telemetry can say (m), and of what is a convention where none does."""
 ANY_TURN = np.pi
 """rad, 1 sigma of a turn that nothing is known of."""
+
+
+@dataclass(frozen=True)
+class Carried:
+    """What an earlier sub-map of the dive has shown, for the next one."""
+
+    state: State
+    """Mountings and the compass's constant error are the same."""
+    heading_sigma: float
+    """rad, 1 sigma of the compass's error against ``state``'s."""
+    place: tuple[float, Array, Array] | None
+    """Moment (s), north and east [2] m of the body by dead reckoning, covariance [2, 2] m^2."""
+    origin: Origin | None
 
 
 @dataclass
@@ -59,11 +72,11 @@ def problem_of(
     config: FusionConfig,
     mounting: MountingConfig | None,
     points: Callable[[], Array],
-    origin: Origin | None,
+    carried: Carried | None,
 ) -> Problem:
     """The problem of the sub-map with ``path``; arguments as of ``estimate``."""
     usable = UsableSeries.of(telemetry, path)
-    problem = _oriented(usable, path, config, mounting)
+    problem = _oriented(usable, path, config, mounting, carried)
     problem.reports += usable.left_out
     _scaled(problem, usable, path)
     if problem.level:
@@ -80,13 +93,19 @@ def problem_of(
                 problem.reports.append(SourceReport(velocity.source, "velocity", reason=why))
         _add_altitudes(problem, usable, path, points)
     if problem.level:
-        _add_positions(problem, usable, path, config, origin)
+        _add_positions(problem, usable, path, None if carried is None else carried.origin)
     _move_to_depth(problem, usable, path)
+    if carried is not None and carried.place is not None and problem.level:
+        _add_place(problem, path, *carried.place)
     return problem
 
 
 def _oriented(
-    usable: UsableSeries, path: CameraPath, config: FusionConfig, mounting: MountingConfig | None
+    usable: UsableSeries,
+    path: CameraPath,
+    config: FusionConfig,
+    mounting: MountingConfig | None,
+    carried: Carried | None,
 ) -> Problem:
     """The problem with what says how the body and the map are turned."""
     R_bc, c_b, sigma = np.asarray(rough.AXES), np.zeros(3), np.radians(config.mounting_sigma_deg)
@@ -105,19 +124,28 @@ def _oriented(
     prior[LAG] = max(config.position_lag_sigma_s, 1e-6)
     state = State(0.0, np.eye(3), np.zeros(3), R_bc, c_b, np.eye(3))
     problem = Problem(state, prior, mounted=mounted)
-    _add_directions(problem, usable, path, config)
-    if not problem.compass:
+    if carried is not None:
+        before = carried.state
+        problem.start = replace(
+            problem.start, R_bc=before.R_bc, R_bd=before.R_bd, heading=before.heading
+        )
+        problem.prior[HEADING] = carried.heading_sigma
+    _add_directions(problem, usable, path)
+    # The attitude filter's heading goes on through a loss, whether x of n is north or not.
+    follows = carried is not None and any(f.kind == "heading" for f in problem.factors)
+    problem.compass = config.heading and any(f.kind == "heading" for f in problem.factors)
+    if not problem.compass and not follows:
+        problem.prior[HEADING] = ANY_TURN
         # By convention the body's first heading is x of n.
         R_nb = problem.start.body(path.R_mc[:1], path.p_m[:1])[0][0]
-        R_nm = rough.turned_about_down(problem.start.R_nm, -rough.heading_of(R_nb))
-        problem.start = replace(problem.start, R_nm=R_nm)
+        first = rough.heading_of(R_nb)
+        R_nm = rough.turned_about_down(problem.start.R_nm, -first)
+        problem.start = replace(problem.start, R_nm=R_nm, heading=problem.start.heading + first)
         problem.prior[TURN.stop - 1] = FIXED
     return problem
 
 
-def _add_directions(
-    problem: Problem, usable: UsableSeries, path: CameraPath, config: FusionConfig
-) -> None:
+def _add_directions(problem: Problem, usable: UsableSeries, path: CameraPath) -> None:
     """Down and north, from the best source there is."""
     state = problem.start
     unknown = "how the camera is mounted in the vehicle is unknown: set fusion.camera"
@@ -125,10 +153,9 @@ def _add_directions(
         R_nm = rough.map_to_level(usable.attitude[0], path, state.R_bc)
         for attitude in usable.attitude:
             problem.factors.append(TiltFactor.of_attitude(attitude, path))
-            if config.heading:
-                problem.factors.append(HeadingFactor(attitude, path))
+            problem.factors.append(HeadingFactor(attitude, path))
+        R_nm = rough.turned_about_down(R_nm, -state.heading)
         problem.start, problem.level = replace(state, R_nm=R_nm), True
-        problem.compass = config.heading
         return
     problem.reports += [SourceReport(s.source, "attitude", reason=unknown) for s in usable.attitude]
     for force in usable.acceleration:
@@ -182,7 +209,6 @@ def _add_positions(
     problem: Problem,
     usable: UsableSeries,
     path: CameraPath,
-    config: FusionConfig,
     origin: Origin | None,
 ) -> None:
     """Fixes on the earth: they also give the heading and the scale."""
@@ -210,6 +236,26 @@ def _add_positions(
         t_n = problem.start.t_n.copy()
         t_n[:2] += np.median(fixes_n - p_n[:, :2], axis=0)
         problem.start = replace(problem.start, t_n=t_n)
+
+
+def _add_place(
+    problem: Problem,
+    path: CameraPath,
+    t_s: float,
+    place_n: Array,  # [2] m
+    covariance: Array,  # [2, 2] m^2
+) -> None:
+    """Where dead reckoning has the body at the start of the sub-map."""
+    moment = np.array([min(max(t_s, path.t_s[0]), path.t_s[-1])])
+    sigma = np.array([np.sqrt(0.5 * np.trace(covariance))])
+    factor = PlaceFactor("dead reckoning", moment, place_n[None], sigma, path)
+    problem.factors.append(factor)
+    problem.prior[SHIFT.start : SHIFT.start + 2] = OPEN_M
+    problem.prior[LAG] = 1e-6
+    _, p_n = problem.start.body(*path.at(moment))
+    t_n = problem.start.t_n.copy()
+    t_n[:2] += place_n - p_n[0, :2]
+    problem.start = replace(problem.start, t_n=t_n)
 
 
 def _move_to_depth(problem: Problem, usable: UsableSeries, path: CameraPath) -> None:

@@ -19,7 +19,7 @@ class DepthFactor(Factor):
 
     kind = "depth"
     slow = SlowPart(
-        0.005,
+        0.007,
         60.0,
         (
             *(Process(time_s) for time_s in (2.0, 8.0, 60.0)),

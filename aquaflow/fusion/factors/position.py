@@ -38,3 +38,11 @@ class PositionFactor(Factor):
         """[N, 2] m."""
         _, p_n = state.body(self._R_mc, self._p_m - state.lag_s * self._v_m)
         return np.asarray(p_n[:, :2] - self._fixes_n)
+
+
+class PlaceFactor(PositionFactor):
+    """The one place at which dead reckoning puts the body when a sub-map starts."""
+
+    kind = "dead_reckoning"
+    slow = SlowPart(1e-4, 1.0, (Process(1.0),))
+    """m: all of its uncertainty is in its sigma."""

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
+from aquaflow.fusion.camera_path import CameraPath
+from aquaflow.fusion.dead_reckoning import carried_from
 from aquaflow.fusion.estimator import Estimate, estimate
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3
@@ -21,12 +24,18 @@ from aquaflow.tracking.metric.world_edges import World
 def estimates_of(survey: Survey) -> dict[int, Estimate]:
     """The metric frame of every component of the graph, by its first keyframe."""
     found: dict[int, Estimate] = {}
+    before: tuple[Estimate, CameraPath] | None = None
     for component in survey.components():
         path = survey.path(component)
+        carried = None
+        if before is not None:
+            carried = carried_from(*before, survey.telemetry, path)
         found[component] = estimate(
             survey.telemetry, path, survey.config, survey.mounting,
-            lambda component=component: survey.ground(component),
+            partial(survey.ground, component), carried=carried,
         )  # fmt: skip
+        if found[component].frame.metric:
+            before = found[component], path
     return found
 
 
