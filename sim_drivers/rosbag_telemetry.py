@@ -24,6 +24,7 @@ from drivers.fixes import sigma_of
 from drivers.plausible import plausible
 from drivers.rotation import Vector, normalised, product
 from sim_drivers.rosbag import decoded, is_bag, messages_in, opened, origin_of, stamp_of
+from sim_drivers.telemetry_log import LoggedUtc
 
 Convert: TypeAlias = Callable[[Any, int, int, str], list[TelemetrySample]]
 
@@ -44,7 +45,7 @@ nothing."""
 
 class RosbagTelemetry:
     """Imu, FluidPressure, Range, TwistWithCovarianceStamped and NavSatFix, on the clock of the
-    pictures."""
+    pictures; UTC from the times of reception."""
 
     specificity = 2
 
@@ -72,10 +73,12 @@ class RosbagTelemetry:
         self.notes = []
         with opened(self.path) as reader:
             base_ns = origin_of(reader) - self._shift_ns
+            utc = LoggedUtc(f"{self.path.stem}/bag", iter([(0, base_ns)]))
             wanted = [c for c in reader.connections if c.msgtype in CONVERSIONS]
             for connection, received_ns, data in messages_in(reader, wanted, self.notes):
                 message = decoded(reader, connection, data)
                 arrival_ns = received_ns - base_ns
+                yield from utc.at(arrival_ns, received_ns)
                 t_ns = min(stamp_of(message, received_ns) - base_ns, arrival_ns)
                 source = connection.topic.strip("/")
                 try:

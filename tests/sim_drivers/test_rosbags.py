@@ -25,6 +25,7 @@ from aquaflow.messages import (
     Dropped,
     Frame,
     Position,
+    UtcTime,
     Velocity,
 )
 from aquaflow.recording.pictures import encode
@@ -141,7 +142,7 @@ def test_pictures_have_their_headers_times_and_the_calibration(bag: Path) -> Non
 
 def test_telemetry_is_turned_from_ros_axes_to_ours(bag: Path) -> None:
     everything = list(open_recorded_telemetry(bag).samples())
-    samples = [sample for sample in everything if not isinstance(sample, Position)]
+    samples = [s for s in everything if not isinstance(s, (Position, UtcTime))]
     assert {sample.t_ns for sample in samples} == {SECOND}
     assert {sample.arrival_ns for sample in samples} == {SECOND + LATE_NS}
     by_kind = {type(sample): sample for sample in samples}
@@ -189,7 +190,8 @@ def test_a_bag_without_pictures_is_telemetry_only(tmp_path: Path) -> None:
         writer.write(connection, BEGAN_NS + t_ns, messages.serialized(message))
     with pytest.raises(InputError, match="holds no picture"):
         open_recording(tmp_path / "a.bag")
-    (sample,) = open_recorded_telemetry(tmp_path / "a.bag").samples()
+    utc, sample = open_recorded_telemetry(tmp_path / "a.bag").samples()
+    assert utc == UtcTime(0, 0, "a/bag", BEGAN_NS + t_ns)
     assert isinstance(sample, Depth)
     assert not isinstance(sample, Dropped)
     assert sample.arrival_ns == 0
