@@ -25,6 +25,7 @@ from aquaflow.export.ply import PlyGaussians, write_ply
 from aquaflow.export.png import write_png
 from aquaflow.export.report import ReportData, write_report
 from aquaflow.export.tum import write_tum
+from aquaflow.fusion.known_lengths.known_lengths_file import FILE as KNOWN_LENGTHS
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.gaussians.gaussians import radiance
@@ -43,7 +44,7 @@ TRACE = "trace.json"
 RESULTS = (
     *("trajectory.tum", "camera.yaml", "calibration.yaml", "map*.ply", "map*.aqf", "medium.json"),
     *("metrics.json", "report.html", "heldout/*.png", "heldout/*.npz", TRACE),
-    "restored/*.png",
+    *("restored/*.png", KNOWN_LENGTHS),
 )
 """What a run writes at its end; of an earlier run in the same folder nothing must remain."""
 

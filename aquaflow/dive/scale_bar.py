@@ -48,6 +48,8 @@ class _Point:
     ray: Array
     """[3] unit, from the camera."""
     range: float
+    sigma: float
+    """Of the range: of the map anywhere, and by how much it differs around the point."""
 
 
 def between_pixels(
@@ -83,7 +85,7 @@ def between_pixels(
     along = (b.place - a.place) / length
     click = CLICK_SIGMA_PX / view.camera.fx * float(np.hypot(a.range, b.range))
     # The ranges of one picture may err together, or apart: the sum of both covers either.
-    apart = RANGE_SIGMA * float(np.hypot(along @ a.ray * a.range, along @ b.ray * b.range))
+    apart = float(np.hypot(along @ a.ray * a.sigma, along @ b.ray * b.sigma))
     sigma = float(np.hypot(np.hypot(click, apart), RANGE_SIGMA * length))
     source = "scale bar {:g},{:g} to {:g},{:g}".format(*points.ravel())
     return KnownLength(frame, source, length, sigma, length_m, sigma_m, sub_map)
@@ -152,8 +154,10 @@ def _seen(
         solid = alpha[rows, columns] >= LEAST_ALPHA
         if alpha[row, column] < LEAST_ALPHA or not solid.any():
             raise InputError(f"the map shows nothing at {u:g},{v:g}; choose another point")
-        distance = float(np.median(ranges[rows, columns][solid]))
+        around = ranges[rows, columns][solid]
+        distance = float(np.median(around))
+        sigma = float(np.hypot(RANGE_SIGMA * distance, np.std(around)))
         ray = view.T_wc.R @ view.camera.unproject(np.array([u, v]))
         ray /= np.linalg.norm(ray)
-        points.append(_Point(view.T_wc.t + distance * ray, ray, distance))
+        points.append(_Point(view.T_wc.t + distance * ray, ray, distance, sigma))
     return points

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aquaflow.config import Config
+from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.frames_csv import read_rows
 from aquaflow.dive.scale_bar import between_pixels, between_points
 from aquaflow.errors import InputError
@@ -152,6 +154,13 @@ def test_lengths_are_read_as_written_and_sub_maps_have_scales_of_their_own(tmp_p
     scales = json.loads((tmp_path / FILE).read_text())["scales"]
     assert [each["sub_map"] for each in scales] == [0, 2]
     assert read_known_lengths(tmp_path / "elsewhere") == []
+
+
+def test_a_dive_mapped_anew_has_another_unit_and_none_of_the_lengths(tmp_path: Path) -> None:
+    DiveFolder(tmp_path, Config()).close()
+    write_known_lengths(tmp_path, [KnownLength(3, "marker 7", 0.5, 0.01, 0.16, 0.001)])
+    DiveFolder(tmp_path, Config(), overwrite=True).close()
+    assert read_known_lengths(tmp_path) == []
 
 
 def test_the_same_length_measured_again_replaces_the_first() -> None:

@@ -32,6 +32,12 @@ LARGEST_DEVIATION = 4.0
 """Sigmas from the median beam offset at which a spot is not the beam's dot."""
 LEAST_SPREAD = 0.02
 """Relative, of the beam offsets: what a sound depth may differ by beyond what it states."""
+LEAST_HEIGHTS = 0.1
+"""Natural logarithm of the largest over the least depth of a beam's dots: pictures from one height
+do not show whether a spot is a dot on the sea floor or dirt on the window."""
+LEAST_SLOPE = 0.5
+"""Of the logarithm of a dot's distance from the image centre over that of the depth, negated: 1 for
+a beam, 0 for dirt."""
 DOT_SIGMA_PX = 1.0
 """1 sigma of a dot's centre against the beam: speckle, and the slope it falls on (judgement)."""
 MOST_HYPOTHESES = 500
@@ -68,7 +74,8 @@ def laser_lengths(
     taken = {id(dot) for dot in first.values()}
     second = _beam([dot for dot in dots if id(dot) not in taken])
     both = sorted(first.keys() & second.keys())
-    if len(both) < LEAST_PICTURES:
+    beams = [[beam[number] for number in both] for beam in (first, second)]
+    if len(both) < LEAST_PICTURES or not all(_moves_as_a_beam(beam) for beam in beams):
         return []
     pairs = [(pictures[number].frame_index, first[number], second[number]) for number in both]
     return [_length(index, a, b, lasers, view_of) for index, a, b in pairs]
@@ -132,6 +139,20 @@ def _agreeing(dots: Sequence[_Dot]) -> dict[int, _Dot]:
 
 def _deviation(dot: _Dot, centre: float) -> float:
     return abs(float(np.log(np.linalg.norm(dot.offset))) - centre)
+
+
+def _moves_as_a_beam(dots: Sequence[_Dot]) -> bool:
+    """True if the dots move outwards as the surface comes nearer."""
+    sub_maps = np.array([dot.sub_map for dot in dots])
+    depths = np.log([dot.z for dot in dots])
+    radii = np.log([float(np.linalg.norm(dot.pixel)) for dot in dots])
+    for sub_map in np.unique(sub_maps):
+        members = sub_maps == sub_map
+        depths[members] -= depths[members].mean()
+        radii[members] -= radii[members].mean()
+    if np.ptp(depths) < LEAST_HEIGHTS:
+        return False
+    return bool(-(depths @ radii) > LEAST_SLOPE * (depths @ depths))
 
 
 def _length(

@@ -18,13 +18,14 @@ def refuse_without_scale(vehicle: VehicleConfig) -> None:
     Raises:
         ConfigError: nothing that is configured can ever give the map's scale.
     """
-    devices = vehicle.telemetry.devices.values()
-    if vehicle.fusion.enabled and any(_is_metric(device) for device in devices):
+    devices, fusion = vehicle.telemetry.devices.values(), vehicle.fusion
+    lengths = bool(fusion.boards) or fusion.lasers is not None
+    if fusion.enabled and (lengths or any(_is_metric(device) for device in devices)):
         return
     raise ConfigError(
         "service.pose.enabled: nothing here can give the map's scale in metres, so that no pose "
         "may steer the vehicle; set it to false, or add to telemetry.devices one that measures "
-        "depth, velocity or altitude, with fusion.enabled"
+        "depth, velocity or altitude, or set fusion.boards or fusion.lasers; with fusion.enabled"
     )
 
 

@@ -149,6 +149,18 @@ def test_a_depth_sensor_is_enough_to_start(device: dict[str, Any]) -> None:
     refuse_without_scale(VehicleConfig.model_validate({"telemetry": telemetry}))
 
 
+@pytest.mark.parametrize(
+    "fusion",
+    [
+        {"boards": [{"kind": "markers", "dictionary": "4X4_50", "marker_m": 0.1}]},
+        {"lasers": {"colour": "red", "spacing_m": 0.1}},
+    ],
+    ids=["boards", "lasers"],
+)
+def test_a_known_length_is_enough_to_start(fusion: dict[str, Any]) -> None:
+    refuse_without_scale(VehicleConfig.model_validate({"fusion": fusion}))
+
+
 def test_a_correction_of_the_maps_place_that_is_small_makes_no_velocity_and_no_reset(
     told: Told,
 ) -> None:

@@ -1,0 +1,47 @@
+"""All configured objects of known size in a dive: found once, measured with the poses of now."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.config.fusion import FusionConfig
+from aquaflow.fusion.known_lengths.board_size import PosedView, board_lengths
+from aquaflow.fusion.known_lengths.boards import BoardDetector, BoardSighting
+from aquaflow.fusion.known_lengths.known_length import KnownLength
+from aquaflow.fusion.known_lengths.laser_dots import DotCandidates, find_dots
+from aquaflow.fusion.known_lengths.laser_spacing import laser_lengths
+
+
+class KnownLengthFinder:
+    """Keeps where the objects were seen, a kilobyte a picture, and no picture."""
+
+    def __init__(self, config: FusionConfig) -> None:
+        self._detector = BoardDetector(config.boards)
+        self._lasers = config.lasers
+        self._boards: list[BoardSighting] = []
+        self._dots: list[DotCandidates] = []
+
+    def look(
+        self,
+        frame_index: int,
+        image: npt.NDArray[np.uint8],  # [H, W, 3] RGB, undistorted
+    ) -> None:
+        """Look for the objects in a picture: 6 to 9 ms of CPU for each at 640 x 480 px."""
+        self._boards += self._detector(frame_index, image)
+        if self._lasers is not None:
+            dots = find_dots(frame_index, image, self._lasers.colour)
+            if len(dots.pixels):
+                self._dots.append(dots)
+
+    def lengths(self, view_of: Callable[[int], PosedView | None]) -> list[KnownLength]:
+        """What was seen until now, measured in the map as it is now.
+
+        ``view_of`` gives a frame's place by its index; None for a frame without a pose.
+        """
+        lengths = board_lengths(self._boards, view_of)
+        if self._lasers is not None:
+            lengths += laser_lengths(self._dots, view_of, self._lasers)
+        return lengths
