@@ -7,6 +7,7 @@ import contextlib
 import csv
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -137,7 +138,7 @@ def _reader_of(path: Path) -> Reader | None:
     ros, gopro = header[0] == TIME, header == ("t_s", "c0", "c1", "c2")
     stream = path.stem.rpartition("_")[2]
     known: list[tuple[bool, Reader]] = [
-        (header == HEADER, lambda table: read_telemetry(table.path)),
+        (header == HEADER, _synthetic),
         (survey_table.is_survey_table(header), CsvTelemetry.survey),
         (ros and "field.depth" in header, lambda table: table.lines(_ros_depth, _ros_stamps)),
         (
@@ -148,6 +149,14 @@ def _reader_of(path: Path) -> Reader | None:
         (gopro and stream == "accl", lambda table: table.lines(_gopro_force, _gopro_stamps)),
     ]
     return next((reader for fits, reader in known if fits), None)
+
+
+def _synthetic(table: CsvTelemetry) -> Samples:
+    """Its times are those of its dive's pictures, not from the first line on."""
+    shift_ns = round(table.starts_s * 1e9)
+    for sample in read_telemetry(table.path):
+        t_ns, arrival_ns = sample.t_ns + shift_ns, sample.arrival_ns + shift_ns
+        yield replace(sample, t_ns=t_ns, arrival_ns=arrival_ns)
 
 
 def _ros_stamps(line: Line) -> tuple[int, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +11,7 @@ from aquaflow.api.dive import Dive, read_dive
 from aquaflow.config.presets import configured
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.sources import RecordedCamera, open_recording
+from aquaflow.sources.telemetry_input import open_telemetry
 
 if TYPE_CHECKING:
     from aquaflow.dive.replay import Progress
@@ -26,6 +27,8 @@ def map_recording(
     settings: Mapping[str, Any] | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
+    telemetry: Sequence[str | os.PathLike[str]] = (),
+    telemetry_offset_s: float | None = None,
 ) -> Dive:
     """Map a recording into the dive folder ``out`` and read what came of it.
 
@@ -44,6 +47,9 @@ def map_recording(
             ``{"source": {"every": 2}}``.
         overwrite: replace a dive that ``out`` holds already.
         progress: called with the stage, the steps done and the number of steps (None: unknown).
+        telemetry: logs that were recorded with ``source``, beside the telemetry in it.
+        telemetry_offset_s: when these logs begin, s after the first picture; None: it is found
+            from the rotations that the logs and the poses have in common.
 
     Raises:
         InputError: the recording cannot be read or the folder cannot be written.
@@ -59,7 +65,11 @@ def map_recording(
         recording, name = open_recording(Path(source), fps=chosen.source.fps), Path(source).name
     else:
         recording, name = source, type(source).__name__
+    path = Path(source) if isinstance(source, (str, os.PathLike)) else None
+    given = open_telemetry(path, [Path(log) for log in telemetry], telemetry_offset_s)
     from aquaflow.dive import replay  # loads torch: after what can be refused without it
 
-    replay.map_recording(recording, name, Path(out), chosen, camera, overwrite, progress)
+    replay.map_recording(
+        recording, name, Path(out), chosen, camera, overwrite, progress, telemetry=given
+    )
     return read_dive(out)

@@ -77,6 +77,13 @@ def map_command(
         float | None, typer.Option(help="Time limit of refining; runs then differ.")
     ] = None,
     tracking_only: Annotated[bool, typer.Option(help="Trajectory without a map.")] = False,
+    telemetry: Annotated[
+        list[Path] | None, typer.Option(help="Log recorded with it; may be given several times.")
+    ] = None,
+    telemetry_offset: Annotated[
+        float | None,
+        typer.Option(help="When the logs begin, s after the first picture; else it is found."),
+    ] = None,
     overwrite: Annotated[bool, typer.Option(help="Replace the dive in --out.")] = False,
     realtime: Annotated[
         bool, typer.Option(help="As the live loop would: newest frame only, mapping in parallel.")
@@ -98,16 +105,24 @@ def map_command(
         {"seed": seed, "threads": threads, "source": source_settings, "mapping": mapping},
         "command line",
     )
+    from aquaflow.errors import InputError
     from aquaflow.geometry.camera import load_camera
     from aquaflow.sources import open_recording
+    from aquaflow.sources.telemetry_input import open_telemetry
 
     calibration = None if calib is None else load_camera(calib)
+    if realtime and telemetry:
+        raise InputError(
+            "--telemetry needs the poses of the whole recording; leave out --realtime, or name the "
+            "log in a replay.yaml"
+        )
     if realtime:
         print_finished(
             map_realtime(source, settings, calibration, out, overwrite, as_json), as_json
         )
         return
     recording = open_recording(source, fps=settings.source.fps)
+    given = open_telemetry(source, telemetry or (), telemetry_offset)
 
     from aquaflow.dive.replay import (
         map_recording,  # loads torch: after what can be refused without it
@@ -115,7 +130,7 @@ def map_command(
 
     with progress_bars(quiet=as_json) as progress:
         replayed = map_recording(
-            recording, source.name, out, settings, calibration, overwrite, progress, trace=profile
+            recording, source.name, out, settings, calibration, overwrite, progress, profile, given
         )
     if as_json:
         typer.echo(json.dumps({"dive": str(replayed.dive), **replayed.metrics}))

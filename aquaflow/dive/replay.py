@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
@@ -11,14 +11,16 @@ from aquaflow.config import Config, SourceConfig
 from aquaflow.cores import usable_threads
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import DiveRun, Finished
+from aquaflow.dive.synchronisation import synchronise
 from aquaflow.errors import NotMappedError
 from aquaflow.errors.failures import Failures
 from aquaflow.messages import CameraModel, Dropped, Frame
 from aquaflow.profiler import Profiler
 from aquaflow.recording.playback import Event, Playback
 from aquaflow.slam import Slam
-from aquaflow.sources import RecordedCamera, RecordedTelemetry, StatesMounting
+from aquaflow.sources import RecordedCamera, StatesMounting
 from aquaflow.sources.reading import read_past_failures
+from aquaflow.sources.telemetry_input import TelemetryInput
 
 Progress = Callable[[str, int, int | None], None]
 """Called with the stage, the steps done and, where known, the steps there are."""
@@ -33,11 +35,12 @@ def map_recording(
     overwrite: bool = False,
     progress: Progress | None = None,
     trace: bool = False,
-    telemetry: Sequence[RecordedTelemetry] = (),
+    telemetry: TelemetryInput | None = None,
 ) -> Finished:
     """Map a recording into the dive folder ``out``; with ``trace`` it gets a ``trace.json`` too.
 
-    ``telemetry`` is on the recording's clock.
+    Logs of ``telemetry`` that are on a clock of their own are used from the last frame on, when
+    the poses have shown their offset.
 
     Raises:
         InputError: the folder cannot be written.
@@ -46,6 +49,7 @@ def map_recording(
     """
     fix_threads(usable_threads(config.threads))
     folder, failures = DiveFolder(out, config, overwrite), Failures()
+    given = telemetry or TelemetryInput()
     try:
         slam = Slam(config, Profiler(trace), folder.work, failures=failures)
         calibration = calibration or recording.camera
@@ -53,21 +57,22 @@ def map_recording(
         try:
             if slam.metric.mounting is None and isinstance(recording, StatesMounting):
                 slam.metric.mounting = recording.mounting
-            playback = Playback(recording, telemetry, failures=failures)
+            playback = Playback(recording, given.synchronised, failures=failures)
             shown = progress or (lambda stage, done, total: None)
-            return _replay(run, recording, playback, config, shown)
+            return _replay(run, recording, given, playback, config, shown)
         finally:
             with failures.contain("closing"):
                 slam.close()
     finally:
-        for close in (folder.close, recording.close):
+        for close in (folder.close, recording.close, given.close):
             with failures.contain("closing"):
                 close()
 
 
 def _replay(
-    run: DiveRun, recording: RecordedCamera, playback: Playback, config: Config, progress: Progress
-) -> Finished:
+    run: DiveRun, recording: RecordedCamera, telemetry: TelemetryInput, playback: Playback,
+    config: Config, progress: Progress,
+) -> Finished:  # fmt: skip
     source, count = config.source, recording.frame_count
     stop = count if source.stop is None else min(source.stop, count or source.stop)
     total = None if stop is None else len(range(source.start, stop, source.every))
@@ -90,7 +95,9 @@ def _replay(
         raise NotMappedError(
             f"{run.name}: none{known} lies between --start {source.start} and {end}"
         )
-    return run.finish(recording.notes, lambda done, total: progress("refine", done, total))
+    synchronise(run, telemetry)
+    notes = recording.notes + telemetry.notes
+    return run.finish(notes, lambda done, total: progress("refine", done, total))
 
 
 def _events(run: DiveRun, playback: Playback, source: SourceConfig) -> Iterator[Event]:
