@@ -180,6 +180,10 @@ class Slam:
         """Where a sub-map lies in the world, as far as telemetry has shown it by now."""
         return self.metric.of(sub_map)
 
+    def metric_frames(self) -> dict[int, MetricFrame]:
+        """By sub-map, after ``finish``: how its world lies in n."""
+        return {each.sub_map: self.metric_frame(each.sub_map) for each in self.keyframes.keyframes}
+
     # --- an earlier run -----------------------------------------------------------------------
 
     def resume(self, frames: FrameTable, used: int) -> None:

@@ -30,7 +30,7 @@ def main(source: str, out: str) -> None:
     scene = aquaflow.load_map(dive.path)
     gaussians = scene.gaussians
     low, high = gaussians.means.min(axis=0), gaussians.means.max(axis=0)
-    print(f"{len(scene)} Gaussians between {low.round(2)} and {high.round(2)} map units")
+    print(f"{len(scene)} Gaussians between {low.round(2)} and {high.round(2)} {scene.unit}")
 
 
 if __name__ == "__main__":

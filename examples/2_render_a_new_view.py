@@ -13,7 +13,7 @@ import numpy as np
 import aquaflow
 from aquaflow.geometry.similarity import Sim3
 
-ASIDE = 0.1  # map units: a tenth of the median depth that the first keyframe saw
+ASIDE = 0.1  # metres, or map units: a tenth of the median depth that the first keyframe saw
 
 
 def main(dive: str, picture: str) -> None:
@@ -26,7 +26,7 @@ def main(dive: str, picture: str) -> None:
     covered = shown.alpha > 0.5
     depths = np.percentile(shown.range[covered], (5, 50, 95)).round(2)
     print(f"{covered.mean():.0%} of the picture is covered by the map")
-    print(f"ranges, 5th, 50th and 95th percentile: {depths} map units")
+    print(f"ranges, 5th, 50th and 95th percentile: {depths} {scene.unit}")
     both = np.hstack([shown.image, shown.clean]).clip(0.0, 1.0)
     cv2.imwrite(picture, (255.0 * both[..., ::-1]).round().astype(np.uint8))
 

@@ -23,11 +23,11 @@ def main(dive_folder: str, truth_file: str, plot: str) -> None:
     sub_maps = dive.sub_map_of_pose
     ours = dive.trajectory.select(sub_maps == np.bincount(sub_maps).argmax())
     of_ours, of_truth = associate(ours.t_s, truth.t_s)
-    # One camera knows no metres, so the map is scaled to the truth (Sim(3) alignment).
+    # One camera knows no metres, so the path is scaled to the truth (Sim(3) alignment).
     found = align(ours.positions[of_ours], truth.positions[of_truth], with_scale=True)
     aligned = ours.select(of_ours).transformed(found.T_target_source).positions
     error_m = np.linalg.norm(aligned - truth.positions[of_truth], axis=1)
-    print(f"1 map unit is {found.T_target_source.scale:.3f} m")
+    print(f"a length of 1 in {dive.unit} is {found.T_target_source.scale:.3f} m of the truth")
     print(f"absolute trajectory error: {np.sqrt((error_m**2).mean()):.4f} m RMS")
 
     figure, (path, errors) = plt.subplots(1, 2, figsize=(10.0, 4.0), layout="constrained")

@@ -29,7 +29,7 @@ def main(dive_folder: str, picture: str) -> None:
     file = sorted(Path(dive_folder, "heldout").glob("*_real.png"))[0]
     seen = cv2.imread(str(file)).astype(np.float32)[..., ::-1] / 255.0
     with np.load(str(file).replace("_real.png", "_range.npz")) as arrays:
-        z = arrays["z"]  # [H, W] map units, 0 where the map is not solid
+        z = arrays["z"]  # [H, W] in the unit of the medium, 0 where the map is not solid
 
     # I = J exp(-beta_a z) + B(z), solved for J
     transmission, backscatter = dive.medium.transmission(z), dive.medium.backscatter(z)
@@ -37,7 +37,7 @@ def main(dive_folder: str, picture: str) -> None:
     known = (z > 0.0)[..., None] & (transmission > LEAST_LIGHT)
     restored = np.where(known, clean, seen).clip(0.0, 1.0)
     share = (backscatter / np.maximum(seen, 1e-3))[z > 0.0].mean(axis=0)
-    print(f"attenuation, red green blue: {np.round(dive.medium.beta_a, 3)} per map unit")
+    print(f"attenuation, red green blue: {np.round(dive.medium.beta_a, 3)} per {dive.unit}")
     print(f"backscatter is {share.clip(0.0, 1.0).round(2)} of what the camera saw")
     both = np.hstack([seen, restored])
     cv2.imwrite(picture, (255.0 * both[..., ::-1]).round().astype(np.uint8))

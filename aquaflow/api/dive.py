@@ -14,6 +14,10 @@ from aquaflow.dive.frames_csv import FrameRow, read_rows
 from aquaflow.evaluation.dive_files import read_metrics, rows_of_poses
 from aquaflow.evaluation.medium import read_recovered
 from aquaflow.evaluation.trajectory import Trajectory, read_tum
+from aquaflow.export.trajectory_csv import NAME as TRAJECTORY_CSV
+from aquaflow.export.trajectory_csv import PoseRow, read_trajectory_csv
+from aquaflow.fusion.metric_file import read_metric_file
+from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.synthetic.water import Medium
 
@@ -22,30 +26,47 @@ from aquaflow.synthetic.water import Medium
 class Dive:
     """What is in a dive folder.
 
-    The world is the camera of the first keyframe: x right, y down, z forward. The unit of length is
-    the map unit, the median depth of that keyframe; one camera cannot know metres. Sub-maps that
-    never met share neither origin nor unit.
+    Where telemetry gave metres and gravity, the world is n: x to north or along the initial
+    heading, y to the right of it, z down, metres. Else it is the camera of the first keyframe (x
+    right, y down, z forward), and the unit of length is the map unit, the median depth of that
+    keyframe; such sub-maps share neither origin nor unit unless they met.
     """
 
     path: Path
     frames: list[FrameRow]
     """Every frame of the recording that was asked for, in the recording's order."""
     trajectory: Trajectory
-    """P poses, camera to world: positions in map units, times in s since the first frame."""
+    """P poses, camera to world: positions in ``unit``, times in s since the first frame."""
     frame_of_pose: npt.NDArray[np.intp]
     """[P] number of each pose's row in ``frames``."""
     camera: CameraModel
     """The pinhole camera of the mapped pictures, pixels."""
     medium: Medium | None
-    """The water of the largest sub-map, with rates per map unit; None if none is modelled."""
+    """The water of the largest sub-map, with rates per ``unit``; None if none is modelled."""
     metrics: dict[str, Any]
     """``metrics.json``: counts, quality on held-out frames, times in ms, memory in MB."""
+    metric_frames: dict[int, MetricFrame]
+    """By sub-map: what its world is, how well that is known, and from which telemetry; empty for a
+    dive that was mapped by an older AquaFlow."""
+
+    @property
+    def unit(self) -> str:
+        """Of lengths in the largest sub-map: ``m`` or ``map units``."""
+        return str(self.metrics.get("unit", MetricFrame.unknown().unit))
 
     @property
     def sub_map_of_pose(self) -> npt.NDArray[np.intp]:
         """[P] number of the sub-map that each pose belongs to; -1 where the table has none."""
         numbers = [self.frames[row].sub_map for row in self.frame_of_pose]
         return np.array([-1 if number is None else number for number in numbers], np.intp)
+
+    def navigation(self) -> list[PoseRow]:
+        """Each pose with what telemetry says of it: UTC, depth, attitude, place on the earth.
+
+        Raises:
+            InputError: ``trajectory.csv`` is missing, as in dives of an older AquaFlow, or damaged.
+        """
+        return read_trajectory_csv(self.path / TRAJECTORY_CSV)
 
     def __len__(self) -> int:
         """Number of frames, posed or not."""
@@ -74,4 +95,5 @@ def read_dive(path: str | os.PathLike[str]) -> Dive:
         camera=load_camera(folder / "camera.yaml"),
         medium=medium if active else None,
         metrics=read_metrics(folder),
+        metric_frames=read_metric_file(folder),
     )

@@ -13,6 +13,8 @@ import torch
 from aquaflow.errors import InputError
 from aquaflow.export.map_file import SUFFIX, read_map_file
 from aquaflow.export.ply import PlyGaussians
+from aquaflow.fusion.metric_file import read_frame_of_map
+from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.gaussians.gaussians import radiance
@@ -36,7 +38,7 @@ class MappedView:
     camera: CameraModel
     """Pixels."""
     T_wc: Sim3
-    """Camera to world, map units; camera axes x right, y down, z forward."""
+    """Camera to world, rigid, in the map's unit; camera axes x right, y down, z forward."""
 
 
 @dataclass(frozen=True)
@@ -50,19 +52,34 @@ class Picture:
     alpha: FloatImage
     """[H, W] in [0, 1]: how much of each pixel the map covers."""
     range: FloatImage
-    """[H, W] along the ray, map units; meaningless where ``alpha`` is near 0."""
+    """[H, W] along the ray, in the map's unit; meaningless where ``alpha`` is near 0."""
 
 
 class Map:
-    """The map of one sub-map; read it with :func:`load_map`."""
+    """The map of one sub-map; read it with :func:`load_map`.
 
-    def __init__(self, mapper: Mapper) -> None:
+    World and unit of length are those of the dive's other files: n and metres where telemetry gave
+    them, else the first keyframe's camera and map units.
+    """
+
+    def __init__(self, mapper: Mapper, metric_frame: MetricFrame | None = None) -> None:
         self._mapper = mapper
+        self.metric_frame = metric_frame or MetricFrame.unknown()
+        """What the world is, how well that is known, and from which telemetry."""
         self.views: list[MappedView] = [
-            MappedView(view.frame_index, view.keyframe, view.camera, view.T_wc)
+            MappedView(view.frame_index, view.keyframe, view.camera, self._posed(view.T_wc))
             for view in in_time(mapper.views)
         ]
         """The mapped frames in the order of the recording."""
+
+    @property
+    def unit(self) -> str:
+        """Of lengths: ``m`` or ``map units``."""
+        return self.metric_frame.unit
+
+    def _posed(self, T_mc: Sim3) -> Sim3:
+        T_nc = self.metric_frame.pose(T_mc)
+        return Sim3(T_nc.R, T_nc.t)
 
     def __len__(self) -> int:
         """Number of Gaussians."""
@@ -70,42 +87,44 @@ class Map:
 
     @property
     def gaussians(self) -> PlyGaussians:
-        """Copies of all Gaussians: world frame, map units, colours without water.
+        """Copies of all Gaussians: world frame, the map's unit, colours without water.
 
         With a decoder, each Gaussian as the mapped view nearest to it sees it.
         """
         with torch.no_grad():
             plain = self._mapper.scene.baked(self._mapper.views)
-            return PlyGaussians(
+            splats = PlyGaussians(
                 means=plain["means"].numpy().copy(),
                 wxyz=torch.nn.functional.normalize(plain["quats"], dim=-1).numpy().copy(),
                 scales=torch.exp(plain["log_scales"]).numpy(),
                 opacities=torch.sigmoid(plain["opacity_logits"][:, 0]).numpy(),
                 colours=radiance(plain["raw_colours"]).numpy(),
             )
+        frame = self.metric_frame
+        return splats if frame.is_identity else splats.transformed(frame.T_nm)
 
     @property
     def medium(self) -> Medium | None:
-        """The water, mean over the views, with rates per map unit; None if none is modelled."""
+        """The water, mean over the views, with rates per unit; None if none is modelled."""
         with torch.no_grad():
             waters = [w for view in self._mapper.views if (w := self._mapper.scene.water(view))]
         if not waters:
             return None
-        first = waters[0]
+        first, scale = waters[0], self.metric_frame.T_nm.scale
         beta_a = torch.stack([water.beta_a for water in waters]).mean(0)
         return Medium(
-            beta_a=_rgb(beta_a),
-            b=_rgb(first.b),
+            beta_a=_rgb(beta_a / scale),
+            b=_rgb(first.b / scale),
             B_inf=_rgb(first.B_inf),
             B_res=_rgb(first.B_res),
-            d=_rgb(first.d),
+            d=_rgb(first.d / scale),
         )
 
     def render(self, T_wc: Sim3, camera: CameraModel | None = None) -> Picture:
         """The map as a camera at ``T_wc`` sees it.
 
         Args:
-            T_wc: camera to world, map units.
+            T_wc: camera to world, in the map's unit.
             camera: a pinhole camera; distortion is not drawn. The first view's if None is given.
 
         Raises:
@@ -115,13 +134,15 @@ class Map:
             if not self.views:
                 raise InputError("the map has no views; give a camera")
             camera = self.views[0].camera
-        view = View(0, NO_PIXELS, camera, T_wc, keyframe=0, robust=False)
+        T_nm = self.metric_frame.T_nm
+        T_mc = T_wc if self.metric_frame.is_identity else T_nm.inverse() @ T_wc
+        view = View(0, NO_PIXELS, camera, T_mc, keyframe=0, robust=False)
         shown = self._mapper.show(view)
         return Picture(
             image=shown.image.clamp(0.0, 1.0).numpy(),
             clean=shown.radiance.numpy(),
             alpha=shown.alpha.numpy(),
-            range=shown.z.numpy(),
+            range=(shown.z * T_nm.scale).numpy(),
         )
 
 
@@ -139,13 +160,14 @@ def load_map(
         threads: of the CPU kernels; as many as torch has if None.
 
     Raises:
-        InputError: the file is not there, damaged, or of a newer AquaFlow.
+        InputError: the file, or the dive's metric.json, is damaged or of a newer AquaFlow; or the
+            file is not there.
         AquaFlowError: a renderer asked for by name cannot run here.
     """
     file = Path(path)
     if file.is_dir():
         file /= f"map{SUFFIX}"
-    return Map(read_map_file(file, select_renderer(renderer, threads)))
+    return Map(read_map_file(file, select_renderer(renderer, threads)), read_frame_of_map(file))
 
 
 def _rgb(

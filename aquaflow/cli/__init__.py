@@ -15,7 +15,7 @@ import typer
 
 from aquaflow import __version__
 from aquaflow.cli.bench import register as register_bench
-from aquaflow.cli.console import Json, progress_bars
+from aquaflow.cli.console import Json, progress_bars, unit_in_words
 from aquaflow.cli.devices import register as register_devices
 from aquaflow.cli.export import register as register_export
 from aquaflow.cli.prior import register as register_prior
@@ -255,6 +255,8 @@ def _print_summary(finished: Finished) -> None:
         f"{metrics['tracked']} of {metrics['frames']} frames posed, {metrics['keyframes']} "
         f"keyframes, {metrics['gaussians']} Gaussians, {quality}, {metrics['wall_s']:.0f} s."
     )
+    for line in unit_in_words(metrics):
+        typer.echo(line)
     for note in finished.notes:
         typer.echo(f"Note: {note}.")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -56,6 +56,18 @@ def progress_bars(quiet: bool) -> Iterator[Any]:
             bars.update(tasks[stage], completed=done, total=total)
 
         yield advance
+
+
+def unit_in_words(metrics: Mapping[str, Any]) -> list[str]:
+    """The unit of the dive's lengths, by its ``metrics.json``; no line without telemetry."""
+    if metrics["unit"] == "m":
+        sigma_pct = 100.0 * metrics["scale_sigma"]
+        return [
+            f"Lengths are metres, +- {sigma_pct:.2g} % (1 sigma), by {metrics['scale_source']}."
+        ]
+    if metrics["telemetry"]:
+        return [f"Lengths are map units; metres: {metrics['scale_source']}."]
+    return []
 
 
 def table_console() -> Console:

@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from aquaflow.cli.console import Json, Seconds, progress_bars, table_console
+from aquaflow.cli.console import (
+    Json,
+    Seconds,
+    progress_bars,
+    table_console,
+    unit_in_words,
+)
 
 if TYPE_CHECKING:
     from aquaflow.config import Config
@@ -189,6 +195,8 @@ def print_finished(finished: Finished | None, as_json: bool) -> None:
         f"{numbers['tracked']} of {numbers['frames']} frames posed, {numbers['keyframes']} "
         f"keyframes, {numbers['gaussians']} Gaussians in {finished.dive}."
     )
+    for line in unit_in_words(numbers):
+        typer.echo(line)
     for note in finished.notes:
         typer.echo(f"Note: {note}.")
     raise typer.Exit(exit_code(finished))

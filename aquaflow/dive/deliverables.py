@@ -11,6 +11,9 @@ from typing import Any
 
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.held_out import HeldOut, examine_held_out, mean_amplification
+from aquaflow.dive.medium_json import medium_json
+from aquaflow.dive.metric_outputs import MetricOutputs, held_out_in, water_in, worlds_in_words
+from aquaflow.dive.path_rows import path_rows
 from aquaflow.dive.report_data import report_data
 from aquaflow.dive.results import (
     WaterSummary,
@@ -19,6 +22,8 @@ from aquaflow.dive.results import (
     summarise_water,
     tracked_poses,
 )
+from aquaflow.export.georeference import GEOREFERENCE, georeference
+from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.messages import CameraModel, Dropped
@@ -36,35 +41,52 @@ class Deliverables:
         slam: Slam,
         results: list[Tracked],
         calibration: CameraModel | None,
+        outputs: MetricOutputs | None = None,
     ) -> None:
-        """``results``: all frames with their final poses; ``calibration``: as given, if any."""
+        """``results``: all frames with their final poses; ``calibration``: as given, if any;
+        ``outputs``: None where nothing but the map is known."""
         self.name, self.folder, self.slam = name, folder, slam
         self.results, self.calibration = results, calibration
+        self.outputs = outputs or MetricOutputs()
         self.held_out: list[HeldOut] = []
-        self.poses: dict[int, Sim3] = tracked_poses(results)
-        """By frame index."""
+        """Ranges in the unit of the largest sub-map's metric frame."""
+        self.poses: dict[int, Sim3] = self._in_n(tracked_poses(results))
+        """T_nc by frame index."""
         self._attempt = slam.failures.attempt
         self._main = largest_sub_map(results)
         self._waters: dict[int, WaterSummary | None] = {}
-        """By sub-map; a sub-map whose summary failed is missing."""
+        """By sub-map, in map units; a sub-map whose summary failed is missing."""
+
+    @property
+    def metric_frame(self) -> MetricFrame:
+        """Of the largest sub-map."""
+        return self.outputs.frame(self._main)
+
+    def _in_n(self, poses: dict[int, Sim3]) -> dict[int, Sim3]:
+        sub_maps = {tracked.frame.index: tracked.sub_map for tracked in self.results}
+        return {index: self.outputs.frame(sub_maps[index]).pose(T) for index, T in poses.items()}
 
     def evaluate(self) -> None:
         """Poses as the map refined them, held-out views, and the water of each sub-map."""
         attempt = self._attempt
         refined = attempt("refined poses", lambda: refined_poses(self.slam, self.results))
-        self.poses = self.poses if refined is None else refined
+        self.poses = self.poses if refined is None else self._in_n(refined)
         held_out = attempt("evaluation", lambda: examine_held_out(self.slam, self._main))
-        self.held_out = [] if held_out is None else held_out
+        scale = self.metric_frame.T_nm.scale
+        self.held_out = [held_out_in(example, scale) for example in held_out or ()]
         for sub_map, mapper in self.slam.mappers.items():
             attempt("water summary", partial(self._summarise_water, sub_map, mapper))
 
     def _summarise_water(self, sub_map: int, mapper: Mapper) -> None:
         self._waters[sub_map] = summarise_water(mapper)
 
-    def write(self, scale_source: str) -> None:
+    def write(self) -> None:
         """Everything but the report and metrics.json."""
         attempt, folder = self._attempt, self.folder
         attempt("writing trajectory.tum", self._write_trajectory)
+        attempt("writing trajectory.csv", self._write_path_table)
+        attempt("writing metric.json", self._write_metric_file)
+        attempt("writing georeference.json", self._write_georeference)
         camera = self.slam.tracker.camera
         if camera is not None:
             write = partial(folder.write_cameras, camera, self.calibration)
@@ -73,25 +95,46 @@ class Deliverables:
             self._write_map(sub_map)
         attempt("writing held-out views", partial(folder.write_held_out, self.held_out))
         if self._main in self._waters or not self.slam.mappers:
-            attempt("writing medium.json", partial(self._write_medium, scale_source))
+            attempt("writing medium.json", self._write_medium)
 
     def _write_trajectory(self) -> None:
         times = {tracked.frame.index: tracked.frame.t_ns * 1e-9 for tracked in self.results}
-        self.folder.write_trajectory([times[i] for i in self.poses], list(self.poses.values()))
+        sub_maps = sorted({t.sub_map for t in self.results if t.frame.index in self.poses})
+        comment = worlds_in_words({number: self.outputs.frame(number) for number in sub_maps})
+        self.folder.write_trajectory(
+            [times[i] for i in self.poses], list(self.poses.values()), comment
+        )
 
-    def _write_medium(self, scale_source: str) -> None:
+    def _write_path_table(self) -> None:
+        self.folder.write_path_table(path_rows(self.outputs, self.results, self.poses))
+
+    def _write_metric_file(self) -> None:
+        self.folder.write_metric_frames(self.outputs.frames, self._main)
+
+    def _write_georeference(self) -> None:
+        content = georeference(self.outputs.frames, self._main)
+        if content is not None:
+            self.folder.write_json(GEOREFERENCE, content)
+
+    def _water(self) -> WaterSummary | None:
+        """Of the largest sub-map, in the unit of its metric frame."""
+        water = self._waters.get(self._main)
+        return None if water is None else water_in(water, self.metric_frame.T_nm.scale)
+
+    def _write_medium(self) -> None:
         mapper = self.slam.mappers.get(self._main)
         evidence = None if mapper is None else mapper.scene.water_evidence
         amplification = mean_amplification(self.held_out)
-        water = self._waters.get(self._main)
-        self.folder.write_medium(water, scale_source, evidence, amplification)
+        content = medium_json(self._water(), self.metric_frame, evidence, amplification)
+        self.folder.write_medium(content)
 
     def _write_map(self, sub_map: int) -> None:
         suffix = "" if sub_map == self._main else f"_{sub_map}"
         mapper, water = self.slam.mappers[sub_map], self._waters.get(sub_map)
+        frame = self.outputs.frame(sub_map)
         for file, write in (
             (f"map{suffix}.aqf", partial(self.folder.write_map, mapper, suffix)),
-            (f"map{suffix}.ply", partial(self.folder.write_splats, mapper, water, suffix)),
+            (f"map{suffix}.ply", partial(self.folder.write_splats, mapper, water, frame, suffix)),
         ):
             self._attempt(f"writing {file}", write)
 
@@ -101,11 +144,11 @@ class Deliverables:
         """report.html, with the ``numbers`` of metrics.json."""
 
         def write() -> None:
-            water = self._waters.get(self._main)
             self.folder.write_report(
                 report_data(
-                    self.name, self.slam, self.results, dropped, self.poses, self.held_out, water,
-                    numbers, notes, calibrated=self.calibration is not None,
+                    self.name, self.slam, self.results, dropped, self.poses, self.held_out,
+                    self._water(), self.outputs, numbers, notes,
+                    calibrated=self.calibration is not None,
                 )
             )  # fmt: skip
 

@@ -24,8 +24,12 @@ from aquaflow.export.map_file import write_map_file
 from aquaflow.export.ply import PlyGaussians, write_ply
 from aquaflow.export.png import write_png
 from aquaflow.export.report import ReportData, write_report
+from aquaflow.export.trajectory_csv import NAME as PATH_TABLE
+from aquaflow.export.trajectory_csv import PoseRow, write_trajectory_csv
 from aquaflow.export.tum import write_tum
 from aquaflow.fusion.known_lengths.known_lengths_file import FILE as KNOWN_LENGTHS
+from aquaflow.fusion.metric_file import write_metric_file
+from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.gaussians.gaussians import radiance
@@ -44,7 +48,8 @@ TRACE = "trace.json"
 RESULTS = (
     *("trajectory.tum", "camera.yaml", "calibration.yaml", "map*.ply", "map*.aqf", "medium.json"),
     *("metrics.json", "report.html", "heldout/*.png", "heldout/*.npz", TRACE),
-    *("restored/*.png", KNOWN_LENGTHS),
+    KNOWN_LENGTHS,
+    *("metric.json", "trajectory.csv", "georeference.json", "restored/*.png"),
 )
 """What a run writes at its end; of an earlier run in the same folder nothing must remain."""
 
@@ -157,17 +162,24 @@ class DiveFolder:
             stream.write(header().encode("utf-8"))
             stream.write(lines)
 
-    def write_trajectory(self, t_s: list[float], poses: list[Sim3]) -> None:
-        """trajectory.tum: every frame that has a pose."""
+    def write_trajectory(self, t_s: list[float], poses: list[Sim3], comment: str = "") -> None:
+        """trajectory.tum: every frame that has a pose; ``comment``: what the world is."""
         order = np.argsort(t_s, kind="stable")
         write_tum(
             self.path / "trajectory.tum",
             np.array([t_s[i] for i in order]),
             np.array([poses[i].t for i in order]).reshape(-1, 3),
             np.array([poses[i].quaternion for i in order]).reshape(-1, 4),
-            comment="camera to world; world is the first keyframe's camera (x right, y down, "
-            "z forward); scale: see scale_source in metrics.json",
+            comment=comment,
         )
+
+    def write_path_table(self, rows: Sequence[PoseRow]) -> None:
+        """trajectory.csv."""
+        write_trajectory_csv(self.path / PATH_TABLE, rows)
+
+    def write_metric_frames(self, frames: Mapping[int, MetricFrame], main: int) -> None:
+        """metric.json; ``main`` is the largest sub-map."""
+        write_metric_file(self.path, frames, main)
 
     def write_cameras(self, mapped: CameraModel, calibration: CameraModel | None) -> None:
         """camera.yaml: the pinhole camera of the mapped pictures; calibration.yaml: the one that
@@ -180,9 +192,14 @@ class DiveFolder:
         """map.aqf: the exact map."""
         write_map_file(self.path / f"map{suffix}.aqf", mapper)
 
-    def write_splats(self, mapper: Mapper, water: WaterSummary | None, suffix: str = "") -> None:
-        """map.ply as seen through water at the median range, map_clear.ply without water; where
-        there is a decoder, each Gaussian as the mapped view nearest to it sees it."""
+    def write_splats(
+        self, mapper: Mapper, water: WaterSummary | None, frame: MetricFrame, suffix: str = ""
+    ) -> None:
+        """map.ply as seen through water at the median range, map_clear.ply without water, both in
+        ``frame``; where there is a decoder, each Gaussian as the mapped view nearest to it sees it.
+
+        ``water``: in map units.
+        """
         with torch.no_grad():
             plain = mapper.scene.baked(mapper.views)
             clear = radiance(plain["raw_colours"])
@@ -193,53 +210,14 @@ class DiveFolder:
                 seen = clear * medium.transmission(z) + medium.backscatter(z)
                 clear = clear * torch.tensor(water.white_gain)
             for name, colours in (("map", seen), ("map_clear", clear)):
-                write_ply(self.path / f"{name}{suffix}.ply", _splats(plain, colours))
+                splats = _splats(plain, colours)
+                if not frame.is_identity:
+                    splats = splats.transformed(frame.T_nm)
+                write_ply(self.path / f"{name}{suffix}.ply", splats)
 
-    def write_medium(
-        self,
-        water: WaterSummary | None,
-        scale_source: str,
-        evidence: float | None = None,
-        amplification: tuple[list[float], list[float]] | None = None,
-    ) -> None:
-        """medium.json: parameters, their units, and the range at which map.ply is shown.
-
-        ``evidence``: log odds of water against clear water or none, before the prior's 5 are added.
-        ``amplification``: of held-out views, see :func:`aquaflow.dive.held_out.mean_amplification`.
-        """
-        data: dict[str, Any] = {"active": water is not None, "scale_source": scale_source}
-        data["evidence"] = evidence
-        if water is not None:
-            data |= {
-                "attenuation_per_unit": water.beta_a,
-                "attenuation_unit": "1/map unit",
-                "backscatter": {
-                    "B_inf": water.B_inf, "b": water.b, "B_res": water.B_res, "d": water.d,
-                },
-                "attenuation_relative_sigma": water.beta_a_sigma,
-                "identifiable": water.beta_a_sigma is not None,
-                "restored": {
-                    "gain": water.white_gain,
-                    "white_balance": "as the camera saw what was at near_range",
-                    "near_range": water.near_range,
-                    "amplification": amplification
-                    and dict(zip(("applied", "allowed"), amplification, strict=True)),
-                },
-                "colour_variance_over_range": water.range_variance
-                and dict(zip(("seen", "restored"), water.range_variance, strict=True)),
-                "shading_log_gain": water.shading,
-                "backscatter_log_gain": water.unevenness,
-                "log_gain_terms": ["x", "y", "x^2", "x y", "y^2"],
-                "units": {
-                    "attenuation, b, d": "1/map unit",
-                    "B_inf, B_res": "share of the camera's full scale",
-                    "log gains": "natural logarithm; x and y run from -1 to 1 over the picture",
-                },
-                "range_p5": water.range_p5,
-                "range_p95": water.range_p95,
-                "map_ply_reference_range": water.range_median,
-            }  # fmt: skip
-        self.write_json("medium.json", data)
+    def write_medium(self, content: dict[str, Any]) -> None:
+        """medium.json: the water, see :func:`aquaflow.dive.medium_json.medium_json`."""
+        self.write_json("medium.json", content)
 
     def write_held_out(self, examples: list[HeldOut]) -> None:
         """heldout/: what the camera saw, also without its water and how much of that is restored,

@@ -37,7 +37,8 @@ class HeldOut:
     ssim: float
     lpips: float | None
     z: npt.NDArray[np.float32] | None = None
-    """[H, W] rendered range, map units; 0 where the map is not solid."""
+    """[H, W] rendered range, 0 where the map is not solid; map units unless something else is
+    said."""
     confidence: npt.NDArray[np.uint8] | None = None
     """[H, W] 0 to 255, the share of ``restored`` that is the picture's (see RestoredPicture)."""
     amplification: npt.NDArray[np.float32] | None = None

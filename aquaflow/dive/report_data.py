@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 
 from aquaflow.dive.held_out import HeldOut
-from aquaflow.dive.results import WaterSummary
+from aquaflow.dive.measures import measures
+from aquaflow.dive.metric_outputs import MetricOutputs
+from aquaflow.dive.results import WaterSummary, largest_sub_map
 from aquaflow.export.report import (
     CameraSummary,
     HeldOutExample,
@@ -32,19 +34,23 @@ def report_data(
     poses: dict[int, Sim3],
     held_out: list[HeldOut],
     water: WaterSummary | None,
+    outputs: MetricOutputs,
     metrics: dict[str, Any],
     notes: list[str],
     calibrated: bool,
 ) -> ReportData:
-    """Everything the report shows."""
+    """Everything the report shows; ``poses`` are T_nc, held-out ranges and water in n's unit."""
+    frame = outputs.frame(largest_sub_map(results))
+    path = _path(results, poses, outputs)
     return ReportData(
         name=name,
         camera=_camera(slam, calibrated),
         metrics=metrics,
-        path=_path(results, poses),
+        path=path,
+        measures=measures(path, frame, water),
         timeline=_timeline(results, dropped),
         examples=_examples(held_out),
-        medium=_curves(water),
+        medium=_curves(water, frame.unit),
         stages=metrics["stage_ms"],
         warnings=metrics["warnings"],
         notes=notes,
@@ -58,15 +64,22 @@ def _camera(slam: Slam, calibrated: bool) -> CameraSummary:
     return CameraSummary(camera.width, camera.height, camera.fx, source)  # type: ignore[arg-type]
 
 
-def _path(results: list[Tracked], poses: dict[int, Sim3]) -> PathPlot:
+def _path(results: list[Tracked], poses: dict[int, Sim3], outputs: MetricOutputs) -> PathPlot:
     posed = sorted(
         (tracked for tracked in results if tracked.T_wc is not None),
         key=lambda tracked: tracked.frame.index,
     )
+    frame = outputs.frame(largest_sub_map(results))
+    frames = [outputs.frame(sub_map) for sub_map in {tracked.sub_map for tracked in posed}]
+    level = bool(frames) and all(each.level for each in frames)
     return PathPlot(
         np.array([poses[tracked.frame.index].t for tracked in posed]),
         [tracked.frame_class.value for tracked in posed],
         [tracked.sub_map for tracked in posed],
+        unit=frame.unit,
+        up=frame.north if level else "",
+        depth_known=frame.depth_known,
+        placed=level and all(each.metric for each in frames),
     )
 
 
@@ -95,7 +108,7 @@ def _examples(held_out: list[HeldOut]) -> list[HeldOutExample]:
     ]
 
 
-def _curves(water: WaterSummary | None) -> MediumCurves | None:
+def _curves(water: WaterSummary | None, unit: str) -> MediumCurves | None:
     if water is None:
         return None
     return MediumCurves(
@@ -106,6 +119,7 @@ def _curves(water: WaterSummary | None) -> MediumCurves | None:
         d=_rgb(water.d),
         range_p5=water.range_p5,
         range_p95=water.range_p95,
+        unit=unit,
     )
 
 

@@ -32,16 +32,14 @@ PROTOCOL = {
 }
 """How the numbers of metrics.json were measured."""
 
-SCALE_SOURCE = "none: the median depth of the first keyframe is 1 map unit"
-"""One camera knows no metres: every start is scaled to median depth 1 (see initialisation)."""
-
 RANGE_PERCENTILES = (5.0, 95.0)
 """Percent; values outside are single pixels at edges of the map."""
 
 
 @dataclass(frozen=True)
 class WaterSummary:
-    """The medium of one sub-map, mean over its views; rates per map unit."""
+    """The medium of one sub-map, mean over its views; rates and ranges in one unit of length, that
+    of the map unless something else is said."""
 
     beta_a: list[float]
     b: list[float]
@@ -169,7 +167,6 @@ def metrics(
         "ate_rmse_m_se3": None,
         "ate_rmse_m_sim3": None,
         "rpe": None,
-        "scale_source": SCALE_SOURCE,
         "renderer": f"{slam.renderer.name} ({slam.renderer.isa}, {slam.renderer.threads} threads)",
         "prior": slam.prior.name,
         "device": "cuda" if slam.renderer.isa == "cuda" else "cpu",

@@ -16,8 +16,13 @@ from aquaflow.dive import calibration_findings
 from aquaflow.dive.deliverables import Deliverables
 from aquaflow.dive.folder import TRACE, DiveFolder
 from aquaflow.dive.frames_csv import FrameRow
-from aquaflow.dive.held_out import HeldOut
-from aquaflow.dive.results import SCALE_SOURCE, metrics
+from aquaflow.dive.metric_outputs import (
+    MetricOutputs,
+    Navigation,
+    frame_numbers,
+    sub_maps_in_words,
+)
+from aquaflow.dive.results import metrics
 from aquaflow.dive.shortcomings import shortcomings
 from aquaflow.errors import InputError, NotMappedError
 from aquaflow.mapping.maps import MIN_VIEWS, Progress
@@ -66,6 +71,8 @@ class DiveRun:
         self.config = config
         self.lens_error: LensError | None = None
         """Result of the calibration check, if a calibration was given; known at the end."""
+        self.navigation = Navigation()
+        """What the vehicle measured by the time of a frame; read at the end of the dive."""
         self.live: dict[str, Any] | None = None
         """Counters of a live run for metrics.json."""
         self.started = time.monotonic()
@@ -167,15 +174,21 @@ class DiveRun:
         attempt = self.slam.failures.attempt
         self.decide(self.slam.finish(progress))
         with self.profiler.stage("write"):
-            results = self.results
-            self._note_what_was_left_out(results, notes)
+            results, outputs = self.results, self._metric_outputs()
+            self._note_what_was_left_out(results, notes, outputs)
             sub_maps = {t.frame.index: t.sub_map for t in results if t.T_wc}
             attempt("writing frames.csv", partial(self.folder.write_frames, sub_maps))
         if sum(tracked.T_wc is not None for tracked in results) < MIN_VIEWS:
             raise NotMappedError(self._why_not(len(results)))
-        return self._write(results)
+        return self._write(results, outputs)
 
-    def _note_what_was_left_out(self, results: list[Tracked], notes: list[str]) -> None:
+    def _metric_outputs(self) -> MetricOutputs:
+        frames = self.slam.failures.attempt("metric frames", self.slam.metric_frames)
+        return MetricOutputs(frames or {}, self.navigation)
+
+    def _note_what_was_left_out(
+        self, results: list[Tracked], notes: list[str], outputs: MetricOutputs
+    ) -> None:
         self.notes += notes
         lost = sum(tracked.T_wc is None for tracked in results)
         if lost:
@@ -183,8 +196,8 @@ class DiveRun:
         sub_maps = {tracked.sub_map for tracked in results if tracked.T_wc is not None}
         if len(sub_maps) > 1:
             self.notes.append(
-                f"tracking was lost {len(sub_maps) - 1} times: the dive has {len(sub_maps)} "
-                "sub-maps without a common scale"
+                f"tracking was lost {len(sub_maps) - 1} times: the dive has "
+                f"{sub_maps_in_words([outputs.frame(number) for number in sub_maps])}"
             )
         if self.calibration is None and self.slam.tracker.camera is not None:
             focal, sigma = self.slam.tracker.camera.fx, self.slam.tracker.focal_sigma
@@ -205,19 +218,19 @@ class DiveRun:
             "the camera must move sideways, see frames.csv for each frame"
         )
 
-    def _write(self, results: list[Tracked]) -> Finished:
-        made = Deliverables(self.name, self.folder, self.slam, results, self.calibration)
+    def _write(self, results: list[Tracked], outputs: MetricOutputs) -> Finished:
+        made = Deliverables(self.name, self.folder, self.slam, results, self.calibration, outputs)
         with self.profiler.stage("evaluate"):
             made.evaluate()
         with self.profiler.stage("write"):
-            made.write(SCALE_SOURCE)
+            made.write()
         self._check_calibration()
         with self.profiler.stage("report"):
             self.warnings = self._shortcomings()
-            numbers = self._numbers(results, made.held_out)
+            numbers = self._numbers(results, made)
             notes = self.notes + self.slam.failures.notes()
             made.write_report(self.dropped, numbers, notes)
-        numbers = self._numbers(results, made.held_out)  # the report's own time included
+        numbers = self._numbers(results, made)  # the report's own time included
         attempt, write = self.slam.failures.attempt, self.folder.write_json
         attempt("writing metrics.json", partial(write, "metrics.json", numbers))
         if self._trace:
@@ -251,9 +264,10 @@ class DiveRun:
             return None
         return calibration_findings.to_json(self.lens_error, self.calibration)
 
-    def _numbers(self, results: list[Tracked], held_out: list[HeldOut]) -> dict[str, Any]:
+    def _numbers(self, results: list[Tracked], made: Deliverables) -> dict[str, Any]:
         wall_s = time.monotonic() - self.started
-        numbers = metrics(self.slam, results, self.dropped, held_out, wall_s)
+        numbers = metrics(self.slam, results, self.dropped, made.held_out, wall_s)
+        numbers |= frame_numbers(made.metric_frame)
         numbers["warnings"], numbers["failures"] = self.warnings, self.slam.failures.to_json()
         numbers["calibration_check"] = self._calibration_numbers()
         numbers["cpu_s"] = round(time.process_time() - self._cpu_before_s, 3)  # of all threads

@@ -39,7 +39,8 @@ def read_picture(dive: Path, index: int, kind: Kind) -> tuple[Picture, npt.NDArr
 
 
 def read_range(dive: Path, index: int) -> npt.NDArray[np.float32] | None:
-    """[H, W] range of each pixel in map units, 0 where the map is not solid; None without a file.
+    """[H, W] range of each pixel in the dive's unit, 0 where the map is not solid; None without a
+    file.
 
     Raises:
         InputError: it cannot be read.

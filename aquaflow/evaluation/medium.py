@@ -1,7 +1,7 @@
 """How well the water was recovered: the dive's ``medium.json`` against a synthetic dive's truth.
 
 The water is ``I = J exp(-beta_a z) + B_inf (1 - exp(-b z)) + B_res exp(-d z)`` with the range z.
-A map of unknown scale has its rates per map unit; the trajectory's alignment (truth = scale x map)
+A dive of unknown scale has its rates per map unit; the trajectory's alignment (truth = scale x map)
 takes them to rates per metre.
 """
 

@@ -15,6 +15,7 @@ import numpy as np
 from aquaflow.errors import InputError
 from aquaflow.evaluation import medium as water
 from aquaflow.evaluation.dive_files import EvaluatedDive, read_dive, read_metrics
+from aquaflow.evaluation.metric_error import MetricError, metric_error
 from aquaflow.evaluation.trajectory import ASSOCIATION_TOLERANCE_S, Trajectory, associate
 from aquaflow.evaluation.trajectory_error import (
     TrajectoryError,
@@ -22,6 +23,8 @@ from aquaflow.evaluation.trajectory_error import (
     trajectory_error,
 )
 from aquaflow.evaluation.truth import PositionTable, read_truth
+from aquaflow.fusion.metric_file import read_metric_file
+from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.synthetic.water import load_medium
 
 COPIED_METRICS = ("psnr", "ssim", "lpips", "lpips_reason")
@@ -35,6 +38,8 @@ class Evaluation:
     dive: EvaluatedDive
     error: TrajectoryError
     medium: water.MediumError | None
+    metric: MetricError | None
+    """None for a dive in map units."""
     metrics: dict[str, Any]
     notes: list[str] = field(default_factory=list)
     """Sentences for the reader on what was compared and how."""
@@ -67,6 +72,7 @@ class Evaluation:
                 "translation": sim3.t.tolist(),
                 "collinear": error.sim3.alignment.collinear,
             },
+            "metric": self.metric.to_json() if self.metric else None,
             "medium_error": self.medium.to_json() if self.medium else None,
             **{key: self.metrics.get(key) for key in COPIED_METRICS},
             "notes": self.notes,
@@ -89,12 +95,20 @@ def evaluate_dive(
     estimate = read_dive(dive)
     known = read_truth(truth)
     notes = _notes_on(estimate)
+    estimated, true = estimate.trajectory, None
     if known.trajectory is not None:
-        error = _with_poses(estimate.trajectory, known.trajectory, tolerance_s, truth)
+        estimated, true, path = _paired(estimate.trajectory, known.trajectory, tolerance_s, truth)
+        error = trajectory_error(estimated, true, path)
     else:
         assert known.positions is not None
         error, said = _with_positions(estimate, known.positions, truth)
         notes += said
+    frame = read_metric_file(dive).get(estimate.sub_map, MetricFrame.unknown())
+    scale = error.sim3.alignment.T_target_source.scale
+    level = (estimated, true) if known.z_down and true is not None else None
+    metric = metric_error(frame, scale, error.se3.rmse, level)
+    if metric is not None and true is not None and not known.z_down:
+        notes.append(f"{truth} is taken to be in metres, as the dive is")
     if error.sim3.alignment.collinear:
         notes.append(
             "the path is a straight line, so the turn about it is unknown and absolute rotations "
@@ -102,11 +116,9 @@ def evaluate_dive(
         )
     compared = None
     if known.medium is not None and (dive / "medium.json").is_file():
-        found, active = water.read_recovered(
-            dive / "medium.json", error.sim3.alignment.T_target_source.scale
-        )
+        found, active = water.read_recovered(dive / "medium.json", scale)
         compared = water.compare_medium(found, load_medium(known.medium), active=active)
-    return Evaluation(estimate, error, compared, read_metrics(dive), notes)
+    return Evaluation(estimate, error, compared, metric, read_metrics(dive), notes)
 
 
 def _notes_on(dive: EvaluatedDive) -> list[str]:
@@ -118,10 +130,10 @@ def _notes_on(dive: EvaluatedDive) -> list[str]:
     ]
 
 
-def _with_poses(
+def _paired(
     estimate: Trajectory, truth: Trajectory, tolerance_s: float, source: Path
-) -> TrajectoryError:
-    """Errors over the poses of the same moment."""
+) -> tuple[Trajectory, Trajectory, float]:
+    """The poses of the same moments, and the length of the true path."""
     ours, theirs = associate(estimate.t_s, truth.t_s, tolerance_s)
     if len(ours) == 0:
         raise InputError(
@@ -132,7 +144,7 @@ def _with_poses(
     # The path between the first and the last common pose, with the truth's poses in between:
     # leaving them out would cut corners.
     path = truth.select(np.arange(theirs[0], theirs[-1] + 1)).path_length
-    return trajectory_error(estimate.select(ours), truth.select(theirs), path)
+    return estimate.select(ours), truth.select(theirs), path
 
 
 def _with_positions(

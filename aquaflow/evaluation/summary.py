@@ -18,6 +18,7 @@ def in_words(result: Values) -> list[str]:
     lines: list[str] = []
     if "posed" in result:
         lines += _trajectory(result)
+        lines += _metric(result)
         lines += _views(result)
     if result.get("medium_error"):
         lines += _water(result["medium_error"])
@@ -53,6 +54,34 @@ def _trajectory(result: Values) -> list[str]:
         moved, turned = relative["translation_pct"], relative["rotation_rmse_deg"]
         lines.append(_row("pose to pose (RPE)", f"{moved:.3g} % of the step, {turned:.3g} degrees"))
     return lines
+
+
+def _metric(result: Values) -> list[str]:
+    """Metres, gravity and north of the dive as it states them."""
+    metric = result.get("metric")
+    if metric is None:
+        return []
+    lines = [
+        "Metres, gravity and north as the dive states them",
+        _row("scale error", _stated(metric, "scale", "pct", "%")),
+    ]
+    if metric["gravity_error_deg"] is not None:
+        lines.append(_row("gravity error", _stated(metric, "gravity", "deg", "degrees")))
+    if metric["heading_error_deg"] is not None:
+        lines.append(_row("heading error", _stated(metric, "heading", "deg", "degrees")))
+    if metric["ate_rmse_m_level"] is not None:
+        said = f"{metric['ate_rmse_m_level']:.4g} m rms, only turned about the vertical and shifted"
+        lines.append(_row("error, level", said))
+    return lines
+
+
+def _stated(metric: Values, what: str, unit: str, word: str) -> str:
+    """An error with its stated sigma, and how many of them it is."""
+    said = f"{metric[f'{what}_error_{unit}']:.3g} {word}"
+    sigma, sigmas = metric[f"{what}_sigma_{unit}"], metric[f"{what}_error_sigmas"]
+    if sigmas is None:
+        return said
+    return f"{said}, {abs(sigmas):.2g} times its stated sigma of {sigma:.3g}"
 
 
 def _views(result: Values) -> list[str]:

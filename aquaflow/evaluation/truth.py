@@ -14,6 +14,7 @@ from aquaflow.evaluation.trajectory import Trajectory, read_tum
 
 SYNTHETIC_POSES = "poses.tum"
 SYNTHETIC_MEDIUM = "medium.yaml"
+SYNTHETIC_FACTS = "synth.yaml"
 """Files of a synthetic dive."""
 POSITION_COLUMNS = ("file", "easting_m", "northing_m")
 """Of a survey's table of positions; metres in a projected grid such as UTM."""
@@ -36,6 +37,8 @@ class GroundTruth:
     positions: PositionTable | None
     medium: Path | None
     """A synthetic dive's medium file, if there is one."""
+    z_down: bool = False
+    """True if the poses are those of a synthetic dive: in metres, z down."""
 
 
 def read_truth(path: Path) -> GroundTruth:
@@ -47,7 +50,8 @@ def read_truth(path: Path) -> GroundTruth:
     if path.is_dir():
         medium = path / SYNTHETIC_MEDIUM
         poses = _trajectory_in(path)
-        return GroundTruth(read_tum(poses), None, medium if medium.is_file() else None)
+        known = medium if medium.is_file() else None
+        return GroundTruth(read_tum(poses), None, known, _is_synthetic(poses))
     if not path.is_file():
         raise InputError(
             f"there is no ground truth at {path}; give a TUM file, a CSV of positions or a "
@@ -55,7 +59,11 @@ def read_truth(path: Path) -> GroundTruth:
         )
     if path.suffix.lower() == ".csv":
         return GroundTruth(None, read_positions(path), None)
-    return GroundTruth(read_tum(path), None, None)
+    return GroundTruth(read_tum(path), None, None, _is_synthetic(path))
+
+
+def _is_synthetic(poses: Path) -> bool:
+    return poses.name == SYNTHETIC_POSES and poses.with_name(SYNTHETIC_FACTS).is_file()
 
 
 def _trajectory_in(folder: Path) -> Path:

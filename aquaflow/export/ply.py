@@ -7,7 +7,7 @@ wxyz, colour as the zeroth spherical harmonic.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.errors import InputError
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.storage.atomic import atomic_write
 
 Array = npt.NDArray[np.floating]
@@ -61,6 +62,21 @@ class PlyGaussians:
     """[N] in [0, 1]."""
     colours: Array
     """[N, 3] RGB, usually in [0, 1]."""
+
+    def transformed(self, T: Sim3) -> PlyGaussians:
+        """The same Gaussians in the frame that ``T`` maps to; their covariance C becomes
+        s^2 R C R^T. Colours stay: they are the same from every direction (degree 0)."""
+        w, v = T.quaternion[0], T.quaternion[1:]
+        w_each, v_each = self.wxyz[:, :1], self.wxyz[:, 1:]
+        turned = np.hstack(
+            [w * w_each - v_each @ v[:, None], w * v_each + w_each * v + np.cross(v, v_each)]
+        )  # the product of the quaternions: SciPy's refuses zeros, which a file may hold
+        return replace(
+            self,
+            means=T.apply(self.means.astype(np.float64)),
+            wxyz=turned,
+            scales=T.scale * self.scales,
+        )
 
 
 def write_ply(path: Path, splats: PlyGaussians) -> int:

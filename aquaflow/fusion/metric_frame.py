@@ -28,6 +28,8 @@ LARGEST_TILT_SIGMA = np.radians(5.0)
 """1 sigma of gravity's direction, rad, up to which the world is turned level: judgement."""
 UNKNOWN_SIGMA = 1e3
 """1 sigma, in m, rad and log-scale, of a direction that nothing has measured."""
+MAP_UNIT = "the median depth of the first keyframe is 1 map unit"
+"""The unit of length of a map whose scale is unknown (see tracking/initialisation)."""
 
 
 @dataclass(frozen=True)
@@ -79,11 +81,31 @@ class MetricFrame:
     sources: tuple[SourceReport, ...] = ()
 
     @staticmethod
-    def unknown(reason: str = "no telemetry was given", scale_source: str = "") -> MetricFrame:
-        """A map without telemetry: its own unit, the first keyframe's camera axes."""
+    def unknown(reason: str = "") -> MetricFrame:
+        """A map of which telemetry, if there is any, says nothing (``reason``: why): its own unit,
+        the first keyframe's camera axes."""
         covariance = np.diag(np.full(7, UNKNOWN_SIGMA**2))
-        said = scale_source or f"none: {reason}; 1 map unit is the median depth of the start"
+        said = f"none: {reason}; {MAP_UNIT}" if reason else f"none: {MAP_UNIT}"
         return MetricFrame(Sim3.identity(), covariance, scale_source=said)
+
+    @property
+    def is_identity(self) -> bool:
+        """True if n is the sub-map's internal world, number for number."""
+        T = self.T_nm
+        return bool(T.scale == 1.0 and not T.t.any() and (np.eye(3) == T.R).all())
+
+    @property
+    def georeferenced(self) -> bool:
+        """True if every point of n has a latitude and a longitude."""
+        known = self.origin is not None and self.metric and self.level
+        return known and self.north == "true north"
+
+    def pose(self, T_mc: Sim3) -> Sim3:
+        """T_nc of a camera: rigid, as lengths in n have one unit; the same object if n is m."""
+        if self.is_identity:
+            return T_mc
+        T_nc = self.T_nm @ T_mc
+        return Sim3(T_nc.R, T_nc.t)
 
     @property
     def unit(self) -> str:

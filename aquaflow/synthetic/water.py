@@ -38,7 +38,7 @@ BEAM_OVER_DIFFUSE = 2.2
 class Medium:
     """Parameters of the image formation, RGB.
 
-    Lengths are in metres in the truth of a synthetic dive, and in map units in a mapped dive.
+    Lengths are in metres in the truth of a synthetic dive, and in its own unit in a mapped dive.
     """
 
     beta_a: Rgb

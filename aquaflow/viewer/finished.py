@@ -14,6 +14,8 @@ import numpy.typing as npt
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.errors import InputError, reason_of
 from aquaflow.export.ply import read_ply
+from aquaflow.fusion.metric_file import read_frame_of_map
+from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.geometry.similarity import Sim3, rotation_from_quaternion
 from aquaflow.viewer.page import ViewerPage
@@ -35,6 +37,15 @@ class FinishedDive:
     """What the camera saw at each pose, where the dive keeps it."""
     camera: CameraModel
     summary: str
+    level: bool = False
+    """True if z points down, else y does, in the first camera."""
+
+
+def _frame_in_words(frame: MetricFrame) -> str:
+    unit = "Lengths are map units"
+    if frame.metric:
+        unit = f"Lengths are metres, \u00b1 {100.0 * frame.scale_sigma:.2g} %"
+    return f"{unit}; x points to {frame.north}, z down" if frame.level else unit
 
 
 def read_dive(folder: Path, budget: int) -> FinishedDive:
@@ -49,15 +60,19 @@ def read_dive(folder: Path, budget: int) -> FinishedDive:
     poses, times = _poses(folder / "trajectory.tum")
     quality, pictures = _of_frames(folder, times)
     shown = _splats(folder, budget)
-    summary = f"**{folder.name}**\n\n{len(poses)} poses, {len(shown)} of the map's Gaussians"
+    frame = read_frame_of_map(folder / "map.aqf")
+    summary = (
+        f"**{folder.name}**\n\n{len(poses)} poses, {len(shown)} of the map's Gaussians\n\n"
+        f"{_frame_in_words(frame)}"
+    )
     return FinishedDive(
-        shown, poses, quality, pictures, load_camera(folder / "camera.yaml"), summary
+        shown, poses, quality, pictures, load_camera(folder / "camera.yaml"), summary, frame.level
     )
 
 
 def show_dive(dive: FinishedDive, config: ViewerConfig) -> ViewerPage:
     """The viewer's page of ``dive``, with a slider along its path."""
-    page = ViewerPage(config, "AquaFlow")
+    page = ViewerPage(config, "AquaFlow", up="-z" if dive.level else "-y")
     page.show_health(dive.summary)
     page.show_splats(dive.splats)
     page.show_path(np.array([pose.t for pose in dive.poses]).reshape(-1, 3), dive.quality)

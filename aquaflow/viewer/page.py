@@ -6,7 +6,7 @@ import contextlib
 import io
 import socket
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -37,8 +37,8 @@ VIEW_SHARE, RAISED_SHARE = 0.9, 0.25
 class ViewerPage:
     """A page at ``address``; everything shown replaces what was shown before."""
 
-    def __init__(self, config: ViewerConfig, title: str) -> None:
-        """Listen at once.
+    def __init__(self, config: ViewerConfig, title: str, up: Literal["-y", "-z"] = "-y") -> None:
+        """Listen at once; ``up``: of the world, by default the first camera's, whose y points down.
 
         Raises:
             InputError: viser is not installed, or the address is taken.
@@ -56,7 +56,8 @@ class ViewerPage:
         self._size = 1.0
         self._path_middle: Float | None = None
         self._scene = self._server.scene
-        self._scene.set_up_direction("-y")  # the first camera's y points down
+        self._up = np.array([0.0, -1.0, 0.0] if up == "-y" else [0.0, 0.0, -1.0])
+        self._scene.set_up_direction(up)
         self._server.gui.configure_theme(show_logo=False)
         self._panel = self._server.gui.add_markdown("")
         self._shown = self._server.gui.add_dropdown("Colours", tuple(LABELS.values()))
@@ -148,11 +149,11 @@ class ViewerPage:
         middle = np.median(self._splats.centres, axis=0).astype(np.float64)
         back = self._path_middle - middle
         back *= VIEW_SHARE * self._size / max(float(np.linalg.norm(back)), 1e-9)
-        start = middle + back + self._size * np.array([0.0, -RAISED_SHARE, 0.0])
+        start = middle + back + self._size * RAISED_SHARE * self._up
         camera = self._server.initial_camera
         camera.look_at = tuple(float(v) for v in middle)
         camera.position = tuple(float(v) for v in start)
-        camera.up = (0.0, -1.0, 0.0)
+        camera.up = tuple(float(v) for v in self._up)
 
 
 def _free_port() -> int:

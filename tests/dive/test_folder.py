@@ -25,7 +25,8 @@ METRICS = {
     *("frames", "tracked", "lost", "skipped", "keyframes", "mapping_frames", "common_frames"),
     *("gaussians", "wall_s", "fps", "stage_ms", "peak_rss_mb", "psnr", "ssim", "lpips"),
     *("lpips_reason", "heldout_frames", "ate_rmse_m_se3", "ate_rmse_m_sim3", "rpe"),
-    *("scale_source", "renderer", "prior", "device", "seed", "version", "protocol"),
+    *("scale_source", "scale_sigma", "unit", "north", "gravity_sigma_deg", "telemetry"),
+    *("renderer", "prior", "device", "seed", "version", "protocol"),
 }
 """The keys that docs/formats.md#metrics-json promises."""
 
@@ -71,6 +72,8 @@ def test_metrics_have_the_stable_keys_and_agree_with_the_table(small_dive: Path)
     assert metrics["mapping_frames"] == classes.count("mapping")
     assert metrics["common_frames"] == classes.count("common")
     assert metrics["heldout_frames"] == len(HELD_OUT)
+    assert (metrics["unit"], metrics["north"]) == ("map units", "first keyframe")
+    assert metrics["scale_sigma"] is metrics["gravity_sigma_deg"] is None
     for stage in metrics["stage_ms"].values():
         assert stage.keys() == {"count", "total", "p50", "p95"}
 

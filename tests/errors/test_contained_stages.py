@@ -184,6 +184,8 @@ def test_a_progress_bar_that_breaks_does_not_matter(small_recording: Path, tmp_p
 
 WRITERS = {
     "write_trajectory": ("writing trajectory.tum", "trajectory.tum"),
+    "write_path_table": ("writing trajectory.csv", "trajectory.csv"),
+    "write_metric_frames": ("writing metric.json", "metric.json"),
     "write_cameras": ("writing camera.yaml", "camera.yaml"),
     "write_map": ("writing map.aqf", "map.aqf"),
     "write_splats": ("writing map.ply", "map.ply"),
@@ -218,7 +220,7 @@ def test_a_file_that_cannot_be_written_leaves_the_others(
     monkeypatch.setattr(folder, broken, partial(fail))
     made = Deliverables("planted", folder, slam, slam.results(), None)
     made.evaluate()
-    made.write("none")
+    made.write()
     made.write_report([], {"stage_ms": {}, "warnings": []}, slam.failures.notes())
     folder.close()
     stage, missing = WRITERS[broken]

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from aquaflow.errors import InputError
 from aquaflow.export.ply import PROPERTIES, PlyGaussians, read_ply, write_ply
+from aquaflow.geometry.similarity import Sim3
 
 
 def splats(seed: int = 0, count: int = 7) -> PlyGaussians:
@@ -132,3 +134,23 @@ def test_cut_off_map_says_how_much_is_there(tmp_path):
 def test_missing_map_is_one_sentence(tmp_path):
     with pytest.raises(InputError, match="cannot read the map"):
         read_ply(tmp_path / "none.ply")
+
+
+def test_transformed_gaussians_have_the_transformed_covariances():
+    """Against matrices: C' = s^2 R C R^T, built from each Gaussian's own rotation and scales."""
+    before = splats(3)
+    T = Sim3(Rotation.from_rotvec([0.3, 2.0, -0.7]).as_matrix(), np.array([1.0, -2.0, 30.0]), 2.5)
+
+    after = before.transformed(T)
+
+    np.testing.assert_allclose(after.means, 2.5 * before.means @ T.R.T + T.t, atol=1e-12)
+    np.testing.assert_allclose(
+        covariances(after), 2.5**2 * T.R @ covariances(before) @ T.R.T, rtol=1e-10, atol=1e-14
+    )
+    np.testing.assert_array_equal(after.colours, before.colours)
+    np.testing.assert_array_equal(after.opacities, before.opacities)
+
+
+def covariances(splats: PlyGaussians) -> np.ndarray:
+    R = Rotation.from_quat(splats.wxyz, scalar_first=True).as_matrix()
+    return R @ (splats.scales[:, :, None] ** 2 * np.swapaxes(R, 1, 2))

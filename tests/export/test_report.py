@@ -15,12 +15,14 @@ from PIL import Image
 from aquaflow.export.report import (
     CameraSummary,
     HeldOutExample,
+    Measures,
     MediumCurves,
     PathPlot,
     ReportData,
     render_report,
     write_report,
 )
+from aquaflow.fusion.metric_frame import SourceReport
 
 CAMERA = CameraSummary(640, 360, 544.0, "guessed")
 VOID = {"br", "meta", "img", "path", "use", "rect"}
@@ -150,6 +152,45 @@ def test_degenerate_paths_do_not_break_the_report(positions):
     path = PathPlot(positions, ["common"] * len(positions), [0] * len(positions))
 
     assert "The path" in render_report(report(path=path))
+
+
+def test_a_level_path_is_seen_from_above_and_from_the_side():
+    positions = np.cumsum(np.full((10, 3), 0.3), axis=0)
+    path = PathPlot(
+        positions, ["common"] * 10, [0] * 10, unit="m", up="true north", depth_known=True
+    )
+    page = render_report(report(path=path))
+
+    for text in ("seen from above", "From above, true north up", "true north, m", "depth, m"):
+        assert text in page, text
+    assert "Widest view" not in page
+
+
+def test_sub_maps_that_telemetry_placed_are_called_so():
+    path = replace(report().path, placed=True)
+
+    assert "telemetry says how they lie" in render_report(report(path=path))
+
+
+def test_every_source_of_telemetry_is_listed_with_what_became_of_it():
+    sources = [
+        SourceReport("bar30", "depth", 1480, 3),
+        SourceReport("dvl <a50>", "velocity", 0, 0, "no sample in the dive"),
+    ]
+    measures = Measures([("length of the path", "34.2 \u00b1 0.1 m")], sources)
+    page = render_report(report(measures=measures))
+
+    for text in (
+        "<td>length of the path</td><td>34.2 \u00b1 0.1 m</td>",
+        '<td>bar30</td><td>depth</td><td class="n">1,480</td><td class="n">3</td>',
+        "<td>dvl &lt;a50&gt;</td>",
+        "<td>no sample in the dive</td>",
+    ):
+        assert text in page, text
+    assert "No telemetry was used" in render_report(report(measures=Measures([])))
+    parser = Balance()
+    parser.feed(page)
+    assert parser.wrong == []
 
 
 def test_figures_take_the_page_s_colours(page):

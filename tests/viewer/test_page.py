@@ -13,11 +13,13 @@ import pytest
 
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.errors import InputError
+from aquaflow.fusion.metric_file import write_metric_file
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.viewer.finished import read_dive, show_dive
 from aquaflow.viewer.page import ViewerPage
 from aquaflow.viewer.splats import splats
+from tests.metric_scenes import metric_frame
 from tests.small_recording import HEIGHT, WIDTH
 
 pytest.importorskip("viser", reason="viser is not installed")
@@ -69,6 +71,18 @@ def test_a_finished_dive_is_read_with_its_colours_poses_and_pictures(small_dive:
     assert len(dive.poses) == len(dive.quality) == len(dive.pictures)
     kept = [picture for picture in dive.pictures if picture is not None]
     assert len(kept) == len(list((small_dive / "heldout").glob("*_real.png")))
+
+
+def test_a_metric_dive_says_its_unit_and_has_its_z_axis_down(
+    small_dive: Path, tmp_path: Path
+) -> None:
+    assert "map units" in read_dive(small_dive, budget=50).summary
+    dive = tmp_path / "dive"
+    shutil.copytree(small_dive, dive)
+    write_metric_file(dive, {0: metric_frame()}, main=0)
+    shown = read_dive(dive, budget=50)
+    assert "metres, \u00b1 0.4 %; x points to true north, z down" in shown.summary
+    assert shown.level
 
 
 def test_a_damaged_line_of_the_frames_costs_itself(small_dive: Path, tmp_path: Path) -> None:

@@ -13,7 +13,8 @@ from aquaflow.evaluation.water_peers.contract import Ranges
 
 
 def held_out_ranges(dive: Path, indices: Sequence[int], size: tuple[int, int]) -> Ranges | None:
-    """[N, H, W] in map units, 0 where the map is not solid; None if any is missing or damaged.
+    """[N, H, W] in the dive's unit, 0 where the map is not solid; None if any is missing or
+    damaged.
 
     ``size`` is the height and width of the held-out pictures.
     """

@@ -3,6 +3,7 @@
 from aquaflow.export.report.data import (
     CameraSummary,
     HeldOutExample,
+    Measures,
     MediumCurves,
     PathPlot,
     ReportData,
@@ -12,6 +13,7 @@ from aquaflow.export.report.page import render_report, write_report
 __all__ = [
     "CameraSummary",
     "HeldOutExample",
+    "Measures",
     "MediumCurves",
     "PathPlot",
     "ReportData",

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+
+from aquaflow.fusion.metric_frame import SourceReport
 
 FocalSource = Literal["calibrated", "guessed", "refined"]
 
@@ -36,11 +38,26 @@ class PathPlot:
     classes: list[str]
     """[M] ``keyframe``, ``mapping``, ``common`` or ``skipped``."""
     sub_maps: list[int]
-    """[M] sub-map of each pose; poses of different sub-maps share no frame of reference."""
+    """[M] sub-map of each pose; unless ``placed``, they share no frame of reference."""
     unit: str = "map units"
     """``m`` where the scale is known."""
+    up: str = ""
+    """What x points to, where z points down in all sub-maps: then the path is seen from above."""
+    depth_known: bool = False
+    """True if z = 0 is the water surface."""
+    placed: bool = False
+    """True if all sub-maps lie in one frame of reference, level and in metres."""
     truth: npt.NDArray[np.floating] | None = None
     """[K, 3] true positions, already aligned to the map's world."""
+
+
+@dataclass(frozen=True)
+class Measures:
+    """Lengths with their uncertainty, gravity, north, and the telemetry that they come from."""
+
+    rows: list[tuple[str, str]]
+    """What, and its value in words."""
+    sources: Sequence[SourceReport] = ()
 
 
 @dataclass(frozen=True)
@@ -86,6 +103,7 @@ class ReportData:
     metrics: Mapping[str, Any]
     """``metrics.json``."""
     path: PathPlot | None = None
+    measures: Measures | None = None
     timeline: list[str] = field(default_factory=list)
     """Class of every frame in order, also ``skipped``, ``lost`` and ``dropped``."""
     examples: list[HeldOutExample] = field(default_factory=list)

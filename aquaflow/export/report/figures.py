@@ -51,8 +51,9 @@ CURVE_SAMPLES = 128
 
 
 def path_svg(path: PathPlot) -> str:
-    """The path seen from two sides: along the direction of least motion, and across it."""
-    figure = _figure(9.0, 3.6, path_axes, path)
+    """The path seen from two sides: from above and from the side where gravity is known, else along
+    the direction of least motion and across it."""
+    figure = _figure(9.0, 3.6, level_axes if path.up else path_axes, path)
     return _svg(figure, "path")
 
 
@@ -73,6 +74,29 @@ def _figure(width_in: float, height_in: float, draw: Any, data: Any) -> Figure:
             axes.patch.set_alpha(0.0)
             axes.set_axisbelow(True)
     return figure
+
+
+def level_axes(figure: Figure, path: PathPlot) -> None:
+    """Draw a path from above, x up, and from the side with its depth, into an empty figure."""
+    finite = np.isfinite(path.positions).all(axis=1)
+    along = np.zeros(3)  # the horizontal direction in which the path is longest
+    along[:2] = _main_directions(path.positions[finite, :2])[1][0]
+    axes_3d = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], along, [0.0, 0.0, 1.0]])
+    ours = path.positions @ axes_3d.T
+    truth = None if path.truth is None else path.truth @ axes_3d.T
+    above, side = figure.subplots(1, 2)
+    for axes, (u, v) in ((above, (0, 1)), (side, (2, 3))):
+        _draw_view(axes, ours, truth, path, u, v)
+        axes.set_aspect("equal", adjustable="datalim")
+    above.set_title(f"From above, {path.up} up")
+    above.set_xlabel(f"{'east' if path.up == 'true north' else 'to the right'}, {path.unit}")
+    above.set_ylabel(f"{path.up}, {path.unit}")
+    side.set_title("From the side")
+    side.set_xlabel(f"along the path's longest direction, {path.unit}")
+    side.set_ylabel(f"{'depth' if path.depth_known else 'down'}, {path.unit}")
+    side.invert_yaxis()
+    handles, labels = above.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
 
 
 def path_axes(figure: Figure, path: PathPlot) -> None:
@@ -96,8 +120,8 @@ def path_axes(figure: Figure, path: PathPlot) -> None:
 
 def _draw_view(
     axes: Axes,
-    ours: npt.NDArray[np.floating],  # [N, 3] along the path's main directions
-    truth: npt.NDArray[np.floating] | None,  # [M, 3] along the same
+    ours: npt.NDArray[np.floating],  # [N, A] along A directions
+    truth: npt.NDArray[np.floating] | None,  # [M, A] along the same
     path: PathPlot,
     u: int,
     v: int,
@@ -117,13 +141,13 @@ def _draw_view(
 
 
 def _main_directions(
-    positions: npt.NDArray[np.floating],  # [M, 3]
+    positions: npt.NDArray[np.floating],  # [M, D]
 ) -> tuple[npt.NDArray[np.floating], npt.NDArray[np.floating]]:
-    """Centre [3] and axes [3, 3] (rows) by falling spread, each with a fixed sign."""
-    centre = positions.mean(axis=0)
-    _, _, axes = np.linalg.svd(positions - centre, full_matrices=len(positions) < 3)
+    """Centre [D] and axes [D, D] (rows) by falling spread, each with a fixed sign."""
+    centre, dimensions = positions.mean(axis=0), positions.shape[1]
+    _, _, axes = np.linalg.svd(positions - centre, full_matrices=len(positions) < dimensions)
     largest = np.abs(axes).argmax(axis=1)
-    return centre, axes * np.sign(axes[np.arange(3), largest])[:, None]
+    return centre, axes * np.sign(axes[np.arange(dimensions), largest])[:, None]
 
 
 def medium_axes(figure: Figure, medium: MediumCurves) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 from pathlib import Path
 
-from aquaflow.export.report import sections
+from aquaflow.export.report import measures, sections
 from aquaflow.export.report.data import ReportData
 from aquaflow.export.report.style import STYLE_SHEET
 from aquaflow.storage.atomic import atomic_write
@@ -28,6 +28,7 @@ def render_report(data: ReportData) -> str:
         sections.warnings(data),
         sections.tiles(data.metrics),
         sections.path(data),
+        measures.measures(data.measures),
         sections.examples(data),
         sections.medium(data),
         sections.timeline(data),

@@ -79,11 +79,15 @@ def path(data: ReportData) -> str:
     if data.path is None or np.isfinite(data.path.positions).all(axis=1).sum() < MINIMUM_PATH:
         return _section("The path", "No path was found: fewer than two frames have a pose.", "")
     said = "Where the camera went, seen from two sides"
+    if data.path.up:
+        said = "Where the camera went, seen from above and from the side"
     said += "; the dashed line is the true path." if data.path.truth is not None else "."
     if len(set(data.path.sub_maps)) > 1:
+        said += " Tracking was lost on the way, so there are several sub-maps"
         said += (
-            " Tracking was lost on the way, so there are several sub-maps, and how they lie to one"
-            " another is not known."
+            "; telemetry says how they lie to one another."
+            if data.path.placed
+            else ", and how they lie to one another is not known."
         )
     return _section("The path", said, path_svg(data.path))
 

@@ -1,0 +1,110 @@
+"""Where on the earth a dive was: latitude and longitude of points of n, and ``georeference.json``.
+
+n is the plane that touches the WGS 84 ellipsoid at the origin, x to true north, z down. The water
+surface (z = 0) is taken to lie on the ellipsoid: the geoid is within 110 m of it, which shifts a
+latitude by less than 2 cm for each kilometre from the origin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.fusion.metric_frame import MetricFrame, Origin
+
+Array = npt.NDArray[np.float64]
+
+GEOREFERENCE = "georeference.json"
+LATITUDES_OF_UTM = (-80.0, 84.0)
+"""Degrees; beyond, maps are polar stereographic."""
+
+
+def to_geodetic(
+    origin: Origin,
+    points_n: Array,  # [N, 3] m: north, east, down
+) -> tuple[Array, Array]:
+    """Latitude [N] and longitude [N], degrees, WGS 84."""
+    from pyproj import Transformer
+
+    plane = f"+proj=topocentric +ellps=WGS84 +h_0=0 +lat_0={origin.latitude_deg!r}"
+    steps = (
+        f"+step +inv {plane} +lon_0={origin.longitude_deg!r}",  # east, north, up to geocentric
+        "+step +inv +proj=cart +ellps=WGS84",
+        "+step +proj=unitconvert +xy_in=rad +xy_out=deg",
+    )
+    transformer = Transformer.from_pipeline(f"+proj=pipeline {' '.join(steps)}")
+    north, east, down = np.asarray(points_n, np.float64).T
+    longitude, latitude, _ = transformer.transform(east, north, -down)
+    return np.asarray(latitude), np.asarray(longitude)
+
+
+def utm_epsg(latitude_deg: float, longitude_deg: float) -> int | None:
+    """EPSG code of the UTM zone (WGS 84) of a place; None near the poles.
+
+    South-west Norway belongs to zone 32, and Svalbard has four wide zones.
+    """
+    low, high = LATITUDES_OF_UTM
+    if not low <= latitude_deg <= high:
+        return None
+    longitude = (longitude_deg + 180.0) % 360.0 - 180.0
+    zone = int((longitude + 180.0) // 6.0) + 1
+    if 56.0 <= latitude_deg < 64.0 and 3.0 <= longitude < 12.0:
+        zone = 32
+    elif latitude_deg >= 72.0 and 0.0 <= longitude < 42.0:
+        zone = 31 + 2 * int((longitude + 3.0) // 12.0)
+    return (32600 if latitude_deg >= 0.0 else 32700) + zone
+
+
+def georeference(frames: Mapping[int, MetricFrame], main: int) -> dict[str, Any] | None:
+    """The content of ``georeference.json``; None if no position was heard.
+
+    n and its origin are those of sub-map ``main``, or of the first sub-map that has an origin.
+    """
+    known = [frames[n] for n in sorted(frames, key=lambda n: (n != main, n)) if frames[n].origin]
+    if not known or known[0].origin is None:
+        return None
+    frame, origin = known[0], known[0].origin
+    return {
+        "datum": "WGS 84",
+        "epsg": 4326,
+        "origin": {
+            "latitude_deg": origin.latitude_deg,
+            "longitude_deg": origin.longitude_deg,
+            "depth_m": 0.0 if frame.depth_known else None,
+            "source": origin.source,
+            "sigma_m": origin.sigma_m,
+        },
+        "axes": f"x {frame.north}, y to the right of it, z down; plane that touches the ellipsoid "
+        "at the origin",
+        "unit": frame.unit,
+        "heading_sigma_deg": float(np.degrees(frame.heading_sigma_rad)),
+        "utm": _utm(origin),
+        "sub_maps": {
+            str(number): {"georeferenced": each.georeferenced, "T_nm": each.T_nm.matrix.tolist()}
+            for number, each in sorted(frames.items())
+        },
+    }
+
+
+def _utm(origin: Origin) -> dict[str, Any] | None:
+    """The origin on the grid, and how the grid's north differs from the true one there."""
+    epsg = utm_epsg(origin.latitude_deg, origin.longitude_deg)
+    if epsg is None:
+        return None
+    from pyproj import Proj
+
+    grid = Proj(f"EPSG:{epsg}")
+    easting, northing = grid(origin.longitude_deg, origin.latitude_deg)
+    factors = grid.get_factors(origin.longitude_deg, origin.latitude_deg)
+    return {
+        "epsg": epsg,
+        "zone": f"{epsg % 100}{'N' if epsg < 32700 else 'S'}",
+        "easting_m": float(easting),
+        "northing_m": float(northing),
+        "convergence_deg": float(factors.meridian_convergence),
+        "convergence": "grid bearing = true bearing - convergence_deg; nothing here is turned",
+        "scale_factor": float(factors.meridional_scale),
+    }

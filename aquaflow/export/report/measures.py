@@ -1,0 +1,40 @@
+"""The report's sections on metres, gravity and north, and on the telemetry behind them."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+
+from aquaflow.export.report.data import Measures
+from aquaflow.fusion.metric_frame import SourceReport
+
+
+def measures(data: Measures | None) -> str:
+    """Lengths with their uncertainty, then every source of telemetry and what became of it."""
+    if data is None:
+        return ""
+    rows = "".join(
+        f"<tr><td>{html.escape(what)}</td><td>{html.escape(value)}</td></tr>"
+        for what, value in data.rows
+    )
+    said = "Lengths and directions, each with 1 sigma where it is known."
+    return (
+        f"<section><h2>Metres, gravity and north</h2><p>{said}</p><table>{rows}</table>"
+        f"{_sources(data.sources)}</section>"
+    )
+
+
+def _sources(sources: Sequence[SourceReport]) -> str:
+    if not sources:
+        return "<p>No telemetry was used.</p>"
+    rows = "".join(
+        f"<tr><td>{html.escape(each.source)}</td><td>{html.escape(each.kind)}</td>"
+        f'<td class="n">{each.used:,}</td><td class="n">{each.rejected:,}</td>'
+        f"<td>{html.escape(each.reason)}</td></tr>"
+        for each in sources
+    )
+    return (
+        "<p>Telemetry: samples used, samples rejected because they contradicted the others, and "
+        'why.</p><table><tr><th>source</th><th>kind</th><th class="n">used</th>'
+        f'<th class="n">rejected</th><th>why</th></tr>{rows}</table>'
+    )
