@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.fusion.metric_frame import MetricFrame, Origin
+from aquaflow.geometry.earth import latitude_longitude
 
 Array = npt.NDArray[np.float64]
 
@@ -27,18 +28,7 @@ def to_geodetic(
     points_n: Array,  # [N, 3] m: north, east, down
 ) -> tuple[Array, Array]:
     """Latitude [N] and longitude [N], degrees, WGS 84."""
-    from pyproj import Transformer
-
-    plane = f"+proj=topocentric +ellps=WGS84 +h_0=0 +lat_0={origin.latitude_deg!r}"
-    steps = (
-        f"+step +inv {plane} +lon_0={origin.longitude_deg!r}",  # east, north, up to geocentric
-        "+step +inv +proj=cart +ellps=WGS84",
-        "+step +proj=unitconvert +xy_in=rad +xy_out=deg",
-    )
-    transformer = Transformer.from_pipeline(f"+proj=pipeline {' '.join(steps)}")
-    north, east, down = np.asarray(points_n, np.float64).T
-    longitude, latitude, _ = transformer.transform(east, north, -down)
-    return np.asarray(latitude), np.asarray(longitude)
+    return latitude_longitude(points_n, (origin.latitude_deg, origin.longitude_deg))
 
 
 def utm_epsg(latitude_deg: float, longitude_deg: float) -> int | None:

@@ -13,6 +13,7 @@ from aquaflow.fusion.metric_frame import (
     LARGEST_SCALE_SIGMA,
     LARGEST_TILT_SIGMA,
     MetricFrame,
+    North,
     SourceReport,
 )
 from aquaflow.fusion.problem import Problem
@@ -72,7 +73,7 @@ def _left_tangent(solution: Solution) -> Array:
     return np.asarray(J @ covariance @ J.T)
 
 
-def _north(problem: Problem, kinds: set[str]) -> str:
+def _north(problem: Problem, kinds: set[str]) -> North:
     if "position" in kinds:
         return "true north"
     return "magnetic north" if problem.compass else "initial heading"

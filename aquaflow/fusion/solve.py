@@ -7,7 +7,7 @@ out, each source's noise is found from its own residuals, and the rest is genera
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -131,7 +131,7 @@ class _Correlated:
 
 def _descend(
     factors: Sequence[Factor],
-    whitening: Sequence[_Robust] | Sequence[_Correlated],
+    whitening: Sequence[Callable[[Array], Array]],
     state: State,
     departed: Array,  # [P] from the start, in the parameters' own units
     prior: Array,  # [P]

@@ -1,21 +1,16 @@
-"""Positions on the earth in a local frame: exact on the WGS 84 ellipsoid, by way of ECEF.
-
-Source: NIMA TR8350.2, Department of Defense World Geodetic System 1984, 3rd edition.
-"""
+"""Positions on the earth in the plane that touches the WGS 84 ellipsoid at an origin."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+if TYPE_CHECKING:
+    from pyproj import Transformer
 
-SEMI_MAJOR_M = 6_378_137.0
-"""m, WGS 84."""
-FLATTENING = 1.0 / 298.257223563
-"""WGS 84."""
-ECCENTRICITY_2 = FLATTENING * (2.0 - FLATTENING)
-"""Squared, of the ellipse through the poles."""
+Array = npt.NDArray[np.float64]
 
 
 def north_east(
@@ -23,27 +18,30 @@ def north_east(
     longitude_deg: Array,  # [N]
     origin: tuple[float, float],
 ) -> Array:
-    """[N, 2] m north and east of ``origin`` (latitude, longitude, deg), in its tangent plane."""
-    latitude, longitude = (np.radians(value) for value in origin)
-    apart = _ecef(latitude_deg, longitude_deg) - _ecef(np.array([origin[0]]), np.array([origin[1]]))
-    north = np.array(
-        [
-            -np.sin(latitude) * np.cos(longitude),
-            -np.sin(latitude) * np.sin(longitude),
-            np.cos(latitude),
-        ]
+    """[N, 2] m north and east of ``origin`` (latitude, longitude, deg), of points at height 0."""
+    height = np.zeros(len(latitude_deg))
+    east, north, _ = _plane(origin).transform(longitude_deg, latitude_deg, height)
+    return np.stack([north, east], axis=1)
+
+
+def latitude_longitude(
+    points_n: Array,  # [N, 3] m: north, east, down
+    origin: tuple[float, float],
+) -> tuple[Array, Array]:
+    """Latitude [N] and longitude [N], deg, of points around ``origin``."""
+    north, east, down = np.asarray(points_n, np.float64).T
+    longitude, latitude, _ = _plane(origin).transform(east, north, -down, direction="INVERSE")
+    return np.asarray(latitude), np.asarray(longitude)
+
+
+def _plane(origin: tuple[float, float]) -> Transformer:
+    """From longitude, latitude (deg) and height (m) to east, north and up (m)."""
+    from pyproj import Transformer
+
+    latitude, longitude = origin
+    steps = (
+        "+step +proj=unitconvert +xy_in=deg +xy_out=rad",
+        "+step +proj=cart +ellps=WGS84",
+        f"+step +proj=topocentric +ellps=WGS84 +lat_0={latitude!r} +lon_0={longitude!r} +h_0=0",
     )
-    east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
-    return np.stack([apart @ north, apart @ east], axis=1)
-
-
-def _ecef(
-    latitude_deg: Array,  # [N]
-    longitude_deg: Array,  # [N]
-) -> Array:
-    """[N, 3] m, points of the ellipsoid."""
-    latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
-    across = SEMI_MAJOR_M / np.sqrt(1.0 - ECCENTRICITY_2 * np.sin(latitude) ** 2)
-    level = across * np.cos(latitude)
-    up = (1.0 - ECCENTRICITY_2) * across * np.sin(latitude)
-    return np.stack([level * np.cos(longitude), level * np.sin(longitude), up], axis=1)
+    return Transformer.from_pipeline(f"+proj=pipeline {' '.join(steps)}")

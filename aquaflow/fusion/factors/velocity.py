@@ -24,7 +24,7 @@ class VelocityFactor(Factor):
     """Displacement of the camera between two poses minus the DVL's, in the axes of the map, m."""
 
     kind = "velocity"
-    slow = SlowPart(0.002, 15.0, tuple(Process(t) for t in (3.0, 15.0, 60.0)))
+    slow = SlowPart(0.003, 15.0, tuple(Process(t) for t in (3.0, 15.0, 60.0)))
     """m in an interval: the camera's own scale wanders along the path."""
     spans = (SCALE, CAMERA, DVL, DVL_SCALE)
 
@@ -50,7 +50,7 @@ class VelocityFactor(Factor):
         R_cb = state.R_bc.T
         v_c = np.exp(state.log_dvl) * self._v @ (R_cb @ state.R_bd).T
         v_m = np.einsum("nij,nj->ni", self._R_mc, v_c)
-        way = cumulative_trapezoid(v_m, self._tau, axis=0, initial=0.0)
+        way = np.asarray(cumulative_trapezoid(v_m, self._tau, axis=0, initial=0))
         arm = self._turned @ (R_cb @ state.c_b)
         body = way[self._last] - way[self._first]
         return np.asarray(state.scale * self._moved_m - body - arm)

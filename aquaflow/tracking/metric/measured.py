@@ -71,7 +71,7 @@ def world_edges(
     spacing = float(np.ptp(t_s)) / max(len(t_s) - 1, 1)
     # Errors that last longer than keyframes are apart: as much information as there is in them.
     repeated = np.sqrt(1.0 + 2.0 * DIRECTION_TIME_S / max(spacing, 1e-3))
-    tilt = _of(estimate, TiltFactor, lambda f, at: (f.turn_wanted(at), f.sigma), repeated)
+    tilt = _of(estimate, TiltFactor, _turn, repeated)
     north = _of(estimate, HeadingFactor, lambda f, at: (-f.residuals(at), f.sigma), repeated)
     depth = place = scale = None
     if estimate.frame.metric:
@@ -97,19 +97,25 @@ def _measured(
     tilt: Corrections | None,
     north: Corrections | None,
 ) -> Measured:
+    deeper, moved, larger = _near(depth, t_s), _near(place, t_s), _near(scale, t_s)
+    turned, swung = _near(tilt, t_s), _near(north, t_s)
     measured = Measured()
-    if (deeper := depth and depth.at(t_s)) is not None:
+    if deeper is not None:
         measured = replace(measured, depth_m=(float(T_nk.t[2] + deeper[0][0]), deeper[1]))
-    if (moved := place and place.at(t_s)) is not None:
+    if moved is not None:
         measured = replace(measured, place_m=(T_nk.t[:2] + moved[0], moved[1]))
-    if (larger := scale and scale.at(t_s)) is not None:
+    if larger is not None:
         measured = replace(measured, scale=(T_nk.scale * float(np.exp(larger[0][0])), larger[1]))
-    if (turned := tilt and tilt.at(t_s)) is not None:
+    if turned is not None:
         turn, sigma, north_sigma = turned[0].copy(), turned[1], np.inf
-        if (swung := north and north.at(t_s)) is not None:
+        if swung is not None:
             turn[2], north_sigma = swung[0][0], swung[1]
         measured = replace(measured, turn=turn, turn_sigma=(sigma, north_sigma))
     return measured
+
+
+def _near(corrections: Corrections | None, t_s: float) -> tuple[Array, float] | None:
+    return None if corrections is None else corrections.at(t_s)
 
 
 def _of(
@@ -128,6 +134,11 @@ def _of(
             chosen = kept & (sigma <= LARGEST_SCALE_SIGMA) if slow == 0.0 else kept
             return Corrections(factor.t_s[chosen], values[chosen], sigma[chosen], slow)
     return None
+
+
+def _turn(factor: Factor, state: State) -> tuple[Array, Array]:
+    assert isinstance(factor, TiltFactor)
+    return factor.turn_wanted(state), factor.sigma
 
 
 def _scale(factor: Factor, state: State) -> tuple[Array, Array]:

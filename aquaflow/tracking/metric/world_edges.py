@@ -69,7 +69,7 @@ def world_edge(
         sigmas = (measured.turn_sigma[0], measured.turn_sigma[0], measured.turn_sigma[1])
         known = np.isfinite(sigmas)
         R = so3_exp(np.where(known, measured.turn, 0.0)) @ R
-        rows += [_turns(axis, T_nk) / sigmas[axis] for axis in np.flatnonzero(known)]
+        rows += [_turns(axis, T_nk) / sigmas[axis] for axis in range(3) if known[axis]]
     if measured.scale is not None:
         scale, sigma = measured.scale
         rows.append(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0 / sigma]))
