@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 from aquaflow.config.telemetry import PositioningConfig
-from aquaflow.messages import Position
+from aquaflow.messages import Position, TelemetrySample
 
 UERE_M = 5.1
 """m, 1 sigma of a range to a satellite, single frequency without corrections: B. Parkinson, "GPS
@@ -26,11 +26,21 @@ def sigma_of(hdop: float | None) -> float:
 
 
 class Fixes:
-    """The fixes of one device, as its config says."""
+    """The fixes of one device, as its config says.
+
+    Acoustic systems, and the programs between them and a vehicle, send the last fix again while
+    there is no newer one, as if it were new. A place that equals the one before to the last digit
+    is taken for that; it would hold a moving vehicle back.
+    """
 
     def __init__(self, config: PositioningConfig) -> None:
         self._lag_ns = round(config.position_lag_s * 1e9)
         self._sigma_m = config.position_sigma_m
+        self._last: dict[str, tuple[float, float]] = {}
+
+    def dated(self, t_ns: int) -> int:
+        """When what the device dates ``t_ns`` was measured."""
+        return t_ns - self._lag_ns
 
     def fix(
         self,
@@ -40,11 +50,15 @@ class Fixes:
         latitude_deg: float,
         longitude_deg: float,
         sigma_m: float,
-    ) -> Position:
-        """A fix that the device dates ``t_ns`` and calls accurate to ``sigma_m``."""
-        sigma_m = self._sigma_m or sigma_m
-        t_ns -= self._lag_ns
-        return Position(t_ns, arrival_ns, source, latitude_deg, longitude_deg, sigma_m)
+    ) -> list[TelemetrySample]:
+        """The sample of a fix that the device dates ``t_ns`` and calls accurate to ``sigma_m``;
+        none if it is the fix before."""
+        place = (latitude_deg, longitude_deg)
+        if self._last.get(source) == place:
+            return []
+        self._last[source] = place
+        t_ns, sigma_m = self.dated(t_ns), self._sigma_m or sigma_m
+        return [Position(t_ns, arrival_ns, source, *place, sigma_m)]
 
 
 def moved(fix: Position, north_m: float, east_m: float) -> Position:

@@ -70,18 +70,18 @@ class DbcDecoder(PacketDecoder):
         source = self.source(message.name)
         # A multiplexed message holds only some of its signals.
         known = [mapping for mapping in mappings if all(name in values for name in mapping.signals)]
-        return [self._sample(mapping, values, arrival_ns, source) for mapping in known]
+        return [s for mapping in known for s in self._samples(mapping, values, arrival_ns, source)]
 
-    def _sample(
+    def _samples(
         self, mapping: DbcSignal, values: dict[str, float], t_ns: int, source: str
-    ) -> TelemetrySample:
+    ) -> list[TelemetrySample]:
         scale = mapping.scale * (len(mapping.signals) // len(mapping.scale))
         scaled = [
             factor * values[name] for factor, name in zip(scale, mapping.signals, strict=True)
         ]
         if mapping.sample == "position":
             return self._fixes.fix(t_ns, t_ns, source, scaled[0], scaled[1], sigma_of(None))
-        return _in_body(mapping, scaled, t_ns, source)
+        return [_in_body(mapping, scaled, t_ns, source)]
 
     def _opened(self, path: str) -> Any:
         try:

@@ -125,7 +125,7 @@ class MavlinkSamples:
         return samples
 
     def _fix(self, message: Any, stamp: MessageTime) -> Samples:
-        """A receiver's fix, each once: an autopilot repeats the last until the next is there."""
+        """A receiver's fix, each once: an autopilot sends the last until the next is there."""
         if message.fix_type < FIX_3D:
             return []  # under water a receiver has none, and that is no fault
         if message.time_usec and message.time_usec == self._fixed_us.get(stamp.source):
@@ -133,11 +133,11 @@ class MavlinkSamples:
         self._fixed_us[stamp.source] = message.time_usec
         hdop = None if message.eph == UNKNOWN_EPH else message.eph / 100.0
         sigma_m = message.h_acc / 1000.0 or sigma_of(hdop)
-        degrees = message.lat * DEGREES, message.lon * DEGREES
-        fix = self._fixes.fix(*stamp, *degrees, sigma_m)
-        if message.time_usec <= SINCE_1970_US:
-            return [fix]
-        return [fix, UtcTime(fix.t_ns, fix.arrival_ns, fix.source, 1000 * message.time_usec)]
+        found = self._fixes.fix(*stamp, message.lat * DEGREES, message.lon * DEGREES, sigma_m)
+        if message.time_usec > SINCE_1970_US:
+            t_ns = self._fixes.dated(stamp.t_ns)
+            found.append(UtcTime(t_ns, *stamp[1:], 1000 * message.time_usec))
+        return found
 
     def _filtered_position(self, message: Any, stamp: MessageTime) -> Samples:
         """The filter has the receiver's lag taken out, and states no accuracy."""

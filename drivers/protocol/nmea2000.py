@@ -125,7 +125,7 @@ class Nmea2000Decoder(PacketDecoder):
             return []
         degrees = [_value("i", data, at) * PLACE_DEG for at in (0, 4)]
         source = self.source(str(POSITION))
-        return [self._fixes.fix(t_ns, t_ns, source, degrees[0], degrees[1], sigma_of(hdop))]
+        return self._fixes.fix(t_ns, t_ns, source, degrees[0], degrees[1], sigma_of(hdop))
 
 
 def _missing(code: str, data: bytes, at: int) -> bool:

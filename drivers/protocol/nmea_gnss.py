@@ -52,10 +52,10 @@ class NmeaGnss:
             return []
         day, month, year = (int(fields[8][at : at + 2]) for at in (0, 2, 4))
         utc_ns = _utc_ns(CENTURY + year, month, day, fields[0])
-        (fix,) = self._fix(fields[2:6], t_ns, source, None)
-        utc = UtcTime(fix.t_ns, t_ns, source, utc_ns)
-        repeated = self._gga_ns is not None and t_ns - self._gga_ns <= GGA_LIFE_NS
-        return [utc] if repeated else [fix, utc]
+        found: Samples = [UtcTime(self._fixes.dated(t_ns), t_ns, source, utc_ns)]
+        if self._gga_ns is None or t_ns - self._gga_ns > GGA_LIFE_NS:
+            found += self._fix(fields[2:6], t_ns, source, None)
+        return found
 
     def gst(self, fields: Fields, t_ns: int, source: str) -> Samples:
         """1 sigma of the next fixes: ..., of latitude, of longitude, of height; m."""
@@ -78,7 +78,7 @@ class NmeaGnss:
             sigma_m = self._accuracy[1]
         latitude_deg = _degrees(place[0], {"N": 1.0, "S": -1.0}[place[1]])
         longitude_deg = _degrees(place[2], {"E": 1.0, "W": -1.0}[place[3]])
-        return [self._fixes.fix(t_ns, t_ns, source, latitude_deg, longitude_deg, sigma_m)]
+        return self._fixes.fix(t_ns, t_ns, source, latitude_deg, longitude_deg, sigma_m)
 
 
 def _degrees(field: str, sign: float) -> float:

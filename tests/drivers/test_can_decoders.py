@@ -109,7 +109,11 @@ def test_values_that_are_not_available_are_counted(number, data):
     assert receiver.counters.invalid_values == 1
 
 
-HERE = group(129025, struct.pack("<ii", -412_500_000, 1_748_000_000))
+def at(latitude: int) -> bytes:
+    return group(129025, struct.pack("<ii", latitude, 1_748_000_000))
+
+
+HERE = at(-412_500_000)
 
 
 def dilution(modes: int, hdop: int) -> bytes:
@@ -119,9 +123,9 @@ def dilution(modes: int, hdop: int) -> bytes:
 def test_a_position_is_as_accurate_as_the_dilution_says():
     receiver = n2k(position_lag_s=0.4)
 
-    (usual,) = receiver.feed(HERE, NOW)
+    (usual,) = receiver.feed(at(1) + at(1), NOW)
     (fix,) = receiver.feed(dilution(0b010_010, 100) + HERE, NOW)
-    (unstated,) = receiver.feed(dilution(0b010_010, 0x7FFF) + HERE, NOW)
+    (unstated,) = receiver.feed(dilution(0b010_010, 0x7FFF) + at(1), NOW)
     (later,) = receiver.feed(HERE, NOW + 6 * 10**9)
 
     assert isinstance(fix, Position)

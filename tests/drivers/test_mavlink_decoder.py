@@ -179,8 +179,8 @@ def test_a_receivers_fix_is_as_accurate_as_it_says_or_as_its_dilution():
 
     fix, by_hdop, unknown = receiver.feed(
         packet("gps_raw_int", time_usec=0, h_acc=700, **FIX)
-        + packet("gps_raw_int", time_usec=0, **FIX)
-        + packet("gps_raw_int", time_usec=0, **{**FIX, "eph": 65535}),
+        + packet("gps_raw_int", time_usec=0, **{**FIX, "lat": 1})
+        + packet("gps_raw_int", time_usec=0, **{**FIX, "lat": 2, "eph": 65535}),
         NOW,
     )
     (known,) = decoder(position_sigma_m=0.3).feed(packet("gps_raw_int", time_usec=0, **FIX), NOW)
@@ -213,12 +213,22 @@ def test_a_fix_that_is_nowhere_is_invalid(place):
 
 def test_a_fix_that_is_sent_again_is_the_same_fix():
     receiver = decoder(messages=["GPS_RAW_INT", "GPS2_RAW"])
-    first, second = (packet("gps_raw_int", time_usec=us, **FIX) for us in (5_000_000, 5_200_000))
-    other = packet("gps2_raw", time_usec=5_000_000, **FIX_2)
+    first, moved, stuck = (
+        packet("gps_raw_int", time_usec=us, **{**FIX, "lat": lat})
+        for us, lat in ((5_000_000, 1), (5_200_000, 2), (5_400_000, 2))
+    )
+    again = packet("gps_raw_int", time_usec=5_200_000, **{**FIX, "lat": 3})
+    other = packet("gps2_raw", time_usec=5_000_000, **{**FIX_2, "lat": 1})
 
-    heard = receiver.feed(first + first + other + second, NOW)
+    heard = receiver.feed(first + first + other + moved + stuck + again, NOW)
 
-    assert [s.source for s in heard] == ["rov/GPS_RAW_INT", "rov/GPS2_RAW", "rov/GPS_RAW_INT"]
+    assert [(s.source, round(1e7 * s.latitude_deg)) for s in heard] == [
+        ("rov/GPS_RAW_INT", 1),
+        ("rov/GPS2_RAW", 1),
+        ("rov/GPS_RAW_INT", 2),
+        ("rov/GPS_RAW_INT", 3),
+    ]
+    assert receiver.counters.invalid_values == 0
 
 
 def test_a_fix_is_as_old_as_it_says_and_by_the_stated_lag_older():

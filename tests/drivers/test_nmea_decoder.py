@@ -172,7 +172,8 @@ RMC = "GPRMC,123519.250,A,4807.038,S,01131.000,E,022.4,084.4,230326,003.1,W"
 
 
 def test_a_fix_has_the_accuracy_of_its_dilution():
-    fix, unstated = hear(GGA, GGA.replace("0.9,", ","), position_lag_s=0.25)
+    elsewhere = GGA.replace("4807", "4808")
+    fix, unstated = hear(GGA, GGA, elsewhere.replace("0.9,", ","), position_lag_s=0.25)
 
     assert isinstance(fix, Position)
     assert (fix.latitude_deg, fix.longitude_deg) == pytest.approx((48.1173, -11.516666667))
@@ -194,7 +195,7 @@ def test_the_accuracy_that_a_receiver_states_is_used_while_it_is_new():
     accuracy, empty = sentence("GPGST,123519,2,,,,0.6,0.8,1"), sentence("GPGST,123519,,,,,,,")
 
     (stated,) = receiver.feed(accuracy + sentence(GGA), NOW)
-    (old,) = receiver.feed(sentence(GGA), NOW + 6 * 10**9)
+    (old,) = receiver.feed(sentence(GGA.replace("4807", "4808")), NOW + 6 * 10**9)
     (withdrawn,) = receiver.feed(accuracy + empty + sentence(GGA), NOW)
     (known,) = hear("GPGST,123519,2,,,,0.6,0.8,1", GGA, position_sigma_m=0.1)
 
@@ -206,15 +207,16 @@ def test_the_accuracy_that_a_receiver_states_is_used_while_it_is_new():
 def test_rmc_gives_utc_and_a_fix_only_where_gga_does_not():
     receiver = decoder(position_lag_s=0.25)
 
-    fix, utc = receiver.feed(sentence(RMC), NOW)
-    both = receiver.feed(sentence(GGA) + sentence(RMC), NOW)
-    later = receiver.feed(sentence(RMC), NOW + 6 * 10**9)
+    utc, fix = receiver.feed(sentence(RMC), NOW)
+    moved = sentence(RMC.replace("4807", "4808"))
+    both = receiver.feed(sentence(GGA) + moved, NOW)
+    later = receiver.feed(moved + moved, NOW + 6 * 10**9)
 
     assert (fix.latitude_deg, fix.longitude_deg) == pytest.approx((-48.1173, 11.516666667))
     # 2026-03-23 12:35:19.25, and the fix is of that moment.
     assert utc == UtcTime(NOW - 250_000_000, NOW, "box/RMC", 1_774_269_319_250_000_000)
     assert [s.source for s in both] == ["box/GGA", "box/RMC"]
-    assert [type(s) for s in later] == [Position, UtcTime]
+    assert [type(s) for s in later] == [UtcTime, Position, UtcTime]
 
 
 def test_zda_gives_utc():

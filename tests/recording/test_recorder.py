@@ -144,7 +144,7 @@ def test_bytes_of_links_are_kept_as_they_came(tmp_path: Path) -> None:
     for read in reads:
         recorder.raw(*read)
     recorder.close()
-    assert list(McapTelemetry(tmp_path, origin_ns=0).link_bytes()) == reads
+    assert [read[:3] for read in McapTelemetry(tmp_path, origin_ns=0).link_bytes()] == reads
 
 
 def test_times_in_the_file_are_arrival_and_exposure(tmp_path: Path) -> None:

@@ -63,12 +63,11 @@ def test_a_tlogs_counts_are_those_of_pymavlinks_own_reader(shared_data: Path) ->
     assert len(of_kind(samples, Depth)) == theirs["SCALED_PRESSURE2"]
     assert len(of_kind(samples, Acceleration)) == theirs["RAW_IMU"]
     assert samples[-1].arrival_ns == pytest.approx(263 * SECOND, abs=SECOND)
-    # The vehicle's fix came from an acoustic system by GPS_INPUT, and its clock was never set.
-    fixes = of_kind(samples, Position)
-    assert len(fixes) == 487  # of 528 messages: the others repeat the fix before
-    assert {(round(fix.latitude_deg, 7), round(fix.longitude_deg, 7)) for fix in fixes} == {
-        (48.3861418, -124.6305732)
-    }
+    # Its 528 fixes came from an acoustic system by GPS_INPUT and are one, sent again and again; the
+    # autopilot's clock was never set.
+    (fix,) = of_kind(samples, Position)
+    assert (fix.latitude_deg, fix.longitude_deg) == pytest.approx((48.3861418, -124.6305732))
+    assert fix.sigma_m == pytest.approx(1.6 * 5.1 / 2**0.5)
     times = of_kind(samples, UtcTime)
     assert {utc.source for utc in times} == {"ardusub_small/log"}
     assert len(times) == 27
