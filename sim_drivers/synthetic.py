@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-
 from aquaflow.config.telemetry import MountingConfig
-from aquaflow.fusion.start import AXES
-from aquaflow.synthetic import read_truth
+from aquaflow.errors import AquaFlowError
+from aquaflow.errors.plain_yaml import read_mapping
 from sim_drivers.images import SUBFOLDER, ImageFolder
 
 MARK = "synth.yaml"
@@ -30,13 +27,10 @@ class SyntheticDive(ImageFolder):
         return cls(path, fps)
 
     @property
-    def mounting(self) -> MountingConfig:
-        """Of the camera, as the dive states it.
-
-        Raises:
-            InputError: a file of the dive is missing or damaged.
-        """
-        T_bc = read_truth(self.folder).T_bc_stated
-        yaw, pitch, roll = Rotation.from_matrix(T_bc[:3, :3] @ AXES.T).as_euler("ZYX", degrees=True)
-        x, y, z = np.asarray(T_bc[:3, 3], np.float64).tolist()
-        return MountingConfig(position_m=(x, y, z), roll_deg=roll, pitch_deg=pitch, yaw_deg=yaw)
+    def mounting(self) -> MountingConfig | None:
+        """Of the camera, as the dive states it; None where its synth.yaml does not say."""
+        try:
+            stated = read_mapping(self.folder / MARK, "facts of the dive", "write the dive again")
+            return MountingConfig.model_validate(stated["mounting"]["camera"])
+        except (AquaFlowError, KeyError, TypeError, ValueError):
+            return None

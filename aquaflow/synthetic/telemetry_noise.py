@@ -30,7 +30,9 @@ class TelemetryNoise(BaseModel):
         "changed by 10 hPa (judgement; the cell's own is 2 m, which zeroing removes)",
     )
     tide_amplitude_m: float = Field(
-        1.0, ge=0, description="m; half the mean range on the coasts of Norway and Britain"
+        1.0,
+        ge=0,
+        description="m; half the range on many coasts of Norway and Japan (judgement)",
     )
     tide_period_s: float = Field(44_714.0, gt=0, description="s; principal lunar tide M2, 12.42 h")
     wave_height_m: float = Field(
@@ -68,8 +70,8 @@ class TelemetryNoise(BaseModel):
     rate_bias_sigma_rad_s: float = Field(
         0.002,
         ge=0,
-        description="rad/s per axis, drawn once; ICM-20602: 0.01 deg/s/K over 10 K of cooling in "
-        "the water after the calibration on deck",
+        description="rad/s per axis, drawn once: what moved since the calibration on deck; an "
+        "ICM-20602 by 0.2 deg/s in three hours (InvenSense user forum)",
     )
     rate_bias_walk: float = Field(
         2e-5, ge=0, description="rad/s/sqrt(s); ADIS16448 of the EuRoC data set, 1.94e-5"
@@ -107,7 +109,7 @@ class TelemetryNoise(BaseModel):
     dvl_lock_loss_s: float = Field(3.0, ge=0, description="s, mean duration of one (judgement)")
 
     altitude_hz: float = Field(
-        10.0, ge=0, description="Hz; Ping Sonar, whose default interval is 100 ms"
+        10.0, ge=0, description="Hz; Ping Sonar, whose interval is 50 to 200 ms near the floor"
     )
     altitude_beam_deg: float = Field(
         25.0, gt=0, le=60, description="degrees, full width; Blue Robotics Ping Sonar manual"

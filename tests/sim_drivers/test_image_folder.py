@@ -229,6 +229,29 @@ def test_synthetic_dive_is_recognised_before_a_plain_folder(tmp_path):
     source.close()
 
 
+@pytest.mark.parametrize(
+    "stated",
+    [
+        "",
+        "mounting: 3\n",
+        "mounting: {camera: {pitch: 1}}\n",
+        "mounting: {R_body_camera: []}\n",
+        ": [",
+    ],
+)
+def test_a_synthetic_dive_that_does_not_say_how_its_camera_is_mounted_is_still_read(
+    tmp_path, stated
+):
+    (tmp_path / "images").mkdir()
+    save(tmp_path / "images" / "000.png", rgb(9))
+    (tmp_path / "synth.yaml").write_text(stated)
+
+    source = SyntheticDive.open(tmp_path, fps=5.0)
+
+    assert source.mounting is None
+    assert values(source) == [9]
+
+
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"the real data are not at {DATA}")
 def test_survey_geotiffs_are_read_without_a_word_on_stderr(capfd):
     source = ImageFolder(DATA / "auv_survey_1")
