@@ -186,6 +186,17 @@ def test_motion_that_repeats_itself_is_refused_with_both_offsets() -> None:
         estimate_time_offset(camera, Turns.of_rates(t, rate))
 
 
+def test_a_single_yaw_fits_any_other_unless_the_mounting_is_known() -> None:
+    rng = np.random.default_rng(2)
+    t, R_cb = np.arange(0.0, 20.0, 0.02), random_rotation(rng)
+    yaw = np.column_stack([0.0 * t, 0.0 * t, 0.4 * np.exp(-0.5 * ((t - 10.0) / 2.0) ** 2)])
+    camera, body = seen(rng, t, yaw, R_cb), Turns.of_rates(t, yaw)
+    with pytest.raises(NotSynchronisedError, match=r"single axis .*\(fusion\.camera\)"):
+        estimate_time_offset(camera, body)
+    offset = estimate_time_offset(camera, body, R_cb)
+    assert offset.offset_s == pytest.approx(0.0, abs=4.0 * offset.sigma_s)
+
+
 def test_too_little_of_either_is_refused() -> None:
     case, _ = found(0)
     with pytest.raises(NotSynchronisedError, match=r"the log's rotations cover 3\.9 s"):
