@@ -132,8 +132,8 @@ def estimate_time_offset(
     fits = [fit for peak in peaks(*cells, R_cb) if (fit := refinement.fit(peak)) is not None]
     if not fits:
         raise NotSynchronisedError("the log's rotations resemble the video's at no offset")
-    best = fits[0]
-    rivals = [fit for fit in fits[1:] if abs(fit.x[OFFSET] - best.x[OFFSET]) > sigma_s]
+    best = max(fits, key=lambda fit: fit.gain)
+    rivals = [fit for fit in fits if abs(fit.x[OFFSET] - best.x[OFFSET]) > sigma_s]
     return _judged(best, rivals, sigma_s)
 
 
