@@ -134,11 +134,15 @@ class Slam:
         self._latest = newest
         return finished
 
-    def finish(self, progress: Callable[[int, int], None] | None = None) -> list[Tracked]:
-        """After the last frame: the frames that still wait, the last keyframe, the refinement."""
+    def finish_tracking(self) -> list[Tracked]:
+        """After the last frame: the frames that still wait."""
         with self.profiler.stage("track"):
             tracked = self.tracker.finish()
-        finished = self._link_map_publish(tracked)
+        return self._link_map_publish(tracked)
+
+    def finish(self, progress: Callable[[int, int], None] | None = None) -> list[Tracked]:
+        """After the last frame: the frames that still wait, the last keyframe, the refinement."""
+        finished = self.finish_tracking()
         self._settle_graph()
         with self.failures.contain("insertion"):
             for insertion in self._retired_keyframes():

@@ -29,6 +29,7 @@ def synchronise(run: DiveRun, telemetry: TelemetryInput) -> dict[str, TimeOffset
     found: dict[str, TimeOffset] = {}
     if not telemetry.unsynchronised:
         return found
+    run.decide(run.slam.finish_tracking())
     camera, R_cb = turns_of(run.results), _body_to_camera(run.slam.metric.mounting)
     for name, log in telemetry.unsynchronised.items():
         with run.slam.failures.contain("telemetry"):

@@ -71,6 +71,14 @@ class Fit:
     """[G, 3] rad/s, camera axes."""
 
     @property
+    def gain(self) -> float:
+        """Twice the logarithm of the likelihood ratio to no explanation, per axis: it counts how
+        much is explained and how well, so that fits of different overlaps can be compared."""
+        seen, left = self.seen[self.used], self.residual[self.used]
+        total = float(((seen - seen.mean(axis=0)) ** 2).sum())
+        return len(seen) * float(np.log(total / max(float((left**2).sum()), 1e-300)))
+
+    @property
     def correlation(self) -> float:
         """Of the rates seen and predicted, about their means: 1 is perfect."""
         seen = self.seen[self.used]

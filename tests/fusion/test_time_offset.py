@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -23,7 +24,14 @@ from aquaflow.fusion.time_offset import (
 from aquaflow.fusion.turns import Turns
 from aquaflow.messages import AngularRate, Attitude, Depth, UtcTime
 from sim_drivers.csv_telemetry import CsvTelemetry
-from tests.fusion.turning import Case, dive, random_rates, random_rotation, seen
+from tests.fusion.turning import (
+    Case,
+    dive,
+    orientations,
+    random_rates,
+    random_rotation,
+    seen,
+)
 
 DIVES = 20
 FRAME_S = 1.0 / 29.97
@@ -146,6 +154,21 @@ def test_tracking_that_jumps_now_and_then_moves_the_offset_little() -> None:
     assert abs(case.error_s(estimate_time_offset(camera, case.body))) < 0.02
 
 
+def test_whole_degrees_once_a_second_are_enough_in_a_longer_dive() -> None:
+    """What the subtitles of a ground station hold."""
+    rng = np.random.default_rng(6)
+    t = np.arange(0.0, 180.0, 0.05)
+    rate, R_cb = random_rates(rng, t), random_rotation(rng)
+    rate[:, 2] += gaussian_filter1d(12.0 * random_rates(rng, t)[:, 2], 60)
+    R = orientations(t, rate)
+    degrees = Rotation.from_matrix(R[::20]).as_euler("ZYX", degrees=True).round()
+    attitudes = Rotation.from_euler("ZYX", degrees, degrees=True).as_matrix()
+    camera = seen(rng, t, rate, R_cb, every=2)
+    offset = estimate_time_offset(camera, Turns.of_orientations(t[::20] - 11.3, attitudes))
+    assert offset.offset_s == pytest.approx(11.3, abs=4.0 * offset.sigma_s)
+    assert offset.sigma_s < 0.02
+
+
 # --- refusals -------------------------------------------------------------------------------------
 
 
@@ -186,6 +209,17 @@ def test_motion_that_repeats_itself_is_refused_with_both_offsets() -> None:
         estimate_time_offset(camera, Turns.of_rates(t, rate))
 
 
+def test_a_single_yaw_fits_any_other_unless_the_mounting_is_known() -> None:
+    rng = np.random.default_rng(2)
+    t, R_cb = np.arange(0.0, 20.0, 0.02), random_rotation(rng)
+    yaw = np.column_stack([0.0 * t, 0.0 * t, 0.4 * np.exp(-0.5 * ((t - 10.0) / 2.0) ** 2)])
+    camera, body = seen(rng, t, yaw, R_cb), Turns.of_rates(t, yaw)
+    with pytest.raises(NotSynchronisedError, match=r"single axis .*\(fusion\.camera\)"):
+        estimate_time_offset(camera, body)
+    offset = estimate_time_offset(camera, body, R_cb)
+    assert offset.offset_s == pytest.approx(0.0, abs=4.0 * offset.sigma_s)
+
+
 def test_too_little_of_either_is_refused() -> None:
     case, _ = found(0)
     with pytest.raises(NotSynchronisedError, match=r"the log's rotations cover 3\.9 s"):
@@ -223,11 +257,7 @@ def test_a_log_of_attitudes_is_used_where_its_gyro_is_too_slow() -> None:
     t = np.arange(0.0, 60.0, 0.05)
     rate = random_rates(rng, t)
     camera = seen(rng, t, rate, np.eye(3), every=2)
-    R = np.empty((len(t), 3, 3))
-    R[0] = np.eye(3)
-    for k in range(len(t) - 1):
-        R[k + 1] = R[k] @ Rotation.from_rotvec(0.025 * (rate[k] + rate[k + 1])).as_matrix()
-    quaternions = np.roll(Rotation.from_matrix(R).as_quat(), 1, axis=1)
+    quaternions = np.roll(Rotation.from_matrix(orientations(t, rate)).as_quat(), 1, axis=1)
     stamps = [round((at - 5.0) * 1e9) for at in t]
     attitudes = [
         Attitude(ns, ns, "ahrs", (float(w), float(x), float(y), float(z)))

@@ -87,6 +87,19 @@ def random_rates(rng: np.random.Generator, t: Array, rms_rad_s: float = 0.09) ->
     return np.asarray(rate * (rms_rad_s / rate.std()))
 
 
+def orientations(
+    t: Array,  # [N] s, equal steps
+    rate_rad_s: Array,  # [N, 3]
+) -> Array:
+    """[N, 3, 3] of what turns at these rates; the identity first."""
+    mean = 0.5 * (rate_rad_s[:-1] + rate_rad_s[1:])
+    R = np.empty((len(t), 3, 3))
+    R[0] = np.eye(3)
+    for k, turn in enumerate(Rotation.from_rotvec(mean * (t[1] - t[0])).as_matrix()):
+        R[k + 1] = R[k] @ turn
+    return R
+
+
 def seen(
     rng: np.random.Generator,
     t: Array,  # [N] s
@@ -96,10 +109,5 @@ def seen(
     sigma_rad: float = np.radians(0.1),
 ) -> Turns:
     """What a camera sees of these rates, one frame every so many steps."""
-    mean = 0.5 * (rate_rad_s[:-1] + rate_rad_s[1:])
-    angle = mean @ R_cb.T * (t[1] - t[0])
-    R_wc = np.empty((len(t), 3, 3))
-    R_wc[0] = np.eye(3)
-    for k, step in enumerate(Rotation.from_rotvec(angle).as_matrix()):
-        R_wc[k + 1] = R_wc[k] @ step
-    return Turns.of_orientations(t[::every], shaken(R_wc[::every], sigma_rad, rng))
+    R_wc = orientations(t, rate_rad_s)[::every] @ R_cb.T
+    return Turns.of_orientations(t[::every], shaken(R_wc, sigma_rad, rng))
