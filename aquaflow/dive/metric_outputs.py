@@ -11,7 +11,10 @@ import numpy as np
 
 from aquaflow.dive.held_out import HeldOut
 from aquaflow.dive.results import WaterSummary
+from aquaflow.fusion.interpolation import Interpolation
 from aquaflow.fusion.metric_frame import MetricFrame
+from aquaflow.fusion.telemetry import Telemetry
+from aquaflow.messages import Altitude, Depth
 
 CAMERA_WORLD = (
     "camera to world; world is the first keyframe's camera (x right, y down, z forward); scale: "
@@ -32,6 +35,14 @@ class Navigation:
     """With its time zone."""
     depth_m_at: Callable[[int], float | None] = _nothing
     altitude_m_at: Callable[[int], float | None] = _nothing
+
+    @staticmethod
+    def of(telemetry: Telemetry) -> Navigation:
+        """What is in the telemetry of a dive, on the clock of its frames."""
+        return Navigation(
+            depth_m_at=Interpolation.of(telemetry.of(Depth)).at,
+            altitude_m_at=Interpolation.of(telemetry.of(Altitude)).at,
+        )
 
 
 @dataclass(frozen=True)

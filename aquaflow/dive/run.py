@@ -71,8 +71,6 @@ class DiveRun:
         self.config = config
         self.lens_error: LensError | None = None
         """Result of the calibration check, if a calibration was given; known at the end."""
-        self.navigation = Navigation()
-        """What the vehicle measured by the time of a frame; read at the end of the dive."""
         self.live: dict[str, Any] | None = None
         """Counters of a live run for metrics.json."""
         self.started = time.monotonic()
@@ -183,8 +181,10 @@ class DiveRun:
         return self._write(results, outputs)
 
     def _metric_outputs(self) -> MetricOutputs:
-        frames = self.slam.failures.attempt("metric frames", self.slam.metric_frames)
-        return MetricOutputs(frames or {}, self.navigation)
+        attempt, telemetry = self.slam.failures.attempt, self.slam.metric.telemetry
+        frames = attempt("metric frames", self.slam.metric_frames)
+        navigation = attempt("navigation", lambda: Navigation.of(telemetry))
+        return MetricOutputs(frames or {}, navigation or Navigation())
 
     def _note_what_was_left_out(
         self, results: list[Tracked], notes: list[str], outputs: MetricOutputs

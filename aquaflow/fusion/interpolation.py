@@ -1,46 +1,48 @@
-"""A measured quantity over time, looked up at the moments of frames."""
+"""What telemetry measured, looked up at the moments of frames."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-LONGEST_GAP_NS = 2_000_000_000
-"""Two samples further apart, ns, are not connected: the slowest altimeters send one a second."""
+from aquaflow.fusion.telemetry import Series
+
+LONGEST_GAP_S = 2.0
+"""Two samples further apart are not connected: the slowest altimeters send one a second."""
 
 
 @dataclass(frozen=True)
-class Series:
-    """Samples in the order of their times; between two of them the value is linear."""
+class Interpolation:
+    """One quantity over time; between two samples it is linear."""
 
-    t_ns: npt.NDArray[np.int64]
-    """[N] strictly increasing, on the clock of the frames."""
+    t_s: npt.NDArray[np.float64]
+    """[N] s of the dive's clock, strictly increasing."""
     values: npt.NDArray[np.float64]
-    """[N] in the unit of the quantity."""
+    """[N] finite, in the unit of the quantity."""
 
     @staticmethod
-    def of(samples: Iterable[tuple[int, float]]) -> Series:
-        """From pairs of t_ns and value in any order; of several at one moment the last counts, and
-        values that are not finite are left out."""
-        by_time = {t_ns: value for t_ns, value in samples if np.isfinite(value)}
-        times = sorted(by_time)
-        return Series(np.array(times, np.int64), np.array([by_time[t] for t in times], np.float64))
+    def of(sources: Sequence[Series]) -> Interpolation:
+        """The first value of the source with most samples; of equals, the first. Others would only
+        make it jump."""
+        if not sources:
+            return Interpolation(np.zeros(0), np.zeros(0))
+        chosen = max(sources, key=len)
+        values = chosen.values[:, 0]
+        finite = np.isfinite(values)
+        return Interpolation(chosen.t_s[finite], values[finite])
 
     def at(self, t_ns: int) -> float | None:
-        """The value at ``t_ns``; None before the first sample, after the last, and in gaps."""
-        after = int(np.searchsorted(self.t_ns, t_ns))
-        if after == len(self.t_ns):
+        """The value at a moment; None before the first sample, after the last, and in gaps."""
+        t_s = t_ns * 1e-9
+        after = int(np.searchsorted(self.t_s, t_s))
+        if after == len(self.t_s):
             return None
-        if self.t_ns[after] == t_ns:
+        if self.t_s[after] == t_s:
             return float(self.values[after])
-        if after == 0:
+        if after == 0 or self.t_s[after] - self.t_s[after - 1] > LONGEST_GAP_S:
             return None
-        gap_ns = int(self.t_ns[after] - self.t_ns[after - 1])
-        if gap_ns > LONGEST_GAP_NS:
-            return None
-        share = (t_ns - int(self.t_ns[after - 1])) / gap_ns
-        before, then = self.values[after - 1], self.values[after]
-        return float(before + share * (then - before))
+        nearest = slice(after - 1, after + 1)
+        return float(np.interp(t_s, self.t_s[nearest], self.values[nearest]))
