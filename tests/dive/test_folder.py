@@ -26,6 +26,7 @@ METRICS = {
     *("gaussians", "wall_s", "fps", "stage_ms", "peak_rss_mb", "psnr", "ssim", "lpips"),
     *("lpips_reason", "heldout_frames", "ate_rmse_m_se3", "ate_rmse_m_sim3", "rpe"),
     *("scale_source", "scale_sigma", "unit", "north", "gravity_sigma_deg", "telemetry"),
+    *("utc_start", "utc_source", "utc_sigma_s"),
     *("renderer", "prior", "device", "seed", "version", "protocol"),
 }
 """The keys that docs/formats.md#metrics-json promises."""

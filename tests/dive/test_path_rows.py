@@ -16,7 +16,7 @@ from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.fusion.telemetry import Telemetry
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.messages import Depth, Frame
+from aquaflow.messages import Depth, Frame, UtcTime
 from aquaflow.tracking.frames import FrameClass, Tracked
 from tests.metric_scenes import SIGMAS, TRONDHEIM, metric_frame
 
@@ -96,11 +96,12 @@ def test_what_was_measured_is_that_of_the_moment() -> None:
     telemetry = Telemetry()
     for t_s, depth_m in ((0, 3.0), (2, 5.0)):
         telemetry.add(Depth(t_s * S, t_s * S, "bar30", depth_m))
-    navigation = replace(
-        Navigation.of(telemetry), utc_of=lambda t_ns: START + timedelta(seconds=t_ns / S)
-    )
-    row = rows(metric_frame(), navigation=navigation)[10]
-    assert row.utc == START + timedelta(seconds=1)
+    for t_s in range(5):
+        utc_ns = (round(START.timestamp()) + t_s) * S
+        telemetry.add(UtcTime(t_s * S, t_s * S, "gps/RMC", utc_ns))
+    row = rows(metric_frame(), navigation=Navigation.of(telemetry))[10]
+    assert row.utc is not None
+    assert abs(row.utc - START - timedelta(seconds=1)) < timedelta(microseconds=10)
     assert row.depth_m == pytest.approx(4.0)
     assert row.altitude_m is None
 
