@@ -64,15 +64,12 @@ def test_a_dive_has_a_row_for_every_pose(small_dive: Path) -> None:
     assert dive.medium is not None
 
 
-def test_a_dive_without_telemetry_is_in_map_units_and_its_table_has_every_pose(
-    small_dive: Path,
-) -> None:
+def test_a_dive_and_its_map_have_one_unit_and_its_table_has_every_pose(small_dive: Path) -> None:
     dive, scene = aquaflow.read_dive(small_dive), aquaflow.load_map(small_dive)
-    assert dive.unit == scene.unit == "map units"
-    assert [frame.is_identity for frame in dive.metric_frames.values()] == [True]
+    assert dive.unit == scene.unit == dive.metric_frames[0].unit
     rows = dive.navigation()
     np.testing.assert_allclose([row.x for row in rows], dive.trajectory.positions[:, 0], atol=1e-6)
-    assert {row.latitude_deg for row in rows} == {None}
+    assert {row.unit for row in rows} == {dive.unit}
 
 
 def test_a_folder_without_a_dive_is_refused_with_its_path(tmp_path: Path) -> None:

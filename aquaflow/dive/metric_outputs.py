@@ -11,7 +11,11 @@ import numpy as np
 
 from aquaflow.dive.held_out import HeldOut
 from aquaflow.dive.results import WaterSummary
+from aquaflow.fusion.interpolation import Interpolation
 from aquaflow.fusion.metric_frame import MetricFrame
+from aquaflow.fusion.telemetry import Telemetry
+from aquaflow.fusion.utc import UtcClock, fit_utc
+from aquaflow.messages import Altitude, Depth
 
 CAMERA_WORLD = (
     "camera to world; world is the first keyframe's camera (x right, y down, z forward); scale: "
@@ -28,10 +32,22 @@ def _nothing(_: int) -> None:
 class Navigation:
     """What the vehicle measured at the moment of a frame, by its ``t_ns``; None: nothing."""
 
-    utc_of: Callable[[int], datetime | None] = _nothing
-    """With its time zone."""
+    clock: UtcClock | None = None
     depth_m_at: Callable[[int], float | None] = _nothing
     altitude_m_at: Callable[[int], float | None] = _nothing
+
+    def utc_of(self, t_ns: int) -> datetime | None:
+        """With its time zone; None where no source stated the time."""
+        return None if self.clock is None else self.clock.utc_of(t_ns)
+
+    @staticmethod
+    def of(telemetry: Telemetry) -> Navigation:
+        """What is in the telemetry of a dive, on the clock of its frames."""
+        return Navigation(
+            fit_utc(telemetry.utc),
+            depth_m_at=Interpolation.of(telemetry.of(Depth)).at,
+            altitude_m_at=Interpolation.of(telemetry.of(Altitude)).at,
+        )
 
 
 @dataclass(frozen=True)
@@ -84,6 +100,17 @@ def frame_numbers(frame: MetricFrame) -> dict[str, Any]:
             for s in frame.sources
         ],
     }  # fmt: skip
+
+
+def utc_numbers(navigation: Navigation) -> dict[str, Any]:
+    """The keys of metrics.json on UTC, null where no source stated it."""
+    clock = navigation.clock
+    start = None if clock is None else clock.utc_of(0).isoformat().replace("+00:00", "Z")
+    return {
+        "utc_start": start,
+        "utc_source": None if clock is None else clock.source,
+        "utc_sigma_s": None if clock is None else clock.sigma_at_s(0),
+    }
 
 
 def sub_maps_in_words(frames: list[MetricFrame]) -> str:

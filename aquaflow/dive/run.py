@@ -21,6 +21,7 @@ from aquaflow.dive.metric_outputs import (
     Navigation,
     frame_numbers,
     sub_maps_in_words,
+    utc_numbers,
 )
 from aquaflow.dive.results import metrics
 from aquaflow.dive.shortcomings import shortcomings
@@ -71,8 +72,6 @@ class DiveRun:
         self.config = config
         self.lens_error: LensError | None = None
         """Result of the calibration check, if a calibration was given; known at the end."""
-        self.navigation = Navigation()
-        """What the vehicle measured by the time of a frame; read at the end of the dive."""
         self.live: dict[str, Any] | None = None
         """Counters of a live run for metrics.json."""
         self.started = time.monotonic()
@@ -183,13 +182,17 @@ class DiveRun:
         return self._write(results, outputs)
 
     def _metric_outputs(self) -> MetricOutputs:
-        frames = self.slam.failures.attempt("metric frames", self.slam.metric_frames)
-        return MetricOutputs(frames or {}, self.navigation)
+        attempt, telemetry = self.slam.failures.attempt, self.slam.metric.telemetry
+        frames = attempt("metric frames", self.slam.metric_frames)
+        navigation = attempt("navigation", lambda: Navigation.of(telemetry))
+        return MetricOutputs(frames or {}, navigation or Navigation())
 
     def _note_what_was_left_out(
         self, results: list[Tracked], notes: list[str], outputs: MetricOutputs
     ) -> None:
         self.notes += notes
+        if outputs.navigation.clock is not None:
+            self.notes += outputs.navigation.clock.notes
         lost = sum(tracked.T_wc is None for tracked in results)
         if lost:
             self.notes.append(f"{lost} of {len(results)} frames got no pose")
@@ -267,7 +270,7 @@ class DiveRun:
     def _numbers(self, results: list[Tracked], made: Deliverables) -> dict[str, Any]:
         wall_s = time.monotonic() - self.started
         numbers = metrics(self.slam, results, self.dropped, made.held_out, wall_s)
-        numbers |= frame_numbers(made.metric_frame)
+        numbers |= frame_numbers(made.metric_frame) | utc_numbers(made.outputs.navigation)
         numbers["warnings"], numbers["failures"] = self.warnings, self.slam.failures.to_json()
         numbers["calibration_check"] = self._calibration_numbers()
         numbers["cpu_s"] = round(time.process_time() - self._cpu_before_s, 3)  # of all threads

@@ -18,6 +18,7 @@ from aquaflow.dive.frames_csv import read_rows
 from aquaflow.errors import InputError
 from aquaflow.export.map_file import SUFFIX, read_map_file
 from aquaflow.fusion.known_lengths.known_length import KnownLength
+from aquaflow.fusion.metric_file import read_frame_of_map
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.views import View
 from aquaflow.render import select_renderer
@@ -98,12 +99,14 @@ def between_points(
     length_m: float,
     sigma_m: float,
 ) -> KnownLength:
-    """The length between two points of the map of the largest sub-map, in map units.
+    """The length between two points of the map of the largest sub-map, as map.ply has them.
 
     Raises:
-        InputError: the dive has no table of its frames, or the points are the same.
+        InputError: the dive has no table of its frames, its metric.json is damaged, or the points
+            are the same.
     """
-    length = float(np.linalg.norm(np.subtract(end, start)))
+    metres_per_unit = read_frame_of_map(dive / f"map{SUFFIX}").T_nm.scale
+    length = float(np.linalg.norm(np.subtract(end, start))) / metres_per_unit
     if not np.isfinite(length) or length <= 0.0:
         raise InputError("the two points are one and the same; mark both ends of a length")
     source = "scale bar {:g},{:g},{:g} to {:g},{:g},{:g}".format(*start, *end)

@@ -67,10 +67,10 @@ def _to_json(frame: MetricFrame) -> dict[str, Any]:
     T, T_bc = frame.T_nm, frame.T_bc
     return {
         "unit": frame.unit,
-        "metric": frame.metric,
-        "level": frame.level,
+        "metric": bool(frame.metric),  # a comparison of NumPy's numbers is no JSON
+        "level": bool(frame.level),
         "north": frame.north,
-        "depth_known": frame.depth_known,
+        "depth_known": bool(frame.depth_known),
         "T_nm": _of_sim3(T),
         "covariance": frame.covariance.tolist(),
         "T_bc": None if T_bc is None else _of_sim3(T_bc),
@@ -81,7 +81,7 @@ def _to_json(frame: MetricFrame) -> dict[str, Any]:
 
 
 def _of_sim3(T: Sim3) -> dict[str, Any]:
-    return {"scale": T.scale, "rotation": T.R.tolist(), "translation": T.t.tolist()}
+    return {"scale": float(T.scale), "rotation": T.R.tolist(), "translation": T.t.tolist()}
 
 
 def _read(folder: Path) -> dict[int, tuple[str, MetricFrame]]:

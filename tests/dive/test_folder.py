@@ -26,6 +26,7 @@ METRICS = {
     *("gaussians", "wall_s", "fps", "stage_ms", "peak_rss_mb", "psnr", "ssim", "lpips"),
     *("lpips_reason", "heldout_frames", "ate_rmse_m_se3", "ate_rmse_m_sim3", "rpe"),
     *("scale_source", "scale_sigma", "unit", "north", "gravity_sigma_deg", "telemetry"),
+    *("utc_start", "utc_source", "utc_sigma_s"),
     *("renderer", "prior", "device", "seed", "version", "protocol"),
 }
 """The keys that docs/formats.md#metrics-json promises."""
@@ -72,8 +73,8 @@ def test_metrics_have_the_stable_keys_and_agree_with_the_table(small_dive: Path)
     assert metrics["mapping_frames"] == classes.count("mapping")
     assert metrics["common_frames"] == classes.count("common")
     assert metrics["heldout_frames"] == len(HELD_OUT)
-    assert (metrics["unit"], metrics["north"]) == ("map units", "first keyframe")
-    assert metrics["scale_sigma"] is metrics["gravity_sigma_deg"] is None
+    assert (metrics["unit"] == "m") == (metrics["scale_sigma"] is not None)
+    assert (metrics["north"] == "first keyframe") == (metrics["gravity_sigma_deg"] is None)
     for stage in metrics["stage_ms"].values():
         assert stage.keys() == {"count", "total", "p50", "p95"}
 
@@ -89,7 +90,8 @@ def test_maps_load_and_differ_only_in_colour(small_dive: Path) -> None:
 def test_water_has_its_rates_and_their_unit(small_dive: Path) -> None:
     medium = json.loads((small_dive / "medium.json").read_text())
     assert medium["active"]
-    assert medium["attenuation_unit"] == "1/map unit"
+    metric = medium.get("unit") == "m"
+    assert medium["attenuation_unit"] == ("1/m" if metric else "1/map unit")
     values = [medium["attenuation_per_unit"], *medium["backscatter"].values()]
     assert np.shape(values) == (5, 3)
     assert np.min(values) >= 0.0

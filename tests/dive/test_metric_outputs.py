@@ -13,13 +13,20 @@ import aquaflow
 from aquaflow.config import Config, load_config
 from aquaflow.dive.deliverables import Deliverables
 from aquaflow.dive.folder import DiveFolder
-from aquaflow.dive.metric_outputs import MetricOutputs, sub_maps_in_words, worlds_in_words
+from aquaflow.dive.metric_outputs import (
+    MetricOutputs,
+    Navigation,
+    sub_maps_in_words,
+    utc_numbers,
+    worlds_in_words,
+)
 from aquaflow.evaluation.trajectory import read_tum
 from aquaflow.export.ply import read_ply
 from aquaflow.export.trajectory_csv import read_trajectory_csv
 from aquaflow.fusion.metric_frame import MetricFrame
+from aquaflow.fusion.telemetry import Telemetry
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.messages import Frame
+from aquaflow.messages import Frame, UtcTime
 from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation
@@ -27,6 +34,7 @@ from tests.metric_scenes import SCALE, SHIFT, TURN, metric_frame
 
 SETTINGS = load_config(Path(__file__).parents[1] / "hasty.yaml")
 FRAMES = 12
+S = 1_000_000_000
 NUMBERS = {"stage_ms": {}, "warnings": []}
 
 
@@ -219,3 +227,16 @@ def test_a_pose_of_a_sub_map_that_no_frame_is_known_for_stays(slam: Slam, tmp_pa
     first = slam.results()[0].T_wc
     assert isinstance(first, Sim3)
     assert made.poses[0] is first or np.array_equal(made.poses[0].t, first.t)
+
+
+def test_numbers_say_when_the_dive_began_if_a_clock_was_heard() -> None:
+    telemetry = Telemetry()
+    assert utc_numbers(Navigation.of(telemetry))["utc_start"] is None
+    for t_s in range(10):
+        telemetry.add(UtcTime(t_s * S, t_s * S, "gps/RMC", (1_800_000_000 + t_s) * S))
+    numbers = utc_numbers(Navigation.of(telemetry))
+    assert numbers["utc_source"] == "gps/RMC"
+    assert numbers["utc_start"].startswith("2027-01-15T0")
+    assert numbers["utc_start"].endswith("Z")
+    assert 0.0 < numbers["utc_sigma_s"] < 1.0
+    json.dumps(numbers, allow_nan=False)

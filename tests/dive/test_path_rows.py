@@ -13,10 +13,10 @@ from aquaflow.dive.metric_outputs import MetricOutputs, Navigation
 from aquaflow.dive.path_rows import path_rows
 from aquaflow.export.trajectory_csv import PoseRow
 from aquaflow.fusion.metric_frame import MetricFrame
-from aquaflow.fusion.series import Series
+from aquaflow.fusion.telemetry import Telemetry
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.messages import Frame
+from aquaflow.messages import Depth, Frame, UtcTime
 from aquaflow.tracking.frames import FrameClass, Tracked
 from tests.metric_scenes import SIGMAS, TRONDHEIM, metric_frame
 
@@ -93,13 +93,16 @@ def test_places_go_north_and_east_from_the_origin() -> None:
 
 
 def test_what_was_measured_is_that_of_the_moment() -> None:
-    depth = Series.of([(0, 3.0), (2 * S, 5.0)])
-    navigation = Navigation(
-        utc_of=lambda t_ns: START + timedelta(seconds=t_ns / S), depth_m_at=depth.at
-    )
-    row = rows(metric_frame(), navigation=navigation)[10]
-    assert row.utc == START + timedelta(seconds=1)
-    assert row.depth_m == 4.0
+    telemetry = Telemetry()
+    for t_s, depth_m in ((0, 3.0), (2, 5.0)):
+        telemetry.add(Depth(t_s * S, t_s * S, "bar30", depth_m))
+    for t_s in range(5):
+        utc_ns = (round(START.timestamp()) + t_s) * S
+        telemetry.add(UtcTime(t_s * S, t_s * S, "gps/RMC", utc_ns))
+    row = rows(metric_frame(), navigation=Navigation.of(telemetry))[10]
+    assert row.utc is not None
+    assert abs(row.utc - START - timedelta(seconds=1)) < timedelta(microseconds=10)
+    assert row.depth_m == pytest.approx(4.0)
     assert row.altitude_m is None
 
 

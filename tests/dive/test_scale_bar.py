@@ -22,9 +22,11 @@ from aquaflow.fusion.known_lengths.known_lengths_file import (
     with_length,
     write_known_lengths,
 )
+from aquaflow.fusion.metric_file import read_frame_of_map, write_metric_file
 from aquaflow.geometry.alignment import align
 from aquaflow.geometry.camera import load_camera
 from tests.command_line import Cli
+from tests.metric_scenes import SCALE, metric_frame
 
 
 @pytest.fixture
@@ -67,7 +69,8 @@ def test_a_length_in_a_picture_gives_the_scale_that_the_path_has(
     found, true = read_tum(dive / "trajectory.tum"), read_tum(small_recording / "poses.tum")
     mine, theirs = associate(found.t_s, true.t_s)
     aligned = align(found.positions[mine], true.positions[theirs], with_scale=True)
-    error = np.log(known.metres_per_unit / aligned.T_target_source.scale)
+    of_the_map = read_frame_of_map(dive / "map.aqf").T_nm.scale  # 1 where it keeps its unit
+    error = np.log(known.metres_per_unit / (aligned.T_target_source.scale * of_the_map))
     assert abs(error) < 0.1
     assert abs(error) < 4.0 * known.relative_sigma
 
@@ -90,9 +93,16 @@ def test_the_command_prints_metres_with_plus_minus_and_keeps_them(dive: Path, co
 
 
 def test_two_points_of_the_map_need_no_picture(dive: Path) -> None:
+    (dive / "metric.json").unlink()
     known = between_points(dive, (0.0, 0.0, 1.0), (0.3, 0.4, 1.0), 1.0, 0.001)
     assert known.metres_per_unit == pytest.approx(2.0)
     assert known.frame_index == -1
+
+
+def test_points_of_a_map_in_metres_are_taken_back_to_its_own_unit(dive: Path) -> None:
+    write_metric_file(dive, {0: metric_frame()}, main=0)
+    known = between_points(dive, (0.0, 0.0, 1.0), (0.3, 0.4, 1.0), 1.0, 0.001)
+    assert known.metres_per_unit == pytest.approx(2.0 * SCALE)
 
 
 @pytest.mark.parametrize(

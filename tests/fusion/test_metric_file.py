@@ -43,6 +43,13 @@ def test_frames_are_read_back_as_they_were(tmp_path: Path) -> None:
             assert getattr(back, name) == getattr(frame, name)
 
 
+def test_flags_may_be_numpys(tmp_path: Path) -> None:
+    yes = np.float64(0.1) <= np.float64(0.2)
+    frame = metric_frame(metric=yes, level=yes, depth_known=yes)
+    write_metric_file(tmp_path, {0: frame}, main=0)
+    assert read_metric_file(tmp_path)[0].level is True
+
+
 def test_a_map_file_has_the_frame_of_its_sub_map(tmp_path: Path) -> None:
     written(tmp_path)
     assert read_frame_of_map(tmp_path / "map.aqf").metric
