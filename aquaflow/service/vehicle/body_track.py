@@ -135,7 +135,7 @@ class BodyTrack:
     def _differ(self, a: Pose, b: Pose, slack_m: float, slack_rad: float) -> bool:
         turn, moved = a.to(b)
         too_far = float(np.linalg.norm(moved)) > self._jump_m + slack_m
-        return too_far or float(np.linalg.norm(turn)) > self._jump_rad + slack_rad
+        return bool(too_far or float(np.linalg.norm(turn)) > self._jump_rad + slack_rad)
 
 
 def _mid_step(a: Pose, b: Pose) -> Array:

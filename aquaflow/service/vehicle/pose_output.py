@@ -8,6 +8,7 @@ that knows it has no vision.
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable
@@ -74,7 +75,7 @@ class PoseOutput:
         """Where the map's scale comes from, or why there is none."""
         self._config, self._feed, self._frame_of = config, feed, frame_of
         self._stated = None if config.mounting is None else camera_in_body(config.mounting)
-        self._track = BodyTrack(config.jump_m, np.radians(config.jump_deg))
+        self._track = BodyTrack(config.jump_m, math.radians(config.jump_deg))
         self._index: int | None = None
         self._place_m: Array | None = None
         self._way_m = 0.0

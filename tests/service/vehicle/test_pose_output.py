@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -186,6 +187,7 @@ def test_a_correction_that_is_large_bumps_the_reset_counter_and_begins_the_veloc
         known = turned(frame(), xi) if k >= 10 else known
         show(told, out, seen(pose, frame()))
     assert [word.reset_counter for word in poses(told)] == [0] * 8 + [1] * 9
+    assert json.loads(json.dumps(out.to_json()))["jumps"] == 1
     assert out.withheld == {Withheld.TOO_RARE: 1, Withheld.NO_VELOCITY: 3}
     speeds = [word.velocity_m_s for word in poses(told)]
     assert np.allclose(speeds, [0.5, 0.0, 0.275], atol=2e-3)
