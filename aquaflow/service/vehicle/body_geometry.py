@@ -10,12 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow.config.telemetry import MountingConfig
 from aquaflow.fusion.metric_frame import MetricFrame
+from aquaflow.fusion.start import camera_in_body
 from aquaflow.geometry.similarity import Sim3, hat
 
 Array = npt.NDArray[np.float64]
 
-CAMERA_TO_BODY = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""Camera (right, down, forward) to body (forward, right, down), for one that looks forward."""
 LEAST_COSINE = 0.1
 """Of the pitch. Roll and yaw cannot be told apart at 90 deg; their covariance stays finite."""
 
@@ -35,11 +34,9 @@ class Pose:
         return np.asarray(turn), later.R.T @ (later.t_m - self.t_m)
 
 
-def camera_in_body(mounting: MountingConfig) -> Sim3:
+def stated_mounting(mounting: MountingConfig) -> Sim3:
     """T_bc of a camera that looks forward without angles, and down with pitch_deg -90."""
-    angles = (mounting.yaw_deg, mounting.pitch_deg, mounting.roll_deg)
-    R = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix() @ CAMERA_TO_BODY
-    return Sim3(R, np.array(mounting.position_m, np.float64))
+    return Sim3(*camera_in_body(mounting))
 
 
 def body_pose(frame: MetricFrame, T_bc: Sim3, T_mc: Sim3) -> Pose:

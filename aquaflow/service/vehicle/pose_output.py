@@ -8,6 +8,7 @@ that knows it has no vision.
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable
@@ -22,7 +23,7 @@ from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.service.feed import Feed
 from aquaflow.service.loop import LiveLoop
-from aquaflow.service.vehicle.body_geometry import body_pose, camera_in_body, pose_covariance
+from aquaflow.service.vehicle.body_geometry import body_pose, pose_covariance, stated_mounting
 from aquaflow.service.vehicle.body_track import BodyTrack, Sighting
 from aquaflow.sources.outbound import BodyMotion, BodyPose, OutboundMessage
 from aquaflow.tracking.frames import Tracked
@@ -73,8 +74,8 @@ class PoseOutput:
         self.scale_source = ""
         """Where the map's scale comes from, or why there is none."""
         self._config, self._feed, self._frame_of = config, feed, frame_of
-        self._stated = None if config.mounting is None else camera_in_body(config.mounting)
-        self._track = BodyTrack(config.jump_m, np.radians(config.jump_deg))
+        self._stated = None if config.mounting is None else stated_mounting(config.mounting)
+        self._track = BodyTrack(config.jump_m, math.radians(config.jump_deg))
         self._index: int | None = None
         self._place_m: Array | None = None
         self._way_m = 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,14 +16,18 @@ from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.errors import ConfigError
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3, so3_log
+from aquaflow.service.checkpoint.resume import Choice
 from aquaflow.service.dive_clock import Continued
 from aquaflow.service.health.prometheus import exposition
+from aquaflow.service.live_dive import LiveDive
 from aquaflow.service.onboard import map_live
+from aquaflow.service.report import report
 from aquaflow.service.vehicle.pose_output import PoseOutput, Withheld
 from aquaflow.service.vehicle.scale_sources import refuse_without_scale
 from aquaflow.sources.outbound import BodyMotion, BodyPose
+from aquaflow.tracking.frames import FrameClass, Tracked
 from tests.service.health.reports import REPORT
-from tests.service.live_scenes import Told
+from tests.service.live_scenes import VEHICLE, Told, ToldFeed, frame_of
 from tests.service.vehicle.swims import MOUNTINGS, diving, frame, seen, show, turned
 
 SECONDS = np.arange(21) / 10.0
@@ -186,6 +191,7 @@ def test_a_correction_that_is_large_bumps_the_reset_counter_and_begins_the_veloc
         known = turned(frame(), xi) if k >= 10 else known
         show(told, out, seen(pose, frame()))
     assert [word.reset_counter for word in poses(told)] == [0] * 8 + [1] * 9
+    assert json.loads(json.dumps(out.to_json()))["jumps"] == 1
     assert out.withheld == {Withheld.TOO_RARE: 1, Withheld.NO_VELOCITY: 3}
     speeds = [word.velocity_m_s for word in poses(told)]
     assert np.allclose(speeds, [0.5, 0.0, 0.275], atol=2e-3)
@@ -289,3 +295,30 @@ def test_stamps_of_a_resumed_dive_are_those_of_this_boots_clock(told: Told) -> N
     known = frame()
     dive(told, output(told, known), known)
     assert poses(told)[-1].t_ns == 2_000_000_000 - 7_000_000_000
+
+
+def test_the_report_of_a_live_dive_holds_the_poses(tmp_path: Path) -> None:
+    feed = ToldFeed()
+    with LiveDive("told", Choice(tmp_path / "dive"), feed, VEHICLE) as dive:
+        out = PoseOutput(PoseConfig(), feed, dive.parts.slam.metric_frame)
+        dive.parts.loop.watchers.append(out.update)
+        for k, pose in enumerate(diving(SECONDS[:5])):
+            tracked = Tracked(frame_of(k), FrameClass.COMMON, 0, 0, seen(pose, frame()))
+            dive.parts.loop.latest = tracked
+            dive.parts.loop.take(None)
+        said = json.loads(json.dumps(report(dive.parts, 60.0, out)))
+        assert said["pose_output"]["withheld"] == {Withheld.NO_SCALE.value: 5}
+        assert said["pose_output"]["scale"].startswith("none")
+        assert report(dive.parts, 60.0)["pose_output"] is None
+
+
+def test_a_service_with_a_source_of_metres_starts_with_its_poses_switched_on(
+    tmp_path: Path,
+) -> None:
+    settings = VEHICLE.model_dump()
+    settings["service"]["pose"]["enabled"] = True
+    devices = {"autopilot": {"kind": "mavlink", "link": {"kind": "udp", "port": 14550}}}
+    settings["telemetry"] = {"devices": devices}
+    feed = ToldFeed()
+    feed.newest.end()
+    assert map_live(feed, VehicleConfig.model_validate(settings), tmp_path / "dive") is None
