@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.geometry.earth import SEMI_MAJOR_M, north_east
+from aquaflow.geometry.earth import latitude_longitude
 from aquaflow.synthetic.motion import BodyMotion
 from aquaflow.synthetic.telemetry.series import chosen
 from aquaflow.synthetic.telemetry_noise import TelemetryNoise
@@ -16,9 +15,6 @@ from aquaflow.synthetic.telemetry_noise import TelemetryNoise
 __all__ = ["position", "utc_time"]
 
 Array: TypeAlias = npt.NDArray[np.float64]
-
-STEPS = 4
-"""Of the iteration from metres to degrees on a sphere: each leaves 0.5 % of the error."""
 
 
 def position(
@@ -58,8 +54,5 @@ def _on_earth(
 ) -> Array:
     """[N, 2] degrees (WGS 84)."""
     origin = (noise.origin_latitude_deg, noise.origin_longitude_deg)
-    per_degree = math.radians(SEMI_MAJOR_M) * np.array([1.0, math.cos(math.radians(origin[0]))])
-    found = np.tile(origin, (len(place), 1))
-    for _ in range(STEPS):
-        found = found + (place - north_east(found[:, 0], found[:, 1], origin)) / per_degree
-    return found
+    at_the_surface = np.column_stack([place, np.zeros(len(place))])
+    return np.stack(latitude_longitude(at_the_surface, origin), axis=1)
