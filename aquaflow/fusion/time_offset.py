@@ -44,7 +44,7 @@ that belong together have 1 to 8 degrees, those that do not but fit, 8 to 34."""
 BLOCK_S = 1.0
 """Pieces of the dive in which two explanations are compared."""
 CHANCE_OF_NOTHING = 1e-4
-"""Chance that an unrelated log explains this much, up to which the log counts as related: of 150
+"""Chance that an unrelated log explains this much, up to which the log counts as related: of 100
 unrelated pairs of simulated random motion none passes, of as many related ones all."""
 CHANCE_OF_RIVAL = 1e-3
 """Chance that another offset is as good, up to which it is not."""
