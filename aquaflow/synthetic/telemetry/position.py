@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.geometry.earth import SEMI_MAJOR_M, north_east
+from aquaflow.geometry.earth import north_east
 from aquaflow.synthetic.motion import BodyMotion
 from aquaflow.synthetic.telemetry.series import chosen
 from aquaflow.synthetic.telemetry_noise import TelemetryNoise
@@ -17,6 +17,8 @@ __all__ = ["position", "utc_time"]
 
 Array: TypeAlias = npt.NDArray[np.float64]
 
+SEMI_MAJOR_M = 6_378_137.0
+"""Of the WGS 84 ellipsoid."""
 STEPS = 4
 """Of the iteration from metres to degrees on a sphere: each leaves 0.5 % of the error."""
 
