@@ -24,7 +24,7 @@ North: TypeAlias = Literal["true north", "magnetic north", "initial heading", "f
 LARGEST_SCALE_SIGMA = 0.1
 """Relative 1 sigma of the scale up to which lengths are called metres: judgement, a ruler that may
 be 10 % off is still one for a pilot; beyond, the map keeps its own unit."""
-LARGEST_TILT_SIGMA = np.radians(5.0)
+LARGEST_TILT_SIGMA = float(np.radians(5.0))
 """1 sigma of gravity's direction, rad, up to which the world is turned level: judgement."""
 UNKNOWN_SIGMA = 1e3
 """1 sigma, in m, rad and log-scale, of a direction that nothing has measured."""

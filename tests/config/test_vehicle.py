@@ -40,7 +40,7 @@ def test_every_example_is_valid(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "settings"), [("bluerov2_usb", 9), ("oak_in_housing", 2), ("can_vehicle", 0)]
+    ("name", "settings"), [("bluerov2_usb", 11), ("oak_in_housing", 2), ("can_vehicle", 0)]
 )
 def test_settings_that_an_example_leaves_as_comments_are_valid_too(
     name: str, settings: int, tmp_path: Path
