@@ -31,10 +31,15 @@ class AltitudeFactor(Factor):
     """m: the same rock stays within the beam for seconds."""
     spans = (SCALE,)
 
-    def __init__(self, altitude: Series, path: CameraPath, points_m: Array, state: State) -> None:
+    def __init__(
+        self,
+        altitude: Series,
+        path: CameraPath,
+        points_m: Array,  # [K, 3] of the map
+        state: State,
+    ) -> None:
         """Keeps the samples whose beam meets the map at the body's pose in ``state``; the beam
-        looks along the body's z. ``points_m`` [K, 3] are of the map; ``path`` covers all samples.
-        """
+        looks along the body's z. ``path`` covers all samples."""
         altitude = altitude.thinned(MOST_BEAMS)
         R_mc, p_m = path.at(altitude.t_s)
         down = (R_mc @ state.R_bc.T)[:, :, 2]
