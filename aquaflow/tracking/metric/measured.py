@@ -28,6 +28,8 @@ NEAR_S = 0.5
 the camera's own path at its own moment, which hardly changes in so short a time."""
 DIRECTION_TIME_S = 60.0
 """s, correlation time of the errors of attitude filters and compasses."""
+HELD = 1e-3
+"""m and rad, 1 sigma of what is a convention: where the world's origin and its x axis are."""
 LARGEST_SCALE_SIGMA = 0.2
 """Relative; what says less of the scale is left out: a vehicle that hovers."""
 
@@ -82,6 +84,8 @@ def world_edges(
     for i, number in enumerate(numbers.tolist()):
         T_nk, t = estimate.frame.T_nm @ T_mk.element(i), float(t_s[i])
         measured = _measured(T_nk, t, depth, place, scale, tilt, north)
+        if i == 0:
+            measured = _held(measured, T_nk, place is None, depth is None, north is None)
         edge = world_edge(number, T_nk, measured)
         if edge is not None:
             found.append(edge)
@@ -111,6 +115,19 @@ def _measured(
         if swung is not None:
             turn[2], north_sigma = swung[0][0], swung[1]
         measured = replace(measured, turn=turn, turn_sigma=(sigma, north_sigma))
+    return measured
+
+
+def _held(measured: Measured, T_nk: Sim3, place: bool, depth: bool, north: bool) -> Measured:
+    """What nothing measures anywhere is held at the first keyframe, or the world would drift."""
+    if place:
+        measured = replace(measured, place_m=(T_nk.t[:2].copy(), HELD))
+    if depth:
+        measured = replace(measured, depth_m=(float(T_nk.t[2]), HELD))
+    if north:
+        tilt_sigma = measured.turn_sigma[0] if measured.turn is not None else np.inf
+        turn = np.zeros(3) if measured.turn is None else measured.turn
+        measured = replace(measured, turn=turn, turn_sigma=(tilt_sigma, HELD))
     return measured
 
 
