@@ -67,6 +67,9 @@ class SyntheticConfig(BaseModel):
     altitude_swing_m: float = Field(
         0.35, ge=0, description="m, amplitude: lowest at the far end of each lane"
     )
+    rises: int | None = Field(
+        None, ge=1, description="how often it rises and falls along the way; None: every other lane"
+    )
     camera_pitch_deg: float = Field(
         42.0,
         ge=5,

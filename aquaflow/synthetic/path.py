@@ -102,7 +102,7 @@ def plan_path(
     way = way_of(config)
     period = config.duration_s
     at = np.linspace(0.0, period, DENSE + 1)
-    omega = 2.0 * math.pi * way.rounds / period
+    omega = 2.0 * math.pi * (config.rises or way.rounds) / period
     swing = min(config.altitude_swing_m, MAX_CLIMB_M_S / omega)
     altitude = config.altitude_m + swing * np.cos(omega * at)
     ground = np.zeros(DENSE + 1) if relief is None else _followed(relief, config, way)
