@@ -70,13 +70,14 @@ class Slam:
         places = Places(self.keyframes, config.tracking)
         self._anchors = Anchors(self.keyframes, self.failures)
         self.gate = FrameGate(config.tracking.gate)
-        self.tracker = Tracker(
-            self.prior, self.keyframes, config.tracking, places, live, self.failures
-        )
         self.metric = MetricFrames(
             self.keyframes, lambda: self.frames, config.fusion, self.failures
         )
         """Telemetry, and the frames in metres that it gives."""
+        self.tracker = Tracker(
+            self.prior, self.keyframes, config.tracking, places, live, self.failures,
+            self.metric.motion,
+        )  # fmt: skip
         self.graph = KeyframeGraph(
             self.keyframes, places, config.tracking, self.failures, self.metric
         )

@@ -23,6 +23,7 @@ from aquaflow.prior.contract import Encoding, Float, Mask, PairGeometry, Prior
 from aquaflow.tracking.frames import FrameClass, Link, Quality, Tracked
 from aquaflow.tracking.loops.neighbours import Neighbours
 from aquaflow.tracking.pose.depth_fusion import fuse, transfer
+from aquaflow.tracking.pose.expected_matches import expected_matches, is_wide
 from aquaflow.tracking.pose.matcher import KeyframeMatcher, Matched
 from aquaflow.tracking.pose.visibility import agreeing, predicted_matches
 
@@ -37,8 +38,12 @@ class CurrentKeyframe:
     T_fk: Sim3 = field(default_factory=Sim3.identity)
     motion: Sim3 = field(default_factory=Sim3.identity)
     """From the frame before to the last one."""
+    measured: bool = False
+    """True if ``motion`` is the next frame's by gyro or DVL, not the last one's again."""
     matches: Float | None = None
     """[H, W, 2] px of the last frame: where the next one's are looked for."""
+    t_ns: int = 0
+    """Moment of the last frame."""
     mapped_parallax_px: float = 0.0
     """Parallax of the last frame that went into the map."""
 
@@ -86,7 +91,7 @@ class KeyframeTracker:
         """The frame's pose against the current keyframe; None where too few matches support one."""
         predicted, seed = at.motion @ at.T_fk, None
         if pair is None:
-            seed = at.matches if self._config.seed_matching else None
+            seed = self._seed(at, predicted, camera)
             pair = self._prior.decode(self._reference(at), encoding, seed)
         solved = self._matcher.pose(at.keyframe, camera, pair, predicted, at.T_fk)
         if solved is None and seed is not None:
@@ -94,6 +99,15 @@ class KeyframeTracker:
             pair = self._prior.decode(self._reference(at), encoding)
             solved = self._matcher.pose(at.keyframe, camera, pair, predicted, at.T_fk)
         return solved
+
+    def _seed(self, at: CurrentKeyframe, predicted: Sim3, camera: CameraModel) -> Float | None:
+        """Where the frame's matches are looked for first: at the last ones, or, where telemetry
+        measured a wide motion since then, where that leads to."""
+        if not self._config.seed_matching:
+            return None
+        if at.measured and is_wide(at.keyframe.pointmap, at.T_fk, predicted, camera):
+            return expected_matches(at.keyframe.pointmap, predicted, camera)
+        return at.matches
 
     def _reference(self, at: CurrentKeyframe) -> Encoding:
         if self._config.reuse_encodings or at.image is None:
@@ -155,7 +169,8 @@ class KeyframeTracker:
     ) -> CurrentKeyframe:
         """The frame as a keyframe; ``motion``: from the frame before it."""
         keyframe = self._keyframes.add(frame.index, frame.t_ns, encoding, T_wc, pointmap, sub_map)
-        return CurrentKeyframe(keyframe, frame.image, motion=motion or Sim3.identity())
+        motion = motion or Sim3.identity()
+        return CurrentKeyframe(keyframe, frame.image, motion=motion, t_ns=frame.t_ns)
 
     # --- keyframes left behind ----------------------------------------------------------------
 

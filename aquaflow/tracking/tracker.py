@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TypeAlias
 
 from aquaflow.config import TrackingConfig
 from aquaflow.errors.failures import Failures
@@ -18,6 +19,10 @@ from aquaflow.tracking.loops.relocaliser import Places
 from aquaflow.tracking.map_start import MapStart
 from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
 
+ExpectedMotion: TypeAlias = Callable[[Keyframe, int, int, Sim3], Sim3 | None]
+"""The camera's motion between two moments (ns) as telemetry has it, in units of the keyframe; the
+last argument is the motion between the two frames before."""
+
 
 class Tracker:
     """One camera, one stream; a loss starts a new sub-map instead of failing."""
@@ -30,11 +35,13 @@ class Tracker:
         places: Places | None = None,
         live: bool = False,
         failures: Failures | None = None,
+        motion: ExpectedMotion | None = None,
     ) -> None:
         """Without ``places`` there is no relocalisation: a lost camera starts a new sub-map.
 
         Frames that waited for a keyframe get their poses once it is there; in a ``live`` run
         whenever there is time, by :meth:`back_fill`. What raises is counted in ``failures``.
+        ``motion`` is asked for what gyro and DVL measured since the last frame.
         """
         self.sub_map = 0
         self.camera: CameraModel | None = None
@@ -42,7 +49,7 @@ class Tracker:
         self.focal_sigma = 0.0
         self._prior, self._keyframes, self._config = prior, keyframes, config
         self._places, self._keyframe_tracker = places, KeyframeTracker(prior, keyframes, config)
-        self._failures = failures or Failures()
+        self._failures, self._motion = failures or Failures(), motion
         self.sub_maps = 1
         """Number of sub-maps started so far."""
         self._waiting = waiting = WaitingFrames()
@@ -216,16 +223,27 @@ class Tracker:
             return self._placed(frame, encoding, pair)
         return None
 
+    def _expect(self, at: CurrentKeyframe, frame: Frame) -> None:
+        """Replace the motion that is expected, the last one again, by what telemetry measured."""
+        motion = None
+        if self._motion is not None and at.t_ns > 0:
+            with self._failures.contain("expected motion", frame.index):
+                motion = self._motion(at.keyframe, at.t_ns, frame.t_ns, at.motion)
+        at.measured = motion is not None
+        at.motion = motion or at.motion
+
     def _placed(
         self, frame: Frame, encoding: Encoding, pair: PairGeometry | None
     ) -> Tracked | None:
         assert self._at is not None
         assert self.camera is not None
         at, camera, keyframe_tracker = self._at, self.camera, self._keyframe_tracker
+        self._expect(at, frame)
         solved = keyframe_tracker.place(at, encoding, camera, pair)
         if solved is None:
             return None
         keyframe_tracker.take(at, solved, camera)
+        at.t_ns = frame.t_ns
         if keyframe_tracker.hidden(solved):
             frame = keyframe_tracker.without_hidden(frame, at, solved, camera)
         frame_class = keyframe_tracker.classify(at, solved, camera)

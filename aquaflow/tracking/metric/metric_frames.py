@@ -10,11 +10,15 @@ import numpy.typing as npt
 from aquaflow.config import FusionConfig
 from aquaflow.errors.failures import Failures
 from aquaflow.fusion.metric_frame import MetricFrame
+from aquaflow.fusion.recent_motion import RecentMotion
+from aquaflow.fusion.start import camera_in_body
 from aquaflow.fusion.telemetry import Telemetry
-from aquaflow.keyframes import KeyframeStore
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes import Keyframe, KeyframeStore
 from aquaflow.messages import TelemetrySample
 from aquaflow.tracking.frame_table import FrameTable
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
+from aquaflow.tracking.metric.motion import motion_of_camera
 from aquaflow.tracking.metric.straightening import estimates_of, straightened
 from aquaflow.tracking.metric.survey import Survey, sampled_points
 
@@ -29,6 +33,7 @@ class MetricFrames:
         failures: Failures,
     ) -> None:  # fmt: skip
         self.telemetry = Telemetry()
+        self._recent = RecentMotion()
         self.mounting = config.camera
         """Of the camera in the body; a recording that states it may set it."""
         self.frames: dict[int, MetricFrame] = {}
@@ -49,6 +54,25 @@ class MetricFrames:
         """A sample of telemetry, in the order of arrival."""
         if self._config.enabled:
             self.telemetry.add(sample)
+            self._recent.add(sample)
+
+    def motion(self, keyframe: Keyframe, first_ns: int, last_ns: int, before: Sim3) -> Sim3 | None:
+        """The camera's motion between two frames by gyro and DVL, from the earlier to the later.
+
+        None where they do not cover the time, or the camera's mounting is unknown. ``before``: the
+        motion between the two frames before.
+        """
+        frame = self.of(keyframe.sub_map)
+        T_bc = frame.T_bc or self._stated
+        if T_bc is None:
+            return None
+        scale = frame.T_nm.scale * keyframe.T_wc.scale if frame.metric else None
+        return motion_of_camera(self._recent, T_bc, scale, first_ns, last_ns, before)
+
+    @property
+    def _stated(self) -> Sim3 | None:
+        """Camera to body as stated."""
+        return None if self.mounting is None else Sim3(*camera_in_body(self.mounting))
 
     def keyframe(self, number: int, parent: int | None) -> bool:
         """A new keyframe; True if it is time to straighten the graph by telemetry."""
