@@ -39,6 +39,9 @@ def estimates_of(survey: Survey) -> dict[int, Estimate]:
     return found
 
 
+STRAIN = 1.5
+"""Mean squared difference of path and telemetry, in sigmas, up to which a sub-map stays as it is:
+the camera alone is more precise than any instrument where nothing has drifted."""
 LINK_TURN = np.radians(0.05)
 """rad, 1 sigma: links of a synthetic forward view of 164 keyframes turn by 0.02 to 0.08 degrees too
 much, root mean square, and mostly the same way; the pose solver's own sigma is 0.01."""
@@ -67,8 +70,9 @@ def straightened(snapshot: Snapshot, survey: Survey, t_s: Mapping[int, float]) -
         numbers = inside["number"]
         moments = np.array([t_s[number] for number in numbers.tolist()])
         edges = world_edges(found, numbers, moments, poses_of(inside))
-        if edges:
-            worlds.append(World.at(component, found.frame, edges))
+        world = World.at(component, found.frame, edges)
+        if world.strain > STRAIN:
+            worlds.append(world)
     result, T_mn = solve_with_worlds(snapshot, worlds)
     frames = {component: found.frame for component, found in estimates.items()}
     for component, T in T_mn.items():
@@ -121,7 +125,7 @@ def _with_worlds(snapshot: Snapshot, worlds: list[World]) -> Snapshot:
     return replace(
         snapshot,
         nodes=_joined(snapshot.nodes, nodes),
-        edges=_joined(_softened(snapshot.edges), edges),
+        edges=_joined(_softened(snapshot.edges) if worlds else snapshot.edges, edges),
         trust=_joined(snapshot.trust, trust),
     )
 

@@ -45,6 +45,10 @@ class WorldEdge:
     T_nk: Sim3
     information: Array
     """[7, 7] of the right tangent of ``T_nk``."""
+    chi2: float
+    """Squared difference to the present pose, in sigmas."""
+    count: int
+    """Numbers that were measured."""
 
 
 def world_edge(
@@ -75,8 +79,9 @@ def world_edge(
         rows.append(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0 / sigma]))
     if not rows:
         return None
-    A = np.stack(rows)
-    return WorldEdge(keyframe, Sim3(R, t, scale), A.T @ A)
+    A, T_measured = np.stack(rows), Sim3(R, t, scale)
+    apart = A @ (T_measured.inverse() @ T_nk).log()
+    return WorldEdge(keyframe, T_measured, A.T @ A, float(apart @ apart), len(rows))
 
 
 def _moves(axis: int, T_nk: Sim3) -> Array:
@@ -96,6 +101,11 @@ class World:
     component: int
     T_mn: Sim3
     edges: Sequence[WorldEdge]
+
+    @property
+    def strain(self) -> float:
+        """Mean of the squared differences, in sigmas: 1 where path and telemetry agree."""
+        return sum(e.chi2 for e in self.edges) / max(sum(e.count for e in self.edges), 1)
 
     @staticmethod
     def at(component: int, frame: MetricFrame, edges: Sequence[WorldEdge]) -> World:
