@@ -39,6 +39,11 @@ class FusionConfig(Stage):
     position_lag_sigma_s: float = Field(
         0.3, ge=0, description="s, 1 sigma of how much older a position fix is than it states"
     )
+    depth_change_sigma_m: float = Field(
+        0.2, gt=0, description="m, 1 sigma of the depth around its mean, taken as constant where "
+        "positions are known and nothing measures down or depth (an AUV that follows the ground: "
+        "heights of shared surveys change by 0.02 to 0.2 m within 3 m of way)"
+    )  # fmt: skip
     every_keyframes: int = Field(
         20, ge=1, description="keyframes after which telemetry straightens the keyframe graph"
     )

@@ -34,12 +34,14 @@ class CameraPath:
         self,
         t_s: Array,  # [M] s
     ) -> Mask:
-        """[M] moments at which the path is known, by interpolation over short gaps only."""
+        """[M] moments at which the path is known: those of poses, and those in short gaps."""
         if len(self) < 2:
             return np.zeros(len(t_s), dtype=bool)
         after = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self) - 1)
         short = (self.t_s[after] - self.t_s[after - 1]) <= LONGEST_GAP_S
-        return np.asarray(short & (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1]))
+        posed = (self.t_s[after] == t_s) | (self.t_s[after - 1] == t_s)
+        inside = (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1])
+        return np.asarray((short | posed) & inside)
 
     def at(
         self,

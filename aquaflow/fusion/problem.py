@@ -14,6 +14,7 @@ from aquaflow.fusion import start as rough
 from aquaflow.fusion.camera_path import CameraPath
 from aquaflow.fusion.factors.altitude import AltitudeFactor
 from aquaflow.fusion.factors.attitude import ForceFactor, HeadingFactor, TiltFactor
+from aquaflow.fusion.factors.constant_depth import ConstantDepthFactor
 from aquaflow.fusion.factors.depth import DepthFactor
 from aquaflow.fusion.factors.factor import Factor
 from aquaflow.fusion.factors.position import PlaceFactor, PositionFactor
@@ -130,7 +131,7 @@ def _oriented(
             problem.start, R_bc=before.R_bc, R_bd=before.R_bd, heading=before.heading
         )
         problem.prior[HEADING] = carried.heading_sigma
-    _add_directions(problem, usable, path)
+    _add_directions(problem, usable, path, config.depth_change_sigma_m)
     # The attitude filter's heading goes on through a loss, whether x of n is north or not.
     follows = carried is not None and any(f.kind == "heading" for f in problem.factors)
     problem.compass = config.heading and any(f.kind == "heading" for f in problem.factors)
@@ -145,7 +146,9 @@ def _oriented(
     return problem
 
 
-def _add_directions(problem: Problem, usable: UsableSeries, path: CameraPath) -> None:
+def _add_directions(
+    problem: Problem, usable: UsableSeries, path: CameraPath, depth_change_sigma_m: float
+) -> None:
     """Down and north, from the best source there is."""
     state = problem.start
     unknown = "how the camera is mounted in the vehicle is unknown: set fusion.camera"
@@ -172,9 +175,25 @@ def _add_directions(problem: Problem, usable: UsableSeries, path: CameraPath) ->
             found = rough.map_from_depth(depth, path)
             if found is not None:
                 problem.start, problem.level = replace(state, R_nm=found[0]), True
+    if not problem.level and usable.position:
+        _add_directions_of_fixes(problem, usable, path, depth_change_sigma_m)
     if not problem.level:
         why = "nothing measures where down is"
         problem.reports += [SourceReport(s.source, "depth", reason=why) for s in usable.depth]
+
+
+def _add_directions_of_fixes(
+    problem: Problem, usable: UsableSeries, path: CameraPath, depth_change_sigma_m: float
+) -> None:
+    """Down from where fixes lie in the map, at their depths or else at a constant one."""
+    depth = usable.depth[0] if usable.depth else None
+    found = rough.map_from_fixes(usable.position[0], depth, path)
+    if found is None:
+        return
+    problem.start = replace(problem.start, R_nm=found[0], log_scale=float(np.log(found[1])))
+    problem.level = True
+    if depth is None:
+        problem.factors.append(ConstantDepthFactor(path, depth_change_sigma_m))
 
 
 def _scaled(problem: Problem, usable: UsableSeries, path: CameraPath) -> None:
@@ -200,9 +219,11 @@ def _add_altitudes(
             why = "its beam meets nothing of the map"
             problem.reports.append(SourceReport(altitude.source, "altitude", reason=why))
             continue
-        problem.factors.append(factor)
         if not any(f.kind in ("velocity", "depth") for f in problem.factors):
             problem.start = replace(problem.start, log_scale=factor.rough_log_scale)
+            # Where the altimeter is, by the camera's pose, depends on the scale.
+            factor = AltitudeFactor(altitude, path, ground, problem.start)
+        problem.factors.append(factor)
 
 
 def _add_positions(

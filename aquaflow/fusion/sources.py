@@ -13,6 +13,8 @@ from aquaflow.messages import Acceleration, Altitude, Attitude, Depth, Position,
 
 LEAST_SAMPLES = 5
 """Of one source while the camera had poses; fewer cannot show their noise."""
+LEAST_FIXES = 3
+"""Of positions, each of which states its own sigma; two would agree with any scale and heading."""
 KINDS: dict[str, type] = {
     "depth": Depth, "attitude": Attitude, "acceleration": Acceleration, "velocity": Velocity,
     "altitude": Altitude, "position": Position,
@@ -39,8 +41,9 @@ class UsableSeries:
         for kind, message in KINDS.items():
             for series in telemetry.of(message):
                 covered = path.covers(series.t_s)
-                if int(covered.sum()) < LEAST_SAMPLES:
-                    reason = _why_not(series, path)
+                least = LEAST_FIXES if message is Position else LEAST_SAMPLES
+                if int(covered.sum()) < least:
+                    reason = _why_not(series, path, least)
                     usable.left_out.append(SourceReport(series.source, kind, reason=reason))
                     continue
                 chosen = Series(series.source, series.t_s[covered], series.values[covered])
@@ -48,8 +51,8 @@ class UsableSeries:
         return usable
 
 
-def _why_not(series: Series, path: CameraPath) -> str:
-    if len(series) < LEAST_SAMPLES:
+def _why_not(series: Series, path: CameraPath, least: int) -> str:
+    if len(series) < least:
         return f"only {len(series)} samples"
     first, last = float(np.min(series.t_s)), float(np.max(series.t_s))
     if last < path.t_s[0] or first > path.t_s[-1]:

@@ -11,6 +11,7 @@ from aquaflow.errors import InputError
 from aquaflow.fusion.camera_path import CameraPath
 from aquaflow.fusion.telemetry import Series
 from aquaflow.geometry.alignment import align
+from aquaflow.geometry.earth import north_east
 from aquaflow.geometry.similarity import on_so3, rotation_from_quaternion
 
 Array = npt.NDArray[np.float64]
@@ -81,6 +82,25 @@ def map_from_depth(depth: Series, path: CameraPath) -> tuple[Array, float] | Non
     down = np.linalg.lstsq(A, depth.values[:, 0] - depth.values[:, 0].mean(), rcond=None)[0]
     scale = float(np.linalg.norm(down))
     return (level_with(down), scale) if scale > 1e-6 else None
+
+
+def map_from_fixes(
+    fixes: Series, depth: Series | None, path: CameraPath
+) -> tuple[Array, float] | None:
+    """R_nm [3, 3] and metres per unit from fixes on the earth; without ``depth`` all lie in a plane.
+
+    None if all fixes are in one place.
+    """
+    latitude, longitude = fixes.values[:, :2].T
+    fixes_n = north_east(latitude, longitude, (float(latitude[0]), float(longitude[0])))
+    z = np.zeros(len(fixes))
+    if depth is not None:
+        z = np.interp(fixes.t_s, depth.t_s, depth.values[:, 0])
+    try:
+        T = align(path.at(fixes.t_s)[1], np.column_stack([fixes_n, z]), with_scale=True)
+    except InputError:
+        return None
+    return T.T_target_source.R, T.T_target_source.scale
 
 
 def level_with(

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from aquaflow.fusion.camera_path import CameraPath
 from aquaflow.fusion.factors.factor import Array, Factor
 from aquaflow.fusion.noise import Process, SlowPart
-from aquaflow.fusion.state import SCALE, State
+from aquaflow.fusion.state import CAMERA, SCALE, State
 from aquaflow.fusion.telemetry import Series
+from aquaflow.geometry.similarity import so3_exp, so3_log
 
 MOST_BEAMS = 100
 """Samples that are compared with the map: each looks through all of its points."""
@@ -21,6 +24,11 @@ LEAST_POINTS = 30
 """Of the map within a beam; fewer are no ground."""
 SIGMA_M, SHARE = 0.01, 0.02
 """1 sigma, m and share of the range: Ping sonar 0.5 % resolution, roughness within the beam."""
+WIDER = np.radians(10.0)
+"""rad around the beam within which points are looked through again for a turned mounting."""
+TURNED = np.radians(2.0)
+"""rad by which the mounting is turned to see what its error does to the ranges: on a slope, 1 % in
+3 degrees."""
 
 
 class AltitudeFactor(Factor):
@@ -29,7 +37,7 @@ class AltitudeFactor(Factor):
     kind = "altitude"
     slow = SlowPart(0.01, 5.0, tuple(Process(t) for t in (1.0, 5.0, 30.0)))
     """m: the same rock stays within the beam for seconds."""
-    spans = (SCALE,)
+    spans = (SCALE, CAMERA)
 
     def __init__(
         self,
@@ -41,13 +49,21 @@ class AltitudeFactor(Factor):
         """Keeps the samples whose beam meets the map at the body's pose in ``state``; the beam
         looks along the body's z. ``path`` covers all samples."""
         altitude = altitude.thinned(MOST_BEAMS)
-        R_mc, p_m = path.at(altitude.t_s)
-        down = (R_mc @ state.R_bc.T)[:, :, 2]
-        body = p_m - (R_mc @ (state.R_bc.T @ state.c_b)) / state.scale
-        ranges = np.array([_first_return(points_m, *beam) for beam in zip(body, down, strict=True)])
-        met = np.isfinite(ranges)
+        turns = TURNED * np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
+        mountings = [so3_exp(turn) @ state.R_bc for turn in turns]
+        ranges = np.array(
+            [
+                _first_returns(points_m, *_beams(R_mc, p_m, mountings, state))
+                for R_mc, p_m in zip(*path.at(altitude.t_s), strict=True)
+            ]
+        ).reshape(-1, len(mountings))
+        met = np.isfinite(ranges).all(axis=1)
+        ranges = ranges[met]
         self.source, self.t_s = altitude.source, altitude.t_s[met]
-        self._range, self._altitude_m = ranges[met], altitude.values[met, 0]
+        self._range, self._altitude_m = ranges[:, 0], altitude.values[met, 0]
+        slopes = (ranges[:, 1::2] - ranges[:, 2::2]) / (2.0 * TURNED)
+        self._by_turn = np.column_stack([slopes, np.zeros(len(slopes))])
+        self._R_bc = state.R_bc
         self.sigma = np.hypot(SIGMA_M, SHARE * self._altitude_m)
 
     @property
@@ -57,24 +73,55 @@ class AltitudeFactor(Factor):
 
     def residuals(self, state: State) -> Array:
         """[N, 1] m."""
-        return np.asarray((state.scale * self._range - self._altitude_m)[:, None])
+        return np.asarray((state.scale * self._ranges(state) - self._altitude_m)[:, None])
 
     def scale_misfit(self, state: State) -> tuple[Array, Array]:
         """Logarithm of the scale that each range alone gives, over the state's; 1 sigma."""
-        ranges = state.scale * self._range
+        ranges = state.scale * self._ranges(state)
         return -self.residuals(state)[:, 0] / ranges, self.sigma / ranges
 
+    def _ranges(self, state: State) -> Array:
+        """[N] map units, with the mounting of ``state``: to first order."""
+        return np.asarray(self._range + self._by_turn @ so3_log(state.R_bc @ self._R_bc.T))
 
-def _first_return(
+
+def _beams(
+    R_mc: Array,  # [3, 3]
+    p_m: Array,  # [3]
+    mountings: Sequence[Array],  # [3, 3] each, R_bc
+    state: State,
+) -> tuple[Array, Array]:
+    """Origins and directions [J, 3] of the beam in the map, for each mounting of the camera."""
+    R_mb = np.stack([R_mc @ R_bc.T for R_bc in mountings])
+    return p_m - R_mb @ state.c_b / state.scale, R_mb[:, :, 2]
+
+
+def _first_returns(
     points: Array,  # [K, 3] map
-    apex: Array,  # [3] map
+    apexes: Array,  # [J, 3] map
+    axes: Array,  # [J, 3] unit vectors, about parallel
+) -> Array:
+    """[J] ranges from each apex to the nearest points within its beam; NaN if it meets none."""
+    points = _within(points, apexes[0], axes[0], HALF_BEAM + WIDER)[0]
+    found = np.full(len(axes), np.nan)
+    for j, (apex, axis) in enumerate(zip(apexes, axes, strict=True)):
+        ranges = _within(points, apex, axis, HALF_BEAM)[1]
+        if len(ranges) >= LEAST_POINTS:
+            found[j] = np.percentile(ranges, FIRST_RETURN)
+    return found
+
+
+def _within(
+    points: Array,  # [K, 3]
+    apex: Array,  # [3]
     axis: Array,  # [3] unit vector
-) -> float:
-    """Range from ``apex`` to the nearest points within the beam; NaN if it meets none."""
+    half_angle: float,
+) -> tuple[Array, Array]:
+    """Points [n, 3] within a cone, and their ranges [n] from its apex."""
     away = points - apex
     along = away @ axis
-    inside = along > 0.0
-    away, along = away[inside], along[inside]
+    ahead = along > 0.0
+    points, away, along = points[ahead], away[ahead], along[ahead]
     ranges = np.linalg.norm(away, axis=1)
-    ranges = ranges[along > np.cos(HALF_BEAM) * ranges]
-    return float(np.percentile(ranges, FIRST_RETURN)) if len(ranges) >= LEAST_POINTS else np.nan
+    inside = along > np.cos(half_angle) * ranges
+    return points[inside], ranges[inside]

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from aquaflow.fusion.camera_path import CameraPath
-from aquaflow.fusion.factors.factor import MOST, Array, Factor
+from aquaflow.fusion.factors.factor import MOST, Array, Factor, axes_along
 from aquaflow.fusion.noise import Process, SlowPart
 from aquaflow.fusion.state import CAMERA, HEADING, TURN, State
 from aquaflow.fusion.telemetry import Series
@@ -56,7 +56,7 @@ class TiltFactor(Factor):
         """[N, 2] rad, across the body's down axis."""
         R_nb, _ = state.body(self._R_mc, self._p_m)
         turn = np.cross(self.down_b, R_nb[:, 2, :])
-        axes = _across(self.down_b)
+        axes = axes_along(self.down_b)[:, 1:]
         return np.asarray(np.einsum("nij,nj->ni", axes, turn))
 
     def turn_wanted(self, state: State) -> Array:
@@ -107,13 +107,3 @@ class HeadingFactor(Factor):
         about = Rotation.from_matrix(R_nb @ self._R_bn).as_rotvec()[:, 2:]
         apart = about + state.heading
         return np.asarray(np.arctan2(np.sin(apart), np.cos(apart)))
-
-
-def _across(
-    axis: Array,  # [N, 3] unit vectors
-) -> Array:
-    """[N, 2, 3] two unit vectors across each."""
-    helper = np.where(np.abs(axis[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    first = np.cross(axis, helper)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(axis, first)], axis=1)

@@ -52,3 +52,16 @@ class Factor(ABC):
                 )
                 found[..., k] = (ahead - behind) / (2.0 * STEP)
         return found
+
+
+def axes_along(
+    vectors: Array,  # [N, 3]
+) -> Array:
+    """[N, 3, 3] unit vectors in rows: along each vector, and two across it."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    still = length < 1e-12
+    along = np.where(still, [[1.0, 0.0, 0.0]], vectors / np.where(still, 1.0, length))
+    helper = np.where(np.abs(along[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    first = np.cross(along, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([along, first, np.cross(along, first)], axis=1)

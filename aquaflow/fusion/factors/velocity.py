@@ -6,7 +6,7 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
 from aquaflow.fusion.camera_path import CameraPath
-from aquaflow.fusion.factors.factor import MOST, Array, Factor
+from aquaflow.fusion.factors.factor import MOST, Array, Factor, axes_along
 from aquaflow.fusion.noise import Process, SlowPart
 from aquaflow.fusion.state import CAMERA, DVL, DVL_SCALE, SCALE, State
 from aquaflow.fusion.telemetry import Series
@@ -21,11 +21,15 @@ LEAST_SIGMA_M_S = 0.005
 
 
 class VelocityFactor(Factor):
-    """Displacement of the camera between two poses minus the DVL's, in the axes of the map, m."""
+    """Displacement of the camera between two poses minus the DVL's, m: along it, and across.
+
+    The camera's own scale errs along the way, with the same sign after the vehicle has turned
+    round; in the axes of the map such an error would seem to average out between two lanes.
+    """
 
     kind = "velocity"
-    slow = SlowPart(0.003, 15.0, tuple(Process(t) for t in (3.0, 15.0, 60.0)))
-    """m in an interval: the camera's own scale wanders along the path."""
+    slow = SlowPart(0.0015, 15.0, tuple(Process(t) for t in (3.0, 15.0, 60.0)))
+    """m in an interval: the camera's own scale wanders along the path, by 0.3 % of 0.5 m."""
     spans = (SCALE, CAMERA, DVL, DVL_SCALE)
 
     def __init__(self, velocity: Series, path: CameraPath) -> None:
@@ -40,6 +44,7 @@ class VelocityFactor(Factor):
         R_begin, p_begin = path.at(begin)
         R_end, p_end = path.at(end)
         self._moved_m, self._turned = p_end - p_begin, R_end - R_begin
+        self._axes = axes_along(self._moved_m)
         merit = np.maximum(velocity.values[:, 3], LEAST_SIGMA_M_S)
         spacing = (end - begin) / np.maximum(last - first, 1)
         means = np.array([merit[i : j + 1].mean() for i, j in zip(first, last, strict=True)])
@@ -53,13 +58,13 @@ class VelocityFactor(Factor):
         way = np.asarray(cumulative_trapezoid(v_m, self._tau, axis=0, initial=0))
         arm = self._turned @ (R_cb @ state.c_b)
         body = way[self._last] - way[self._first]
-        return np.asarray(state.scale * self._moved_m - body - arm)
+        apart = state.scale * self._moved_m - body - arm
+        return np.asarray(np.einsum("nij,nj->ni", self._axes, apart))
 
     def scale_misfit(self, state: State) -> tuple[Array, Array]:
         """Logarithm of the scale that each displacement alone gives, over the state's; 1 sigma."""
-        moved = state.scale * self._moved_m
-        square = np.maximum((moved**2).sum(axis=1), 1e-12)
-        return -(self.residuals(state) * moved).sum(axis=1) / square, self.sigma / np.sqrt(square)
+        moved = np.maximum(state.scale * np.linalg.norm(self._moved_m, axis=1), 1e-6)
+        return -self.residuals(state)[:, 0] / moved, self.sigma / moved
 
 
 def _intervals(
