@@ -12,6 +12,7 @@ from aquaflow.fusion.factors.factor import Factor
 from aquaflow.fusion.metric_frame import (
     LARGEST_SCALE_SIGMA,
     LARGEST_TILT_SIGMA,
+    MAP_UNIT,
     MetricFrame,
     North,
     SourceReport,
@@ -108,14 +109,14 @@ def _scale_source(
         ]
         return ", ".join(named)
     if not alone:
-        return "none: no telemetry measures a length; 1 map unit is the median depth of the start"
+        return f"none: no telemetry measures a length; {MAP_UNIT}"
     rise = float(np.ptp(path.p_m @ solution.state.R_nm[2]))
     best = min(alone.values())
     said = f"none: {', '.join(sorted({SCALING[factor.kind] for factor in alone}))} give the scale "
     said += f"to {100.0 * min(best, 9.99):.0f} % only"
     if {factor.kind for factor in alone} == {"depth"}:
         said += f", because the camera rose and sank by only {rise:.2g} map units"
-    return said + "; 1 map unit is the median depth of the start"
+    return f"{said}; {MAP_UNIT}"
 
 
 def _alone(problem: Problem, solution: Solution, factor: Factor) -> float:
