@@ -10,10 +10,11 @@ import numpy.typing as npt
 
 from aquaflow.config import FusionConfig
 from aquaflow.config.telemetry import MountingConfig
+from aquaflow.fusion.building import problem_of
 from aquaflow.fusion.camera_path import CameraPath
 from aquaflow.fusion.factors.factor import Factor
 from aquaflow.fusion.metric_frame import MetricFrame
-from aquaflow.fusion.problem import Carried, Problem, problem_of
+from aquaflow.fusion.problem import Carried, Problem
 from aquaflow.fusion.solution_frame import frame_of
 from aquaflow.fusion.solve import Solution, solve
 from aquaflow.fusion.telemetry import Telemetry
