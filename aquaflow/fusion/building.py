@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +15,8 @@ from aquaflow.fusion.camera_path import CameraPath
 from aquaflow.fusion.directions import oriented
 from aquaflow.fusion.factors.altitude import AltitudeFactor
 from aquaflow.fusion.factors.depth import DepthFactor
+from aquaflow.fusion.factors.factor import Factor
+from aquaflow.fusion.factors.length import LengthFactor
 from aquaflow.fusion.factors.position import PlaceFactor, PositionFactor
 from aquaflow.fusion.factors.velocity import VelocityFactor
 from aquaflow.fusion.metric_frame import Origin, SourceReport
@@ -34,12 +36,13 @@ def problem_of(
     mounting: MountingConfig | None,
     points: Callable[[], Array],
     carried: Carried | None,
+    extra: Sequence[Factor],
 ) -> Problem:
     """The problem of the sub-map with ``path``; arguments as of ``estimate``."""
     usable = UsableSeries.of(telemetry, path)
     problem = oriented(usable, path, config, mounting, carried)
     problem.reports += usable.left_out
-    _scaled(problem, usable, path)
+    _scaled(problem, usable, path, extra)
     if problem.level:
         for depth in usable.depth:
             problem.factors.append(DepthFactor(depth, path))
@@ -58,15 +61,19 @@ def problem_of(
     _move_to_depth(problem, usable, path)
     if carried is not None and carried.place is not None and problem.level:
         _add_place(problem, path, *carried.place)
+    problem.factors += extra
     return problem
 
 
-def _scaled(problem: Problem, usable: UsableSeries, path: CameraPath) -> None:
+def _scaled(
+    problem: Problem, usable: UsableSeries, path: CameraPath, extra: Sequence[Factor]
+) -> None:
     """A rough scale, from the source that gives the best one."""
     guesses = [rough.scale_from_velocity(velocity, path) for velocity in usable.velocity]
     if problem.level:
         R_nm = problem.start.R_nm
         guesses += [rough.scale_from_depth(depth, path, R_nm) for depth in usable.depth]
+    guesses += [factor.rough_scale for factor in extra if isinstance(factor, LengthFactor)]
     known = [guess for guess in guesses if guess is not None]
     if known:
         problem.start = replace(problem.start, log_scale=float(np.log(known[0])))

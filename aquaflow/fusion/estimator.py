@@ -59,8 +59,7 @@ def estimate(
         return Estimate(MetricFrame.unknown(f"the sub-map has only {len(path)} poses"))
     if not telemetry and not extra:
         return Estimate(MetricFrame.unknown())
-    problem = problem_of(telemetry, path, config, mounting, points, carried)
-    problem.factors += extra
+    problem = problem_of(telemetry, path, config, mounting, points, carried, extra)
     if not problem.factors:
         unused = MetricFrame.unknown("no telemetry could be used")
         return Estimate(replace(unused, sources=tuple(problem.reports)))
