@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -37,10 +37,16 @@ def problem_of(
     points: Callable[[], Array],
     carried: Carried | None,
     extra: Sequence[Factor],
+    rejected: Mapping[tuple[str, str], SourceReport],
 ) -> Problem:
-    """The problem of the sub-map with ``path``; arguments as of ``estimate``."""
-    usable = UsableSeries.of(telemetry, path)
-    problem = oriented(usable, path, config, mounting, carried)
+    """The problem of the sub-map with ``path``; arguments as of ``estimate``.
+
+    ``rejected``: sources, by name and kind, that an earlier solution has shown to be wrong.
+    """
+    usable = UsableSeries.of(telemetry, path, rejected)
+    compasses = [each for each in usable.attitude if (each.source, "heading") not in rejected]
+    problem = oriented(usable, compasses, path, config, mounting, carried)
+    extra = [factor for factor in extra if (factor.source, factor.kind) not in rejected]
     problem.reports += usable.left_out
     _scaled(problem, usable, path, extra)
     if problem.level:

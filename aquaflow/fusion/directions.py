@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from aquaflow.fusion.metric_frame import SourceReport
 from aquaflow.fusion.problem import ANY_TURN, FIXED, Carried, Problem
 from aquaflow.fusion.sources import UsableSeries
 from aquaflow.fusion.state import CAMERA, DVL, DVL_SCALE, HEADING, LAG, SCALE, SHIFT, TURN, P, State
+from aquaflow.fusion.telemetry import Series
 
 SCALE_SIGMA = 3.0
 """Log: a start's median depth may be 5 cm or 20 m."""
@@ -22,12 +24,14 @@ SCALE_SIGMA = 3.0
 
 def oriented(
     usable: UsableSeries,
+    compasses: Sequence[Series],
     path: CameraPath,
     config: FusionConfig,
     mounting: MountingConfig | None,
     carried: Carried | None,
 ) -> Problem:
-    """The problem with what says how the body and the map are turned."""
+    """The problem with what says how the body and the map are turned; ``compasses`` are the
+    attitudes whose heading counts."""
     R_bc, c_b, sigma = np.asarray(rough.AXES), np.zeros(3), np.radians(config.mounting_sigma_deg)
     mounted = mounting is not None
     if mounting is not None:
@@ -50,7 +54,7 @@ def oriented(
             problem.start, R_bc=before.R_bc, R_bd=before.R_bd, heading=before.heading
         )
         problem.prior[HEADING] = carried.heading_sigma
-    _add_directions(problem, usable, path)
+    _add_directions(problem, usable, compasses, path)
     # The attitude filter's heading goes on through a loss, whether x of n is north or not.
     follows = carried is not None and any(f.kind == "heading" for f in problem.factors)
     problem.compass = config.heading and any(f.kind == "heading" for f in problem.factors)
@@ -65,7 +69,9 @@ def oriented(
     return problem
 
 
-def _add_directions(problem: Problem, usable: UsableSeries, path: CameraPath) -> None:
+def _add_directions(
+    problem: Problem, usable: UsableSeries, compasses: Sequence[Series], path: CameraPath
+) -> None:
     """Down and north, from the best source there is."""
     state = problem.start
     unknown = "how the camera is mounted in the vehicle is unknown: set fusion.camera"
@@ -73,7 +79,7 @@ def _add_directions(problem: Problem, usable: UsableSeries, path: CameraPath) ->
         R_nm = rough.map_to_level(usable.attitude[0], path, state.R_bc)
         for attitude in usable.attitude:
             problem.factors.append(TiltFactor.of_attitude(attitude, path))
-            problem.factors.append(HeadingFactor(attitude, path))
+        problem.factors += [HeadingFactor(attitude, path) for attitude in compasses]
         R_nm = rough.turned_about_down(R_nm, -state.heading)
         problem.start, problem.level = replace(state, R_nm=R_nm), True
         return

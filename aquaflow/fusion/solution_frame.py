@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.fusion.camera_path import CameraPath
+from aquaflow.fusion.contradictions import SCALING
 from aquaflow.fusion.factors.factor import Factor
 from aquaflow.fusion.metric_frame import (
     LARGEST_SCALE_SIGMA,
@@ -24,11 +25,6 @@ from aquaflow.geometry.similarity import Sim3, hat
 
 Array = npt.NDArray[np.float64]
 
-SCALING = {
-    "depth": "pressure depth", "velocity": "DVL", "altitude": "altimeter", "position": "position",
-    "length": "known length",
-}  # fmt: skip
-"""Kinds of factor that know metres, in the words of a surveyor."""
 WORTH_NAMING = 5.0
 """A source whose own scale is less sure than the result's by more than this is not named."""
 
