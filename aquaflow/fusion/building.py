@@ -12,6 +12,7 @@ from aquaflow.config import FusionConfig
 from aquaflow.config.telemetry import MountingConfig
 from aquaflow.fusion import start as rough
 from aquaflow.fusion.camera_path import CameraPath
+from aquaflow.fusion.declination import declination_of
 from aquaflow.fusion.directions import oriented
 from aquaflow.fusion.factors.altitude import AltitudeFactor
 from aquaflow.fusion.factors.depth import DepthFactor
@@ -45,7 +46,8 @@ def problem_of(
     """
     usable = UsableSeries.of(telemetry, path, rejected)
     compasses = [each for each in usable.attitude if (each.source, "heading") not in rejected]
-    problem = oriented(usable, compasses, path, config, mounting, carried)
+    declination = declination_of(telemetry, config)
+    problem = oriented(usable, compasses, path, config, mounting, carried, declination)
     extra = [factor for factor in extra if (factor.source, factor.kind) not in rejected]
     problem.reports += usable.left_out
     _scaled(problem, usable, path, extra)
@@ -67,6 +69,7 @@ def problem_of(
     _move_to_depth(problem, usable, path)
     if carried is not None and carried.place is not None and problem.level:
         _add_place(problem, path, *carried.place)
+        problem.origin = problem.origin or carried.origin
     problem.factors += extra
     return problem
 

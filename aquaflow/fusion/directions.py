@@ -29,9 +29,40 @@ def oriented(
     config: FusionConfig,
     mounting: MountingConfig | None,
     carried: Carried | None,
+    declination: float | None,
 ) -> Problem:
     """The problem with what says how the body and the map are turned; ``compasses`` are the
-    attitudes whose heading counts."""
+    attitudes whose heading counts, and ``declination`` what to add to it, rad."""
+    problem = _as_mounted(usable, path, config, mounting)
+    if config.heading and declination is not None:
+        problem.start = replace(problem.start, heading=-declination)
+        problem.declination_known = True
+    if carried is not None:
+        before = carried.state
+        problem.start = replace(
+            problem.start, R_bc=before.R_bc, R_bd=before.R_bd, heading=before.heading
+        )
+        problem.prior[HEADING] = carried.heading_sigma
+        problem.declination_known |= carried.true_north
+    _add_directions(problem, usable, compasses, path)
+    # The attitude filter's heading goes on through a loss, whether x of n is north or not.
+    follows = carried is not None and any(f.kind == "heading" for f in problem.factors)
+    problem.compass = config.heading and any(f.kind == "heading" for f in problem.factors)
+    if not problem.compass and not follows:
+        problem.prior[HEADING] = ANY_TURN
+        # By convention the body's first heading is x of n.
+        R_nb = problem.start.body(path.R_mc[:1], path.p_m[:1])[0][0]
+        first = rough.heading_of(R_nb)
+        R_nm = rough.turned_about_down(problem.start.R_nm, -first)
+        problem.start = replace(problem.start, R_nm=R_nm, heading=problem.start.heading + first)
+        problem.prior[TURN.stop - 1] = FIXED
+    return problem
+
+
+def _as_mounted(
+    usable: UsableSeries, path: CameraPath, config: FusionConfig, mounting: MountingConfig | None
+) -> Problem:
+    """The problem with nothing but the camera's place in the body."""
     R_bc, c_b, sigma = np.asarray(rough.AXES), np.zeros(3), np.radians(config.mounting_sigma_deg)
     mounted = mounting is not None
     if mounting is not None:
@@ -47,26 +78,7 @@ def oriented(
     prior[HEADING] = np.radians(config.heading_sigma_deg)
     prior[LAG] = max(config.position_lag_sigma_s, 1e-6)
     state = State(0.0, np.eye(3), np.zeros(3), R_bc, c_b, np.eye(3))
-    problem = Problem(state, prior, mounted=mounted)
-    if carried is not None:
-        before = carried.state
-        problem.start = replace(
-            problem.start, R_bc=before.R_bc, R_bd=before.R_bd, heading=before.heading
-        )
-        problem.prior[HEADING] = carried.heading_sigma
-    _add_directions(problem, usable, compasses, path)
-    # The attitude filter's heading goes on through a loss, whether x of n is north or not.
-    follows = carried is not None and any(f.kind == "heading" for f in problem.factors)
-    problem.compass = config.heading and any(f.kind == "heading" for f in problem.factors)
-    if not problem.compass and not follows:
-        problem.prior[HEADING] = ANY_TURN
-        # By convention the body's first heading is x of n.
-        R_nb = problem.start.body(path.R_mc[:1], path.p_m[:1])[0][0]
-        first = rough.heading_of(R_nb)
-        R_nm = rough.turned_about_down(problem.start.R_nm, -first)
-        problem.start = replace(problem.start, R_nm=R_nm, heading=problem.start.heading + first)
-        problem.prior[TURN.stop - 1] = FIXED
-    return problem
+    return Problem(state, prior, mounted=mounted)
 
 
 def _add_directions(

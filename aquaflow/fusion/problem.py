@@ -30,6 +30,8 @@ class Carried:
     place: tuple[float, Array, Array] | None
     """Moment (s), north and east [2] m of the body by dead reckoning, covariance [2, 2] m^2."""
     origin: Origin | None
+    true_north: bool
+    """True if ``state``'s heading is the compass's error against true north."""
 
 
 @dataclass
@@ -44,6 +46,8 @@ class Problem:
     """Of sources that give no factor."""
     compass: bool = False
     """True if x of n is north."""
+    declination_known: bool = False
+    """True if the compass's north is the true one, but for its error."""
     level: bool = False
     """True if something measures down."""
     mounted: bool = True

@@ -71,7 +71,7 @@ def _left_tangent(solution: Solution) -> Array:
 
 
 def _north(problem: Problem, kinds: set[str]) -> North:
-    if "position" in kinds:
+    if "position" in kinds or (problem.compass and problem.declination_known):
         return "true north"
     return "magnetic north" if problem.compass else "initial heading"
 
