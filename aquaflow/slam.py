@@ -122,6 +122,7 @@ class Slam:
         finished = []
         for anchored in self._anchor(tracked):
             linked = self._link(anchored)
+            self._look_for_known_lengths(linked.tracked)
             self._map(linked.tracked)
             finished.append(self._publish(linked))
         return finished
@@ -238,6 +239,15 @@ class Slam:
         linked = Anchored(settled, None if settled.T_wc is None else T_kf)
         self._latest = None if linked.T_kf is None else len(self.frames)
         return linked
+
+    def _look_for_known_lengths(self, tracked: Tracked) -> None:
+        """In the pictures that the map is made from, if there is anything to look for."""
+        sightings, mapped = self.metric.sightings, (FrameClass.KEYFRAME, FrameClass.MAPPING)
+        if sightings.looks_for and tracked.T_wc is not None and tracked.frame_class in mapped:
+            frame = tracked.frame
+            camera, failures = self.tracker.camera or frame.camera, self.failures
+            with self.profiler.stage("look"), failures.contain("known lengths", frame.index):
+                sightings.look(frame.index, frame.image, camera)
 
     def _map(self, tracked: Tracked) -> None:
         """Hold the frame out, or let the map grow by it."""

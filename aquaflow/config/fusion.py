@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Annotated, Literal
+
 from pydantic import Field
 
 from aquaflow.config.known_lengths import BoardConfig, LasersConfig
@@ -25,8 +27,16 @@ class FusionConfig(Stage):
         description="deg, 1 sigma of every stated mounting: set by eye (judgement)",
     )
     heading: bool = Field(
-        True, description="trust the attitude's heading as magnetic north; False: x of the world "
-        "is the vehicle's first heading"
+        True, description="trust the attitude's heading as a compass's; False: x of the world is "
+        "the vehicle's first heading"
+    )  # fmt: skip
+    declination: Literal["auto", "none"] | Annotated[float, Field(ge=-180, le=180)] = Field(
+        "auto", description="deg from true to magnetic north, east positive, that the vehicle has "
+        "not added to its heading. auto: that of the World Magnetic Model at the first position, "
+        "if the date is known; 0 if the compass's own device states positions, as ArduPilot adds "
+        "the declination by itself once it has a position, and not without one (COMPASS_AUTODEC "
+        "is 1 by default, COMPASS_DEC 0; AP_Compass.cpp, qgroundcontrol issue 143). none: unknown, "
+        "north is magnetic. A vehicle that was given COMPASS_DEC, or its position by hand, needs 0"
     )  # fmt: skip
     heading_sigma_deg: float = Field(
         5.0, gt=0, le=90, description="deg, 1 sigma of the compass's constant error in a vehicle "

@@ -64,7 +64,7 @@ def carried_from(
         _, p_n = state.body(path.R_mc[-1:], path.p_m[-1:])
         covariance = frame.position_covariance(p_n[0])[:2, :2] + reckoned.covariance
         place = (last_s, (p_n[0] + reckoned.moved_m)[:2], covariance)
-    return Carried(state, heading_sigma, place, frame.origin)
+    return Carried(state, heading_sigma, place, frame.origin, frame.north == "true north")
 
 
 def _reckoned(

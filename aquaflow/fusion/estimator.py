@@ -10,10 +10,12 @@ import numpy.typing as npt
 
 from aquaflow.config import FusionConfig
 from aquaflow.config.telemetry import MountingConfig
+from aquaflow.fusion.building import problem_of
 from aquaflow.fusion.camera_path import CameraPath
+from aquaflow.fusion.contradictions import contradiction_in
 from aquaflow.fusion.factors.factor import Factor
-from aquaflow.fusion.metric_frame import MetricFrame
-from aquaflow.fusion.problem import Carried, Problem, problem_of
+from aquaflow.fusion.metric_frame import MetricFrame, SourceReport
+from aquaflow.fusion.problem import Carried, Problem
 from aquaflow.fusion.solution_frame import frame_of
 from aquaflow.fusion.solve import Solution, solve
 from aquaflow.fusion.telemetry import Telemetry
@@ -58,10 +60,16 @@ def estimate(
         return Estimate(MetricFrame.unknown(f"the sub-map has only {len(path)} poses"))
     if not telemetry and not extra:
         return Estimate(MetricFrame.unknown())
-    problem = problem_of(telemetry, path, config, mounting, points, carried)
-    problem.factors += extra
-    if not problem.factors:
-        unused = MetricFrame.unknown("no telemetry could be used")
-        return Estimate(replace(unused, sources=tuple(problem.reports)))
-    solution = solve(problem.factors, problem.start, problem.prior)
-    return Estimate(frame_of(problem, solution, path), problem, solution)
+    rejected: dict[tuple[str, str], SourceReport] = {}
+    while True:
+        problem = problem_of(telemetry, path, config, mounting, points, carried, extra, rejected)
+        if not problem.factors:
+            unused = MetricFrame.unknown("no telemetry could be used")
+            return Estimate(replace(unused, sources=tuple(problem.reports)))
+        solution = solve(problem.factors, problem.start, problem.prior)
+        wrong = contradiction_in(problem, solution)
+        if wrong is None:
+            return Estimate(frame_of(problem, solution, path), problem, solution)
+        rejected[wrong.source, wrong.kind] = SourceReport(
+            wrong.source, wrong.kind, rejected=wrong.samples, reason=wrong.reason
+        )

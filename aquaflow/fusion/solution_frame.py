@@ -8,10 +8,12 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.fusion.camera_path import CameraPath
+from aquaflow.fusion.contradictions import SCALING
 from aquaflow.fusion.factors.factor import Factor
 from aquaflow.fusion.metric_frame import (
     LARGEST_SCALE_SIGMA,
     LARGEST_TILT_SIGMA,
+    MAP_UNIT,
     MetricFrame,
     North,
     SourceReport,
@@ -23,11 +25,6 @@ from aquaflow.geometry.similarity import Sim3, hat
 
 Array = npt.NDArray[np.float64]
 
-SCALING = {
-    "depth": "pressure depth", "velocity": "DVL", "altitude": "altimeter", "position": "position",
-    "length": "known length",
-}  # fmt: skip
-"""Kinds of factor that know metres, in the words of a surveyor."""
 WORTH_NAMING = 5.0
 """A source whose own scale is less sure than the result's by more than this is not named."""
 
@@ -74,7 +71,7 @@ def _left_tangent(solution: Solution) -> Array:
 
 
 def _north(problem: Problem, kinds: set[str]) -> North:
-    if "position" in kinds:
+    if "position" in kinds or (problem.compass and problem.declination_known):
         return "true north"
     return "magnetic north" if problem.compass else "initial heading"
 
@@ -108,14 +105,14 @@ def _scale_source(
         ]
         return ", ".join(named)
     if not alone:
-        return "none: no telemetry measures a length; 1 map unit is the median depth of the start"
+        return f"none: no telemetry measures a length; {MAP_UNIT}"
     rise = float(np.ptp(path.p_m @ solution.state.R_nm[2]))
     best = min(alone.values())
     said = f"none: {', '.join(sorted({SCALING[factor.kind] for factor in alone}))} give the scale "
     said += f"to {100.0 * min(best, 9.99):.0f} % only"
     if {factor.kind for factor in alone} == {"depth"}:
         said += f", because the camera rose and sank by only {rise:.2g} map units"
-    return said + "; 1 map unit is the median depth of the start"
+    return f"{said}; {MAP_UNIT}"
 
 
 def _alone(problem: Problem, solution: Solution, factor: Factor) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -35,11 +36,16 @@ class UsableSeries:
     left_out: list[SourceReport] = field(default_factory=list)
 
     @staticmethod
-    def of(telemetry: Telemetry, path: CameraPath) -> UsableSeries:
-        """All sources with enough samples along the path."""
-        usable = UsableSeries()
+    def of(
+        telemetry: Telemetry, path: CameraPath, rejected: Mapping[tuple[str, str], SourceReport]
+    ) -> UsableSeries:
+        """All sources with enough samples along the path that are not ``rejected``, which are
+        given by source and kind."""
+        usable = UsableSeries(left_out=list(rejected.values()))
         for kind, message in KINDS.items():
             for series in telemetry.of(message):
+                if (series.source, kind) in rejected:
+                    continue
                 covered = path.covers(series.t_s)
                 least = LEAST_FIXES if message is Position else LEAST_SAMPLES
                 if int(covered.sum()) < least:

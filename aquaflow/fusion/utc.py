@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta, timezone
 from enum import IntEnum
 from itertools import pairwise
 
@@ -88,7 +88,9 @@ class UtcClock:
 
     def utc_of(self, t_ns: int) -> datetime:
         """UTC of a moment of the dive's clock, to the microsecond below."""
-        return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=self.utc_ns(t_ns) // 1000)
+        return datetime(1970, 1, 1, tzinfo=timezone.utc) + timedelta(
+            microseconds=self.utc_ns(t_ns) // 1000
+        )
 
     def sigma_at_s(self, t_ns: int) -> float:
         """1 sigma of the UTC of a moment: it grows with the distance from what was heard."""

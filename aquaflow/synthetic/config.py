@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, Self, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -125,7 +125,7 @@ class SyntheticConfig(BaseModel):
         return data if own is None else {**own, **data}
 
     @model_validator(mode="after")
-    def _wall_is_faced(self) -> Self:
+    def _wall_is_faced(self) -> SyntheticConfig:
         if self.scene == "wall" and self.turns:
             raise ValueError("a vehicle at a wall faces it; turns must be false for this scene")
         return self

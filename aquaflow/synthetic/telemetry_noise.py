@@ -6,7 +6,7 @@ error out, a rate of 0 its instrument.
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
 
@@ -155,7 +155,7 @@ class TelemetryNoise(BaseModel):
     origin_longitude_deg: float = Field(10.40, ge=-180, le=180, description="degrees (WGS 84)")
     utc_hz: float = Field(0.1, ge=0, description="Hz; SYSTEM_TIME of an autopilot, thinned out")
     starts_utc: AwareDatetime = Field(
-        datetime(2026, 6, 1, 8, 0, tzinfo=UTC), description="UTC of the first picture"
+        datetime(2026, 6, 1, 8, 0, tzinfo=timezone.utc), description="UTC of the first picture"
     )
 
     latency_s: float = Field(0.03, ge=0, description="s; mean delay from measurement to arrival")

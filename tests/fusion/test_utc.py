@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from itertools import pairwise
 
 import numpy as np
@@ -14,7 +14,7 @@ from aquaflow.fusion.utc import fit_utc, utc_of
 from aquaflow.messages import UtcTime
 
 SECOND = 10**9
-BEGAN = datetime(2026, 11, 22, 9, 30, tzinfo=UTC)
+BEGAN = datetime(2026, 11, 22, 9, 30, tzinfo=timezone.utc)
 BEGAN_NS = round(BEGAN.timestamp()) * SECOND
 """UTC when the dive's clock shows 0."""
 
@@ -46,7 +46,7 @@ def test_a_receivers_time_becomes_that_of_every_moment() -> None:
     clock = fit_utc(stated("gnss/ZDA", range(30)))
     assert clock is not None
     assert clock.utc_of(0) == BEGAN
-    assert utc_of(clock, -3600 * SECOND) == datetime(2026, 11, 22, 8, 30, tzinfo=UTC)
+    assert utc_of(clock, -3600 * SECOND) == datetime(2026, 11, 22, 8, 30, tzinfo=timezone.utc)
     assert clock.source == "gnss/ZDA"
     assert clock.notes == ()
 
@@ -56,7 +56,7 @@ def test_a_wall_clock_that_is_set_in_mid_dive_counts_as_it_was_set_last() -> Non
     before = stated("computer/clock", range(400), away_s=-86_400.0)
     clock = fit_utc([*before, *stated("computer/clock", range(400, 600))])
     assert clock is not None
-    assert clock.utc_of(100 * SECOND) == datetime(2026, 11, 22, 9, 31, 40, tzinfo=UTC)
+    assert clock.utc_of(100 * SECOND) == datetime(2026, 11, 22, 9, 31, 40, tzinfo=timezone.utc)
     assert clock.notes == ("computer/clock was set by +86400.0 s during the dive",)
 
 

@@ -25,7 +25,8 @@ class Factor(ABC):
 
     kind: ClassVar[str]
     """Name of its message in a recording."""
-    slow: ClassVar[SlowPart]
+    slow: SlowPart
+    """Of the kind, or of this source."""
     spans: ClassVar[tuple[slice, ...]]
     """Parameters that the residuals depend on."""
 

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from aquaflow.fusion.factors.factor import Array, Factor
+from aquaflow.fusion.known_lengths.known_length import KnownLength
 from aquaflow.fusion.noise import Process, SlowPart
 from aquaflow.fusion.state import SCALE, State
 
+APART_S, LASTING_S = 100.0, 1e9
+"""Stated moments of measurements, each of which errs on its own, and the correlation time of what
+they all share: the length that was measured by hand."""
+
 
 class LengthFactor(Factor):
-    """Length in the map, in metres, minus the known one."""
+    """Lengths in the map, in metres, minus the known one."""
 
     kind = "length"
-    slow = SlowPart(1e-4, 1.0, (Process(1.0),))
-    """m: what is printed and measured is right to a tenth of a millimetre at best."""
     spans = (SCALE,)
 
     def __init__(
@@ -22,14 +27,32 @@ class LengthFactor(Factor):
         source: str,
         map_lengths: Array,  # [N] map units
         map_sigma: Array,  # [N] map units
-        lengths_m: Array,  # [N] m
-        sigma_m: Array,  # [N] m
+        length_m: float,
+        sigma_m: float,
     ) -> None:
-        self.source, self._map, self._m = source, map_lengths, lengths_m
-        self.t_s = 100.0 * np.arange(len(map_lengths), dtype=np.float64)  # each on its own
-        scale = float(np.median(lengths_m / map_lengths))
-        self.sigma = np.hypot(sigma_m, scale * map_sigma)
+        self.source, self._map, self._m = source, map_lengths, length_m
+        self.t_s = APART_S * np.arange(len(map_lengths), dtype=np.float64)
+        self.rough_scale = float(length_m / np.median(map_lengths))
+        self.sigma = self.rough_scale * map_sigma
+        self.slow = SlowPart(sigma_m, LASTING_S, (Process(1.0),))
 
     def residuals(self, state: State) -> Array:
         """[N, 1] m."""
         return np.asarray((state.scale * self._map - self._m)[:, None])
+
+
+def length_factors(lengths: Sequence[KnownLength]) -> list[LengthFactor]:
+    """The known lengths of one sub-map, as one factor for each that was measured by hand."""
+    groups: dict[float, list[KnownLength]] = {}
+    for length in lengths:
+        groups.setdefault(length.length_m, []).append(length)
+    return [
+        LengthFactor(
+            ", ".join(sorted({each.source for each in group})),
+            np.array([each.map_length for each in group]),
+            np.array([each.map_sigma for each in group]),
+            length_m,
+            float(np.median([each.sigma_m for each in group])),
+        )
+        for length_m, group in groups.items()
+    ]

@@ -38,6 +38,28 @@ LEAST_DEPTH = 1e-6
 
 
 @dataclass(frozen=True)
+class PixelDepths:
+    """Inverse depth of some pixels of a picture."""
+
+    pixels: Array
+    """[N, 2]"""
+    rho: Array
+    """[N] inverse depth, 0 where unknown."""
+    variance: Array
+    """[N]; infinite where unknown."""
+
+    def at(
+        self,
+        pixels: Array,  # [M, 2]
+    ) -> tuple[Array, Array]:
+        """Inverse depths [M] and their variances [M]; unknown for any pixel that was not kept."""
+        kept = {(u, v): row for row, (u, v) in enumerate(self.pixels.tolist())}
+        rows = np.array([kept.get((u, v), -1) for u, v in pixels.tolist()], int)
+        rho = np.append(self.rho, 0.0)[rows]
+        return rho, np.append(self.variance, np.inf)[rows]
+
+
+@dataclass(frozen=True)
 class PosedView:
     """A picture's place in a sub-map, and its depth at a board's corners where it is known."""
 
@@ -48,12 +70,16 @@ class PosedView:
     """[H, W] inverse depth, 0 where unknown."""
     variance: Array | None = None
     """[H, W]"""
+    depths: PixelDepths | None = None
+    """In place of both, where only the depths that will be asked for were kept."""
 
     def depth_at(
         self,
         pixels: Array,  # [N, 2]
     ) -> tuple[Array, Array]:
         """Inverse depths [N] and their variances [N]; infinite where nothing is known."""
+        if self.depths is not None:
+            return self.depths.at(pixels)
         if self.rho is None or self.variance is None:
             return np.zeros(len(pixels)), np.full(len(pixels), np.inf)
         columns = np.clip(pixels[:, 0].astype(int), 0, self.rho.shape[1] - 1)

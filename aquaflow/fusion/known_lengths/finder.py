@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +14,8 @@ from aquaflow.fusion.known_lengths.boards import BoardDetector, BoardSighting
 from aquaflow.fusion.known_lengths.known_length import KnownLength
 from aquaflow.fusion.known_lengths.laser_dots import DotCandidates, find_dots
 from aquaflow.fusion.known_lengths.laser_spacing import laser_lengths
+
+Array = npt.NDArray[np.float64]
 
 
 class KnownLengthFinder:
@@ -28,13 +31,30 @@ class KnownLengthFinder:
         self,
         frame_index: int,
         image: npt.NDArray[np.uint8],  # [H, W, 3] RGB, undistorted
-    ) -> None:
-        """Look for the objects in a picture: 6 to 9 ms of CPU for each at 640 x 480 px."""
-        self._boards += self._detector(frame_index, image)
+    ) -> Array:
+        """Look for the objects in a picture: 6 to 9 ms of CPU for each at 640 x 480 px.
+
+        Returns [N, 2] where something was seen: there the picture's depth is worth keeping.
+        """
+        boards = self._detector(frame_index, image)
+        self._boards += boards
+        seen = [each.pixels for each in boards]
         if self._lasers is not None:
             dots = find_dots(frame_index, image, self._lasers.colour)
             if len(dots.pixels):
                 self._dots.append(dots)
+                seen.append(dots.pixels)
+        return np.concatenate([np.zeros((0, 2)), *seen])
+
+    def __bool__(self) -> bool:
+        """True once something was seen."""
+        return bool(self._boards or self._dots)
+
+    def copy(self) -> KnownLengthFinder:
+        """What was seen until now, to be measured by another thread."""
+        other = copy(self)
+        other._boards, other._dots = list(self._boards), list(self._dots)
+        return other
 
     def lengths(self, view_of: Callable[[int], PosedView | None]) -> list[KnownLength]:
         """What was seen until now, measured in the map as it is now.

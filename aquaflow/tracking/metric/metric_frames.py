@@ -1,4 +1,4 @@
-"""Telemetry of a dive, and the metric frames that it gives the sub-maps."""
+"""Telemetry and known lengths of a dive, and the metric frames that they give."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from aquaflow.messages import TelemetrySample
 from aquaflow.tracking.frame_table import FrameTable
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
 from aquaflow.tracking.metric.motion import motion_of_camera
+from aquaflow.tracking.metric.sightings import Sightings
 from aquaflow.tracking.metric.straightening import estimates_of, straightened
 from aquaflow.tracking.metric.survey import Survey, sampled_points
 
@@ -26,7 +27,7 @@ Array = npt.NDArray[np.float64]
 
 
 class MetricFrames:
-    """Collects samples and keyframes' points; the rest works on a :class:`Survey` of them."""
+    """Collects samples, sightings and keyframes' points; a :class:`Survey` does the rest."""
 
     def __init__(
         self, keyframes: KeyframeStore, frames: Callable[[], FrameTable], config: FusionConfig,
@@ -34,6 +35,8 @@ class MetricFrames:
     ) -> None:  # fmt: skip
         self.telemetry = Telemetry()
         self._recent = RecentMotion()
+        self.sightings = Sightings(config)
+        """Objects of known size in the pictures."""
         self.mounting = config.camera
         """Of the camera in the body; a recording that states it may set it."""
         self.frames: dict[int, MetricFrame] = {}
@@ -47,8 +50,8 @@ class MetricFrames:
 
     @property
     def present(self) -> bool:
-        """True once there is telemetry."""
-        return bool(self.telemetry)
+        """True once there is telemetry, or an object of known size was seen."""
+        return bool(self.telemetry) or bool(self.sightings)
 
     def add(self, sample: TelemetrySample) -> None:
         """A sample of telemetry, in the order of arrival."""
@@ -76,7 +79,7 @@ class MetricFrames:
 
     def keyframe(self, number: int, parent: int | None) -> bool:
         """A new keyframe; True if it is time to straighten the graph by telemetry."""
-        if not self.telemetry:
+        if not self.present:
             return False
         if parent is not None:
             self._keep_points(parent)
@@ -88,16 +91,23 @@ class MetricFrames:
 
     def _keep_points(self, number: int) -> None:
         """A keyframe's depths are as good as they get once another one takes its place."""
+        keyframe = self._keyframes[number]
+        with self._failures.contain("depths of known lengths", keyframe.frame_index):
+            self.sightings.keep_depths(keyframe.frame_index, lambda: keyframe.pointmap)
+        if not self.telemetry:
+            return
         while len(self._points) <= number:
             self._points.append(np.zeros((0, 3)))
         with self._failures.contain("points for the altimeter"):
-            self._points[number] = sampled_points(self._keyframes[number].pointmap)
+            self._points[number] = sampled_points(keyframe.pointmap)
 
     def survey(self, snapshot: Snapshot) -> Survey:
         """All that is known now, for any thread."""
         rows, telemetry = self._frames().rows(), self.telemetry.copy()
-        points = tuple(self._points)
-        return Survey(snapshot.nodes, rows, telemetry, points, self.mounting, self._config)
+        return Survey(
+            snapshot.nodes, rows, telemetry, tuple(self._points), self.mounting, self._config,
+            self.sightings.copy(),
+        )  # fmt: skip
 
     def job(self, snapshot: Snapshot) -> Callable[[], GraphResult]:
         """The optimisation of a snapshot together with telemetry, to be called in any thread."""
@@ -117,7 +127,7 @@ class MetricFrames:
 
     def update(self, snapshot: Snapshot) -> dict[int, MetricFrame]:
         """Estimate the frames of all sub-maps from their poses as they are now."""
-        if len(snapshot.nodes) and self.telemetry:
+        if len(snapshot.nodes) and self.present:
             self._keep_points(len(self._keyframes) - 1)
             with self._failures.contain("metric frames"):
                 found = estimates_of(self.survey(snapshot))

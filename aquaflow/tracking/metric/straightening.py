@@ -11,6 +11,7 @@ import numpy as np
 from aquaflow.fusion.camera_path import CameraPath
 from aquaflow.fusion.dead_reckoning import carried_from
 from aquaflow.fusion.estimator import Estimate, estimate
+from aquaflow.fusion.factors.length import length_factors
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.tracking.graph.equations import Rows, poses_of
@@ -25,6 +26,7 @@ def estimates_of(survey: Survey) -> dict[int, Estimate]:
     """The metric frame of every component of the graph, by its first keyframe."""
     found: dict[int, Estimate] = {}
     before: tuple[Estimate, CameraPath] | None = None
+    lengths = survey.known_lengths()
     for component in survey.components():
         path = survey.path(component)
         carried = None
@@ -32,7 +34,7 @@ def estimates_of(survey: Survey) -> dict[int, Estimate]:
             carried = carried_from(*before, survey.telemetry, path)
         found[component] = estimate(
             survey.telemetry, path, survey.config, survey.mounting,
-            partial(survey.ground, component), carried=carried,
+            partial(survey.ground, component), length_factors(lengths.get(component, ())), carried,
         )  # fmt: skip
         if found[component].frame.metric:
             before = found[component], path
@@ -85,6 +87,8 @@ def solve_with_worlds(
     snapshot: Snapshot, worlds: list[World]
 ) -> tuple[GraphResult, dict[int, Sim3]]:
     """Optimise keyframes and worlds: the result of the keyframes alone, and T_mn by component."""
+    if not worlds:
+        return Optimisation(snapshot, everything=False).run(), {}
     edges, count = len(snapshot.edges), len(snapshot.nodes)
     result = Optimisation(_with_worlds(snapshot, worlds), everything=False).run()
     own = result.rows < count

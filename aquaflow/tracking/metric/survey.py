@@ -11,10 +11,14 @@ import numpy.typing as npt
 from aquaflow.config import FusionConfig
 from aquaflow.config.telemetry import MountingConfig
 from aquaflow.fusion.camera_path import CameraPath
+from aquaflow.fusion.known_lengths.known_length import KnownLength
 from aquaflow.fusion.telemetry import Telemetry
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.keyframes import Pointmap
+from aquaflow.storage.arrays import to_sim3
 from aquaflow.tracking.graph.equations import Rows, poses_of
+from aquaflow.tracking.metric.sightings import Sightings
 
 Array = npt.NDArray[np.float64]
 
@@ -39,6 +43,7 @@ class Survey:
     """[n, 3] of each keyframe by its number, in its own camera frame; empty for some."""
     mounting: MountingConfig | None
     config: FusionConfig
+    sightings: Sightings
 
     def components(self) -> list[int]:
         """Sub-maps in the order of their first keyframe, by its number."""
@@ -60,6 +65,26 @@ class Survey:
         T_mc = poses_of(self.nodes[at]) @ _similarities(posed["T_kf"])
         t_s, first = np.unique(posed["t_ns"] * 1e-9, return_index=True)
         return CameraPath(t_s, T_mc.R[first], T_mc.t[first])
+
+    def known_lengths(self) -> dict[int, list[KnownLength]]:
+        """What was seen of known size, by component, measured with the poses of now."""
+        if not self.sightings:
+            return {}
+        node = {int(number): row for row, number in enumerate(self.nodes["number"].tolist())}
+        frame = {int(index): row for row, index in enumerate(self.frames["index"].tolist())}
+
+        def place_of(frame_index: int) -> tuple[Sim3, int] | None:
+            row = self.frames[frame[frame_index]] if frame_index in frame else None
+            at = None if row is None else node.get(int(row["keyframe"]))
+            if row is None or at is None:
+                return None
+            T_mk, T_kf = poses_of(self.nodes[at : at + 1]), to_sim3(row["T_kf"])
+            return T_mk.element(0) @ T_kf, int(self.nodes["component"][at])
+
+        found: dict[int, list[KnownLength]] = {}
+        for length in self.sightings.lengths(place_of):
+            found.setdefault(length.sub_map, []).append(length)
+        return found
 
     def ground(self, component: int) -> Array:
         """[K, 3] points of a sub-map, in its world."""

@@ -1,0 +1,73 @@
+"""Where objects of known size were seen in a dive, with what measuring them in the map needs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.config import FusionConfig
+from aquaflow.fusion.known_lengths.board_size import PixelDepths, PosedView
+from aquaflow.fusion.known_lengths.finder import KnownLengthFinder
+from aquaflow.fusion.known_lengths.known_length import KnownLength
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes import Pointmap
+
+Array = npt.NDArray[np.float64]
+PlaceOf = Callable[[int], tuple[Sim3, int] | None]
+"""T_wc and the component of a frame by its index; None for a frame without a pose."""
+
+
+class Sightings:
+    """Grows with the pictures; a kilobyte for each that shows something."""
+
+    def __init__(self, config: FusionConfig) -> None:
+        self.looks_for = bool(config.enabled and (config.boards or config.lasers))
+        """True if the settings name an object."""
+        self._finder = KnownLengthFinder(config)
+        self._cameras: dict[int, CameraModel] = {}
+        self._pixels: dict[int, Array] = {}
+        self._depths: dict[int, PixelDepths] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self._finder)
+
+    def look(
+        self,
+        frame_index: int,
+        image: npt.NDArray[np.uint8],  # [H, W, 3] RGB, undistorted
+        camera: CameraModel,
+    ) -> None:
+        """Look for the objects in a picture: some milliseconds for each."""
+        pixels = self._finder.look(frame_index, image)
+        if len(pixels):
+            self._cameras[frame_index], self._pixels[frame_index] = camera, pixels
+
+    def keep_depths(self, frame_index: int, pointmap: Callable[[], Pointmap]) -> None:
+        """Keep a keyframe's depths where something was seen in it."""
+        pixels = self._pixels.get(frame_index)
+        if pixels is not None:
+            found = pointmap()
+            view = PosedView(found.camera, Sim3.identity(), 0, found.rho, found.variance)
+            self._depths[frame_index] = PixelDepths(pixels, *view.depth_at(pixels))
+
+    def copy(self) -> Sightings:
+        """What was seen until now, to be measured by another thread."""
+        other = copy(self)
+        other._finder = self._finder.copy()
+        other._cameras, other._depths = dict(self._cameras), dict(self._depths)
+        return other
+
+    def lengths(self, place_of: PlaceOf) -> list[KnownLength]:
+        """What was seen, measured with the poses of now; ``sub_map`` of each is its component."""
+
+        def view_of(frame_index: int) -> PosedView | None:
+            place, camera = place_of(frame_index), self._cameras.get(frame_index)
+            if place is None or camera is None:
+                return None
+            return PosedView(camera, *place, depths=self._depths.get(frame_index))
+
+        return self._finder.lengths(view_of)
