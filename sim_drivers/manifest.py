@@ -1,12 +1,14 @@
 """``replay.yaml``: a camera's recording and the telemetry logs that were recorded with it.
 
     camera: dive.mp4
+    mounting: {pitch_deg: -90}
     telemetry:
       - {file: dive.tlog, starts_s: -3.2}
       - file: sounder.nmea
         device: {kind: nmea0183, link: {port: log}, depth_sentences: [DBT]}
 
-``starts_s`` is when the log begins, in seconds after the first picture.
+``mounting`` is the camera's in the vehicle, as in a vehicle's configuration. ``starts_s`` is when
+the log begins, in seconds after the first picture.
 """
 
 from __future__ import annotations
@@ -18,10 +20,10 @@ from pathlib import Path
 from pydantic import Field
 
 from aquaflow.config.stage import Stage, validated
-from aquaflow.config.telemetry import AnyDevice
+from aquaflow.config.telemetry import AnyDevice, MountingConfig
 from aquaflow.errors import ConfigError, InputError
 from aquaflow.errors.plain_yaml import read_mapping
-from aquaflow.messages import TelemetrySample
+from aquaflow.messages import Dropped, Frame, TelemetrySample
 from aquaflow.sources import (
     RawTap,
     RecordedCamera,
@@ -50,6 +52,8 @@ class Manifest(Stage):
     """What lies in the folder."""
 
     camera: str | None = None
+    mounting: MountingConfig | None = None
+    """Of the camera; None: as its own file states it, else unknown."""
     telemetry: tuple[LogEntry, ...] = ()
 
 
@@ -80,7 +84,49 @@ class ManifestCamera:
         manifest = read_manifest(path)
         if manifest.camera is None:
             raise InputError(f"{path / MANIFEST} names no camera")
-        return open_recording(_named(path, manifest.camera), fps)
+        camera = open_recording(_named(path, manifest.camera), fps)
+        return camera if manifest.mounting is None else MountedCamera(camera, manifest.mounting)
+
+
+class MountedCamera:
+    """A recorded camera whose mounting is stated outside of its own file."""
+
+    def __init__(self, recording: RecordedCamera, mounting: MountingConfig) -> None:
+        self._recording, self._mounting = recording, mounting
+        self.specificity = recording.specificity
+        self.camera, self.frame_count = recording.camera, recording.frame_count
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        return ManifestCamera.recognises(path)
+
+    @classmethod
+    def open(cls, path: Path, fps: float | None = None) -> RecordedCamera:
+        """Raises InputError as :meth:`ManifestCamera.open` does."""
+        return ManifestCamera.open(path, fps)
+
+    @property
+    def notes(self) -> list[str]:
+        return self._recording.notes
+
+    @notes.setter
+    def notes(self, notes: list[str]) -> None:
+        self._recording.notes = notes
+
+    def stated_mounting(self) -> MountingConfig:
+        """As the manifest states it."""
+        return self._mounting
+
+    def name_of(self, index: int) -> str:
+        return self._recording.name_of(index)
+
+    def frames(
+        self, every: int = 1, start: int = 0, stop: int | None = None
+    ) -> Iterator[Frame | Dropped]:
+        return self._recording.frames(every, start, stop)
+
+    def close(self) -> None:
+        self._recording.close()
 
 
 class ManifestTelemetry:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.config.telemetry import MountingConfig
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import CameraModel, Port, guess_camera
 from aquaflow.messages import Dropped, EncodedPicture, Frame
@@ -27,6 +28,8 @@ RAW_NAMES = frozenset({RAW, "Image"})
 """Foxglove's and ROS's messages of pictures that are not compressed."""
 OURS = "aquaflow"
 """Name of the metadata that AquaFlow's recorder writes."""
+MOUNTING = "mounting"
+"""Key of a camera's metadata: its mounting in the vehicle as JSON."""
 
 
 def picture_kind(message: McapMessage) -> str | None:
@@ -109,6 +112,22 @@ class McapCamera:
 
     def close(self) -> None:
         """Nothing stays open between passes."""
+
+    def stated_mounting(self) -> MountingConfig | None:
+        """Of the camera in the vehicle, as the recorder knew it.
+
+        Raises:
+            InputError: the statement in the file is damaged.
+        """
+        facts = self._messages.facts.get(f"camera:{self._base.strip('/')}", {})
+        if not self._ours or MOUNTING not in facts:
+            return None
+        try:
+            return MountingConfig.model_validate_json(facts[MOUNTING])
+        except ValueError:
+            raise InputError(
+                f"the mounting of the camera in {self.path.name} is damaged; give fusion.camera"
+            ) from None
 
     def _first_picture(self, camera: str | None) -> tuple[McapMessage, int]:
         """The first picture, and when it or a missing one before it was taken."""

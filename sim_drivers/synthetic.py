@@ -26,8 +26,7 @@ class SyntheticDive(ImageFolder):
     def open(cls, path: Path, fps: float | None = None) -> SyntheticDive:
         return cls(path, fps)
 
-    @property
-    def mounting(self) -> MountingConfig | None:
+    def stated_mounting(self) -> MountingConfig | None:
         """Of the camera, as the dive states it; None where its synth.yaml does not say."""
         try:
             stated = read_mapping(self.folder / MARK, "facts of the dive", "write the dive again")

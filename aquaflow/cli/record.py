@@ -75,6 +75,7 @@ def _with_picture(vehicle: VehicleConfig, picture: str) -> VehicleConfig:
 
 def _devices(vehicle: VehicleConfig) -> Callable[[RecordingSession], None]:
     """Open the cameras; links are opened with the recorder, which gets their first byte."""
+    from aquaflow.service.mounting import record_mountings
     from aquaflow.sources import open_camera, open_links
 
     cameras = {name: open_camera(name, config) for name, config in vehicle.cameras.items()}
@@ -82,6 +83,7 @@ def _devices(vehicle: VehicleConfig) -> Callable[[RecordingSession], None]:
         camera.connect()
 
     def add(session: RecordingSession) -> None:
+        record_mountings(session.recorder, vehicle, cameras)
         tap, telemetry = session.recorder.raw, vehicle.telemetry
         session.add_live(cameras, [open_links(telemetry, tap)] if telemetry.devices else [])
 

@@ -78,7 +78,9 @@ class OakConfig(LiveCameraConfig):
         200, ge=0, le=400, description="accelerometer and gyroscope readings/s; 0: none"
     )
     mounting: MountingConfig = Field(
-        MountingConfig(), description="of the camera; without it, it looks forward"
+        MountingConfig(),
+        description="of the camera; without it, the IMU counts as that of one that looks forward, "
+        "and how the camera sits as unknown",
     )
 
     @model_validator(mode="after")

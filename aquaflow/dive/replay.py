@@ -18,7 +18,7 @@ from aquaflow.messages import CameraModel, Dropped, Frame
 from aquaflow.profiler import Profiler
 from aquaflow.recording.playback import Event, Playback
 from aquaflow.slam import Slam
-from aquaflow.sources import RecordedCamera, StatesMounting
+from aquaflow.sources import RecordedCamera, mounting_of
 from aquaflow.sources.reading import read_past_failures
 from aquaflow.sources.telemetry_input import TelemetryInput
 
@@ -55,8 +55,9 @@ def map_recording(
         calibration = calibration or recording.camera
         run = DiveRun(name, folder, config, slam, calibration, recording.name_of, trace)
         try:
-            if slam.metric.mounting is None and isinstance(recording, StatesMounting):
-                slam.metric.mounting = recording.mounting
+            if slam.metric.mounting is None:
+                with failures.contain("camera mounting"):
+                    slam.metric.mounting = mounting_of(recording)
             playback = Playback(recording, given.synchronised, failures=failures)
             shown = progress or (lambda stage, done, total: None)
             return _replay(run, recording, given, playback, config, shown)

@@ -9,9 +9,10 @@ from dataclasses import replace
 from itertools import chain, dropwhile
 from typing import TypeAlias
 
+from aquaflow.config.telemetry import MountingConfig
 from aquaflow.errors.failures import Failures
 from aquaflow.messages import Dropped, Frame, TelemetrySample
-from aquaflow.sources import CameraSource, TelemetrySource
+from aquaflow.sources import CameraSource, TelemetrySource, mounting_of
 
 Event: TypeAlias = Frame | Dropped | TelemetrySample
 
@@ -65,6 +66,10 @@ class Playback:
     def frame_count(self) -> int | None:
         """Number of the camera's frames, where it knows it."""
         return None if self._camera is None else self._camera.frame_count
+
+    def stated_mounting(self) -> MountingConfig | None:
+        """Of the camera; see :func:`aquaflow.sources.mounting_of`."""
+        return mounting_of(self._camera)
 
     def _samples(self, source: TelemetrySource) -> Iterator[TelemetrySample]:
         with self._failures.contain("telemetry"):

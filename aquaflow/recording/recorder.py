@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from aquaflow.config.recording import RecordingConfig
+from aquaflow.config.telemetry import MountingConfig
 from aquaflow.errors import InputError
 from aquaflow.messages import Dropped, Frame, TelemetrySample
 from aquaflow.recording.disk import free_bytes
@@ -52,6 +53,11 @@ class Recorder:
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
+
+    def mounted(self, camera: str, mounting: MountingConfig | None) -> None:
+        """State how a camera sits in the vehicle, before its first picture; None: not known."""
+        if mounting is not None:
+            self._writer.mountings[camera] = mounting
 
     def frame(self, camera: str, frame: Frame | Dropped) -> None:
         """Record a picture; its ``image`` must not change afterwards."""

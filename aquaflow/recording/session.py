@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Protocol, TypeAlias, runtime_checkable
 
+from aquaflow.errors import AquaFlowError
 from aquaflow.messages import Dropped, Frame, TelemetrySample
 from aquaflow.recording.playback import Event, Playback, arrival_of, arrived
 from aquaflow.recording.recorder import Recorder
@@ -79,6 +80,10 @@ class RecordingSession:
                 shift_ns = now_ns - arrival_of(event) if shift_ns is None else shift_ns
                 self._hand_over(name, arrived(event, shift_ns, now_ns))
 
+        try:
+            self.recorder.mounted(name, playback.stated_mounting())
+        except AquaFlowError as error:
+            self.notes.append(str(error))
         self._pumps.append((f"recording '{name}'", pump))
         self._closing.append(playback.close)
 

@@ -13,7 +13,8 @@ import numpy.typing as npt
 from aquaflow import __version__
 from aquaflow.clocks.wall import WallClockWatch
 from aquaflow.config.recording import RecordingConfig
-from aquaflow.messages import Dropped, Frame, TelemetrySample
+from aquaflow.config.telemetry import MountingConfig
+from aquaflow.messages import CameraModel, Dropped, Frame, TelemetrySample
 from aquaflow.recording.dive_file import DiveFile
 from aquaflow.recording.pictures import (
     calibration_message,
@@ -47,6 +48,8 @@ class DiveWriter:
         self._finished_bytes = 0
         self._masks: dict[str, npt.NDArray[np.bool_]] = {}
         self._has_video = False
+        self.mountings: dict[str, MountingConfig] = {}
+        """Of cameras in the vehicle, as far as they are known; for the metadata of each file."""
         self._begin()
 
     def write(self, item: Item) -> None:
@@ -127,7 +130,7 @@ class DiveWriter:
         message = picture_message(frame, camera, self._settings)
         if camera not in self._announced:
             self._announced.add(camera)
-            self._file.metadata(f"camera:{camera}", {"model": camera_to_json(frame.camera)})
+            self._file.metadata(f"camera:{camera}", self._facts_of(camera, frame.camera))
             calibration = calibration_message(frame.camera, frame.t_ns, camera)
             self._protobuf(f"/{camera}/calibration", calibration, frame)
         known = self._masks.get(camera)
@@ -145,6 +148,11 @@ class DiveWriter:
         self._has_video |= video
         self._protobuf(f"/{camera}/{'video' if video else 'image'}", message, frame)
         self._status.frames += 1
+
+    def _facts_of(self, camera: str, model: CameraModel) -> dict[str, str]:
+        facts = {"model": camera_to_json(model)}
+        mounting = self.mountings.get(camera)
+        return facts if mounting is None else facts | {"mounting": mounting.model_dump_json()}
 
     def _missing(self, topic: str, dropped: Dropped) -> None:
         reason = {"reason": dropped.reason}

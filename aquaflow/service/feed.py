@@ -25,13 +25,14 @@ from typing import Protocol, runtime_checkable
 
 from aquaflow.clocks.device import Learned
 from aquaflow.config import SourceConfig
+from aquaflow.config.telemetry import MountingConfig
 from aquaflow.errors.failures import Failures
 from aquaflow.messages import CameraModel, Dropped, Frame, TelemetrySample
 from aquaflow.recording.playback import Event, Playback, arrived
 from aquaflow.recording.recorder import Recorder
 from aquaflow.recording.session import HasSamples
 from aquaflow.service.dive_clock import Continued
-from aquaflow.sources import CameraSource, TelemetrySource
+from aquaflow.sources import CameraSource, TelemetrySource, mounting_of
 from aquaflow.sources.newest import Newest
 from aquaflow.sources.outbound import AcceptsMessages, OutboundMessage
 from aquaflow.sources.reading import read_past_failures
@@ -109,6 +110,10 @@ class Feed(Protocol):
 
     def continue_from(self, continued: Continued) -> None:
         """Continue frame indices and time of an earlier run; call it before ``start``."""
+        ...
+
+    def stated_mounting(self) -> MountingConfig | None:
+        """Of the mapping camera in the body; see :func:`aquaflow.sources.mounting_of`."""
         ...
 
     def clocks(self) -> Mapping[str, Learned]:
@@ -195,6 +200,9 @@ class LiveFeed(_Pumps):
     def name_of(self, index: int) -> str:
         return f"{self.name}#{index}"
 
+    def stated_mounting(self) -> MountingConfig | None:
+        return mounting_of(self._cameras[self.name])
+
     def describe(self) -> dict[str, dict[str, object]]:
         devices: dict[str, dict[str, object]] = {}
         for name, camera in self._cameras.items():
@@ -280,6 +288,9 @@ class PlaybackFeed(_Pumps):
         super().__init__(failures)
         self.calibration, self.name_of, self._notes = calibration, name_of, notes
         self._playback, self._source = playback, source
+
+    def stated_mounting(self) -> MountingConfig | None:
+        return self._playback.stated_mounting()
 
     def describe(self) -> dict[str, dict[str, object]]:
         return {}

@@ -32,6 +32,7 @@ from aquaflow.service.health.pressure import PressureReader
 from aquaflow.service.health.systemd import Notifier
 from aquaflow.service.loop import LiveLoop
 from aquaflow.service.map_thread import MapThread
+from aquaflow.service.mounting import camera_mounting
 from aquaflow.signals import stop_on_signals
 from aquaflow.slam import Slam
 
@@ -98,6 +99,8 @@ class LiveDive:
         maps = Maps(config, renderer, profiler, self.folder.work, failures)
         thread = MapThread(maps, service.mapping, self._heartbeats, lambda: self._degradation.level)
         slam = Slam(config, profiler, self.folder.work, True, thread, failures)
+        with failures.contain("camera mounting"):
+            slam.metric.mounting = camera_mounting(config, service, feed)
         run = DiveRun(name, self.folder, config, slam, feed.calibration, feed.name_of)
         continued = Continued()
         if choice.checkpoint is not None:

@@ -12,6 +12,7 @@ from aquaflow.messages import CameraModel
 from aquaflow.recording.playback import Playback
 from aquaflow.recording.recorder import Recorder
 from aquaflow.service.feed import LiveFeed, PlaybackFeed
+from aquaflow.service.mounting import record_mountings
 from aquaflow.sources import open_camera, open_links, open_recording, telemetry_reader
 
 
@@ -29,6 +30,8 @@ def devices(vehicle: VehicleConfig) -> LiveFeed:
         raise ConfigError(f"service.camera is '{name}'; the cameras are: {known}")
     cameras = {key: open_camera(key, config) for key, config in vehicle.cameras.items()}
     recorder = _recorder(vehicle) if vehicle.service.record else None
+    if recorder is not None:
+        record_mountings(recorder, vehicle, cameras)
     tap = None if recorder is None else recorder.raw
     links = open_links(vehicle.telemetry, tap) if vehicle.telemetry.devices else None
     return LiveFeed(name, cameras, links, vehicle.source, recorder)

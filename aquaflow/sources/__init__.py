@@ -54,12 +54,24 @@ def is_asked(index: int, every: int, start: int) -> bool:
 
 @runtime_checkable
 class StatesMounting(Protocol):
-    """A camera source that knows how its camera sits in the vehicle."""
+    """A source of frames that knows how its camera sits in the vehicle."""
 
-    @property
-    def mounting(self) -> MountingConfig | None:
-        """Of the camera in the body; None if it is not stated."""
+    def stated_mounting(self) -> MountingConfig | None:
+        """Of the camera in the body; None if it is not stated.
+
+        Raises:
+            InputError, ConfigError: what states it cannot be read.
+        """
         ...
+
+
+def mounting_of(camera: object) -> MountingConfig | None:
+    """The mounting that a source states, if it is one that can.
+
+    Raises:
+        InputError, ConfigError: as of :meth:`StatesMounting.stated_mounting`.
+    """
+    return camera.stated_mounting() if isinstance(camera, StatesMounting) else None
 
 
 class RecordedCamera(CameraSource, Protocol):

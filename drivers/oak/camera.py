@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.cameras import OakConfig
+from aquaflow.config.telemetry import MountingConfig
 from aquaflow.messages import Acceleration, AngularRate, CameraModel, TelemetrySample
 from aquaflow.sources.newest import Newest
 from drivers.capture import RawPicture, UnusablePictureError
@@ -86,6 +87,10 @@ class OakCamera(LiveCamera):
     def configured(cls, name: str, config: OakConfig) -> OakCamera:
         """The camera of :func:`aquaflow.sources.open_camera`."""
         return cls(name, config)
+
+    def stated_mounting(self) -> MountingConfig | None:
+        """As configured; a camera whose configuration is silent may look anywhere."""
+        return self._oak.mounting if "mounting" in self._oak.model_fields_set else None
 
     def samples(self) -> Iterator[TelemetrySample]:
         """Specific force and angular rate, in the order of arrival, until :meth:`close`."""

@@ -11,13 +11,14 @@ import cv2
 import numpy as np
 import pytest
 
-from aquaflow.config import Config
+from aquaflow.config import Config, SourceConfig
 from aquaflow.dive.replay import map_recording
-from aquaflow.errors import NotMappedError
+from aquaflow.errors import InputError, NotMappedError
 from aquaflow.messages import Frame
 from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation
+from sim_drivers.synthetic import SyntheticDive
 from tests.command_line import Cli
 from tests.small_recording import FRAMES, HASTY, HEIGHT, QUICK, WIDTH
 
@@ -45,6 +46,20 @@ def test_held_out_frames_are_tracked_and_never_mapped(small_recording: Path) -> 
     assert {t.frame.index for t in tracked if t.T_wc is not None} >= set(held_out)
     mapped = [view.frame_index for view in slam.mappers[0].views]
     assert sorted(mapped + held_out) == list(range(FRAMES))
+
+
+@pytest.mark.usefixtures("contained")
+def test_a_mounting_that_cannot_be_read_costs_itself(
+    small_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(self: SyntheticDive) -> None:
+        raise InputError("planted")
+
+    monkeypatch.setattr(SyntheticDive, "stated_mounting", fail)
+    config = TRACKING_ONLY.model_copy(update={"source": SourceConfig(stop=8)})
+    finished = map_recording(open_recording(small_recording), "x", tmp_path / "dive", config)
+    assert [each["stage"] for each in finished.metrics["failures"]] == ["camera mounting"]
+    assert (tmp_path / "dive" / "trajectory.tum").exists()
 
 
 def test_holding_out_counts_the_frames_that_are_used(

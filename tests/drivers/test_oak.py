@@ -92,6 +92,13 @@ def test_the_mounting_turns_the_imu() -> None:
     assert down.acceleration_m_s2 == pytest.approx((GRAVITY_M_S2, 0.0, 0.0))
 
 
+def test_a_camera_states_the_mounting_that_its_configuration_gives() -> None:
+    for given, stated in (({}, None), ({"mounting": {"pitch_deg": -90.0}}, -90.0)):
+        with closing(oak(feed(), **given)[0]) as camera:
+            found = camera.stated_mounting()
+            assert (None if found is None else found.pitch_deg) == stated
+
+
 def test_the_imu_can_be_switched_off() -> None:
     camera, _ = oak(feed(), imu_rate_hz=0)
     with closing(camera):

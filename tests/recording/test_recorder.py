@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from aquaflow.config.recording import RecordingConfig
+from aquaflow.config.telemetry import MountingConfig
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import CameraModel, Port
 from aquaflow.messages import (
@@ -32,6 +33,9 @@ from aquaflow.messages import (
 from aquaflow.recording import Recorder, RecorderStatus, dive_file
 from aquaflow.recording.dive_file import DiveFile
 from aquaflow.recording.pictures import encode
+from aquaflow.recording.playback import Playback
+from aquaflow.recording.session import RecordingSession
+from aquaflow.sources import mounting_of
 from sim_drivers.mcap_camera import McapCamera
 from sim_drivers.mcap_messages import McapMessages, mcap_files
 from sim_drivers.mcap_telemetry import McapTelemetry
@@ -120,6 +124,31 @@ def test_missing_pictures_keep_their_place(tmp_path: Path) -> None:
     first, second, third = camera.frames()
     assert (first, third) == (Dropped(0, 0, "black"), Dropped(2, 2 * SECOND, "torn"))
     assert second.t_ns == given[1].t_ns - 4 * SECOND
+
+
+def test_how_a_camera_is_mounted_comes_back_from_every_file(tmp_path: Path) -> None:
+    recorder, down = Recorder(tmp_path, LOSSLESS), MountingConfig(pitch_deg=-90.1)
+    recorder.mounted("c", down)
+    recorder.mounted("other", None)
+    recorder.frame("c", picture(0))
+    recorder.frame("other", picture(0))
+    recorder.close()
+    assert mounting_of(McapCamera(tmp_path, "c")) == down
+    assert mounting_of(McapCamera(tmp_path, "other")) is None
+
+
+def test_a_damaged_mounting_is_refused_with_its_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = recorded(tmp_path, [picture(0)], LOSSLESS)
+    monkeypatch.setitem(camera._messages.facts["camera:c"], "mounting", '{"pitch": 1}')
+    with pytest.raises(InputError, match=r"mounting.*fusion\.camera"):
+        mounting_of(camera)
+    session = RecordingSession(Recorder(tmp_path / "again", LOSSLESS))
+    session.add_playback("c", Playback(camera, []), [])
+    session.run()
+    assert session.recorder.status.frames == 1
+    assert "mounting" in session.notes[0]
 
 
 def test_samples_of_every_kind_keep_every_bit(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from aquaflow.clocks.device import Learned
 from aquaflow.config import Config, parse_config
 from aquaflow.config.service import ServiceConfig
+from aquaflow.config.telemetry import MountingConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import DiveRun
@@ -84,9 +85,13 @@ class ToldFeed:
         self.continued = Continued()
         self.told: list[OutboundMessage] = []
         self.learned: dict[str, Learned] = {}
+        self.mounting: MountingConfig | None = None
 
     def name_of(self, index: int) -> str:
         return f"told#{index}"
+
+    def stated_mounting(self) -> MountingConfig | None:
+        return self.mounting
 
     def describe(self) -> dict[str, dict[str, object]]:
         return self.devices

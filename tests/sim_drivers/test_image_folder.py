@@ -248,7 +248,7 @@ def test_a_synthetic_dive_that_does_not_say_how_its_camera_is_mounted_is_still_r
 
     source = SyntheticDive.open(tmp_path, fps=5.0)
 
-    assert source.mounting is None
+    assert source.stated_mounting() is None
     assert values(source) == [9]
 
 

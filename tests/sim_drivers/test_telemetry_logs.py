@@ -24,7 +24,12 @@ from aquaflow.messages import (
     UtcTime,
     Velocity,
 )
-from aquaflow.sources import open_recorded_telemetry, open_recording, telemetry_reader
+from aquaflow.sources import (
+    mounting_of,
+    open_recorded_telemetry,
+    open_recording,
+    telemetry_reader,
+)
 from sim_drivers.candump import Candump
 from sim_drivers.csv_telemetry import CsvTelemetry
 from sim_drivers.dataflash import Dataflash
@@ -266,6 +271,15 @@ def test_a_manifest_brings_pictures_and_logs_together(dive: Path) -> None:
     ]  # fmt: skip
     assert isinstance(samples[-1], Attitude)
     assert abs(samples[-1].wxyz[0]) == pytest.approx(0.5**0.5)
+
+
+def test_a_manifest_states_how_its_camera_is_mounted(pictures: Path) -> None:
+    (pictures / "replay.yaml").write_text("camera: images\nmounting: {pitch_deg: -90}\n")
+    recording = open_recording(pictures)
+    assert mounting_of(recording) == MountingConfig(pitch_deg=-90.0)
+    assert (recording.frame_count, recording.name_of(1)) == (3, "1.png")
+    assert [frame.index for frame in recording.frames(every=2)] == [0, 2]
+    assert recording.notes == []
 
 
 def test_a_logs_bytes_can_be_tapped_as_a_live_links(dive: Path) -> None:

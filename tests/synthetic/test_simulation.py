@@ -223,7 +223,7 @@ def test_a_written_dive_states_its_mounting_and_keeps_the_truth(tmp_path: Path) 
     np.testing.assert_allclose(truth.R_bc, truth.T_bc[:3, :3])
     np.testing.assert_allclose(truth.errors["R_body_dvl"], simulated.R_bd, atol=1e-12)
     assert truth.errors["dvl_scale"] == simulated.constants.dvl_scale
-    assert SyntheticDive.open(tmp_path).mounting == simulated.mounting
+    assert SyntheticDive.open(tmp_path).stated_mounting() == simulated.mounting
     first = next(s for s in read_telemetry(tmp_path / "telemetry.csv") if isinstance(s, Depth))
     T_wb = truth.T_wc @ np.linalg.inv(truth.T_bc)
     offset = truth.errors["depth_offset_m"]
