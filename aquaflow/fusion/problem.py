@@ -220,9 +220,9 @@ def _add_altitudes(
             problem.reports.append(SourceReport(altitude.source, "altitude", reason=why))
             continue
         if not any(f.kind in ("velocity", "depth") for f in problem.factors):
-            problem.start = replace(problem.start, log_scale=factor.rough_log_scale)
-            # Where the altimeter is, by the camera's pose, depends on the scale.
-            factor = AltitudeFactor(altitude, path, ground, problem.start)
+            for _ in range(2):  # where the altimeter is, by the camera's pose, depends on the scale
+                problem.start = replace(problem.start, log_scale=factor.rough_log_scale)
+                factor = AltitudeFactor(altitude, path, ground, problem.start)
         problem.factors.append(factor)
 
 
