@@ -25,6 +25,9 @@ from aquaflow.geometry.similarity import Sim3, hat
 
 Array = npt.NDArray[np.float64]
 
+ZERO_DEPTH_SIGMA_M = 0.1
+"""m, 1 sigma of a pressure sensor's zero, which nothing in the dive shows: 10 hPa of weather since it
+was set, or a zero that was set with the vehicle's top at the surface."""
 WORTH_NAMING = 5.0
 """A source whose own scale is less sure than the result's by more than this is not named."""
 
@@ -32,6 +35,8 @@ WORTH_NAMING = 5.0
 def frame_of(problem: Problem, solution: Solution, path: CameraPath) -> MetricFrame:
     """The frame, in metres and level only as far as its covariance allows."""
     state, covariance = solution.state, _left_tangent(solution)
+    if any(factor.kind == "depth" for factor in problem.factors):
+        covariance[2, 2] += ZERO_DEPTH_SIGMA_M**2
     scale_sigma = float(np.sqrt(covariance[6, 6]))
     tilt_sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[3:5, 3:5])[-1]))
     metric, level = scale_sigma <= LARGEST_SCALE_SIGMA, tilt_sigma <= LARGEST_TILT_SIGMA
