@@ -16,6 +16,10 @@ LONGEST_GAP_S = 1.5
 second, and an ROV changes its speed within a few seconds."""
 
 
+SAME_S = 1e-6
+"""A moment so near to a pose is the pose's; sums of seconds round by less."""
+
+
 @dataclass(frozen=True)
 class CameraPath:
     """Camera poses of one sub-map in its own world m, map units."""
@@ -39,15 +43,16 @@ class CameraPath:
             return np.zeros(len(t_s), dtype=bool)
         after = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self) - 1)
         short = (self.t_s[after] - self.t_s[after - 1]) <= LONGEST_GAP_S
-        posed = (self.t_s[after] == t_s) | (self.t_s[after - 1] == t_s)
+        apart = np.minimum(np.abs(self.t_s[after] - t_s), np.abs(self.t_s[after - 1] - t_s))
         inside = (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1])
-        return np.asarray((short | posed) & inside)
+        return np.asarray((short & inside) | (apart <= SAME_S))
 
     def at(
         self,
         t_s: Array,  # [M] s, covered
     ) -> tuple[Array, Array]:
         """Rotations [M, 3, 3] and camera centres [M, 3]; between poses at constant rates."""
+        t_s = np.clip(t_s, self.t_s[0], self.t_s[-1])
         rotations = Slerp(self.t_s, Rotation.from_matrix(self.R_mc))(t_s).as_matrix()
         centres = np.stack([np.interp(t_s, self.t_s, self.p_m[:, k]) for k in range(3)], axis=1)
         return np.asarray(rotations), centres

@@ -87,7 +87,7 @@ def map_from_depth(depth: Series, path: CameraPath) -> tuple[Array, float] | Non
 def map_from_fixes(
     fixes: Series, depth: Series | None, path: CameraPath
 ) -> tuple[Array, float] | None:
-    """R_nm [3, 3] and metres per unit from fixes on the earth; without ``depth`` all lie in a plane.
+    """R_nm [3, 3] and metres per unit from fixes on the earth, without ``depth`` in a plane.
 
     None if all fixes are in one place.
     """

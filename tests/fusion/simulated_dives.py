@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,9 +15,12 @@ from aquaflow.fusion.camera_path import CameraPath
 from aquaflow.fusion.estimator import Estimate, estimate
 from aquaflow.fusion.start import AXES
 from aquaflow.fusion.telemetry import Telemetry
+from aquaflow.geometry.alignment import align
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.recording.telemetry_json import KIND_OF
 from aquaflow.synthetic import SimulatedDive, SyntheticConfig, simulate
+from aquaflow.synthetic.simulation import CELL_M
+from aquaflow.synthetic.site import site_of
 
 Array = npt.NDArray[np.float64]
 
@@ -26,6 +29,8 @@ JITTER_M = 0.001
 """White noise of a position, of a map whose ground is some metres away."""
 SCALE_WANDER, WANDER_S = 0.003, 20.0
 """Relative size and correlation time of what the local scale does along a path."""
+GROUND_EVERY, GROUND_SIGMA_M = 2, 0.005
+"""Share and noise of the relief's cells that become points of the map."""
 TURN_RAD = np.radians(0.02)
 """Random walk of the orientation, in each root of a second."""
 
@@ -61,14 +66,31 @@ def swum(config: SyntheticConfig, *kinds: str) -> Swum:
     R_bent = turns.as_matrix() @ R
     scale = float(rng.uniform(0.3, 3.0))
     path = CameraPath(dive.times_s, R_bent[0].T @ R_bent, (bent - bent[0]) @ R_bent[0] / scale)
+    T_nm = align(path.p_m, p, with_scale=True).T_target_source
+    return Swum(dive, path, T_nm, telemetry_of(dive, *kinds))
+
+
+def telemetry_of(dive: SimulatedDive, *kinds: str) -> Telemetry:
+    """What the instruments of the given kinds measured."""
     telemetry = Telemetry()
     for sample in dive.samples:
         if KIND_OF[type(sample)] in kinds:
             telemetry.add(sample)
-    from aquaflow.geometry.alignment import align
+    return telemetry
 
-    T_nm = align(path.p_m, p, with_scale=True).T_target_source
-    return Swum(dive, path, T_nm, telemetry)
+
+def ground_of(swum: Swum, seed: int = 0) -> Array:
+    """[K, 3] points of the map: the true relief under the path, as a map with that bend has it."""
+    dive = swum.dive
+    site, rng = site_of(dive.config, CELL_M), np.random.default_rng(seed)
+    area, heights = site.relief.area, site.crests
+    rows, columns = (grid.ravel()[::GROUND_EVERY] for grid in np.indices(heights.shape))
+    x = area.x0 + (columns + 0.5) * area.cell
+    y = area.y0 + (rows + 0.5) * area.cell
+    ground_s = np.column_stack([x, y, -heights[rows, columns].astype(np.float64)])
+    ground_n = ground_s @ site.path.R_ws.T + site.path.t_ws
+    ground_n += GROUND_SIGMA_M * rng.standard_normal(ground_n.shape)
+    return swum.T_nm.inverse().apply(ground_n)
 
 
 def stated_mounting(dive: SimulatedDive) -> MountingConfig:
@@ -83,3 +105,15 @@ def estimated(swum: Swum, points: Array = NOTHING, **settings: Any) -> Estimate:
     """What the estimator makes of it."""
     config = FusionConfig(**settings)
     return estimate(swum.telemetry, swum.path, config, stated_mounting(swum.dive), lambda: points)
+
+
+def part_of(swum: Swum, *kinds: str) -> Swum:
+    """The same dive with the instruments of the given kinds only."""
+    return replace(swum, telemetry=telemetry_of(swum.dive, *kinds))
+
+
+def between(path: CameraPath, first_s: float, last_s: float, scale: float) -> CameraPath:
+    """A sub-map of that time: from its first camera's axes, ``scale`` units a unit."""
+    kept = (path.t_s >= first_s) & (path.t_s <= last_s)
+    R, p = path.R_mc[kept], path.p_m[kept]
+    return CameraPath(path.t_s[kept], R[0].T @ R, scale * (p - p[0]) @ R[0])

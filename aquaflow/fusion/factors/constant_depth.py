@@ -1,4 +1,4 @@
-"""No source at all: the vehicle is taken to keep its depth, where nothing else says what is down."""
+"""No source: the vehicle is taken to keep its depth, where nothing else says what is down."""
 
 from __future__ import annotations
 
