@@ -26,8 +26,8 @@ from aquaflow.geometry.similarity import Sim3, hat
 Array = npt.NDArray[np.float64]
 
 ZERO_DEPTH_SIGMA_M = 0.1
-"""m, 1 sigma of a pressure sensor's zero, which nothing in the dive shows: 10 hPa of weather since it
-was set, or a zero that was set with the vehicle's top at the surface."""
+"""m, 1 sigma of a pressure sensor's zero, which nothing in the dive shows: 10 hPa of weather since
+it was set, or the vehicle's top at the surface when it was."""
 WORTH_NAMING = 5.0
 """A source whose own scale is less sure than the result's by more than this is not named."""
 

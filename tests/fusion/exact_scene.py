@@ -96,7 +96,8 @@ class ExactScene:
         sigma = np.full(len(fixes), 0.1)
         force = ForceFactor.of_force(Series("imu", t, -GRAVITY * down_b), path)
         assert force is not None
-        lengths = np.array([0.2, 0.35])
+        length_m = 0.2
+        seen = np.full(2, length_m / s.scale)
         found: list[Factor] = [
             DepthFactor(Series("pressure", t, p_nb[:, 2:]), path),
             TiltFactor.of_attitude(attitude, path),
@@ -105,7 +106,7 @@ class ExactScene:
             VelocityFactor(Series("dvl", t, np.column_stack([v_d, 0.01 + 0.0 * t])), path),
             PositionFactor("usbl", t[::50], fixes, sigma, path),
             PlaceFactor("dead reckoning", t[:1], p_nb[:1, :2], sigma[:1], path),
-            LengthFactor("bar", lengths / s.scale, 0.0 * lengths, lengths, 0.001 + 0.0 * lengths),
+            LengthFactor("bar", seen, 0.001 * seen, length_m, 0.001),
         ]
         if self.flat:
             found.append(ConstantDepthFactor(path, 0.1))

@@ -141,7 +141,7 @@ def test_a_dvl_without_attitude_gives_metres_but_no_gravity(dive: Swum) -> None:
 
 def test_an_altimeter_gives_metres_where_its_beam_meets_the_map(dive: Swum) -> None:
     part = part_of(dive, "attitude", "altitude")
-    found = estimated(part, ground_of(part)[::3])
+    found = estimated(part, ground_of(part))
     assert found.frame.metric
     assert abs(scale_error(found, dive)) < 4.0 * found.frame.scale_sigma < 0.03
     nothing = estimated(part)

@@ -110,7 +110,7 @@ def test_what_nothing_measures_keeps_its_prior() -> None:
     assert solution.state.scale == START.scale
     assert not solution.state.t_n.any()
     np.testing.assert_allclose(np.sqrt(np.diag(solution.covariance)), prior)
-    length = LengthFactor("bar", *(np.array([value]) for value in (2.0, 1e-6, 1.0, 0.001)))
+    length = LengthFactor("bar", np.array([2.0]), np.array([1e-6]), 1.0, 0.001)
     prior[SCALE] = 3.0
     solution = solve([length], START, prior)
     assert solution.state.scale == pytest.approx(0.5, rel=1e-3)

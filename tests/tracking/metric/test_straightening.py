@@ -1,0 +1,157 @@
+"""The keyframe graph with a world: scale drift is pulled straight, loops are judged as before."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.tracking.graph.equations import poses_of
+from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph
+from aquaflow.tracking.graph.table import GraphResult
+from aquaflow.tracking.metric.straightening import solve_with_worlds
+from aquaflow.tracking.metric.world_edges import Measured, World, WorldEdge, world_edge
+from tests.tracking.graph.graph_scenes import LOOP_SIGMA, Dive
+
+Array = npt.NDArray[np.float64]
+
+COUNT = 60
+DRIFT = 0.05
+"""Relative, from the first keyframe to the last."""
+LINK = np.diag(np.array([0.01, 0.01, 0.01, 0.002, 0.002, 0.002, 0.003]) ** -2.0)
+
+
+def way() -> Sim3Batch:
+    """Keyframes on a way that rises and sinks, 0.5 m apart; the map is n, turned by nothing."""
+    k = np.arange(COUNT)
+    t = np.column_stack([0.5 * k, 0.3 * np.sin(0.2 * k), 1.5 * np.sin(0.3 * k)])
+    return Sim3Batch(np.tile(np.eye(3), (COUNT, 1, 1)), t, np.ones(COUNT))
+
+
+def drifted(truth: Sim3Batch) -> PoseGraph:
+    """Links of which each is a little too large: scale and all that follows grow by DRIFT."""
+    graph = PoseGraph()
+    grown = Sim3.exp(np.array([0, 0, 0, 0, 0, 0, np.log1p(DRIFT) / (COUNT - 1)]))
+    T = truth.element(0)
+    graph.add_keyframe(0, T)
+    for k in range(1, COUNT):
+        link = truth.element(k - 1).inverse() @ truth.element(k) @ grown
+        T = T @ link
+        graph.add_keyframe(k, T)
+        assert graph.add_edge(Edge(k - 1, k, link, LINK))
+    return graph
+
+
+def world(graph: PoseGraph, truth: Sim3Batch, kind: str) -> World:
+    """What exact instruments say of every keyframe."""
+    edges: list[WorldEdge] = []
+    for k in range(COUNT):
+        T, true = graph.pose(k), truth.element(k)
+        measured = {
+            "depth": Measured(depth_m=(float(true.t[2]), 0.01), turn=np.zeros(3),
+                              turn_sigma=(0.002, 0.01),
+                              place_m=(true.t[:2], 1e-3) if k == 0 else None),
+            "scale": Measured(scale=(true.scale, 0.005),
+                              turn=np.zeros(3), turn_sigma=(0.002, 0.01),
+                              place_m=(true.t[:2], 1e-3) if k == 0 else None,
+                              depth_m=(float(true.t[2]), 1e-3) if k == 0 else None),
+        }[kind]  # fmt: skip
+        edge = world_edge(k, T, measured)
+        assert edge is not None
+        edges.append(edge)
+    return World(0, Sim3.identity(), edges)
+
+
+def local_scales(t: Array, truth: Array) -> Array:
+    """Length of each step over the true one."""
+    return np.asarray(
+        np.linalg.norm(np.diff(t, axis=0), axis=1) / np.linalg.norm(np.diff(truth, axis=0), axis=1)
+    )
+
+
+def solved(graph: PoseGraph, worlds: list[World]) -> tuple[GraphResult, Sim3Batch]:
+    result, _ = solve_with_worlds(graph.snapshot(), worlds)
+    graph.apply(result)
+    return result, poses_of(graph.snapshot().nodes)
+
+
+@pytest.mark.parametrize(("kind", "left"), [("depth", 0.5), ("scale", 0.2)])
+def test_scale_drift_of_five_percent_is_pulled_straight(kind: str, left: float) -> None:
+    truth = way()
+    graph = drifted(truth)
+    before = local_scales(poses_of(graph.snapshot().nodes).t, truth.t)
+    assert before[-1] == pytest.approx(1.0 + DRIFT, rel=0.01)
+    _, poses = solved(graph, [world(graph, truth, kind)])
+    after = local_scales(poses.t, truth.t)
+    # What counts is drift: the unit of the whole is the world's to say.
+    assert np.ptp(after) < left * DRIFT
+    np.testing.assert_allclose(poses.scale / poses.scale[0], 1.0, atol=left * DRIFT)
+
+
+def test_without_a_world_nothing_of_the_graph_changes() -> None:
+    graph = drifted(way())
+    before = poses_of(graph.snapshot().nodes)
+    result, T_mn = solve_with_worlds(graph.snapshot(), [])
+    assert not result.poses
+    assert not T_mn
+    graph.apply(result)
+    np.testing.assert_array_equal(poses_of(graph.snapshot().nodes).t, before.t)
+
+
+def test_the_result_holds_keyframes_only_and_the_world_by_its_component() -> None:
+    truth = way()
+    graph = drifted(truth)
+    snapshot = graph.snapshot()
+    result, T_mn = solve_with_worlds(snapshot, [world(graph, truth, "depth")])
+    assert set(result.poses) <= set(range(COUNT))
+    assert set(T_mn) == {0}
+    assert len(result.edge_trust) == len(snapshot.edges)
+    assert (result.rows < len(snapshot.nodes)).all()
+    assert result.snapshot is snapshot
+    # In the world, keyframes are where instruments have them.
+    at = T_mn[0].inverse() @ result.poses.get(COUNT - 1, graph.pose(COUNT - 1))
+    assert at.t[2] == pytest.approx(truth.t[-1, 2], abs=0.05)
+
+
+def looped(false: bool) -> tuple[Dive, list[World]]:
+    """A circle of which telemetry says exactly where every keyframe is; and a loop."""
+    dive = Dive(count=40, seed=2)
+    (dive.plant if false else dive.close)((3, 30) if false else (0, 39))
+    edges = []
+    for k in range(dive.count):
+        true = dive.truth.element(k)
+        measured = Measured(
+            depth_m=(float(true.t[2]), 0.01), place_m=(true.t[:2], 0.01), turn=np.zeros(3),
+            turn_sigma=(0.1, 0.1),
+        )  # fmt: skip
+        edge = world_edge(k, dive.graph.pose(k), measured)
+        assert edge is not None
+        edges.append(edge)
+    return dive, [World(0, Sim3.identity(), edges)]
+
+
+@pytest.mark.parametrize("false", [True, False])
+def test_loops_are_judged_by_the_links_and_not_through_the_world(false: bool) -> None:
+    dive, worlds = looped(false)
+    loop = int(np.flatnonzero(dive.graph.snapshot().edges["loop"])[0])
+    for chosen in ([], worlds):
+        result, _ = solve_with_worlds(dive.graph.snapshot(), chosen)
+        assert (result.trust[loop] == 0.0) == false
+
+
+def test_a_chain_through_the_world_admits_no_loop_that_the_links_contradict() -> None:
+    """Two keyframes far apart by links, whom a wrong world puts in one place."""
+    dive = Dive(count=40, seed=2)
+    near = dive.graph.pose(3)
+    dive.graph.add_edge(Edge(3, 30, Sim3.identity(), np.diag(LOOP_SIGMA**-2), loop=True))
+    edges = []
+    for k in (3, 30):
+        measured = Measured(depth_m=(float(near.t[2]), 1e-3), place_m=(near.t[:2], 1e-3))
+        edge = world_edge(k, dive.graph.pose(k), measured)
+        assert edge is not None
+        edges.append(edge)
+    result, _ = solve_with_worlds(dive.graph.snapshot(), [World(0, Sim3.identity(), edges)])
+    loop = int(np.flatnonzero(dive.graph.snapshot().edges["loop"])[0])
+    assert result.trust[loop] == 0.0
