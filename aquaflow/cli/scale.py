@@ -57,8 +57,8 @@ def scale(
     write_known_lengths(dive, lengths)
     together = scale_of([each for each in lengths if each.sub_map == known.sub_map])
     assert together is not None
-    frame = read_metric_file(dive).get(known.sub_map)
-    unchanged = why_not(frame, together)
+    of_map = read_metric_file(dive).get(known.sub_map)
+    unchanged = why_not(of_map, together)
     if unchanged is None:
         members = [each for each in lengths if each.sub_map == known.sub_map]
         rescale(dive, known.sub_map, members, together)
