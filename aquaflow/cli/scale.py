@@ -14,6 +14,11 @@ from aquaflow.cli.console import Json
 if TYPE_CHECKING:
     from aquaflow.fusion.known_lengths.known_length import KnownLength
 
+RESCALED = (
+    "The dive is in metres now: trajectory.tum, trajectory.csv, map.ply, map_clear.ply, "
+    "medium.json, metrics.json, metric.json and the ranges of heldout/. report.html still shows "
+    "map units."
+)
 RULER_SIGMA_M = 0.001
 """1 sigma of a length measured with a ruler."""
 
@@ -36,6 +41,7 @@ def scale(
     for name, value in (("length", length), ("sigma", sigma)):
         if not (math.isfinite(value) and value > 0.0):
             raise typer.BadParameter(f"--{name} must be a positive number of metres")
+    from aquaflow.dive.rescaling import rescale, why_not
     from aquaflow.fusion.known_lengths.known_length import scale_of
     from aquaflow.fusion.known_lengths.known_lengths_file import (
         FILE,
@@ -43,6 +49,7 @@ def scale(
         with_length,
         write_known_lengths,
     )
+    from aquaflow.fusion.metric_file import read_metric_file
 
     earlier = read_known_lengths(dive)
     known = _measured(dive, frame, _numbers("--from", start), _numbers("--to", end), length, sigma)
@@ -50,12 +57,18 @@ def scale(
     write_known_lengths(dive, lengths)
     together = scale_of([each for each in lengths if each.sub_map == known.sub_map])
     assert together is not None
+    of_map = read_metric_file(dive).get(known.sub_map)
+    unchanged = why_not(of_map, together)
+    if unchanged is None:
+        members = [each for each in lengths if each.sub_map == known.sub_map]
+        rescale(dive, known.sub_map, members, together)
     if as_json:
         said = {
             "metres_per_unit": known.metres_per_unit, "relative_sigma": known.relative_sigma,
             "all_metres_per_unit": together.metres_per_unit,
             "all_relative_sigma": together.relative_sigma,
             "lengths": together.used, "rejected": len(together.rejected), "sub_map": known.sub_map,
+            "rescaled": unchanged is None, "why_not": unchanged,
         }  # fmt: skip
         typer.echo(json.dumps(said))
         return
@@ -67,6 +80,7 @@ def scale(
             f"{_plus_minus(together.metres_per_unit, together.relative_sigma)}."
         )
     typer.echo(f"Written to {dive / FILE}.")
+    typer.echo(unchanged or RESCALED)
 
 
 def _measured(

@@ -49,7 +49,7 @@ def _rows(
     frame, navigation = outputs.frame(sub_map), outputs.navigation
     positions = np.array([T.t for T in poses])
     t_s = np.array([tracked.frame.t_ns * 1e-9 for tracked in members])
-    speeds = _speeds(t_s, positions) if frame.metric else [None] * len(poses)
+    speeds = speeds_of(t_s, positions) if frame.metric else [None] * len(poses)
     places = _places(frame, positions)
     rows = []
     for tracked, T_nc, speed, (latitude, longitude) in zip(
@@ -64,7 +64,7 @@ def _rows(
                 x, y, z, frame.unit, latitude, longitude,
                 navigation.depth_m_at(t_ns), navigation.altitude_m_at(t_ns),
                 heading, roll, pitch, speed,
-                _position_sigma(frame, T_nc.t), _heading_sigma_deg(frame),
+                position_sigma(frame, T_nc.t), _heading_sigma_deg(frame),
             )
         )  # fmt: skip
     return rows
@@ -95,7 +95,7 @@ def _attitude(
     return float(heading), float(roll), float(pitch)
 
 
-def _speeds(
+def speeds_of(
     t_s: Array,  # [N] increasing
     positions: Array,  # [N, 3] m
 ) -> list[float | None]:
@@ -114,10 +114,11 @@ def _speeds(
     ]
 
 
-def _position_sigma(
+def position_sigma(
     frame: MetricFrame,
     p_n: Array,  # [3]
 ) -> float | None:
+    """m, 1 sigma of a place in the direction that is known least; None where it is not known."""
     if not (frame.metric and frame.level):
         return None  # of a frame that is not level, no turn is known
     return float(np.sqrt(np.linalg.eigvalsh(frame.position_covariance(p_n))[-1]))

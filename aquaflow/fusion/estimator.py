@@ -35,6 +35,10 @@ class Estimate:
     solution: Solution | None = None
     """None where no telemetry could be used."""
 
+    def reporting(self, sources: Sequence[SourceReport]) -> Estimate:
+        """The same with reports of further sources, which could not be used."""
+        return replace(self, frame=replace(self.frame, sources=(*self.frame.sources, *sources)))
+
 
 def estimate(
     telemetry: Telemetry,

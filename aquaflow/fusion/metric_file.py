@@ -49,6 +49,15 @@ def read_metric_file(folder: Path) -> dict[int, MetricFrame]:
     return {number: frame for number, (_, frame) in _read(folder).items()}
 
 
+def read_main(folder: Path) -> int:
+    """The sub-map of ``map.aqf``; 0 for a dive without the file.
+
+    Raises:
+        InputError: the file is damaged, or of a newer AquaFlow.
+    """
+    return next((number for number, (name, _) in _read(folder).items() if name == "map.aqf"), 0)
+
+
 def read_frame_of_map(map_file: Path) -> MetricFrame:
     """The frame of the sub-map in ``map_file``, ``map.aqf`` or ``map_N.aqf`` of a dive folder.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from copy import copy
 
@@ -13,7 +14,7 @@ from aquaflow.fusion.known_lengths.board_size import PosedView, board_lengths
 from aquaflow.fusion.known_lengths.boards import BoardDetector, BoardSighting
 from aquaflow.fusion.known_lengths.known_length import KnownLength
 from aquaflow.fusion.known_lengths.laser_dots import DotCandidates, find_dots
-from aquaflow.fusion.known_lengths.laser_spacing import laser_lengths
+from aquaflow.fusion.known_lengths.laser_spacing import DOTS, laser_lengths
 
 Array = npt.NDArray[np.float64]
 
@@ -65,3 +66,13 @@ class KnownLengthFinder:
         if self._lasers is not None:
             lengths += laser_lengths(self._dots, view_of, self._lasers)
         return lengths
+
+    def seen(self, view_of: Callable[[int], PosedView | None]) -> Counter[tuple[int, str]]:
+        """Pictures with a pose that show each object, by sub-map and name."""
+        found: Counter[tuple[int, str]] = Counter()
+        names = [(each.frame_index, each.name) for each in self._boards]
+        for frame_index, name in [*names, *((dots.frame_index, DOTS) for dots in self._dots)]:
+            view = view_of(frame_index)
+            if view is not None:
+                found[view.sub_map, name] += 1
+        return found

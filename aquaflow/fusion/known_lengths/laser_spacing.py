@@ -22,6 +22,8 @@ from aquaflow.fusion.known_lengths.laser_dots import DotCandidates
 
 Array = npt.NDArray[np.float64]
 
+DOTS = "laser dots"
+"""Their name in the report."""
 LEAST_PICTURES = 5
 """In which both dots lie where the beams go; fewer do not show where that is."""
 LINE_PX = 3.0
@@ -174,6 +176,4 @@ def _length(
     metres = lasers.spacing_m / length
     lean = np.radians(lasers.parallel_sigma_deg) * metres * float(np.hypot(a.z, b.z))
     sigma_m = float(np.hypot(lasers.sigma_m, lean))
-    return KnownLength(
-        frame_index, "laser dots", length, map_sigma, lasers.spacing_m, sigma_m, a.sub_map
-    )
+    return KnownLength(frame_index, DOTS, length, map_sigma, lasers.spacing_m, sigma_m, a.sub_map)

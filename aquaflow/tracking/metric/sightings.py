@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +13,7 @@ from aquaflow.config import FusionConfig
 from aquaflow.fusion.known_lengths.board_size import PixelDepths, PosedView
 from aquaflow.fusion.known_lengths.finder import KnownLengthFinder
 from aquaflow.fusion.known_lengths.known_length import KnownLength
+from aquaflow.fusion.metric_frame import SourceReport
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
@@ -19,6 +21,15 @@ from aquaflow.keyframes import Pointmap
 Array = npt.NDArray[np.float64]
 PlaceOf = Callable[[int], tuple[Sim3, int] | None]
 """T_wc and the component of a frame by its index; None for a frame without a pose."""
+
+
+@dataclass(frozen=True)
+class SeenLengths:
+    """Objects of known size in one sub-map."""
+
+    lengths: list[KnownLength]
+    unknown: list[SourceReport]
+    """Of objects that were seen, but could not be measured."""
 
 
 class Sightings:
@@ -61,8 +72,8 @@ class Sightings:
         other._cameras, other._depths = dict(self._cameras), dict(self._depths)
         return other
 
-    def lengths(self, place_of: PlaceOf) -> list[KnownLength]:
-        """What was seen, measured with the poses of now; ``sub_map`` of each is its component."""
+    def measured(self, place_of: PlaceOf) -> dict[int, SeenLengths]:
+        """What was seen, by component, measured with the poses of now."""
 
         def view_of(frame_index: int) -> PosedView | None:
             place, camera = place_of(frame_index), self._cameras.get(frame_index)
@@ -70,4 +81,14 @@ class Sightings:
                 return None
             return PosedView(camera, *place, depths=self._depths.get(frame_index))
 
-        return self._finder.lengths(view_of)
+        lengths = self._finder.lengths(view_of)
+        known = {(length.sub_map, length.source) for length in lengths}
+        seen = self._finder.seen(view_of)
+        found = {component: SeenLengths([], []) for component, _ in seen}
+        for length in lengths:
+            found[length.sub_map].lengths.append(length)
+        for (component, name), pictures in seen.items():
+            if (component, name) not in known:
+                reason = f"its size does not follow from the pictures that show it ({pictures})"
+                found[component].unknown.append(SourceReport(name, "length", reason=reason))
+        return found

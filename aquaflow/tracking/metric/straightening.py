@@ -18,6 +18,7 @@ from aquaflow.tracking.graph.equations import Rows, poses_of
 from aquaflow.tracking.graph.optimisation import Optimisation
 from aquaflow.tracking.graph.table import EDGE, NODE, TRUST, GraphResult, Snapshot
 from aquaflow.tracking.metric.measured import world_edges
+from aquaflow.tracking.metric.sightings import SeenLengths
 from aquaflow.tracking.metric.survey import Survey
 from aquaflow.tracking.metric.world_edges import World
 
@@ -26,16 +27,17 @@ def estimates_of(survey: Survey) -> dict[int, Estimate]:
     """The metric frame of every component of the graph, by its first keyframe."""
     found: dict[int, Estimate] = {}
     before: tuple[Estimate, CameraPath] | None = None
-    lengths = survey.known_lengths()
+    measured = survey.known_lengths()
     for component in survey.components():
         path = survey.path(component)
         carried = None
         if before is not None:
             carried = carried_from(*before, survey.telemetry, path)
+        known = measured.get(component, SeenLengths([], []))
         found[component] = estimate(
             survey.telemetry, path, survey.config, survey.mounting,
-            partial(survey.ground, component), length_factors(lengths.get(component, ())), carried,
-        )  # fmt: skip
+            partial(survey.ground, component), length_factors(known.lengths), carried,
+        ).reporting(known.unknown)  # fmt: skip
         if found[component].frame.metric:
             before = found[component], path
     return found

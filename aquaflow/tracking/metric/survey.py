@@ -11,14 +11,13 @@ import numpy.typing as npt
 from aquaflow.config import FusionConfig
 from aquaflow.config.telemetry import MountingConfig
 from aquaflow.fusion.camera_path import CameraPath
-from aquaflow.fusion.known_lengths.known_length import KnownLength
 from aquaflow.fusion.telemetry import Telemetry
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.keyframes import Pointmap
 from aquaflow.storage.arrays import to_sim3
 from aquaflow.tracking.graph.equations import Rows, poses_of
-from aquaflow.tracking.metric.sightings import Sightings
+from aquaflow.tracking.metric.sightings import SeenLengths, Sightings
 
 Array = npt.NDArray[np.float64]
 
@@ -66,7 +65,7 @@ class Survey:
         t_s, first = np.unique(posed["t_ns"] * 1e-9, return_index=True)
         return CameraPath(t_s, T_mc.R[first], T_mc.t[first])
 
-    def known_lengths(self) -> dict[int, list[KnownLength]]:
+    def known_lengths(self) -> dict[int, SeenLengths]:
         """What was seen of known size, by component, measured with the poses of now."""
         if not self.sightings:
             return {}
@@ -81,10 +80,7 @@ class Survey:
             T_mk, T_kf = poses_of(self.nodes[at : at + 1]), to_sim3(row["T_kf"])
             return T_mk.element(0) @ T_kf, int(self.nodes["component"][at])
 
-        found: dict[int, list[KnownLength]] = {}
-        for length in self.sightings.lengths(place_of):
-            found.setdefault(length.sub_map, []).append(length)
-        return found
+        return self.sightings.measured(place_of)
 
     def ground(self, component: int) -> Array:
         """[K, 3] points of a sub-map, in its world."""
