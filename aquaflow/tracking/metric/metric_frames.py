@@ -103,9 +103,9 @@ class MetricFrames:
 
     def survey(self, snapshot: Snapshot) -> Survey:
         """All that is known now, for any thread."""
-        rows, telemetry = self._frames().rows(), self.telemetry.copy()
+        parts, telemetry = self._frames().parts(), self.telemetry.copy()
         return Survey(
-            snapshot.nodes, rows, telemetry, tuple(self._points), self.mounting, self._config,
+            snapshot.nodes, parts, telemetry, tuple(self._points), self.mounting, self._config,
             self.sightings.copy(),
         )  # fmt: skip
 
