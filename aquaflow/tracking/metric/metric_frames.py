@@ -134,6 +134,13 @@ class MetricFrames:
                 self._take({component: each.frame for component, each in found.items()})
         return self.frames
 
+    def resume(self, snapshot: Snapshot) -> None:
+        """Take up a restored dive, whose telemetry is there again."""
+        for keyframe in self._keyframes.keyframes:
+            if keyframe.number not in self._keyframes.lost:
+                self._keep_points(keyframe.number)
+        self.update(snapshot)
+
     def _take(self, frames: Mapping[int, MetricFrame]) -> None:
         self.frames = {
             self._keyframes[component].sub_map: frame for component, frame in frames.items()
