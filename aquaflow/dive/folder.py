@@ -34,6 +34,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.gaussians.gaussians import radiance
 from aquaflow.mapping.mapper import Mapper
+from aquaflow.recording.telemetry_lines import NAME as TELEMETRY
 from aquaflow.storage.atomic import atomic_write, write_json, write_yaml
 from aquaflow.storage.camera_file import save_camera
 
@@ -49,9 +50,11 @@ RESULTS = (
     *("trajectory.tum", "camera.yaml", "calibration.yaml", "map*.ply", "map*.aqf", "medium.json"),
     *("metrics.json", "report.html", "heldout/*.png", "heldout/*.npz", TRACE),
     KNOWN_LENGTHS,
+    TELEMETRY,
     *("metric.json", "trajectory.csv", "georeference.json", "restored/*.png"),
 )
-"""What a run writes at its end; of an earlier run in the same folder nothing must remain."""
+"""What a run writes, mostly at its end; of an earlier run in the same folder nothing must
+remain."""
 
 CHECKPOINT = "checkpoint"
 """Folder of the checkpoints of a live run."""

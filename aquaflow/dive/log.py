@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import os
 from pathlib import Path
+
+from aquaflow.storage.lines import is_cut_short
 
 LOGGERS = ("aquaflow", "py.warnings")
 """Loggers whose records go to log.jsonl."""
@@ -21,7 +22,7 @@ class JsonLog(logging.Handler):
 
     def __init__(self, path: Path, append: bool = False) -> None:
         super().__init__(logging.INFO)
-        cut_short = append and _is_cut_short(path)
+        cut_short = append and is_cut_short(path)
         self._stream = path.open("a" if append else "w", encoding="utf-8")
         if cut_short:  # what follows begins a line of its own
             self._stream.write("\n")
@@ -57,13 +58,3 @@ class JsonLog(logging.Handler):
         with contextlib.suppress(OSError):
             self._stream.close()
         super().close()
-
-
-def _is_cut_short(path: Path) -> bool:
-    """True if the file's last line has no end."""
-    try:
-        with path.open("rb") as stream:
-            stream.seek(-1, os.SEEK_END)
-            return stream.read() != b"\n"
-    except OSError:  # there is none, or it is empty
-        return False

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,6 +29,8 @@ from aquaflow.errors import InputError, NotMappedError
 from aquaflow.mapping.maps import MIN_VIEWS, Progress
 from aquaflow.messages import CameraModel, Dropped, Frame, TelemetrySample
 from aquaflow.profiler import pace
+from aquaflow.recording.telemetry_lines import NAME as TELEMETRY
+from aquaflow.recording.telemetry_lines import TelemetryLog
 from aquaflow.slam import Slam
 from aquaflow.sources.preprocessing import Preparation
 from aquaflow.tracking.calibration_check import LensError, lens_error
@@ -74,6 +76,8 @@ class DiveRun:
         """Result of the calibration check, if a calibration was given; known at the end."""
         self.live: dict[str, Any] | None = None
         """Counters of a live run for metrics.json."""
+        self.telemetry_log: TelemetryLog | None = None
+        """Of a live run: a replay's telemetry is in files already."""
         self.started = time.monotonic()
         self.frame_ms = array("d")
         """Of every frame that was read: preparing, tracking and mapping it."""
@@ -105,6 +109,15 @@ class DiveRun:
         """A sample of telemetry; it never costs a frame."""
         with self.slam.failures.contain("telemetry"):
             self.slam.metric.add(sample)
+
+    def samples(self, samples: Sequence[TelemetrySample]) -> None:
+        """Samples in the order of arrival; a live dive keeps them in its folder."""
+        with self.profiler.stage("telemetry"):
+            for sample in samples:
+                self.sample(sample)
+            if self.telemetry_log is not None and samples:
+                with self.slam.failures.contain("keeping of telemetry"):
+                    self.telemetry_log.add(samples)
 
     def _prepared(self, frame: Frame) -> Frame | None:
         """None for a picture that cannot be prepared, which is dropped."""
@@ -161,6 +174,11 @@ class DiveRun:
             tracked.reason,
         )
 
+    def close(self) -> None:
+        """Close what the run itself has open; may be called again."""
+        if self.telemetry_log is not None:
+            self.telemetry_log.close()
+
     # --- the end ------------------------------------------------------------------------------
 
     def finish(self, notes: list[str], progress: Progress | None = None) -> Finished:
@@ -207,6 +225,11 @@ class DiveRun:
             self.notes.append(
                 "no calibration was given: the focal length was guessed and refined to "
                 f"{focal:.0f} px ({100.0 * sigma:.0f} % formal uncertainty), distortion ignored"
+            )
+        if self.telemetry_log is not None and self.telemetry_log.lost:
+            self.notes.append(
+                f"{self.telemetry_log.lost} samples of telemetry are not in {TELEMETRY}: the disk "
+                "was full"
             )
         for note in self.notes:
             log.info(note)

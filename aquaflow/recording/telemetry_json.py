@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -33,6 +34,9 @@ KINDS: dict[str, type[TelemetrySample]] = {
 """Telemetry samples by the name that they are recorded under."""
 KIND_OF: dict[type[TelemetrySample], str] = {sample: kind for kind, sample in KINDS.items()}
 """The same the other way round."""
+
+NAMES = {kind: tuple(field.name for field in fields(sample)) for kind, sample in KINDS.items()}
+"""Names of the fields of each kind."""
 
 LENGTHS = {"wxyz": 4, "rate_rad_s": 3, "acceleration_m_s2": 3, "velocity_m_s": 3}
 """Fields that are arrays."""
@@ -70,15 +74,23 @@ def sample_from_json(kind: str, data: bytes) -> TelemetrySample:
     Raises:
         ValueError: the data are not such a sample.
     """
-    sample_type = KINDS[kind]
+    return sample_from_values(kind, json.loads(data))
+
+
+def sample_from_values(kind: str, values: Mapping[str, Any]) -> TelemetrySample:
+    """The sample that a parsed JSON object holds.
+
+    Raises:
+        ValueError: it holds no such sample.
+    """
     try:
-        values = json.loads(data)
-        known = {field.name: values[field.name] for field in fields(sample_type)}
-    except (KeyError, TypeError, UnicodeDecodeError) as error:
+        sample_type = KINDS[kind]
+        known = {name: values[name] for name in NAMES[kind]}
+        for name, length in LENGTHS.items():
+            if name in known:
+                known[name] = tuple(float(value) for value in known[name])
+                if len(known[name]) != length:
+                    raise ValueError(f"{name} holds {len(known[name])} values, not {length}")
+    except (KeyError, TypeError) as error:
         raise ValueError(f"not a sample of kind {kind}") from error
-    for name, length in LENGTHS.items():
-        if name in known:
-            known[name] = tuple(float(value) for value in known[name])
-            if len(known[name]) != length:
-                raise ValueError(f"{name} holds {len(known[name])} values, not {length}")
     return sample_type(**known)

@@ -32,8 +32,9 @@ class Continued:
         """After the run that took a checkpoint at ``moment``, knew the devices' ``clocks`` then and
         left ``rows``. With another boot CLOCK_MONOTONIC is another one: clocks are learned anew."""
         first = 1 + max((row.index for row in rows), default=-1)
-        shift_ns = moment.shift_ns(now or Moment.now())
-        return Continued(first, shift_ns, clocks if shift_ns == 0 else {})
+        now = now or Moment.now()
+        known = clocks if moment.is_of_the_boot_of(now) else {}
+        return Continued(first, moment.shift_ns(now), known)
 
     def shifted(self, sample: TelemetrySample) -> TelemetrySample:
         """A sample on the dive's clock."""

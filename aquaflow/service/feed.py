@@ -51,24 +51,26 @@ JOIN_S = 3.0
 class LatestSamples:
     """The newest sample of every telemetry source; written by pumps, read by anyone."""
 
-    def __init__(self) -> None:
+    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
         self.samples = 0
-        self._latest: dict[tuple[str, str], TelemetrySample] = {}
+        self._now_s = now_s
+        self._latest: dict[tuple[str, str], tuple[TelemetrySample, float]] = {}
         self._new: deque[TelemetrySample] = deque(maxlen=MOST_SAMPLES)
 
     def take(self, sample: TelemetrySample) -> None:
         """Count the sample and keep it as the latest of its source and kind."""
         self.samples += 1
-        self._latest[sample.source, type(sample).__name__] = sample
+        self._latest[sample.source, type(sample).__name__] = sample, self._now_s()
         self._new.append(sample)
 
     def taken(self) -> list[TelemetrySample]:
         """Those that came since the last call, in the order of arrival."""
         return [self._new.popleft() for _ in range(len(self._new))]
 
-    def latest(self) -> list[TelemetrySample]:
-        """The newest of each source and kind."""
-        return list(self._latest.values())
+    def latest(self) -> list[tuple[TelemetrySample, float]]:
+        """The newest of each source and kind, and the seconds since it came."""
+        now = self._now_s()
+        return [(sample, now - came) for sample, came in list(self._latest.values())]
 
 
 @runtime_checkable

@@ -19,10 +19,13 @@ from aquaflow.errors import AquaFlowError, NotMappedError
 from aquaflow.mapping.maps import Maps, Progress
 from aquaflow.messages import Dropped
 from aquaflow.profiler import Profiler
+from aquaflow.recording.telemetry_lines import NAME as TELEMETRY
+from aquaflow.recording.telemetry_lines import TelemetryLog
 from aquaflow.render import select_renderer
 from aquaflow.service.checkpoint.checkpoint import Checkpointer, restore
 from aquaflow.service.checkpoint.resume import Choice
 from aquaflow.service.checkpoint.salvage import Salvaged, lost_with_their_files, salvaged
+from aquaflow.service.checkpoint.telemetry import hear_again
 from aquaflow.service.checkpoint.tracking import refuse_another_size
 from aquaflow.service.dive_clock import Continued
 from aquaflow.service.feed import Feed
@@ -118,17 +121,22 @@ class LiveDive:
                 for row in rows
                 if row.frame_class == "dropped"
             ]
+            hear_again(run)
             log.info("resumed %s with %d keyframes", self.folder.path, len(slam.keyframes))
         run.notes += [*choice.notes, *(self._salvaged.losses if self._salvaged else ())]
         for note in run.notes:
             log.warning("%s", note)
         feed.continue_from(continued)
+        telemetry_log = partial(TelemetryLog, self.folder.path / TELEMETRY)
+        run.telemetry_log = failures.attempt(f"opening {TELEMETRY}", telemetry_log)
         loop = LiveLoop(
             run, feed, thread, service, self._heartbeats, self._degradation,
             PressureReader(self.folder.path), self._notifier,
         )  # fmt: skip
-        every_s = service.checkpoint.every_s
-        checkpointer = Checkpointer(self.folder.path, run, slam, thread, every_s, feed.clocks)
+        checkpointer = Checkpointer(
+            self.folder.path, run, slam, thread, service.checkpoint.every_s, feed.clocks,
+            continued.shift_ns,
+        )  # fmt: skip
         loop.watchers.append(
             lambda live: checkpointer.take_if_due(live.pressure.disk_is_full(service.limits))
         )
@@ -172,6 +180,7 @@ class LiveDive:
             self.feed.close,
             partial(self.parts.slam.close, keep),
             self._remove_checkpoint,
+            self.parts.run.close,
             self._notifier.close,
             partial(self.folder.close, keep),  # last: until then failures go to its log
         ):

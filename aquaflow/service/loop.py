@@ -90,8 +90,7 @@ class LiveLoop:
 
     def take(self, frame: Frame | Dropped | None) -> None:
         """One turn: a frame, the note that one is missing, or an idle moment."""
-        for sample in self.feed.latest_samples.taken():
-            self.run_.sample(sample)
+        self.run_.samples(self.feed.latest_samples.taken())
         if frame is not None:
             self._frame_s, self._pictured = self._now_s(), True
         if isinstance(frame, Dropped):
@@ -103,7 +102,9 @@ class LiveLoop:
         self._tend()
 
     def stop(self, reason: str) -> None:
-        """Set the state to stopping and notify systemd."""
+        """Set the state to stopping and notify systemd; telemetry of after the last frame is
+        taken."""
+        self.run_.samples(self.feed.latest_samples.taken())
         self.health.set(State.STOPPING, reason)
         self.heartbeats.retire(STAGE)  # from here on systemd's timeout of stopping counts
         self.notifier.stopping()

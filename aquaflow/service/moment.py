@@ -20,6 +20,13 @@ class Moment:
     monotonic_ns: int
     wall_ns: int
     boot: str
+    dive_shift_ns: int = 0
+    """From the monotonic clock to the dive's; the dive may have begun before another boot."""
+
+    @property
+    def dive_ns(self) -> int:
+        """On the dive's clock."""
+        return self.monotonic_ns + self.dive_shift_ns
 
     @staticmethod
     def now(boot_id: Path = BOOT_ID) -> Moment:
@@ -30,16 +37,20 @@ class Moment:
             boot = ""
         return Moment(time.monotonic_ns(), time.time_ns(), boot)
 
+    def is_of_the_boot_of(self, now: Moment) -> bool:
+        """True if the monotonic clock has run on until ``now``."""
+        return self.boot == now.boot and now.monotonic_ns >= self.monotonic_ns
+
     def shift_ns(self, now: Moment) -> int:
         """What to add to ``now``'s monotonic clock so that the dive's clock continues from here.
 
-        Nothing after a restart of the process. After one of the machine, what the wall clock says
+        As before after a restart of the process. After one of the machine, what the wall clock says
         has passed; if that was set back meanwhile, a second.
         """
-        if self.boot == now.boot and now.monotonic_ns >= self.monotonic_ns:
-            return 0
+        if self.is_of_the_boot_of(now):
+            return self.dive_shift_ns
         passed = max(now.wall_ns - self.wall_ns, LEAST_GAP_NS)
-        return self.monotonic_ns + passed - now.monotonic_ns
+        return self.dive_ns + passed - now.monotonic_ns
 
     def age_h(self, now: Moment) -> float:
         """Hours until ``now``; 0 where the wall clock was set back."""

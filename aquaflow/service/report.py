@@ -9,6 +9,7 @@ from typing import Any
 
 from aquaflow import __version__
 from aquaflow.service.health.state import State
+from aquaflow.service.health.telemetry import metric_frame_numbers, newest_values
 from aquaflow.service.live_dive import Parts
 from aquaflow.service.vehicle.pose_output import PoseOutput
 
@@ -54,6 +55,8 @@ def report(
         "machine": asdict(loop.pressure) | {"peak_rss_mb": _peak_rss_mb()},
         "devices": loop.feed.describe(),
         "telemetry_samples": loop.feed.latest_samples.samples,
+        "telemetry": newest_values(loop.feed.latest_samples.latest()),
+        "metric_frame": metric_frame_numbers(parts.slam.metric_frame(parts.slam.tracker.sub_map)),
         "pose_output": None if poses is None else poses.to_json(),
     }
 

@@ -72,7 +72,13 @@ class FrameTable:
 
     def rows(self) -> Array:
         """[N] FRAME, a copy."""
-        return np.concatenate([np.zeros(0, FRAME), *self._chunks])[: self._count]
+        return np.concatenate(self.parts())
+
+    def parts(self) -> list[Array]:
+        """The same in pieces [n] that never change again; their cost hardly grows with the dive."""
+        whole, rest = divmod(self._count, CHUNK)
+        newest = self._chunks[whole][:rest].copy() if rest else np.zeros(0, FRAME)
+        return [*self._chunks[:whole], newest]
 
     def __len__(self) -> int:
         return self._count

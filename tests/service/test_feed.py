@@ -83,7 +83,7 @@ def test_the_computers_clock_is_heard_as_a_recording_holds_it(tmp_path: Path) ->
     feed.start()
     try:
         until(lambda: feed.latest_samples.samples > 0)
-        (utc,) = feed.latest_samples.latest()
+        ((utc, _),) = feed.latest_samples.latest()
         assert (type(utc), utc.source) == (UtcTime, "computer/clock")
     finally:
         feed.close()
@@ -193,7 +193,9 @@ def test_a_flood_of_garbage_costs_its_bytes_and_no_sample() -> None:
         assert described["state"] == "connected"
         assert int(str(described["garbage_bytes"])) > 100_000
         assert all(
-            abs(s.depth_m - 3.0) < 0.1 for s in feed.latest_samples.latest() if isinstance(s, Depth)
+            abs(s.depth_m - 3.0) < 0.1
+            for s, _ in feed.latest_samples.latest()
+            if isinstance(s, Depth)
         )
     finally:
         device.close()

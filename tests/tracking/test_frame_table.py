@@ -55,6 +55,16 @@ def test_a_table_goes_on_from_its_rows() -> None:
     assert np.array_equal(again.rows(), table_of(count + 1).rows())
 
 
+def test_the_parts_of_a_table_stay_as_they_were_when_it_grows() -> None:
+    for count in (0, 3, CHUNK, CHUNK + 7):
+        table = table_of(count)
+        before, parts = table.rows(), table.parts()
+        for index in range(count, count + 5):
+            table.add(*tracked(index))
+        assert np.array_equal(np.concatenate(parts), before)
+        assert len(before) == count
+
+
 def test_a_row_is_read_by_its_number() -> None:
     table = table_of(CHUNK + 7)
     for i in (0, 4, CHUNK, CHUNK + 6):

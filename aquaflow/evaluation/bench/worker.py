@@ -23,6 +23,9 @@ from aquaflow.sources import open_recording
 def perform(job: Job) -> dict[str, Any]:
     """Run the job and measure what it wrote.
 
+    No run hears telemetry, also where the recording has it: the table compares monocular methods,
+    and the peers have pictures alone. Trajectories are compared after a Sim(3) alignment.
+
     Raises:
         AquaFlowError: the run failed; the sentence says why.
     """

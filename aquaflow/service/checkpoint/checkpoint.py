@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from aquaflow.clocks.device import Learned
 from aquaflow.dive.run import DiveRun
 from aquaflow.errors import InputError
 from aquaflow.mapping.maps import Maps
+from aquaflow.recording.telemetry_lines import NAME as TELEMETRY
 from aquaflow.service.checkpoint import maps as map_state
 from aquaflow.service.checkpoint import tracking
 from aquaflow.service.checkpoint.generations import (
@@ -51,8 +53,10 @@ class Checkpointer:
         maps: MapThread,
         every_s: float,
         clocks: Callable[[], Mapping[str, Learned]],
+        shift_ns: int = 0,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
+        """``shift_ns``: from this boot's clock to the dive's."""
         self.taken = 0
         self.failures = 0
         self.size_bytes = 0
@@ -60,6 +64,7 @@ class Checkpointer:
         """Duration of the last write."""
         self._dive, self._run, self._slam, self._maps = dive, run, slam, maps
         self._every_s, self._clocks, self._now_s = every_s, clocks, now_s
+        self._shift_ns = shift_ns
         self._due_s = now_s() + every_s
         self._writing = False
 
@@ -83,7 +88,8 @@ class Checkpointer:
             except OSError as error:  # what it would name is not there
                 self._failed(error)
                 return
-        head = {"format": FORMAT, "version": __version__, "moment": Moment.now().to_json()}
+        moment = replace(Moment.now(), dive_shift_ns=self._shift_ns)
+        head = {"format": FORMAT, "version": __version__, "moment": moment.to_json()}
         head |= {"tracking": facts, "clocks": self._clocks()}
         arrays = prefixed("tracking", arrays)
 
@@ -107,7 +113,7 @@ class Checkpointer:
             facts, own = map_state.serialise(maps)
             facts["lacking"], more = map_state.serialise_corrections(lacking)
             own |= more
-            bring_to_disk([*files, *maps.views.save()])
+            bring_to_disk([*files, self._dive / TELEMETRY, *maps.views.save()])
             write_state(self._dive, head | {"mapping": facts}, arrays | prefixed("mapping", own))
             self.taken += 1
             self.size_bytes = state_file(self._dive).stat().st_size

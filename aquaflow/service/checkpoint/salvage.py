@@ -23,7 +23,9 @@ from aquaflow.service.checkpoint.generations import (
 )
 from aquaflow.service.checkpoint.salvage_rows import SalvagedRows, salvaged_rows
 from aquaflow.service.checkpoint.set_aside import SetAside
+from aquaflow.service.checkpoint.telemetry import cut_at_checkpoint
 from aquaflow.service.checkpoint.tracking import lost_since
+from aquaflow.service.moment import Moment
 from aquaflow.slam import Slam
 from aquaflow.storage.spill import SUFFIX, read_item
 
@@ -40,7 +42,9 @@ class Salvaged:
     """A sentence for each loss that the checkpoint's own files and the rows show."""
 
 
-def salvaged(checkpoint: Checkpoint, dive: Path, name_of: Callable[[int], str]) -> Salvaged:
+def salvaged(
+    checkpoint: Checkpoint, dive: Path, name_of: Callable[[int], str], now: Moment | None = None
+) -> Salvaged:
     """Prepare ``dive`` for resuming from ``checkpoint``; ``name_of`` gives a frame index's name.
 
     Raises:
@@ -60,6 +64,7 @@ def salvaged(checkpoint: Checkpoint, dive: Path, name_of: Callable[[int], str]) 
     for path in sorted((dive / WORK).glob(f"*/*{SUFFIX}")):
         _look_at(path, checkpoint.keyframes if older else None, aside)
     known = checkpoint.frames
+    cut_at_checkpoint(dive, checkpoint.moment, now or Moment.now(), aside)
     after = [or_lost(row, known) for row in rows.rows]
     return Salvaged(after, losses + _row_losses(rows, dive / MARKER))
 

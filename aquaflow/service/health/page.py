@@ -12,6 +12,9 @@ h1 { font-weight: 500; } .ok { color: #17803d; } .bad { color: #b42318; }
 <script>
 const text = value => typeof value === "object" && value !== null
   ? Object.entries(value).map(([k, v]) => k + ": " + text(v)).join(", ") : String(value);
+const heard = sources => Object.entries(sources).flatMap(([source, kinds]) =>
+  Object.entries(kinds).map(([kind, now]) => [source + " " + kind.replaceAll("_", " "),
+    [now.value].flat().join(", ") + " " + now.unit + ", " + now.age_s + " s ago"]));
 async function look() {
   try {
     const report = await (await fetch("health")).json();
@@ -21,9 +24,11 @@ async function look() {
     const facts = document.getElementById("facts"); facts.replaceChildren();
     for (const [name, value] of Object.entries(report)) {
       if (name === "state" || name === "reason") continue;
-      const row = facts.insertRow();
-      row.insertCell().textContent = name.replaceAll("_", " ");
-      row.insertCell().textContent = text(value);
+      const rows = name === "telemetry" ? heard(value) : [[name.replaceAll("_", " "), text(value)]];
+      for (const cells of rows) {
+        const row = facts.insertRow();
+        for (const cell of cells) row.insertCell().textContent = cell;
+      }
     }
   } catch (error) { document.getElementById("state").textContent = "no answer"; }
 }

@@ -103,9 +103,9 @@ class MetricFrames:
 
     def survey(self, snapshot: Snapshot) -> Survey:
         """All that is known now, for any thread."""
-        rows, telemetry = self._frames().rows(), self.telemetry.copy()
+        parts, telemetry = self._frames().parts(), self.telemetry.copy()
         return Survey(
-            snapshot.nodes, rows, telemetry, tuple(self._points), self.mounting, self._config,
+            snapshot.nodes, parts, telemetry, tuple(self._points), self.mounting, self._config,
             self.sightings.copy(),
         )  # fmt: skip
 
@@ -133,6 +133,13 @@ class MetricFrames:
                 found = estimates_of(self.survey(snapshot))
                 self._take({component: each.frame for component, each in found.items()})
         return self.frames
+
+    def resume(self, snapshot: Snapshot) -> None:
+        """Take up a restored dive, whose telemetry is there again."""
+        for keyframe in self._keyframes.keyframes:
+            if keyframe.number not in self._keyframes.lost:
+                self._keep_points(keyframe.number)
+        self.update(snapshot)
 
     def _take(self, frames: Mapping[int, MetricFrame]) -> None:
         self.frames = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -35,14 +36,19 @@ class Survey:
 
     nodes: Rows
     """[K] NODE of the keyframe graph."""
-    frames: Rows
-    """[N] FRAME: finished frames."""
+    parts: Sequence[Rows]
+    """[n] FRAME: finished frames, in pieces."""
     telemetry: Telemetry
     points: Sequence[Array]
     """[n, 3] of each keyframe by its number, in its own camera frame; empty for some."""
     mounting: MountingConfig | None
     config: FusionConfig
     sightings: Sightings
+
+    @cached_property
+    def frames(self) -> Rows:
+        """[N] FRAME: the same in one piece, put together by the thread that works on them."""
+        return np.concatenate(self.parts)
 
     def components(self) -> list[int]:
         """Sub-maps in the order of their first keyframe, by its number."""

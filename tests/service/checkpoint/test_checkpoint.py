@@ -200,6 +200,17 @@ def test_the_dives_clock_goes_on_over_restarts_and_jumps(
     assert before.shift_ns(now) == shift_ns
 
 
+def test_the_dives_clock_goes_on_over_two_boots_and_a_restart() -> None:
+    first = Moment(5_000, 10**18, "a")
+    second = Moment(100, 10**18 + 2 * 10**9, "b")
+    second = replace(second, dive_shift_ns=first.shift_ns(second))
+    assert second.dive_ns == 5_000 + 2 * 10**9
+    restarted = Moment(700, 10**18 + 3 * 10**9, "b")
+    assert second.shift_ns(restarted) == second.dive_shift_ns
+    third = Moment(50, second.wall_ns + 4 * 10**9, "c")
+    assert third.monotonic_ns + second.shift_ns(third) == second.dive_ns + 4 * 10**9
+
+
 def test_a_devices_clock_is_known_after_a_restart_but_not_after_another_boot(
     cut: Cut, back: LiveDive
 ) -> None:

@@ -1,0 +1,16 @@
+"""Files of lines that are appended to, also after a power cut in the middle of a line."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+
+def is_cut_short(path: Path) -> bool:
+    """True if the file's last line has no end."""
+    try:
+        with path.open("rb") as stream:
+            stream.seek(-1, os.SEEK_END)
+            return stream.read(1) != b"\n"
+    except OSError:  # there is none, or it is empty
+        return False
