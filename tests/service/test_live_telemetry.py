@@ -12,6 +12,7 @@ import pytest
 
 from aquaflow.config import Config
 from aquaflow.config.vehicle import VehicleConfig
+from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.replay import map_recording
 from aquaflow.evaluation.trajectory import read_tum
 from aquaflow.fusion.metric_file import read_metric_file
@@ -200,6 +201,18 @@ def test_after_another_boot_telemetry_ends_where_the_checkpoint_was_taken(
     assert aside.exists() is (boot == "other")
     cut_at_checkpoint(tmp_path, taken, now, SetAside(tmp_path))
     assert not (tmp_path / "set-aside-2").exists()
+
+
+def test_a_new_dive_in_the_same_folder_begins_without_the_old_telemetry(tmp_path: Path) -> None:
+    folder = DiveFolder(tmp_path, Config())
+    log = TelemetryLog(tmp_path / "telemetry.jsonl")
+    log.add([Depth(1, 1, "d", 1.0)])
+    log.close()
+    folder.close()
+    DiveFolder(tmp_path, Config(), resume=folder.rows).close()
+    assert (tmp_path / "telemetry.jsonl").exists()
+    DiveFolder(tmp_path, Config(), overwrite=True).close()
+    assert not (tmp_path / "telemetry.jsonl").exists()
 
 
 def test_a_dive_without_telemetry_so_far_has_none_to_cut(tmp_path: Path) -> None:
