@@ -31,7 +31,7 @@ def survey(frames: Array, points: tuple[Array, ...] = ()) -> Survey:
     for k, T in enumerate(POSES):
         nodes[k] = (k, 3 if k == 3 else 0, T.R, T.t, T.scale)
     values = {
-        "nodes": nodes, "frames": frames, "telemetry": Telemetry(), "points": points,
+        "nodes": nodes, "parts": (frames,), "telemetry": Telemetry(), "points": points,
         "mounting": None, "config": FusionConfig(),
     }  # fmt: skip
     fields = inspect.signature(Survey).parameters
