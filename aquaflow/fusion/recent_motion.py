@@ -61,7 +61,7 @@ class RecentMotion:
 
 
 def _keep(
-    kept: dict[str, deque[tuple[float, Array]]],
+    kept: dict[str, deque[tuple[float, Array]]],  # s and [3] of each source
     source: str,
     t_ns: int,
     value: Array,  # [3]
@@ -76,7 +76,10 @@ def _keep(
 
 
 def _between(
-    samples: deque[tuple[float, Array]], first_s: float, last_s: float, held_s: float
+    samples: deque[tuple[float, Array]],  # s and [3]
+    first_s: float,
+    last_s: float,
+    held_s: float,
 ) -> list[tuple[float, Array]] | None:
     """Durations and values [3] that fill the time; None where a gap is longer than ``held_s``."""
     pieces: list[tuple[float, Array]] = []
