@@ -51,8 +51,8 @@ class FusionConfig(Stage):
     )
     depth_change_sigma_m: float = Field(
         0.2, gt=0, description="m, 1 sigma of the depth around its mean, taken as constant where "
-        "positions are known and nothing measures down or depth (an AUV that follows the ground: "
-        "heights of shared surveys change by 0.02 to 0.2 m within 3 m of way)"
+        "positions are known and nothing measures down or depth: an AUV that follows even "
+        "ground (judgement)"
     )  # fmt: skip
     every_keyframes: int = Field(
         20, ge=1, description="keyframes after which telemetry straightens the keyframe graph"
