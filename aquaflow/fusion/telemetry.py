@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -91,12 +92,18 @@ class Telemetry:
         """Not among the arrays: nanoseconds since 1970 need all 64 bits."""
 
     def add(self, sample: TelemetrySample) -> None:
-        """Keep a sample."""
+        """Keep a sample.
+
+        Raises:
+            ArithmeticError: a value of it is not finite; one such would spoil every estimate.
+        """
         if isinstance(sample, UtcTime):
             self.utc.append(sample)
             return
         key = (type(sample), sample.source)
         row = (sample.t_ns * 1e-9, *_values(sample))
+        if not all(map(math.isfinite, row)):
+            raise ArithmeticError(f"a sample of '{sample.source}' is not finite")
         if key not in self._tables:
             self._tables[key] = _Table(len(row))
         self._tables[key].add(row)

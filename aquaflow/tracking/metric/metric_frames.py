@@ -17,6 +17,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore
 from aquaflow.messages import TelemetrySample
 from aquaflow.tracking.frame_table import FrameTable
+from aquaflow.tracking.graph.pose_graph import solve
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
 from aquaflow.tracking.metric.motion import motion_of_camera
 from aquaflow.tracking.metric.sightings import Sightings
@@ -114,12 +115,14 @@ class MetricFrames:
         survey = self.survey(snapshot)
         t_s = {k.number: k.t_ns * 1e-9 for k in self._keyframes.keyframes}
 
-        def solve() -> GraphResult:
-            solved = straightened(snapshot, survey, t_s)
-            self._solved = solved.frames
-            return solved.result
+        def together() -> GraphResult:
+            with self._failures.contain("telemetry in the keyframe graph"):
+                solved = straightened(snapshot, survey, t_s)
+                self._solved = solved.frames
+                return solved.result
+            return solve(snapshot)  # what telemetry cannot do must not cost the loops
 
-        return solve
+        return together
 
     def applied(self) -> None:
         """The last job's result has been taken over by the keyframes."""
