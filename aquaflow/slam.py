@@ -159,12 +159,17 @@ class Slam:
 
     def _settle_graph(self) -> None:
         """The last optimisations, of loops and telemetry, and then the frames in metres."""
-        for _ in range(SETTLING_ROUNDS if self.metric.present else 1):
-            self.graph.straighten()
-            while self.graph.optimising:
-                self._follow_graph(wait=True)
-        with self.profiler.stage("metric"):
-            self.metric.update(self.graph.snapshot)
+        self._wait_for_graph()
+        if self.metric.present:
+            for _ in range(SETTLING_ROUNDS):
+                self.graph.straighten()
+                self._wait_for_graph()
+            with self.profiler.stage("metric"):
+                self.metric.update(self.graph.snapshot)
+
+    def _wait_for_graph(self) -> None:
+        while self.graph.optimising:
+            self._follow_graph(wait=True)
 
     def close(self, keep: bool = False) -> None:
         """End the background work; remove the files of the work folder, or ``keep`` them."""

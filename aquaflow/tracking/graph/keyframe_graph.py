@@ -124,8 +124,8 @@ class KeyframeGraph:
         self._optimise()
 
     def straighten(self) -> None:
-        """Start an optimisation together with telemetry, if there is some and none is running."""
-        self._due |= self._telemetry is not None and self._telemetry.present
+        """Start an optimisation together with telemetry, if none is running."""
+        self._due = True
         self._optimise()
 
     def resume(self, graph: PoseGraph, loops: int) -> None:
