@@ -9,7 +9,7 @@ import pytest
 
 from aquaflow.config.recording import RecordingConfig
 from aquaflow.recording import Recorder
-from aquaflow.sources import open_recorded_telemetry, open_recording
+from aquaflow.sources import mounting_of, open_recorded_telemetry, open_recording
 from sim_drivers.mcap_telemetry import McapTelemetry
 from tests.command_line import Cli
 from tests.small_recording import QUICK
@@ -22,7 +22,9 @@ def recorded(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) ->
     """The small synthetic dive, some hours after the computer was started."""
     out = tmp_path_factory.mktemp("recorded")
     recorder = Recorder(out, RecordingConfig(picture="raw", keep_received=False, reserve_mb=0))
-    for frame in open_recording(small_recording).frames():
+    source = open_recording(small_recording)
+    recorder.mounted("camera", mounting_of(source))
+    for frame in source.frames():
         recorder.frame("camera", frame)
     for sample in open_recorded_telemetry(small_recording).samples():
         recorder.sample(sample)
