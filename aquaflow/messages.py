@@ -6,7 +6,7 @@ device reports it; ``arrival_ns`` is when the sample reached this process.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -15,6 +15,11 @@ import numpy.typing as npt
 from aquaflow.geometry.camera import CameraModel
 
 __all__ = [
+    "KINDS",
+    "KIND_OF",
+    "LENGTHS",
+    "STAMP",
+    "VALUES",
     "Acceleration",
     "Altitude",
     "AngularRate",
@@ -29,6 +34,7 @@ __all__ = [
     "TelemetrySample",
     "UtcTime",
     "Velocity",
+    "values_of",
 ]
 
 
@@ -177,3 +183,36 @@ TelemetrySample: TypeAlias = (
     | Position
     | UtcTime
 )
+
+KINDS: dict[str, type[TelemetrySample]] = {
+    "depth": Depth,
+    "attitude": Attitude,
+    "angular_rate": AngularRate,
+    "acceleration": Acceleration,
+    "velocity": Velocity,
+    "altitude": Altitude,
+    "lights": Lights,
+    "position": Position,
+    "utc_time": UtcTime,
+}
+"""Telemetry samples by the name that files, tables and reports call them."""
+KIND_OF: dict[type[TelemetrySample], str] = {sample: kind for kind, sample in KINDS.items()}
+"""The same the other way round."""
+LENGTHS = {"wxyz": 4, "rate_rad_s": 3, "acceleration_m_s2": 3, "velocity_m_s": 3}
+"""Fields that are arrays."""
+STAMP = ("t_ns", "arrival_ns", "source")
+"""The first fields of every sample."""
+VALUES: dict[type[TelemetrySample], tuple[str, ...]] = {
+    sample: tuple(field.name for field in fields(sample) if field.name not in STAMP)
+    for sample in KIND_OF
+}
+"""The other fields, in their order."""
+
+
+def values_of(sample: TelemetrySample) -> list[float]:
+    """The numbers that a sample holds, in the order of its fields."""
+    values: list[float] = []
+    for name in VALUES[type(sample)]:
+        value = getattr(sample, name)
+        values += value if isinstance(value, tuple) else (value,)
+    return values

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from aquaflow.config.telemetry import AnyDevice
 from aquaflow.errors import InputError
-from aquaflow.messages import TelemetrySample
-from aquaflow.recording.telemetry_json import KINDS, sample_from_json
+from aquaflow.messages import KINDS, TelemetrySample
+from aquaflow.recording.telemetry_json import sample_from_json
 from sim_drivers.mcap_camera import McapCamera
 from sim_drivers.mcap_messages import McapMessages, mcap_files
 from sim_drivers.telemetry_log import DecodedReads, Read

@@ -10,16 +10,13 @@ import numpy as np
 from aquaflow.fusion.camera_path import CameraPath
 from aquaflow.fusion.metric_frame import SourceReport
 from aquaflow.fusion.telemetry import Series, Telemetry
-from aquaflow.messages import Acceleration, Altitude, Attitude, Depth, Position, Velocity
+from aquaflow.messages import KINDS
 
 LEAST_SAMPLES = 5
 """Of one source while the camera had poses; fewer cannot show their noise."""
 LEAST_FIXES = 3
 """Of positions, each of which states its own sigma; two would agree with any scale and heading."""
-KINDS: dict[str, type] = {
-    "depth": Depth, "attitude": Attitude, "acceleration": Acceleration, "velocity": Velocity,
-    "altitude": Altitude, "position": Position,
-}  # fmt: skip
+USED = ("depth", "attitude", "acceleration", "velocity", "altitude", "position")
 """Kinds of message that say something about the map's frame."""
 
 
@@ -42,12 +39,12 @@ class UsableSeries:
         """All sources with enough samples along the path that are not ``rejected``, which are
         given by source and kind."""
         usable = UsableSeries(left_out=list(rejected.values()))
-        for kind, message in KINDS.items():
-            for series in telemetry.of(message):
+        for kind in USED:
+            for series in telemetry.of(KINDS[kind]):
                 if (series.source, kind) in rejected:
                     continue
                 covered = path.covers(series.t_s)
-                least = LEAST_FIXES if message is Position else LEAST_SAMPLES
+                least = LEAST_FIXES if kind == "position" else LEAST_SAMPLES
                 if int(covered.sum()) < least:
                     reason = _why_not(series, path, least)
                     usable.left_out.append(SourceReport(series.source, kind, reason=reason))

@@ -10,18 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.messages import (
-    Acceleration,
-    Altitude,
-    AngularRate,
-    Attitude,
-    Depth,
-    Lights,
-    Position,
-    TelemetrySample,
-    UtcTime,
-    Velocity,
-)
+from aquaflow.messages import TelemetrySample, UtcTime, values_of
 
 Array = npt.NDArray[np.float64]
 
@@ -101,7 +90,7 @@ class Telemetry:
             self.utc.append(sample)
             return
         key = (type(sample), sample.source)
-        row = (sample.t_ns * 1e-9, *_values(sample))
+        row = (sample.t_ns * 1e-9, *values_of(sample))
         if not all(map(math.isfinite, row)):
             raise ArithmeticError(f"a sample of '{sample.source}' is not finite")
         if key not in self._tables:
@@ -130,24 +119,3 @@ class Telemetry:
             _, first = np.unique(rows[:, 0], return_index=True)
             self._series[key] = Series(key[1], rows[first, 0], rows[first, 1:])
         return self._series[key]
-
-
-FIELDS: dict[type, tuple[str, ...]] = {
-    Depth: ("depth_m",),
-    Attitude: ("wxyz",),
-    AngularRate: ("rate_rad_s",),
-    Acceleration: ("acceleration_m_s2",),
-    Velocity: ("velocity_m_s", "figure_of_merit_m_s"),
-    Altitude: ("altitude_m",),
-    Lights: ("level",),
-    Position: ("latitude_deg", "longitude_deg", "sigma_m"),
-}
-"""What is kept of each kind of message, in the order of the columns."""
-
-
-def _values(sample: TelemetrySample) -> list[float]:
-    values: list[float] = []
-    for name in FIELDS[type(sample)]:
-        value = getattr(sample, name)
-        values += value if isinstance(value, tuple) else (value,)
-    return values

@@ -7,39 +7,7 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
-from aquaflow.messages import (
-    Acceleration,
-    Altitude,
-    AngularRate,
-    Attitude,
-    Depth,
-    Lights,
-    Position,
-    TelemetrySample,
-    UtcTime,
-    Velocity,
-)
-
-KINDS: dict[str, type[TelemetrySample]] = {
-    "depth": Depth,
-    "attitude": Attitude,
-    "angular_rate": AngularRate,
-    "acceleration": Acceleration,
-    "velocity": Velocity,
-    "altitude": Altitude,
-    "lights": Lights,
-    "position": Position,
-    "utc_time": UtcTime,
-}
-"""Telemetry samples by the name that they are recorded under."""
-KIND_OF: dict[type[TelemetrySample], str] = {sample: kind for kind, sample in KINDS.items()}
-"""The same the other way round."""
-
-NAMES = {kind: tuple(field.name for field in fields(sample)) for kind, sample in KINDS.items()}
-"""Names of the fields of each kind."""
-
-LENGTHS = {"wxyz": 4, "rate_rad_s": 3, "acceleration_m_s2": 3, "velocity_m_s": 3}
-"""Fields that are arrays."""
+from aquaflow.messages import KINDS, LENGTHS, STAMP, VALUES, TelemetrySample
 
 
 def sample_schema(kind: str) -> bytes:
@@ -85,7 +53,7 @@ def sample_from_values(kind: str, values: Mapping[str, Any]) -> TelemetrySample:
     """
     try:
         sample_type = KINDS[kind]
-        known = {name: values[name] for name in NAMES[kind]}
+        known = {name: values[name] for name in (*STAMP, *VALUES[sample_type])}
         for name, length in LENGTHS.items():
             if name in known:
                 known[name] = tuple(float(value) for value in known[name])

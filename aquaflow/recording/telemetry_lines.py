@@ -12,8 +12,8 @@ import logging
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from aquaflow.messages import TelemetrySample
-from aquaflow.recording.telemetry_json import KIND_OF, sample_from_values, sample_to_json
+from aquaflow.messages import KIND_OF, TelemetrySample
+from aquaflow.recording.telemetry_json import sample_from_values, sample_to_json
 from aquaflow.storage.lines import is_cut_short
 
 log = logging.getLogger(__name__)

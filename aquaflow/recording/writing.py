@@ -14,7 +14,7 @@ from aquaflow import __version__
 from aquaflow.clocks.wall import WallClockWatch
 from aquaflow.config.recording import RecordingConfig
 from aquaflow.config.telemetry import MountingConfig
-from aquaflow.messages import CameraModel, Dropped, Frame, TelemetrySample
+from aquaflow.messages import KIND_OF, CameraModel, Dropped, Frame, TelemetrySample
 from aquaflow.recording.dive_file import DiveFile
 from aquaflow.recording.pictures import (
     calibration_message,
@@ -23,7 +23,7 @@ from aquaflow.recording.pictures import (
     picture_message,
 )
 from aquaflow.recording.status import RecorderStatus
-from aquaflow.recording.telemetry_json import KIND_OF, sample_to_json
+from aquaflow.recording.telemetry_json import sample_to_json
 from aquaflow.recording.write_queue import Item, LinkBytes, QueuedPicture
 
 FORMAT = "1"

@@ -17,7 +17,7 @@ from aquaflow.fusion.start import AXES
 from aquaflow.fusion.telemetry import Telemetry
 from aquaflow.geometry.alignment import align
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.recording.telemetry_json import KIND_OF
+from aquaflow.messages import KIND_OF
 from aquaflow.synthetic import SimulatedDive, SyntheticConfig, simulate
 from aquaflow.synthetic.simulation import CELL_M
 from aquaflow.synthetic.site import site_of

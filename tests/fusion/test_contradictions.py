@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from aquaflow.fusion.estimator import Estimate
 from aquaflow.fusion.metric_frame import SourceReport
 from aquaflow.fusion.telemetry import Telemetry
-from aquaflow.messages import Altitude, Attitude, Depth, TelemetrySample, Velocity
-from aquaflow.recording.telemetry_json import KIND_OF
+from aquaflow.messages import KIND_OF, Altitude, Attitude, Depth, TelemetrySample, Velocity
 from aquaflow.synthetic import SyntheticConfig
 from tests.fusion.simulated_dives import Swum, estimated, swum
 

@@ -10,9 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from aquaflow.fusion.metric_frame import MetricFrame
-from aquaflow.fusion.telemetry import FIELDS
-from aquaflow.messages import Attitude, Position, TelemetrySample, UtcTime
-from aquaflow.recording.telemetry_json import KIND_OF
+from aquaflow.messages import KIND_OF, VALUES, Attitude, Position, TelemetrySample, UtcTime
 
 UNITS = {
     "depth": "m",
@@ -55,7 +53,7 @@ def _value(sample: TelemetrySample) -> float | list[float] | str:
         return [round(float(angle), DIGITS) for angle in (roll, pitch, yaw % 360.0)]
     if isinstance(sample, Position):
         return [round(each, PLACE_DIGITS) for each in (sample.latitude_deg, sample.longitude_deg)]
-    value = getattr(sample, FIELDS[type(sample)][0])
+    value = getattr(sample, VALUES[type(sample)][0])
     if isinstance(value, tuple):
         return [round(each, DIGITS) for each in value]
     return round(float(value), DIGITS)

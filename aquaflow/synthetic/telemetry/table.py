@@ -16,23 +16,12 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from aquaflow.errors import InputError, reason_of
-from aquaflow.messages import (
-    Acceleration,
-    Altitude,
-    AngularRate,
-    Attitude,
-    Depth,
-    Position,
-    TelemetrySample,
-    UtcTime,
-    Velocity,
-)
+from aquaflow.messages import KIND_OF, KINDS, LENGTHS, VALUES, TelemetrySample, values_of
 
 __all__ = ["HEADER", "read_telemetry", "sample_of", "write_telemetry"]
 
@@ -43,26 +32,10 @@ DIGITS = 9
 """Significant ones of a value: finer than any instrument."""
 
 
-@dataclass(frozen=True)
-class _Kind:
-    message: type[TelemetrySample]
-    fields: dict[str, int]
-    """Name of each field after the source, and how many columns it takes."""
-    exact: bool = False
-    """Written with every digit: the ninth of a longitude is 0.1 m."""
-
-
-KINDS = {
-    "depth": _Kind(Depth, {"depth_m": 1}),
-    "attitude": _Kind(Attitude, {"wxyz": 4}),
-    "angular_rate": _Kind(AngularRate, {"rate_rad_s": 3}),
-    "acceleration": _Kind(Acceleration, {"acceleration_m_s2": 3}),
-    "velocity": _Kind(Velocity, {"velocity_m_s": 3, "figure_of_merit_m_s": 1}),
-    "altitude": _Kind(Altitude, {"altitude_m": 1}),
-    "position": _Kind(Position, {"latitude_deg": 1, "longitude_deg": 1, "sigma_m": 1}, exact=True),
-    "utc_time": _Kind(UtcTime, {"utc_ns": 1}, exact=True),
-}
-"""What a line of each kind holds."""
+WRITTEN = frozenset(KINDS) - {"lights"}
+"""Kinds that a line may be of: a synthetic vehicle has no lamps."""
+EXACT = frozenset({"position", "utc_time"})
+"""Kinds that are written with every digit: the ninth of a longitude is 0.1 m."""
 
 
 def write_telemetry(path: Path, samples: Iterable[TelemetrySample]) -> None:
@@ -106,24 +79,22 @@ def sample_of(
     Raises:
         ValueError: the kind is unknown, or has another number of values.
     """
-    if kind not in KINDS or len(values) != sum(KINDS[kind].fields.values()):
+    names = VALUES[KINDS[kind]] if kind in WRITTEN else ()
+    counts = {name: LENGTHS.get(name, 1) for name in names}
+    if not names or len(values) != sum(counts.values()):
         raise ValueError(f"no sample of kind '{kind}' has {len(values)} values")
     left = iter(values)
     fields: dict[str, Any] = {
         name: next(left) if count == 1 else tuple(islice(left, count))
-        for name, count in KINDS[kind].fields.items()
+        for name, count in counts.items()
     }
-    return KINDS[kind].message(t_ns, arrival_ns, source, **fields)
+    return KINDS[kind](t_ns, arrival_ns, source, **fields)
 
 
 def _cells(sample: TelemetrySample) -> list[str]:
     """Kind, source and values of one sample."""
-    for name, kind in KINDS.items():
-        if isinstance(sample, kind.message):
-            found = (getattr(sample, field) for field in kind.fields)
-            values = [
-                v for value in found for v in (value if isinstance(value, tuple) else [value])
-            ]
-            cells = [repr(v) if kind.exact else f"{v:.{DIGITS}g}" for v in values]
-            return [name, sample.source, *cells, *[""] * (4 - len(cells))]
-    raise ValueError(f"telemetry.csv has no kind for {type(sample).__name__}")
+    kind = KIND_OF[type(sample)]
+    if kind not in WRITTEN:
+        raise ValueError(f"telemetry.csv has no kind for {type(sample).__name__}")
+    cells = [repr(v) if kind in EXACT else f"{v:.{DIGITS}g}" for v in values_of(sample)]
+    return [kind, sample.source, *cells, *[""] * (4 - len(cells))]
