@@ -190,25 +190,32 @@ def evaluate(
         Path | None, typer.Option(help="The same recording without water, for restored views.")
     ] = None,
     clean_crop: Annotated[str | None, typer.Option(help="Crop of --clean, such as right.")] = None,
+    recording: Annotated[
+        Path | None, typer.Option(help="What was mapped: do its pictures agree with the poses?")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Measure a dive: colours of restored views, and what the truth allows to compare."""
     from aquaflow.errors import InputError
+    from aquaflow.evaluation.epipolar_error import evaluate_epipolar
     from aquaflow.evaluation.naturalness import evaluate_naturalness
     from aquaflow.evaluation.protocol import evaluate_dive
     from aquaflow.evaluation.restoration import evaluate_restoration
     from aquaflow.evaluation.summary import in_words
 
     natural = evaluate_naturalness(dive)
-    if truth is None and clean is None and natural is None:
+    if truth is None and clean is None and recording is None and natural is None:
         raise InputError(
-            f"{dive} has no restored held-out views to look at; give --truth, --clean, or both"
+            f"{dive} has no restored held-out views to look at; give --truth, --clean or "
+            "--recording"
         )
     result: dict[str, Any] = {"naturalness": natural and natural.to_json()}
     if truth is not None:
         result |= evaluate_dive(dive, truth).to_json()
     if clean is not None:
         result["restoration"] = evaluate_restoration(dive, clean, clean_crop).to_json()
+    if recording is not None:
+        result["epipolar"] = evaluate_epipolar(dive, recording, truth).to_json()
     if as_json:
         typer.echo(json.dumps(result))
     else:

@@ -19,6 +19,7 @@ from aquaflow.evaluation.metric_error import MetricError, metric_error
 from aquaflow.evaluation.trajectory import ASSOCIATION_TOLERANCE_S, Trajectory, associate
 from aquaflow.evaluation.trajectory_error import (
     TrajectoryError,
+    horizontal_error,
     position_error,
     trajectory_error,
 )
@@ -161,11 +162,12 @@ def _with_positions(
         )
     positions = truth.positions[[row_of[names[i]] for i in ours]]
     path = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
-    error = position_error(dive.trajectory.positions[ours], positions, path)
-    missed = error.sim3.alignment.T_target_source.apply(dive.trajectory.positions[ours]) - positions
-    level = float(np.sqrt((missed[:, :2] ** 2).sum(axis=1).mean()))
+    posed = dive.trajectory.select(np.array(ours))
+    error = position_error(posed.positions, positions, path)
+    level = horizontal_error(posed, positions[:, :2])
     return error, [
         "the truth has horizontal positions only: camera positions are aligned in 3D with a true "
-        "height of zero, so height differences count as error; in the horizontal alone the Sim(3) "
-        f"error is {level:.3g} m"
+        "height of zero, so height differences count as error; in the horizontal alone, the mean "
+        f"viewing direction taken as the vertical, it is {level:.3g} m, "
+        f"{100.0 * level / path:.2g} % of the path"
     ]

@@ -20,6 +20,8 @@ def in_words(result: Values) -> list[str]:
         lines += _trajectory(result)
         lines += _metric(result)
         lines += _views(result)
+    if "epipolar" in result:
+        lines += _epipolar(result["epipolar"])
     if result.get("medium_error"):
         lines += _water(result["medium_error"])
     if result.get("naturalness"):
@@ -82,6 +84,18 @@ def _stated(metric: Values, what: str, unit: str, word: str) -> str:
     if sigmas is None:
         return said
     return f"{said}, {abs(sigmas):.2g} times its stated sigma of {sigma:.3g}"
+
+
+def _epipolar(error: Values) -> list[str]:
+    """One line for every distance in time."""
+    lines = [
+        f"Epipolar distance of keypoint matches, median, px of {error['width_px']} px wide pictures"
+    ]
+    for gap in error["gaps"]:
+        true = "" if gap["truth_px"] is None else f", truth {gap['truth_px']:.2f}"
+        said = f"dive {gap['dive_px']:.2f}{true}, best fit of each pair {gap['best_px']:.2f}"
+        lines.append(_row(f"{gap['gap_s']:.2f} s apart", f"{said} ({gap['matches']} matches)"))
+    return lines
 
 
 def _views(result: Values) -> list[str]:

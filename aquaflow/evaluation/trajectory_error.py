@@ -102,6 +102,26 @@ def position_error(
     )
 
 
+def horizontal_error(
+    estimate: Trajectory,
+    truth: Positions,  # [N, 2] easting, northing
+) -> float:
+    """RMS distance in the horizontal, truth's unit; the estimate's own heights do not count.
+
+    The vertical is the mean viewing direction, since such a truth is of pictures taken from above;
+    the rest is a similarity of the plane: heading, scale and two shifts.
+    """
+    down = estimate.R_wc[:, :, 2].mean(axis=0)
+    level = Rotation.align_vectors([[0.0, 0.0, 1.0]], [down])[0]
+    forward_right = level.apply(estimate.positions)[:, :2]
+    # Seen from below x and y change places, so that both turn the same way.
+    p = forward_right @ (1.0, 1.0j)
+    q = truth @ (1.0j, 1.0)
+    p, q = p - p.mean(), q - q.mean()
+    scale = np.vdot(p, q) / max(float(np.vdot(p, p).real), np.finfo(float).tiny)
+    return _rms(np.abs(scale * p - q))
+
+
 def trajectory_error(
     estimate: Trajectory, truth: Trajectory, path_length: float
 ) -> TrajectoryError:

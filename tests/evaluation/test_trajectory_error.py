@@ -9,7 +9,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from aquaflow.evaluation.trajectory import Trajectory
-from aquaflow.evaluation.trajectory_error import position_error, trajectory_error
+from aquaflow.evaluation.trajectory_error import (
+    horizontal_error,
+    position_error,
+    trajectory_error,
+)
 from aquaflow.geometry.similarity import Sim3
 
 
@@ -110,3 +114,36 @@ def test_positions_alone_give_the_same_absolute_error():
     assert plain.sim3.rmse == full.sim3.rmse
     assert plain.relative is None
     assert plain.drift_pct is None
+
+
+def downward_survey(seed: int) -> Trajectory:
+    """Pictures from above, in a world with z up, at changing heights."""
+    rng = np.random.default_rng(seed)
+    positions = np.cumsum(rng.normal((1.0, 0.0, 0.0), 1.0, (12, 3)), axis=0)
+    headings = Rotation.from_euler("z", rng.uniform(-180.0, 180.0, (12, 1)), degrees=True)
+    looking_down = Rotation.from_euler("x", 180.0, degrees=True)
+    wxyz = (headings * looking_down).as_quat(scalar_first=True)
+    return Trajectory(np.arange(12) * 1.0, positions, wxyz)
+
+
+@given(st.integers(0, 2**31), st.floats(0.05, 20.0))
+def test_heights_of_a_survey_are_no_horizontal_error(seed, scale):
+    survey = downward_survey(seed)
+
+    moved = survey.transformed(similarity(seed, scale))
+
+    assert horizontal_error(moved, survey.positions[:, :2]) < 1e-6
+
+
+def test_a_mirrored_survey_does_not_fit():
+    survey = downward_survey(5)
+
+    assert horizontal_error(survey, survey.positions[:, :2] * [1.0, -1.0]) > 0.1
+
+
+def test_a_shift_of_one_position_is_a_horizontal_error():
+    survey = downward_survey(6)
+    truth = survey.positions[:, :2].copy()
+    truth[5, 1] += 1.0
+
+    assert 0.1 < horizontal_error(survey, truth) < 1.0 / np.sqrt(len(truth))
