@@ -11,13 +11,11 @@ from aquaflow.dive.metric_outputs import MetricOutputs
 from aquaflow.export.georeference import to_geodetic
 from aquaflow.export.trajectory_csv import PoseRow
 from aquaflow.fusion.metric_frame import MetricFrame
-from aquaflow.geometry.similarity import Sim3
+from aquaflow.geometry.similarity import BODY_FROM_CAMERA, Sim3
 from aquaflow.tracking.frames import Tracked
 
 Array = npt.NDArray[np.float64]
 
-FORWARD_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""Camera axes (right, down, forward) to a body's (forward, right, down), if it looks forward."""
 SPEED_SPAN_S = 0.5
 """Seconds over which a speed is taken: 1 mm of noise in a position gives 3 mm/s."""
 LONGEST_SPAN_S = 5.0
@@ -88,7 +86,7 @@ def _attitude(
     none while gravity is unknown."""
     if not frame.level:
         return None, None, None
-    R = T_nc.R @ (FORWARD_CAMERA if frame.T_bc is None else frame.T_bc.R).T
+    R = T_nc.R @ (BODY_FROM_CAMERA if frame.T_bc is None else frame.T_bc.R).T
     heading = np.degrees(np.arctan2(R[1, 0], R[0, 0])) % 360.0
     pitch = np.degrees(np.arcsin(np.clip(-R[2, 0], -1.0, 1.0)))
     roll = np.degrees(np.arctan2(R[2, 1], R[2, 2]))

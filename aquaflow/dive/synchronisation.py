@@ -65,7 +65,7 @@ def _turns_of_sub_map(posed: Sequence[Tracked]) -> Turns:
 
 
 def _body_to_camera(mounting: MountingConfig | None) -> Array | None:
-    return None if mounting is None else np.asarray(camera_in_body(mounting)[0].T)
+    return None if mounting is None else camera_in_body(mounting).R.T
 
 
 def in_words(name: str, offset: TimeOffset) -> str:

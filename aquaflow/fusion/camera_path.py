@@ -8,6 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation, Slerp
 
+from aquaflow.fusion.interpolation import columns_at
+
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
@@ -54,7 +56,7 @@ class CameraPath:
         """Rotations [M, 3, 3] and camera centres [M, 3]; between poses at constant rates."""
         t_s = np.clip(t_s, self.t_s[0], self.t_s[-1])
         rotations = Slerp(self.t_s, Rotation.from_matrix(self.R_mc))(t_s).as_matrix()
-        centres = np.stack([np.interp(t_s, self.t_s, self.p_m[:, k]) for k in range(3)], axis=1)
+        centres = columns_at(t_s, self.t_s, self.p_m)
         return np.asarray(rotations), centres
 
     def velocity(
@@ -63,4 +65,4 @@ class CameraPath:
     ) -> Array:
         """[M, 3] map units/s."""
         slope = np.gradient(self.p_m, self.t_s, axis=0)
-        return np.stack([np.interp(t_s, self.t_s, slope[:, k]) for k in range(3)], axis=1)
+        return columns_at(t_s, self.t_s, slope)

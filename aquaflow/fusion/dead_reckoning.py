@@ -15,9 +15,10 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from aquaflow.fusion.camera_path import CameraPath
 from aquaflow.fusion.estimator import Estimate
+from aquaflow.fusion.interpolation import columns_at
 from aquaflow.fusion.problem import Carried
 from aquaflow.fusion.state import HEADING
-from aquaflow.fusion.telemetry import Series, Telemetry
+from aquaflow.fusion.telemetry import Telemetry
 from aquaflow.geometry.similarity import rotation_from_quaternion
 from aquaflow.messages import Attitude, Velocity
 
@@ -83,7 +84,7 @@ def _reckoned(
         return None
     R_nb = Slerp(attitude.t_s, Rotation.from_matrix(rotation_from_quaternion(attitude.values)))
     turn = Rotation.from_euler("z", -heading)
-    v_b = _interpolated(velocity, t_s)
+    v_b = columns_at(t_s, velocity.t_s, velocity.values[:, :3])
     v_n = (turn * R_nb(t_s)).apply(v_b)
     moved = np.trapezoid(v_n, t_s, axis=0)
     merit = float(np.median(velocity.values[:, 3]))
@@ -92,11 +93,3 @@ def _reckoned(
     across = np.array([-moved[1], moved[0]])
     covariance = white * np.eye(2) + HEADING_WANDER**2 * np.outer(across, across)
     return Reckoned(moved, covariance + (0.003 * float(np.linalg.norm(moved))) ** 2 * np.eye(2))
-
-
-def _interpolated(
-    velocity: Series,
-    t_s: Array,  # [N] s
-) -> Array:
-    """[N, 3] m/s, body."""
-    return np.stack([np.interp(t_s, velocity.t_s, velocity.values[:, k]) for k in range(3)], axis=1)

@@ -18,6 +18,7 @@ from aquaflow.fusion.problem import ANY_TURN, FIXED, Carried, Problem
 from aquaflow.fusion.sources import UsableSeries
 from aquaflow.fusion.state import CAMERA, DVL, DVL_SCALE, HEADING, LAG, SCALE, SHIFT, TURN, P, State
 from aquaflow.fusion.telemetry import Series
+from aquaflow.geometry.similarity import BODY_FROM_CAMERA
 
 SCALE_SIGMA = 3.0
 """Log: a start's median depth may be 5 cm or 20 m."""
@@ -68,10 +69,11 @@ def _as_mounted(
     usable: UsableSeries, path: CameraPath, config: FusionConfig, mounting: MountingConfig | None
 ) -> Problem:
     """The problem with nothing but the camera's place in the body."""
-    R_bc, c_b, sigma = np.asarray(rough.AXES), np.zeros(3), np.radians(config.mounting_sigma_deg)
+    R_bc, c_b, sigma = BODY_FROM_CAMERA, np.zeros(3), np.radians(config.mounting_sigma_deg)
     mounted = mounting is not None
     if mounting is not None:
-        R_bc, c_b = rough.camera_in_body(mounting)
+        stated = rough.camera_in_body(mounting)
+        R_bc, c_b = stated.R, stated.t
     elif usable.attitude:
         found = rough.mounting_from_turns(usable.attitude[0], path)
         if found is not None:

@@ -46,3 +46,12 @@ class Interpolation:
             return None
         nearest = slice(after - 1, after + 1)
         return float(np.interp(t_s, self.t_s[nearest], self.values[nearest]))
+
+
+def columns_at(
+    t_s: npt.NDArray[np.float64],  # [M] s
+    known_s: npt.NDArray[np.float64],  # [N] s, increasing
+    values: npt.NDArray[np.float64],  # [N, C]
+) -> npt.NDArray[np.float64]:
+    """[M, C] each column between its neighbours in time; the ends hold beyond them."""
+    return np.stack([np.interp(t_s, known_s, column) for column in values.T], axis=1)

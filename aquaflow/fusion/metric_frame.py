@@ -14,7 +14,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.geometry.similarity import Sim3
+from aquaflow.geometry.similarity import Sim3, hat
 
 Array = npt.NDArray[np.float64]
 
@@ -132,7 +132,12 @@ class MetricFrame:
         p_n: Array,  # [3] in n
     ) -> Array:
         """[3, 3] m^2 of a point in n that follows from the frame alone: first order."""
-        x, y, z = p_n
-        turn = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])  # d(w x p) / dw
-        J = np.hstack([np.eye(3), turn, np.asarray(p_n)[:, None]])
+        J = moved_by_frame(p_n)
         return np.asarray(J @ self.covariance @ J.T)
+
+
+def moved_by_frame(
+    p_n: Array,  # [3] m in n
+) -> Array:
+    """[3, 7] change of a point in n with the frame's place, turn and log-scale."""
+    return np.hstack([np.eye(3), -hat(p_n), p_n[:, None]])

@@ -15,6 +15,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import correlate, find_peaks
 
 from aquaflow.fusion.turns import Turns
+from aquaflow.geometry.similarity import nearest_rotation
 
 Array = npt.NDArray[np.float64]
 
@@ -91,7 +92,9 @@ def peaks(camera: Cells, body: Cells, R_cb: Array | None) -> list[Peak]:  # [3, 
     found, _ = find_peaks(floor, prominence=PEAK_PROMINENCE * explained.max())
     found = found[floor[found] >= RIVAL_SHARE * explained.max()]
     found = found[np.argsort(-floor[found], kind="stable")][:MOST_PEAKS] - 1
-    rotation = wahba(H[found]) if R_cb is None else np.broadcast_to(R_cb, (len(found), 3, 3))
+    rotation = (
+        nearest_rotation(H[found]) if R_cb is None else np.broadcast_to(R_cb, (len(found), 3, 3))
+    )
     return [
         Peak(float(offsets_s[i]), rotation[n], float(explained[i])) for n, i in enumerate(found)
     ]
@@ -134,10 +137,3 @@ def _largest_trace(H: Array) -> Array:  # [N, 3, 3]
     """[N] largest trace of R^T H over all rotations R."""
     singular = np.linalg.svd(H, compute_uv=False)
     return np.asarray(singular[:, 0] + singular[:, 1] + np.sign(np.linalg.det(H)) * singular[:, 2])
-
-
-def wahba(H: Array) -> Array:  # [N, 3, 3]
-    """[N, 3, 3] rotations R that make the trace of R^T H largest."""
-    U, _, Vt = np.linalg.svd(H)
-    U[..., 2] *= np.linalg.det(U @ Vt)[..., None]
-    return np.asarray(U @ Vt)

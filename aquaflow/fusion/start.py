@@ -12,21 +12,25 @@ from aquaflow.fusion.camera_path import CameraPath
 from aquaflow.fusion.telemetry import Series
 from aquaflow.geometry.alignment import align
 from aquaflow.geometry.earth import north_east
-from aquaflow.geometry.similarity import on_so3, rotation_from_quaternion
+from aquaflow.geometry.similarity import (
+    BODY_FROM_CAMERA,
+    Sim3,
+    nearest_rotation,
+    on_so3,
+    rotation_from_quaternion,
+)
 
 Array = npt.NDArray[np.float64]
 
-AXES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""Camera (right, down, forward) to body (forward, right, down), for one that looks forward."""
 LEAST_TURN = np.radians(3.0)
 """rad; rotations about two axes of at least so much show how the camera is mounted."""
 
 
-def camera_in_body(mounting: MountingConfig) -> tuple[Array, Array]:
-    """R_bc [3, 3] and the camera's place c_b [3] m."""
+def camera_in_body(mounting: MountingConfig) -> Sim3:
+    """T_bc, metres, of a camera that looks forward without angles, and down with pitch_deg -90."""
     angles = (mounting.yaw_deg, mounting.pitch_deg, mounting.roll_deg)
-    R_bc = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix() @ AXES
-    return np.asarray(R_bc), np.array(mounting.position_m, np.float64)
+    R_bc = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix() @ BODY_FROM_CAMERA
+    return Sim3(np.asarray(R_bc), np.array(mounting.position_m, np.float64))
 
 
 def mounting_from_turns(attitude: Series, path: CameraPath) -> Array | None:
@@ -39,12 +43,11 @@ def mounting_from_turns(attitude: Series, path: CameraPath) -> Array | None:
     R_nb = Rotation.from_quat(attitude.values, scalar_first=True)
     R_mc = Rotation.from_matrix(path.at(attitude.t_s)[0])
     a, b = ((R.mean().inv() * R).as_rotvec() for R in (R_nb, R_mc))
-    U, D, Vt = np.linalg.svd(a.T @ b / len(a))
-    if np.sqrt(max(D[1], 0.0)) < LEAST_TURN:
+    turns = a.T @ b / len(a)
+    if np.sqrt(np.linalg.svd(turns, compute_uv=False)[1]) < LEAST_TURN:
         return None
-    S = np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
     # Turns about the two mean orientations: both are of the frames at the mean, so this is R_bc.
-    return np.asarray(U @ S @ Vt)
+    return nearest_rotation(turns)
 
 
 def map_to_level(
@@ -54,9 +57,8 @@ def map_to_level(
 ) -> Array:
     """R_nm [3, 3] that agrees best with all attitudes: their chordal mean."""
     R_nb = rotation_from_quaternion(attitude.values)
-    total = (R_nb @ R_bc @ np.swapaxes(path.at(attitude.t_s)[0], 1, 2)).sum(axis=0)
-    U, _, Vt = np.linalg.svd(total)
-    return np.asarray(U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt)
+    R_nm = R_nb @ R_bc @ np.swapaxes(path.at(attitude.t_s)[0], 1, 2)
+    return nearest_rotation(R_nm.sum(axis=0))
 
 
 def map_from_force(

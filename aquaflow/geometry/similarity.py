@@ -19,6 +19,9 @@ Array = npt.NDArray[np.float64]
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
 
+BODY_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""Axes (forward, right, down) from (right, down, forward), for a camera that looks forward."""
+
 
 def hat(
     w: Array,  # [..., 3]
@@ -42,6 +45,15 @@ def so3_log(
 ) -> Array:
     """Rotation vector [3], rad, angle in [0, pi]."""
     return np.asarray(Rotation.from_matrix(R).as_rotvec())
+
+
+def nearest_rotation(
+    M: Array,  # [..., 3, 3]
+) -> Array:
+    """Rotations R [..., 3, 3] with the largest trace of R^T M: the answer to Wahba's problem."""
+    U, _, Vt = np.linalg.svd(M)
+    U[..., 2] *= np.linalg.det(U @ Vt)[..., None]
+    return np.asarray(U @ Vt)
 
 
 def on_so3(

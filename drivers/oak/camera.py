@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from aquaflow.config.cameras import OakConfig
 from aquaflow.config.telemetry import MountingConfig
+from aquaflow.geometry.similarity import BODY_FROM_CAMERA
 from aquaflow.messages import Acceleration, AngularRate, CameraModel, TelemetrySample
 from aquaflow.sources.newest import Newest
 from drivers.capture import RawPicture, UnusablePictureError
@@ -21,9 +22,6 @@ from drivers.oak.dai_backend import DaiBackend
 
 MAX_SAMPLES = 8_000
 """IMU samples kept until fetched, then the oldest go: 10 s of both sensors at 400 Hz."""
-
-BODY_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""Axes (forward, right, down) from (right, down, forward): a camera that looks ahead."""
 
 log = logging.getLogger(__name__)
 

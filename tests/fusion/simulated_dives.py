@@ -13,10 +13,9 @@ from aquaflow.config import FusionConfig
 from aquaflow.config.telemetry import MountingConfig
 from aquaflow.fusion.camera_path import CameraPath
 from aquaflow.fusion.estimator import Estimate, estimate
-from aquaflow.fusion.start import AXES
 from aquaflow.fusion.telemetry import Telemetry
 from aquaflow.geometry.alignment import align
-from aquaflow.geometry.similarity import Sim3
+from aquaflow.geometry.similarity import BODY_FROM_CAMERA, Sim3
 from aquaflow.messages import KIND_OF
 from aquaflow.synthetic import SimulatedDive, SyntheticConfig, simulate
 from aquaflow.synthetic.simulation import CELL_M
@@ -96,7 +95,7 @@ def ground_of(swum: Swum, seed: int = 0) -> Array:
 def stated_mounting(dive: SimulatedDive) -> MountingConfig:
     """Of the camera, as the dive states it."""
     R_bc = dive.T_bc_stated[:3, :3]
-    yaw, pitch, roll = Rotation.from_matrix(R_bc @ AXES.T).as_euler("ZYX", degrees=True)
+    yaw, pitch, roll = Rotation.from_matrix(R_bc @ BODY_FROM_CAMERA.T).as_euler("ZYX", degrees=True)
     x, y, z = dive.T_bc_stated[:3, 3].tolist()
     return MountingConfig(position_m=(x, y, z), roll_deg=roll, pitch_deg=pitch, yaw_deg=yaw)
 

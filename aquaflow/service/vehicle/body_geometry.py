@@ -8,10 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from aquaflow.config.telemetry import MountingConfig
-from aquaflow.fusion.metric_frame import MetricFrame
-from aquaflow.fusion.start import camera_in_body
-from aquaflow.geometry.similarity import Sim3, hat
+from aquaflow.fusion.metric_frame import MetricFrame, moved_by_frame
+from aquaflow.geometry.similarity import Sim3
 
 Array = npt.NDArray[np.float64]
 
@@ -34,11 +32,6 @@ class Pose:
         return np.asarray(turn), later.R.T @ (later.t_m - self.t_m)
 
 
-def stated_mounting(mounting: MountingConfig) -> Sim3:
-    """T_bc of a camera that looks forward without angles, and down with pitch_deg -90."""
-    return Sim3(*camera_in_body(mounting))
-
-
 def body_pose(frame: MetricFrame, T_bc: Sim3, T_mc: Sim3) -> Pose:
     """The body's pose for a camera pose ``T_mc`` in the sub-map that ``frame`` places."""
     R = frame.T_nm.R @ T_mc.R @ T_bc.R.T
@@ -52,7 +45,7 @@ def pose_covariance(
 ) -> Array:
     """[6, 6] of x, y, z (m) and roll, pitch, yaw (rad): the frame's own, and the pose's in it."""
     J = np.zeros((6, 7))
-    J[:3] = np.hstack([np.eye(3), -hat(pose.t_m), pose.t_m[:, None]])
+    J[:3] = moved_by_frame(pose.t_m)
     J[3:, 3:6] = np.eye(3)
     K = np.eye(6)
     K[3:, 3:] = _angles_by_rotation(pose.R)

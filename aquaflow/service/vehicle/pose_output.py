@@ -20,10 +20,11 @@ import numpy.typing as npt
 
 from aquaflow.config.service import PoseConfig
 from aquaflow.fusion.metric_frame import MetricFrame
+from aquaflow.fusion.start import camera_in_body
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.service.feed import Feed
 from aquaflow.service.loop import LiveLoop
-from aquaflow.service.vehicle.body_geometry import body_pose, pose_covariance, stated_mounting
+from aquaflow.service.vehicle.body_geometry import body_pose, pose_covariance
 from aquaflow.service.vehicle.body_track import BodyTrack, Sighting
 from aquaflow.sources.outbound import BodyMotion, BodyPose, OutboundMessage
 from aquaflow.tracking.frames import Tracked
@@ -74,7 +75,7 @@ class PoseOutput:
         self.scale_source = ""
         """Where the map's scale comes from, or why there is none."""
         self._config, self._feed, self._frame_of = config, feed, frame_of
-        self._stated = None if config.mounting is None else stated_mounting(config.mounting)
+        self._stated = None if config.mounting is None else camera_in_body(config.mounting)
         self._track = BodyTrack(config.jump_m, math.radians(config.jump_deg))
         self._index: int | None = None
         self._place_m: Array | None = None

@@ -76,7 +76,7 @@ class MetricFrames:
     @property
     def _stated(self) -> Sim3 | None:
         """Camera to body as stated."""
-        return None if self.mounting is None else Sim3(*camera_in_body(self.mounting))
+        return None if self.mounting is None else camera_in_body(self.mounting)
 
     def keyframe(self, number: int, parent: int | None) -> bool:
         """A new keyframe; True if it is time to straighten the graph by telemetry."""

@@ -9,8 +9,9 @@ import numpy as np
 
 from aquaflow.config.telemetry import MountingConfig
 from aquaflow.fusion.metric_frame import MetricFrame, North
+from aquaflow.fusion.start import camera_in_body
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.service.vehicle.body_geometry import Pose, stated_mounting
+from aquaflow.service.vehicle.body_geometry import Pose
 from aquaflow.service.vehicle.pose_output import PoseOutput
 from aquaflow.tracking.frames import FrameClass, Quality, Tracked
 from tests.service.live_scenes import Told, frame_of
@@ -27,7 +28,7 @@ T_NM = Sim3(so3_exp(np.array([0.4, -1.1, 0.7])), np.array([3.0, -2.0, 1.5]), 2.0
 def frame(mounting: str | None = "forward", scale_sigma: float = 0.01) -> MetricFrame:
     """The map's place in the world, well known."""
     sigmas = np.array([0.05, 0.05, 0.02, 0.005, 0.005, 0.02, scale_sigma])
-    T_bc = None if mounting is None else stated_mounting(MOUNTINGS[mounting])
+    T_bc = None if mounting is None else camera_in_body(MOUNTINGS[mounting])
     north: North = "magnetic north"
     return MetricFrame(
         T_NM, np.diag(sigmas**2), metric=True, level=True, north=north, T_bc=T_bc,
@@ -54,7 +55,7 @@ def diving(seconds: np.ndarray) -> list[Pose]:
 def seen(pose: Pose, known: MetricFrame, mounting: str = "forward") -> Sim3:
     """The camera's pose in the map."""
     T_nb = Sim3(pose.R, pose.t_m)
-    return known.T_nm.inverse() @ T_nb @ stated_mounting(MOUNTINGS[mounting])
+    return known.T_nm.inverse() @ T_nb @ camera_in_body(MOUNTINGS[mounting])
 
 
 def show(

@@ -7,12 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from aquaflow.fusion.recent_motion import RecentMotion
-from aquaflow.fusion.start import AXES
-from aquaflow.geometry.similarity import Sim3
+from aquaflow.geometry.similarity import BODY_FROM_CAMERA, Sim3
 from aquaflow.messages import AngularRate, Velocity
 from aquaflow.tracking.metric.motion import LONGEST_S, motion_of_camera
 
-T_BC = Sim3(Rotation.from_euler("y", -40, degrees=True).as_matrix() @ AXES, np.array([0.2, 0, 0.1]))
+T_BC = Sim3(
+    Rotation.from_euler("y", -40, degrees=True).as_matrix() @ BODY_FROM_CAMERA,
+    np.array([0.2, 0, 0.1]),
+)
 RATE, SPEED = np.array([0.05, -0.1, 0.3]), np.array([0.4, 0.1, -0.2])
 SCALE = 1.7
 SECOND = 1_000_000_000
