@@ -13,7 +13,12 @@ import numpy.typing as npt
 
 from aquaflow.config.telemetry import MountingConfig
 from aquaflow.errors import InputError
-from aquaflow.geometry.camera import CameraModel, Port, guess_camera
+from aquaflow.geometry.camera import (
+    CameraModel,
+    camera_of_values,
+    guess_camera,
+    has_unmeasured_port,
+)
 from aquaflow.messages import Dropped, EncodedPicture, Frame
 from aquaflow.sources import is_asked
 from sim_drivers.h264 import decode_units, is_key
@@ -149,8 +154,12 @@ class McapCamera:
             return None
         try:
             fields = json.loads(facts["model"])
-            extra = {"distortion": tuple(fields["distortion"]), "port": Port(**fields["port"])}
-            return CameraModel(**fields | extra)
+            if has_unmeasured_port(fields):
+                self._damage.append(
+                    f"the calibration in {self.path.name} names a {fields['port']['kind']} port "
+                    "without its measures, which was left out; give --calib with them"
+                )
+            return camera_of_values(fields)
         except (KeyError, TypeError, ValueError, RecursionError):
             self._damage.append(f"the calibration in {self.path.name} is damaged and was left out")
             return None

@@ -6,16 +6,26 @@ is W / 2. OpenCV's convention is half a pixel less; that is applied where OpenCV
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from aquaflow.errors import ConfigError, path_of_key, words_of
 from aquaflow.errors.plain_yaml import read_mapping
+from aquaflow.geometry.port import Port
+from aquaflow.geometry.port_file import DomePortFile, FlatPortFile, PortFile, port_of, stated
 
 DistortionModel = Literal["none", "radtan", "fisheye"]
 
@@ -31,19 +41,8 @@ MIN_DEPTH = 1e-9
 
 
 @dataclass(frozen=True)
-class Port:
-    """The window between camera and water; ``flat`` and ``dome`` are carried for later use."""
-
-    kind: Literal["none", "flat", "dome"] = "none"
-    thickness_m: float = 0.0
-    distance_m: float = 0.0
-    refractive_index_glass: float = 1.49
-    refractive_index_water: float = 1.34
-
-
-@dataclass(frozen=True)
 class CameraModel:
-    """Intrinsics in pixels for images of ``width`` x ``height``."""
+    """Intrinsics in pixels for images of ``width`` x ``height``; behind a port they are of air."""
 
     width: int
     height: int
@@ -54,7 +53,8 @@ class CameraModel:
     distortion_model: DistortionModel = "none"
     distortion: tuple[float, ...] = ()
     """OpenCV order: k1 k2 p1 p2 [k3 ...] for ``radtan``, k1..k4 for ``fisheye``."""
-    port: Port = Port()
+    port: Port | None = None
+    """The window to the water; None if there is none, or the calibration was made in water."""
     calibrated: bool = True
     """False while the focal length is only a guess."""
 
@@ -67,6 +67,11 @@ class CameraModel:
     def is_distorted(self) -> bool:
         """True if any coefficient of the distortion is not zero."""
         return self.distortion_model != "none" and any(k != 0.0 for k in self.distortion)
+
+    @property
+    def is_pinhole(self) -> bool:
+        """True if neither distortion nor a port bends its rays."""
+        return not self.is_distorted and self.port is None
 
     def scaled(self, width: int, height: int) -> CameraModel:
         """The same camera for the same picture resized to ``width`` x ``height``."""
@@ -145,7 +150,12 @@ class CameraFile(BaseModel):
     cy: float
     distortion_model: Literal["none", "radial", "radtan", "opencv", "fisheye"] = "none"
     distortion: list[float] = Field(default_factory=list, max_length=14)
-    port: Literal["none", "flat", "dome"] = "none"
+    port: PortFile | None = None
+
+    @field_validator("port", mode="before")
+    @classmethod
+    def _port_has_measures(cls, value: Any) -> Any:
+        return stated(value)
 
     @property
     def kind(self) -> DistortionModel:
@@ -153,6 +163,20 @@ class CameraFile(BaseModel):
         if self.distortion_model in ("none", "fisheye"):
             return self.distortion_model  # type: ignore[return-value]
         return "radtan"
+
+    def camera(self) -> CameraModel:
+        """For computing."""
+        return CameraModel(
+            self.width,
+            self.height,
+            self.fx,
+            self.fy,
+            self.cx,
+            self.cy,
+            distortion_model=self.kind,
+            distortion=tuple(self.distortion),
+            port=port_of(self.port),
+        )
 
     @model_validator(mode="after")
     def _is_a_camera(self) -> CameraFile:
@@ -178,29 +202,54 @@ def load_camera(path: Path) -> CameraModel:
 
     Raises:
         InputError: the file is not there or is not YAML.
-        ConfigError: a key is unknown, missing, or its value is out of range.
+        ConfigError: a key is unknown, missing, or its value is out of range; or a port is named
+            without its measures.
     """
     data = read_mapping(path, "calibration", "compare it with docs/formats.md")
     try:
         file = CameraFile.model_validate(data)
     except ValidationError as error:
-        # A misspelt key is also a missing one; the one that was written says more.
-        found = sorted(error.errors(), key=lambda each: each["type"] != "extra_forbidden")
-        first = found[0]
-        key = path_of_key(first["loc"])
-        named = f"key '{key}': " if key else ""
-        raise ConfigError(
-            f"{path}: {named}{words_of(first['msg'])}; known keys are "
-            f"{', '.join(CameraFile.model_fields)}"
-        ) from error
-    return CameraModel(
-        file.width,
-        file.height,
-        file.fx,
-        file.fy,
-        file.cx,
-        file.cy,
-        distortion_model=file.kind,
-        distortion=tuple(file.distortion),
-        port=Port(kind=file.port),
-    )
+        raise ConfigError(f"{path}: {_what_is_wrong(error)}") from error
+    return file.camera()
+
+
+def camera_of_values(values: dict[str, Any]) -> CameraModel:
+    """The camera whose ``asdict`` gave ``values``, read back from JSON with every bit.
+
+    A port in the form that AquaFlow 0.1 wrote, by name and without its measures, is left out.
+
+    Raises:
+        KeyError, TypeError, ValueError: the values are no camera.
+    """
+    plain = {name: value for name, value in values.items() if name != "calibrated"}
+    if has_unmeasured_port(values) or plain["port"] == UNMEASURED | {"kind": "none"}:
+        plain["port"] = None
+    camera = CameraFile.model_validate_json(json.dumps(plain), strict=True).camera()
+    return replace(camera, calibrated=bool(values["calibrated"]))
+
+
+UNMEASURED = {
+    "thickness_m": 0.0,
+    "distance_m": 0.0,
+    "refractive_index_glass": 1.49,
+    "refractive_index_water": 1.34,
+}
+"""What AquaFlow 0.1 wrote of every port besides its name."""
+
+
+def has_unmeasured_port(values: dict[str, Any]) -> bool:
+    """True for a camera that AquaFlow 0.1 wrote with a port's name and no measure of it."""
+    return values["port"] in [UNMEASURED | {"kind": kind} for kind in ("flat", "dome")]
+
+
+def _what_is_wrong(error: ValidationError) -> str:
+    # A misspelt key is also a missing one; the one that was written says more.
+    first = sorted(error.errors(), key=lambda each: each["type"] != "extra_forbidden")[0]
+    place = first["loc"]
+    fields: dict[str, Any] = CameraFile.model_fields
+    if len(place) > 1 and place[0] == "port":  # its second part says which model was tried
+        fields = (FlatPortFile if place[1] == "flat" else DomePortFile).model_fields
+        place = (place[0], *place[2:])
+    key = path_of_key(place)
+    named = f"key '{key}': " if key else ""
+    return f"{named}{words_of(first['msg'])}; known keys are {', '.join(fields)}"

@@ -1,7 +1,8 @@
-"""Distorted pictures made pinhole pictures of a chosen width."""
+"""Distorted and refracted pictures made pinhole pictures of a chosen width."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,19 +10,25 @@ import numpy.typing as npt
 
 from aquaflow.errors import ConfigError
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.distortion import undistort_points
+from aquaflow.geometry.optics import pixels_of_points, points_at_depth, virtual_centre
+
+Array = npt.NDArray[np.float64]
+Map = npt.NDArray[np.float32]
 
 BORDER_SAMPLES = 200
 """Points per picture edge that decide how far to zoom in."""
-
-NEWTON_ITERATIONS = 50
-"""Limit of the search for the point that is distorted to a given one."""
-MAX_UNDISTORTION_ERROR_PX = 0.01
-"""Error up to which that search counts as successful; beyond, the lens model has no inverse
-there."""
+KNOT_PX = 4.0
+"""Between the pixels at which the maps are computed; the spline errs by less than 0.001 px."""
+MIN_KNOTS = 8
+"""Along a side of a small picture; a cubic spline needs four."""
 
 
 class Rectifier:
-    """Resizes and undistorts; the result has square corners of real pixels, no black border."""
+    """Resizes and undistorts, the port's refraction included.
+
+    The result has square corners of real pixels, no black border.
+    """
 
     def __init__(self, camera: CameraModel, width: int) -> None:
         """Prepare for pictures of ``camera``, to be made ``width`` pixels wide.
@@ -34,9 +41,17 @@ class Rectifier:
         self._maps = None
         self.camera = self._source
         """The camera of the rectified pictures."""
-        if camera.is_distorted:
-            self.camera = _pinhole_inside(self._source)
-            self._maps = _maps(self._source, self.camera)
+        self.centre_m = virtual_centre(self._source)
+        """[3] where that camera has its centre, in the frame of the real one; not zero behind a
+        port."""
+        if not camera.is_pinhole:
+            self.camera = _pinhole_inside(self._source, self.centre_m)
+            port, target = camera.port, self.camera
+            self._maps = (
+                _undistortion(self._source, target)
+                if port is None
+                else _refraction(self._source, target, self.centre_m, port.range_m)
+            )
 
     def __call__(
         self,
@@ -72,89 +87,60 @@ class Rectifier:
         return np.asarray(grey) > 0
 
 
-def undistort_points(
-    pixels: npt.NDArray[np.float64],  # [M, 2] px, distorted
+def _pinhole_inside(
     camera: CameraModel,
-) -> npt.NDArray[np.float64]:
-    """Points [M, 2] at z = 1 on the rays of distorted pixels; NaN where there is no such ray.
-
-    OpenCV's own inverse of ``radtan`` stops after five rounds, pixels away at wide corners.
-    """
-    import cv2
-
-    coefficients = np.asarray(camera.distortion, dtype=np.float64)
-    if camera.distortion_model == "fisheye":
-        points = cv2.fisheye.undistortPoints(pixels[:, None], camera.K, coefficients)[:, 0]
-        # OpenCV marks what did not converge with -1e6.
-        lost = np.abs(points).max(1, keepdims=True) > 1e5
-        return np.where(lost, np.nan, points).astype(np.float64)
-    points = camera.unproject(pixels)[:, :2]
-    for _ in range(NEWTON_ITERATIONS):
-        found, J = _distort(points, camera)
-        error = np.nan_to_num(found - pixels, posinf=1e9, neginf=-1e9)
-        step = np.einsum("nij,nj->ni", np.linalg.pinv(J), error)
-        # Half a radian at most: far out the polynomial sends Newton anywhere.
-        points = points - step / np.maximum(1.0, 2.0 * np.linalg.norm(step, axis=1))[:, None]
-    found, _ = _distort(points, camera)
-    close = np.linalg.norm(found - pixels, axis=1) < MAX_UNDISTORTION_ERROR_PX
-    return np.where((close & _unfolded(points, camera))[:, None], points, np.nan)
-
-
-def _distort(
-    points: npt.NDArray[np.float64],  # [M, 2] at z = 1
-    camera: CameraModel,
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Pixels [M, 2] where ``radtan`` sees the points, and their derivative [M, 2, 2]."""
-    import cv2
-
-    rays = np.concatenate([points, np.ones((len(points), 1))], axis=1)
-    zero, coefficients = np.zeros(3), np.asarray(camera.distortion, dtype=np.float64)
-    pixels, J = cv2.projectPoints(rays, zero, zero, camera.K, coefficients)
-    # With the identity as pose, moving the camera by (tx, ty) moves the point by as much.
-    derivative = np.nan_to_num(np.asarray(J[:, 3:5], dtype=np.float64)).reshape(-1, 2, 2)
-    return np.asarray(pixels, dtype=np.float64).reshape(-1, 2), derivative
-
-
-def _unfolded(
-    points: npt.NDArray[np.float64],  # [M, 2] at z = 1
-    camera: CameraModel,
-) -> npt.NDArray[np.bool_]:
-    """[M] True where the way from the centre to the point never turns back in the picture."""
-    unfolded = np.ones(len(points), dtype=bool)
-    for share in np.linspace(0.05, 1.0, 20):
-        unfolded &= np.linalg.det(_distort(share * points, camera)[1]) > 0.0
-    return unfolded
-
-
-def _pinhole_inside(camera: CameraModel) -> CameraModel:
+    centre_m: Array,  # [3] of the pinhole camera
+) -> CameraModel:
     """The widest pinhole camera all of whose pixels lie inside the distorted picture."""
-    W, H = float(camera.width), float(camera.height)
-    along = np.linspace(0.0, 1.0, BORDER_SAMPLES)
-    zero, one = np.zeros_like(along), np.ones_like(along)
-    edges = {
-        "left": np.stack([zero, along * H], -1),
-        "right": np.stack([one * W, along * H], -1),
-        "top": np.stack([along * W, zero], -1),
-        "bottom": np.stack([along * W, one * H], -1),
-    }
-    ray = {name: undistort_points(pixels, camera) for name, pixels in edges.items()}
+    left, right, top, bottom = np.split(_slopes(_outline(camera), camera, centre_m), 4)
     # Each edge of the new picture must not reach past the nearest point of the old one's edge.
     needed = [
-        camera.cx / -ray["left"][:, 0].max(),
-        (W - camera.cx) / ray["right"][:, 0].min(),
-        camera.cy / -ray["top"][:, 1].max(),
-        (H - camera.cy) / ray["bottom"][:, 1].min(),
+        camera.cx / -left[:, 0].max(),
+        (camera.width - camera.cx) / right[:, 0].min(),
+        camera.cy / -top[:, 1].max(),
+        (camera.height - camera.cy) / bottom[:, 1].min(),
     ]
     if not np.isfinite(needed).all() or min(needed) <= 0.0:
-        raise ConfigError(
+        raise ConfigError(_no_pinhole(camera))
+    focal = float(max(needed))
+    return replace(camera, fx=focal, fy=focal, distortion_model="none", distortion=(), port=None)
+
+
+def _outline(camera: CameraModel) -> Array:
+    """[4 N, 2] px along the left, right, upper and lower edge of the picture."""
+    W, H = float(camera.width), float(camera.height)
+    along = np.linspace(0.0, 1.0, BORDER_SAMPLES)
+    x, y = along * W, along * H
+    edges = [(0 * y, y), (0 * y + W, y), (x, 0 * x), (x, 0 * x + H)]
+    return np.concatenate([np.stack(edge, axis=-1) for edge in edges])
+
+
+def _no_pinhole(camera: CameraModel) -> str:
+    if camera.is_distorted and not np.isfinite(undistort_points(_outline(camera), camera)).all():
+        return (
             f"the distortion {camera.distortion} folds a {camera.width} x {camera.height} picture "
             "over itself; check the coefficients and their order in camera.yaml"
         )
-    focal = float(max(needed))
-    return replace(camera, fx=focal, fy=focal, distortion_model="none", distortion=())
+    return (
+        "the camera cannot look through the port that camera.yaml describes with its whole "
+        "picture; check the port's measures, and that fx and fy were measured in air"
+    )
 
 
-def _maps(source: CameraModel, target: CameraModel) -> tuple[npt.NDArray, npt.NDArray]:  # type: ignore[type-arg]
+def _slopes(
+    pixels: Array,  # [M, 2] px, distorted
+    camera: CameraModel,
+    centre_m: Array,  # [3]
+) -> Array:
+    """Points [M, 2] at z = 1 where a pinhole camera at ``centre_m`` sees what ``pixels`` show."""
+    if camera.port is None:
+        return undistort_points(pixels, camera)
+    from_centre = points_at_depth(camera, pixels, camera.port.range_m) - centre_m
+    return np.asarray(from_centre[:, :2] / from_centre[:, 2:])
+
+
+def _undistortion(source: CameraModel, target: CameraModel) -> tuple[Map, Map]:
+    """For ``cv2.remap``: x and y [H, W] in the picture of ``source``, whose first centre is 0."""
     import cv2
 
     # OpenCV counts pixel centres from 0, this package from 0.5.
@@ -169,4 +155,30 @@ def _maps(source: CameraModel, target: CameraModel) -> tuple[npt.NDArray, npt.ND
     first, second = initialise(
         source.K - shift, coefficients, np.eye(3), target.K - shift, size, cv2.CV_32FC1
     )
-    return first, second
+    return np.asarray(first, np.float32), np.asarray(second, np.float32)
+
+
+def _refraction(
+    source: CameraModel,
+    target: CameraModel,
+    centre_m: Array,  # [3] of the target
+    range_m: float,
+) -> tuple[Map, Map]:
+    """The same for a camera behind a port, with its distortion.
+
+    Both maps are smooth: they are computed at every few pixels, with a cubic spline between.
+    """
+    from scipy.interpolate import RectBivariateSpline
+
+    u, v = _knots(target.width), _knots(target.height)
+    pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    points = centre_m + (range_m - centre_m[2]) * target.unproject(pixels)
+    found = pixels_of_points(source, points).reshape(len(v), len(u), 2)
+    rows, columns = np.arange(target.height) + 0.5, np.arange(target.width) + 0.5
+    x, y = (RectBivariateSpline(v, u, found[..., k])(rows, columns) - 0.5 for k in (0, 1))
+    return np.asarray(x, np.float32), np.asarray(y, np.float32)
+
+
+def _knots(side: int) -> Array:
+    """Pixel coordinates from one edge of the picture to the other."""
+    return np.linspace(0.0, float(side), max(MIN_KNOTS, math.ceil(side / KNOT_PX) + 1))

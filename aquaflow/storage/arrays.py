@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.geometry.camera import CameraFile, CameraModel, Port
+from aquaflow.geometry.camera import CameraModel, camera_of_values
 from aquaflow.geometry.similarity import Sim3
 
 Array = npt.NDArray[Any]
@@ -38,12 +38,8 @@ def of_camera(camera: CameraModel) -> dict[str, Any]:
 
 
 def to_camera(values: dict[str, Any]) -> CameraModel:
-    """Raises TypeError, ValueError where the values are no camera."""
-    port = Port(**values["port"])
-    plain = {name: each for name, each in values.items() if name != "calibrated"}
-    CameraFile.model_validate({**plain, "port": port.kind}, strict=True)
-    tuples = {"distortion": tuple(values["distortion"]), "port": port}
-    return CameraModel(**{**values, **tuples})
+    """Raises KeyError, TypeError, ValueError where the values are no camera."""
+    return camera_of_values(values)
 
 
 class Cameras:

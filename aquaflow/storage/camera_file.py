@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.storage.atomic import write_yaml
@@ -14,16 +16,11 @@ def save_camera(camera: CameraModel, path: Path) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    data = {
-        "width": camera.width,
-        "height": camera.height,
-        "model": "pinhole",
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "distortion_model": camera.distortion_model,
-        "distortion": list(camera.distortion),
-        "port": camera.port.kind,
-    }
+    data = asdict(camera) | {"distortion": list(camera.distortion), "model": "pinhole"}
+    del data["calibrated"]
+    data["port"] = "none" if camera.port is None else _plain(asdict(camera.port))
     write_yaml(path, data)
+
+
+def _plain(values: dict[str, Any]) -> dict[str, Any]:
+    return {name: list(v) if isinstance(v, tuple) else v for name, v in values.items()}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +16,13 @@ from aquaflow.errors import ConfigError, InputError
 from aquaflow.geometry.camera import (
     GUESSED_FOCAL_WIDTHS,
     CameraModel,
-    Port,
+    camera_of_values,
     guess_camera,
+    has_unmeasured_port,
     load_camera,
 )
+from aquaflow.geometry.port import DomePort, FlatPort, Port
+from aquaflow.geometry.water_index import FRESH_WATER, SEA_WATER, water_index
 from aquaflow.storage.camera_file import save_camera
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -155,7 +160,15 @@ def test_the_names_of_distortion_models_are_understood(
     assert load_camera(path).distortion_model == read_as
 
 
-def test_a_saved_camera_loads_as_it_was(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "port",
+    [
+        None,
+        FlatPort(0.05, 0.01, 1.5, 1.3391, (0.6 * 0.1, 0.8 * 0.1, float(np.sqrt(0.99))), 2.0),
+        DomePort(0.05, 0.003, (1e-3, -2e-3, 1 / 300), 1.59, 1.3391, 0.7),
+    ],
+)
+def test_a_saved_camera_loads_as_it_was(tmp_path: Path, port: Port | None) -> None:
     camera = CameraModel(
         640,
         480,
@@ -165,7 +178,7 @@ def test_a_saved_camera_loads_as_it_was(tmp_path: Path) -> None:
         242.0,
         distortion_model="fisheye",
         distortion=(0.1, -0.02, 0.0, 0.001),
-        port=Port(kind="flat"),
+        port=port,
     )
     save_camera(camera, tmp_path / "camera.yaml")
     assert load_camera(tmp_path / "camera.yaml") == camera
@@ -236,3 +249,86 @@ def test_a_file_without_keys_is_a_config_error(tmp_path: Path, text: str) -> Non
     path.write_text(text)
     with pytest.raises(ConfigError, match="holds no key: value pairs"):
         load_camera(path)
+
+
+# --- the port -------------------------------------------------------------------------------------
+
+FLAT = {"kind": "flat", "distance_m": 0.05, "thickness_m": 0.01}
+DOME = {"kind": "dome", "radius_m": 0.05, "thickness_m": 0.003}
+
+
+def test_a_flat_port_is_read_with_its_defaults(tmp_path: Path) -> None:
+    assert load_camera(written(tmp_path, port=FLAT)).port == FlatPort(0.05, 0.01, 1.49, SEA_WATER)
+
+
+@pytest.mark.parametrize(
+    ("water", "index"),
+    [
+        ("fresh", FRESH_WATER),
+        (1.337, 1.337),
+        ({"salinity_psu": 7.0, "temperature_c": 15.0}, water_index(7.0, 15.0)),
+        ({"depth_m": 3000.0}, water_index(depth_m=3000.0)),
+    ],
+)
+def test_the_water_is_named_measured_or_given_as_its_index(
+    tmp_path: Path, water: object, index: float
+) -> None:
+    port = load_camera(written(tmp_path, port=DOME | {"water": water, "glass": "glass"})).port
+    assert port == DomePort(0.05, 0.003, glass=1.52, water=index)
+
+
+def test_the_normal_of_a_port_is_made_a_unit_vector(tmp_path: Path) -> None:
+    port = load_camera(written(tmp_path, port=FLAT | {"normal": [0.3, 0.0, 0.4]})).port
+    assert isinstance(port, FlatPort)
+    assert port.normal == pytest.approx((0.6, 0.0, 0.8))
+
+
+@pytest.mark.parametrize("kind", ["flat", "dome"])
+def test_a_port_without_measures_is_refused_in_one_sentence(tmp_path: Path, kind: str) -> None:
+    with pytest.raises(ConfigError, match=f"key 'port': port: {kind} lacks its measures") as caught:
+        load_camera(written(tmp_path, port=kind))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("port", "message"),
+    [
+        (FLAT | {"gap": 0.1}, r"key 'port.gap': .*known keys are .*distance_m"),
+        (DOME | {"distance_m": 0.1}, r"key 'port.distance_m': .*known keys are .*radius_m"),
+        ({"kind": "flat", "distance_m": 0.1}, r"key 'port.thickness_m': field required"),
+        ({"distance_m": 0.1}, r"key 'port': it is none, or has kind"),
+        (FLAT | {"distance_m": 50.0}, r"key 'port.distance_m'"),
+        (FLAT | {"water": "beer"}, r"key 'port.water"),
+        (FLAT | {"glass": 3.0}, r"key 'port.glass"),
+        (FLAT | {"normal": [1.0, 0.0, 0.2]}, r"key 'port': the normal of the port must lie"),
+        (FLAT | {"normal": [0.0, 0.0, 0.0]}, r"key 'port': the normal of the port must lie"),
+        (FLAT | {"range_m": 0.05}, r"key 'port': range_m lies inside the housing"),
+        (DOME | {"range_m": 0.05}, r"key 'port': range_m lies inside the housing"),
+        (DOME | {"centre_m": [0.0, 0.06, 0.0]}, r"key 'port': centre_m is farther away"),
+    ],
+)
+def test_a_wrong_measure_of_a_port_is_named(
+    tmp_path: Path, port: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_camera(written(tmp_path, port=port))
+
+
+def old_form(kind: str) -> dict[str, object]:
+    """What AquaFlow 0.1 wrote into recordings and checkpoints."""
+    measures = {"thickness_m": 0.0, "distance_m": 0.0}
+    indexes = {"refractive_index_glass": 1.49, "refractive_index_water": 1.34}
+    return asdict(CAMERA) | {"port": {"kind": kind} | measures | indexes}
+
+
+def test_a_camera_reads_back_from_json_with_every_bit() -> None:
+    camera = replace(CAMERA, port=DomePort(0.05, 0.003, (1e-3, -2e-3, 1 / 300)), calibrated=False)
+    assert camera_of_values(json.loads(json.dumps(asdict(camera)))) == camera
+
+
+@pytest.mark.parametrize(("kind", "unmeasured"), [("none", False), ("flat", True), ("dome", True)])
+def test_a_port_of_old_recordings_is_left_out_and_known_to_lack_its_measures(
+    kind: str, unmeasured: bool
+) -> None:
+    assert camera_of_values(old_form(kind)) == CAMERA
+    assert has_unmeasured_port(old_form(kind)) is unmeasured

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -9,7 +11,10 @@ import pytest
 
 from aquaflow.errors import ConfigError
 from aquaflow.geometry.camera import CameraModel, DistortionModel
-from aquaflow.geometry.rectification import Rectifier, undistort_points
+from aquaflow.geometry.distortion import undistort_points
+from aquaflow.geometry.optics import pixels_of_points
+from aquaflow.geometry.port import DomePort, FlatPort
+from aquaflow.geometry.rectification import Rectifier
 
 Array = npt.NDArray[np.float64]
 
@@ -215,3 +220,50 @@ def test_a_distortion_that_folds_the_picture_is_refused(
     )
     with pytest.raises(ConfigError, match="folds a 320 x 240 picture over itself"):
         Rectifier(camera, 320)
+
+
+# --- behind a port --------------------------------------------------------------------------------
+
+BEHIND_GLASS = replace(RADTAN, port=FlatPort(0.05, 0.01, range_m=1.0))
+IN_A_DOME = replace(FISHEYE, port=DomePort(0.05, 0.003, (0.003, -0.002, -0.008), range_m=1.0))
+PORTS = pytest.mark.parametrize("camera", [BEHIND_GLASS, IN_A_DOME], ids=["flat", "dome"])
+
+
+@PORTS
+def test_points_at_the_reference_range_land_where_the_virtual_camera_sees_them(
+    camera: CameraModel,
+) -> None:
+    rectifier = Rectifier(camera, camera.width)
+    pinhole = rectifier.camera
+    assert pinhole.is_pinhole
+    wanted = np.array([[60.0, 50.0], [250.0, 60.0], [160.0, 120.0], [70.0, 190.0], [260.0, 180.0]])
+    depth = 1.0 - rectifier.centre_m[2]
+    image = spots(
+        pixels_of_points(camera, rectifier.centre_m + depth * pinhole.unproject(wanted)), camera
+    )
+
+    rectified = rectifier(image)
+
+    for pixel in wanted:
+        np.testing.assert_allclose(spot_at(rectified, pixel, pinhole), pixel, atol=0.15)
+
+
+@PORTS
+@pytest.mark.parametrize("width", [320, 200])
+def test_a_picture_behind_a_port_has_no_black_border(camera: CameraModel, width: int) -> None:
+    rectifier = Rectifier(camera, width)
+    assert rectifier.mask(np.ones((camera.height, camera.width), bool)).all()
+
+
+def test_water_lengthens_the_focal_length_by_its_index() -> None:
+    port = FlatPort(0.0, 0.0, water=1.34, range_m=1.0)
+    narrow = CameraModel(320, 240, 3000.0, 3000.0, 160.0, 120.0, port=port)
+    assert Rectifier(narrow, 320).camera.fx == pytest.approx(1.34 * 3000.0, rel=2e-3)
+
+
+def test_a_camera_that_cannot_see_through_its_port_is_refused() -> None:
+    # The pane is turned by 40 degrees, and the fisheye sees 70 degrees to its left.
+    turned = (float(np.sin(np.radians(40.0))), 0.0, float(np.cos(np.radians(40.0))))
+    port = FlatPort(0.05, 0.01, normal=turned)
+    with pytest.raises(ConfigError, match="cannot look through the port"):
+        Rectifier(replace(FISHEYE, fx=130.0, fy=130.0, port=port), 320)

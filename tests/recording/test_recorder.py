@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import errno
+import json
 import threading
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,8 @@ import pytest
 from aquaflow.config.recording import RecordingConfig
 from aquaflow.config.telemetry import MountingConfig
 from aquaflow.errors import InputError
-from aquaflow.geometry.camera import CameraModel, Port
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.port import FlatPort
 from aquaflow.messages import (
     Acceleration,
     Altitude,
@@ -44,7 +46,7 @@ from tests.small_recording import GIVE_UP_S
 
 SECOND = 1_000_000_000
 CAMERA = CameraModel(
-    64, 48, 50.1, 50.2, 31.7, 24.3, "radtan", (0.1, -0.02, 1e-3, 1 / 3), Port("dome", 0.004)
+    64, 48, 50.1, 50.2, 31.7, 24.3, "radtan", (0.1, -0.02, 1e-3, 1 / 3), FlatPort(0.05, 1 / 300)
 )
 LOSSLESS = RecordingConfig(picture="png", reserve_mb=0)
 BIG_MB = 10**9
@@ -83,6 +85,21 @@ def recorded(out: Path, frames: list[Frame | Dropped], settings: RecordingConfig
         recorder.frame("c", frame)
     assert recorder.close().stopped is None
     return McapCamera(out)
+
+
+def test_a_port_that_an_old_recording_only_names_is_left_out_with_a_note(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unmeasured = {"thickness_m": 0.0, "distance_m": 0.0, "refractive_index_glass": 1.49}
+    port = {"kind": "dome", **unmeasured, "refractive_index_water": 1.34}
+    monkeypatch.setattr(
+        "aquaflow.recording.writing.camera_to_json",
+        lambda camera: json.dumps(asdict(camera) | {"port": port}),
+    )
+    camera = recorded(tmp_path, [picture(0)], LOSSLESS)
+    assert camera.camera == replace(CAMERA, port=None)
+    list(camera.frames())
+    assert any("names a dome port without its measures" in note for note in camera.notes)
 
 
 @pytest.mark.parametrize("kind", ["png", "raw"])
