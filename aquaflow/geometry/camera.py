@@ -65,8 +65,15 @@ class CameraModel:
 
     @property
     def is_distorted(self) -> bool:
-        """True if any coefficient of the distortion is not zero."""
-        return self.distortion_model != "none" and any(k != 0.0 for k in self.distortion)
+        """True for every fisheye, and where a coefficient of ``radtan`` is not zero."""
+        if self.distortion_model == "fisheye":
+            return True  # without coefficients it is equidistant, no pinhole
+        return self.distortion_model == "radtan" and any(k != 0.0 for k in self.distortion)
+
+    @property
+    def coefficients(self) -> npt.NDArray[np.float64]:
+        """[N] of the distortion as OpenCV takes them."""
+        return np.array(self.distortion or (0.0, 0.0, 0.0, 0.0))
 
     @property
     def is_pinhole(self) -> bool:

@@ -25,7 +25,7 @@ def distort_points(
         return camera.project(np.concatenate([points, np.ones((len(points), 1))], axis=1))
     if camera.distortion_model == "radtan":
         return _distort(points, camera)[0]
-    coefficients = np.asarray(camera.distortion, dtype=np.float64)
+    coefficients = camera.coefficients
     pixels = cv2.fisheye.distortPoints(points[:, None], camera.K, coefficients)
     return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
@@ -42,7 +42,7 @@ def undistort_points(
 
     if not camera.is_distorted:
         return camera.unproject(pixels)[:, :2]
-    coefficients = np.asarray(camera.distortion, dtype=np.float64)
+    coefficients = camera.coefficients
     if camera.distortion_model == "fisheye":
         points = cv2.fisheye.undistortPoints(pixels[:, None], camera.K, coefficients)[:, 0]
         # OpenCV marks what did not converge with -1e6.
@@ -68,7 +68,7 @@ def _distort(
     import cv2
 
     rays = np.concatenate([points, np.ones((len(points), 1))], axis=1)
-    zero, coefficients = np.zeros(3), np.asarray(camera.distortion, dtype=np.float64)
+    zero, coefficients = np.zeros(3), camera.coefficients
     pixels, J = cv2.projectPoints(rays, zero, zero, camera.K, coefficients)
     # With the identity as pose, moving the camera by (tx, ty) moves the point by as much.
     derivative = np.nan_to_num(np.asarray(J[:, 3:5], dtype=np.float64)).reshape(-1, 2, 2)

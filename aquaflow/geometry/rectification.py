@@ -145,7 +145,7 @@ def _undistortion(source: CameraModel, target: CameraModel) -> tuple[Map, Map]:
 
     # OpenCV counts pixel centres from 0, this package from 0.5.
     shift = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
-    coefficients = np.asarray(source.distortion, dtype=np.float64)
+    coefficients = source.coefficients
     initialise = (
         cv2.fisheye.initUndistortRectifyMap
         if source.distortion_model == "fisheye"

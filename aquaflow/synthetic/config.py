@@ -6,6 +6,7 @@ from typing import Any, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from aquaflow.geometry.port_file import PortFile
 from aquaflow.synthetic.telemetry_noise import TelemetryNoise
 
 __all__ = ["Display", "SceneKind", "SyntheticConfig", "TelemetryNoise", "WaterType"]
@@ -49,6 +50,15 @@ class SyntheticConfig(BaseModel):
         gt=0.3,
         le=3.0,
         description="focal length / width; geometric mean of the shared clips (geometry.camera)",
+    )
+    lens: Literal["pinhole", "fisheye"] = Field(
+        "pinhole",
+        description="fisheye: r = f theta; 0.44 focal_widths see 130 degrees",
+    )
+    port: PortFile | None = Field(
+        None,
+        description="measures of a flat port or a dome as in camera.yaml; focal_widths are then of "
+        "air: 0.77 see 48 degrees of water through a flat port",
     )
     scene: SceneKind = Field("reef", description="what the sea floor is made of")
     water: WaterType = Field(

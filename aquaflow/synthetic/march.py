@@ -78,7 +78,7 @@ class HeightField:
 
     def bundle_start(
         self,
-        origin: torch.Tensor,  # [3]
+        origin: torch.Tensor,  # [3], or [3, N] of each ray
         rays: torch.Tensor,  # [3, N] unit vectors
         spread: float,  # radius of the bundle over its range
         max_range: float,
@@ -98,7 +98,7 @@ class HeightField:
 
     def _above(
         self,
-        origin: torch.Tensor,  # [3] m
+        origin: torch.Tensor,  # [3] m, or [3, N] of each ray
         rays: torch.Tensor,  # [3, N] unit vectors
         spread: float,
     ) -> torch.Tensor:
@@ -109,7 +109,7 @@ class HeightField:
 
     def hit(
         self,
-        origin: torch.Tensor,  # [3]
+        origin: torch.Tensor,  # [3], or [3, N] of each ray
         rays: torch.Tensor,  # [3, N] unit vectors
         start: torch.Tensor,  # [N] m, from bundle_start
         pixel: float,  # angle between neighbouring rays
@@ -119,11 +119,11 @@ class HeightField:
         t, last = start.clone(), torch.zeros_like(start)
         live = torch.arange(t.shape[0])
         radii = torch.tensor(BALLS_M[:FEW])[:, None]
-        now, stride = t, last
+        now, stride, at = t, last, origin
         ray = torch.cat([rays, torch.hypot(rays[0], rays[1])[None]])
         # Every step is a step forward, so this ends; a limit would leave rays in open water.
         for step in itertools.count():
-            x, y, z = (origin[k] + now * ray[k] for k in range(3))
+            x, y, z = (at[k] + now * ray[k] for k in range(3))
             gap = z - self.height(x, y)
             over = z - self._sample(self._few_crests, x, y)
             # Down to the highest point within the radius, or out to the radius.
@@ -140,12 +140,13 @@ class HeightField:
                 if keep.numel() == 0:
                     break
                 live, now, stride, ray = live[keep], now[keep], stride[keep], ray[:, keep]
+                at = at if at.dim() == 1 else at[:, keep]
         t = self._refined(origin, rays, t - last, t)
         return torch.where(t < max_range, t, torch.inf)
 
     def _refined(
         self,
-        origin: torch.Tensor,  # [3] m
+        origin: torch.Tensor,  # [3] m, or [3, N] of each ray
         rays: torch.Tensor,  # [3, N] unit vectors
         above: torch.Tensor,  # [N] m
         below: torch.Tensor,  # [N] m
@@ -165,7 +166,7 @@ class HeightField:
 
     def _gap(
         self,
-        origin: torch.Tensor,  # [3] m
+        origin: torch.Tensor,  # [3] m, or [3, N] of each ray
         rays: torch.Tensor,  # [3, N] unit vectors
         t: torch.Tensor,  # [N] m
     ) -> torch.Tensor:

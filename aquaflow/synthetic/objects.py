@@ -64,26 +64,35 @@ class Shape:
 
 def _local(
     shape: Shape,
-    origin: torch.Tensor,  # [3] m
+    origin: torch.Tensor,  # [3] m, or [3, N] of each ray
     rays: torch.Tensor,  # [3, N] unit vectors
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Origin [3] and rays [3, N] in the shape's axes."""
+    """Origins, of the shape that they had, and rays [3, N] in the shape's axes."""
     R = torch.tensor(shape.R.T, dtype=torch.float32)
-    o = (R * (origin - torch.tensor(shape.centre, dtype=torch.float32))).sum(1)
-    # Written out: a matrix product may round differently with the number of threads.
-    d = torch.stack([R[k, 0] * rays[0] + R[k, 1] * rays[1] + R[k, 2] * rays[2] for k in range(3)])
-    return o, d
+    centre = torch.tensor(shape.centre, dtype=torch.float32)
+    if origin.dim() == 1:
+        return (R * (origin - centre)).sum(1), _turned(R, rays)
+    return _turned(R, origin - centre[:, None]), _turned(R, rays)
+
+
+def _turned(
+    R: torch.Tensor,  # [3, 3]
+    vectors: torch.Tensor,  # [3, N]
+) -> torch.Tensor:
+    """[3, N]; written out, as a matrix product may round differently with the number of threads."""
+    x, y, z = vectors
+    return torch.stack([R[k, 0] * x + R[k, 1] * y + R[k, 2] * z for k in range(3)])
 
 
 def hit(
     shape: Shape,
-    origin: torch.Tensor,  # [3] m
+    origin: torch.Tensor,  # [3] m, or [3, N] of each ray
     rays: torch.Tensor,  # [3, N] unit vectors
 ) -> torch.Tensor:
     """Range [N] (m) at which ``rays`` [3, N] enter the shape; infinite where they miss."""
     o, d = _local(shape, origin, rays)
     if shape.kind == "sphere":
-        return _quadratic(torch.ones_like(d[0]), _dot(o, d), (o * o).sum() - shape.size[0] ** 2)
+        return _quadratic(torch.ones_like(d[0]), _dot(o, d), (o * o).sum(0) - shape.size[0] ** 2)
     if shape.kind == "box":
         near, far = _slabs(o, d, shape.size, (0, 1, 2))
         return torch.where((near < far) & (near > 0.0), near, torch.inf)
@@ -133,14 +142,14 @@ def _slabs(
 def radiance(
     shape: Shape,
     texture: MipAtlas,
-    origin: torch.Tensor,  # [3]
+    origin: torch.Tensor,  # [3] m, or [3, N] of each ray
     rays: torch.Tensor,  # [3, N]
     t: torch.Tensor,  # [N] m, where they hit
     pixel: float,
 ) -> torch.Tensor:
     """Clean radiance [3, N] where ``rays`` meet ``shape``."""
     o, d = _local(shape, origin, rays)
-    p = o[:, None] + t * d
+    p = o.reshape(3, -1) + t * d
     normal, u, v = _surface(shape, p)
     facing = -(normal * d).sum(0).clamp(-1.0, -0.05)
     footprint = t * pixel * facing.rsqrt() / TEXEL_M

@@ -13,6 +13,7 @@ import numpy.typing as npt
 import torch
 
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.optics import rays_of_pixels
 from aquaflow.synthetic import objects
 from aquaflow.synthetic.march import HeightField
 from aquaflow.synthetic.radiance import TEXELS_PER_CELL
@@ -48,7 +49,8 @@ class RenderedView:
     """What one pose sees."""
 
     range_m: npt.NDArray[np.float32]
-    """[H, W] m along the ray of the pixel's centre; inf where nothing is hit."""
+    """[H, W] m along the ray of the pixel's centre, behind a port from where the water begins; inf
+    where nothing is hit."""
     clean: npt.NDArray[np.float32]
     """[H, W, 3] radiance J, mean over the pixel; 0 where nothing is hit."""
     water: npt.NDArray[np.float32]
@@ -80,7 +82,7 @@ def render(
         view.clean[part] = _pixel_mean(J, supersampling)
         view.water[part] = _pixel_mean(medium.compose(J, t), supersampling)
         if supersampling > 1:
-            t = _ranges(scene, camera, rotation, origin, part, 1)[1].reshape(-1, width).numpy()
+            t = _ranges(scene, camera, rotation, origin, part, 1)[2].reshape(-1, width).numpy()
         view.range_m[part] = t
 
     # Each worker computes alone: parts need not wait for each other inside every operation, and
@@ -109,62 +111,71 @@ def _pixel_mean(
 def _rays(
     camera: CameraModel,
     rotation: Array,  # [3, 3] camera to the area's axes, z up
+    centre: torch.Tensor,  # [3] m
     rows: Array,  # [R] px
     columns: Array,  # [C] px
-) -> torch.Tensor:
-    """Unit vectors [3, R * C] (z up) through pixel coordinates rows x columns."""
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Origins [3] or [3, R * C] (m) and unit vectors [3, R * C] (z up) of pixels rows x columns."""
+    if not camera.is_pinhole:
+        pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+        origins, bent = (rotation @ each.T for each in rays_of_pixels(camera, pixels))
+        start = centre[:, None].double() + torch.from_numpy(origins)
+        return start.float(), torch.from_numpy(bent).float()
     x = torch.tensor((columns - camera.cx) / camera.fx, dtype=torch.float32)[None, :]
     y = torch.tensor((rows - camera.cy) / camera.fy, dtype=torch.float32)[:, None]
     inverse = torch.rsqrt(x * x + y * y + 1.0)
     r = rotation.tolist()
     parts = [(r[k][0] * x + r[k][1] * y + r[k][2]) * inverse for k in range(3)]
-    return torch.stack([part.reshape(-1) for part in parts])
+    return centre, torch.stack([part.reshape(-1) for part in parts])
 
 
 def _ranges(
     scene: SyntheticScene,
     camera: CameraModel,
     rotation: Array,  # [3, 3]
-    origin: torch.Tensor,  # [3] m
+    centre: torch.Tensor,  # [3] m
     part: slice,
     k: int,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Rays [3, N], their ranges [N] and what they hit [N] (-1 floor), k x k rays a pixel."""
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Origins [3] or [3, N], rays [3, N], their ranges [N] and what they hit [N] (-1 floor).
+
+    There are k x k rays a pixel.
+    """
     rows = part.start + (np.arange((part.stop - part.start) * k) + 0.5) / k
     columns = (np.arange(camera.width * k) + 0.5) / k
-    rays = _rays(camera, rotation, rows, columns)
+    origin, rays = _rays(camera, rotation, centre, rows, columns)
     pixel = 1.0 / (camera.fx * k)
     tall, wide = math.ceil(len(rows) / BUNDLE), math.ceil(len(columns) / BUNDLE)
     middle_rows = part.start + (np.arange(tall) + 0.5) * BUNDLE / k
     middle_columns = (np.arange(wide) + 0.5) * BUNDLE / k
-    bundles = _rays(camera, rotation, middle_rows, middle_columns)
+    of_bundle, bundles = _rays(camera, rotation, centre, middle_rows, middle_columns)
     spread = pixel * BUNDLE / math.sqrt(2.0)
-    start = scene.field.bundle_start(origin, bundles, spread, scene.max_range_m)
+    start = scene.field.bundle_start(of_bundle, bundles, spread, scene.max_range_m)
     start = start.reshape(tall, wide).repeat_interleave(BUNDLE, 0).repeat_interleave(BUNDLE, 1)
     start = start[: len(rows), : len(columns)].reshape(-1)
     t = scene.field.hit(origin, rays, start, pixel, scene.max_range_m)
     what = torch.full(t.shape, -1)
     axes, angle = bundles, spread
     for index, shape in enumerate(scene.shapes):
-        if not _may_meet(shape, origin, axes, angle):
+        if not _may_meet(shape, of_bundle, axes, angle):
             continue
         met = objects.hit(shape, origin, rays)
         nearer = (met < t) & (met < scene.max_range_m)
         t = torch.where(nearer, met, t)
         what = torch.where(nearer, index, what)
-    return rays, t, what
+    return origin, rays, t, what
 
 
 def _may_meet(
     shape: objects.Shape,
-    origin: torch.Tensor,  # [3] m
+    origin: torch.Tensor,  # [3] m, or [3, N] of each ray
     axes: torch.Tensor,  # [3, N] unit vectors
     spread: float,
 ) -> bool:
     """False if no ray within ``spread`` of ``axes`` [3, N] passes the shape's ball."""
-    to = torch.tensor(shape.centre, dtype=torch.float32) - origin
+    to = torch.tensor(shape.centre, dtype=torch.float32)[:, None] - origin.reshape(3, -1)
     along = to[0] * axes[0] + to[1] * axes[1] + to[2] * axes[2]
-    aside = ((to * to).sum() - along * along).clamp_min(0.0).sqrt()
+    aside = ((to * to).sum(0) - along * along).clamp_min(0.0).sqrt()
     return bool(((aside < shape.reach + 2.0 * spread * along.abs()) & (along > -shape.reach)).any())
 
 
@@ -172,12 +183,12 @@ def _trace(
     scene: SyntheticScene,
     camera: CameraModel,
     rotation: Array,  # [3, 3]
-    origin: torch.Tensor,  # [3] m
+    centre: torch.Tensor,  # [3] m
     part: slice,
     k: int,
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
     """Ranges [k R, k W] and clean radiances [k R, k W, 3] of all rays of some rows."""
-    rays, t, what = _ranges(scene, camera, rotation, origin, part, k)
+    origin, rays, t, what = _ranges(scene, camera, rotation, centre, part, k)
     pixel = 1.0 / (camera.fx * k)
     shape = ((part.stop - part.start) * k, camera.width * k)
     near = torch.where(t.isfinite(), t, 0.0)
@@ -187,17 +198,30 @@ def _trace(
     J = scene.floor.sample((x - scene.area.x0) / texel, (y - scene.area.y0) / texel, footprint)
     J, steep = J[:3], J[3]
     which = ((steep > 0.05) & (what < 0)).nonzero()[:, 0]
-    z = origin[2] + near[which] * rays[2, which]
+    z = _picked(origin, which)[2] + near[which] * rays[2, which]
     J[:, which] *= 1.0 + steep[which] * _grain(scene, x[which], y[which], z, near[which] * pixel)
     for index in np.unique(what.numpy()).tolist():
         if index < 0:
             continue
         which = (what == index).nonzero()[:, 0]
         J[:, which] = objects.radiance(
-            scene.shapes[index], scene.object_texture, origin, rays[:, which], t[which], pixel
+            scene.shapes[index],
+            scene.object_texture,
+            _picked(origin, which),
+            rays[:, which],
+            t[which],
+            pixel,
         )
     J = torch.where(t.isfinite(), J.clamp_max(0.98), 0.0)
     return t.reshape(shape).numpy(), J.reshape(3, *shape).permute(1, 2, 0).numpy()
+
+
+def _picked(
+    origin: torch.Tensor,  # [3] m, or [3, N] of each ray
+    which: torch.Tensor,  # [M] rays
+) -> torch.Tensor:
+    """[3] or [3, M]"""
+    return origin if origin.dim() == 1 else origin[:, which]
 
 
 def _grain(

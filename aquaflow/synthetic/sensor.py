@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.optics import pixels_of_points
 from aquaflow.synthetic.config import SyntheticConfig
 from aquaflow.synthetic.water import Medium
 
@@ -57,7 +58,8 @@ class Snow:
         local = (self._position + CURRENT_M_S * t_s - centre) @ R_sc
         distance = np.linalg.norm(local, axis=1)
         seen = (local[:, 2] > 0.0) & (distance > SNOW_RANGE_M[0]) & (distance < SNOW_RANGE_M[1])
-        pixels = camera.project(local)
+        pixels = np.full((len(local), 2), np.nan)
+        pixels[seen] = pixels_of_points(camera, local[seen])
         size = np.array([camera.width, camera.height])
         seen &= ((pixels > -4.0) & (pixels < size + 4.0)).all(axis=1)
         for k in np.flatnonzero(seen).tolist():

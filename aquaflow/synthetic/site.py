@@ -10,6 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.optics import rays_of_pixels
+from aquaflow.geometry.port_file import port_of
 from aquaflow.synthetic import objects, pool
 from aquaflow.synthetic import path as paths
 from aquaflow.synthetic.config import SyntheticConfig
@@ -48,10 +50,18 @@ class Site:
 
 
 def camera_of(config: SyntheticConfig) -> CameraModel:
-    """The calibrated pinhole camera of a dive."""
-    focal = config.focal_px
+    """The calibrated camera of a dive."""
+    focal, wide = config.focal_px, config.lens == "fisheye"
     return CameraModel(
-        config.width, config.height, focal, focal, config.width / 2.0, config.height / 2.0
+        config.width,
+        config.height,
+        focal,
+        focal,
+        config.width / 2.0,
+        config.height / 2.0,
+        distortion_model="fisheye" if wide else "none",
+        distortion=(0.0, 0.0, 0.0, 0.0) if wide else (),
+        port=port_of(config.port),
     )
 
 
@@ -87,8 +97,7 @@ def _seen(config: SyntheticConfig, flat: paths.Path) -> tuple[Array, Array]:
     t = np.linspace(0.0, config.duration_s, looks)
     camera = camera_of(config)
     corners = np.array([[x, y] for x in (0, camera.width) for y in (0, camera.height)], float)
-    rays = camera.unproject(corners)
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = rays_of_pixels(camera, corners)[1]
     directions = np.einsum("nij,kj->nki", flat.R_ws.T @ flat.R_wc(t), rays)
     centre = flat.centre_s(t)[:, None, :]
     # Relief makes rays travel further than over a flat floor; a metre more than the camera's

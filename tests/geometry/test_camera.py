@@ -109,9 +109,11 @@ def test_a_guessed_camera_says_that_it_is_a_guess() -> None:
         ("radtan", (0.0, 0.0), False),
         ("radtan", (0.0, 0.1), True),
         ("fisheye", (0.1, 0.0, 0.0, 0.0), True),
+        ("fisheye", (0.0, 0.0, 0.0, 0.0), True),
+        ("fisheye", (), True),
     ],
 )
-def test_only_coefficients_that_are_not_zero_distort(
+def test_a_fisheye_and_coefficients_that_are_not_zero_distort(
     model: str, coefficients: tuple[float, ...], distorted: bool
 ) -> None:
     camera = CameraModel(

@@ -8,11 +8,14 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
+import torch
 from pydantic import ValidationError
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from aquaflow.errors import InputError
+from aquaflow.geometry.optics import rays_of_pixels
+from aquaflow.geometry.port import FlatPort
 from aquaflow.synthetic import (
     SyntheticConfig,
     Truth,
@@ -210,3 +213,45 @@ def test_damaged_dives_are_refused_in_one_sentence(tmp_path: Path) -> None:
     bad.write_text("t_s,arrival_s,kind,source,v0,v1,v2,v3\n0,0,depth,x,deep,,,\n")
     with pytest.raises(InputError, match="no telemetry sample"):
         list(read_telemetry(bad))
+
+
+FLAT_PORT = {"kind": "flat", "distance_m": 0.05, "thickness_m": 0.01}
+DOME = {"kind": "dome", "radius_m": 0.05, "thickness_m": 0.004, "centre_m": [0.003, -0.002, -0.01]}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"port": FLAT_PORT, "focal_widths": 0.77},
+        {"port": DOME},
+        {"lens": "fisheye", "focal_widths": 0.44},
+    ],
+    ids=["flat port", "dome", "fisheye"],
+)
+def test_every_pixel_shows_the_range_of_what_its_ray_meets(changes: dict[str, object]) -> None:
+    from aquaflow.synthetic.dive import build, camera_of
+    from aquaflow.synthetic.render import render
+    from aquaflow.synthetic.water import WATER_TYPES
+
+    # A sandy floor is flat but for ripples of some centimetres: the range follows from the ray.
+    asked = {"scene": "flat_sand", "frames": 2, "width": 64, "height": 48, "camera_pitch_deg": 90}
+    config = SyntheticConfig.model_validate(asked | changes)
+    scene, path = build(config)
+    camera, t = camera_of(config), np.array([0.0])
+    R, centre = (path.R_ws.T @ path.R_wc(t))[0], path.centre_s(t)[0]
+    view = render(scene, camera, R, centre, WATER_TYPES["clear"], 1)
+
+    origins, rays = rays_of_pixels(camera, camera.pixel_centres().reshape(-1, 2))
+    starts, down = centre + origins @ R.T, (rays @ R.T)[:, 2]
+    points = starts + view.range_m.reshape(-1, 1) * (rays @ R.T)
+    floor = -scene.field.height(*(torch.tensor(points[:, k], dtype=torch.float32) for k in (0, 1)))
+    on_floor = np.abs(points[:, 2] - floor.numpy()) < 0.002
+    assert down.min() > 0.0
+    # What is not the floor is one of the few objects that lie on it.
+    assert on_floor.mean() > 0.9
+
+
+def test_the_port_of_a_dive_is_in_its_camera_file(tmp_path: Path) -> None:
+    asked = {"frames": 2, "width": 32, "height": 24, "port": FLAT_PORT, "focal_widths": 0.77}
+    write_dive(tmp_path / "dive", SyntheticConfig.model_validate(asked))
+    assert read_truth(tmp_path / "dive").camera.port == FlatPort(0.05, 0.01)
