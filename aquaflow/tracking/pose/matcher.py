@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -11,11 +11,12 @@ from aquaflow.config import TrackingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe
-from aquaflow.prior.contract import Encoding, Mask, PairGeometry
+from aquaflow.prior.contract import Encoding, Float, Mask, PairGeometry
 from aquaflow.tracking.frames import Quality
 from aquaflow.tracking.pose.pnp import pose_from_scratch
 from aquaflow.tracking.pose.problem import pose_problem
 from aquaflow.tracking.pose.solver import PoseEstimate, PoseProblem, solve_pose
+from aquaflow.tracking.pose.surroundings import surroundings
 from aquaflow.tracking.pose.visibility import Visibility, visibility
 
 
@@ -60,8 +61,8 @@ class KeyframeMatcher:
         """The pose from ``predicted``; from the matches alone, or from ``fallback``, where that
         fails; None where too few matches support one."""
         config = self._config
-        known = keyframe.pointmap.known(config.known_sigma)
-        problem, pixels_k = self._problem(keyframe, pair, camera, known)
+        around, known = surroundings(keyframe.pointmap, config.known_sigma)
+        problem, pixels_k = self._problem(keyframe, pair, camera, around, known)
         if len(problem.points) < config.min_matches:
             return None
         estimate = self._solve(problem, predicted)
@@ -87,6 +88,7 @@ class KeyframeMatcher:
         keyframe: Keyframe,
         pair: PairGeometry,
         camera: CameraModel,
+        around: Float,  # [H, W]
         known: Mask,  # [H, W]
     ) -> tuple[PoseProblem, npt.NDArray[np.float64]]:
         """At most ``matches`` matches whose depth is known, and their keyframe pixels."""
@@ -98,7 +100,8 @@ class KeyframeMatcher:
         weights = pair.C[rows, columns].astype(np.float64)
         sigma_px = self._config.sigma_px
         problem = pose_problem(keyframe.pointmap, pixels_k, pixels, camera, sigma_px, weights)
-        return problem, pixels_k
+        around_rho = around[rows, columns].astype(np.float64)
+        return replace(problem, around_rho=around_rho), pixels_k
 
 
 def matched_share(encoding: Encoding, pair: PairGeometry) -> float:

@@ -49,6 +49,9 @@ class PoseProblem:
     """[M, 3] the same points as the frame alone knows them, its camera frame; NaN where unknown."""
     frame_rho_variance: Array | None = None
     """[M] variance of their inverse depths in the frame."""
+    around_rho: Array | None = None
+    """[M] inverse depth around the points in the keyframe, without their own errors; derivatives
+    are taken there."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +71,10 @@ class Matches:
         if residual == "point" and problem.frame_points is None:
             raise ValueError("the point residual needs the frame's own points")
         own, own_variance = _own(problem)
+        around = problem.around_rho
+        nearer = np.zeros(len(problem.points)) if around is None else around * problem.points[:, 2]
         columns = np.vstack(
-            [problem.points.T, problem.rho_variance, problem.pixels.T, problem.weights]
+            [problem.points.T, problem.rho_variance, problem.pixels.T, problem.weights, nearer]
         )
         usable = np.isfinite(columns).all(0)
         known = np.isfinite(own).all(0) & np.isfinite(own_variance) & (own[2] > 0.0)
@@ -81,6 +86,8 @@ class Matches:
         self.camera, self.sigma_px, self.size = problem.camera, problem.sigma_px, 6 + free_scale
         self.X, self.variance = columns[:3], columns[3]
         self.u, self.v, self.weights = columns[4], columns[5], columns[6]
+        self.nearer = None if around is None else columns[7]
+        """[M] inverse depth around a point over its own."""
         self.own, self.has_own = np.where(known, own, 1.0), bool(known.any())
         self.own_range = np.sqrt((self.own**2).sum(0))
         # Relative variance of the range; of the keyframe's points and of the frame's own.
@@ -166,9 +173,11 @@ def pixel_rows(matches: Matches, T: Sim3) -> Rows:
     """Calibrated: along and across the epipolar line, then the log range where it is known.
 
     An error of the keyframe's inverse depth rho moves the projection along the epipolar line alone.
-    rho is eliminated: the residual is what is left at its best value, and the derivatives are
-    taken there. Taken at the measured rho they would share its noise with the residual, and the
-    translation would shrink by the relative variance of rho at every frame (errors in variables).
+    rho is eliminated: the residual is what is left at its best value. Derivatives taken at the
+    measured rho would share its noise with the residual, and the translation would shrink by the
+    relative variance of rho at every frame (errors in variables). They are taken at the inverse
+    depth around the point, or, where that is not known, at the best value: as good if the variances
+    of rho and match are true, while a ratio of the two that is wrong by half leaves half the bias.
     """
     camera, z, variance = matches.camera, matches.X[2], matches.variance
     moved = T.scale * (T.R @ matches.X)
@@ -199,9 +208,7 @@ def pixel_rows(matches: Matches, T: Sim3) -> Rows:
         rows.residual[2] = (log_ratio - coupling * along) * inverse_range
         change -= left * lever * rows.residual[2] * inverse_range
 
-    # An outlier's residual says nothing about its depth.
-    change = np.clip(z * change, -MAX_DEPTH_CHANGE, MAX_DEPTH_CHANGE)
-    change[(np.abs(rows.residual) >= INLIER).any(0)] = 0.0
+    change = _depth_change(matches, z * change, rows)
     best = moved / (1.0 + change) + T.t[:, None]
     iz = 1.0 / np.maximum(best[2], nearest)
     x, y = best[0] * iz, best[1] * iz
@@ -217,6 +224,20 @@ def pixel_rows(matches: Matches, T: Sim3) -> Rows:
     if behind.any():
         rows.residual[:, behind], rows.J[:, :, behind] = BEHIND, 0.0
     return rows
+
+
+def _depth_change(
+    matches: Matches,
+    to_best: Array,  # [M]
+    rows: Rows,
+) -> Array:
+    """[M] relative change of inverse depth to where the derivatives are taken."""
+    if matches.nearer is not None:
+        return matches.nearer - 1.0
+    to_best = np.clip(to_best, -MAX_DEPTH_CHANGE, MAX_DEPTH_CHANGE)
+    # An outlier's residual says nothing about its depth.
+    to_best[(np.abs(rows.residual) >= INLIER).any(0)] = 0.0
+    return to_best
 
 
 def _epipolar(
