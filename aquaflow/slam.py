@@ -27,6 +27,7 @@ from aquaflow.tracking.gate.gate import FrameGate, GateKind, Verdict
 from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph
 from aquaflow.tracking.loops.relocaliser import Places
 from aquaflow.tracking.metric.metric_frames import MetricFrames
+from aquaflow.tracking.overlay.finder import OverlayFinder
 from aquaflow.tracking.tracker import Tracker
 
 SETTLING_ROUNDS = 2
@@ -70,6 +71,7 @@ class Slam:
         places = Places(self.keyframes, config.tracking)
         self._anchors = Anchors(self.keyframes, self.failures)
         self.gate = FrameGate(config.tracking.gate)
+        self.overlays = OverlayFinder()
         self.metric = MetricFrames(
             self.keyframes, lambda: self.frames, config.fusion, self.failures
         )
@@ -101,6 +103,9 @@ class Slam:
         # Sec. 3.2, Eq. 4: the graph as optimised meanwhile; keyframes move, and the map follows.
         if self._live:
             self._follow_graph(wait=False)
+
+        # Not in the paper: what a recorder burned into the pictures is masked.
+        frame = self._without_overlay(frame)
 
         # Not in the paper: frames that cannot help are skipped before anything costly.
         verdict = self._gate(frame)
@@ -202,6 +207,15 @@ class Slam:
         self.frames, self.used = frames, used
 
     # --- the steps of a frame -----------------------------------------------------------------
+
+    def _without_overlay(self, frame: Frame) -> Frame:
+        """The frame with overlays masked, as far as they are found by now."""
+        if not self.config.tracking.mask_overlays:
+            return frame
+        masked = frame
+        with self.profiler.stage("overlay"), self.failures.contain("overlay", frame.index):
+            masked = self.overlays.masked(frame)
+        return masked
 
     def _gate(self, frame: Frame) -> Verdict:
         """Whether the frame is worth tracking; it is decided here which of those are held out."""

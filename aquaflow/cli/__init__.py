@@ -68,6 +68,9 @@ def map_command(
     stop: Annotated[int | None, typer.Option(help="First frame not used.")] = None,
     width: Annotated[int | None, typer.Option(help="Width in pixels to map at.")] = None,
     crop: Annotated[str | None, typer.Option(help="left | right | x,y,width,height")] = None,
+    mask: Annotated[
+        Path | None, typer.Option(help="Picture of the camera's size: white is used, black not.")
+    ] = None,
     fps: Annotated[float | None, typer.Option(help="Frames/s of a folder.")] = None,
     preset: Annotated[str | None, typer.Option(help="fast | balanced | accurate")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of every random draw.")] = None,
@@ -94,6 +97,7 @@ def map_command(
     """Turn a recording into a dive folder: trajectory, map, water, report."""
     source_settings = {
         "every": every, "start": start, "stop": stop, "width": width, "crop": crop, "fps": fps,
+        "mask": mask,
     }  # fmt: skip
     optimiser = {"refine_steps": refine_steps, "refine_seconds": refine_seconds}
     mapping = {"optimiser": optimiser, "enabled": False if tracking_only else None}
@@ -153,7 +157,7 @@ def synth(
     height: Annotated[int | None, typer.Option(help="Pixels.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of every random draw.")] = 0,
     display: Annotated[
-        str | None, typer.Option(help="Burned into the pictures: clock | clock_and_crosshair")
+        str | None, typer.Option(help="Burned in: clock | clock_and_crosshair | panel")
     ] = None,
     as_json: Json = False,
 ) -> None:

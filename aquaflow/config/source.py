@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from pydantic import Field
 
 from aquaflow.config.stage import Stage
@@ -20,4 +22,9 @@ class SourceConfig(Stage):
         description="px; frames are made this wide (None: 480, or less if smaller)",
     )
     crop: str | None = Field(None, description="left | right | x,y,width,height, before resizing")
+    mask: Path | None = Field(
+        None,
+        description="picture of the camera's or the crop's size: white is used, black is not "
+        "(vehicle frame, display)",
+    )
     fps: float | None = Field(None, gt=0, description="frames/s of a folder without timestamps")

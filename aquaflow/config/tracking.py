@@ -286,6 +286,11 @@ class TrackingConfig(Stage):
     stop_converged: bool = Field(
         True, description="skip: the pose solver stops when it converged; False: at its last step"
     )
+    mask_overlays: bool = Field(
+        True,
+        description="what stays in the picture while the scene moves (clock, crosshair, logo, the "
+        "vehicle's own arm) is masked for tracking and map",
+    )
     lost_after: int = Field(
         3, ge=1, description="consecutive lost frames after which a new sub-map starts"
     )

@@ -226,6 +226,11 @@ class DiveRun:
                 "no calibration was given: the focal length was guessed and refined to "
                 f"{focal:.0f} px ({100.0 * sigma:.0f} % formal uncertainty), distortion ignored"
             )
+        overlay = self.slam.overlays.share
+        if overlay > 0.0:
+            self.notes.append(
+                f"an overlay of {100.0 * overlay:.1f} % of the picture was found and masked"
+            )
         if self.telemetry_log is not None and self.telemetry_log.lost:
             self.notes.append(
                 f"{self.telemetry_log.lost} samples of telemetry are not in {TELEMETRY}: the disk "

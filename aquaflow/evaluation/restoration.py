@@ -148,7 +148,9 @@ def clean_pictures(dive: Path, clean: Path, crop: str | None, indices: list[int]
         InputError: a frame is missing or cannot be read.
         ConfigError: the crop does not fit the pictures.
     """
-    source = load_config(dive / "config.yaml").source.model_copy(update={"crop": crop})
+    source = load_config(dive / "config.yaml").source.model_copy(
+        update={"crop": crop, "mask": None}
+    )
     if (clean / SYNTHETIC_MARK).is_file():
         clean = clean / SYNTHETIC_CLEAN
     prepare = Preparation(source, _calibration(dive))

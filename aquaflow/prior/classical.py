@@ -14,7 +14,7 @@ import numpy.typing as npt
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior import flow as dense
 from aquaflow.prior.candidates import best_flow, from_homography, from_prediction
-from aquaflow.prior.contract import Encoding, Float
+from aquaflow.prior.contract import Encoding, Float, Mask
 from aquaflow.prior.flow_pair import FlowEncoding, FlowPair
 
 
@@ -31,10 +31,11 @@ class ClassicalPrior:
         self,
         image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
         camera: CameraModel,
+        mask: Mask | None = None,  # [H, W] True where the scene is seen
     ) -> FlowEncoding:
         """Grey picture and texture, for dense flow."""
-        grey = dense.normalised_grey(image)
-        return FlowEncoding(camera, grey, dense.texture(grey))
+        grey = dense.normalised_grey(image, mask)
+        return FlowEncoding(camera, grey, dense.texture(grey, mask), mask=mask)
 
     def pack(self, encoding: Encoding) -> dict[str, npt.NDArray[Any]]:
         """Grey and texture; keypoints only if they were detected."""

@@ -118,8 +118,10 @@ class Prior(Protocol):
         self,
         image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
         camera: CameraModel,
+        mask: Mask | None = None,  # [H, W] True where the scene is seen
     ) -> Encoding:
-        """What decoding needs of a picture; once for each picture."""
+        """What decoding needs of a picture; once for each picture. Of what is masked, nothing is
+        matched."""
         ...
 
     def decode(

@@ -13,6 +13,10 @@ from aquaflow.prior.refinement import refine
 
 Float = npt.NDArray[np.float32]
 Grey = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
+
+FILL_PX = 31
+"""Square around a masked pixel whose mean it takes; eight times that where all of it is masked."""
 
 CLAHE_CLIP = 2.0
 """OpenCV's clip limit of the histogram in each tile."""
@@ -67,20 +71,41 @@ class Flow:
 
 def normalised_grey(
     image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
+    mask: Mask | None = None,  # [H, W] True where the scene is seen
 ) -> Grey:
-    """[H, W] grey with local contrast equalised."""
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    """[H, W] grey with local contrast equalised; smooth where it is masked, for an overlay's edges
+    would hold the flow around it."""
+    grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    if mask is not None:
+        grey = _smoothly_filled(grey, mask)
     clahe = cv2.createCLAHE(CLAHE_CLIP, CLAHE_TILES)
     return np.asarray(clahe.apply(grey), dtype=np.uint8)
 
 
+def _smoothly_filled(
+    grey: Grey,  # [H, W]
+    mask: Mask,  # [H, W]
+) -> Grey:
+    """[H, W] with the mean of what is seen around in place of what is masked."""
+    seen = mask.astype(np.float32)
+    filled, known = grey * seen, seen
+    for side in (FILL_PX, 8 * FILL_PX):
+        around = cv2.blur(known, (side, side))
+        mean = cv2.blur(filled, (side, side)) / np.maximum(around, 1e-6)
+        here = (known == 0.0) & (around > 1e-6)
+        filled, known = np.where(here, mean, filled), np.where(here, 1.0, known)
+    return np.asarray(np.rint(filled), dtype=np.uint8)
+
+
 def texture(
     grey: Grey,  # [H, W]
+    mask: Mask | None = None,  # [H, W] True where the scene is seen
 ) -> Float:
-    """[H, W] smoothed squared gradient: what flow can hold on to."""
+    """[H, W] smoothed squared gradient: what flow can hold on to; 0 where it is masked."""
     dx = cv2.Sobel(grey, cv2.CV_32F, 1, 0)
     dy = cv2.Sobel(grey, cv2.CV_32F, 0, 1)
-    return np.asarray(cv2.GaussianBlur(dx * dx + dy * dy, (0, 0), 2.0), dtype=np.float32)
+    smooth = np.asarray(cv2.GaussianBlur(dx * dx + dy * dy, (0, 0), 2.0), dtype=np.float32)
+    return smooth if mask is None else np.where(mask, smooth, np.float32(0.0))
 
 
 def pixel_grid(height: int, width: int) -> Float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -31,6 +31,8 @@ class FlowEncoding:
     camera: CameraModel
     grey: npt.NDArray[np.uint8]
     texture: Float
+    mask: Mask | None = field(default=None, kw_only=True)
+    """[H, W] True where the scene is seen; None: everywhere."""
 
     @cached_property
     def interesting(self) -> Mask:
@@ -38,11 +40,13 @@ class FlowEncoding:
 
     @cached_property
     def keypoints(self) -> Keypoints:
-        return sparse.detect(self.grey)
+        return sparse.detect(self.grey, self.mask)
 
     def pack(self) -> dict[str, npt.NDArray[Any]]:
         """Its arrays, not copied; keypoints only if they were detected."""
         arrays: dict[str, npt.NDArray[Any]] = {"grey": self.grey, "texture": self.texture}
+        if self.mask is not None:
+            arrays["mask"] = self.mask
         keypoints = vars(self).get("keypoints")
         if keypoints is not None:
             arrays |= {"pixels": keypoints.pixels, "descriptors": keypoints.descriptors}
@@ -53,6 +57,7 @@ class FlowEncoding:
         arrays: Mapping[str, npt.NDArray[Any]],  # as from pack
     ) -> None:
         """Take back what was computed when first asked for, and packed."""
+        self.mask = arrays.get("mask")
         if "pixels" in arrays:
             self.keypoints = Keypoints(arrays["pixels"], arrays["descriptors"])
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.prior.contract import Keypoints
+from aquaflow.prior.contract import Keypoints, Mask
 from aquaflow.prior.flow import Float, Grey, pixel_grid
 
 SIFT_FEATURES = 2000
@@ -25,10 +25,13 @@ MIN_DENOMINATOR = 1e-6
 
 def detect(
     grey: Grey,  # [H, W]
+    mask: Mask | None = None,  # [H, W] True where the scene is seen
 ) -> Keypoints:
     """SIFT keypoints; empty where the picture shows nothing."""
     sift = cv2.SIFT.create(SIFT_FEATURES, contrastThreshold=SIFT_CONTRAST)
-    points, descriptors = sift.detectAndCompute(grey, None)
+    points, descriptors = sift.detectAndCompute(
+        grey, None if mask is None else mask.astype(np.uint8)
+    )
     if descriptors is None:
         return Keypoints(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32))
     pixels = np.array([point.pt for point in points], dtype=np.float32) + 0.5

@@ -20,7 +20,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior import flow as dense
 from aquaflow.prior.candidates import best_flow, from_homography, from_prediction
 from aquaflow.prior.coarse import coarse_flow
-from aquaflow.prior.contract import Encoding, Float
+from aquaflow.prior.contract import Encoding, Float, Mask
 from aquaflow.prior.flow_pair import FlowEncoding, FlowPair
 from aquaflow.prior.learned_range import LearnedRange, filled
 
@@ -125,11 +125,12 @@ class HybridPrior:
         self,
         image: Picture,  # [H, W, 3] RGB
         camera: CameraModel,
+        mask: Mask | None = None,  # [H, W] True where the scene is seen
     ) -> HybridEncoding:
         """What dense flow and the network's comparison need of a picture."""
-        grey = dense.normalised_grey(image)
-        fitted = self._describer.fitted(image)
-        return HybridEncoding(camera, grey, dense.texture(grey), fitted, self._describer)
+        grey = dense.normalised_grey(image, mask)
+        fitted, texture = self._describer.fitted(image), dense.texture(grey, mask)
+        return HybridEncoding(camera, grey, texture, fitted, self._describer, mask=mask)
 
     def pack(self, encoding: Encoding) -> dict[str, npt.NDArray[Any]]:
         """Grey, texture and the picture; keypoints and features only if they were computed."""

@@ -11,6 +11,7 @@ from aquaflow.errors import ConfigError, InputError
 from aquaflow.geometry.camera import ASPECT_TOLERANCE, CameraModel, guess_camera
 from aquaflow.geometry.rectification import Rectifier
 from aquaflow.messages import Frame
+from aquaflow.sources.mask_file import Mask, fit_mask, read_mask
 
 DEFAULT_WIDTH_PX = 480
 """Width mapped when none is asked for: two CPU cores track and map a few such frames a second."""
@@ -25,8 +26,11 @@ class Preparation:
     """Prepares every frame of one recording in the same way."""
 
     def __init__(self, config: SourceConfig, calibration: CameraModel | None) -> None:
+        """Raises ConfigError where the mask of ``config`` is none."""
         self._config, self._calibration = config, calibration
         self._rectifier: Rectifier | None = None
+        self._mask = None if config.mask is None else read_mask(config.mask)
+        self._fitted_mask: Mask | None = None
         self._box: Box = (0, 0, 0, 0)
         self._size = (0, 0)
 
@@ -39,7 +43,7 @@ class Preparation:
         """The prepared frame.
 
         Raises:
-            ConfigError: the crop or the calibration does not fit the picture.
+            ConfigError: the crop, the calibration or the mask does not fit the picture.
             InputError: the picture cannot be tracked, or is of another size than the first.
         """
         check_picture(frame)
@@ -47,6 +51,9 @@ class Preparation:
         if self._rectifier is None:
             self._rectifier = self._plan(width, height)
             self._size = (width, height)
+            if self._mask is not None and self._config.mask is not None:
+                fitted = fit_mask(self._mask, self._config.mask, self._size, self._box)
+                self._fitted_mask = self._rectifier.mask(fitted)
         if (width, height) != self._size:
             raise InputError(
                 f"frame {frame.index} is {width} x {height}, the recording is "
@@ -57,6 +64,8 @@ class Preparation:
         mask = frame.mask
         if mask is not None:
             mask = self._rectifier.mask(mask[y : y + h, x : x + w])
+        if self._fitted_mask is not None:
+            mask = self._fitted_mask if mask is None else self._fitted_mask & mask
         # The camera's own bytes are no longer those of this picture.
         camera = self._rectifier.camera
         return replace(frame, image=image, camera=camera, mask=mask, encoded=None)

@@ -12,7 +12,7 @@ from aquaflow.synthetic.telemetry_noise import TelemetryNoise
 __all__ = ["Display", "SceneKind", "SyntheticConfig", "TelemetryNoise", "WaterType"]
 
 SceneKind: TypeAlias = Literal["reef", "flat_sand", "wall", "pipe", "pool", "survey"]
-Display: TypeAlias = Literal["clock", "clock_and_crosshair"]
+Display: TypeAlias = Literal["clock", "clock_and_crosshair", "panel"]
 WaterType: TypeAlias = Literal[
     "clear", "oceanic_IB", "oceanic_II", "coastal_1C", "coastal_3C", "coastal_5C"
 ]

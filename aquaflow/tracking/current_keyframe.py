@@ -35,6 +35,8 @@ class CurrentKeyframe:
     keyframe: Keyframe
     image: npt.NDArray[np.uint8] | None = None
     """Its picture, while it may still be encoded again."""
+    mask: Mask | None = None
+    """[H, W] of ``image``."""
     T_fk: Sim3 = field(default_factory=Sim3.identity)
     motion: Sim3 = field(default_factory=Sim3.identity)
     """From the frame before to the last one."""
@@ -112,7 +114,7 @@ class KeyframeTracker:
     def _reference(self, at: CurrentKeyframe) -> Encoding:
         if self._config.reuse_encodings or at.image is None:
             return at.keyframe.encoding
-        return self._prior.encode(at.image, at.keyframe.pointmap.camera)
+        return self._prior.encode(at.image, at.keyframe.pointmap.camera, at.mask)
 
     def take(self, at: CurrentKeyframe, solved: Matched, camera: CameraModel) -> None:
         """Update the motion prediction and the keyframe's depths from the frame."""
@@ -170,7 +172,7 @@ class KeyframeTracker:
         """The frame as a keyframe; ``motion``: from the frame before it."""
         keyframe = self._keyframes.add(frame.index, frame.t_ns, encoding, T_wc, pointmap, sub_map)
         motion = motion or Sim3.identity()
-        return CurrentKeyframe(keyframe, frame.image, motion=motion, t_ns=frame.t_ns)
+        return CurrentKeyframe(keyframe, frame.image, frame.mask, motion=motion, t_ns=frame.t_ns)
 
     # --- keyframes left behind ----------------------------------------------------------------
 

@@ -90,7 +90,7 @@ class MapStart:
         if solution is None:
             return None
         reference, camera = initialiser.frame, calibrated(solution.camera)
-        encoding = self._prior.encode(reference.image, camera)
+        encoding = self._prior.encode(reference.image, camera, reference.mask)
         pointmap = fused_pointmap(solution, camera, self._config.sigma_px)
         posed = [
             PosedFrame(waiting.frame, T, waiting.pair)

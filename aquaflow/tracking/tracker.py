@@ -130,7 +130,7 @@ class Tracker:
 
     def _encode(self, frame: Frame) -> Encoding | None:
         with self._failures.contain("encoding", frame.index):
-            return self._prior.encode(frame.image, self.camera or frame.camera)
+            return self._prior.encode(frame.image, self.camera or frame.camera, frame.mask)
         return None
 
     # --- initialisation -----------------------------------------------------------------------

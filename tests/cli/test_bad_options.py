@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from tests.command_line import Cli, refused
@@ -20,6 +22,18 @@ def test_a_crop_that_does_not_fit_is_refused(
 ) -> None:
     ran = aquaflow("map", small_recording, f"--crop={crop}", "--out", tmp_path / "out")
     refused(ran, crop)
+
+
+def test_a_mask_that_is_no_picture_or_of_another_size_is_refused(
+    aquaflow: Cli, small_recording: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "mask.png"
+    given = ("map", small_recording, "--mask", file, "--out")
+    refused(aquaflow(*given, tmp_path / "1"), file)
+    file.write_text("white")
+    refused(aquaflow(*given, tmp_path / "2"), file, "no picture")
+    cv2.imwrite(str(file), np.full((60, 80), 255, np.uint8))
+    refused(aquaflow(*given, tmp_path / "3"), "80 x 60", "160 x 120")
 
 
 def test_a_misspelt_key_of_a_calibration_is_named(

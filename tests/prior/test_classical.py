@@ -10,7 +10,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.prior import flow_pair, homography
 from aquaflow.prior.classical import ClassicalPrior
-from aquaflow.prior.flow import CONFIDENCE_SIGMA_PX, sample
+from aquaflow.prior.flow import CONFIDENCE_SIGMA_PX, pixel_grid, sample
 from aquaflow.prior.flow_pair import FlowPair
 from tests.prior.textured_pictures import (
     HEIGHT,
@@ -204,15 +204,39 @@ def test_a_wrong_prediction_without_a_homography_falls_back_to_plain_flow(
     assert pair_of(*moved_pair(shift(3.0, 1.0)), wrong).valid.mean() > 0.8
 
 
+def test_nothing_that_is_masked_is_matched_or_a_keypoint() -> None:
+    a, b = (picture.copy() for picture in moved_pair(shift(6.0, 0.0)))
+    a[:40, :80] = b[:40, :80] = a[-40:, -80:]
+    mask = np.ones((HEIGHT, WIDTH), bool)
+    mask[:40, :80] = False
+    prior = ClassicalPrior()
+    free, masked = (
+        [prior.encode(picture, CAMERA, each) for picture in (a, b)] for each in (None, mask)
+    )
+    assert prior.decode(*free).valid[:30, :70].mean() > 0.5, "the display stands still"
+    pair = prior.decode(*masked)
+    assert not pair.valid[~mask].any()
+    assert not masked[0].interesting[~mask].any()
+    rows, columns = (masked[0].keypoints.pixels[:, ::-1] - 0.5).astype(int).T
+    assert not ((rows < 38) & (columns < 78)).any()
+    beside = pair.valid & mask
+    assert beside.mean() > 0.5
+    moved = pair.matches[beside] - pixel_grid(HEIGHT, WIDTH)[beside]
+    assert np.median(np.abs(moved - (6.0, 0.0))) < 0.2
+    assert prior.unpack(prior.pack(masked[0]), CAMERA).mask is mask
+
+
 def test_keypoints_are_found_once_per_picture_and_only_when_needed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     calls = []
     detect = homography.detect
 
-    def counted(grey: npt.NDArray[np.uint8]) -> homography.Keypoints:
+    def counted(
+        grey: npt.NDArray[np.uint8], mask: npt.NDArray[np.bool_] | None = None
+    ) -> homography.Keypoints:
         calls.append(grey)
-        return detect(grey)
+        return detect(grey, mask)
 
     monkeypatch.setattr(homography, "detect", counted)
     prior = ClassicalPrior()

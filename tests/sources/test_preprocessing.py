@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 
@@ -100,6 +103,73 @@ def test_a_calibration_of_another_shape_is_refused_in_one_sentence() -> None:
         "the calibration is for 400 x 400 pictures, these are 320 x 240; "
         "calibrate at this shape or choose the --crop that it was made for"
     )
+
+
+# --- masks ----------------------------------------------------------------------------------------
+
+
+def mask_file(folder: Path, width: int, height: int) -> Path:
+    """White but for its left quarter."""
+    path = folder / "mask.png"
+    picture = np.full((height, width), 255, np.uint8)
+    picture[:, : width // 4] = 0
+    cv2.imwrite(str(path), picture)
+    return path
+
+
+def test_a_mask_of_the_picture_s_size_is_prepared_with_the_picture(tmp_path: Path) -> None:
+    result = prepared(frame(), mask=mask_file(tmp_path, 640, 240), width=320)
+    assert result.mask is not None
+    assert result.mask.shape == (120, 320)
+    assert not result.mask[:, :78].any()
+    assert result.mask[:, 82:].all()
+
+
+@pytest.mark.parametrize(("width", "left"), [(640, 160), (320, 80)])
+def test_a_mask_is_of_the_whole_picture_or_of_the_crop(
+    width: int, left: int, tmp_path: Path
+) -> None:
+    result = prepared(frame(), mask=mask_file(tmp_path, width, 240), crop="left")
+    assert result.mask is not None
+    np.testing.assert_array_equal(result.mask.any(axis=0), np.arange(320) >= left)
+
+
+def test_a_mask_of_the_frame_is_limited_by_the_one_given(tmp_path: Path) -> None:
+    picture = frame(mask=True)
+    result = prepared(picture, mask=mask_file(tmp_path, 640, 240))
+    assert result.mask is not None
+    assert picture.mask is not None
+    assert not result.mask.any(), "the frame shows the scene only where the file is black"
+
+
+def test_a_mask_of_another_size_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    path = mask_file(tmp_path, 100, 80)
+    with pytest.raises(ConfigError) as caught:
+        prepared(frame(), mask=path)
+    assert str(caught.value) == (
+        f"the mask {path} is 100 x 80, the pictures are 640 x 240; make it of their size"
+    )
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (None, "cannot read"),
+        (b"", "is no picture"),
+        (b"white", "is no picture"),
+        ("black", "black"),
+    ],
+)
+def test_a_file_that_is_no_mask_is_refused(
+    content: bytes | str | None, says: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "mask.png"
+    if content == "black":
+        cv2.imwrite(str(path), np.zeros((240, 640), np.uint8))
+    elif isinstance(content, bytes):
+        path.write_bytes(content)
+    with pytest.raises(ConfigError, match=says):
+        prepared(frame(), mask=path)
 
 
 # --- frames ---------------------------------------------------------------------------------------

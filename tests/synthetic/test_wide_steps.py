@@ -64,7 +64,7 @@ def test_a_pool_has_a_floor_and_four_walls_of_equal_tiles() -> None:
     assert pool.TILES_M[0] <= basin[0].tile_m <= pool.TILES_M[1]
 
 
-@pytest.mark.parametrize("display", ["clock", "clock_and_crosshair"])
+@pytest.mark.parametrize("display", ["clock", "clock_and_crosshair", "panel"])
 def test_a_display_covers_little_of_the_picture_and_nothing_of_the_truth(
     display: str, tmp_path: Path
 ) -> None:

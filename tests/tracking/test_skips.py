@@ -23,9 +23,11 @@ class Counting(ClassicalPrior):
         super().__init__()
         self.encoded = self.seeded = 0
 
-    def encode(self, image: np.ndarray, camera: CameraModel) -> FlowEncoding:
+    def encode(
+        self, image: np.ndarray, camera: CameraModel, mask: np.ndarray | None = None
+    ) -> FlowEncoding:
         self.encoded += 1
-        return super().encode(image, camera)
+        return super().encode(image, camera, mask)
 
     def decode(self, a: Encoding, b: Encoding, predicted: np.ndarray | None = None) -> FlowPair:
         self.seeded += predicted is not None

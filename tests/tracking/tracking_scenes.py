@@ -103,7 +103,12 @@ class KnownPrior:
         self.views, self.true, self.noise_px = views, true, noise_px
         self.predictions: list[npt.NDArray[np.float32] | None] = []
 
-    def encode(self, image: npt.NDArray[np.uint8], camera: CameraModel) -> KnownView:
+    def encode(
+        self,
+        image: npt.NDArray[np.uint8],
+        camera: CameraModel,
+        mask: npt.NDArray[np.bool_] | None = None,
+    ) -> KnownView:
         return replace(self.views[int(image[0, 0, 0])], camera=camera)
 
     def decode(

@@ -78,7 +78,7 @@ class BackFill:
 
     def _place(self, frame: Frame) -> _Placed | None:
         """At the keyframe; where the frame no longer shows that, at the frame placed before."""
-        encoding = self._prior.encode(frame.image, self._camera)
+        encoding = self._prior.encode(frame.image, self._camera, frame.mask)
         solved = self._keyframe_tracker.place(self._at, encoding, self._camera)
         if solved is not None:
             return _Placed(frame, encoding, solved, self._at, solved.estimate.T)

@@ -1,0 +1,1 @@
+"""Burned-in overlays (clock, crosshair, logo): found by themselves and masked."""

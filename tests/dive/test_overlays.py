@@ -1,0 +1,80 @@
+"""A burned-in display in a whole dive: found, said, and masked in what is tracked and mapped."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aquaflow.config import Config, parse_config
+from aquaflow.dive.replay import map_recording
+from aquaflow.messages import Frame
+from aquaflow.slam import Slam
+from aquaflow.sources import open_recording
+from aquaflow.synthetic import SyntheticConfig, write_dive
+from tests.slam_scenes import ToldTracker, frame_of
+
+FRAMES = 12
+
+
+@pytest.fixture(scope="module")
+def pool(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("dives") / "pool"
+    small = {"frames": FRAMES, "width": 240, "height": 180, "supersampling": 1, "speed_m_s": 1.0}
+    shown = {"scene": "pool", "display": "clock_and_crosshair"}
+    write_dive(out, SyntheticConfig.model_validate({**small, **shown}))
+    return out
+
+
+def settings(mask_overlays: bool = True) -> Config:
+    tracking = {"mask_overlays": mask_overlays, "gate": {"skip_duplicates": False}}
+    return parse_config({"threads": 1, "tracking": tracking, "mapping": {"enabled": False}}, "test")
+
+
+def test_the_notes_say_that_an_overlay_was_found_and_how_large_it_is(
+    pool: Path, tmp_path: Path
+) -> None:
+    finished = map_recording(open_recording(pool), "pool", tmp_path / "dive", settings())
+    [note] = [note for note in finished.notes if "overlay" in note]
+    assert note.startswith("an overlay of ")
+    assert note.endswith(" % of the picture was found and masked")
+    assert 2.0 < float(note.split()[3]) < 16.0
+
+
+def masks_seen(pool: Path, config: Config) -> list[bool]:
+    """Whether the tracker got a mask, for every frame."""
+    slam, recording = Slam(config), open_recording(pool)
+    slam.tracker = ToldTracker(slam, "K" + "C" * FRAMES)  # type: ignore[assignment]
+    tracked = []
+    for frame in recording.frames():
+        assert isinstance(frame, Frame)
+        tracked += slam.process(frame)
+    recording.close()
+    slam.close()
+    return [each.frame.mask is not None for each in tracked]
+
+
+def test_the_tracker_gets_the_frames_with_the_overlay_masked(pool: Path) -> None:
+    masked = masks_seen(pool, settings())
+    assert not masked[0]
+    assert all(masked[FRAMES // 2 :])
+
+
+def test_overlays_are_not_looked_for_where_that_is_switched_off(pool: Path) -> None:
+    assert not any(masks_seen(pool, settings(mask_overlays=False)))
+
+
+@pytest.mark.usefixtures("contained")
+def test_a_finder_that_fails_costs_no_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    slam = Slam(settings())
+    slam.tracker = ToldTracker(slam, "KC")  # type: ignore[assignment]
+
+    def fail(frame: Frame) -> Frame:
+        raise ValueError("no overlay")
+
+    monkeypatch.setattr(slam.overlays, "masked", fail)
+    tracked = [each for k in range(2) for each in slam.process(frame_of(k))]
+    slam.close()
+    assert [each.frame.index for each in tracked] == [0, 1]
+    assert all(np.isfinite(each.T_wc.t).all() for each in tracked if each.T_wc is not None)
