@@ -149,7 +149,7 @@ def map_command(
 def synth(
     out: Annotated[Path, typer.Argument(help="Folder to write.")],
     scene: Annotated[
-        str, typer.Option(help="reef | flat_sand | wall | pipe | pool | survey")
+        str, typer.Option(help="reef | flat_sand | wall | pipe | pool | survey | hull | net")
     ] = "reef",
     water: Annotated[str | None, typer.Option(help="Water type, such as coastal_1C.")] = None,
     frames: Annotated[int | None, typer.Option(help="Number of pictures.")] = None,

@@ -9,19 +9,22 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from aquaflow.geometry.port_file import PortFile
 from aquaflow.synthetic.telemetry_noise import TelemetryNoise
 
-__all__ = ["Display", "SceneKind", "SyntheticConfig", "TelemetryNoise", "WaterType"]
+__all__ = ["FACED", "Display", "SceneKind", "SyntheticConfig", "TelemetryNoise", "WaterType"]
 
-SceneKind: TypeAlias = Literal["reef", "flat_sand", "wall", "pipe", "pool", "survey"]
+SceneKind: TypeAlias = Literal["reef", "flat_sand", "wall", "pipe", "pool", "survey", "hull", "net"]
 Display: TypeAlias = Literal["clock", "clock_and_crosshair", "panel"]
 WaterType: TypeAlias = Literal[
     "clear", "oceanic_IB", "oceanic_II", "coastal_1C", "coastal_3C", "coastal_5C"
 ]
 
+FACED: tuple[SceneKind, ...] = ("wall", "hull", "net")
+"""Scenes that the vehicle faces: they stand upright, and its lanes go up and down."""
+
 SCENE_DEFAULTS: dict[str, dict[str, object]] = {
     # A small vehicle in a test tank, filmed at 1 picture/s: 0.25 m and 6 degrees from one to the
-    # next. The forward view sees floor, walls and no surface.
+    # next, four laps. The forward view sees floor, walls and no surface.
     "pool": {
-        "frames": 60, "fps": 1.0, "speed_m_s": 0.25, "altitude_m": 1.1, "altitude_swing_m": 0.1,
+        "frames": 220, "fps": 1.0, "speed_m_s": 0.25, "altitude_m": 1.1, "altitude_swing_m": 0.1,
         "camera_pitch_deg": 10.0, "roll_deg": 2.0, "pitch_deg": 2.0, "yaw_deg": 5.0,
         "floor_depth_m": 3.2, "water": "oceanic_IB", "snow_per_m3": 2.0,
     },
@@ -30,6 +33,16 @@ SCENE_DEFAULTS: dict[str, dict[str, object]] = {
     "survey": {
         "frames": 9, "fps": 1.0, "speed_m_s": 0.5, "altitude_m": 2.0, "altitude_swing_m": 0.1,
         "camera_pitch_deg": 90.0, "roll_deg": 2.0, "pitch_deg": 2.0, "yaw_deg": 4.0,
+    },
+    # A hull inspection: 1.2 m from the plates, looking a little down along them.
+    "hull": {
+        "altitude_m": 1.2, "altitude_swing_m": 0.15, "camera_pitch_deg": 70.0, "speed_m_s": 0.4,
+        "floor_depth_m": 5.0, "snow_per_m3": 20.0,
+    },
+    # A net cage's side from inside, with water behind it.
+    "net": {
+        "altitude_m": 1.2, "altitude_swing_m": 0.15, "camera_pitch_deg": 75.0, "speed_m_s": 0.3,
+        "floor_depth_m": 8.0, "water": "oceanic_II", "snow_per_m3": 20.0,
     },
 }  # fmt: skip
 """What differs from the fields' defaults where nothing else is asked for."""
@@ -136,8 +149,10 @@ class SyntheticConfig(BaseModel):
 
     @model_validator(mode="after")
     def _wall_is_faced(self) -> SyntheticConfig:
-        if self.scene == "wall" and self.turns:
-            raise ValueError("a vehicle at a wall faces it; turns must be false for this scene")
+        if self.scene in FACED and self.turns:
+            raise ValueError(
+                f"a vehicle at a {self.scene} faces it; turns must be false for this scene"
+            )
         return self
 
     @property

@@ -2,7 +2,7 @@
 
 The survey frame has x along the lanes, y to the right and z down, with the mean floor at z = 0.
 World is NED-like (z down, 0 at the surface). For floors the two differ by the depth only; for the
-wall the survey's x points up and its z points into the wall.
+scenes that are faced (a wall, a hull, a net) the survey's x points up and its z points into them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from aquaflow.config.telemetry import MountingConfig
-from aquaflow.synthetic.config import SyntheticConfig
+from aquaflow.synthetic.config import FACED, SyntheticConfig
 from aquaflow.synthetic.streams import stream
 
 __all__ = ["Mountings", "mountings_of", "survey_to_world"]
@@ -27,7 +27,7 @@ Array: TypeAlias = npt.NDArray[np.float64]
 def survey_to_world(config: SyntheticConfig) -> tuple[Array, Array]:
     """R_ws [3, 3] and t_ws [3] (m)."""
     offset = np.array([0.0, 0.0, config.floor_depth_m])
-    if config.scene == "wall":
+    if config.scene in FACED:
         # Columns: survey x is up, survey y is east, survey z (into the wall) is north.
         return np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]), offset
     return np.eye(3), offset
@@ -66,7 +66,7 @@ def mountings_of(config: SyntheticConfig) -> Mountings:
     survey = np.array([[0.0, -s, c], [1.0, 0.0, 0.0], [0.0, c, s]])
     R_bc = np.asarray(survey_to_world(config)[0] @ survey)
     # Level is along the lanes; at a wall, whose lanes go up, it is into the wall.
-    level_deg = 90.0 if config.scene == "wall" else 0.0
+    level_deg = 90.0 if config.scene in FACED else 0.0
     stated = MountingConfig(
         position_m=config.camera_position_m, pitch_deg=level_deg - config.camera_pitch_deg
     )

@@ -37,13 +37,14 @@ GRAIN, GLAZE_GRAIN = 0.16, 0.04
 class Shape:
     """One solid; its axes are the columns of ``R``."""
 
-    kind: Literal["cylinder", "box", "sphere"]
+    kind: Literal["cylinder", "box", "sphere", "net"]
     centre: Array
     """[3] m"""
     R: Array
     """[3, 3]"""
     size: tuple[float, float, float]
-    """Half sizes, m; a cylinder lies along its x and has radius size[1]; a sphere has size[0]."""
+    """Half sizes, m; a cylinder lies along its x and has radius size[1]; a sphere has size[0];
+    a net lies in the plane of its x and y."""
     paint: Rgb
     growth: Rgb
     """Albedo of the bare object, and of the growth on it."""
@@ -51,6 +52,10 @@ class Shape:
     """How much is overgrown: 0.5 is half of it, 0 an eighth, -0.3 a thirtieth."""
     tile_m: float = 0.0
     """Edge of the tiles that cover it; 0: none."""
+    mesh_m: float = 0.0
+    """Edge of a net's meshes."""
+    twine_m: float = 0.0
+    """Thickness of a net's twine; what is between is open."""
 
     @property
     def reach(self) -> float:
@@ -93,6 +98,8 @@ def hit(
     o, d = _local(shape, origin, rays)
     if shape.kind == "sphere":
         return _quadratic(torch.ones_like(d[0]), _dot(o, d), (o * o).sum(0) - shape.size[0] ** 2)
+    if shape.kind == "net":
+        return _meet_twine(shape, o, d)
     if shape.kind == "box":
         near, far = _slabs(o, d, shape.size, (0, 1, 2))
         return torch.where((near < far) & (near > 0.0), near, torch.inf)
@@ -103,6 +110,23 @@ def hit(
     near, far = _slabs(o, d, shape.size, (0,))
     enter, leave = torch.maximum(near, (-b - root) / a), torch.minimum(far, (-b + root) / a)
     return torch.where((disc > 0.0) & (enter < leave) & (enter > 0.0), enter, torch.inf)
+
+
+def _meet_twine(
+    shape: Shape,
+    o: torch.Tensor,  # [3] or [3, N] m, in the shape's axes
+    d: torch.Tensor,  # [3, N]
+) -> torch.Tensor:
+    """Range [N] (m) at which rays meet a net's twine; infinite where they go through a mesh."""
+    t = -o[2] / torch.where(d[2].abs() < 1e-7, 1e-7, d[2])
+    on_twine = torch.zeros_like(t, dtype=torch.bool)
+    inside = torch.ones_like(on_twine)
+    for k in (0, 1):
+        at = o[k] + t * d[k]
+        from_twine = (torch.remainder(at / shape.mesh_m + 0.5, 1.0) - 0.5).abs() * shape.mesh_m
+        on_twine |= from_twine < 0.5 * shape.twine_m
+        inside &= at.abs() < shape.size[k]
+    return torch.where((t > 0.0) & on_twine & inside, t, torch.inf)
 
 
 def _dot(
@@ -184,6 +208,10 @@ def _surface(
         return torch.where(is_cap, cap, side), u, torch.where(is_cap, p[2], angle * shape.size[1])
     axis = (p / half).abs().argmax(0)
     face = torch.nn.functional.one_hot(axis, 3).T * p.sign()
+    if shape.kind == "net":
+        up = torch.zeros_like(p)
+        up[2] = 1.0
+        return up, p[0], p[1]
     normal = p / shape.size[0] if shape.kind == "sphere" else face
     # Each pair of faces reads its own part of the texture.
     apart = 0.7 * axis + 0.23 * (face.sum(0) > 0)

@@ -11,12 +11,16 @@ import numpy.typing as npt
 
 from aquaflow.synthetic import pool
 from aquaflow.synthetic.config import SceneKind
+from aquaflow.synthetic.net import netting
 from aquaflow.synthetic.objects import Rgb, Shape
 from aquaflow.synthetic.relief import Relief
 
 __all__ = ["place_objects"]
 
 Array: TypeAlias = npt.NDArray[np.float64]
+
+NET_ROPES_M = 2.5
+"""Between the upright ropes of a net cage."""
 
 
 def place_objects(
@@ -31,18 +35,31 @@ def place_objects(
     def ground(x: float, y: float) -> float:
         return float(relief.area.sample(relief.height, np.array([[x, y]]))[0])
 
+    shapes: list[Shape] = []
     if kind == "pipe":
-        return _pipeline(low, high, ground, rng)
-    if kind == "flat_sand":
+        shapes = _pipeline(low, high, ground, rng)
+    elif kind == "flat_sand":
         x, y = high[0] + rng.uniform(0.8, 1.2), low[1] - rng.uniform(0.6, 0.9)
-        return [_crate(x, y, ground(x, y), 0.16, rng)]
-    if kind == "pool":
-        return [*pool.tiled_basin(*pool.corners(loop), rng), *_in_pool(low, high, rng)]
-    if kind == "survey":
-        return []
-    if kind == "wall":
+        shapes = [_crate(x, y, ground(x, y), 0.16, rng)]
+    elif kind == "pool":
+        shapes = [*pool.tiled_basin(*pool.corners(loop), rng), *_in_pool(low, high, rng)]
+    elif kind == "net":
+        shapes = [netting(low, high, rng), *_frame_of_net(low, high)]
+    elif kind == "wall":
         y = high[1] + 0.9
-        return [_rope((low[0] - 1.0, y, 0.35), (high[0] + 4.0, y + 0.2, 0.4))]
+        shapes = [_rope((low[0] - 1.0, y, 0.35), (high[0] + 4.0, y + 0.2, 0.4))]
+    elif kind == "reef":
+        shapes = _on_reef(low, high, ground, rng)
+    return shapes
+
+
+def _on_reef(
+    low: Array,  # [2] m
+    high: Array,  # [2] m
+    ground: Callable[[float, float], float],
+    rng: np.random.Generator,
+) -> list[Shape]:
+    """A crate, a mooring, a pipe and a ball, ahead of the lanes and beside them."""
     x, y = high[0] + rng.uniform(0.5, 0.9), low[1] - rng.uniform(0.6, 0.8)
     shapes = [_crate(x, y, ground(x, y), 0.22, rng)]
     x, y = high[0] + rng.uniform(0.2, 0.5), high[1] + rng.uniform(0.8, 1.1)
@@ -71,6 +88,20 @@ def _in_pool(
     shapes += _mooring(middle[0] + 0.3, middle[1] + rng.uniform(-0.2, 0.2), 0.0, rng)
     ends = (low[0] - 1.2, low[1] - 0.3, 1.9), (high[0] + 1.2, high[1] + 0.5, 1.6)
     return [*shapes, _rope(*ends)]
+
+
+def _frame_of_net(
+    low: Array,  # [2] m
+    high: Array,  # [2] m
+) -> list[Shape]:
+    """Ropes up and across, on which the net hangs."""
+    ends = low - NET_ROPES_M, high + 2.0 * NET_ROPES_M
+    up = [
+        _rope((ends[0][0], y, 0.02), (ends[1][0], y, 0.02))
+        for y in np.arange(ends[0][1], ends[1][1], NET_ROPES_M).tolist()
+    ]
+    middle = 0.5 * (low[0] + high[0])
+    return [*up, _rope((middle, ends[0][1], 0.03), (middle, ends[1][1], 0.03))]
 
 
 def _pipeline(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from aquaflow.synthetic import hull
 from aquaflow.synthetic.config import SceneKind
 from aquaflow.synthetic.noise import FloatMap, blur, fractal, resized, smoothstep
 from aquaflow.synthetic.relief import Relief
@@ -64,6 +65,8 @@ def _albedo(
     texel: float,
     rng: np.random.Generator,
 ) -> FloatMap:
+    if kind == "hull":
+        return hull.painted_plates(relief.area, shape, texel, rng)
     cover = np.clip(resized(relief.cover, shape), 0.0, 1.0)
     broad = fractal(rng, shape, texel, 3.0, 0.0, 0.72)
     spots = fractal(rng, shape, texel, 0.20, 0.0, 0.85)

@@ -81,7 +81,9 @@ def site_of(config: SyntheticConfig, least_cell_m: float = 0.0) -> Site:
     area = Area.around(low, high, max(texel * TEXELS_PER_CELL, least_cell_m))
     relief = build_relief(config.scene, area, loop, stream(config.seed, "terrain"))
     shapes = place_objects(config.scene, relief, loop, stream(config.seed, "objects"))
-    below = area.sample(relief.height, loop)
+    # A net hangs where the floor of other scenes is; what is behind it is not followed.
+    followed = np.zeros(area.shape, np.float32) if config.scene == "net" else relief.height
+    below = area.sample(followed, loop)
     path = paths.plan_path(config, stream(config.seed, "sway"), below)
     motion = BodyMotion(path, mountings_of(config))
     return Site(relief, shapes, objects.casters(relief, shapes), path, motion)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from aquaflow.synthetic import stamps
+from aquaflow.synthetic import hull, net, stamps
 from aquaflow.synthetic.config import SceneKind
 from aquaflow.synthetic.noise import FloatMap, fractal, smoothstep
 from aquaflow.synthetic.relief import Area, Array, Relief
@@ -89,9 +89,14 @@ def _bedding(rng: np.random.Generator, area: Area) -> FloatMap:
     return np.full(area.shape, -0.01, np.float32)
 
 
+def _open_water(rng: np.random.Generator, area: Area) -> FloatMap:
+    """Nothing solid behind a net, as far as can be seen."""
+    return np.full(area.shape, -net.BEHIND_M, np.float32)
+
+
 _BASES = {
     "reef": _reef, "flat_sand": _sand, "wall": _wall, "pipe": _sand, "pool": _bedding,
-    "survey": _reef,
+    "survey": _reef, "hull": hull.plated_side, "net": _open_water,
 }  # fmt: skip
 """Large shapes of each scene."""
 _REEF = _Plan(
@@ -111,6 +116,8 @@ _PLANS = {
     "reef": _REEF,
     "survey": _REEF,
     "pool": _Plan(0.0, 0.0, ()),
+    "hull": _Plan(0.0, 0.0, ()),
+    "net": _Plan(0.0, 0.0, ()),
     "flat_sand": _Plan(0.0, 0.0, ((stamps.boulder, 0.03), (stamps.pebble, 6.0))),
     "wall": _Plan(
         1.0,

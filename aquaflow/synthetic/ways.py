@@ -20,6 +20,10 @@ DENSE = 2048
 """Steps of a way from which splines are made."""
 OVAL = 0.6
 """Short over long axis of the way round a pool."""
+LAP_M = 15.0
+"""About the length of a lap round a pool; a longer dive makes several."""
+LAP_SWING = 0.15
+"""By which laps are wider or narrower than their mean."""
 WANDER_M = 0.08
 """Amplitude by which a survey leaves its line."""
 
@@ -84,8 +88,12 @@ def _spread(
 
 
 def _oval(config: SyntheticConfig) -> Array:
-    angle = np.linspace(0.0, 2.0 * math.pi, DENSE + 1)
-    points = _equal_arcs(np.stack([np.sin(angle), -OVAL * np.cos(angle)], axis=1), DENSE)
+    """Laps round a pool, wider and narrower ones by turns; one lap is a plain oval."""
+    laps = max(1, round(config.speed_m_s * config.duration_s / LAP_M))
+    angle = np.linspace(0.0, 2.0 * math.pi * laps, (DENSE + 1) * laps)
+    wide = 1.0 + (LAP_SWING * np.sin(angle * (laps - 1) / laps) if laps > 1 else 0.0)
+    oval = np.stack([np.sin(angle), -OVAL * np.cos(angle)], axis=1) * np.reshape(wide, (-1, 1))
+    points = _equal_arcs(oval, DENSE)
     points[-1] = points[0]
     round_ = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
     return np.asarray(points * (config.speed_m_s * config.duration_s / round_))

@@ -75,7 +75,9 @@ def test_another_seed_gives_another_dive(small: Path, tmp_path: Path) -> None:
     ).read_bytes()
 
 
-@pytest.mark.parametrize("scene", ["reef", "flat_sand", "wall", "pipe", "pool", "survey"])
+@pytest.mark.parametrize(
+    "scene", ["reef", "flat_sand", "wall", "pipe", "pool", "survey", "hull", "net"]
+)
 def test_picture_is_clean_radiance_through_the_stated_water(scene: str, tmp_path: Path) -> None:
     config = SyntheticConfig.model_validate(
         {"frames": 2, "width": 160, "height": 120, "scene": scene, **BARE}

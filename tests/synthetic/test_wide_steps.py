@@ -44,7 +44,7 @@ def test_a_survey_looks_down_and_shares_two_thirds_with_the_next_picture(tmp_pat
 
 
 def test_a_pool_is_seen_forward_in_wide_steps_and_all_round(tmp_path: Path) -> None:
-    truth = written(tmp_path, scene="pool")
+    truth = written(tmp_path, scene="pool", frames=60)
     steps = np.linalg.norm(np.diff(truth.T_wc[:, :3, 3], axis=0), axis=1)
     np.testing.assert_allclose(steps, 0.25, atol=0.03)
     assert 4.0 < np.median(turns_deg(truth)) < 8.0
@@ -53,6 +53,21 @@ def test_a_pool_is_seen_forward_in_wide_steps_and_all_round(tmp_path: Path) -> N
     ahead = np.einsum("ni,ni->n", forward[:-1], np.diff(truth.T_wc[:, :3, 3], axis=0)) / steps
     assert ahead.min() > 0.9, "the camera looks where the vehicle goes"
     assert all(np.isfinite(truth.range_m(k)).all() for k in range(0, 60, 10)), "walls all round"
+
+
+def test_a_long_dive_in_a_pool_makes_several_laps_of_different_width() -> None:
+    from aquaflow.synthetic.ways import way_of
+
+    config = SyntheticConfig.model_validate({"scene": "pool"})
+    assert config.frames == 220
+    way = way_of(config)
+    steps = np.linalg.norm(np.diff(way.points, axis=0), axis=1)
+    np.testing.assert_allclose(steps.sum(), config.speed_m_s * config.duration_s, rtol=1e-3)
+    np.testing.assert_array_equal(way.points[0], way.points[-1])
+    laps = (way.heading[-1] - way.heading[0]) / (2.0 * np.pi)
+    assert abs(laps) == pytest.approx(4.0, abs=0.02)
+    radius = np.linalg.norm(way.points / (1.0, 0.6), axis=1)
+    assert radius.max() / radius.min() > 1.2
 
 
 def test_a_pool_has_a_floor_and_four_walls_of_equal_tiles() -> None:

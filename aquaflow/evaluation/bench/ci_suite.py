@@ -20,9 +20,16 @@ PLAIN: dict[str, dict[str, object]] = {
     "reef, loop": {"scene": "reef"},
     "flat sand, fast": {"scene": "flat_sand", "speed_m_s": 0.9},
     "wall, murky, slow": {"scene": "wall", "water": "coastal_5C", "speed_m_s": 0.5},
+    "pool, tiles, display": {
+        "scene": "pool",
+        "camera_pitch_deg": 10.0,
+        "display": "clock_and_crosshair",
+    },
+    "hull, equal plates": {"scene": "hull"},
+    "net, open water": {"scene": "net"},
 }
 PIPE: dict[str, object] = {"scene": "pipe", "water": "oceanic_IB"}
-"""The first three scenes by name, and the pipe that a pause is made in: what differs from SMALL."""
+"""The plain scenes by name, and the pipe that a pause is made in: what differs from SMALL."""
 PAUSED, DIMMED = "pipe, clear, pause", "reef, light change"
 DIMMED_FROM = "reef, loop"
 """Scenes that are made of others: the pipe with a pause, a reef whose light changes."""
