@@ -16,18 +16,14 @@ from scipy.stats import f as f_distribution
 
 from aquaflow.geometry.lens_error import TERMS
 from aquaflow.keyframes import Keyframe
-from aquaflow.tracking.lens_adjustment import LensAdjustment, adjust_lens, clusters_of
+from aquaflow.tracking.lens_adjustment import adjust_lens, clusters_of, model_error
 from aquaflow.tracking.lens_equations import Array, LensObservations
-from aquaflow.tracking.loops.keypoints import match_keypoints
+from aquaflow.tracking.lens_matches import LensView, matched
 
 MAX_VIEWS = 8
 """Keyframes used: with the pairs below, ten pairs."""
 MIN_VIEWS = 4
 """With fewer, the scatter between the views is no estimate."""
-MATCHES_PER_PAIR = 200
-"""At most; of more, an even choice: matches of one pair of views share errors."""
-MIN_MATCHES = 300
-"""Of all pairs together."""
 TOLERANCE = np.array([0.02, 0.02])
 """Error of log focal length and k1 that a good calibration in water may have."""
 SIGNIFICANCE = 1e-3
@@ -87,7 +83,9 @@ def lens_error(keyframes: Sequence[Keyframe]) -> LensError | None:
         InputError: a keyframe cannot be read back.
     """
     chosen = most_turning([each for each in keyframes if each.T_wc.is_finite()])
-    observations = None if len(chosen) < MIN_VIEWS else matched(chosen)
+    if len(chosen) < MIN_VIEWS:
+        return None
+    observations = matched([view_of(keyframe) for keyframe in chosen], pairs_of(len(chosen)))
     if observations is None:
         return None
     R_wc = np.stack([keyframe.T_wc.R for keyframe in chosen])
@@ -96,6 +94,21 @@ def lens_error(keyframes: Sequence[Keyframe]) -> LensError | None:
         return estimated(observations, R_wc, centres)
     except np.linalg.LinAlgError:
         return None
+
+
+def view_of(keyframe: Keyframe) -> LensView:
+    """What a keyframe shows of the lens.
+
+    Raises:
+        InputError: it cannot be read back.
+    """
+    encoding = keyframe.encoding
+    return LensView(encoding.keypoints, encoding.camera, keyframe.T_wc)
+
+
+def pairs_of(views: int) -> list[tuple[int, int]]:
+    """Neighbours, and every other view with the next but one."""
+    return [(i, i + 1) for i in range(views - 1)] + [(i, i + 2) for i in range(0, views - 2, 2)]
 
 
 def estimated(
@@ -110,7 +123,7 @@ def estimated(
     """
     simple = adjust_lens(observations, R_wc, centres, terms=2)
     full = adjust_lens(observations, R_wc, centres, terms=TERMS)
-    covariance = simple.covariance + _model_error(simple, full)
+    covariance = simple.covariance + model_error(simple, full)
     error = simple.adjusted.lens[:2]
     if not np.isfinite(covariance).all():
         raise np.linalg.LinAlgError("the matches determine no error of the lens")
@@ -127,14 +140,6 @@ def estimated(
     )
 
 
-def _model_error(simple: LensAdjustment, full: LensAdjustment) -> Array:
-    """[2, 2] Of a lens of two terms: where more terms explain part of the noise, that part of the
-    estimates' difference is a matter of the model and not of the calibration."""
-    explained = max(0.0, 1.0 - (full.sigma / simple.sigma) ** 2)
-    difference = full.adjusted.lens[:2] - simple.adjusted.lens[:2]
-    return np.diag(explained * difference**2)
-
-
 def _chance(
     error: Array,  # [2] u and k
     covariance: Array,  # [2, 2] of u and k
@@ -149,8 +154,8 @@ def _chance(
     return float(f_distribution.sf(squared * freedom / (2.0 * (clusters - 1)), 2, freedom))
 
 
-def most_turning(keyframes: Sequence[Keyframe]) -> list[Keyframe]:
-    """The run of up to ``MAX_VIEWS`` keyframes of one sub-map in which the camera turns most.
+def most_turning(keyframes: Sequence[Keyframe], most: int = MAX_VIEWS) -> list[Keyframe]:
+    """The run of up to ``most`` keyframes of one sub-map in which the camera turns most.
 
     A camera that only translates says nothing about its focal length.
     """
@@ -159,7 +164,7 @@ def most_turning(keyframes: Sequence[Keyframe]) -> list[Keyframe]:
     best_turn = 0.0
     for start, first in enumerate(keyframes):
         run = [first]
-        for keyframe in keyframes[start + 1 : start + MAX_VIEWS]:
+        for keyframe in keyframes[start + 1 : start + most]:
             if keyframe.sub_map != first.sub_map:
                 break
             run.append(keyframe)
@@ -172,30 +177,3 @@ def most_turning(keyframes: Sequence[Keyframe]) -> list[Keyframe]:
 def _angle(a: Keyframe, b: Keyframe) -> float:
     cosine = 0.5 * (float(np.sum(a.T_wc.R * b.T_wc.R)) - 1.0)
     return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
-
-
-def matched(keyframes: Sequence[Keyframe]) -> LensObservations | None:
-    """Keypoint matches of neighbours, and of every other keyframe; None for too few."""
-    views = range(len(keyframes))
-    pairs = [(i, i + 1) for i in views[:-1]] + [(i, i + 2) for i in views[:-2:2]]
-    encodings = [keyframe.encoding for keyframe in keyframes]
-    rows: dict[tuple[int, int], int] = {}
-    """Number of the point by its view and keypoint."""
-    point, view, pixels = [], [], []
-    for i, j in pairs:
-        mine, theirs = match_keypoints(encodings[i].keypoints, encodings[j].keypoints)
-        step = -(-len(mine) // MATCHES_PER_PAIR) or 1
-        for a, b in zip(mine[::step].tolist(), theirs[::step].tolist(), strict=True):
-            point.append(rows.setdefault((i, a), len(rows)))
-            view.append(j)
-            pixels.append(encodings[j].camera.unproject(encodings[j].keypoints.pixels[b])[:2])
-    if len(point) < MIN_MATCHES:
-        return None
-    points = [encodings[i].camera.unproject(encodings[i].keypoints.pixels[a])[:2] for i, a in rows]
-    return LensObservations(
-        np.array(points),
-        np.array([i for i, _ in rows], dtype=np.int64),
-        np.array(point, dtype=np.int64),
-        np.array(view, dtype=np.int64),
-        np.array(pixels),
-    )

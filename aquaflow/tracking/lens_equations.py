@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -95,28 +96,40 @@ class LensEquations:
     ) -> None:
         self._observations, self._state = observations, state
         error, J, along = _derivatives(observations, state)
-        weights = weighting.weights(error)
-        self._J, self._error = J, error
+        weights, point = weighting.weights(error), observations.point
         self._wJ = weights[:, None, None] * J
-        count = len(state.rho)
-        point = observations.point
+        self._J, self._columns = J, _columns(observations, len(state.R_wc))
+        count, width = len(state.rho), 6 * len(state.R_wc) + TERMS
         self._H_pp = 1e-9 + np.bincount(point, weights * np.sum(along**2, axis=1), count)
         self._g_p = np.bincount(point, weights * np.sum(along * error, axis=1), count)
-        self._H_pc = np.zeros((count, J.shape[-1]))
-        np.add.at(self._H_pc, point, np.einsum("mr,mrk->mk", along, self._wJ))
+        by_point = np.einsum("mr,mrk->mk", along, self._wJ)
+        self._H_pc = _summed(point[:, None] * width + self._columns, by_point, count * width)
+        self._H_pc = self._H_pc.reshape(count, width)
+        self._by_match = np.einsum("mrk,mr->mk", self._wJ, error)
 
-    def reduced(
+    @cached_property
+    def hessian(self) -> Array:
+        """[C, C] the depths eliminated."""
+        width = self._H_pc.shape[1]
+        H = np.zeros((width, width))
+        # Matches between the same two views depend on the same columns.
+        pair = self._columns[:, 0] * width + self._columns[:, 6]
+        order = np.argsort(pair, kind="stable")
+        for rows in np.split(order, np.flatnonzero(np.diff(pair[order])) + 1):
+            columns, size = self._columns[rows[0]], self._columns.shape[1]
+            J, wJ = self._J[rows].reshape(-1, size), self._wJ[rows].reshape(-1, size)
+            H[np.ix_(columns, columns)] += wJ.T @ J
+        return np.asarray(H - (self._H_pc / self._H_pp[:, None]).T @ self._H_pc)
+
+    def gradient(
         self,
         points: npt.NDArray[np.bool_],  # [P] which of them
-    ) -> tuple[Array, Array]:
-        """H [C, C] and gradient [C] of the ``points`` [P], their depths eliminated."""
-        rows = points[self._observations.point]
-        columns = self._J.shape[-1]
-        J, wJ = self._J[rows].reshape(-1, columns), self._wJ[rows].reshape(-1, columns)
-        H_pc = self._H_pc[points]
-        gain = H_pc / self._H_pp[points, None]
-        gradient = wJ.T @ self._error[rows].ravel() - gain.T @ self._g_p[points]
-        return J.T @ wJ - gain.T @ H_pc, gradient
+    ) -> Array:
+        """[C] of the ``points``, their depths eliminated."""
+        rows, width = points[self._observations.point], self._H_pc.shape[1]
+        direct = _summed(self._columns[rows], self._by_match[rows], width)
+        gain = self._g_p[points] / self._H_pp[points]
+        return np.asarray(direct - gain @ self._H_pc[points])
 
     def held(
         self,
@@ -129,8 +142,8 @@ class LensEquations:
 
     def stepped(self, damping: float, terms: int) -> Adjusted:
         """The state after a damped step in which only the first ``terms`` of the lens move."""
-        state, everything = self._state, np.ones(len(self._state.rho), dtype=bool)
-        H, gradient = self.reduced(everything)
+        state = self._state
+        H, gradient = self.hessian, self.gradient(np.ones(len(state.rho), dtype=bool))
         gradient[-TERMS:] += state.lens / LENS_PRIOR_SIGMA**2
         free = slice(0, len(H) - TERMS + terms)
         A = self.held(H) + damping * np.diag(np.diag(H))
@@ -140,6 +153,23 @@ class LensEquations:
         R = np.stack([R @ so3_exp(move[3:]) for R, move in zip(state.R_wc, moves, strict=True)])
         rho = state.rho - (self._g_p + self._H_pc @ step) / self._H_pp
         return Adjusted(R, state.centres + moves[:, :3], rho, state.lens + step[-TERMS:])
+
+
+def _columns(observations: LensObservations, views: int) -> Indices:
+    """[M, 12 + TERMS] columns that a match depends on: its point's view, its own, the lens."""
+    reference = observations.reference[observations.point]
+    blocks = [6 * each[:, None] + np.arange(6) for each in (reference, observations.view)]
+    lens = np.broadcast_to(6 * views + np.arange(TERMS), (len(reference), TERMS))
+    return np.concatenate([*blocks, lens], axis=1)
+
+
+def _summed(
+    where: Indices,  # [...] below size
+    values: Array,  # [...]
+    size: int,
+) -> Array:
+    """[size] sums of the values that go to the same place."""
+    return np.bincount(where.ravel(), values.ravel(), size)
 
 
 def _transformed(
@@ -164,7 +194,8 @@ def residuals(observations: LensObservations, state: Adjusted) -> Array:
 
 
 def _derivatives(observations: LensObservations, state: Adjusted) -> tuple[Array, Array, Array]:
-    """Residuals [M, 2], their derivatives [M, 2, C] by views and lens, and [M, 2] by rho."""
+    """Residuals [M, 2], their derivatives [M, 2, 12 + TERMS] by the columns of ``_columns``, and
+    [M, 2] by rho."""
     rays, R, way, Y = _transformed(observations, state)
     z = np.maximum(Y[:, 2], MIN_Z)
     at = Y[:, :2] / z[:, None]
@@ -172,28 +203,13 @@ def _derivatives(observations: LensObservations, state: Adjusted) -> tuple[Array
     project[:, 0, 0] = project[:, 1, 1] = 1.0 / z
     project[:, :, 2] = -at / z[:, None]
     D = slope(at, state.lens) @ project
-    J = np.zeros((len(at), 2, 6 * len(state.R_wc) + TERMS))
-    reference, view = observations.reference[observations.point], observations.view
-    R_cw = np.swapaxes(state.R_wc, 1, 2)[view]
+    R_cw = np.swapaxes(state.R_wc, 1, 2)[observations.view]
     by_centre = D @ R_cw * state.rho[observations.point, None, None]
-    _put(J, reference, by_centre, -D @ R @ hat(rays))
-    _put(J, view, -by_centre, D @ hat(Y))
     bent = np.linalg.solve(slope(rays[:, :2], state.lens), by_lens(rays[:, :2], state.lens))
-    J[:, :, -TERMS:] = by_lens(at, state.lens) - D @ R[:, :, :2] @ bent
-    return seen_at(at, state.lens) - observations.matches, J, _applied(D, way)
-
-
-def _put(
-    J: Array,  # [M, 2, C], changed in place
-    view: Indices,  # [M]
-    by_centre: Array,  # [M, 2, 3]
-    by_rotation: Array,  # [M, 2, 3]
-) -> None:
-    """Into the six columns of every match's ``view`` [M]."""
-    rows = np.arange(len(J))
-    for axis in range(3):
-        J[rows, :, 6 * view + axis] = by_centre[:, :, axis]
-        J[rows, :, 6 * view + 3 + axis] = by_rotation[:, :, axis]
+    by_errors = by_lens(at, state.lens) - D @ R[:, :, :2] @ bent
+    parts = [by_centre, -D @ R @ hat(rays), -by_centre, D @ hat(Y), by_errors]
+    error = seen_at(at, state.lens) - observations.matches
+    return error, np.concatenate(parts, axis=2), _applied(D, way)
 
 
 def triangulated(observations: LensObservations, state: Adjusted) -> Array:

@@ -6,14 +6,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aquaflow.dive.calibration_findings import to_json, verdict, warning
 from aquaflow.geometry.camera import CameraModel
-from aquaflow.geometry.lens_error import rays_of, seen_at
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.prior.contract import Keypoints
 from aquaflow.tracking.calibration_check import (
@@ -22,57 +20,14 @@ from aquaflow.tracking.calibration_check import (
     LensError,
     estimated,
     lens_error,
-    matched,
     most_turning,
+    pairs_of,
+    view_of,
 )
-from aquaflow.tracking.lens_equations import LensObservations
+from aquaflow.tracking.lens_matches import matched
+from tests.tracking.lens_scenes import FOCAL_PX, HALF, swim
 
-Array = npt.NDArray[np.float64]
-
-FOCAL_PX = 400.0
-NOISE = 0.1 / FOCAL_PX
-HALF = np.array([0.6, 0.45])
-"""Half a picture on the normalised plane."""
 CALIBRATION = CameraModel(480, 360, FOCAL_PX, FOCAL_PX, 240.0, 180.0, "radtan", (0.05, 0, 0, 0))
-
-
-def swim(
-    lens: tuple[float, ...],
-    turning: float = 0.1,
-    relief: float = 0.3,
-    views: int = 7,
-    seed: int = 0,
-) -> tuple[LensObservations, Array, Array]:
-    """Matches of a camera with an error of its lens that swims over a floor, and its poses."""
-    rng = np.random.default_rng(seed)
-    error = np.zeros(5)
-    error[: len(lens)] = lens
-    R = np.stack([so3_exp(rng.normal(0.0, turning, 3)) for _ in range(views)])
-    centres = np.stack([(0.2 * i, 0.1 * (i % 2), 0.0) for i in range(views)])
-    points, reference, point, view, matches = [], [], [], [], []
-    for i in range(views):
-        seen = rng.uniform(-HALF, HALF, (120, 2))
-        rays = np.concatenate([rays_of(seen, error), np.ones((120, 1))], axis=1) @ R[i].T
-        floor = rng.normal(1.0, relief, 120).clip(0.4, 1.6)
-        world = centres[i] + rays * (floor / rays[:, 2])[:, None]
-        first = len(points)
-        points += list(seen)
-        reference += [i] * 120
-        for j in (i + 1, i + 2):
-            if j >= views:
-                continue
-            Y = (world - centres[j]) @ R[j]
-            match = seen_at(Y[:, :2] / Y[:, 2:], error)
-            inside = (np.abs(match) < HALF).all(axis=1)
-            match += rng.normal(0.0, NOISE, match.shape)
-            point += list(first + np.flatnonzero(inside))
-            view += [j] * int(inside.sum())
-            matches += list(match[inside])
-    found = LensObservations(
-        np.array(points), np.array(reference), np.array(point), np.array(view), np.array(matches)
-    )
-    # What tracking made of it is near the truth, not the truth.
-    return found, R, centres + rng.normal(0.0, 0.005, centres.shape)
 
 
 def test_a_right_calibration_is_left_alone() -> None:
@@ -163,12 +118,13 @@ def test_keyframes_at_one_place_that_see_the_same_say_nothing() -> None:
 def test_a_keypoint_seen_in_several_keyframes_is_one_point() -> None:
     keyframes = [keyframe(i, 0.0, keypoints=200) for i in range(3)]
 
-    observations = matched(keyframes)
+    observations = matched([view_of(each) for each in keyframes], pairs_of(3))
 
     assert observations is not None
-    assert len(observations.matches) == 3 * 200
-    assert len(observations.points) == 2 * 200  # of the first and of the second
-    assert set(observations.view[observations.point < 200]) == {1, 2}
+    assert len(observations.points) == 200
+    assert len(observations.matches) == 2 * 200
+    assert set(observations.reference) == {0}
+    assert set(observations.view) == {1, 2}
 
 
 @pytest.mark.parametrize(

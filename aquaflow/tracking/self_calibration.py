@@ -1,0 +1,106 @@
+"""Self-calibration: focal length and first radial distortion of a camera without
+calibration.
+
+The guess that a dive begins with is treated as a calibration with an error of its lens, which a
+bundle adjustment over keypoint matches of many views finds. What the motion does not determine
+stays as it was guessed, and its standard deviation says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.lens_error import TERMS
+from aquaflow.tracking.lens_adjustment import LensAdjustment, adjust_lens, model_error
+from aquaflow.tracking.lens_equations import Array, LensObservations
+from aquaflow.tracking.lens_matches import LensView, matched
+
+MIN_VIEWS = 6
+"""With fewer, the scatter between the views is no estimate."""
+STEPS = (1, 2, 3, 5, 8, 13)
+"""From one view to those that it is matched with: neighbours are matched surely, and distant ones
+show the focal length, which is a matter of wide angles."""
+SYSTEMATIC = np.array([0.003, 0.0015])
+"""Standard deviations of log focal length and k1 that no scatter between views shows: detected
+keypoints are pulled towards pixel centres and along edges. Measured on synthetic dives whose
+scatter states 0.1 to 0.3 % (docs/measurements.md#self-calibration)."""
+KNOWN_SIGMA = 0.1
+"""Of the log focal length; above, the dive hardly says more than the guess."""
+
+
+@dataclass(frozen=True)
+class FoundLens:
+    """The lens of a camera without calibration, as its own pictures show it."""
+
+    lens: Array
+    """[5] error of the guess, as in ``geometry.lens_error``; the last three are 0."""
+    sigma: Array
+    """[2] standard deviations of the log focal length and of k1."""
+    noise: float
+    """Of the matches, normalised units."""
+    views: int
+    matches: int
+
+    @property
+    def known(self) -> bool:
+        """Whether the motion determines the focal length."""
+        return bool(self.sigma[0] < KNOWN_SIGMA)
+
+    def camera(self, guess: CameraModel) -> CameraModel:
+        """The calibration; of a focal length that is not known, the guess is what it is."""
+        scaled = guess.with_focal_scaled(float(np.exp(self.lens[0])))
+        distortion = (float(self.lens[1]), 0.0, 0.0, 0.0)
+        return replace(scaled, distortion_model="radtan", distortion=distortion, calibrated=True)
+
+
+def found_lens(
+    views: Sequence[LensView],
+    start: Array | None = None,  # [5] lens error that the poses of the views go with, 0 if None
+) -> FoundLens | None:
+    """The lens that ``views`` of one guessed camera show; None if they are too few."""
+    if len(views) < MIN_VIEWS:
+        return None
+    observations = matched(views, pairs_of(len(views)))
+    if observations is None:
+        return None
+    R_wc = np.stack([view.T_wc.R for view in views])
+    centres = np.stack([view.T_wc.t for view in views])
+    try:
+        return estimated(observations, R_wc, centres, start)
+    except np.linalg.LinAlgError:
+        return None
+
+
+def pairs_of(views: int) -> list[tuple[int, int]]:
+    """Views that are matched with each other."""
+    return [(i, i + step) for i in range(views) for step in STEPS if i + step < views]
+
+
+def estimated(
+    observations: LensObservations,
+    R_wc: Array,  # [V, 3, 3]
+    centres: Array,  # [V, 3]
+    start: Array | None = None,  # [5]
+) -> FoundLens:
+    """The lens from poses that are roughly right.
+
+    Raises:
+        numpy.linalg.LinAlgError: the matches determine nothing at all.
+    """
+    simple = adjust_lens(observations, R_wc, centres, 2, start)
+    state = simple.adjusted
+    full = adjust_lens(observations, state.R_wc, state.centres, TERMS, state.lens)
+    covariance = simple.covariance + model_error(simple, full) + np.diag(SYSTEMATIC**2)
+    if not np.isfinite(covariance).all():
+        raise np.linalg.LinAlgError("the matches determine no lens")
+    return _found(simple, covariance, observations)
+
+
+def _found(simple: LensAdjustment, covariance: Array, observations: LensObservations) -> FoundLens:
+    sigma, state = np.sqrt(np.diag(covariance)), simple.adjusted
+    views, matches = len(state.R_wc), len(observations.matches)
+    return FoundLens(state.lens, sigma, simple.sigma, views, matches)
