@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any
 
 from aquaflow.dive.folder import DiveFolder
+from aquaflow.dive.found_camera import FoundCamera
 from aquaflow.dive.held_out import HeldOut, examine_held_out, mean_amplification
 from aquaflow.dive.medium_json import medium_json
 from aquaflow.dive.metric_outputs import MetricOutputs, held_out_in, water_in, worlds_in_words
@@ -42,11 +43,12 @@ class Deliverables:
         results: list[Tracked],
         calibration: CameraModel | None,
         outputs: MetricOutputs | None = None,
+        found: FoundCamera | None = None,
     ) -> None:
-        """``results``: all frames with their final poses; ``calibration``: as given, if any;
-        ``outputs``: None where nothing but the map is known."""
+        """``results``: all frames with their final poses; ``calibration``: as given, if any, else
+        ``found`` may be there; ``outputs``: None where nothing but the map is known."""
         self.name, self.folder, self.slam = name, folder, slam
-        self.results, self.calibration = results, calibration
+        self.results, self.calibration, self._found = results, calibration, found
         self.outputs = outputs or MetricOutputs()
         self.held_out: list[HeldOut] = []
         """Ranges in the unit of the largest sub-map's metric frame."""
@@ -89,13 +91,23 @@ class Deliverables:
         attempt("writing georeference.json", self._write_georeference)
         camera = self.slam.tracker.camera
         if camera is not None:
-            write = partial(folder.write_cameras, camera, self.calibration)
-            attempt("writing camera.yaml", write)
+            attempt("writing camera.yaml", partial(self._write_cameras, camera))
         for sub_map in self.slam.mappers:
             self._write_map(sub_map)
         attempt("writing held-out views", partial(folder.write_held_out, self.held_out))
         if self._main in self._waters or not self.slam.mappers:
             attempt("writing medium.json", self._write_medium)
+
+    def _write_cameras(self, mapped: CameraModel) -> None:
+        """With the calibration that was given, or found: in time for this dive or for the next."""
+        found = self._found if self.calibration is None else None
+        if found is None:
+            self.folder.write_cameras(mapped, self.calibration)
+            return
+        comment = f"found from the dive itself: focal length {found.words}"
+        self.folder.write_cameras(mapped, found.camera if found.used else None, comment)
+        if found.suggested:
+            self.folder.write_suggested_camera(found.camera, comment)
 
     def _write_trajectory(self) -> None:
         times = {tracked.frame.index: tracked.frame.t_ns * 1e-9 for tracked in self.results}

@@ -46,8 +46,12 @@ MARKER = "frames.csv"
 TRACE = "trace.json"
 """Every run of every stage, in Chrome's trace event format; written when asked for."""
 
+SUGGESTED = "found_camera.yaml"
+"""Calibration that a dive without one found too late to use it."""
+
 RESULTS = (
     *("trajectory.tum", "camera.yaml", "calibration.yaml", "map*.ply", "map*.aqf", "medium.json"),
+    SUGGESTED,
     *("metrics.json", "report.html", "heldout/*.png", "heldout/*.npz", TRACE),
     KNOWN_LENGTHS,
     TELEMETRY,
@@ -184,12 +188,18 @@ class DiveFolder:
         """metric.json; ``main`` is the largest sub-map."""
         write_metric_file(self.path, frames, main)
 
-    def write_cameras(self, mapped: CameraModel, calibration: CameraModel | None) -> None:
+    def write_cameras(
+        self, mapped: CameraModel, calibration: CameraModel | None, comment: str = ""
+    ) -> None:
         """camera.yaml: the pinhole camera of the mapped pictures; calibration.yaml: the one that
-        they were undistorted with, where there is one."""
+        they were undistorted with, where there is one, with a ``comment`` on where it is from."""
         save_camera(mapped, self.path / "camera.yaml")
         if calibration is not None:
-            save_camera(calibration, self.path / "calibration.yaml")
+            save_camera(calibration, self.path / "calibration.yaml", comment)
+
+    def write_suggested_camera(self, camera: CameraModel, comment: str) -> None:
+        """found_camera.yaml: a calibration for the next dive."""
+        save_camera(camera, self.path / SUGGESTED, comment)
 
     def write_map(self, mapper: Mapper, suffix: str = "") -> None:
         """map.aqf: the exact map."""

@@ -9,6 +9,7 @@ import torch
 
 from aquaflow.config import Config, SourceConfig
 from aquaflow.cores import usable_threads
+from aquaflow.dive.calibration_pass import found_in
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import DiveRun, Finished
 from aquaflow.dive.synchronisation import synchronise
@@ -60,6 +61,8 @@ def map_recording(
                     slam.metric.mounting = mounting_of(recording)
             playback = Playback(recording, given.synchronised, failures=failures)
             shown = progress or (lambda stage, done, total: None)
+            if calibration is None:
+                _find_camera(run, recording, shown)
             return _replay(run, recording, given, playback, config, shown)
         finally:
             with failures.contain("closing"):
@@ -68,6 +71,14 @@ def map_recording(
         for close in (folder.close, recording.close, given.close):
             with failures.contain("closing"):
                 close()
+
+
+def _find_camera(run: DiveRun, recording: RecordedCamera, progress: Progress) -> None:
+    """Give the run the camera that the recording itself shows, if it shows one."""
+    with run.profiler.stage("self-calibration"), run.slam.failures.contain("self-calibration"):
+        found = found_in(recording, run.config, lambda done, of: progress("calibrate", done, of))
+        if found is not None:
+            run.adopt(found)
 
 
 def _replay(

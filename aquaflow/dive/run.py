@@ -14,7 +14,8 @@ from typing import Any
 from aquaflow.config import Config
 from aquaflow.dive import calibration_findings
 from aquaflow.dive.deliverables import Deliverables
-from aquaflow.dive.folder import TRACE, DiveFolder
+from aquaflow.dive.folder import SUGGESTED, TRACE, DiveFolder
+from aquaflow.dive.found_camera import FoundCamera, from_keyframes, in_words
 from aquaflow.dive.frames_csv import FrameRow
 from aquaflow.dive.metric_outputs import (
     MetricOutputs,
@@ -74,6 +75,8 @@ class DiveRun:
         self.config = config
         self.lens_error: LensError | None = None
         """Result of the calibration check, if a calibration was given; known at the end."""
+        self.found: FoundCamera | None = None
+        """The camera of a dive without calibration, as far as its own pictures show it."""
         self.live: dict[str, Any] | None = None
         """Counters of a live run for metrics.json."""
         self.telemetry_log: TelemetryLog | None = None
@@ -85,6 +88,11 @@ class DiveRun:
         """Seconds from the start of the run."""
         self._name_of, self._trace = name_of, trace
         self._cpu_before_s = time.process_time()
+
+    def adopt(self, found: FoundCamera) -> None:
+        """Use the camera that the recording itself showed; before the first frame."""
+        self.found = found
+        self.preparation = Preparation(self.config.source, found.camera)
 
     @property
     def results(self) -> list[Tracked]:
@@ -190,6 +198,8 @@ class DiveRun:
         """
         attempt = self.slam.failures.attempt
         self.decide(self.slam.finish(progress))
+        if self.calibration is None and self.found is None:
+            self._find_camera()
         with self.profiler.stage("write"):
             results, outputs = self.results, self._metric_outputs()
             self._note_what_was_left_out(results, notes, outputs)
@@ -220,12 +230,9 @@ class DiveRun:
                 f"tracking was lost {len(sub_maps) - 1} times: the dive has "
                 f"{sub_maps_in_words([outputs.frame(number) for number in sub_maps])}"
             )
-        if self.calibration is None and self.slam.tracker.camera is not None:
-            focal, sigma = self.slam.tracker.camera.fx, self.slam.tracker.focal_sigma
-            self.notes.append(
-                "no calibration was given: the focal length was guessed and refined to "
-                f"{focal:.0f} px ({100.0 * sigma:.0f} % formal uncertainty), distortion ignored"
-            )
+        camera = self.slam.tracker.camera
+        if self.calibration is None and camera is not None:
+            self.notes.append(in_words(self.found, camera, SUGGESTED))
         overlay = self.slam.overlays.share
         if overlay > 0.0:
             self.notes.append(
@@ -239,6 +246,15 @@ class DiveRun:
         for note in self.notes:
             log.info(note)
 
+    def _find_camera(self) -> None:
+        """From the keyframes, for the next dive, where neither the user nor a first pass gave a
+        camera for this one."""
+        with (
+            self.profiler.stage("self-calibration"),
+            self.slam.failures.contain("self-calibration"),
+        ):
+            self.found = from_keyframes(self.slam.keyframes.keyframes)
+
     def _why_not(self, read: int) -> str:
         if read == 0:
             return f"{self.name}: no frame could be read, see {self.folder.path}/frames.csv"
@@ -250,7 +266,9 @@ class DiveRun:
         )
 
     def _write(self, results: list[Tracked], outputs: MetricOutputs) -> Finished:
-        made = Deliverables(self.name, self.folder, self.slam, results, self.calibration, outputs)
+        made = Deliverables(
+            self.name, self.folder, self.slam, results, self.calibration, outputs, self.found
+        )
         with self.profiler.stage("evaluate"):
             made.evaluate()
         with self.profiler.stage("write"):
@@ -301,6 +319,7 @@ class DiveRun:
         numbers |= frame_numbers(made.metric_frame) | utc_numbers(made.outputs.navigation)
         numbers["warnings"], numbers["failures"] = self.warnings, self.slam.failures.to_json()
         numbers["calibration_check"] = self._calibration_numbers()
+        numbers["self_calibration"] = None if self.found is None else self.found.to_json()
         numbers["cpu_s"] = round(time.process_time() - self._cpu_before_s, 3)  # of all threads
         if self.live is not None:
             numbers["live"] = self.live

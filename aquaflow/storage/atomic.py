@@ -49,12 +49,14 @@ def write_json(path: Path, data: dict[str, Any]) -> None:
         stream.write(text.encode("utf-8"))
 
 
-def write_yaml(path: Path, data: dict[str, Any]) -> None:
-    """Write a YAML file atomically, with its keys in the order of ``data``.
+def write_yaml(path: Path, data: dict[str, Any], comment: str = "") -> None:
+    """Write a YAML file atomically, with its keys in the order of ``data``, after a ``comment`` of
+    one line.
 
     Raises:
         InputError: the file cannot be written.
     """
-    text = yaml.safe_dump(data, sort_keys=False)
+    head = f"# {comment}\n" if comment else ""
+    text = head + yaml.safe_dump(data, sort_keys=False, allow_unicode=False)
     with atomic_write(path) as stream:
         stream.write(text.encode("utf-8"))

@@ -10,8 +10,8 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.storage.atomic import write_yaml
 
 
-def save_camera(camera: CameraModel, path: Path) -> None:
-    """Write ``camera`` to ``path``.
+def save_camera(camera: CameraModel, path: Path, comment: str = "") -> None:
+    """Write ``camera`` to ``path``, after a ``comment`` of one line.
 
     Raises:
         InputError: the file cannot be written.
@@ -19,7 +19,7 @@ def save_camera(camera: CameraModel, path: Path) -> None:
     data = asdict(camera) | {"distortion": list(camera.distortion), "model": "pinhole"}
     del data["calibrated"]
     data["port"] = "none" if camera.port is None else _plain(asdict(camera.port))
-    write_yaml(path, data)
+    write_yaml(path, data, comment)
 
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:

@@ -24,10 +24,10 @@ MIN_VIEWS = 6
 STEPS = (1, 2, 3, 5, 8, 13)
 """From one view to those that it is matched with: neighbours are matched surely, and distant ones
 show the focal length, which is a matter of wide angles."""
-SYSTEMATIC = np.array([0.003, 0.0015])
-"""Standard deviations of log focal length and k1 that no scatter between views shows: detected
-keypoints are pulled towards pixel centres and along edges. Measured on synthetic dives whose
-scatter states 0.1 to 0.3 % (docs/measurements.md#self-calibration)."""
+SYSTEMATIC = np.array([10.0, 5.0])
+"""Standard deviations of log focal length and k1, over the noise of the matches (normalised units),
+that no scatter between views shows: keypoints are pulled along edges and by the pixels' grid the
+same way everywhere. Measured on synthetic dives (docs/measurements.md#self-calibration)."""
 KNOWN_SIGMA = 0.1
 """Of the log focal length; above, the dive hardly says more than the guess."""
 
@@ -94,7 +94,8 @@ def estimated(
     simple = adjust_lens(observations, R_wc, centres, 2, start)
     state = simple.adjusted
     full = adjust_lens(observations, state.R_wc, state.centres, TERMS, state.lens)
-    covariance = simple.covariance + model_error(simple, full) + np.diag(SYSTEMATIC**2)
+    shared = np.diag((SYSTEMATIC * simple.sigma) ** 2)
+    covariance = simple.covariance + model_error(simple, full) + shared
     if not np.isfinite(covariance).all():
         raise np.linalg.LinAlgError("the matches determine no lens")
     return _found(simple, covariance, observations)

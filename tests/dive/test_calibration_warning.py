@@ -49,19 +49,6 @@ def test_the_right_calibration_is_no_warning(small_dive: Path) -> None:
     assert numbers["calibration_check"]["chance"] > 0.001
 
 
-def test_without_a_calibration_nothing_is_checked(small_recording: Path, tmp_path: Path) -> None:
-    source = tmp_path / "source"
-    shutil.copytree(small_recording, source)
-    (source / "camera.yaml").unlink()
-
-    finished = replay.map_recording(
-        open_recording(source), "uncalibrated", tmp_path / "dive", TRACKING
-    )
-
-    assert finished.metrics["calibration_check"] is None
-    assert "calibration check" not in finished.metrics["stage_ms"]
-
-
 @pytest.mark.usefixtures("contained")
 def test_a_check_that_fails_costs_itself(
     small_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -115,16 +115,6 @@ def test_black_frames_in_the_middle_cost_those_frames_and_are_noted(
     assert f"{unposed} of {FRAMES} frames got no pose" in (dive / "report.html").read_text()
 
 
-def test_without_a_calibration_the_focal_length_is_found_and_noted(
-    small_recording: Path, tmp_path: Path
-) -> None:
-    recording = open_recording(small_recording / "images")
-    assert recording.camera is None
-    replayed = map_recording(recording, "uncalibrated", tmp_path / "dive", TRACKING_ONLY)
-    assert any("focal length was guessed and refined" in note for note in replayed.notes)
-    assert not (tmp_path / "dive" / "calibration.yaml").exists()
-
-
 def test_progress_reaches_the_number_of_frames(small_recording: Path, tmp_path: Path) -> None:
     seen: list[tuple[str, int, int | None]] = []
     map_recording(

@@ -1,0 +1,154 @@
+"""A recording without calibration is looked at twice: first to find its lens, then to map it.
+
+The first pass tracks from the beginning until the lens is known well enough, or for as many frames
+as it may. Its poses are rough where the guess was wrong; the adjustment of the lens corrects them.
+Where many frames were lost with the guess, the pass is repeated with what it found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.config import Config
+from aquaflow.dive.found_camera import FoundCamera, usable
+from aquaflow.errors import InputError
+from aquaflow.errors.failures import Failures
+from aquaflow.geometry.camera import CameraModel, guess_camera
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes import Keyframe
+from aquaflow.messages import Frame
+from aquaflow.prior.contract import Keypoints
+from aquaflow.slam import Slam
+from aquaflow.sources import CameraSource
+from aquaflow.sources.preprocessing import Preparation
+from aquaflow.tracking.frames import Tracked
+from aquaflow.tracking.lens_views import LensViews
+from aquaflow.tracking.self_calibration import FoundLens, found_lens
+
+MOST_FRAMES = 600
+"""Looked at for the lens: a minute of the dive at 10 frames/s, and a minute of two cores."""
+GOOD_SIGMA = np.array([0.0075, 0.01])
+"""Of log focal length and k1: better than calibrations in water agree with each other."""
+REPEAT_LOST_SHARE = 0.1
+"""Of the frames without a pose, above which tracking is repeated with what was found."""
+EVERY_PIXEL = 8
+"""Of a pointmap, for its median."""
+
+Picture = npt.NDArray[np.uint8]
+Progress = Callable[[int, int | None], None]
+
+
+def found_in(recording: CameraSource, config: Config, progress: Progress) -> FoundCamera | None:
+    """The camera of a recording without calibration; None where its beginning shows too little."""
+    first = _Pass(recording, config, progress)
+    found = first.run()
+    camera = None if found is None else usable(found.camera(first.guess))
+    if found is None or camera is None:
+        return None
+    if first.lost_share > REPEAT_LOST_SHARE:
+        again = _Pass(recording, config, progress, camera, found).run()
+        better = None if again is None else usable(again.camera(first.guess))
+        if again is not None and better is not None:
+            camera, found = better, again
+    return FoundCamera(camera, found, used=True)
+
+
+class _Pass:
+    """Tracking from the beginning, with ``camera`` or the guess, for views of the lens."""
+
+    def __init__(
+        self,
+        recording: CameraSource,
+        config: Config,
+        progress: Progress,
+        camera: CameraModel | None = None,
+        found: FoundLens | None = None,
+    ) -> None:
+        tracking = config.mapping.model_copy(update={"enabled": False})
+        self._config = config.model_copy(update={"mapping": tracking})
+        self._recording, self._progress = recording, progress
+        self._camera, self._found = camera, found
+        self._pictures: dict[int, Picture] = {}
+        """As they are, distortion and all, by frame index, until their pose is known."""
+        self.guess = guess_camera(1, 1)
+        """Of the pictures; known with the first."""
+        self.lost_share = 0.0
+        """Of the frames, how many have no pose."""
+
+    def run(self) -> FoundLens | None:
+        """The lens as far as it was found."""
+        slam = Slam(self._config)
+        try:
+            return self._run(slam)
+        finally:
+            slam.close()
+
+    def _run(self, slam: Slam) -> FoundLens | None:
+        plain = Preparation(self._config.source, None)
+        rectified = (
+            plain if self._camera is None else Preparation(self._config.source, self._camera)
+        )
+        views: LensViews | None = None
+        for frame in self._frames():
+            try:
+                seen = plain(frame)
+                tracked = seen if rectified is plain else rectified(frame)
+            except InputError:
+                continue
+            if views is None:
+                self.guess = seen.camera
+                views = LensViews(seen.camera)
+            self._pictures[frame.index] = seen.image
+            self._take(slam, views, slam.process(tracked))
+            if views.full:
+                found = self._estimate(slam, views)
+                if views.complete or (found is not None and (found.sigma < GOOD_SIGMA).all()):
+                    return found
+                views.thin()
+        if views is None:
+            return None
+        self._take(slam, views, slam.finish_tracking())
+        return self._estimate(slam, views)
+
+    def _frames(self) -> Iterator[Frame]:
+        """Until the recording ends or fails, which the mapping then meets again and counts."""
+        source = self._config.source
+        events = self._recording.frames(source.every, source.start, source.stop)
+        for done in range(1, MOST_FRAMES + 1):
+            event = None
+            with Failures(strict=False).contain("reading"):
+                event = next(events, None)
+            if event is None:
+                return
+            self._progress(done, None)
+            if isinstance(event, Frame):
+                yield event
+
+    def _take(self, slam: Slam, views: LensViews, decided: list[Tracked]) -> None:
+        for tracked in decided:
+            picture = self._pictures.pop(tracked.frame.index)
+            if tracked.T_wc is None or tracked.keyframe is None:
+                continue
+            rho = _nearness(slam.keyframes[tracked.keyframe])
+            keypoints = partial(self._keypoints, slam, picture)
+            views.offer(tracked.frame.index, tracked.T_wc, tracked.sub_map, rho, keypoints)
+
+    def _keypoints(self, slam: Slam, picture: Picture) -> Keypoints:
+        return slam.prior.encode(picture, self.guess).keypoints
+
+    def _estimate(self, slam: Slam, views: LensViews) -> FoundLens | None:
+        results = slam.results()
+        poses: dict[int, Sim3] = {t.frame.index: t.T_wc for t in results if t.T_wc is not None}
+        self.lost_share = 1.0 - len(poses) / max(len(results), 1)
+        return found_lens(views.posed(poses), None if self._found is None else self._found.lens)
+
+
+def _nearness(keyframe: Keyframe) -> float:
+    """Median inverse depth, 1 / world units; 0 where none is known."""
+    rho = keyframe.pointmap.rho[::EVERY_PIXEL, ::EVERY_PIXEL]
+    known = rho[rho > 0.0]
+    return float(np.median(known)) / keyframe.T_wc.scale if len(known) else 0.0
