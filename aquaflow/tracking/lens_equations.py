@@ -169,7 +169,7 @@ def _summed(
     size: int,
 ) -> Array:
     """[size] sums of the values that go to the same place."""
-    return np.bincount(where.ravel(), values.ravel(), size)
+    return np.asarray(np.bincount(where.ravel(), values.ravel(), size), dtype=np.float64)
 
 
 def _transformed(

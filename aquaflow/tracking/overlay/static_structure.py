@@ -44,7 +44,7 @@ class StaticStructure:
         keep = 1.0 - 1.0 / MEMORY
         totals, values = (self._gx, self._gy, self._power), (gx, gy, power)
         self._gx, self._gy, self._power = (
-            np.asarray(cv2.addWeighted(total, keep, value, 1.0, 0.0))
+            np.asarray(cv2.addWeighted(total, keep, value, 1.0, 0.0), dtype=np.float32)
             for total, value in zip(totals, values, strict=True)
         )
         self._weight = keep * self._weight + 1.0

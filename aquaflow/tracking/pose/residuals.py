@@ -233,7 +233,7 @@ def _depth_change(
 ) -> Array:
     """[M] relative change of inverse depth to where the derivatives are taken."""
     if matches.nearer is not None:
-        return matches.nearer - 1.0
+        return np.asarray(matches.nearer - 1.0)
     to_best = np.clip(to_best, -MAX_DEPTH_CHANGE, MAX_DEPTH_CHANGE)
     # An outlier's residual says nothing about its depth.
     to_best[(np.abs(rows.residual) >= INLIER).any(0)] = 0.0

@@ -57,5 +57,5 @@ def _mean_around(
     count, total = np.moveaxis(outer - inner, -1, 0)
     enough = count > LEAST_CELLS
     mean = np.where(enough, total / np.where(enough, count, 1.0), 0.0).astype(np.float32)
-    mean = cv2.resize(mean, (width, height), interpolation=cv2.INTER_NEAREST)
-    return np.asarray(np.where(mean > 0.0, mean, rho), dtype=np.float32)
+    everywhere = cv2.resize(mean, (width, height), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(np.where(everywhere > 0.0, everywhere, rho), dtype=np.float32)
