@@ -20,6 +20,7 @@ from aquaflow.messages import Frame
 from aquaflow.prior.factory import make_prior
 from aquaflow.profiler import Profiler
 from aquaflow.render import select_renderer
+from aquaflow.tracking.adjustment.adjuster import Adjuster
 from aquaflow.tracking.anchored import Anchored, Anchors
 from aquaflow.tracking.frame_table import FrameTable
 from aquaflow.tracking.frames import FrameClass, Tracked
@@ -80,9 +81,13 @@ class Slam:
             self.prior, self.keyframes, config.tracking, places, live, self.failures,
             self.metric.motion,
         )  # fmt: skip
+        adjustment = config.tracking.adjustment
+        self.adjuster = Adjuster(self.keyframes, adjustment)
+        """Joint adjustments of keyframes."""
         self.graph = KeyframeGraph(
-            self.keyframes, places, config.tracking, self.failures, self.metric
-        )
+            self.keyframes, places, config.tracking, self.failures, self.metric,
+            self.adjuster if adjustment.enabled else None,
+        )  # fmt: skip
         self.renderer = select_renderer(config.mapping.renderer, config.threads or os.cpu_count())
         self.maps: MapWork = maps or Maps(config, self.renderer, self.profiler, work, self.failures)
         self.skipped: Counter[str] = Counter()
@@ -164,6 +169,8 @@ class Slam:
 
     def _settle_graph(self) -> None:
         """The last optimisations, of loops and telemetry, and then the frames in metres."""
+        self._wait_for_graph()
+        self.graph.adjust_everything()
         self._wait_for_graph()
         if self.metric.present:
             for _ in range(SETTLING_ROUNDS):
@@ -254,6 +261,7 @@ class Slam:
             index = tracked.frame.index
             with self.profiler.stage("graph"), self.failures.contain("keyframe graph", index):
                 self.graph.add(tracked.keyframe, tracked.link)
+            tracked = replace(tracked, link=None)  # its matches are let go
         settled = self._anchors.settled(tracked, T_kf)
         linked = Anchored(settled, None if settled.T_wc is None else T_kf)
         self._latest = None if linked.T_kf is None else len(self.frames)

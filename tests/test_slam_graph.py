@@ -21,6 +21,9 @@ class ToldGraph:
         self.asked.append(f"add {number}")
         self.optimising = True
 
+    def adjust_everything(self) -> None:
+        self.asked.append("adjust")
+
     def correction(self, wait: bool) -> Correction:
         self.asked.append("wait" if wait else "look")
         self.optimising &= not wait
@@ -30,8 +33,8 @@ class ToldGraph:
 @pytest.mark.parametrize(
     ("live", "asked"),
     [
-        (False, ["wait", "add 0", "wait", "add 1", "wait"]),
-        (True, ["look", "add 0", "look", "look", "add 1", "look", "wait"]),
+        (False, ["wait", "add 0", "wait", "add 1", "wait", "adjust"]),
+        (True, ["look", "add 0", "look", "look", "add 1", "look", "wait", "adjust"]),
     ],
 )
 def test_only_a_replay_waits_for_the_graph_and_only_at_keyframes(

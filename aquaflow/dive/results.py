@@ -152,6 +152,7 @@ def metrics(
         "sub_maps": len({t.sub_map for t in results if t.T_wc is not None}),
         "skipped_by": dict(slam.skipped) | ({"dropped": len(dropped)} if dropped else {}),
         "loops": slam.graph.loops,
+        "adjustments": slam.adjuster.tally.to_json(),
         "gaussians": sum(len(mapper.gaussians) for mapper in slam.mappers.values()),
         "steps": sum(mapper.steps for mapper in slam.mappers.values()),
         "steps_undone": sum(mapper.undone for mapper in slam.mappers.values()),

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
 from aquaflow.messages import Frame
+from aquaflow.prior.contract import PairGeometry
 
 
 class FrameClass(str, Enum):
@@ -44,6 +45,8 @@ class Link:
     """Earlier keyframe to new one."""
     covariance: npt.NDArray[np.float64]
     """[6, 6] of the left tangent [translation, rotation]."""
+    pair: PairGeometry | None = None
+    """The matches that it was solved from, earlier to new; let go once they were sampled."""
 
 
 @dataclass(frozen=True)

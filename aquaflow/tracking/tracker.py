@@ -259,7 +259,8 @@ class Tracker:
         if frame_class is FrameClass.MAPPING:
             at.mapped_parallax_px = solved.parallax_px
             return at.tracked(frame, frame_class, solved.quality, pointmap.copy())
-        link = Link(at.keyframe.number, solved.estimate.T, solved.estimate.covariance)
+        estimate = solved.estimate
+        link = Link(at.keyframe.number, estimate.T, estimate.covariance, solved.pair)
         self.sub_map = at.keyframe.sub_map
         keyframe_tracker.leave(at)
         new = keyframe_tracker.at_new_keyframe

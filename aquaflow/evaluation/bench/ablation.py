@@ -64,6 +64,7 @@ PARTS = (
     AblatedPart("without depth loss", {"mapping": {"loss": {"depth": 0.0}}}),
     AblatedPart("without loop closure", _tracking(graph={"enabled": False})),
     AblatedPart("without masking of overlays", _tracking(mask_overlays=False)),
+    AblatedPart("without joint adjustment", _tracking(adjustment={"enabled": False})),
     AblatedPart("with neural Gaussians (LGPD)", _decoder()),
     AblatedPart("with neural Gaussians, base held as inserted", _decoder(optimise_initial=False)),
     AblatedPart("with neural Gaussians, without distance embedding", _decoder(distance=False)),

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -22,6 +21,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.keyframes import Keyframe, KeyframeStore
 from aquaflow.tracking.frames import Link
+from aquaflow.tracking.graph.improvement import Improvement
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph, edge_information, solve
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
 from aquaflow.tracking.loops.relocaliser import Places
@@ -49,8 +49,29 @@ class Telemetry(Protocol):
         """A new keyframe; True if an optimisation is due."""
         ...
 
-    def job(self, snapshot: Snapshot) -> Callable[[], GraphResult]:
-        """The optimisation of a snapshot, to be called in any thread."""
+    def job(self, snapshot: Snapshot) -> Callable[[Snapshot], GraphResult]:
+        """The optimisation of a snapshot, or of one with better poses and edges, to be called in
+        any thread."""
+        ...
+
+    def applied(self) -> None:
+        """The last job's result has been taken over."""
+        ...
+
+
+class Adjustments(Protocol):
+    """Poses and depths of several keyframes solved together (``tracking/adjustment``)."""
+
+    def keyframe(self, keyframe: Keyframe, link: Link | None, edge: Edge | None) -> None:
+        """A new keyframe, how it was linked, and the edge made of that."""
+        ...
+
+    def window(self, number: int) -> Callable[[Snapshot], Improvement] | None:
+        """The adjustment of the newest keyframes, to be called in any thread."""
+        ...
+
+    def everything(self) -> Callable[[Snapshot], Improvement] | None:
+        """The adjustment of all keyframes, to be called in any thread."""
         ...
 
     def applied(self) -> None:
@@ -71,8 +92,10 @@ class KeyframeGraph:
         config: TrackingConfig,
         failures: Failures | None = None,
         telemetry: Telemetry | None = None,
+        adjustments: Adjustments | None = None,
     ) -> None:
-        """``telemetry`` takes part in the optimisations, once there is some."""
+        """``telemetry`` takes part in the optimisations, once there is some; ``adjustments`` come
+        before them."""
         self.graph = PoseGraph(config.graph)
         self._telemetry = telemetry
         self._failures = failures or Failures()
@@ -83,6 +106,9 @@ class KeyframeGraph:
         """In the graph; the store may hold some that are not yet."""
         self._executor = ThreadPoolExecutor(1, "keyframe graph")
         self._optimisation: Future[GraphResult] | None = None
+        self._adjustments = adjustments
+        self._to_adjust: int | None = None
+        """The newest keyframe, if its window has not been adjusted."""
         self._due = False
         """True if loops or telemetry came that no optimisation has seen."""
 
@@ -108,10 +134,16 @@ class KeyframeGraph:
             keyframe.sub_map = earlier.sub_map
         self.graph.add_keyframe(number, keyframe.T_wc)
         self._known.append(keyframe)
+        edge = None
         if link is not None:
             sigma = self._config.link_scale_sigma
             information = edge_information(link.covariance, sigma, link.T_fk)
-            self.graph.add_edge(Edge(number, link.keyframe, link.T_fk, information))
+            edge = Edge(number, link.keyframe, link.T_fk, information)
+            self.graph.add_edge(edge)
+        if self._adjustments is not None:
+            with self._failures.contain("joint adjustment", keyframe.frame_index):
+                self._adjustments.keyframe(keyframe, link, edge)
+                self._to_adjust = number
         if self._config.enabled:
             with self._failures.contain("loop search", keyframe.frame_index):
                 self._close_loops(keyframe)
@@ -122,6 +154,12 @@ class KeyframeGraph:
             with self._failures.contain("metric frames", keyframe.frame_index):
                 self._due |= self._telemetry.keyframe(number, parent)
         self._optimise()
+
+    def adjust_everything(self) -> None:
+        """Start a joint adjustment of all keyframes, and then an optimisation; none may run."""
+        if self._adjustments is not None:
+            self._due = True
+            self._optimise(everything=True)
 
     def straighten(self) -> None:
         """Start an optimisation together with telemetry, if none is running."""
@@ -152,8 +190,9 @@ class KeyframeGraph:
             result = self.graph.apply(finished.result())
             assert result is not None  # only this method applies results
             correction = self._taken_over(result)
-            if self._telemetry is not None:
-                self._telemetry.applied()
+            for taking_part in (self._adjustments, self._telemetry):
+                if taking_part is not None:
+                    taking_part.applied()
         self._optimise()
         return correction
 
@@ -161,15 +200,46 @@ class KeyframeGraph:
         """End the thread; the result of a running optimisation is discarded."""
         self._executor.shutdown()
 
-    def _optimise(self) -> None:
-        """Start an optimisation if there is something new and none is running."""
-        if self._due and self._optimisation is None:
-            self._due = False
-            snapshot = self.graph.snapshot()
-            job: Callable[[], GraphResult] = partial(solve, snapshot)
-            if self._telemetry is not None and self._telemetry.present:
-                job = self._telemetry.job(snapshot)
-            self._optimisation = self._executor.submit(job)
+    def _optimise(self, everything: bool = False) -> None:
+        """Start an adjustment or optimisation if there is something new and none is running."""
+        if self._optimisation is not None:
+            return
+        job = self._adjustment(everything)
+        if job is None and not self._due:
+            return
+        snapshot, optimise = self.graph.snapshot(), None
+        with_telemetry = self._telemetry is not None and self._telemetry.present
+        if self._telemetry is not None and with_telemetry and self._due:
+            optimise = self._telemetry.job(snapshot)
+        elif not with_telemetry:
+            optimise = solve
+        self._due = False
+        self._optimisation = self._executor.submit(self._improved, job, snapshot, optimise)
+
+    def _adjustment(self, everything: bool) -> Callable[[Snapshot], Improvement] | None:
+        number, self._to_adjust = self._to_adjust, None
+        if self._adjustments is not None:
+            with self._failures.contain("joint adjustment"):
+                if everything:
+                    return self._adjustments.everything()
+                return None if number is None else self._adjustments.window(number)
+        return None
+
+    def _improved(
+        self,
+        adjust: Callable[[Snapshot], Improvement] | None,
+        snapshot: Snapshot,
+        optimise: Callable[[Snapshot], GraphResult] | None,
+    ) -> GraphResult:
+        """In the graph's thread: adjust, then optimise with what that found. Without ``optimise``
+        telemetry's next turn does it: what it straightened must not be bent back meanwhile."""
+        better = Improvement.none()
+        if adjust is not None:
+            with self._failures.contain("joint adjustment"):
+                better = adjust(snapshot)
+        if optimise is None:
+            return better.alone(snapshot)
+        return better.within(optimise(better.of(snapshot)), snapshot)
 
     def _close_loops(self, keyframe: Keyframe) -> None:
         """Edges to all earlier keyframes that prove to show the same place."""

@@ -43,6 +43,7 @@ class Optimisation:
     def run(self) -> GraphResult:
         """Optimise."""
         fresh = np.arange(0 if self.everything else self.snapshot.settled, len(self.edges))
+        fresh = np.union1d(self.snapshot.changed, fresh)
         asked = self._ends(self._strained(fresh[self.counts[fresh]]))
         candidates = self._candidates(fresh)
         for round_ in range(ROUNDS):

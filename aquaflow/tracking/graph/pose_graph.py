@@ -26,6 +26,7 @@ from aquaflow.tracking.graph.table import (
     Join,
     Snapshot,
     Table,
+    no_rows,
     write_poses,
 )
 
@@ -94,6 +95,7 @@ class PoseGraph:
         self._shifted: set[int] = set()
         self._members: Counter[int] = Counter()
         self._seen = 0
+        self._changed = no_rows()
 
     def __contains__(self, number: int) -> bool:
         return number in self._row
@@ -190,6 +192,7 @@ class PoseGraph:
             self._settled,
             self._version,
             self.config,
+            self._changed,
         )
 
     def optimise(self, everything: bool = False) -> GraphResult:
@@ -222,7 +225,11 @@ class PoseGraph:
         trust = self._trust.rows.copy()
         trust[: len(result.edge_trust)] = result.edge_trust
         self._trust.replace(trust)
-        self._settled = len(result.edge_trust)
+        if len(result.better):
+            edges = self._edges.rows.copy()
+            edges[result.better] = result.better_edges
+            self._edges.replace(edges)
+        self._settled, self._changed = len(result.edge_trust), result.pending
         self._version += 1
         self._joins, self._shifted = [], set()
         ordered = sorted(numbers)

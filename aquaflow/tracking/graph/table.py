@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -78,6 +78,11 @@ class Table:
         self._count = len(rows)
 
 
+def no_rows() -> Index:
+    """[0] of a table."""
+    return np.zeros(0, dtype=np.intp)
+
+
 @dataclass(frozen=True)
 class Snapshot:
     """A keyframe graph at one moment: read-only, so that another thread may work on it."""
@@ -95,6 +100,8 @@ class Snapshot:
     version: int
     """How many results had been applied."""
     config: GraphConfig
+    changed: Index = field(default_factory=no_rows)
+    """Older edges that are to be looked at again: an adjustment changed them or their poses."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +123,12 @@ class GraphResult:
     """[k] NODE, with their new poses."""
     edge_trust: Rows
     """[M] TRUST"""
+    better: Index = field(default_factory=no_rows)
+    """[b] edges that an adjustment found better values for."""
+    better_edges: Rows = field(default_factory=lambda: np.zeros(0, EDGE))
+    """[b] EDGE"""
+    pending: Index = field(default_factory=no_rows)
+    """Edges for the next optimisation to look at, as ``Snapshot.changed``."""
 
 
 def write_poses(

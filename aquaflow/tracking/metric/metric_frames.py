@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -110,17 +111,17 @@ class MetricFrames:
             self.sightings.copy(),
         )  # fmt: skip
 
-    def job(self, snapshot: Snapshot) -> Callable[[], GraphResult]:
+    def job(self, snapshot: Snapshot) -> Callable[[Snapshot], GraphResult]:
         """The optimisation of a snapshot together with telemetry, to be called in any thread."""
         survey = self.survey(snapshot)
         t_s = {k.number: k.t_ns * 1e-9 for k in self._keyframes.keyframes}
 
-        def together() -> GraphResult:
+        def together(better: Snapshot) -> GraphResult:
             with self._failures.contain("telemetry in the keyframe graph"):
-                solved = straightened(snapshot, survey, t_s)
+                solved = straightened(better, replace(survey, nodes=better.nodes), t_s)
                 self._solved = solved.frames
                 return solved.result
-            return solve(snapshot)  # what telemetry cannot do must not cost the loops
+            return solve(better)  # what telemetry cannot do must not cost the loops
 
         return together
 

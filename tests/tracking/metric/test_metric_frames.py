@@ -44,7 +44,8 @@ def test_a_failing_estimate_leaves_the_graph_its_own_optimisation(
     failures = Failures(strict=False)
     metric, graph = of_a_dive(failures), looped()
     metric.add(Depth(0, 0, "bar30", 3.0))
-    result = metric.job(graph.snapshot())()
+    snapshot = graph.snapshot()
+    result = metric.job(snapshot)(snapshot)
     assert 1.83 < result.poses[2].t[0] < 1.86  # between the links and what goes across
     (kind,) = failures.to_json()
     assert kind["stage"] == "telemetry in the keyframe graph"

@@ -1,0 +1,201 @@
+"""Joint adjustments of a growing keyframe graph: what they need is collected here.
+
+In the tracking thread :meth:`Adjuster.keyframe` takes what a new keyframe brings, and
+:meth:`Adjuster.window` hands over all that an adjustment reads, as a job for the
+graph's thread; :meth:`Adjuster.applied` keeps the matches that it made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from time import thread_time
+
+import numpy as np
+
+from aquaflow.config.tracking import AdjustmentConfig
+from aquaflow.errors import InputError
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes import Keyframe, KeyframeStore
+from aquaflow.prior.flow_pair import FlowEncoding
+from aquaflow.tracking.adjustment.anchored_points import (
+    AnchoredPoints,
+    sampled_points,
+    see_each_other,
+)
+from aquaflow.tracking.adjustment.joint import adjust
+from aquaflow.tracking.adjustment.matching import KeyframePairs, KeyframeView
+from aquaflow.tracking.adjustment.window import (
+    MeasuredLink,
+    copied,
+    improvement_of,
+    poses_at,
+    problem_of,
+)
+from aquaflow.tracking.frames import Link
+from aquaflow.tracking.graph.improvement import Improvement
+from aquaflow.tracking.graph.pose_graph import Edge
+from aquaflow.tracking.graph.table import Snapshot
+
+Adjust = Callable[[Snapshot], Improvement]
+"""A job for any thread."""
+
+LEAST_SHARE = 0.05
+"""Of a keyframe's points that another must see for the pair to be of use."""
+
+
+@dataclass
+class Tally:
+    """What became of the adjustments so far."""
+
+    kept: int = 0
+    refused: int = 0
+    """The points held out of it did not fit better."""
+    cpu_ms: list[float] = field(default_factory=list)
+    """Of each adjustment, matching included."""
+
+    def to_json(self) -> dict[str, float | int | None]:
+        """As metrics.json has it."""
+        times = np.array(self.cpu_ms)
+        mean, p95 = (
+            (round(float(each), 1) for each in (times.mean(), np.percentile(times, 95)))
+            if len(times)
+            else (None, None)
+        )
+        return {"kept": self.kept, "refused": self.refused, "cpu_ms_mean": mean, "cpu_ms_p95": p95}
+
+
+@dataclass(frozen=True)
+class Job:
+    """An adjustment to be done in any thread."""
+
+    numbers: Sequence[int]
+    """Keyframes, the oldest first."""
+    held: frozenset[int]
+    """Those whose pose stays."""
+    points: dict[int, AnchoredPoints]
+    links: dict[int, MeasuredLink]
+    views: Sequence[KeyframeView]
+    """The newest keyframe, and those that it is to be matched with."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a job found."""
+
+    points: dict[int, AnchoredPoints]
+    kept: bool
+    cpu_ms: float
+
+
+class Adjuster:
+    """Collects anchored points and links; makes jobs of them."""
+
+    def __init__(self, keyframes: KeyframeStore, config: AdjustmentConfig) -> None:
+        self.tally = Tally()
+        self._keyframes, self._config = keyframes, config
+        self._points: dict[int, AnchoredPoints] = {}
+        self._links: dict[int, MeasuredLink] = {}
+        self._pairs = KeyframePairs()
+        self._outcome: Outcome | None = None
+        """Set in the thread of the last job."""
+
+    def keyframe(self, keyframe: Keyframe, link: Link | None, edge: Edge | None) -> None:
+        """Take the points of a new keyframe, and the matches that its link was solved from.
+
+        Raises:
+            InputError: what a keyframe shows cannot be read back.
+        """
+        encoding = keyframe.encoding
+        if not isinstance(encoding, FlowEncoding):
+            return
+        number = keyframe.number
+        points = sampled_points(
+            number, keyframe.pointmap, encoding.texture, encoding.interesting, self._config.points
+        )
+        self._points[number] = points
+        if link is None or edge is None:
+            return
+        self._links[number] = MeasuredLink(edge.b, edge.T_ab, edge.information)
+        parent = self._points.get(link.keyframe)
+        if parent is not None:
+            parent.take_depths(self._keyframes[link.keyframe].pointmap)
+            if link.pair is not None:
+                see_each_other(parent, points, link.pair)
+
+    def window(self, number: int) -> Adjust | None:
+        """The newest keyframes along the links that lead to ``number``; None for fewer than two."""
+        chain = [number]
+        while len(chain) < self._config.window and chain[-1] in self._links:
+            chain.append(self._links[chain[-1]].parent)
+        if len(chain) < 2 or number not in self._points:
+            return None
+        reached = [n for n in chain[2 : self._config.reach + 1] if n in self._points]
+        views = [view for view in map(self._view, [number, *reached]) if view is not None]
+        return partial(self._run, self._job(chain[::-1], frozenset(chain[-1:]), views))
+
+    def everything(self) -> Adjust | None:
+        """All keyframes along links; those without a link stay where they are."""
+        numbers = sorted(set(self._links) | {link.parent for link in self._links.values()})
+        roots = frozenset(number for number in numbers if number not in self._links)
+        if not numbers or not self._config.at_end:
+            return None
+        return partial(self._run, self._job(numbers, roots, []))
+
+    def _job(
+        self, numbers: Sequence[int], held: frozenset[int], views: Sequence[KeyframeView]
+    ) -> Job:
+        points = {n: copied(self._points[n]) for n in numbers if n in self._points}
+        links = {n: self._links[n] for n in numbers if n in self._links}
+        return Job(numbers, held, points, links, views)
+
+    def _view(self, number: int) -> KeyframeView | None:
+        keyframe = self._keyframes[number]
+        try:
+            return KeyframeView(number, keyframe.encoding, keyframe.pointmap.copy())
+        except InputError:
+            return None
+
+    def _run(self, job: Job, snapshot: Snapshot) -> Improvement:
+        """Match and adjust, in any thread.
+
+        Raises:
+            numpy.linalg.LinAlgError: the equations cannot be solved.
+        """
+        began = thread_time()
+        row = {int(number): i for i, number in enumerate(snapshot.nodes["number"])}
+        nodes = np.array([row[number] for number in job.numbers], dtype=np.intp)
+        poses = poses_at(snapshot, nodes)
+        self._match(job, {n: poses.element(i) for i, n in enumerate(job.numbers)})
+        held = np.array([number in job.held for number in job.numbers], dtype=bool)
+        problem = problem_of(job.numbers, job.points, job.links, poses, held)
+        adjusted = adjust(problem, self._config.iterations)
+        found = Improvement.none()
+        if adjusted.better:
+            found = improvement_of(snapshot, nodes, problem, adjusted, certain=bool(job.views))
+        spent = 1e3 * (thread_time() - began)
+        self._outcome = Outcome(job.points, adjusted.better, spent)
+        return found
+
+    def _match(self, job: Job, poses: dict[int, Sim3]) -> None:
+        if not job.views:
+            return
+        newest = job.views[0]
+        for earlier in job.views[1:]:
+            T_ba = poses[newest.number].inverse() @ poses[earlier.number]
+            pair = self._pairs.match(earlier, newest, T_ba)
+            if pair is not None and float(pair.valid.mean()) > LEAST_SHARE:
+                see_each_other(job.points[earlier.number], job.points[newest.number], pair)
+
+    def applied(self) -> None:
+        """Keep the matches that the last job made, and count it."""
+        outcome, self._outcome = self._outcome, None
+        if outcome is None:
+            return
+        for number, points in outcome.points.items():
+            own = self._points[number].seen
+            own.update({other: at for other, at in points.seen.items() if other not in own})
+        self.tally.kept += int(outcome.kept)
+        self.tally.refused += int(not outcome.kept)
+        self.tally.cpu_ms.append(outcome.cpu_ms)

@@ -1,0 +1,186 @@
+"""The normal equations of a joint adjustment, one anchor keyframe at a time.
+
+A point belongs to the keyframe that it was sampled in and has one unknown, its inverse depth there,
+so the points' block of the normal equations is diagonal and is eliminated (Schur complement) anchor
+by anchor: each leaves a small dense block between the anchor and the keyframes that see its points.
+
+Poses are Sim(3): the scale of a keyframe is the unit of its depths. They step from the right,
+T_wc exp(d), as those of the keyframe graph do. Matches see the scale through the prior of the
+depths: what a keyframe's pointmap says, in its own unit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.geometry.similarity import hat
+from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.tracking.adjustment.robust import huber_weights
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.intp]
+Mask = npt.NDArray[np.bool_]
+
+MIN_Z = 1e-3
+"""Of the depth at the anchor; a point behind a view is projected as if just in front of it."""
+LEAST_CURVATURE = 1e-9
+"""Of a depth that nothing measures, in inverse variances."""
+
+
+@dataclass(frozen=True)
+class AnchorMatches:
+    """What the V keyframes that see an anchor's P points measured."""
+
+    anchor: int
+    """Place among the poses."""
+    views: Index
+    """[V] places among the poses."""
+    rays: Array
+    """[P, 3] z = 1"""
+    rho: Array
+    """[P] inverse depth that the pointmap has."""
+    variance: Array
+    """[P] of that; infinite where nothing is known."""
+    at: Array
+    """[V, P, 2] normalised plane; NaN where a point is not seen."""
+    used: Mask
+    """[V, P]"""
+    sigma: Array
+    """[V] noise of the matches of each pair, normalised plane."""
+
+    @property
+    def places(self) -> Index:
+        """[1 + V] of the anchor and the views among the poses."""
+        return np.concatenate([[self.anchor], self.views])
+
+
+@dataclass(frozen=True)
+class Projected:
+    """The points as the views see them from the present poses."""
+
+    R: Array
+    """[V, 3, 3] scale times rotation from the anchor to each view."""
+    t: Array
+    """[V, 3]"""
+    Y: Array
+    """[V, P, 3] points in the views, over their depth in the anchor."""
+    z: Array
+    """[V, P] positive"""
+    error: Array
+    """[V, P, 2] normalised plane; 0 where a point is not seen."""
+
+
+def projected(
+    matches: AnchorMatches,
+    poses: Sim3Batch,
+    rho: Array,  # [P]
+) -> Projected:
+    """Project the points of an anchor into the views that see them."""
+    count = len(matches.views)
+    T_va = poses[matches.views].inverse() @ poses[np.full(count, matches.anchor)]
+    R = T_va.scale[:, None, None] * T_va.R
+    Y = matches.rays @ R.transpose(0, 2, 1) + rho[None, :, None] * T_va.t[:, None, :]
+    z = np.maximum(Y[..., 2], MIN_Z)
+    error = np.where(matches.used[..., None], Y[..., :2] / z[..., None] - matches.at, 0.0)
+    return Projected(R, T_va.t, Y, z, error)
+
+
+@dataclass(frozen=True)
+class AnchorEquations:
+    """One anchor's part of the normal equations, its depths eliminated; n = 7 (1 + V)."""
+
+    H: Array
+    """[n, n]"""
+    scores: Array
+    """[P, n] what each point adds to the gradient."""
+    gain: Array
+    """[P, n] step of a depth by a step of the poses, negative."""
+    offset: Array
+    """[P] step of a depth while the poses stay, negative."""
+
+    @property
+    def gradient(self) -> Array:
+        """[n]"""
+        return np.asarray(self.scores.sum(axis=0))
+
+    def depth_steps(
+        self,
+        step: Array,  # [n] of the anchor's and the views' poses
+    ) -> Array:
+        """[P] steps of the inverse depths that go with a step of the poses."""
+        return np.asarray(-self.offset - self.gain @ step)
+
+
+def anchor_equations(
+    matches: AnchorMatches,
+    poses: Sim3Batch,
+    rho: Array,  # [P]
+) -> AnchorEquations:
+    """Linearise an anchor's matches at ``poses`` and inverse depths."""
+    at = projected(matches, poses, rho)
+    by_point = _by_point(at)
+    by_view = -_moved(by_point, at.Y, rho)
+    by_anchor = _moved(by_point @ at.R[:, None], np.broadcast_to(matches.rays, at.Y.shape), rho)
+    by_rho = np.einsum("vpij,vj->vpi", by_point, at.t)
+    weights = _weights(matches, at.error)
+    precision = 1.0 / matches.variance
+    views, points = at.z.shape
+
+    weighted = weights[..., None, None] * by_view
+    H_pp = (weights * (by_rho**2).sum(-1)).sum(0) + precision + LEAST_CURVATURE
+    g_p = (weights * (by_rho * at.error).sum(-1)).sum(0) + precision * (rho - matches.rho)
+    H_pc = np.empty((points, 1 + views, 7))
+    scores = np.empty((points, 1 + views, 7))
+    H = np.zeros((1 + views, 7, 1 + views, 7))
+    H_pc[:, 1:] = np.einsum("vpik,vpi->pvk", weighted, by_rho)
+    scores[:, 1:] = np.einsum("vpik,vpi->pvk", weighted, at.error)
+    anchored = weights[..., None, None] * by_anchor
+    H_pc[:, 0] = np.einsum("vpik,vpi->pk", anchored, by_rho)
+    scores[:, 0] = np.einsum("vpik,vpi->pk", anchored, at.error)
+    flat = (views, 2 * points, 7)
+    J_v, W_v = by_view.reshape(flat), weighted.reshape(flat)
+    J_a, W_a = by_anchor.reshape(flat), anchored.reshape(flat)
+    H[0, :, 0] = (W_a.transpose(0, 2, 1) @ J_a).sum(0)
+    across, own = W_v.transpose(0, 2, 1) @ J_a, W_v.transpose(0, 2, 1) @ J_v
+    for v in range(views):
+        H[1 + v, :, 0], H[0, :, 1 + v] = across[v], across[v].T
+        H[1 + v, :, 1 + v] = own[v]
+
+    n = 7 * (1 + views)
+    H_pc, scores = H_pc.reshape(points, n), scores.reshape(points, n)
+    gain, offset = H_pc / H_pp[:, None], g_p / H_pp
+    return AnchorEquations(
+        H.reshape(n, n) - H_pc.T @ gain, scores - offset[:, None] * H_pc, gain, offset
+    )
+
+
+def _weights(
+    matches: AnchorMatches,
+    error: Array,  # [V, P, 2]
+) -> Array:
+    """[V, P] inverse variances, Huber's."""
+    sigma = matches.sigma[:, None]
+    size = np.linalg.norm(error, axis=-1) / sigma
+    return np.asarray(np.where(matches.used, huber_weights(size) / sigma**2, 0.0))
+
+
+def _by_point(at: Projected) -> Array:
+    """[V, P, 2, 3] derivative of the projection by the point over its anchor's depth."""
+    J = np.zeros((*at.z.shape, 2, 3))
+    J[..., 0, 0] = J[..., 1, 1] = 1.0 / at.z
+    J[..., 2] = -at.Y[..., :2] / (at.z**2)[..., None]
+    return J
+
+
+def _moved(
+    by_point: Array,  # [V, P, 2, 3]
+    Y: Array,  # [V, P, 3] over the anchor's depth
+    rho: Array,  # [P]
+) -> Array:
+    """[V, P, 2, 7] derivative by a step d of the frame: Y + u rho + w x Y + q Y."""
+    turned = -by_point @ hat(Y)
+    grown = np.einsum("vpij,vpj->vpi", by_point, Y)[..., None]
+    return np.concatenate([by_point * rho[None, :, None, None], turned, grown], axis=-1)

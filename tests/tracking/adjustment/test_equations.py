@@ -1,0 +1,107 @@
+"""Derivatives against finite differences, and the elimination of the depths against solving all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.tracking.adjustment.equations import AnchorMatches, anchor_equations, projected
+from aquaflow.tracking.adjustment.links import Links
+from aquaflow.tracking.adjustment.solver import State, assembled, cost_of, linearised
+from tests.tracking.adjustment.adjustment_scenes import Array, no_links, scene, shaken
+
+STEP = 1e-6
+
+
+def stretched(matches: AnchorMatches) -> AnchorMatches:
+    """Huber's loss is a square everywhere: so is the model of the equations."""
+    return replace(matches, sigma=np.full(len(matches.views), 1.0))
+
+
+def test_the_gradient_is_that_of_the_cost_along_poses_and_depths() -> None:
+    known = scene(count=4)
+    poses = shaken(known.poses, 0.01)
+    matches = [stretched(each) for each in known.problem(poses).matches]
+    state = State(Sim3Batch.of(poses), [1.02 * each.rho for each in matches])
+    equations = linearised(matches, state)
+    rng = np.random.default_rng(5)
+    step = rng.normal(0.0, 1.0, (4, 7))
+    # The eliminated gradient is the slope along steps that take the best depths with them.
+    slope = sum(
+        float(part.gradient @ step[each.places].ravel())
+        for each, part in zip(matches, equations, strict=True)
+    )
+
+    def cost_at(size: float) -> float:
+        moved = state.poses @ Sim3Batch.exp(size * step)
+        rho = [
+            rho - size * part.gain @ step[each.places].ravel()
+            for each, part, rho in zip(matches, equations, state.rho, strict=True)
+        ]
+        return cost_of(matches, no_links(), State(moved, rho))
+
+    # At depths that are not the best, -offset . g_p remains; it is the same at both ends.
+    numeric = (cost_at(STEP) - cost_at(-STEP)) / (2 * STEP)
+    assert numeric == pytest.approx(slope, rel=1e-5)
+
+
+@pytest.mark.parametrize("moved", [0, 1, 2])
+def test_residuals_move_as_their_derivatives_say(moved: int) -> None:
+    known = scene(count=3, noise=0.0)
+    matches = stretched(known.matches[1])
+    poses, rho = Sim3Batch.of(shaken(known.poses, 0.01)), 1.01 * known.rho[1]
+    rng = np.random.default_rng(moved)
+    d = rng.normal(0.0, 1.0, 7)
+
+    def errors(size: float) -> Array:
+        steps = np.zeros((3, 7))
+        steps[moved] = size * d
+        return projected(matches, poses @ Sim3Batch.exp(steps), rho).error
+
+    slope = (errors(STEP) - errors(-STEP)) / (2 * STEP)
+    at = list(matches.places).index(moved)
+    exact = replace(matches, variance=np.full(len(rho), 1e-30))  # holds the depths
+    part = anchor_equations(replace(exact, rho=rho), poses, rho)
+    own = part.gradient[7 * at : 7 * at + 7]
+    assert float((slope * errors(0.0)).sum()) == pytest.approx(float(own @ d), rel=1e-5)
+    curvature = part.H[7 * at : 7 * at + 7, 7 * at : 7 * at + 7]
+    assert float((slope**2).sum()) == pytest.approx(float(d @ curvature @ d), rel=1e-5)
+
+
+def test_links_pull_as_their_cost_says() -> None:
+    poses = Sim3Batch.of(shaken(scene(count=3).poses, 0.02))
+    rng = np.random.default_rng(2)
+    root = rng.normal(size=(2, 7, 7))
+    links = Links(
+        np.array([1, 2]),
+        np.array([0, 1]),
+        Sim3Batch.of([Sim3.exp(rng.normal(0.0, 0.1, 7)) for _ in range(2)]),
+        root @ root.transpose(0, 2, 1),
+    )
+    free = np.ones(3, dtype=bool)
+    H, gradient = assembled([], [], links, poses, free)
+    step = rng.normal(size=(3, 7))
+
+    def cost_at(size: float) -> float:
+        return links.cost(poses @ Sim3Batch.exp(size * step))
+
+    numeric = (cost_at(STEP) - cost_at(-STEP)) / (2 * STEP)
+    assert numeric == pytest.approx(float(gradient @ step.ravel()), rel=1e-5)
+    assert np.abs((H - H.T).toarray()).max() < 1e-9
+    assert np.linalg.eigvalsh(H.toarray()).min() > -1e-9
+
+
+def test_poses_that_are_held_are_no_unknowns() -> None:
+    known = scene(count=4)
+    problem = known.problem(known.poses)
+    state = State(problem.poses, known.rho)
+    free = np.array([False, True, False, True])
+    H, gradient = assembled(
+        problem.matches, linearised(problem.matches, state), no_links(), state.poses, free
+    )
+    assert H.shape == (14, 14)
+    assert gradient.shape == (14,)

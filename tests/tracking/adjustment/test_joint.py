@@ -1,0 +1,105 @@
+"""Adjustments with known answers: poses, scales, outliers, the judge, and what is degenerate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.tracking.adjustment.held_out import triangulated, verdict
+from aquaflow.tracking.adjustment.joint import LEAST_GAIN, adjust
+from aquaflow.tracking.adjustment.uncertainty import covariance
+from tests.tracking.adjustment.adjustment_scenes import NOISE, apart, scene, shaken
+
+
+def test_poses_and_units_come_back_from_exact_matches() -> None:
+    known = scene(noise=0.0)
+    adjusted = adjust(known.problem(shaken(known.poses, 0.01), relative_sigma=1e-4), 10)
+    assert apart(adjusted.state.poses, known.poses).max() < 1e-4
+    assert adjusted.better
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_is_estimated_and_poses_are_as_good_as_stated(seed: int) -> None:
+    known = scene(noise=NOISE, seed=seed)
+    problem = known.problem(shaken(known.poses, 0.01))
+    adjusted = adjust(problem, 10)
+    found = np.concatenate([each.sigma for each in adjusted.matches])
+    assert 0.6 * NOISE < np.median(found) < 2.0 * NOISE
+    spread = covariance(adjusted.matches, problem.links, adjusted.state, problem.free)
+    true = Sim3Batch.of(known.poses)
+    d = (true.inverse() @ adjusted.state.poses).log()[1:].ravel()
+    assert d @ np.linalg.solve(spread, d) < 3.0 * len(d)
+    assert adjusted.better
+
+
+def test_outliers_are_left_out() -> None:
+    known = scene(outliers=0.2)
+    adjusted = adjust(known.problem(shaken(known.poses, 0.005)), 10)
+    used = sum(int(each.used.sum()) for each in adjusted.matches)
+    given = sum(int(each.used[:, np.arange(120) % 5 != 4].sum()) for each in known.matches)
+    assert 0.7 * given < used < 0.9 * given
+    assert apart(adjusted.state.poses, known.poses).max() < 0.01
+
+
+def test_poses_that_are_right_already_are_kept_as_they_are() -> None:
+    known = scene()
+    adjusted = adjust(known.problem(known.poses), 10)
+    assert not adjusted.better
+
+
+def test_points_that_took_no_part_refuse_worse_poses() -> None:
+    known = scene()
+    judges = known.problem(known.poses).matches
+    true, worse = Sim3Batch.of(known.poses), Sim3Batch.of(shaken(known.poses, 0.01))
+    assert verdict(judges, true, worse).gain_sigmas < -LEAST_GAIN
+    assert verdict(judges, worse, true).gain_sigmas > LEAST_GAIN
+    assert verdict(judges, true, true).gain_sigmas == 0.0
+
+
+def test_without_enough_points_nothing_is_judged() -> None:
+    known = scene(count=2)
+    problem = known.problem(shaken(known.poses, 0.01))
+    few = [replace(each, used=each.used & (np.arange(120) < 15)) for each in problem.matches]
+    adjusted = adjust(replace(problem, matches=few), 10)
+    assert adjusted.verdict.points < 20
+    assert not adjusted.better
+
+
+def test_depths_are_triangulated_whatever_the_pointmap_says() -> None:
+    known = scene(noise=0.0)
+    wrong = replace(known.matches[2], rho=5.0 * known.rho[2])
+    seen = wrong.used.any(axis=0)
+    found = triangulated(wrong, Sim3Batch.of(known.poses))
+    np.testing.assert_allclose(found[seen], known.rho[2][seen], rtol=1e-6)
+
+
+def test_two_keyframes_are_adjusted() -> None:
+    known = scene(count=2)
+    adjusted = adjust(known.problem(shaken(known.poses, 0.01)), 10)
+    assert apart(adjusted.state.poses, known.poses).max() < 0.01
+
+
+def test_a_camera_that_only_turns_stays_finite_and_keeps_its_unit() -> None:
+    known = scene(step=0.0)
+    still = [Sim3(T.R, np.zeros(3), T.scale) for T in known.poses]
+    adjusted = adjust(scene_at(still).problem(still), 10)
+    assert np.isfinite(adjusted.state.poses.t).all()
+    np.testing.assert_allclose(adjusted.state.poses.scale, [T.scale for T in still], rtol=0.05)
+
+
+def scene_at(poses: list[Sim3]):  # type: ignore[no-untyped-def]
+    """The scene whose camera only turned: what it sees holds no depth."""
+    known = scene(step=0.0)
+    matches = []
+    for each, T in zip(known.matches, poses, strict=True):
+        at = each.at.copy()
+        for v, j in enumerate(each.views):
+            seen = (poses[j].inverse() @ T).apply(each.rays / known.rho[each.anchor][:, None])
+            at[v] = seen[:, :2] / seen[:, 2:]
+        matches.append(replace(each, at=at, sigma=np.full(len(each.views), NOISE)))
+    known.poses, known.matches = poses, matches
+    return known
