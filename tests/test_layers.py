@@ -16,7 +16,7 @@ FLOORS = (
     {"evaluation", "service", "doctor"},
     {"dive", "viewer"},
     {"slam", "export", "sim_drivers"},
-    {"tracking", "mapping", "training", "recording", "drivers"},
+    {"tracking", "mapping", "training", "recording", "drivers", "calibration"},
     {"keyframes", "sources", "synthetic", "fusion"},
     {"prior", "messages", "storage", "access"},
     {"config", "geometry", "render"},

@@ -15,6 +15,7 @@ import typer
 
 from aquaflow import __version__
 from aquaflow.cli.bench import register as register_bench
+from aquaflow.cli.calibrate import register as register_calibrate
 from aquaflow.cli.console import Json, progress_bars, unit_in_words
 from aquaflow.cli.devices import register as register_devices
 from aquaflow.cli.export import register as register_export
@@ -273,6 +274,7 @@ def _print_summary(finished: Finished) -> None:
 
 
 register_bench(app)
+register_calibrate(app)
 register_devices(app)
 register_export(app)
 register_prior(app)

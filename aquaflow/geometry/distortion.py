@@ -9,6 +9,8 @@ from aquaflow.geometry.camera import CameraModel
 
 NEWTON_ITERATIONS = 50
 """Limit of the search for the point that is distorted to a given one."""
+CONVERGED = 1e-15
+"""Step at z = 1 after which none changes the point."""
 MAX_UNDISTORTION_ERROR_PX = 0.01
 """Error up to which that search counts as successful; beyond, the lens model has no inverse
 there."""
@@ -55,6 +57,8 @@ def undistort_points(
         step = np.einsum("nij,nj->ni", np.linalg.pinv(J), error)
         # Half a radian at most: far out the polynomial sends Newton anywhere.
         points = points - step / np.maximum(1.0, 2.0 * np.linalg.norm(step, axis=1))[:, None]
+        if np.abs(step).max(initial=0.0) < CONVERGED:
+            break
     found, _ = _distort(points, camera)
     close = np.linalg.norm(found - pixels, axis=1) < MAX_UNDISTORTION_ERROR_PX
     return np.where((close & _unfolded(points, camera))[:, None], points, np.nan)
