@@ -6,12 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from aquaflow.geometry.optics import virtual_centre
+from aquaflow.geometry.port import FlatPort, Port
 from aquaflow.messages import CameraModel
 from aquaflow.tracking.calibration_check import TOLERANCE, LensError
 
 REMEDY = (
-    "calibrate the camera in water, or leave out --calib to have the focal length estimated from "
-    "the dive; until then distances and shapes are distorted"
+    "calibrate the camera in water, or in air with its port's measures, or leave out --calib to "
+    "have the focal length estimated from the dive; until then distances and shapes are distorted"
 )
 """What a user can do about a calibration that does not fit."""
 
@@ -66,6 +68,21 @@ def warning(error: LensError, calibration: CameraModel) -> str:
         f"the calibration does not fit the dive: its pictures ask for {' and '.join(asked)}; a "
         f"calibration good to {100.0 * TOLERANCE[0]:.0f} % would look so by chance once in "
         f"{_times(error.chance)} dives; {REMEDY}"
+    )
+
+
+def port_note(calibration: CameraModel, port: Port) -> str:
+    """Through which port the pictures were rectified."""
+    size = (
+        f"{port.distance_m:g} m before {port.thickness_m:g} m of glass"
+        if isinstance(port, FlatPort)
+        else f"{port.radius_m:g} m in radius, {port.thickness_m:g} m thick"
+    )
+    behind = -1e3 * float(virtual_centre(calibration)[2])
+    where = f"{abs(behind):.1f} mm {'behind' if behind >= 0.0 else 'ahead of'} the lens"
+    return (
+        f"the pictures were rectified through a {port.kind} port ({size}, water of index "
+        f"{port.water:.4f}), exactly at {port.range_m:g} m; the path is that of a point {where}"
     )
 
 

@@ -238,6 +238,10 @@ class DiveRun:
             self.notes.append(
                 f"an overlay of {100.0 * overlay:.1f} % of the picture was found and masked"
             )
+        if self.calibration is not None and self.calibration.port is not None:
+            self.notes.append(
+                calibration_findings.port_note(self.calibration, self.calibration.port)
+            )
         if self.telemetry_log is not None and self.telemetry_log.lost:
             self.notes.append(
                 f"{self.telemetry_log.lost} samples of telemetry are not in {TELEMETRY}: the disk "
