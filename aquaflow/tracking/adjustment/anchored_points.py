@@ -49,7 +49,7 @@ class AnchoredPoints:
     @property
     def held_out(self) -> Mask:
         """[P] which points judge adjustments and take no part in them."""
-        return np.arange(len(self.rho)) % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
+        return np.asarray(np.arange(len(self.rho)) % HELD_OUT_EVERY == HELD_OUT_EVERY - 1)
 
     def take_depths(self, pointmap: Pointmap) -> None:
         """The depths that the keyframe's pointmap has now."""

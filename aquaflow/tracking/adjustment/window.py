@@ -75,7 +75,7 @@ def _matches_of(points: AnchoredPoints, place: Mapping[int, int]) -> AnchorMatch
         np.where(known, rho, usual),
         np.where(known, variance, np.inf),
         at,
-        np.isfinite(at).all(axis=-1),
+        np.asarray(np.isfinite(at).all(axis=-1)),
         np.full(len(views), 1.0 / points.camera.fx),
     )
 
