@@ -13,6 +13,7 @@ from aquaflow.keyframes import UNKNOWN_VARIANCE, KeyframeStore, Pointmap
 from aquaflow.tracking.pose.depth_fusion import (
     DISAGREEMENT_INFLATION,
     FUSED_FLOOR,
+    LEAST_CONFIDENCE,
     MEASUREMENT_FLOOR,
     MOST_FUSED,
     TRANSFER_INFLATION,
@@ -104,7 +105,8 @@ def test_a_measurement_of_low_confidence_weighs_less(first: Measured) -> None:
     known = first[2]
     np.testing.assert_allclose(measured(pair)[1][known], 4.0 * first[1][known], rtol=1e-6)
     pair.C = np.zeros_like(pair.C)
-    np.testing.assert_allclose(measured(pair)[1][known], 20.0 * first[1][known], rtol=1e-6)
+    least = first[1][known] / LEAST_CONFIDENCE
+    np.testing.assert_allclose(measured(pair)[1][known], least, rtol=1e-6)
 
 
 def test_a_disagreement_keeps_the_depth_and_lowers_the_trust(first: Measured) -> None:
