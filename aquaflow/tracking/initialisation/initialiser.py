@@ -45,6 +45,12 @@ RETRY_GROWTH = 1.05
 attempt takes seconds, and the next frame alone changes little."""
 
 
+MIN_CONFIDENCE = 0.1
+"""Of a match that decides the geometry, where there are enough of them. Next to depth edges, where
+the match follows what is in front, it is below; the first keyframe's depths, bent by such matches,
+turned every link for 70 frames (docs/measurements.md#forward-views)."""
+
+
 class Initialiser:
     """Collects frames matched to one reference and solves their geometry once it is determined."""
 
@@ -75,6 +81,9 @@ class Initialiser:
         parallax = rotation_compensated_parallax_px(
             self._pixels_reference[observed], pixels[observed], self.reference.camera
         )
+        sure = observed & (pair.C[rows, columns] > MIN_CONFIDENCE)
+        if sure.sum() >= MIN_MATCHES:
+            observed = sure
         # What is not a number compares with nothing: one such frame would hold up every start.
         parallax = parallax if np.isfinite(parallax) else 0.0
         self.waiting.append(MatchedFrame(frame, pixels, observed, parallax, pair))

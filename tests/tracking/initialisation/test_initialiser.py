@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from aquaflow.config import InitialisationConfig
@@ -14,7 +15,7 @@ from aquaflow.geometry.similarity import Sim3, so3_log
 from aquaflow.tracking.initialisation import initialiser as initialiser_module
 from aquaflow.tracking.initialisation.hypotheses import Hypotheses
 from aquaflow.tracking.initialisation.initialiser import Initialiser, calibrated
-from tests.tracking.tracking_scenes import KnownPrior, KnownView, depth_map, pose
+from tests.tracking.tracking_scenes import KnownPair, KnownPrior, KnownView, depth_map, pose
 
 CAMERA = CameraModel(96, 72, 80.0, 80.0, 48.0, 36.0)
 CONFIG = InitialisationConfig(points=300, pairs=1)
@@ -222,6 +223,45 @@ def test_a_frame_that_sees_only_a_corner_of_the_place_is_turned_away() -> None:
     pair = prior.decode(prior.views[0], prior.views[1])
     assert pair.valid.sum() > 40
     assert not initialiser.add(frames[1], prior.encode(frames[1].image, CAMERA))
+
+
+class BentPrior(KnownPrior):
+    """Every third column's matches lie as far to the right as the scene is deep: as if they
+    followed what is in front."""
+
+    confidence = 0.05
+
+    def decode(
+        self, a: KnownView, b: KnownView, predicted: npt.NDArray[np.float32] | None = None
+    ) -> KnownPair:
+        pair = super().decode(a, b, predicted)
+        pair.matches[:, ::3, 0] += a.depth[:, ::3].astype(np.float32)
+        pair.C[:, ::3] *= self.confidence
+        return pair
+
+
+def test_matches_of_low_confidence_do_not_bend_the_start() -> None:
+    views = prior_of(MOVING).views
+    prior = BentPrior(views, CAMERA)
+    assert_poses(started(prior), MOVING, 0.01)
+    prior.confidence = 1.0
+    with pytest.raises(AssertionError):
+        assert_poses(started(prior), MOVING, 0.01)
+
+
+class UnsurePrior(KnownPrior):
+    """Its matches are right, and it is sure of none."""
+
+    def decode(
+        self, a: KnownView, b: KnownView, predicted: npt.NDArray[np.float32] | None = None
+    ) -> KnownPair:
+        pair = super().decode(a, b, predicted)
+        pair.C *= np.float32(0.01)
+        return pair
+
+
+def test_a_start_without_a_confident_match_takes_what_there_is() -> None:
+    assert_poses(started(UnsurePrior(prior_of(MOVING).views, CAMERA)), MOVING, 0.01)
 
 
 @pytest.mark.filterwarnings("error")
