@@ -280,6 +280,13 @@ class TrackingConfig(Stage):
     min_inlier_share: float = Field(
         0.35, gt=0, lt=1, description="inliers below which the frame is lost"
     )
+    sure_inlier_share: float = Field(
+        0.85,
+        gt=0,
+        le=1,
+        description="inliers from which a pose after a wide step has no rival: flow that is a tile "
+        "off leaves 0.4 to 0.8 of the matches (synthetic pool), right flow over 0.85",
+    )
     min_support: float = Field(
         0.1,
         ge=0,
@@ -312,6 +319,15 @@ class TrackingConfig(Stage):
         True,
         description="what stays in the picture while the scene moves (clock, crosshair, logo, the "
         "vehicle's own arm) is masked for tracking and map",
+    )
+    recent_keyframes: int = Field(
+        3, ge=0, description="keyframes left last that a lost frame is looked for in; 0: none"
+    )
+    recovered_support: float = Field(
+        0.2,
+        gt=0,
+        lt=1,
+        description="matched share x inlier share of a frame found there; twice min_support",
     )
     lost_after: int = Field(
         3, ge=1, description="consecutive lost frames after which a new sub-map starts"

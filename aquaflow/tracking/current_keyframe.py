@@ -8,6 +8,7 @@ left, that one is taken up again: hovering adds none.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -26,6 +27,7 @@ from aquaflow.tracking.pose.depth_fusion import fuse, transfer
 from aquaflow.tracking.pose.expected_matches import expected_matches, is_wide
 from aquaflow.tracking.pose.matcher import KeyframeMatcher, Matched
 from aquaflow.tracking.pose.visibility import agreeing, predicted_matches
+from aquaflow.tracking.wide_steps import WideSteps
 
 
 @dataclass
@@ -82,6 +84,8 @@ class KeyframeTracker:
     def __init__(self, prior: Prior, keyframes: KeyframeStore, config: TrackingConfig) -> None:
         self._prior, self._keyframes, self._config = prior, keyframes, config
         self._matcher, self._neighbours = KeyframeMatcher(config), Neighbours(config)
+        self._wide_steps = WideSteps(prior, self._matcher, config)
+        self._recent: deque[Keyframe] = deque(maxlen=config.recent_keyframes)
 
     def place(
         self,
@@ -100,7 +104,18 @@ class KeyframeTracker:
             # After a wide step flow may hold on to a neighbour: on tiles it comes back from there.
             pair = self._prior.decode(self._reference(at), encoding)
             solved = self._matcher.pose(at.keyframe, camera, pair, predicted, at.T_fk)
+        keyframe, wide = at.keyframe, self._wide_steps
+        if wide.doubtful(keyframe, solved, at.T_fk, predicted, camera):
+            reference = self._reference(at)
+            return wide.best(keyframe, reference, encoding, camera, solved, predicted)
         return solved
+
+    def place_after_turn(
+        self, at: CurrentKeyframe, encoding: Encoding, camera: CameraModel
+    ) -> Matched | None:
+        """The pose of a frame that shows what of the keyframe has no depth yet."""
+        reference, predicted = self._reference(at), at.motion @ at.T_fk
+        return self._wide_steps.after_turn(at.keyframe, reference, encoding, camera, predicted)
 
     def _seed(self, at: CurrentKeyframe, predicted: Sim3, camera: CameraModel) -> Float | None:
         """Where the frame's matches are looked for first: at the last ones, or, where telemetry
@@ -179,6 +194,26 @@ class KeyframeTracker:
     def leave(self, at: CurrentKeyframe) -> None:
         """Register the keyframe, so that tracking may return to it."""
         self._neighbours.add(at.keyframe)
+        self._recent.append(at.keyframe)
+
+    def recent(
+        self, at: CurrentKeyframe | None, encoding: Encoding, camera: CameraModel
+    ) -> CurrentKeyframe | None:
+        """One of the keyframes left last that shows a frame which ``at``, the one in use, does not:
+        keypoints say where, dense matches whether. The first frame after a loss is often still in
+        view of one, where it is not of the last."""
+        for keyframe in reversed(self._recent):
+            if at is not None and keyframe is at.keyframe:
+                continue
+            try:
+                solved = self._wide_steps.shown_by(keyframe, encoding, camera)
+                if solved is None:
+                    continue
+                self._keyframes.hold(keyframe.number)
+            except InputError:
+                continue  # a keyframe that cannot be read back is skipped
+            return CurrentKeyframe(keyframe, T_fk=solved.estimate.T, matches=solved.pair.matches)
+        return None
 
     def earlier(
         self, at: CurrentKeyframe, encoding: Encoding, camera: CameraModel

@@ -195,7 +195,8 @@ class Tracker:
             return []
         before, there = self._at, None
         with self._failures.contain("relocalisation", frame.index):
-            found = self._places.of_frame(encoding, self.camera)
+            there = self._keyframe_tracker.recent(before, encoding, self.camera)
+            found = None if there else self._places.of_frame(encoding, self.camera)
             if found is not None:
                 keyframe = self._keyframes.hold(found.keyframe.number)
                 there = CurrentKeyframe(keyframe, T_fk=found.estimate.T)
@@ -240,6 +241,7 @@ class Tracker:
         at, camera, keyframe_tracker = self._at, self.camera, self._keyframe_tracker
         self._expect(at, frame)
         solved = keyframe_tracker.place(at, encoding, camera, pair)
+        solved = solved or keyframe_tracker.place_after_turn(at, encoding, camera)
         if solved is None:
             return None
         keyframe_tracker.take(at, solved, camera)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.messages import Frame
+from aquaflow.prior.contract import Keypoints
 from aquaflow.tracking.pose.solver import PoseProblem
 
 Array = npt.NDArray[np.float64]
@@ -64,6 +65,10 @@ class KnownView:
     @property
     def interesting(self) -> Mask:
         return np.ones(self.depth.shape, bool)
+
+    @property
+    def keypoints(self) -> Keypoints:
+        return Keypoints(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32))
 
 
 class KnownPair:

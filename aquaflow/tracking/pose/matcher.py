@@ -36,6 +36,11 @@ class Matched:
     visibility: Visibility
 
     @property
+    def support(self) -> float:
+        """Part of what the keyframe shows that is matched where the pose says."""
+        return self.share * self.estimate.inlier_share
+
+    @property
     def quality(self) -> Quality:
         """Quality of the pose."""
         estimate = self.estimate

@@ -18,20 +18,21 @@ LEAST_WIDTH = 1e-3
 """Of a set of points over its length; thinner is a line, to the depths' own precision."""
 
 
-def pose_from_scratch(problem: PoseProblem) -> Sim3 | None:
-    """T_fk by PnP in RANSAC; None without consensus.
+def pose_from_scratch(problem: PoseProblem, least: int = MIN_INLIERS) -> Sim3 | None:
+    """T_fk by PnP in RANSAC; None without a consensus of ``least`` matches.
 
     SQPnP raises on one degenerate sample (points on a line, or at one place), and with it ends the
     whole search: there P3P, which skips such samples, searches again.
     """
     import cv2
 
-    if len(problem.points) < MIN_INLIERS:
+    if len(problem.points) < least:
         return None
     try:
-        pose = _consensus(problem, cv2.SOLVEPNP_SQPNP)
+        pose = _consensus(problem, cv2.SOLVEPNP_SQPNP, least)
     except cv2.error:
-        pose = _consensus(problem, cv2.SOLVEPNP_AP3P) if _is_no_line(problem.points) else None
+        line = not _is_no_line(problem.points)
+        pose = None if line else _consensus(problem, cv2.SOLVEPNP_AP3P, least)
     return pose if pose is not None and pose.is_finite() else None
 
 
@@ -43,7 +44,7 @@ def _is_no_line(
     return bool(spread[1] > LEAST_WIDTH * spread[0])
 
 
-def _consensus(problem: PoseProblem, solver: int) -> Sim3 | None:
+def _consensus(problem: PoseProblem, solver: int, least: int) -> Sim3 | None:
     import cv2
 
     rays = problem.camera.unproject(problem.pixels)[:, :2]
@@ -56,7 +57,7 @@ def _consensus(problem: PoseProblem, solver: int) -> Sim3 | None:
         reprojectionError=RANSAC_PX / problem.camera.fx,
         flags=solver,
     )
-    if not found or inliers is None or len(inliers) < MIN_INLIERS:
+    if not found or inliers is None or len(inliers) < least:
         return None
     rotation, translation = (np.asarray(each[:, 0], dtype=np.float64) for each in (w, t))
     return Sim3(so3_exp(rotation), translation)

@@ -1,0 +1,107 @@
+"""What is tried after a wide step, and only then: other poses, new depth, other keyframes.
+
+Flow follows a step that is small against the picture, and against the distance after which the
+picture repeats itself. Beyond that, several starts of the flow are compared by how much of the
+picture they explain.
+"""
+
+from __future__ import annotations
+
+from aquaflow.config import TrackingConfig
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes import Keyframe
+from aquaflow.prior.contract import Encoding, Prior
+from aquaflow.prior.flow import pixel_grid
+from aquaflow.prior.homography import flow_of_homography, homography
+from aquaflow.tracking.loops.keypoint_poses import keypoint_poses
+from aquaflow.tracking.pose.depth_fusion import fuse
+from aquaflow.tracking.pose.expected_matches import expected_matches, is_wide
+from aquaflow.tracking.pose.matcher import KeyframeMatcher, Matched, matched_share
+from aquaflow.tracking.pose.turning_step import turning_step
+
+
+class WideSteps:
+    """Poses of frames that flow from the last frame's matches does not explain."""
+
+    def __init__(self, prior: Prior, matcher: KeyframeMatcher, config: TrackingConfig) -> None:
+        self._prior, self._matcher, self._config = prior, matcher, config
+
+    def doubtful(
+        self,
+        keyframe: Keyframe,
+        solved: Matched | None,
+        T_before: Sim3,
+        predicted: Sim3,
+        camera: CameraModel,
+    ) -> bool:
+        """True without a pose, and for one that many matches contradict where the step from
+        ``T_before`` was wide, or should have been: flow that is a tile off may say that nothing
+        moved."""
+        if solved is None:
+            return True
+        if solved.estimate.inlier_share >= self._config.sure_inlier_share:
+            return False
+        steps = solved.estimate.T, predicted
+        return any(is_wide(keyframe.pointmap, T_before, step, camera) for step in steps)
+
+    def best(
+        self,
+        keyframe: Keyframe,
+        reference: Encoding,
+        encoding: Encoding,
+        camera: CameraModel,
+        solved: Matched | None,
+        predicted: Sim3,
+    ) -> Matched | None:
+        """``solved``, unless dense matches support another pose better, which keypoints or the
+        motion so far speak for."""
+        best, poses = solved, keypoint_poses(keyframe, encoding, camera, self._config.known_sigma)
+        for pose in [*poses, predicted]:
+            seed = expected_matches(keyframe.pointmap, pose, camera)
+            pair = self._prior.decode(reference, encoding, seed)
+            rival = self._matcher.pose(keyframe, camera, pair, pose, pose)
+            if rival is not None and (best is None or rival.support > best.support):
+                best = rival
+            if best is not None and best.estimate.inlier_share >= self._config.sure_inlier_share:
+                break
+        return best
+
+    def after_turn(
+        self,
+        keyframe: Keyframe,
+        reference: Encoding,
+        encoding: Encoding,
+        camera: CameraModel,
+        predicted: Sim3,
+    ) -> Matched | None:
+        """The pose of a frame that shows what of the keyframe has no depth yet, which it gets from
+        this pair of views; the keyframe must be the one held."""
+        pointmap, config = keyframe.pointmap, self._config
+        H = homography(reference.keypoints, encoding.keypoints)
+        if H is None:
+            return None
+        height, width = pointmap.rho.shape
+        seed = pixel_grid(height, width) + flow_of_homography(H, height, width)
+        pair = self._prior.decode(reference, encoding, seed)
+        if matched_share(keyframe.encoding, pair) < config.recovered_support:
+            return None
+        known = pointmap.known(config.known_sigma)
+        T_fk = turning_step(pointmap, pair, known, camera, predicted)
+        if T_fk is None:
+            return None
+        fuse(pointmap, pair, T_fk, camera, config.sigma_px)
+        return self._matcher.pose(keyframe, camera, pair, T_fk, T_fk)
+
+    def shown_by(
+        self, keyframe: Keyframe, encoding: Encoding, camera: CameraModel
+    ) -> Matched | None:
+        """The pose of a lost frame at a keyframe that shows its place: keypoints say where, dense
+        matches whether."""
+        for pose in keypoint_poses(keyframe, encoding, camera, self._config.known_sigma):
+            seed = expected_matches(keyframe.pointmap, pose, camera)
+            pair = self._prior.decode(keyframe.encoding, encoding, seed)
+            solved = self._matcher.pose(keyframe, camera, pair, pose, pose)
+            if solved is not None and solved.support >= self._config.recovered_support:
+                return solved
+        return None
