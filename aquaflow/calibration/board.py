@@ -70,6 +70,7 @@ class Detector:
         settings = cv2.aruco.DetectorParameters()
         self._charuco_detector = None
         if isinstance(made, cv2.aruco.CharucoBoard):
+            self._squares = np.asarray(made.getChessboardCorners(), np.float64)
             # The markers' own corners, refined, move the squares' by 0.1 px in tilted views.
             settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
             parameters = cv2.aruco.CharucoParameters()
@@ -92,7 +93,7 @@ class Detector:
             if ids is None or len(ids) == 0:
                 return _nothing()
             numbers = np.ravel(ids).astype(np.int64)
-            points = np.asarray(self._made.getChessboardCorners(), np.float64)[numbers]
+            points = self._squares[numbers]
             return Found(numbers, points, np.asarray(corners, np.float64).reshape(-1, 2) + 0.5)
         quads, ids, _ = self._detector.detectMarkers(grey)
         if ids is None or len(ids) == 0:
