@@ -15,7 +15,9 @@ class LiveCameraConfig(Stage):
     """What all live cameras have in common."""
 
     calibration: Path | None = Field(
-        None, description="camera.yaml, made in water; None: the device's own, or a guess"
+        None,
+        description="camera.yaml, made in water, or in air with its port's measures; None: the "
+        "device's own, or a guess",
     )
     stall_s: float = Field(
         3.0,

@@ -117,9 +117,11 @@ def _outline(camera: CameraModel) -> Array:
 
 def _no_pinhole(camera: CameraModel) -> str:
     if camera.is_distorted and not np.isfinite(undistort_points(_outline(camera), camera)).all():
+        wide = "; of 180 degrees and more take a part with --crop"
         return (
             f"the distortion {camera.distortion} folds a {camera.width} x {camera.height} picture "
             "over itself; check the coefficients and their order in camera.yaml"
+            f"{wide if camera.distortion_model == 'fisheye' else ''}"
         )
     return (
         "the camera cannot look through the port that camera.yaml describes with its whole "

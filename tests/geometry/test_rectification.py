@@ -222,6 +222,12 @@ def test_a_distortion_that_folds_the_picture_is_refused(
         Rectifier(camera, 320)
 
 
+def test_a_fisheye_that_no_pinhole_picture_holds_is_refused_with_the_way_out() -> None:
+    everything = replace(FISHEYE, fx=90.0, fy=90.0, distortion=(0.0, 0.0, 0.0, 0.0))
+    with pytest.raises(ConfigError, match="of 180 degrees and more take a part with --crop"):
+        Rectifier(everything, 320)
+
+
 # --- behind a port --------------------------------------------------------------------------------
 
 BEHIND_GLASS = replace(RADTAN, port=FlatPort(0.05, 0.01, range_m=1.0))
