@@ -12,7 +12,7 @@ COMPRESSIBILITY_PER_DBAR = 4.4e-6
 SEA_SALINITY_PSU = 35.0
 """Of the open ocean."""
 TEMPERATURE_C = 10.0
-"""Between a Norwegian winter and a summer in Kobe; 10 degrees C change the index by 0.0007."""
+"""Between a Norwegian winter and a summer in Kobe; 10 degrees C change the index by 0.0009."""
 
 
 def water_index(
