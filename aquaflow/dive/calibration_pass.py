@@ -18,6 +18,7 @@ from aquaflow.dive.found_camera import FoundCamera, usable
 from aquaflow.errors import InputError
 from aquaflow.errors.failures import Failures
 from aquaflow.geometry.camera import CameraModel, guess_camera
+from aquaflow.geometry.lens_error import TERMS
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe
 from aquaflow.messages import Frame
@@ -39,6 +40,7 @@ EVERY_PIXEL = 8
 """Of a pointmap, for its median."""
 
 Picture = npt.NDArray[np.uint8]
+Array = npt.NDArray[np.float64]
 Progress = Callable[[int, int | None], None]
 
 
@@ -137,14 +139,28 @@ class _Pass:
             keypoints = partial(self._keypoints, slam, picture)
             views.offer(tracked.frame.index, tracked.T_wc, tracked.sub_map, rho, keypoints)
 
-    def _keypoints(self, slam: Slam, picture: Picture) -> Keypoints:
+    def _keypoints(
+        self,
+        slam: Slam,
+        picture: Picture,  # [H, W, 3] RGB
+    ) -> Keypoints:
         return slam.prior.encode(picture, self.guess).keypoints
 
     def _estimate(self, slam: Slam, views: LensViews) -> FoundLens | None:
         results = slam.results()
         poses: dict[int, Sim3] = {t.frame.index: t.T_wc for t in results if t.T_wc is not None}
         self.lost_share = 1.0 - len(poses) / max(len(results), 1)
-        return found_lens(views.posed(poses), None if self._found is None else self._found.lens)
+        return found_lens(views.posed(poses), self._lens_of(slam.tracker.camera))
+
+    def _lens_of(self, tracked: CameraModel | None) -> Array:
+        """[5] the lens that the poses go with, as an error of the guess: what the start of the map
+        made of the focal length, or what an earlier pass found."""
+        lens = np.zeros(TERMS)
+        if self._found is not None:
+            lens = self._found.lens
+        elif tracked is not None:
+            lens[0] = np.log(tracked.fx / self.guess.fx)
+        return lens
 
 
 def _nearness(keyframe: Keyframe) -> float:

@@ -94,6 +94,11 @@ def estimated(
     simple = adjust_lens(observations, R_wc, centres, 2, start)
     state = simple.adjusted
     full = adjust_lens(observations, state.R_wc, state.centres, TERMS, state.lens)
+    if model_error(simple, full)[0, 0] > simple.covariance[0, 0]:
+        # The further terms describe the lens, or they led out of a local minimum.
+        state, lens = full.adjusted, np.where(np.arange(TERMS) < 2, full.adjusted.lens, 0.0)
+        again = adjust_lens(observations, state.R_wc, state.centres, 2, lens)
+        simple = min(simple, again, key=lambda each: each.sigma)
     shared = np.diag((SYSTEMATIC * simple.sigma) ** 2)
     covariance = simple.covariance + model_error(simple, full) + shared
     if not np.isfinite(covariance).all():
@@ -101,7 +106,11 @@ def estimated(
     return _found(simple, covariance, observations)
 
 
-def _found(simple: LensAdjustment, covariance: Array, observations: LensObservations) -> FoundLens:
+def _found(
+    simple: LensAdjustment,
+    covariance: Array,  # [2, 2]
+    observations: LensObservations,
+) -> FoundLens:
     sigma, state = np.sqrt(np.diag(covariance)), simple.adjusted
     views, matches = len(state.R_wc), len(observations.matches)
     return FoundLens(state.lens, sigma, simple.sigma, views, matches)
