@@ -29,7 +29,9 @@ class StaticStructure:
 
     def __init__(self, shape: tuple[int, int]) -> None:
         """``shape``: rows, columns."""
-        self._gx, self._gy, self._power = (np.zeros(shape, np.float32) for _ in range(3))
+        self._gx: Float = np.zeros(shape, np.float32)
+        self._gy: Float = np.zeros(shape, np.float32)
+        self._power: Float = np.zeros(shape, np.float32)
         self._weight = self._squares = 0.0
         self.persistent: Float = np.full(shape, np.inf, np.float32)
         """[H, W] least contrast of any sample in a character's surroundings."""
