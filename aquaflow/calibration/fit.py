@@ -112,7 +112,11 @@ def _poses(views: Sequence[View], camera: CameraModel) -> Array | None:
     return np.array(poses)
 
 
-def _cost(views: Sequence[View], camera: CameraModel, poses: Array) -> float:
+def _cost(
+    views: Sequence[View],
+    camera: CameraModel,
+    poses: Array,  # [V, 6]
+) -> float:
     """Median distance, px, of the corners from where they are expected."""
     return float(np.median(np.abs(_residuals(views, camera, poses))))
 
@@ -132,7 +136,11 @@ def _residuals(
     return np.where(np.isfinite(left), left, UNSEEN_PX)
 
 
-def _refined(views: Sequence[View], parameters: Parameters, poses: Array) -> Fit:
+def _refined(
+    views: Sequence[View],
+    parameters: Parameters,
+    poses: Array,  # [V, 6]
+) -> Fit:
     """Fit, leave out what was found wrongly, and fit again."""
     counts = [len(view.found.numbers) for view in views]
     everything = np.ones(sum(counts), bool)
@@ -195,7 +203,7 @@ def _sigma(
     J: Array,  # [M, P + 6 V]
     left: Array,  # [M] residuals
     size: int,
-    rows_of: Sequence[npt.NDArray[np.int64]],  # of each view
+    rows_of: Sequence[npt.NDArray[np.int64]],  # [V] of each view, its rows of J
 ) -> Array:
     """[P] 1 sigma: the larger of what the residuals' noise gives and what the views' scatter gives.
 
