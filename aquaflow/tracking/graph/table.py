@@ -34,6 +34,9 @@ TRUST = np.dtype([("trust", np.float64), ("allowed", np.float64)])
 """Switch variable of an edge, 0 for a loop that is not (yet) admitted; and its phi, the squared
 residual that a loop may keep at full trust."""
 
+LEAST_ROWS = 16
+"""Of a buffer."""
+
 ROUNDING = 1e-9
 """Smallest move, in m, rad and log-scale, that counts as one."""
 
@@ -42,7 +45,7 @@ class Table:
     """Rows that only ever grow: views handed out earlier never change."""
 
     def __init__(self, dtype: np.dtype[np.void]) -> None:
-        self._buffer: Rows = np.zeros(16, dtype=dtype)
+        self._buffer: Rows = np.zeros(LEAST_ROWS, dtype=dtype)
         self._count = 0
 
     def __len__(self) -> int:
@@ -51,7 +54,7 @@ class Table:
     def append(self, **values: object) -> None:
         """Append one row, given by field."""
         if self._count == len(self._buffer):
-            grown = np.zeros(2 * self._count, dtype=self._buffer.dtype)
+            grown = np.zeros(max(2 * self._count, LEAST_ROWS), dtype=self._buffer.dtype)
             grown[: self._count] = self._buffer
             self._buffer = grown
         for name, value in values.items():
