@@ -184,7 +184,7 @@ class AdjustmentConfig(Stage):
         3,
         ge=1,
         description="keyframes back that a new one is matched with; synthetic forward view of 60 "
-        "keyframes: ATE 0.124 % without adjustment, 0.054 % with 3; beyond, a quarter overlaps",
+        "keyframes, all adjusted at once: ATE 0.124 to 0.060 %; beyond 3 less than a quarter overlaps",
     )
     points: int = Field(
         300,

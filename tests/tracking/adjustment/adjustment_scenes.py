@@ -83,7 +83,7 @@ def scene(
             at[v] = seen[:, :2] / seen[:, 2:] + rng.normal(0.0, noise, (POINTS, 2))
         wrong = rng.random(at.shape[:2]) < outliers
         at[wrong] += rng.normal(0.0, 0.05, (int(wrong.sum()), 2))
-        used = (np.abs(at) < HALF).all(axis=-1)
+        used = np.asarray((np.abs(at) < HALF).all(axis=-1))
         depths.append(rho)
         matches.append(
             AnchorMatches(
@@ -102,4 +102,4 @@ def shaken(poses: list[Sim3], sigma: float, seed: int = 3) -> list[Sim3]:
 
 def apart(found: Sim3Batch, true: list[Sim3]) -> Array:
     """[K] the largest entry of the motion between found and true poses."""
-    return np.abs((found.inverse() @ Sim3Batch.of(true)).log()).max(axis=1)
+    return np.asarray(np.abs((found.inverse() @ Sim3Batch.of(true)).log()).max(axis=1))
