@@ -184,7 +184,7 @@ class AdjustmentConfig(Stage):
         3,
         ge=1,
         description="keyframes back that a new one is matched with; synthetic forward view of 60 "
-        "keyframes, all adjusted at once: ATE 0.124 to 0.060 %; beyond 3 less than a quarter overlaps",
+        "keyframes, all adjusted at once: ATE 0.124 to 0.060 %; beyond, little overlaps",
     )
     points: int = Field(
         300,

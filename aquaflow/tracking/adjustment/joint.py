@@ -26,8 +26,8 @@ FEW = 10
 LEAST_JUDGES = 20
 """Held-out points below which nothing is judged, and nothing kept."""
 LEAST_GAIN = 3.0
-"""Standard errors by which the held-out points must fit better. With 1 instead, the reef clip ends at
-0.105 % instead of 0.091, a forward view of 60 keyframes at 0.094 instead of 0.102 (without any
+"""Standard errors by which the held-out points must fit better. With 1 instead, the reef clip ends
+at 0.105 % instead of 0.091, a forward view of 60 keyframes at 0.094 instead of 0.102 (without any
 adjustment: 0.086 and 0.124)."""
 
 
