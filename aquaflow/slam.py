@@ -126,7 +126,11 @@ class Slam:
         # Sec. 3.3.3, Eqs. 16 and 17: medium-guided insertion of Gaussians.
         # Sec. 3.4, Eqs. 18 to 23: joint optimisation of Gaussians and medium.
         # The frame's row, from which its pose follows after every later correction.
-        return self._link_map_publish(tracked)
+        finished = self._link_map_publish(tracked)
+
+        # Not in the paper: keyframes that the monitor of scale had to join anew.
+        self._revisit(frame)
+        return finished
 
     def _link_map_publish(self, tracked: list[Tracked]) -> list[Tracked]:
         finished = []
@@ -266,6 +270,12 @@ class Slam:
         linked = Anchored(settled, None if settled.T_wc is None else T_kf)
         self._latest = None if linked.T_kf is None else len(self.frames)
         return linked
+
+    def _revisit(self, frame: Frame) -> None:
+        found, self.tracker.revisits = self.tracker.revisits, []
+        for revisit in found:
+            with self.failures.contain("keyframe graph", frame.index):
+                self.graph.revisit(revisit)
 
     def _look_for_known_lengths(self, tracked: Tracked) -> None:
         """In the pictures that the map is made from, if there is anything to look for."""

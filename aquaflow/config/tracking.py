@@ -195,6 +195,51 @@ class AdjustmentConfig(Stage):
     at_end: bool = Field(True, description="adjust all keyframes together once, at the end")
 
 
+class MonitorConfig(Stage):
+    """The monitor of consistency (docs/frame.md#consistency)."""
+
+    enabled: bool = Field(True, description="False: a wrong scale is not looked for")
+    every: int = Field(
+        10, ge=1, description="frames with a pose between two checks, of 0.5 ms each"
+    )
+    witnesses: int = Field(5, ge=1, description="keyframes around that a check asks")
+    max_change: float = Field(
+        0.01,
+        gt=0,
+        description="relative change of a keyframe's depths since it was first left; measured: "
+        "0.1 % at most on the reef and Curasao clips and on a dive at one place",
+    )
+    max_gap: float = Field(
+        0.05,
+        gt=0,
+        description="relative difference of scale from most keyframes around; measured there: "
+        "0.2 % from the keyframe before, 1.8 % over eight, 1 % at one place",
+    )
+    sigmas: float = Field(
+        5.0, gt=0, description="of the median over the points that both show, as well"
+    )
+    min_inlier_share: float = Field(
+        0.5,
+        ge=0,
+        le=1,
+        description="inliers of the matches below which the keyframe's depths do not fit; measured "
+        "on calibrated clips: 0.61 to 0.97 in every frame",
+    )
+    rigid_share: float = Field(
+        0.8,
+        ge=0,
+        le=1,
+        description="matches that one motion explains from which those that do not fit the depths "
+        "are no snow in front of the scene",
+    )
+    usual_share: float = Field(
+        0.65,
+        ge=0,
+        le=1,
+        description="the same, over the dive's median: a wrong calibration lowers that (to 0.53)",
+    )
+
+
 class VerificationConfig(Stage):
     """When a place counts as found again. Measured on all shared clips: in 912 pairs of different
     places at most 19 keypoints match and none agree on a pose; where a clip's frames still share a
@@ -268,6 +313,21 @@ class TrackingConfig(Stage):
     return_candidates: int = Field(
         2, ge=0, description="earlier keyframes tried, each for one more matching; 0: none"
     )
+    crowd: int = Field(
+        3,
+        ge=1,
+        description="earlier keyframes of a place that are enough: no more are made there while "
+        "one of them, or the one in use, still shows crowd_share",
+    )
+    crowd_overlap: float = Field(
+        0.6, gt=0, le=1, description="predicted share in view of a keyframe that counts as one"
+    )
+    crowd_share: float = Field(
+        0.4,
+        gt=0,
+        lt=1,
+        description="matched share down to which a keyframe stays in use in a crowded place",
+    )
     mapping_parallax_widths: float = Field(
         30.0 / 512.0, gt=0, description="tau_mapframe over width; paper: 30 px at 512 px"
     )
@@ -336,5 +396,6 @@ class TrackingConfig(Stage):
     gate: GateConfig = GateConfig()
     graph: GraphConfig = GraphConfig()
     adjustment: AdjustmentConfig = AdjustmentConfig()
+    monitor: MonitorConfig = MonitorConfig()
     retrieval: RetrievalConfig = RetrievalConfig()
     verification: VerificationConfig = VerificationConfig()

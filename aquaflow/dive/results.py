@@ -153,6 +153,7 @@ def metrics(
         "skipped_by": dict(slam.skipped) | ({"dropped": len(dropped)} if dropped else {}),
         "loops": slam.graph.loops,
         "adjustments": slam.adjuster.tally.to_json(),
+        "consistency": slam.tracker.monitor.counts.to_json(),
         "gaussians": sum(len(mapper.gaussians) for mapper in slam.mappers.values()),
         "steps": sum(mapper.steps for mapper in slam.mappers.values()),
         "steps_undone": sum(mapper.undone for mapper in slam.mappers.values()),

@@ -247,6 +247,7 @@ class DiveRun:
                 f"{self.telemetry_log.lost} samples of telemetry are not in {TELEMETRY}: the disk "
                 "was full"
             )
+        self.notes += self.slam.tracker.monitor.counts.notes()
         for note in self.notes:
             log.info(note)
 

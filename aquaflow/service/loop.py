@@ -211,6 +211,7 @@ class LiveLoop:
             str(cameras[0]["reason"]) if cameras else "",
             self._unposed < LOST_AFTER,
             self._ever_posed,
+            self.run_.slam.tracker.monitor.trouble,
             self._troubles(devices),
         )
 

@@ -45,6 +45,7 @@ def report(
         "resumed": parts.choice.checkpoint is not None,
         **loop.status(),
         "keyframes": len(parts.slam.keyframes),
+        "consistency": parts.slam.tracker.monitor.counts.to_json(),
         "gaussians": sum(len(mapper.gaussians) for mapper in list(parts.maps.mappers.values())),
         "checkpoint": {
             "taken": parts.checkpointer.taken,

@@ -22,7 +22,7 @@ from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
 from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, Float, Mask, PairGeometry, Prior
 from aquaflow.tracking.frames import FrameClass, Link, Quality, Tracked
-from aquaflow.tracking.loops.neighbours import Neighbours
+from aquaflow.tracking.loops.neighbours import Neighbour, Neighbours
 from aquaflow.tracking.pose.depth_fusion import fuse, transfer
 from aquaflow.tracking.pose.expected_matches import expected_matches, is_wide
 from aquaflow.tracking.pose.matcher import KeyframeMatcher, Matched
@@ -83,7 +83,7 @@ class KeyframeTracker:
 
     def __init__(self, prior: Prior, keyframes: KeyframeStore, config: TrackingConfig) -> None:
         self._prior, self._keyframes, self._config = prior, keyframes, config
-        self._matcher, self._neighbours = KeyframeMatcher(config), Neighbours(config)
+        self._matcher, self.neighbours = KeyframeMatcher(config), Neighbours(config)
         self._wide_steps = WideSteps(prior, self._matcher, config)
         self._recent: deque[Keyframe] = deque(maxlen=config.recent_keyframes)
 
@@ -193,7 +193,7 @@ class KeyframeTracker:
 
     def leave(self, at: CurrentKeyframe) -> None:
         """Register the keyframe, so that tracking may return to it."""
-        self._neighbours.add(at.keyframe)
+        self.neighbours.add(at.keyframe)
         self._recent.append(at.keyframe)
 
     def recent(
@@ -215,34 +215,61 @@ class KeyframeTracker:
             return CurrentKeyframe(keyframe, T_fk=solved.estimate.T, matches=solved.pair.matches)
         return None
 
-    def earlier(
-        self, at: CurrentKeyframe, encoding: Encoding, camera: CameraModel
+    def instead(
+        self, at: CurrentKeyframe, solved: Matched, encoding: Encoding, camera: CameraModel
     ) -> tuple[CurrentKeyframe, Matched] | None:
-        """An earlier keyframe that shows the last frame well, to be held in memory from now on.
+        """Instead of a new keyframe: an earlier one that shows the last frame well, to be held in
+        memory from now on, or, in a place that has keyframes enough, the one in use.
 
         Only one that agrees with the keyframe in use about where the frame is: of a place that the
         graph does not know to be the same, a new keyframe closes the loop.
         """
-        nearest = self._neighbours.best(at.T_wc, camera, at.keyframe.sub_map)
-        for keyframe, T_fk in nearest[: self._config.return_candidates]:
-            if keyframe is at.keyframe:
-                continue
-            back = CurrentKeyframe(keyframe, T_fk=T_fk)
-            try:
-                solved = self.place(back, encoding, camera)
-                if solved is None or not self._returned(solved, T_fk, camera):
-                    continue
-                self._keyframes.hold(keyframe.number)
-            except InputError:
-                continue  # a keyframe that cannot be read back is skipped
-            back.moved_to(solved.estimate.T, solved.pair.matches)
-            back.motion, back.mapped_parallax_px = at.motion, solved.parallax_px
-            return back, solved
-        return None
+        config = self._config
+        around = self.neighbours.around(at.T_wc, camera, at.keyframe.sub_map, at.keyframe)
+        crowded = len(around) >= config.crowd
+        best, least = None, solved.share if crowded else config.return_share
+        for neighbour in around[: config.return_candidates]:
+            back = self.back_at(neighbour, at, encoding, camera)
+            if back is not None and back[1].share >= least:
+                best, least = back, back[1].share
+            if least >= config.return_share:
+                break
+        if best is not None:
+            self.take_up(best[0])
+            return best
+        return (at, solved) if crowded and solved.share >= config.crowd_share else None
 
-    def _returned(self, solved: Matched, T_fk: Sim3, camera: CameraModel) -> bool:
-        if solved.share < self._config.return_share or self.hidden(solved):
-            return False
+    def take_up(self, back: CurrentKeyframe) -> None:
+        """Hold an earlier keyframe in memory: tracking goes on there."""
+        self._keyframes.hold(back.keyframe.number)
+
+    def shows(self, solved: Matched) -> bool:
+        """True if enough was matched to go on at a keyframe."""
+        return solved.share >= self._config.crowd_share
+
+    def back_at(
+        self,
+        neighbour: Neighbour,
+        at: CurrentKeyframe,
+        encoding: Encoding,
+        camera: CameraModel,
+        drifted: bool = False,
+    ) -> tuple[CurrentKeyframe, Matched] | None:
+        """The last frame's pose at an earlier keyframe, where that agrees with its pose; where the
+        keyframe in use has ``drifted``, in any case."""
+        back, T_fk = CurrentKeyframe(neighbour.keyframe, T_fk=neighbour.T_fk), neighbour.T_fk
+        try:
+            expected = expected_matches(back.keyframe.pointmap, T_fk, camera)
+            pair = self._prior.decode(self._reference(back), encoding, expected)
+            solved = self.place(back, encoding, camera, pair)
+        except InputError:
+            return None  # a keyframe that cannot be read back is skipped
+        if solved is None or self.hidden(solved):
+            return None
         shift = camera.project(solved.estimate.T.apply(solved.points))
         shift = np.linalg.norm(shift - camera.project(T_fk.apply(solved.points)), axis=1)
-        return bool(np.median(shift) < self._config.return_widths * camera.width)
+        if not drifted and np.median(shift) > self._config.return_widths * camera.width:
+            return None
+        back.moved_to(solved.estimate.T, solved.pair.matches)
+        back.motion, back.mapped_parallax_px = at.motion, solved.parallax_px
+        return back, solved

@@ -50,6 +50,20 @@ class Link:
 
 
 @dataclass(frozen=True)
+class Revisit:
+    """Relative pose and scale of two keyframes that one frame was matched to."""
+
+    keyframe: int
+    earlier: int
+    T_ke: Sim3
+    """Earlier keyframe to the other."""
+    covariance: npt.NDArray[np.float64]
+    """[6, 6] of the left tangent [translation, rotation]."""
+    scale_sigma: float
+    """Of the logarithm of the scale."""
+
+
+@dataclass(frozen=True)
 class Tracked:
     """A frame with its pose, or the reason why it has none."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import TypeAlias
 
@@ -12,12 +13,18 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore
 from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, PairGeometry, Prior
+from aquaflow.tracking.consistency import ConsistencyMonitor
 from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
-from aquaflow.tracking.frames import FrameClass, Link, Quality, Tracked
+from aquaflow.tracking.frames import FrameClass, Link, Quality, Revisit, Tracked
 from aquaflow.tracking.initialisation.back_fill import BackFills
 from aquaflow.tracking.loops.relocaliser import Places
 from aquaflow.tracking.map_start import MapStart
+from aquaflow.tracking.pose.matcher import Matched
+from aquaflow.tracking.repairs import LastFrame, Repairs
+from aquaflow.tracking.revisits import revisited
 from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
+
+log = logging.getLogger(__name__)
 
 ExpectedMotion: TypeAlias = Callable[[Keyframe, int, int, Sim3], Sim3 | None]
 """The camera's motion between two moments (ns) as telemetry has it, in units of the keyframe; the
@@ -57,6 +64,14 @@ class Tracker:
         self._back_fills = BackFills(waiting, prior, self._keyframe_tracker, self._failures, live)
         self._at: CurrentKeyframe | None = None
         self._origin = Sim3.identity()
+        self.monitor = ConsistencyMonitor(self._keyframe_tracker.neighbours, config)
+        self._repair = Repairs(self.monitor, self._keyframe_tracker)
+        self._solved: Matched | None = None
+        """The last frame at the keyframe in use; None if it has become a keyframe itself."""
+        self._joined: set[tuple[int, int]] = set()
+        """Pairs of keyframes, the later one first, whose relative pose was noted."""
+        self.revisits: list[Revisit] = []
+        """Relative poses of keyframes that one frame was matched to, to be taken by the graph."""
 
     def track(self, frame: Frame) -> list[Tracked]:
         """Track a frame; returns the frames finished by it: none while it waits, several
@@ -119,6 +134,8 @@ class Tracker:
         if self._at is None:
             return self._find_again(frame, encoding) or self._initialise(frame, encoding)
         tracked = self._follow(frame, encoding)
+        if tracked is not None:
+            self._check(frame, encoding)
         found = [tracked] if tracked is not None else self._find_again(frame, encoding)
         if found:
             self._waiting.move(Wait.LOST, Wait.FOR_A_KEYFRAME)
@@ -173,6 +190,41 @@ class Tracker:
         assert self._at is not None
         assert self.camera is not None
         return self._back_fills.start(self._at, self.camera)
+
+    # --- consistency ---------------------------------------------------------------------------
+
+    def _check(self, frame: Frame, encoding: Encoding) -> None:
+        """Ask the monitor, and repair what it finds; the last frame keeps its pose."""
+        at, camera, solved = self._at, self.camera, self._solved
+        if at is None or camera is None:
+            return
+        with self._failures.contain("consistency monitor", frame.index):
+            finding = self.monitor.after(at.keyframe, frame.index, solved, camera)
+            if finding is None or solved is None:
+                return
+            log.warning("frame %d: %s", frame.index, finding)
+            repaired = self._repair(finding, at, LastFrame(encoding, camera, solved))
+            if repaired is not None:
+                self._at = repaired.at
+                self.revisits += [] if repaired.revisit is None else [repaired.revisit]
+
+    def _join(
+        self,
+        at: CurrentKeyframe,
+        solved: Matched,
+        back: CurrentKeyframe,
+        solved_back: Matched,
+        camera: CameraModel,
+    ) -> None:
+        """Note what the last frame, placed at both, says of two keyframes; once for a pair."""
+        numbers = at.keyframe.number, back.keyframe.number
+        pair = (max(numbers), min(numbers))
+        if pair[0] == pair[1] or pair in self._joined:
+            return
+        self._joined.add(pair)
+        pointmap = self._keyframe_tracker.pointmap(at, solved, camera)
+        revisit = revisited(at, solved, back, solved_back, pointmap)
+        self.revisits += [] if revisit is None else [revisit]
 
     # --- loss -----------------------------------------------------------------------------------
 
@@ -239,6 +291,7 @@ class Tracker:
         assert self._at is not None
         assert self.camera is not None
         at, camera, keyframe_tracker = self._at, self.camera, self._keyframe_tracker
+        self._solved = None
         self._expect(at, frame)
         solved = keyframe_tracker.place(at, encoding, camera, pair)
         solved = solved or keyframe_tracker.place_after_turn(at, encoding, camera)
@@ -250,11 +303,13 @@ class Tracker:
             frame = keyframe_tracker.without_hidden(frame, at, solved, camera)
         frame_class = keyframe_tracker.classify(at, solved, camera)
         if frame_class is FrameClass.KEYFRAME:
-            earlier = keyframe_tracker.earlier(at, encoding, camera)
-            if earlier is not None:
+            instead = keyframe_tracker.instead(at, solved, encoding, camera)
+            if instead is not None:
                 keyframe_tracker.leave(at)
-                self._at, solved = earlier
+                self._join(at, solved, *instead, camera)
+                self._at, solved = instead
                 frame_class = FrameClass.COMMON
+        self._solved = solved
         if frame_class is FrameClass.COMMON:
             return self._at.tracked(frame, frame_class, solved.quality)
         pointmap = keyframe_tracker.pointmap(at, solved, camera)
@@ -265,6 +320,8 @@ class Tracker:
         link = Link(at.keyframe.number, estimate.T, estimate.covariance, solved.pair)
         self.sub_map = at.keyframe.sub_map
         keyframe_tracker.leave(at)
+        self._solved = None
+        self._joined.add((len(self._keyframes), at.keyframe.number))
         new = keyframe_tracker.at_new_keyframe
         self._at = new(frame, encoding, at.T_wc, pointmap, self.sub_map, at.motion)
         return self._at.tracked(frame, frame_class, solved.quality, pointmap.copy(), link)

@@ -12,6 +12,7 @@ from aquaflow.errors import AquaFlowError
 from aquaflow.messages import Dropped
 from aquaflow.service.health.degradation import DegradationLevel
 from aquaflow.service.health.state import State
+from aquaflow.tracking.consistency import SHOWN_FRAMES, Cause, Finding
 from tests.service.live_scenes import CALM, Told, frame_of, rows_of, visited
 
 
@@ -68,6 +69,19 @@ def test_a_silent_link_degrades_with_its_name_and_comes_back(told: Told) -> None
     assert "autopilot" in told.loop.health.reason
     link["state"] = "connected"
     told.frames("p", first=5)
+    assert told.loop.health.state is State.TRACKING
+
+
+def test_a_finding_of_the_monitor_is_a_state_with_its_reason_and_ends(told: Told) -> None:
+    told.frames("pp")
+    monitor = told.loop.run_.slam.tracker.monitor
+    monitor.counts.add(Finding(1, 0, Cause.POSE, 1.2))
+    monitor._frames_since = 0
+    told.frames("p", first=5)
+    assert told.loop.health.state is State.INCONSISTENT
+    assert "+20 %" in told.loop.health.reason
+    monitor._frames_since = SHOWN_FRAMES
+    told.frames("p", first=6)
     assert told.loop.health.state is State.TRACKING
 
 

@@ -102,6 +102,29 @@ def test_hovering_over_one_place_adds_no_keyframes() -> None:
     assert used[len(THERE) :].count(0) > 2
 
 
+def wander(count: int) -> list[Sim3]:
+    """Over one place, never twice the same, turning by up to 40 degrees to either side."""
+    i = np.arange(count)
+    turns = [0.1 * np.sin(0.21 * i), 0.1 * np.sin(0.17 * i), 0.7 * np.sin(0.047 * i)]
+    centres = [0.35 * np.sin(0.13 * i), 0.3 * np.sin(0.111 * i + 0.3), 0.1 * np.sin(0.07 * i)]
+    pairs = zip(np.transpose(turns), np.transpose(centres), strict=True)
+    return [pose(tuple(turn), tuple(centre)) for turn, centre in pairs]
+
+
+def test_a_place_that_has_keyframes_enough_gets_no_more() -> None:
+    poses = wander(250)
+    made = {}
+    for crowd in (3, 1000):
+        prior = told(poses)
+        config = QUICK.model_copy(update={"crowd": crowd})
+        result = run(prior.frames(SMALL), config, prior)
+        assert {t.frame_class for t in result.tracked} <= PLACED
+        assert error_share(result.tracked, poses) < 0.005
+        made[crowd] = [keyframe.frame_index for keyframe in result.store.keyframes]
+    assert len(made[3]) < len(made[1000])
+    assert len([index for index in made[3] if index > 190]) <= 1
+
+
 def test_a_keyframe_that_is_in_another_place_than_thought_is_not_taken_up_again() -> None:
     """A new one is made: the loop between the two is for the graph to close."""
     prior = told(HOVER[:24])

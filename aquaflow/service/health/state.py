@@ -25,6 +25,7 @@ class State(str, Enum):
     LOST = "lost"
     DEGRADED = "degraded"
     STOPPING = "stopping"
+    INCONSISTENT = "tracking, inconsistent"
 
     @property
     def number(self) -> int:
@@ -85,6 +86,9 @@ class Facts:
     posed: bool
     """The newest frame has a pose."""
     ever_posed: bool
+    inconsistent: str
+    """Why the poses of the last seconds are doubtful, by the monitor of scale; empty: they are
+    not."""
     troubles: list[str]
     """Why the service works with less than everything."""
 
@@ -100,6 +104,7 @@ def judged(facts: Facts) -> tuple[State, str]:
         return State.INITIALISING, "no pose yet: the camera must move sideways over texture"
     if not facts.posed:
         return State.LOST, "the newest frames have no pose; the place is being looked for"
-    if facts.troubles:
-        return State.DEGRADED, "; ".join(facts.troubles)
+    if facts.inconsistent or facts.troubles:
+        state = State.INCONSISTENT if facts.inconsistent else State.DEGRADED
+        return state, "; ".join(filter(None, [facts.inconsistent, *facts.troubles]))
     return State.TRACKING, "every frame has a pose"

@@ -20,6 +20,7 @@ SEVERITY: dict[State, Literal["error", "warning", "notice", "info"]] = {
     State.WAITING: "error",
     State.LOST: "warning",
     State.DEGRADED: "warning",
+    State.INCONSISTENT: "warning",
     State.TRACKING: "notice",
 }
 """How urgent each state is to the pilot."""

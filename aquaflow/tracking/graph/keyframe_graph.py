@@ -20,7 +20,7 @@ from aquaflow.errors.failures import Failures
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.keyframes import Keyframe, KeyframeStore
-from aquaflow.tracking.frames import Link
+from aquaflow.tracking.frames import Link, Revisit
 from aquaflow.tracking.graph.improvement import Improvement
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph, edge_information, solve
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
@@ -102,6 +102,8 @@ class KeyframeGraph:
         self._keyframes, self._places, self._config = keyframes, places, config.graph
         self.loops = 0
         """Loop edges found."""
+        self._revisited: set[tuple[int, int]] = set()
+        """Pairs of keyframes that have such an edge."""
         self._known: list[Keyframe] = []
         """In the graph; the store may hold some that are not yet."""
         self._executor = ThreadPoolExecutor(1, "keyframe graph")
@@ -160,6 +162,22 @@ class KeyframeGraph:
         if self._adjustments is not None:
             self._due = True
             self._optimise(everything=True)
+
+    def revisit(self, found: Revisit) -> None:
+        """Add what a frame said of two keyframes as a loop edge, the only one for this pair; the
+        keyframe's pose is set to what the graph holds it to be."""
+        keyframe = self._keyframes[found.keyframe]
+        keyframe.T_wc = self.graph.pose(found.keyframe)
+        pair = (found.keyframe, found.earlier)
+        if pair in self._revisited or not self._config.enabled:
+            return
+        self._revisited.add(pair)
+        information = edge_information(found.covariance, found.scale_sigma, found.T_ke)
+        edge = Edge(found.keyframe, found.earlier, found.T_ke, information, loop=True)
+        if self.graph.add_edge(edge):
+            self.loops += 1
+            self._due = True
+        self._optimise()
 
     def straighten(self) -> None:
         """Start an optimisation together with telemetry, if none is running."""

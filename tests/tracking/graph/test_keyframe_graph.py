@@ -14,7 +14,7 @@ from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.messages import Frame
 from aquaflow.prior.classical import ClassicalPrior
-from aquaflow.tracking.frames import FrameClass, Tracked
+from aquaflow.tracking.frames import FrameClass, Revisit, Tracked
 from aquaflow.tracking.graph.keyframe_graph import Correction, KeyframeGraph
 from aquaflow.tracking.loops.relocaliser import Places
 from aquaflow.tracking.tracker import Tracker
@@ -56,6 +56,9 @@ class Swim:
     def run(self, frames: Sequence[Frame]) -> Swim:
         for frame in frames:
             self._take(self.tracker.track(frame))
+            found, self.tracker.revisits = self.tracker.revisits, []
+            for revisit in found:
+                self.graph.revisit(revisit)
         self._take(self.tracker.finish())
         self.corrections.append(self.graph.correction(wait=True))
         return self
@@ -119,8 +122,9 @@ def test_without_the_graph_no_loop_is_looked_for(clip: list[Frame]) -> None:
     assert Swim(settings).run(clip).loops == 0
 
 
-def test_drift_at_the_seam_falls_fivefold_when_the_loop_closes(swim: Swim) -> None:
-    """A path that drifts by planted errors of its links, and one true loop."""
+def test_drift_at_the_seam_falls_fivefold_when_the_loop_closes() -> None:
+    """A path that drifts by planted errors of its links, and one true loop, of a new keyframe."""
+    swim = Swim(TrackingConfig(return_candidates=0)).run(filmed(SeaFloor(), POSES))
     drifting = Swim()
     store, graph = drifting.store, drifting.graph.graph
     for keyframe in swim.store.keyframes:
@@ -201,3 +205,22 @@ def test_frames_that_waited_are_placed_when_the_place_is_found_again(clip: list[
     swim = Swim().run([*clip[:12], *lost, *back])
     assert sorted(t.frame.index for t in swim.tracked) == list(range(18))
     assert all(t.sub_map == 0 for t in swim.tracked if t.frame.index >= 15)
+
+
+# --- what a repair found --------------------------------------------------------------------------
+
+
+def test_a_pair_that_a_repair_joined_gets_one_edge_and_the_graphs_pose() -> None:
+    swim = Swim().run(filmed(SeaFloor(), POSES[:12]))
+    edges, loops = len(swim.graph.snapshot.edges), swim.graph.loops
+    last = swim.store.keyframes[-1]
+    earlier, true = swim.store[last.number - 2], last.T_wc
+    T_ke = true.inverse() @ earlier.T_wc
+    last.T_wc = Sim3(true.R, true.t, 1.2 * true.scale)
+    found = Revisit(last.number, earlier.number, T_ke, 1e-6 * np.eye(6), 0.005)
+    for _ in range(3):
+        swim.graph.revisit(found)
+        swim.graph.correction(wait=True)
+    assert len(swim.graph.snapshot.edges) == edges + 1
+    assert swim.graph.loops == loops + 1
+    assert last.T_wc.scale == pytest.approx(true.scale, rel=1e-3)

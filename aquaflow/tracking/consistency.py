@@ -1,0 +1,234 @@
+"""A monitor of consistency: do the depths of the keyframe in use fit its past, its neighbours, and
+the matches?
+
+A frame's pose takes its scale from its keyframe's pointmap and hands its errors back with its
+depths; a new keyframe inherits both. A wrong scale fits everything that follows, and every frame
+has a pose. What it does not fit are depths from before: a few points of every keyframe, taken when
+it was first left, are kept (:class:`Neighbours`) and looked up in the pointmap in use. Depths whose
+errors are no common scale are seen by the matches that no pose explains.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from aquaflow.config import TrackingConfig
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes import Keyframe
+from aquaflow.tracking.depth_ratio import DepthRatio, depth_ratio
+from aquaflow.tracking.loops.neighbours import Array, Neighbour, Neighbours, sketch
+from aquaflow.tracking.pose.matcher import Matched
+from aquaflow.tracking.pose.rigidity import rigid_share
+
+REMEMBERED = 20
+"""Findings that are listed."""
+SHOWN_FRAMES = 50
+"""Frames with a pose for which a finding stays in the state of the service: 5 s at 10 a second."""
+USUAL_FRAMES = 600
+"""Frames whose median is the usual share of inliers: a minute at 10 a second."""
+
+
+SOON = 3
+"""Frames between two checks where few matches fit."""
+
+
+class Cause(str, Enum):
+    """What does not fit."""
+
+    DEPTHS = "depths"
+    """The keyframe's own depths have changed their scale since it was first left."""
+    POSE = "scale"
+    """Its depths, scaled by its pose, do not fit those of keyframes around it."""
+    MATCHES = "matches"
+    """Too few matches fit its depths, wherever the frame is taken to be."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A keyframe that is not consistent."""
+
+    frame: int
+    """Index of the frame at which it was noticed."""
+    keyframe: int
+    cause: Cause
+    ratio: float
+    """Of its scale to the one that it should have; of ``MATCHES`` the share of inliers."""
+
+    def __str__(self) -> str:
+        if self.cause is Cause.MATCHES:
+            return f"only {100.0 * self.ratio:.0f} % of the matches fit keyframe {self.keyframe}"
+        off = 100.0 * (self.ratio - 1.0)
+        of = "the one it had" if self.cause is Cause.DEPTHS else "that of the keyframes around it"
+        return f"scale of keyframe {self.keyframe} is {off:+.0f} % off {of}"
+
+
+@dataclass
+class Counts:
+    """What the monitor did in a dive; written by tracking, read by anyone."""
+
+    checks: int = 0
+    found: int = 0
+    rescaled: int = 0
+    """Keyframes whose depths were brought back to their scale."""
+    refused: int = 0
+    """Keyframes whose depths are triangulated anew."""
+    relocalised: int = 0
+    """Times that tracking went on at an earlier keyframe."""
+    unrepaired: int = 0
+    """Findings of which no earlier keyframe could be matched."""
+    findings: tuple[Finding, ...] = ()
+    """The latest."""
+
+    def add(self, finding: Finding) -> None:
+        """A finding that was confirmed."""
+        self.found += 1
+        self.findings = (*self.findings, finding)[-REMEMBERED:]
+
+    def notes(self) -> list[str]:
+        """A sentence for the user if there were findings."""
+        if not self.found:
+            return []
+        times = "once" if self.found == 1 else f"{self.found} times"
+        last = self.findings[-1]
+        return [
+            f"tracking was inconsistent {times}, last at frame {last.frame} ({last}); "
+            f"{self.found - self.unrepaired} repaired"
+        ]
+
+    def to_json(self) -> dict[str, object]:
+        """For /health and metrics.json."""
+        return {
+            "checks": self.checks,
+            "found": self.found,
+            "rescaled": self.rescaled,
+            "triangulated_anew": self.refused,
+            "relocalised": self.relocalised,
+            "unrepaired": self.unrepaired,
+            "findings": [
+                {
+                    "frame": each.frame,
+                    "keyframe": each.keyframe,
+                    "cause": each.cause.value,
+                    "ratio": round(each.ratio, 4),
+                }
+                for each in self.findings
+            ],
+        }
+
+
+class ConsistencyMonitor:
+    """Checks the keyframe in use now and then; a finding counts when the next frame confirms it."""
+
+    def __init__(self, neighbours: Neighbours, config: TrackingConfig) -> None:
+        self._neighbours, self._config = neighbours, config
+        self._own: tuple[Keyframe, Array] | None = None
+        self._inliers: deque[float] = deque(maxlen=USUAL_FRAMES)
+        self._since, self._suspected = 0, False
+        self._frames_since = SHOWN_FRAMES
+        self.counts = Counts()
+
+    @property
+    def trouble(self) -> str:
+        """The last finding, for some seconds; empty if there is none."""
+        recent = self._frames_since < SHOWN_FRAMES and self.counts.findings
+        return str(self.counts.findings[-1]) if recent else ""
+
+    def after(
+        self, keyframe: Keyframe, frame: int, solved: Matched | None, camera: CameraModel
+    ) -> Finding | None:
+        """To be called after every frame with a pose; a finding that two checks in a row had.
+
+        ``solved``: the frame at the keyframe, or None if it has become the keyframe itself.
+        """
+        self._since += 1
+        self._frames_since += 1
+        few = False
+        if solved is not None:
+            self._inliers.append(solved.estimate.inlier_share)
+            few = solved.estimate.inlier_share < self._config.monitor.min_inlier_share
+        if self._own is None or self._own[0] is not keyframe:
+            known = self._neighbours.points(keyframe)
+            self._own = (keyframe, sketch(keyframe, self._config) if known is None else known)
+            self._suspected = False
+        monitor = self._config.monitor
+        due = self._suspected or self._since >= (SOON if few else monitor.every)
+        if not (monitor.enabled and due):
+            return None
+        self._since = 0
+        self.counts.checks += 1
+        finding = self._check(keyframe, frame)
+        if finding is None and solved is not None and self._misfits(keyframe, solved, camera):
+            share = solved.estimate.inlier_share
+            finding = Finding(frame, keyframe.number, Cause.MATCHES, share)
+        confirmed = self._suspected and finding is not None
+        self._suspected = finding is not None and not confirmed
+        if finding is None or not confirmed:
+            return None
+        self._frames_since = 0
+        self.counts.add(finding)
+        return finding
+
+    def _check(self, keyframe: Keyframe, frame: int) -> Finding | None:
+        monitor, number = self._config.monitor, keyframe.number
+        own = self._change(keyframe)
+        if own is not None and _is_off(own, monitor.max_change, monitor.sigmas):
+            return Finding(frame, number, Cause.DEPTHS, float(np.exp(own.log)))
+        gap = self._gap(keyframe)
+        if gap is not None:
+            return Finding(frame, number, Cause.POSE, float(np.exp(gap.log)))
+        return None
+
+    def _misfits(self, keyframe: Keyframe, solved: Matched, camera: CameraModel) -> bool:
+        """True if the scene is in plain view, but where the keyframe's depths do not put it."""
+        if solved.estimate.inlier_share >= self.least_inliers:
+            return False
+        rigid = rigid_share(solved.pair, keyframe.pointmap.camera, camera)
+        return rigid >= self._config.monitor.rigid_share
+
+    @property
+    def least_inliers(self) -> float:
+        """Share of inliers below which the depths do not fit the matches."""
+        usual = float(np.median(self._inliers)) if self._inliers else 0.0
+        monitor = self._config.monitor
+        return min(monitor.min_inlier_share, monitor.usual_share * usual)
+
+    def _change(self, keyframe: Keyframe) -> DepthRatio | None:
+        """Of the keyframe's depths since they were first known."""
+        assert self._own is not None
+        known_sigma = self._config.known_sigma
+        return depth_ratio(self._own[1], Sim3.identity(), keyframe.pointmap, known_sigma)
+
+    def _gap(self, keyframe: Keyframe) -> DepthRatio | None:
+        """Between the keyframe's scale and that of most around it, if it is too large.
+
+        Where most of them are off, and to the same side, it is not they who are wrong.
+        """
+        monitor = self._config.monitor
+        ratios = sorted((ratio for _, ratio in self.witnesses(keyframe)), key=lambda r: r.log)
+        off = [r for r in ratios if _is_off(r, monitor.max_gap, monitor.sigmas)]
+        if 2 * len(off) <= len(ratios):
+            return None
+        middle = ratios[len(ratios) // 2]
+        return middle if middle in off else None
+
+    def witnesses(self, keyframe: Keyframe) -> list[tuple[Neighbour, DepthRatio]]:
+        """The keyframes around, the most alike first, and what they say of its depths."""
+        camera = keyframe.pointmap.camera
+        around = self._neighbours.around(keyframe.T_wc, camera, keyframe.sub_map, keyframe)
+        found = []
+        for neighbour in around[: self._config.monitor.witnesses]:
+            points = self._neighbours.points(neighbour.keyframe)
+            assert points is not None
+            ratio = depth_ratio(points, neighbour.T_fk, keyframe.pointmap, self._config.known_sigma)
+            if ratio is not None:
+                found.append((neighbour, ratio))
+        return found
+
+
+def _is_off(ratio: DepthRatio, most: float, sigmas: float) -> bool:
+    return abs(ratio.log) > max(most, sigmas * ratio.sigma)
