@@ -23,7 +23,7 @@ FAMILIES = (
 """As the table groups the cases."""
 _MODULES = (
     "images", "motion", "clock", "water", "gaussians", "optimisation", "solvers", "precision",
-    "soak",
+    "soak", "hovering",
 )  # fmt: skip
 """Those that register cases, in the order of the table."""
 
