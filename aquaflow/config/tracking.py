@@ -290,13 +290,6 @@ class TrackingConfig(Stage):
         "a frame that hides the scene; a keyframe full of flakes loses the depth under them, so "
         "late: on the reef clip, one made at 0.8 kept the depth of 15 % of its pixels",
     )
-    return_overlap: float = Field(
-        0.75,
-        gt=0,
-        le=1,
-        description="predicted share of an earlier keyframe in view from which it is tried again "
-        "before a new one is made; above keyframe_share, for what is in view is not all matched",
-    )
     return_share: float = Field(
         0.75,
         gt=0,
