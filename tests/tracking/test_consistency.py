@@ -50,7 +50,7 @@ def bend(at: CurrentKeyframe, index: int) -> None:
     """Depths are wrong by turns, with no common scale, in a keyframe that has had its frames."""
     if index == PLANTED:
         which = np.arange(SMALL.height)[:, None] // 6 % 3
-        at.keyframe.pointmap.rho *= 1.7 ** (which - 1.0)
+        at.keyframe.pointmap.rho *= 1.2 ** (which - 1.0)
         at.keyframe.pointmap.fused = MOST_FUSED
 
 
