@@ -182,6 +182,11 @@ class KeyframeStore:
         self._cameras[number] = (self._cameras[number][0], pointmap.camera)
         self._contents[number] = replace(self.content(number), pointmap=pointmap)
 
+    @property
+    def readable(self) -> list[Keyframe]:
+        """All but the ``lost`` ones."""
+        return [each for each in self.keyframes if each.number not in self.lost]
+
     def __len__(self) -> int:
         return len(self.keyframes)
 

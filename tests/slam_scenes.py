@@ -10,7 +10,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
 from aquaflow.messages import Frame
 from aquaflow.slam import Slam
-from aquaflow.tracking.frames import FrameClass, Tracked
+from aquaflow.tracking.frames import FrameClass, Revisit, Tracked
 
 CAMERA = CameraModel(64, 48, 55.0, 55.0, 32.0, 24.0)
 STEPS = {"steps_keyframe": 3, "steps_mapping": 2, "steps_common": 1, "refine_steps": 4}
@@ -29,9 +29,9 @@ def frame_of(index: int) -> Frame:
     return Frame(index, index, index, image, CAMERA)
 
 
-def pointmap() -> Pointmap:
-    rho = np.full((48, 64), 0.5)
-    return Pointmap(CAMERA, rho, (0.01 * rho) ** 2)
+def pointmap(height: int = 48, width: int = 64) -> Pointmap:
+    rho = np.full((height, width), 0.5)
+    return Pointmap(CAMERA.scaled(width, height), rho, (0.01 * rho) ** 2)
 
 
 class ToldTracker:
@@ -42,6 +42,7 @@ class ToldTracker:
 
     def __init__(self, slam: Slam, classes: str, sub_maps: str = "") -> None:
         self._slam, self._classes, self._sub_maps = slam, classes, sub_maps or "0" * len(classes)
+        self.revisits: list[Revisit] = []
 
     def track(self, frame: Frame) -> list[Tracked]:
         kind, sub_map = self._classes[frame.index], int(self._sub_maps[frame.index])
@@ -51,10 +52,11 @@ class ToldTracker:
         frame_class, seen = FrameClass.COMMON, None
         if kind in "KM":
             frame_class = FrameClass.KEYFRAME if kind == "K" else FrameClass.MAPPING
-            seen = pointmap()
+            seen = pointmap(*frame.image.shape[:2])
         if kind == "K":
             encoding = self._slam.prior.encode(frame.image, CAMERA)
-            self._slam.keyframes.add(frame.index, 0, encoding, T_wc, pointmap(), sub_map)
+            depths = pointmap(*frame.image.shape[:2])
+            self._slam.keyframes.add(frame.index, 0, encoding, T_wc, depths, sub_map)
         number = len(self._slam.keyframes) - 1
         return [Tracked(frame, frame_class, sub_map, number, T_wc, pointmap=seen)]
 

@@ -258,7 +258,7 @@ class DiveRun:
             self.profiler.stage("self-calibration"),
             self.slam.failures.contain("self-calibration"),
         ):
-            self.found = from_keyframes(self.slam.keyframes.keyframes)
+            self.found = from_keyframes(self.slam.keyframes.readable)
 
     def _why_not(self, read: int) -> str:
         if read == 0:
@@ -304,7 +304,7 @@ class DiveRun:
             self.profiler.stage("calibration check"),
             self.slam.failures.contain("calibration check"),
         ):
-            self.lens_error = lens_error(self.slam.keyframes.keyframes)
+            self.lens_error = lens_error(self.slam.keyframes.readable)
 
     def _shortcomings(self) -> list[str]:
         gaussians = sum(len(mapper.gaussians) for mapper in self.slam.mappers.values())

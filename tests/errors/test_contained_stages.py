@@ -41,7 +41,7 @@ SETTINGS = Config.model_validate(
     {
         "threads": 1,
         "source": {"width": 96},
-        "tracking": {"keyframe_share": 0.9},
+        "tracking": {"keyframe_share": 0.9, "recent_keyframes": 0},
         "mapping": {
             "optimiser": FEW_STEPS | {"heldout_steps": 2},
             "medium": {"first_fit_views": 4},

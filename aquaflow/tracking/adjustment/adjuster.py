@@ -7,8 +7,8 @@ graph's thread; :meth:`Adjuster.applied` keeps the matches that it made.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Container, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from time import thread_time
 
@@ -78,6 +78,14 @@ class Job:
     links: dict[int, MeasuredLink]
     views: Sequence[KeyframeView]
     """The newest keyframe, and those that it is to be matched with."""
+
+    def within(self, known: Container[int]) -> Job:
+        """The part of it that is ``known``: a keyframe may be missing from the graph, and what was
+        linked to it is held."""
+        numbers = [number for number in self.numbers if number in known]
+        orphans = {n for n in numbers if n in self.links and self.links[n].parent not in known}
+        views = [view for view in self.views if view.number in known]
+        return replace(self, numbers=numbers, held=self.held | orphans, views=views)
 
 
 @dataclass(frozen=True)
@@ -165,6 +173,9 @@ class Adjuster:
         """
         began = thread_time()
         row = {int(number): i for i, number in enumerate(snapshot.nodes["number"])}
+        job = job.within(row)
+        if len(job.numbers) < 2:
+            return Improvement.none()
         nodes = np.array([row[number] for number in job.numbers], dtype=np.intp)
         poses = poses_at(snapshot, nodes)
         self._match(job, {n: poses.element(i) for i, n in enumerate(job.numbers)})

@@ -36,12 +36,16 @@ class Verdict:
     """Mean robust cost of their matches, in sigmas."""
     after: float
     gain_sigmas: float
-    """Mean fall of a point's cost, over its standard deviation from point to point."""
+    """Mean fall of a point's cost, over its standard error: from the scatter from point to point,
+    and grown, because matches err together."""
     points: int
 
 
-def verdict(matches: Sequence[AnchorMatches], before: Sim3Batch, after: Sim3Batch) -> Verdict:
-    """Compare poses [K] by the matches of points held out of the adjustment."""
+def verdict(
+    matches: Sequence[AnchorMatches], before: Sim3Batch, after: Sim3Batch, grown: float = 1.0
+) -> Verdict:
+    """Compare poses [K] by the matches of points held out of the adjustment; errors in common make
+    their standard error ``grown`` times that of independent ones."""
     falls, costs, count = [], np.zeros(2), 0
     for old, new in zip(
         held_out_errors(matches, before), held_out_errors(matches, after), strict=True
@@ -54,7 +58,7 @@ def verdict(matches: Sequence[AnchorMatches], before: Sim3Batch, after: Sim3Batc
     fall = np.concatenate(falls) if falls else np.zeros(0)
     if len(fall) < 2:
         return Verdict(float("nan"), float("nan"), 0.0, len(fall))
-    spread = max(float(fall.std()) / np.sqrt(len(fall)), 1e-12)
+    spread = max(grown * float(fall.std()) / np.sqrt(len(fall)), 1e-12)
     return Verdict(costs[0] / count, costs[1] / count, float(fall.mean()) / spread, len(fall))
 
 
