@@ -199,9 +199,7 @@ class MonitorConfig(Stage):
     """The monitor of consistency (docs/frame.md#consistency)."""
 
     enabled: bool = Field(True, description="False: a wrong scale is not looked for")
-    every: int = Field(
-        10, ge=1, description="frames with a pose between two checks, of 0.5 ms each"
-    )
+    every: int = Field(10, ge=1, description="frames with a pose between two checks")
     witnesses: int = Field(5, ge=1, description="keyframes around that a check asks")
     max_change: float = Field(
         0.03,

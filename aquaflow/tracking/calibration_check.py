@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.stats import f as f_distribution
 
-from aquaflow.geometry.lens_error import TERMS
+from aquaflow.geometry.lens_error import LENS_PRIOR_SIGMA, TERMS
 from aquaflow.keyframes import Keyframe
 from aquaflow.tracking.lens_adjustment import adjust_lens, clusters_of, model_error
 from aquaflow.tracking.lens_equations import Array, LensObservations
@@ -32,6 +32,9 @@ KNOWN_SIGMA = np.array([0.03, 0.03])
 """Above, log focal length or k1 is not determined by the dive."""
 NAMED_SIGMAS = 3.0
 """An error that is larger by itself is named in the warning."""
+LENS_SIGMAS = 3.0
+"""Of what lenses are; an error beyond is no lens but an adjustment that went astray, as of a few
+pictures of 128 px: k1 = 2.5."""
 GRID = 41
 """Steps along each side of the tolerance."""
 
@@ -125,7 +128,8 @@ def estimated(
     full = adjust_lens(observations, R_wc, centres, terms=TERMS)
     covariance = simple.covariance + model_error(simple, full)
     error = simple.adjusted.lens[:2]
-    if not np.isfinite(covariance).all():
+    is_a_lens = (np.abs(error) < LENS_SIGMAS * LENS_PRIOR_SIGMA[:2]).all()
+    if not (is_a_lens and np.isfinite(covariance).all()):
         raise np.linalg.LinAlgError("the matches determine no error of the lens")
     return LensError(
         float(error[0]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,6 +15,7 @@ from aquaflow.dive.calibration_findings import to_json, verdict, warning
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.prior.contract import Keypoints
+from aquaflow.tracking import calibration_check
 from aquaflow.tracking.calibration_check import (
     MAX_VIEWS,
     MIN_VIEWS,
@@ -24,6 +26,7 @@ from aquaflow.tracking.calibration_check import (
     pairs_of,
     view_of,
 )
+from aquaflow.tracking.lens_adjustment import adjust_lens
 from aquaflow.tracking.lens_matches import matched
 from tests.tracking.lens_scenes import FOCAL_PX, HALF, swim
 
@@ -66,6 +69,17 @@ def test_a_camera_that_does_not_turn_says_nothing_of_its_focal_length() -> None:
     assert not error.wrong
     assert verdict(error) == "cannot be told"
     assert to_json(error, CALIBRATION)["focal_px"] is None
+
+
+def test_an_error_that_no_lens_has_is_no_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
+    def astray(*given: Any, terms: int) -> Any:
+        found = adjust_lens(*given, terms=terms)
+        return replace(found, adjusted=replace(found.adjusted, lens=found.adjusted.lens + 1.0))
+
+    monkeypatch.setattr(calibration_check, "adjust_lens", astray)
+
+    with pytest.raises(np.linalg.LinAlgError, match="determine no error"):
+        estimated(*swim((0.0, 0.0)))
 
 
 def test_mismatches_do_not_move_the_estimate() -> None:
