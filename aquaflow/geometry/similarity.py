@@ -120,6 +120,10 @@ class Sim3:
         t = self.scale * (self.R @ other.t) + self.t
         return Sim3(R, t, self.scale * other.scale)
 
+    def in_source_unit(self) -> Sim3:
+        """The pose with scale 1 that projects every point to where this one does."""
+        return Sim3(self.R, self.t / self.scale)
+
     def apply(
         self,
         points: Array,  # [..., 3]

@@ -65,7 +65,8 @@ def triangulate(
         (pixels_b[:, 1] - camera_b.cy) / camera_b.fy,
     )
     ax, ay, az = (row[0] * xa + row[1] * ya + row[2] for row in T_ba.R)
-    tx, ty, tz = T_ba.t
+    t_ba = T_ba.in_source_unit().t
+    tx, ty, tz = t_ba
     # x_b ~ a_in_b + rho t  =>  x_b x (a_in_b + rho t) = 0, solved for rho by least squares. Solved
     # for z, the noise of x_b would be in the divisor, and every depth too small by its variance.
     cx, cy, cz = yb * az - ay, ax - xb * az, xb * ay - yb * ax
@@ -80,7 +81,7 @@ def triangulate(
         expected_z = np.where(
             expected_rho > MIN_RHO, 1.0 / np.maximum(expected_rho, MIN_RHO), z_safe
         )
-    sine = _sin_parallax(xa, ya, expected_z, -(T_ba.R.T @ T_ba.t))
+    sine = _sin_parallax(xa, ya, expected_z, -(T_ba.R.T @ t_ba))
     in_b_z = z_safe * az + tz
     inverse = 1.0 / np.maximum(in_b_z, MIN_DEPTH)
     off_u = camera_b.fx * ((z_safe * ax + tx) * inverse - xb)

@@ -257,7 +257,8 @@ class KeyframeTracker:
     ) -> tuple[CurrentKeyframe, Matched] | None:
         """The last frame's pose at an earlier keyframe, where that agrees with its pose; where the
         keyframe in use has ``drifted``, in any case."""
-        back, T_fk = CurrentKeyframe(neighbour.keyframe, T_fk=neighbour.T_fk), neighbour.T_fk
+        T_fk = neighbour.T_fk.in_source_unit()
+        back = CurrentKeyframe(neighbour.keyframe, T_fk=T_fk)
         try:
             expected = expected_matches(back.keyframe.pointmap, T_fk, camera)
             pair = self._prior.decode(self._reference(back), encoding, expected)

@@ -91,6 +91,16 @@ def test_applying_a_product_is_applying_one_after_the_other(a: Sim3, b: Sim3) ->
     np.testing.assert_allclose((a @ b).apply(points), a.apply(b.apply(points)), atol=1e-7)
 
 
+@given(elements)
+def test_the_pose_in_the_unit_of_its_source_projects_every_point_to_the_same_place(
+    a: Sim3,
+) -> None:
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    unscaled = a.in_source_unit()
+    assert unscaled.scale == 1.0
+    np.testing.assert_allclose(unscaled.apply(points) * a.scale, a.apply(points), atol=1e-7)
+
+
 @given(tangents())
 def test_exp_is_the_matrix_exponential_of_the_generator(xi: Array) -> None:
     expected = expm(generator(xi))

@@ -44,6 +44,19 @@ def test_depths_are_exact_without_noise(seed: int) -> None:
     np.testing.assert_allclose(1.0 / points.rho, depth, rtol=1e-9)
 
 
+@given(st.floats(1e-4, 1e4))
+def test_depths_are_in_the_unit_of_the_first_view_whatever_that_of_the_second_is(
+    scale: float,
+) -> None:
+    rays, depth = scene(0)
+    T_ba = Sim3(SIDEWAYS.R, scale * SIDEWAYS.t, scale)
+    points = triangulate(rays, seen(rays, depth, T_ba), T_ba, CAMERA, NOISE_PX)
+    assert points.good.all()
+    np.testing.assert_allclose(1.0 / points.rho, depth, rtol=1e-9)
+    plain = triangulate(rays, seen(rays, depth, SIDEWAYS), SIDEWAYS, CAMERA, NOISE_PX)
+    np.testing.assert_allclose(points.variance, plain.variance, rtol=1e-6)
+
+
 def test_the_parallax_is_the_angle_between_the_rays() -> None:
     rays, depth = scene(0)
     points = triangulate(rays, seen(rays, depth, SIDEWAYS), SIDEWAYS, CAMERA, NOISE_PX)

@@ -11,6 +11,8 @@ from aquaflow.errors import InputError
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.tracking.frames import FrameClass
+from aquaflow.tracking.pose.matcher import KeyframeMatcher
+from aquaflow.tracking.pose.solver import PoseEstimate, PoseProblem
 from aquaflow.tracking.tracker import Tracker
 from tests.tracking.tracked_clips import (
     PLACED,
@@ -123,6 +125,37 @@ def test_a_place_that_has_keyframes_enough_gets_no_more() -> None:
         made[crowd] = [keyframe.frame_index for keyframe in result.store.keyframes]
     assert len(made[3]) < len(made[1000])
     assert len([index for index in made[3] if index > 190]) <= 1
+
+
+def test_keyframes_of_slightly_other_scale_leave_the_frames_their_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The expected motion is the last one again. Where one pose starts with the scale of the graph
+    and the next, solved from the matches alone, with none, it must not have the step between."""
+    prior, store = told(HOVER), KeyframeStore()
+    frames, solve = prior.frames(SMALL), KeyframeMatcher._solve
+    tracker = Tracker(prior, store, QUICK)
+    for frame in frames[:12]:
+        tracker.track(frame)
+    for keyframe in store.keyframes[::2]:
+        T = keyframe.T_wc
+        keyframe.T_wc = Sim3(T.R, T.t, 1.01 * T.scale)
+    later = []
+    for frame in frames[12:]:
+        from_scratch = frame.index % 4 == 0
+
+        def start(
+            matcher: KeyframeMatcher, problem: PoseProblem, at: Sim3, none: bool = from_scratch
+        ) -> PoseEstimate | None:
+            return solve(matcher, problem, Sim3(at.R, at.t / at.scale) if none else at)
+
+        monkeypatch.setattr(KeyframeMatcher, "_solve", start)
+        later += tracker.track(frame)
+    scales = [t.T_wc.scale for t in later if t.T_wc is not None]
+    of_keyframes = [keyframe.T_wc.scale for keyframe in store.keyframes]
+    assert len({t.keyframe for t in later}) > 1
+    assert len(scales) == len(later)
+    assert min(of_keyframes) <= min(scales) <= max(scales) <= max(of_keyframes) < 1.02
 
 
 def test_a_keyframe_that_is_in_another_place_than_thought_is_not_taken_up_again() -> None:

@@ -67,7 +67,9 @@ def solve_pose(
     unsolvable. Without ``stop_converged`` it takes all MAX_ITERATIONS.
 
     A match that is no number is left out. With ``free_scale`` the pose is a similarity; the
-    ``pixel`` and ``ray`` residuals see its scale only through the frame's own points.
+    ``pixel`` and ``ray`` residuals see its scale only through the frame's own points. Without, its
+    scale is 1, whatever that of ``initial`` is: poses of the graph have one, and a motion
+    that was extrapolated with it would grow with every frame.
 
     Raises:
         ValueError: ``point`` is asked for and the problem has no points of the frame's own.
@@ -76,7 +78,7 @@ def solve_pose(
     if len(matches) == 0 or not initial.is_finite():
         return None
     linearise = ROWS[residual]
-    T, damping = initial, FIRST_DAMPING
+    T, damping = initial if free_scale else initial.in_source_unit(), FIRST_DAMPING
     rows = linearise(matches, T)
     cost = _cost(rows.residual, matches.weights)
     for _ in range(MAX_ITERATIONS):

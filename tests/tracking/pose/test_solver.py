@@ -60,6 +60,17 @@ def test_a_known_pose_is_found_exactly_without_noise(flat: bool) -> None:
     assert estimate.T.scale == 1.0
 
 
+@pytest.mark.parametrize("scale", [0.774, 1.3, 1e-9])
+def test_the_scale_of_the_start_does_not_come_back(scale: float) -> None:
+    """Of a frame that nothing measures the scale of: extrapolated, it would grow without limit."""
+    problem = problem_of(cloud(1), TRUTH)
+    start = Sim3(TRUTH.R, scale * TRUTH.t, scale)
+    estimate = solve_pose(problem, start)
+    assert estimate is not None
+    assert estimate.T.scale == 1.0
+    assert max(errors(estimate.T)) < 1e-7
+
+
 def test_thirty_percent_outliers_do_not_move_the_pose() -> None:
     problem = problem_of(cloud(2, 600), TRUTH, noise_px=0.5)
     rng = np.random.default_rng(3)
