@@ -338,6 +338,13 @@ class TrackingConfig(Stage):
         description="inliers from which a pose after a wide step has no rival: flow that is a tile "
         "off leaves 0.4 to 0.8 of the matches (synthetic pool), right flow over 0.85",
     )
+    least_known_share: float = Field(
+        0.05,
+        ge=0,
+        le=1,
+        description="of the matches, those of known depth, below which others are triangulated "
+        "first",
+    )
     min_support: float = Field(
         0.1,
         ge=0,

@@ -60,11 +60,15 @@ class ClassicalPrior:
         a: Encoding,
         b: Encoding,
         predicted: Float | None = None,  # [H, W, 2] px, expected matches of a in b
+        alone: bool = False,
     ) -> FlowPair:
-        """Flow from the prediction; where it fails, from a SIFT homography, then from nothing."""
+        """Flow from the prediction; where it fails, unless it stands ``alone``, from a SIFT
+        homography, then from nothing."""
         assert isinstance(a, FlowEncoding)
         assert isinstance(b, FlowEncoding)
-        return FlowPair(a, b, best_flow(self._matcher, a, b, _starts(a, b, predicted)))
+        only = alone and predicted is not None
+        starts = from_prediction(predicted) if only else _starts(a, b, predicted)
+        return FlowPair(a, b, best_flow(self._matcher, a, b, starts))
 
 
 def _starts(

@@ -129,7 +129,14 @@ class Prior(Protocol):
         a: Encoding,
         b: Encoding,
         predicted: Float | None = None,  # [H, W, 2] px, expected matches of a in b
-    ) -> PairGeometry: ...
+        alone: bool = False,
+    ) -> PairGeometry:
+        """What a pair of pictures shows.
+
+        ``alone``: only matches near ``predicted`` are wanted, however few they are, to tell whether
+        they explain the pair. Of a scene that repeats itself, others may be more.
+        """
+        ...
 
     def pack(self, encoding: Encoding) -> dict[str, npt.NDArray[Any]]:
         """The arrays of an encoding, not copied, for a file; what was not computed is left out."""

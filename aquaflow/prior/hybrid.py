@@ -154,11 +154,15 @@ class HybridPrior:
         a: Encoding,
         b: Encoding,
         predicted: Float | None = None,  # [H, W, 2] px, expected matches of a in b
+        alone: bool = False,
     ) -> HybridPair:
-        """Flow from the prediction; where it fails, from the descriptors, then from keypoints."""
+        """Flow from the prediction; where it fails, unless it stands ``alone``, from the
+        descriptors, then from keypoints."""
         assert isinstance(a, HybridEncoding)
         assert isinstance(b, HybridEncoding)
-        return HybridPair(a, b, best_flow(self._matcher, a, b, _starts(a, b, predicted)))
+        only = alone and predicted is not None
+        starts = from_prediction(predicted) if only else _starts(a, b, predicted)
+        return HybridPair(a, b, best_flow(self._matcher, a, b, starts))
 
     def warm_up(self) -> None:
         """Run the network once: the first picture of a dive then waits for no preparation."""

@@ -111,11 +111,15 @@ class KeyframeTracker:
         return solved
 
     def place_after_turn(
-        self, at: CurrentKeyframe, encoding: Encoding, camera: CameraModel
+        self, at: CurrentKeyframe, encoding: Encoding, camera: CameraModel, solved: Matched | None
     ) -> Matched | None:
-        """The pose of a frame that shows what of the keyframe has no depth yet."""
+        """``solved``, unless the frame shows hardly anything of the keyframe that has a depth
+        yet."""
+        if solved is not None and solved.known_share >= self._config.least_known_share:
+            return solved
         reference, predicted = self._reference(at), at.motion @ at.T_fk
-        return self._wide_steps.after_turn(at.keyframe, reference, encoding, camera, predicted)
+        turned = self._wide_steps.after_turn(at.keyframe, reference, encoding, camera, predicted)
+        return turned or solved
 
     def _seed(self, at: CurrentKeyframe, predicted: Sim3, camera: CameraModel) -> Float | None:
         """Where the frame's matches are looked for first: at the last ones, or, where telemetry

@@ -294,7 +294,7 @@ class Tracker:
         self._solved = None
         self._expect(at, frame)
         solved = keyframe_tracker.place(at, encoding, camera, pair)
-        solved = solved or keyframe_tracker.place_after_turn(at, encoding, camera)
+        solved = keyframe_tracker.place_after_turn(at, encoding, camera, solved)
         if solved is None:
             return None
         keyframe_tracker.take(at, solved, camera)

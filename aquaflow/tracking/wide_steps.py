@@ -59,9 +59,9 @@ class WideSteps:
         best, poses = solved, keypoint_poses(keyframe, encoding, camera, self._config.known_sigma)
         for pose in [*poses, predicted]:
             seed = expected_matches(keyframe.pointmap, pose, camera)
-            pair = self._prior.decode(reference, encoding, seed)
+            pair = self._prior.decode(reference, encoding, seed, alone=True)
             rival = self._matcher.pose(keyframe, camera, pair, pose, pose)
-            if rival is not None and (best is None or rival.support > best.support):
+            if rival is not None and (best is None or rival.explained > best.explained):
                 best = rival
             if best is not None and best.estimate.inlier_share >= self._config.sure_inlier_share:
                 break

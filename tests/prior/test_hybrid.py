@@ -59,6 +59,17 @@ def test_a_good_prediction_keeps_the_network_from_running() -> None:
     assert describer.asked == 0
 
 
+@pytest.mark.parametrize("prior", [ClassicalPrior(), HybridPrior(PatchDescriber())])
+def test_a_prediction_that_stands_alone_has_no_rival(prior: ClassicalPrior | HybridPrior) -> None:
+    """Whether it explains the pair is what is asked; what else would, must not answer."""
+    pictures = [prior.encode(picture, CAMERA) for picture in moved_pair(shift(*FAR))]
+    nothing_moved = pixel_centres().astype(np.float32)
+    alone = prior.decode(pictures[0], pictures[1], nothing_moved, alone=True)
+    free = prior.decode(pictures[0], pictures[1], nothing_moved)
+    assert alone.valid.mean() < 0.2
+    assert free.valid.mean() > 0.5
+
+
 def test_a_picture_is_described_once() -> None:
     describer = PatchDescriber()
     prior = HybridPrior(describer)

@@ -29,9 +29,11 @@ class Counting(ClassicalPrior):
         self.encoded += 1
         return super().encode(image, camera, mask)
 
-    def decode(self, a: Encoding, b: Encoding, predicted: np.ndarray | None = None) -> FlowPair:
+    def decode(
+        self, a: Encoding, b: Encoding, predicted: np.ndarray | None = None, alone: bool = False
+    ) -> FlowPair:
         self.seeded += predicted is not None
-        return super().decode(a, b, predicted)
+        return super().decode(a, b, predicted, alone)
 
 
 @pytest.fixture(scope="module")

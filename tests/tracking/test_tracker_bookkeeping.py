@@ -89,8 +89,10 @@ def test_a_pose_that_explains_too_few_matches_is_no_pose() -> None:
     prior = told(poses)
     decode = prior.decode
 
-    def wrong(a: KnownView, b: KnownView, predicted: np.ndarray | None = None) -> object:
-        pair = decode(a, b, predicted)
+    def wrong(
+        a: KnownView, b: KnownView, predicted: np.ndarray | None = None, alone: bool = False
+    ) -> object:
+        pair = decode(a, b, predicted, alone)
         if any(b.T_wc is view.T_wc for view in prior.views[13:]):
             pair.matches = (
                 np.random.default_rng(0).uniform(3, 69, pair.matches.shape).astype(np.float32)

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from aquaflow.config import TrackingConfig
-from aquaflow.geometry.similarity import Sim3
+from aquaflow.geometry.similarity import Sim3, so3_log
 from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
 from aquaflow.messages import Frame
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.contract import Keypoints
 from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
 from aquaflow.tracking.loops.keypoint_poses import keypoint_poses
+from aquaflow.tracking.pose.matcher import KeyframeMatcher
+from aquaflow.tracking.pose.visibility import Visibility
 from aquaflow.tracking.wide_steps import WideSteps
 from tests.tracking.tracked_clips import error_share, run
 from tests.tracking.tracking_scenes import CAMERA, SeaFloor, black, filmed, pose
@@ -38,6 +42,11 @@ def shift_px(found: Sim3, truth: Sim3) -> float:
     points = CAMERA.unproject(CAMERA.pixel_centres()) * FLOOR.depth(HERE)[..., None]
     a, b = (CAMERA.project(T.apply(points.reshape(-1, 3))) for T in (found, truth))
     return float(np.median(np.linalg.norm(a - b, axis=1)))
+
+
+def turn_deg(found: Sim3, truth: Sim3) -> float:
+    """Angle between two attitudes."""
+    return float(np.degrees(np.linalg.norm(so3_log(found.R @ truth.R.T))))
 
 
 # --- hypotheses from keypoints --------------------------------------------------------------------
@@ -116,6 +125,27 @@ def test_a_sure_pose_has_no_rival() -> None:
     assert wide.doubtful(keyframe, None, HERE, HERE, CAMERA)
 
 
+def test_of_two_poses_that_one_wins_which_explains_what_it_puts_into_view(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Between tiles, the pose that is one of them off may have more matches."""
+    store, config = KeyframeStore(), TrackingConfig()
+    keyframe = keyframe_at(HERE, store)
+    frame = PRIOR.encode(FLOOR.picture(pose((0.0, 0.0, 0.0), (0.1, 0.0, 0.0))), CAMERA)
+    tracker = KeyframeTracker(PRIOR, store, config)
+    right = tracker.place(CurrentKeyframe(keyframe), frame, CAMERA)
+    assert right is not None
+    unsure = replace(right.estimate, inlier_share=0.7)
+    right = replace(right, estimate=unsure, share=0.40, visibility=Visibility(0.5, 0.95))
+    wrong = replace(right, estimate=unsure, share=0.48, visibility=Visibility(0.9, 0.5))
+    assert wrong.support > right.support
+    for first, second in ((right, wrong), (wrong, right)):
+        matcher = KeyframeMatcher(config)
+        monkeypatch.setattr(matcher, "pose", lambda *_, it=second: it)
+        wide = WideSteps(PRIOR, matcher, config)
+        assert wide.best(keyframe, keyframe.encoding, frame, CAMERA, first, HERE) is right
+
+
 # --- depth after a turn ---------------------------------------------------------------------------
 
 
@@ -129,10 +159,43 @@ def test_what_a_turn_has_just_brought_into_view_gets_its_depth_from_the_next_ste
     at.motion = T_wc.inverse()
     tracker = KeyframeTracker(PRIOR, store, config)
     assert tracker.place(at, frame, CAMERA) is None
-    solved = tracker.place_after_turn(at, frame, CAMERA)
+    solved = tracker.place_after_turn(at, frame, CAMERA, None)
     assert solved is not None
     assert shift_px(solved.estimate.T, T_wc.inverse()) < 3.0
     assert keyframe.pointmap.known(0.15).mean() > 0.1
+
+
+def test_a_pose_from_the_rim_of_what_is_known_is_replaced_after_a_turn() -> None:
+    """One corner has depths, which are 10 % off: where that leads to, the rest does not fit."""
+    store, config = KeyframeStore(), TrackingConfig()
+    known = np.zeros((CAMERA.height, CAMERA.width), bool)
+    known[20:44, 190:214] = True
+    T_wc = pose((0.0, 0.45, 0.0), (0.25, 0.05, 0.0))
+    frame = PRIOR.encode(FLOOR.picture(T_wc), CAMERA)
+    keyframe = keyframe_at(HERE, store, known)
+    keyframe.pointmap.rho *= 1.0 + np.linspace(-0.1, 0.1, CAMERA.width * 4)[: CAMERA.width]
+    at = CurrentKeyframe(keyframe)
+    at.motion = T_wc.inverse()
+    tracker = KeyframeTracker(PRIOR, store, config)
+    rough = tracker.place(at, frame, CAMERA)
+    assert rough is not None
+    solved = tracker.place_after_turn(at, frame, CAMERA, rough)
+    assert solved is not None
+    assert rough.known_share < config.least_known_share < solved.known_share
+    turned, rough_turned = (turn_deg(m.estimate.T, T_wc.inverse()) for m in (solved, rough))
+    assert turned < 0.1 < 0.5 * rough_turned
+
+
+def test_a_pose_from_a_known_view_stays_as_it_is() -> None:
+    store = KeyframeStore()
+    T_wc = pose((0.0, 0.0, 0.0), (0.1, 0.0, 0.0))
+    at = CurrentKeyframe(keyframe_at(HERE, store))
+    frame = PRIOR.encode(FLOOR.picture(T_wc), CAMERA)
+    tracker = KeyframeTracker(PRIOR, store, TrackingConfig())
+    solved = tracker.place(at, frame, CAMERA)
+    assert solved is not None
+    assert solved.known_share > 0.9
+    assert tracker.place_after_turn(at, frame, CAMERA, solved) is solved
 
 
 # --- other keyframes ------------------------------------------------------------------------------
@@ -176,6 +239,6 @@ def test_steps_of_half_a_view_stay_in_one_map(
     assert all(t.T_wc is not None for t in result.tracked)
     assert {t.sub_map for t in result.tracked} == {0}
     assert error_share(result.tracked, poses) < 0.06
-    monkeypatch.setattr(KeyframeTracker, "place_after_turn", lambda *_: None)
+    monkeypatch.setattr(KeyframeTracker, "place_after_turn", lambda *given: given[-1])
     without = run(frames)
     assert any(t.T_wc is None for t in without.tracked) or without.tracker.sub_maps > 1

@@ -117,7 +117,11 @@ class KnownPrior:
         return replace(self.views[int(image[0, 0, 0])], camera=camera)
 
     def decode(
-        self, a: KnownView, b: KnownView, predicted: npt.NDArray[np.float32] | None = None
+        self,
+        a: KnownView,
+        b: KnownView,
+        predicted: npt.NDArray[np.float32] | None = None,
+        alone: bool = False,
     ) -> KnownPair:
         self.predictions.append(predicted)
         return KnownPair(a, b, self.noise_px, self.true)

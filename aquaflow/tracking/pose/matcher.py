@@ -34,11 +34,19 @@ class Matched:
     points: npt.NDArray[np.float64]
     """[M, 3] of the keyframe that the pose was solved from."""
     visibility: Visibility
+    known_share: float
+    """Of the matches, those whose depth is known."""
 
     @property
     def support(self) -> float:
         """Part of what the keyframe shows that is matched where the pose says."""
         return self.share * self.estimate.inlier_share
+
+    @property
+    def explained(self) -> float:
+        """Support, times the part of what the pose puts into view that is matched there: between
+        tiles, a pose that is one of them off matches more, but not what it should."""
+        return self.support * self.visibility.seen
 
     @property
     def quality(self) -> Quality:
@@ -83,7 +91,9 @@ class KeyframeMatcher:
         visible = visibility(
             keyframe.pointmap, looked_at, pair.matches, pair.valid, estimate.T, camera
         )
-        return Matched(estimate, pair, share, float(displacement.mean()), problem.points, visible)
+        parallax_px = float(displacement.mean())
+        known_share = float((pair.valid & known).sum() / max(pair.valid.sum(), 1))
+        return Matched(estimate, pair, share, parallax_px, problem.points, visible, known_share)
 
     def _solve(self, problem: PoseProblem, initial: Sim3) -> PoseEstimate | None:
         return solve_pose(problem, initial, self._config.stop_converged, self._config.residual)

@@ -51,12 +51,8 @@ def turning_step(
 
     None where too few matches agree on a pose, or nothing says how long the step was.
     """
-    rows, columns = np.nonzero(pair.valid)
-    step = max(1, len(rows) // MATCHES)
-    rows, columns = rows[::step], columns[::step]
-    pixels_k = np.stack([columns + 0.5, rows + 0.5], -1)
-    pixels = pair.matches[rows, columns].astype(np.float64)
-    if len(rows) < MIN_MATCHES:
+    pixels_k, pixels = _matches(pair, pair.valid)
+    if len(pixels) < MIN_MATCHES:
         return None
     if rotation_compensated_parallax_px(pixels_k, pixels, camera) < LEAST_PARALLAX_PX:
         return None
@@ -65,14 +61,25 @@ def turning_step(
         return None
     likely = [c.T_ba for c in candidates if c.support >= AS_GOOD * candidates[0].support]
     T = max(likely, key=lambda each: float(each.t @ predicted.t))
-    here = known[rows, columns]
-    length = _length(pointmap, pixels_k[here], pixels[here], camera, T)
+    length = _length(pointmap, *_matches(pair, pair.valid & known), camera, T)
     usual = float(np.linalg.norm(predicted.t))
     if length is None:
         length = usual
     elif usual > 0.0 and not 1.0 / MOST_CHANGE < length / usual < MOST_CHANGE:
         return None
     return Sim3(T.R, length * T.t) if length > 0.0 else None
+
+
+def _matches(
+    pair: PairGeometry,
+    which: Mask,  # [H, W]
+) -> tuple[Array, Array]:
+    """[M, 2] px each: about ``MATCHES`` pixels of the keyframe at most, evenly taken, and where
+    they are seen."""
+    rows, columns = np.nonzero(which)
+    step = max(1, len(rows) // MATCHES)
+    rows, columns = rows[::step], columns[::step]
+    return np.stack([columns + 0.5, rows + 0.5], -1), pair.matches[rows, columns].astype(np.float64)
 
 
 def _length(

@@ -232,9 +232,13 @@ class BentPrior(KnownPrior):
     confidence = 0.05
 
     def decode(
-        self, a: KnownView, b: KnownView, predicted: npt.NDArray[np.float32] | None = None
+        self,
+        a: KnownView,
+        b: KnownView,
+        predicted: npt.NDArray[np.float32] | None = None,
+        alone: bool = False,
     ) -> KnownPair:
-        pair = super().decode(a, b, predicted)
+        pair = super().decode(a, b, predicted, alone)
         pair.matches[:, ::3, 0] += a.depth[:, ::3].astype(np.float32)
         pair.C[:, ::3] *= self.confidence
         return pair
@@ -253,9 +257,13 @@ class UnsurePrior(KnownPrior):
     """Its matches are right, and it is sure of none."""
 
     def decode(
-        self, a: KnownView, b: KnownView, predicted: npt.NDArray[np.float32] | None = None
+        self,
+        a: KnownView,
+        b: KnownView,
+        predicted: npt.NDArray[np.float32] | None = None,
+        alone: bool = False,
     ) -> KnownPair:
-        pair = super().decode(a, b, predicted)
+        pair = super().decode(a, b, predicted, alone)
         pair.C *= np.float32(0.01)
         return pair
 
