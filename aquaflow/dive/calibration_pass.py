@@ -2,11 +2,13 @@
 
 The first pass tracks from the beginning until the lens is known well enough, or for as many frames
 as it may. Its poses are rough where the guess was wrong; the adjustment of the lens corrects them.
-Where many frames were lost with the guess, the pass is repeated with what it found.
+Where they do not hang together, because the guess lost frames or broke the map into sub-maps, the
+pass is repeated with what it found.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
 
@@ -28,18 +30,19 @@ from aquaflow.sources import CameraSource
 from aquaflow.sources.preprocessing import Preparation
 from aquaflow.tracking.frames import Tracked
 from aquaflow.tracking.lens_views import LensViews
+from aquaflow.tracking.overlay.finder import OverlayFinder
 from aquaflow.tracking.self_calibration import FoundLens, found_lens
 
 MOST_FRAMES = 600
 """Looked at for the lens: a minute of the dive at 10 frames/s, and a minute of two cores."""
 GOOD_SIGMA = np.array([0.0075, 0.01])
 """Of log focal length and k1: better than calibrations in water agree with each other."""
-REPEAT_LOST_SHARE = 0.1
-"""Of the frames without a pose, above which tracking is repeated with what was found."""
+REPEAT_OUTSIDE_SHARE = 0.1
+"""Frames that are not in the largest sub-map, above which tracking is repeated with what was
+found."""
 EVERY_PIXEL = 8
 """Of a pointmap, for its median."""
 
-Picture = npt.NDArray[np.uint8]
 Array = npt.NDArray[np.float64]
 Progress = Callable[[int, int | None], None]
 
@@ -51,7 +54,7 @@ def found_in(recording: CameraSource, config: Config, progress: Progress) -> Fou
     camera = None if found is None else usable(found.camera(first.guess))
     if found is None or camera is None:
         return None
-    if first.lost_share > REPEAT_LOST_SHARE:
+    if first.outside_share > REPEAT_OUTSIDE_SHARE:
         again = _Pass(recording, config, progress, camera, found).run()
         better = None if again is None else usable(again.camera(first.guess))
         if again is not None and better is not None:
@@ -74,12 +77,15 @@ class _Pass:
         self._config = config.model_copy(update={"mapping": tracking})
         self._recording, self._progress = recording, progress
         self._camera, self._found = camera, found
-        self._pictures: dict[int, Picture] = {}
+        self._pictures: dict[int, Frame] = {}
         """As they are, distortion and all, by frame index, until their pose is known."""
+        self._overlays = OverlayFinder()
+        """In these: what is burned in stays where it is, and looks like a camera that stands still
+        in front of it."""
         self.guess = guess_camera(1, 1)
         """Of the pictures; known with the first."""
-        self.lost_share = 0.0
-        """Of the frames, how many have no pose."""
+        self.outside_share = 0.0
+        """Of the frames, how many have no pose in the largest sub-map."""
 
     def run(self) -> FoundLens | None:
         """The lens as far as it was found."""
@@ -95,6 +101,7 @@ class _Pass:
             plain if self._camera is None else Preparation(self._config.source, self._camera)
         )
         views: LensViews | None = None
+        surest: FoundLens | None = None
         for frame in self._frames():
             try:
                 seen = plain(frame)
@@ -104,17 +111,17 @@ class _Pass:
             if views is None:
                 self.guess = seen.camera
                 views = LensViews(seen.camera)
-            self._pictures[frame.index] = seen.image
+            self._pictures[frame.index] = self._without_overlay(seen)
             self._take(slam, views, slam.process(tracked))
             if views.full:
-                found = self._estimate(slam, views)
-                if views.complete or (found is not None and (found.sigma < GOOD_SIGMA).all()):
-                    return found
+                surest = _surer(surest, self._estimate(slam, views))
+                if views.complete or (surest is not None and (surest.sigma < GOOD_SIGMA).all()):
+                    return surest
                 views.thin()
         if views is None:
             return None
         self._take(slam, views, slam.finish_tracking())
-        return self._estimate(slam, views)
+        return _surer(surest, self._estimate(slam, views))
 
     def _frames(self) -> Iterator[Frame]:
         """Until the recording ends or fails, which the mapping then meets again and counts."""
@@ -139,18 +146,20 @@ class _Pass:
             keypoints = partial(self._keypoints, slam, picture)
             views.offer(tracked.frame.index, tracked.T_wc, tracked.sub_map, rho, keypoints)
 
-    def _keypoints(
-        self,
-        slam: Slam,
-        picture: Picture,  # [H, W, 3] RGB
-    ) -> Keypoints:
-        return slam.prior.encode(picture, self.guess).keypoints
+    def _without_overlay(self, frame: Frame) -> Frame:
+        return self._overlays.masked(frame) if self._config.tracking.mask_overlays else frame
+
+    def _keypoints(self, slam: Slam, picture: Frame) -> Keypoints:
+        return slam.prior.encode(picture.image, self.guess, picture.mask).keypoints
 
     def _estimate(self, slam: Slam, views: LensViews) -> FoundLens | None:
         results = slam.results()
         poses: dict[int, Sim3] = {t.frame.index: t.T_wc for t in results if t.T_wc is not None}
-        self.lost_share = 1.0 - len(poses) / max(len(results), 1)
-        return found_lens(views.posed(poses), self._lens_of(slam.tracker.camera))
+        posed_in = Counter(t.sub_map for t in results if t.T_wc is not None)
+        self.outside_share = 1.0 - max(posed_in.values(), default=0) / max(len(results), 1)
+        # The first views were taken before the overlay was found.
+        shown = [view.where(self._overlays.shown) for view in views.posed(poses)]
+        return found_lens(shown, self._lens_of(slam.tracker.camera))
 
     def _lens_of(self, tracked: CameraModel | None) -> Array:
         """[5] the lens that the poses go with, as an error of the guess: what the start of the map
@@ -161,6 +170,13 @@ class _Pass:
         elif tracked is not None:
             lens[0] = np.log(tracked.fx / self.guess.fx)
         return lens
+
+
+def _surer(a: FoundLens | None, b: FoundLens | None) -> FoundLens | None:
+    """The one whose focal length is known better; views further apart need not show more."""
+    if a is None or b is None:
+        return a or b
+    return a if a.sigma[0] < b.sigma[0] else b
 
 
 def _nearness(keyframe: Keyframe) -> float:

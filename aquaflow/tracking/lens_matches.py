@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.prior.contract import Keypoints
+from aquaflow.prior.contract import Keypoints, Mask
 from aquaflow.tracking.lens_equations import LensObservations
 from aquaflow.tracking.loops.keypoints import Index, match_keypoints
 
@@ -33,6 +33,19 @@ class LensView:
     """The one whose error is asked for."""
     T_wc: Sim3
     """Roughly right."""
+
+    def where(
+        self,
+        shown: Mask | None,  # [H, W] True where the scene is seen; None: everywhere
+    ) -> LensView:
+        """The view with its keypoints there."""
+        if shown is None:
+            return self
+        height, width = shown.shape
+        column, row = np.floor(self.keypoints.pixels).astype(np.intp).T
+        kept = shown[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+        pixels, descriptors = self.keypoints.pixels[kept], self.keypoints.descriptors[kept]
+        return replace(self, keypoints=Keypoints(pixels, descriptors))
 
 
 class _Points:

@@ -21,7 +21,7 @@ from aquaflow.tracking.lens_matches import LensView, matched
 
 MIN_VIEWS = 6
 """With fewer, the scatter between the views is no estimate."""
-STEPS = (1, 2, 3, 5, 8, 13)
+STEPS = (1, 2, 3, 5, 8, 13, 21)
 """From one view to those that it is matched with: neighbours are matched surely, and distant ones
 show the focal length, which is a matter of wide angles."""
 SYSTEMATIC = np.array([10.0, 5.0])

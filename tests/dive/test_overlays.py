@@ -8,23 +8,35 @@ import numpy as np
 import pytest
 
 from aquaflow.config import Config, parse_config
+from aquaflow.dive import calibration_pass
 from aquaflow.dive.replay import map_recording
 from aquaflow.messages import Frame
 from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
 from aquaflow.synthetic import SyntheticConfig, write_dive
+from aquaflow.tracking.lens_matches import LensView
+from aquaflow.tracking.overlay.finder import OverlayFinder
 from tests.slam_scenes import ToldTracker, frame_of
 
 FRAMES = 12
 
 
+def pool_dive(out: Path, **other: float) -> Path:
+    small = {"frames": FRAMES, "width": 240, "height": 180, "supersampling": 1}
+    shown = {"scene": "pool", "display": "clock_and_crosshair"}
+    write_dive(out, SyntheticConfig.model_validate({**small, **shown, **other}))
+    return out
+
+
 @pytest.fixture(scope="module")
 def pool(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("dives") / "pool"
-    small = {"frames": FRAMES, "width": 240, "height": 180, "supersampling": 1, "speed_m_s": 1.0}
-    shown = {"scene": "pool", "display": "clock_and_crosshair"}
-    write_dive(out, SyntheticConfig.model_validate({**small, **shown}))
-    return out
+    return pool_dive(tmp_path_factory.mktemp("dives") / "pool", speed_m_s=1.0)
+
+
+@pytest.fixture(scope="module")
+def slow_pool(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """In which tracking needs no calibration."""
+    return pool_dive(tmp_path_factory.mktemp("dives") / "slow_pool")
 
 
 def settings(mask_overlays: bool = True) -> Config:
@@ -63,6 +75,45 @@ def test_the_tracker_gets_the_frames_with_the_overlay_masked(pool: Path) -> None
 
 def test_overlays_are_not_looked_for_where_that_is_switched_off(pool: Path) -> None:
     assert not any(masks_seen(pool, settings(mask_overlays=False)))
+
+
+def keypoints_of_the_lens(
+    pool: Path, config: Config, monkeypatch: pytest.MonkeyPatch
+) -> tuple[np.ndarray, np.ndarray]:
+    """[M, 2] those that the lens is found from, and [H, W] what is no overlay."""
+    pixels, shown = [], []
+
+    def spy(views: list[LensView], start: object) -> None:
+        pixels.extend(view.keypoints.pixels for view in views)
+
+    def keep(finder: OverlayFinder, frame: Frame) -> Frame:
+        masked = find(finder, frame)
+        shown.append(finder.shown)
+        return masked
+
+    find = OverlayFinder.masked
+    monkeypatch.setattr(OverlayFinder, "masked", keep)
+    monkeypatch.setattr(calibration_pass, "found_lens", spy)
+    recording = open_recording(pool / "images")
+    calibration_pass.found_in(recording, config, lambda done, of: None)
+    recording.close()
+    seen = [each for each in shown if each is not None]
+    return np.concatenate(pixels), seen[-1] if seen else np.ones((180, 240), bool)
+
+
+def test_the_lens_is_found_from_the_scene_and_not_from_the_display(
+    slow_pool: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What stands still in the picture says that the camera does; the first pictures were taken
+    before the display was found, and have keypoints on it."""
+    with monkeypatch.context() as patch:
+        pixels, shown = keypoints_of_the_lens(slow_pool, settings(), patch)
+    column, row = np.floor(pixels).astype(int).T
+    assert not shown.all()
+    assert shown[row, column].all()
+    pixels, _ = keypoints_of_the_lens(slow_pool, settings(mask_overlays=False), monkeypatch)
+    column, row = np.floor(pixels).astype(int).T
+    assert (~shown[row, column]).any()
 
 
 @pytest.mark.usefixtures("contained")

@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from aquaflow.config import Config
-from aquaflow.dive import replay, run
+from aquaflow.dive import calibration_pass, replay, run
 from aquaflow.dive.calibration_pass import found_in
 from aquaflow.dive.found_camera import FoundCamera, in_words, usable
 from aquaflow.geometry.camera import guess_camera, load_camera
@@ -114,6 +114,54 @@ def test_a_recording_that_cannot_be_read_to_its_end_is_used_until_there(
         Failing(open_recording(small_recording / "images")), TRACKING, lambda k, _: seen.append(k)
     )
     assert seen == [1, 2]
+
+
+def passes(monkeypatch: pytest.MonkeyPatch, *ends: tuple[FoundLens | None, float]) -> list[Any]:
+    """The cameras that passes begin with; each ends as in ``ends``: what was found, and the share
+    of frames outside of the largest sub-map."""
+    began: list[Any] = []
+
+    class Pass:
+        guess = GUESS
+
+        def __init__(self, *given: Any) -> None:
+            began.append(given[3] if len(given) > 3 else None)
+            self._lens, self.outside_share = ends[len(began) - 1]
+
+        def run(self) -> FoundLens | None:
+            return self._lens
+
+    monkeypatch.setattr(calibration_pass, "_Pass", Pass)
+    return began
+
+
+def test_where_the_guess_broke_the_map_tracking_is_repeated_with_what_was_found(
+    small_recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    began = passes(monkeypatch, (lens(0.2, 0.02), 0.4), (lens(0.25, 0.01), 0.0))
+    camera = found_in(open_recording(small_recording / "images"), TRACKING, lambda *_: None)
+    assert camera is not None
+    assert began[0] is None
+    assert began[1].fx == pytest.approx(GUESS.fx * np.exp(0.2))
+    assert len(began) == 2
+    assert camera.camera.fx == pytest.approx(GUESS.fx * np.exp(0.25))
+
+
+def test_a_map_in_one_piece_is_not_repeated(
+    small_recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    began = passes(monkeypatch, (lens(0.2, 0.02), 0.05))
+    assert found_in(open_recording(small_recording / "images"), TRACKING, lambda *_: None)
+    assert len(began) == 1
+
+
+def test_views_further_apart_replace_a_lens_only_where_they_know_it_better() -> None:
+    sure, unsure = lens(0.25, 0.01), lens(0.9, 0.014)
+    assert calibration_pass._surer(sure, unsure) is sure
+    assert calibration_pass._surer(unsure, sure) is sure
+    assert calibration_pass._surer(None, unsure) is unsure
+    assert calibration_pass._surer(sure, None) is sure
+    assert calibration_pass._surer(None, None) is None
 
 
 class Failing:

@@ -45,6 +45,11 @@ class OverlayFinder:
         self._shown: Mask | None = None
         self._last: tuple[Float, Float] | None = None
 
+    @property
+    def shown(self) -> Mask | None:
+        """[H, W] what is no overlay, as far as is known by now; None: no overlay is known."""
+        return self._shown
+
     def masked(self, frame: Frame) -> Frame:
         """The frame with its mask limited to what is no overlay."""
         if self._moved(frame.image):
