@@ -94,7 +94,9 @@ def is_defined(name: str) -> bool:
         if file is None:
             continue
         node: Any = parsed(file)
-        for part in parts[length:]:
+        for i, part in enumerate(parts[length:], length):
+            if isinstance(node, ast.ImportFrom):  # a package hands on what its module defines
+                return is_defined(".".join([str(node.module), *parts[i - 1 :]]))
             if not isinstance(node, (ast.Module, ast.ClassDef)):
                 return False
             found = dict(names_of(node))

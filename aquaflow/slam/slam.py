@@ -14,12 +14,13 @@ from aquaflow.errors.failures import Failures
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.maps import Growth, Insertion, Maps, MapWork
+from aquaflow.mapping.maps import Maps, MapWork
 from aquaflow.mapping.views import View
 from aquaflow.messages import Frame
 from aquaflow.prior.factory import make_prior
 from aquaflow.profiler import Profiler
 from aquaflow.render import select_renderer
+from aquaflow.slam.contributions import Contributions
 from aquaflow.tracking.adjustment.adjuster import Adjuster
 from aquaflow.tracking.anchored import Anchored, Anchors
 from aquaflow.tracking.frame_table import FrameTable
@@ -95,13 +96,9 @@ class Slam:
         self._live = live
         self.frames = FrameTable()
         """Finished frames, in completion order."""
-        self.used = 0
-        """Frames that passed the gate so far."""
-        self._to_hold_out: set[int] = set()
-        """Indices of the frames in tracking that the map shall not see."""
+        self._contributions = Contributions(self.maps, self.keyframes, config.mapping)
         self._latest: int | None = None
         """The row of the frame linked last, if it has a pose."""
-        self._keyframe_views: dict[int, View] = {}
 
     def process(self, frame: Frame) -> list[Tracked]:
         """One frame's way through the paper; returns the frames that it finished."""
@@ -161,8 +158,7 @@ class Slam:
         finished = self.finish_tracking()
         self._settle_graph()
         with self.failures.contain("insertion"):
-            for insertion in self._retired_keyframes():
-                self.maps.insert(insertion)
+            self._contributions.retire_last()
         with self.failures.contain("refinement"):
             self.maps.refine(progress)
         settled = self.results(len(self.frames) - len(finished))
@@ -194,6 +190,11 @@ class Slam:
         self.maps.close(keep)
 
     @property
+    def used(self) -> int:
+        """Frames that passed the gate so far."""
+        return self._contributions.used
+
+    @property
     def mappers(self) -> dict[int, Mapper]:
         """By sub-map; complete after ``finish``."""
         return self.maps.mappers
@@ -215,7 +216,7 @@ class Slam:
 
     def resume(self, frames: FrameTable, used: int) -> None:
         """Take over the frames of an earlier run; ``used`` of them passed the gate."""
-        self.frames, self.used = frames, used
+        self.frames, self._contributions.used = frames, used
 
     # --- the steps of a frame -----------------------------------------------------------------
 
@@ -234,9 +235,7 @@ class Slam:
         with self.profiler.stage("gate"), self.failures.contain("frame gate", frame.index):
             verdict = self.gate.judge(frame.image, frame.mask)
         if verdict.passed:
-            if self._is_next_held_out():
-                self._to_hold_out.add(frame.index)
-            self.used += 1
+            self._contributions.expect(frame.index)
         else:
             self.skipped[verdict.kind.value] += 1
         return verdict
@@ -291,15 +290,11 @@ class Slam:
         if not self.config.mapping.enabled or tracked.T_wc is None:
             return
         with self.failures.contain("mapping", tracked.frame.index):
-            view = self._view(tracked)
-            if tracked.frame.index in self._to_hold_out:
-                self.maps.hold_out(view, tracked.sub_map)
-            else:
-                self.maps.grow(self._growth(tracked, view))
+            self._contributions.add(tracked, self.tracker.camera or tracked.frame.camera)
 
     def _publish(self, anchored: Anchored) -> Tracked:
         """The frame is finished: its row goes into the table."""
-        self._to_hold_out.discard(anchored.tracked.frame.index)
+        self._contributions.forget(anchored.tracked.frame.index)
         self.frames.add(anchored.tracked, anchored.T_kf)
         return anchored.tracked
 
@@ -329,48 +324,3 @@ class Slam:
         """Finished frames from row ``first`` on, without pictures and reasons; pose and sub-map
         are those of now, after all corrections of keyframes."""
         return [self._anchors.settled(tracked, T_kf) for tracked, T_kf in self.frames.since(first)]
-
-    # --- the map ------------------------------------------------------------------------------
-
-    def _growth(self, tracked: Tracked, view: View) -> Growth:
-        """What the frame brings to the map; a new keyframe also retires the one before it."""
-        retired: list[Insertion] = []
-        if tracked.frame_class is FrameClass.KEYFRAME:
-            retired = self._retired_keyframes()
-            self._keyframe_views = {view.keyframe: view}
-        steps = self._steps(tracked.frame_class)
-        return Growth(view, tracked.sub_map, steps, tracked.pointmap, tuple(retired))
-
-    def _is_next_held_out(self) -> bool:
-        """i % n == 0 and i != 0, i counts used frames (docs/paper.md#deviations-evaluation)."""
-        every, i = self.config.mapping.hold_out_every, self.used
-        return every > 0 and i != 0 and i % every == 0
-
-    def _retired_keyframes(self) -> list[Insertion]:
-        """The keyframe in use, with its pointmap as fused until now; from here on it is not."""
-        retired, self._keyframe_views = self._keyframe_views, {}
-        return [
-            Insertion(view, self.keyframes[number].sub_map, self.keyframes[number].pointmap)
-            for number, view in retired.items()
-        ]
-
-    def _steps(self, frame_class: FrameClass) -> int:
-        optimiser = self.config.mapping.optimiser
-        return {
-            FrameClass.KEYFRAME: optimiser.steps_keyframe,
-            FrameClass.MAPPING: optimiser.steps_mapping,
-        }.get(frame_class, optimiser.steps_common)
-
-    def _view(self, tracked: Tracked) -> View:
-        assert tracked.T_wc is not None
-        assert tracked.keyframe is not None
-        camera = self.tracker.camera or tracked.frame.camera
-        return View(
-            tracked.frame.index,
-            tracked.frame.image,
-            camera,
-            tracked.T_wc,
-            tracked.keyframe,
-            robust=tracked.frame_class is FrameClass.COMMON,
-            mask=tracked.frame.mask,
-        )
