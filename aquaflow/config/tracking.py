@@ -193,6 +193,14 @@ class AdjustmentConfig(Stage):
     )
     iterations: int = Field(10, ge=1, description="most steps between two estimates of the noise")
     at_end: bool = Field(True, description="adjust all keyframes together once, at the end")
+    at_loops: int = Field(
+        10,
+        ge=0,
+        description="keyframes between two adjustments of all keyframes after loops; 0: none",
+    )
+    most_at_loops: int = Field(
+        300, ge=2, description="keyframes beyond which loops are left to the end; bounds its time"
+    )
 
 
 class MonitorConfig(Stage):

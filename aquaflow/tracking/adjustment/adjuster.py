@@ -41,6 +41,9 @@ from aquaflow.tracking.graph.table import Snapshot
 Adjust = Callable[[Snapshot], Improvement]
 """A job for any thread."""
 
+MOST_LOOPS = 4
+"""Loops whose keyframes one adjustment matches, evenly chosen: what they show may have to be read
+from disk, while the camera waits."""
 LEAST_SHARE = 0.05
 """Of a keyframe's points that another must see for the pair to be of use."""
 
@@ -76,16 +79,18 @@ class Job:
     """Those whose pose stays."""
     points: dict[int, AnchoredPoints]
     links: dict[int, MeasuredLink]
-    views: Sequence[KeyframeView]
-    """The newest keyframe, and those that it is to be matched with."""
+    pairs: Sequence[tuple[KeyframeView, KeyframeView]]
+    """Keyframes to be matched, the earlier one first."""
+    certain: bool
+    """Whether edges get the covariance that the adjustment finds."""
 
     def within(self, known: Container[int]) -> Job:
         """The part of it that is ``known``: a keyframe may be missing from the graph, and what was
         linked to it is held."""
         numbers = [number for number in self.numbers if number in known]
         orphans = {n for n in numbers if n in self.links and self.links[n].parent not in known}
-        views = [view for view in self.views if view.number in known]
-        return replace(self, numbers=numbers, held=self.held | orphans, views=views)
+        pairs = [each for each in self.pairs if all(view.number in numbers for view in each)]
+        return replace(self, numbers=numbers, held=self.held | orphans, pairs=pairs)
 
 
 @dataclass(frozen=True)
@@ -106,6 +111,8 @@ class Adjuster:
         self._points: dict[int, AnchoredPoints] = {}
         self._links: dict[int, MeasuredLink] = {}
         self._pairs = KeyframePairs()
+        self._loops: list[tuple[int, int]] = []
+        """Earlier and later keyframe of loops that were not matched yet."""
         self._outcome: Outcome | None = None
         """Set in the thread of the last job."""
 
@@ -132,6 +139,11 @@ class Adjuster:
             if link.pair is not None:
                 see_each_other(parent, points, link.pair)
 
+    def loop(self, number: int, earlier: int) -> None:
+        """Keyframe ``number`` shows a place of ``earlier``: the next adjustment of all matches
+        them."""
+        self._loops.append((earlier, number))
+
     def window(self, number: int) -> Adjust | None:
         """The newest keyframes along the links that lead to ``number``; None for fewer than two."""
         chain = [number]
@@ -140,23 +152,33 @@ class Adjuster:
         if len(chain) < 2 or number not in self._points:
             return None
         reached = [n for n in chain[2 : self._config.reach + 1] if n in self._points]
-        views = [view for view in map(self._view, [number, *reached]) if view is not None]
-        return partial(self._run, self._job(chain[::-1], frozenset(chain[-1:]), views))
+        pairs = [(earlier, number) for earlier in reached]
+        return partial(self._run, self._job(chain[::-1], frozenset(chain[-1:]), pairs, True))
 
     def everything(self) -> Adjust | None:
-        """All keyframes along links; those without a link stay where they are."""
+        """All keyframes along links, and the pairs of the loops since the last time; keyframes
+        without a link stay where they are."""
         numbers = sorted(set(self._links) | {link.parent for link in self._links.values()})
         roots = frozenset(number for number in numbers if number not in self._links)
-        if not numbers or not self._config.at_end:
+        loops, self._loops = self._loops[:: -(-len(self._loops) // MOST_LOOPS) or 1], []
+        if not numbers:
             return None
-        return partial(self._run, self._job(numbers, roots, []))
+        pairs = [(a, b) for a, b in loops if a in self._points and b in self._points]
+        return partial(self._run, self._job(numbers, roots, pairs, False))
 
     def _job(
-        self, numbers: Sequence[int], held: frozenset[int], views: Sequence[KeyframeView]
+        self,
+        numbers: Sequence[int],
+        held: frozenset[int],
+        pairs: Sequence[tuple[int, int]],
+        certain: bool,
     ) -> Job:
         points = {n: copied(self._points[n]) for n in numbers if n in self._points}
         links = {n: self._links[n] for n in numbers if n in self._links}
-        return Job(numbers, held, points, links, views)
+        views = {n: self._view(n) for n in {n for pair in pairs for n in pair}}
+        found = [(views[a], views[b]) for a, b in pairs]
+        seen = [(a, b) for a, b in found if a is not None and b is not None]
+        return Job(numbers, held, points, links, seen, certain)
 
     def _view(self, number: int) -> KeyframeView | None:
         keyframe = self._keyframes[number]
@@ -184,20 +206,17 @@ class Adjuster:
         adjusted = adjust(problem, self._config.iterations)
         found = Improvement.none()
         if adjusted.better:
-            found = improvement_of(snapshot, nodes, problem, adjusted, certain=bool(job.views))
+            found = improvement_of(snapshot, nodes, problem, adjusted, job.certain)
         spent = 1e3 * (thread_time() - began)
         self._outcome = Outcome(job.points, adjusted.better, spent)
         return found
 
     def _match(self, job: Job, poses: dict[int, Sim3]) -> None:
-        if not job.views:
-            return
-        newest = job.views[0]
-        for earlier in job.views[1:]:
-            T_ba = poses[newest.number].inverse() @ poses[earlier.number]
-            pair = self._pairs.match(earlier, newest, T_ba)
+        for earlier, later in job.pairs:
+            T_ba = poses[later.number].inverse() @ poses[earlier.number]
+            pair = self._pairs.match(earlier, later, T_ba)
             if pair is not None and float(pair.valid.mean()) > LEAST_SHARE:
-                see_each_other(job.points[earlier.number], job.points[newest.number], pair)
+                see_each_other(job.points[earlier.number], job.points[later.number], pair)
 
     def applied(self) -> None:
         """Keep the matches that the last job made, and count it."""

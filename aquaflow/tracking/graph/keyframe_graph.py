@@ -66,6 +66,10 @@ class Adjustments(Protocol):
         """A new keyframe, how it was linked, and the edge made of that."""
         ...
 
+    def loop(self, number: int, earlier: int) -> None:
+        """Keyframe ``number`` was found to show a place of ``earlier``."""
+        ...
+
     def window(self, number: int) -> Callable[[Snapshot], Improvement] | None:
         """The adjustment of the newest keyframes, to be called in any thread."""
         ...
@@ -95,11 +99,12 @@ class KeyframeGraph:
         adjustments: Adjustments | None = None,
     ) -> None:
         """``telemetry`` takes part in the optimisations, once there is some; ``adjustments`` come
-        before them."""
+        before them, and of all keyframes after those that closed loops."""
         self.graph = PoseGraph(config.graph)
         self._telemetry = telemetry
         self._failures = failures or Failures()
         self._keyframes, self._places, self._config = keyframes, places, config.graph
+        self._adjustment_config = config.adjustment
         self.loops = 0
         """Loop edges found."""
         self._revisited: set[tuple[int, int]] = set()
@@ -111,6 +116,8 @@ class KeyframeGraph:
         self._adjustments = adjustments
         self._to_adjust: int | None = None
         """The newest keyframe, if its window has not been adjusted."""
+        self._closed, self._adjusted = False, 0
+        """True if loops were closed since all keyframes were adjusted; how many those were."""
         self._due = False
         """True if loops or telemetry came that no optimisation has seen."""
 
@@ -159,7 +166,7 @@ class KeyframeGraph:
 
     def adjust_everything(self) -> None:
         """Start a joint adjustment of all keyframes, and then an optimisation; none may run."""
-        if self._adjustments is not None:
+        if self._adjustments is not None and self._adjustment_config.at_end:
             self._due = True
             self._optimise(everything=True)
 
@@ -211,8 +218,18 @@ class KeyframeGraph:
             for taking_part in (self._adjustments, self._telemetry):
                 if taking_part is not None:
                     taking_part.applied()
-        self._optimise()
+        self._optimise(everything=self._loops_to_adjust())
         return correction
+
+    def _loops_to_adjust(self) -> bool:
+        """True if loops were closed, the graph has taken them in, and it is not too soon."""
+        count, config = len(self._known), self._adjustment_config
+        return (
+            self._closed
+            and not self._due
+            and 0 < config.at_loops <= count - self._adjusted
+            and count <= config.most_at_loops
+        )
 
     def close(self) -> None:
         """End the thread; the result of a running optimisation is discarded."""
@@ -239,6 +256,7 @@ class KeyframeGraph:
         if self._adjustments is not None:
             with self._failures.contain("joint adjustment"):
                 if everything:
+                    self._closed, self._adjusted = False, len(self._known)
                     return self._adjustments.everything()
                 return None if number is None else self._adjustments.window(number)
         return None
@@ -274,7 +292,9 @@ class KeyframeGraph:
             edge = Edge(number, found.keyframe.number, T_fk, information, loop=True)
             if self.graph.add_edge(edge):
                 self.loops += 1
-                self._due = True
+                self._due = self._closed = True
+                if self._adjustments is not None:
+                    self._adjustments.loop(number, found.keyframe.number)
 
     def _taken_over(self, result: GraphResult) -> Correction:
         """Apply the result to the keyframes."""

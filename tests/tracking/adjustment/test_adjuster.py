@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from aquaflow.config import TrackingConfig
-from aquaflow.config.tracking import AdjustmentConfig
+from aquaflow.config.tracking import AdjustmentConfig, GraphConfig
 from aquaflow.errors.failures import Failures
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore, Pointmap
@@ -95,8 +95,9 @@ def swim() -> Iterator[Callable[..., Swim]]:
 
     def make(wait: bool = True, **settings: object) -> Swim:
         store, failures = KeyframeStore(), Failures(strict=False)
-        config = TrackingConfig()
-        adjuster = Adjuster(store, AdjustmentConfig.model_validate(settings))
+        adjustment = AdjustmentConfig.model_validate(settings)
+        config = TrackingConfig(adjustment=adjustment, graph=GraphConfig(loop_gap=3))
+        adjuster = Adjuster(store, adjustment)
         graph = KeyframeGraph(store, Places(store, config), config, failures, None, adjuster)
         made.append(Swim(adjuster, graph, store, failures, wait))
         return made[-1]
@@ -201,9 +202,9 @@ def test_the_window_is_as_long_as_the_config_says(swim: Callable[..., Swim]) -> 
     asked: list[int] = []
     job_of = dive.adjuster._job
 
-    def noted(numbers: list[int], held: frozenset[int], views: list[object]) -> object:
+    def noted(numbers: list[int], *others: object) -> object:
         asked.append(len(numbers))
-        return job_of(numbers, held, views)  # type: ignore[arg-type]
+        return job_of(numbers, *others)  # type: ignore[arg-type]
 
     dive.adjuster._job = noted  # type: ignore[assignment, method-assign]
     for number in range(5):
@@ -211,3 +212,50 @@ def test_the_window_is_as_long_as_the_config_says(swim: Callable[..., Swim]) -> 
     dive.end()
     assert max(asked[:-1]) == 3
     assert asked[-1] == 5, "all of them, at the end"
+
+
+# --- loops ----------------------------------------------------------------------------------------
+
+
+def out_and_back() -> list[int]:
+    """Places of the path, of which the last ones are those of the first again."""
+    return [0, 1, 2, 3, 4, 5, 3, 1]
+
+
+def looped(dive: Swim, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Keyframes over places of ``out_and_back``; returns how many there were at each adjustment of
+    all of them, before the end."""
+    places, asked = out_and_back(), []
+    everything, truth, shown = dive.adjuster.everything, dive.truth, pictures()
+    dive.truth = [truth[place] for place in places]
+    monkeypatch.setattr(f"{__name__}.pictures", lambda: [shown[place] for place in places])
+    monkeypatch.setattr(
+        dive.adjuster, "everything", lambda: (asked.append(len(dive.store)), everything())[1]
+    )
+    for number in range(len(places)):
+        dive.add(number)
+    while dive.graph.optimising:
+        dive.graph.correction(wait=True)
+    return asked
+
+
+def test_after_loops_all_keyframes_are_adjusted_and_the_loops_matched(
+    swim: Callable[..., Swim], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dive = swim(at_loops=2)
+    asked = looped(dive, monkeypatch)
+    assert dive.graph.loops > 0
+    assert asked
+    edges = dive.graph.snapshot.edges
+    loops = edges[edges["loop"]]
+    seen = dive.adjuster._points
+    assert any(int(a) in seen[int(b)].seen for a, b in zip(loops["a"], loops["b"], strict=True))
+    assert dive.error(dive.end()) < 0.2 * LENGTH_ERROR
+    assert dive.failures.to_json() == []
+
+
+@pytest.mark.parametrize("settings", [{"at_loops": 0}, {"at_loops": 9}, {"most_at_loops": 3}])
+def test_loops_are_left_to_the_end_where_the_config_says_so(
+    swim: Callable[..., Swim], monkeypatch: pytest.MonkeyPatch, settings: dict[str, int]
+) -> None:
+    assert looped(swim(**{"at_loops": 2, **settings}), monkeypatch) == []
