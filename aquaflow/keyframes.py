@@ -37,6 +37,8 @@ class Pointmap:
     """[H, W] variance of ``rho``."""
     fused: int = 0
     """Frames whose depths were fused into it."""
+    learned: Mask | None = None
+    """[H, W] pixels whose depth is the prior's and was not triangulated yet; None: no pixel."""
 
     @staticmethod
     def unknown(camera: CameraModel) -> Pointmap:
@@ -48,8 +50,25 @@ class Pointmap:
         self,
         relative_sigma: float,
     ) -> Mask:
-        """[H, W] pixels whose inverse depth is known to better than ``relative_sigma``."""
+        """[H, W] pixels triangulated to better than ``relative_sigma``."""
+        known = self.known_or_learned(relative_sigma)
+        return known if self.learned is None else known & ~self.learned
+
+    def known_or_learned(
+        self,
+        relative_sigma: float,
+    ) -> Mask:
+        """[H, W] pixels whose inverse depth is known to better than ``relative_sigma``, by
+        whatever: errors of learned depths are alike in large parts of the picture."""
         return (self.rho > 1e-6) & (self.variance < (relative_sigma * self.rho) ** 2)
+
+    def triangulated(
+        self,
+        rows: npt.NDArray[np.integer],  # [M]
+        columns: npt.NDArray[np.integer],  # [M]
+    ) -> Mask:
+        """[M] pixels whose depth, if they have one, is not the prior's."""
+        return np.ones(len(rows), bool) if self.learned is None else ~self.learned[rows, columns]
 
     @property
     def Q(self) -> Array:
@@ -65,7 +84,8 @@ class Pointmap:
 
     def copy(self) -> Pointmap:
         """With arrays of its own."""
-        return Pointmap(self.camera, self.rho.copy(), self.variance.copy(), self.fused)
+        learned = None if self.learned is None else self.learned.copy()
+        return Pointmap(self.camera, self.rho.copy(), self.variance.copy(), self.fused, learned)
 
 
 @dataclass(frozen=True)
@@ -233,8 +253,10 @@ class KeyframeStore:
     def _pack(self, content: _Content) -> Arrays:
         assert self._prior is not None
         pointmap = content.pointmap
-        arrays = {"rho": pointmap.rho, "variance": pointmap.variance}
+        arrays: Arrays = {"rho": pointmap.rho, "variance": pointmap.variance}
         arrays["fused"] = np.array([pointmap.fused])
+        if pointmap.learned is not None:
+            arrays["learned"] = pointmap.learned
         packed = self._prior.pack(content.encoding)
         return arrays | {f"encoding.{name}": array for name, array in packed.items()}
 
@@ -246,7 +268,8 @@ class KeyframeStore:
         assert self._prior is not None
         encoding_camera, pointmap_camera = self._cameras[number]
         rho, variance, fused = (arrays.pop(name) for name in ("rho", "variance", "fused"))
-        pointmap = Pointmap(pointmap_camera, rho, variance, int(fused[0]))
+        learned = arrays.pop("learned", None)
+        pointmap = Pointmap(pointmap_camera, rho, variance, int(fused[0]), learned)
         _set_writable(pointmap, False)
         packed = {name.removeprefix("encoding."): array for name, array in arrays.items()}
         return _Content(self._prior.unpack(packed, encoding_camera), pointmap)
@@ -256,3 +279,5 @@ def _set_writable(pointmap: Pointmap, writable: bool) -> None:
     """A change that would be lost with the file's next reading is refused by numpy."""
     pointmap.rho.setflags(write=writable)
     pointmap.variance.setflags(write=writable)
+    if pointmap.learned is not None:
+        pointmap.learned.setflags(write=writable)

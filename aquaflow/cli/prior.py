@@ -45,6 +45,7 @@ def register(app: typer.Typer) -> None:
     prior.command()(export)
     prior.command()(verify)
     prior.command()(bench)
+    prior.command()(oracle)
     train = typer.Typer(help="Train a network.", no_args_is_help=True)
     train.command("mast3r")(train_mast3r)
     train.command("compact")(train_compact)
@@ -94,6 +95,23 @@ def verify(folder: Folder = None, checkpoint: Checkpoint = None, as_json: Json =
             f"prior {name} differs from torch by {worst:.1e}, more than {MOST_RELATIVE:.0e}; "
             "export it again"
         )
+
+
+def oracle(
+    recording: Annotated[Path, typer.Argument(help="Synthetic dive, or what --dive was made of.")],
+    out: Annotated[Path, typer.Option(help="New folder to write, for prior.folder.")],
+    dive: Annotated[Path | None, typer.Option(help="Mapped dive whose map gives ranges.")] = None,
+    range_sigma: Annotated[
+        float, typer.Option(min=0.0, max=2.0, help="Relative error of its ranges.")
+    ] = 0.05,
+    as_json: Json = False,
+) -> None:
+    """Write a prior that knows one dive, to find out what a good prior is worth."""
+    from aquaflow.evaluation.oracle_views import make_oracle
+
+    with progress_bars(as_json) as advance:
+        count = make_oracle(recording, out, range_sigma, advance, dive)
+    typer.echo(json.dumps({"pictures": count}) if as_json else f"{count} pictures, {out}")
 
 
 def bench(

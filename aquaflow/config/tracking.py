@@ -203,6 +203,31 @@ class AdjustmentConfig(Stage):
     )
 
 
+class LearnedConfig(Stage):
+    """What a prior that knows ranges (X, Q) is used for; a classical one knows none."""
+
+    depth: bool = Field(
+        True,
+        description="pixels of key and mapping frames that are not triangulated, or worse, get the "
+        "learned depth",
+    )
+    least_triangulated: float = Field(
+        0.3,
+        ge=0,
+        le=1,
+        description="of the matches of known depth, those triangulated, below which learned depths "
+        "take part in poses",
+    )
+    start: bool = Field(
+        True, description="a map starts at the second picture where ranges are certain enough"
+    )
+    start_sigma: float = Field(
+        0.1,
+        gt=0,
+        description="relative sigma of a learned range up to which a map starts from it",
+    )
+
+
 class MonitorConfig(Stage):
     """The monitor of consistency (docs/frame.md#consistency)."""
 
@@ -402,6 +427,7 @@ class TrackingConfig(Stage):
     gate: GateConfig = GateConfig()
     graph: GraphConfig = GraphConfig()
     adjustment: AdjustmentConfig = AdjustmentConfig()
+    learned: LearnedConfig = LearnedConfig()
     monitor: MonitorConfig = MonitorConfig()
     retrieval: RetrievalConfig = RetrievalConfig()
     verification: VerificationConfig = VerificationConfig()

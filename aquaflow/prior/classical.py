@@ -1,4 +1,4 @@
-"""The prior without a network: SIFT-homography-initialised DIS flow and two-view geometry.
+"""The prior without a network: SIFT-homography-initialised DIS flow.
 
 It is the safety net, and the baseline that every trained prior has to beat.
 """
@@ -22,6 +22,7 @@ class ClassicalPrior:
     """SIFT-homography-initialised DIS flow behind the prior contract."""
 
     name = "classical"
+    ranged = False
     metric = False
 
     def __init__(self) -> None:

@@ -77,22 +77,23 @@ class PairGeometry(Protocol):
         ...
 
     @property
-    def X_a(self) -> Float:
-        """[H, W, 3] pointmap of a in a's frame; NaN where unknown. Scale is the prior's."""
+    def X_a(self) -> Float | None:
+        """[H, W, 3] pointmap of a in a's own frame (paper: X_i^i) as the prior has it without
+        parallax; NaN where unknown, None for a prior that knows none. Scale is the prior's."""
         ...
 
     @property
-    def X_b(self) -> Float:
-        """[H, W, 3] pointmap of b in a's frame; NaN where unknown."""
+    def X_b(self) -> Float | None:
+        """[H, W, 3] pointmap of b in b's own frame (paper: X_j^j), as X_a."""
         ...
 
     @property
-    def Q_a(self) -> Float:
+    def Q_a(self) -> Float | None:
         """[H, W] point confidence: 1 / relative variance of the range; 0 where unknown."""
         ...
 
     @property
-    def Q_b(self) -> Float:
+    def Q_b(self) -> Float | None:
         """[H, W] confidence of X_b, as Q_a."""
         ...
 
@@ -111,6 +112,8 @@ class Prior(Protocol):
     """A two-view prior."""
 
     name: str
+    ranged: bool
+    """True if it knows pointmaps (X, Q) of single pictures or still cameras."""
     metric: bool
     """True if its pointmaps are in metres."""
 

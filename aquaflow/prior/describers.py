@@ -6,6 +6,7 @@ what it keeps of a picture are tokens, and descriptors come with the pair.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from aquaflow.prior.contract import Float
 from aquaflow.prior.folder import DECODER, ENCODER, read_card
 from aquaflow.prior.hybrid import Describer, Half, Picture
 from aquaflow.prior.learned_range import MOST_LOG, LearnedRange
+from aquaflow.prior.oracle import OracleDescriber
 from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
 
 MULTIPLE_PX = 16
@@ -79,23 +81,25 @@ class CompactDescriber:
         found = self._encoder({self._input: as_input(picture)})["Dc"][0]
         return np.ascontiguousarray(unit(found.transpose(1, 2, 0)).astype(np.float16))
 
-    def cells(
-        self,
-        a: Half,  # [h / 8, w / 8, d]
-        b: Half,  # [h / 8, w / 8, d]
-    ) -> tuple[Float, Float]:
-        """The features themselves."""
-        return a.astype(np.float32), b.astype(np.float32)
-
-    def range_of(
+    def compared(
         self,
         a: Half,  # [h / 8, w / 8, d]
         b: Half,  # [h / 8, w / 8, d]
         camera_a: CameraModel,
         camera_b: CameraModel,
-    ) -> LearnedRange:
-        """By comparing rays: nearly monocular, and up to a factor (docs/measurements.md)."""
-        found = self._decoder(
+    ) -> CompactPair:
+        """Descriptors are the features themselves; ranges come from comparing rays."""
+        return CompactPair(self, a, b, camera_a, camera_b)
+
+    def decoded(
+        self,
+        a: Half,  # [h / 8, w / 8, d]
+        b: Half,  # [h / 8, w / 8, d]
+        camera_a: CameraModel,
+        camera_b: CameraModel,
+    ) -> dict[str, Float]:
+        """The decoder's outputs."""
+        return self._decoder(
             {
                 "Dc_a": _channels_first(a.astype(np.float32)),
                 "Dc_b": _channels_first(b.astype(np.float32)),
@@ -103,12 +107,48 @@ class CompactDescriber:
                 "rays_b": _channels_first(cell_rays(camera_b, *b.shape[:2])),
             }
         )
-        variance = np.exp(np.clip(found["log_variance_ab"][0], -MOST_LOG, MOST_LOG))
-        return LearnedRange(found["log_range_ab"][0], variance, self.metric)
 
     @cached_property
     def _decoder(self) -> NetworkSession:
         return NetworkSession(self._folder / DECODER, self._settings)
+
+
+@dataclass
+class CompactPair:
+    """Two pictures that the compact network compared. Ranges are nearly monocular, and up to a
+    factor (docs/measurements.md#compact-prior)."""
+
+    describer: CompactDescriber
+    a: Half
+    """[h / 8, w / 8, d]"""
+    b: Half
+    """[h / 8, w / 8, d]"""
+    camera_a: CameraModel
+    camera_b: CameraModel
+
+    @property
+    def cells(self) -> tuple[Float, Float]:
+        return self.a.astype(np.float32), self.b.astype(np.float32)
+
+    @property
+    def range_a(self) -> LearnedRange:
+        return self._range("ab")
+
+    @property
+    def range_b(self) -> LearnedRange:
+        return self._range("ba")
+
+    @cached_property
+    def confidence(self) -> Float | None:
+        return None
+
+    def _range(self, way: str) -> LearnedRange:
+        log_variance = np.clip(self._decoded[f"log_variance_{way}"][0], -MOST_LOG, MOST_LOG)
+        return LearnedRange(self._decoded[f"log_range_{way}"][0], np.exp(log_variance))
+
+    @cached_property
+    def _decoded(self) -> dict[str, Float]:
+        return self.describer.decoded(self.a, self.b, self.camera_a, self.camera_b)
 
 
 class Mast3rDescriber:
@@ -137,37 +177,69 @@ class Mast3rDescriber:
         """[1, N, D] tokens."""
         return self._encoder({"image": as_input(picture)})["tokens"].astype(np.float16)
 
-    def cells(
-        self,
-        a: Half,  # [1, N, D]
-        b: Half,  # [1, N, D]
-    ) -> tuple[Float, Float]:
-        """[h / 8, w / 8, d] the descriptors at the cells' centres."""
-        found = self._decoded(a, b)
-        return found["D_a"][0, MIDDLE, MIDDLE], found["D_b"][0, MIDDLE, MIDDLE]
-
-    def range_of(
+    def compared(
         self,
         a: Half,  # [1, N, D]
         b: Half,  # [1, N, D]
         camera_a: CameraModel,
         camera_b: CameraModel,
-    ) -> LearnedRange:
-        """Of its points, in metres. Its confidence Q weighed errors while it was trained, so that
-        an error of POINTS_ALPHA / Q metres is what it expects."""
-        found = self._decoded(a, b)
-        distance = np.linalg.norm(found["X_a"][0, MIDDLE, MIDDLE], axis=-1)
-        distance = np.maximum(distance, SHORTEST)
-        expected = POINTS_ALPHA / found["Q_a"][0, MIDDLE, MIDDLE]
-        return LearnedRange(np.log(distance), (expected / distance) ** 2, self.metric)
+    ) -> Mast3rPair:
+        """The cameras are not asked for: the network finds its own."""
+        return Mast3rPair(self, a, b)
 
-    def _decoded(
+    def decoded(
         self,
         a: Half,  # [1, N, D]
         b: Half,  # [1, N, D]
     ) -> dict[str, Float]:
+        """The decoder's outputs; points of both are in the first one's frame."""
         tokens = {"tokens_a": a.astype(np.float32), "tokens_b": b.astype(np.float32)}
         return self._decoder(tokens)
+
+
+@dataclass
+class Mast3rPair:
+    """Two pictures after each has looked at the other; decoded once for each way."""
+
+    describer: Mast3rDescriber
+    a: Half
+    """[1, N, D]"""
+    b: Half
+    """[1, N, D]"""
+
+    @property
+    def cells(self) -> tuple[Float, Float]:
+        """[h / 8, w / 8, d] the descriptors at the cells' centres."""
+        found = self._decoded
+        return found["D_a"][0, MIDDLE, MIDDLE], found["D_b"][0, MIDDLE, MIDDLE]
+
+    @property
+    def range_a(self) -> LearnedRange:
+        return _range_of_points(self._decoded)
+
+    @cached_property
+    def range_b(self) -> LearnedRange:
+        """From the pair the other way round: that has its points in b's own frame."""
+        return _range_of_points(self.describer.decoded(self.b, self.a))
+
+    @property
+    def confidence(self) -> Float | None:
+        return None
+
+    @cached_property
+    def _decoded(self) -> dict[str, Float]:
+        return self.describer.decoded(self.a, self.b)
+
+
+def _range_of_points(
+    found: dict[str, Float],  # outputs of the decoder by name
+) -> LearnedRange:
+    """Distances of the first picture's points, in metres. Their confidence Q weighed errors in
+    training, so that the network expects an error of POINTS_ALPHA / Q metres."""
+    distance = np.linalg.norm(found["X_a"][0, MIDDLE, MIDDLE], axis=-1)
+    distance = np.maximum(distance, SHORTEST)
+    expected = POINTS_ALPHA / found["Q_a"][0, MIDDLE, MIDDLE]
+    return LearnedRange(np.log(distance), (expected / distance) ** 2)
 
 
 def _encoder(folder: Path, has_int8: bool, settings: RuntimeSettings) -> NetworkSession:
@@ -184,8 +256,11 @@ def _encoder(folder: Path, has_int8: bool, settings: RuntimeSettings) -> Network
 
 def describer_in(folder: Path, settings: RuntimeSettings) -> Describer:
     """The describer for the network that ``folder`` holds; raises as they do."""
+    name = read_card(folder).name
+    if name == "oracle":
+        return OracleDescriber(folder)
     kinds: dict[str, Any] = {"compact": CompactDescriber, "mast3r": Mast3rDescriber}
-    describer: Describer = kinds[read_card(folder).name](folder, settings)
+    describer: Describer = kinds[name](folder, settings)
     return describer
 
 

@@ -1,4 +1,4 @@
-"""Pairs whose matches are a flow: confidence, and points from two-view geometry when asked for."""
+"""Pairs whose matches are a flow, and how certain each match is."""
 
 from __future__ import annotations
 
@@ -11,17 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
-from aquaflow.geometry.triangulation import triangulate
-from aquaflow.geometry.two_view import relative_pose
 from aquaflow.prior import flow as dense
 from aquaflow.prior import homography as sparse
 from aquaflow.prior.contract import Float, Keypoints, Mask
-
-MATCH_SIGMA_PX = 0.2
-"""Noise of a refined match: 0.15 px on synthetic dives (prior.refinement)."""
-
-POSE_SAMPLES = 2000
-"""Matches that the two-view pose is estimated from."""
 
 
 @dataclass
@@ -63,7 +55,7 @@ class FlowEncoding:
 
 
 class FlowPair:
-    """Matches at once; pointmaps, up to scale, on demand."""
+    """Matches and their confidence; flow alone knows no ranges and has no descriptors."""
 
     D_a: Float | None = None
     D_b: Float | None = None
@@ -97,55 +89,18 @@ class FlowPair:
     def C(self) -> Float:
         return dense.confidence(self.flow)
 
-    @cached_property
-    def _geometry(self) -> tuple[Float, Float]:
-        """(X_a, Q_a)"""
-        return self._triangulated()
-
-    def _triangulated(self) -> tuple[Float, Float]:
-        """[H, W, 3] and [H, W]: two-view pose from the matches, every valid match triangulated."""
-        height, width = self._a.grey.shape
-        X = np.full((height, width, 3), np.nan, np.float32)
-        Q = np.zeros((height, width), np.float32)
-        rows, columns = np.nonzero(self.valid)
-        if len(rows) == 0:
-            return X, Q
-        pixels_a = np.stack([columns + 0.5, rows + 0.5], -1)
-        pixels_b = self.matches[rows, columns].astype(np.float64)
-        step = max(1, len(rows) // POSE_SAMPLES)
-        T_ba = relative_pose(pixels_a[::step], pixels_b[::step], self._a.camera, self._b.camera)
-        if T_ba is None:
-            return X, Q
-        rays = self._a.camera.unproject(pixels_a)
-        points = triangulate(rays, pixels_b, T_ba, self._b.camera, MATCH_SIGMA_PX)
-        good = points.good
-        X[rows[good], columns[good]] = rays[good] / points.rho[good, None]
-        Q[rows[good], columns[good]] = points.rho[good] ** 2 / points.variance[good]
-        return X, Q
+    @property
+    def X_a(self) -> Float | None:
+        return None
 
     @property
-    def X_a(self) -> Float:
-        return self._geometry[0]
+    def X_b(self) -> Float | None:
+        return None
 
     @property
-    def Q_a(self) -> Float:
-        return self._geometry[1]
-
-    @cached_property
-    def _in_b(self) -> tuple[Float, Float]:
-        """(X_b, Q_b): b's pixels take the point of the pixel of a that they match."""
-        height, width = self._a.grey.shape
-        column = np.clip(np.floor(self.matches_back[..., 0]).astype(int), 0, width - 1)
-        row = np.clip(np.floor(self.matches_back[..., 1]).astype(int), 0, height - 1)
-        known = self.valid_back
-        X = np.where(known[..., None], self.X_a[row, column], np.nan).astype(np.float32)
-        return X, np.where(known, self.Q_a[row, column], 0.0).astype(np.float32)
+    def Q_a(self) -> Float | None:
+        return None
 
     @property
-    def X_b(self) -> Float:
-        return self._in_b[0]
-
-    @property
-    def Q_b(self) -> Float:
-        """[H, W] confidence of X_b; 0 where unknown."""
-        return self._in_b[1]
+    def Q_b(self) -> Float | None:
+        return None

@@ -22,7 +22,7 @@ READ_BYTES = 1 << 20
 class PriorCard(Stage):
     """What a prior is, where it comes from, and how its files are known to be whole."""
 
-    name: Literal["compact", "mast3r"]
+    name: Literal["compact", "mast3r", "oracle"]
     width: int
     """px of the pictures it takes"""
     height: int

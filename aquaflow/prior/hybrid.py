@@ -22,13 +22,37 @@ from aquaflow.prior.candidates import best_flow, from_homography, from_predictio
 from aquaflow.prior.coarse import coarse_flow
 from aquaflow.prior.contract import Encoding, Float, Mask
 from aquaflow.prior.flow_pair import FlowEncoding, FlowPair
-from aquaflow.prior.learned_range import LearnedRange, filled
+from aquaflow.prior.learned_range import LearnedRange
 
 Picture = npt.NDArray[np.uint8]
 Half = npt.NDArray[np.float16]
 
 WARM_UP = (240, 320, 3)
 """Shape of a picture to warm up with."""
+
+
+class ComparedPair(Protocol):
+    """What a network says of two pictures; computed when first asked for, and kept."""
+
+    @property
+    def cells(self) -> tuple[Float, Float]:
+        """[rows, columns, d] unit descriptors of cells that cover each picture."""
+        ...
+
+    @property
+    def range_a(self) -> LearnedRange:
+        """Distances in the first picture, from its own camera."""
+        ...
+
+    @property
+    def range_b(self) -> LearnedRange:
+        """Distances in the second picture, from its own camera."""
+        ...
+
+    @property
+    def confidence(self) -> Float | None:
+        """[rows, columns] in [0, 1] of matches of the first picture's cells; None: it has none."""
+        ...
 
 
 class Describer(Protocol):
@@ -51,22 +75,14 @@ class Describer(Protocol):
         """What is computed once for a picture and kept with it."""
         ...
 
-    def cells(
-        self,
-        a: Half,  # [...] features of one picture
-        b: Half,  # [...] of the other
-    ) -> tuple[Float, Float]:
-        """[rows, columns, d] unit descriptors of cells that cover each picture, from features."""
-        ...
-
-    def range_of(
+    def compared(
         self,
         a: Half,  # [...] features of one picture
         b: Half,  # [...] of the other
         camera_a: CameraModel,
         camera_b: CameraModel,
-    ) -> LearnedRange:
-        """Distances in the first picture; cameras are those of the pictures before fitting."""
+    ) -> ComparedPair:
+        """What it says of the pair; cameras are those of the pictures before fitting."""
         ...
 
 
@@ -98,23 +114,59 @@ class HybridEncoding(FlowEncoding):
             self.features = arrays["features"]
 
 
-class HybridPair(FlowPair):
-    """Matches at once; points of all pixels of a, learned where parallax sees none."""
+class Comparison:
+    """The network's view of a pair of encodings, asked for at most once."""
 
-    def __init__(self, a: HybridEncoding, b: HybridEncoding, flow: dense.Flow) -> None:
-        super().__init__(a, b, flow)
-        self._encodings = a, b
+    def __init__(self, a: HybridEncoding, b: HybridEncoding) -> None:
+        self._a, self._b = a, b
 
     @cached_property
-    def _geometry(self) -> tuple[Float, Float]:
+    def found(self) -> ComparedPair:
+        """What the network says of the pair."""
+        a, b = self._a, self._b
+        return a.describer.compared(a.features, b.features, a.camera, b.camera)
+
+
+class HybridPair(FlowPair):
+    """Matches of flow; ranges and their confidence are the network's."""
+
+    def __init__(
+        self, a: HybridEncoding, b: HybridEncoding, flow: dense.Flow, comparison: Comparison
+    ) -> None:
+        super().__init__(a, b, flow)
+        self._comparison = comparison
+
+    @cached_property
+    def _in_a(self) -> tuple[Float, Float]:
         """(X_a, Q_a)"""
-        a, b = self._encodings
-        learned = a.describer.range_of(a.features, b.features, a.camera, b.camera)
-        return filled(*self._triangulated(), a.camera, learned)
+        return self._comparison.found.range_a.pointmap(self._a.camera)
+
+    @cached_property
+    def _in_b(self) -> tuple[Float, Float]:
+        """(X_b, Q_b)"""
+        return self._comparison.found.range_b.pointmap(self._b.camera)
+
+    @property
+    def X_a(self) -> Float | None:
+        return self._in_a[0]
+
+    @property
+    def X_b(self) -> Float | None:
+        return self._in_b[0]
+
+    @property
+    def Q_a(self) -> Float | None:
+        return self._in_a[1]
+
+    @property
+    def Q_b(self) -> Float | None:
+        return self._in_b[1]
 
 
 class HybridPrior:
     """Flow that starts from learned matches, behind the prior contract."""
+
+    ranged = True
 
     def __init__(self, describer: Describer) -> None:
         self.name, self.metric = describer.name, describer.metric
@@ -160,24 +212,28 @@ class HybridPrior:
         descriptors, then from keypoints."""
         assert isinstance(a, HybridEncoding)
         assert isinstance(b, HybridEncoding)
-        only = alone and predicted is not None
-        starts = from_prediction(predicted) if only else _starts(a, b, predicted)
-        return HybridPair(a, b, best_flow(self._matcher, a, b, starts))
+        comparison, only = Comparison(a, b), alone and predicted is not None
+        starts = from_prediction(predicted) if only else _starts(a, b, predicted, comparison)
+        return HybridPair(a, b, best_flow(self._matcher, a, b, starts), comparison)
 
     def warm_up(self) -> None:
         """Run the network once: the first picture of a dive then waits for no preparation."""
         features = self._describer.features(self._describer.fitted(np.zeros(WARM_UP, np.uint8)))
-        self._describer.cells(features, features)
+        height, width, _ = WARM_UP
+        camera = CameraModel(width, height, width, width, 0.5 * width, 0.5 * height)
+        learned_range = self._describer.compared(features, features, camera, camera).range_a
+        learned_range.pointmap(camera)
 
 
 def _starts(
     a: HybridEncoding,
     b: HybridEncoding,
     predicted: Float | None,  # [H, W, 2] px, expected matches of a in b
+    comparison: Comparison,
 ) -> Iterator[Float | None]:
     yield from from_prediction(predicted)
     height, width = a.grey.shape
-    flow = coarse_flow(*a.describer.cells(a.features, b.features), height, width)
+    flow = coarse_flow(*comparison.found.cells, height, width)
     if flow is not None:
         yield flow
     yield from from_homography(a, b)

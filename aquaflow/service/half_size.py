@@ -43,4 +43,5 @@ def _pointmap(pointmap: Pointmap, small: View) -> Pointmap:
     rows = slice(1, 2 * small.camera.height, 2)
     columns = slice(1, 2 * small.camera.width, 2)
     rho, variance = pointmap.rho[rows, columns], pointmap.variance[rows, columns]
-    return Pointmap(small.camera, rho.copy(), variance.copy())
+    learned = None if pointmap.learned is None else pointmap.learned[rows, columns].copy()
+    return Pointmap(small.camera, rho.copy(), variance.copy(), learned=learned)

@@ -58,15 +58,15 @@ class Slam:
         Raises:
             ConfigError: the prior cannot give what the config asks tracking for.
         """
-        if config.tracking.residual == "point":
-            raise ConfigError(
-                "tracking.residual 'point' needs points of each frame's own, which the classical "
-                "prior does not have; choose pixel or ray"
-            )
         self.config = config
         self.profiler = profiler or Profiler()
         self.failures = failures or Failures()
         self.prior = make_prior(config.prior)
+        if config.tracking.residual == "point" and not self.prior.ranged:
+            raise ConfigError(
+                "tracking.residual 'point' needs points of each frame's own, which the "
+                f"{self.prior.name} prior does not have; choose pixel or ray, or another prior"
+            )
         if live:
             self.prior.warm_up()
         self.keyframes = KeyframeStore(work, self.prior)

@@ -22,6 +22,7 @@ from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
 from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, Float, Mask, PairGeometry, Prior
 from aquaflow.tracking.frames import FrameClass, Link, Quality, Tracked
+from aquaflow.tracking.learned.fusion import add_learned
 from aquaflow.tracking.loops.neighbours import Neighbour, Neighbours
 from aquaflow.tracking.pose.depth_fusion import fuse, transfer
 from aquaflow.tracking.pose.expected_matches import expected_matches, is_wide
@@ -162,10 +163,12 @@ class KeyframeTracker:
         return FrameClass.COMMON
 
     def pointmap(self, at: CurrentKeyframe, solved: Matched, camera: CameraModel) -> Pointmap:
-        """The keyframe's depths in the frame's own pixels."""
+        """The keyframe's depths in the frame's own pixels, and the prior's where it knows them."""
         pair, T_fk, pointmap = solved.pair, solved.estimate.T, at.keyframe.pointmap
         reliable = self.shown(at, solved, camera) if self.hidden(solved) else pair.valid_back
-        return transfer(pointmap, pair.matches_back, reliable, T_fk, camera)
+        own = transfer(pointmap, pair.matches_back, reliable, T_fk, camera)
+        add_learned(own, pair.X_b, pair.Q_b, self._config.known_sigma, self._config.learned)
+        return own
 
     def shown(self, at: CurrentKeyframe, solved: Matched, camera: CameraModel) -> Mask:
         """[H, W] pixels of the frame that show what the keyframe shows."""

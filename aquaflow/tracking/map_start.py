@@ -13,6 +13,8 @@ from aquaflow.keyframes import Pointmap
 from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, PairGeometry, Prior
 from aquaflow.tracking.initialisation.initialiser import Initialiser, calibrated, fused_pointmap
+from aquaflow.tracking.initialisation.learned_start import learned_start
+from aquaflow.tracking.learned.fusion import add_learned
 from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
 
 
@@ -79,6 +81,29 @@ class MapStart:
             return None
         with self._failures.contain("initialisation", initialiser.frame.index):
             started = self._solve(initialiser)
+        return self._taken(started)
+
+    def begin_learned(self) -> Started | None:
+        """A map from the reference and the picture after it, by the prior's ranges; None where it
+        knows none, or not well enough (docs/prior.md#start)."""
+        initialiser, started = self._initialiser, None
+        if initialiser is None or len(initialiser.waiting) != 1:
+            return None
+        with self._failures.contain("learned start", initialiser.frame.index):
+            started = self._begun(initialiser)
+        return self._taken(started)
+
+    def _begun(self, initialiser: Initialiser) -> Started | None:
+        reference, second = initialiser.frame, initialiser.waiting[0]
+        camera = initialiser.reference.camera
+        found = learned_start(second.pair, camera, self._config)
+        if found is None:
+            return None
+        posed = [PosedFrame(second.frame, found.T_fk, second.pair)]
+        return Started(reference, initialiser.reference, found.pointmap, camera, 0.0, posed)
+
+    def _taken(self, started: Started | None) -> Started | None:
+        """The frames of a map that starts are in hand, and no reference is waited for."""
         if started is not None:
             frames = [started.reference, *(posed.frame for posed in started.posed)]
             self._waiting.put(frames, Wait.IN_HAND)
@@ -92,6 +117,8 @@ class MapStart:
         reference, camera = initialiser.frame, calibrated(solution.camera)
         encoding = self._prior.encode(reference.image, camera, reference.mask)
         pointmap = fused_pointmap(solution, camera, self._config.sigma_px)
+        pair = max(solution.waiting, key=lambda waiting: waiting.parallax_px).pair
+        add_learned(pointmap, pair.X_a, pair.Q_a, self._config.known_sigma, self._config.learned)
         posed = [
             PosedFrame(waiting.frame, T, waiting.pair)
             for waiting, T in zip(solution.waiting, solution.T, strict=True)

@@ -94,7 +94,7 @@ def rescale(at: CurrentKeyframe, ratio: float) -> None:
     by 2 to 8 % within ten frames).
     """
     pointmap = at.keyframe.pointmap
-    known = pointmap.known(1.0)
+    known = pointmap.known_or_learned(1.0)
     pointmap.rho *= ratio
     pointmap.variance[known] *= ratio**2
     pointmap.fused = MOST_FUSED

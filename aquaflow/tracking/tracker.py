@@ -18,7 +18,7 @@ from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
 from aquaflow.tracking.frames import FrameClass, Link, Quality, Revisit, Tracked
 from aquaflow.tracking.initialisation.back_fill import BackFills
 from aquaflow.tracking.loops.relocaliser import Places
-from aquaflow.tracking.map_start import MapStart
+from aquaflow.tracking.map_start import MapStart, Started
 from aquaflow.tracking.pose.matcher import Matched
 from aquaflow.tracking.repairs import LastFrame, Repairs
 from aquaflow.tracking.revisits import revisited
@@ -154,18 +154,19 @@ class Tracker:
 
     def _initialise(self, frame: Frame, encoding: Encoding) -> list[Tracked]:
         matched = self._start.add(frame, encoding)
-        if matched and not self._start.ready:
+        started = self._start.begin_learned() if matched else None
+        if started is None and matched and not self._start.ready:
             return []
-        tracked = self._begin()
+        tracked = self._begin(started)
         if self._at is None:
             if not matched:  # so are frames that cannot be: the next reference is another one
                 self._start.restart(frame, encoding)
             return []
         return tracked if matched else tracked + self._track(frame)
 
-    def _begin(self) -> list[Tracked]:
+    def _begin(self, started: Started | None = None) -> list[Tracked]:
         """Make the first keyframe from the initial geometry, and pose the frames that waited."""
-        started = self._start.solve()
+        started = started or self._start.solve()
         if started is None:
             return []
         if self.camera is None:

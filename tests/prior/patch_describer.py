@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +24,7 @@ class PatchDescriber:
 
     def __init__(self) -> None:
         self.asked = 0
+        self.compared_pairs = 0
 
     def fitted(self, image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
         return image
@@ -36,18 +39,31 @@ class PatchDescriber:
         flat = patches.reshape(*patches.shape[:2], -1)
         return unit(flat - flat.mean(-1, keepdims=True)).astype(np.float16)
 
-    def cells(
-        self, a: npt.NDArray[np.float16], b: npt.NDArray[np.float16]
-    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-        return a.astype(np.float32), b.astype(np.float32)
-
-    def range_of(
+    def compared(
         self,
         a: npt.NDArray[np.float16],
         b: npt.NDArray[np.float16],
         camera_a: CameraModel,
         camera_b: CameraModel,
-    ) -> LearnedRange:
-        """Three units everywhere, known to 30 %."""
-        shape = a.shape[:2]
-        return LearnedRange(np.full(shape, np.log(3.0)), np.full(shape, 0.09), self.metric)
+    ) -> PatchPair:
+        self.compared_pairs += 1
+        return PatchPair((a.astype(np.float32), b.astype(np.float32)))
+
+
+@dataclass
+class PatchPair:
+    """Three units everywhere, known to 30 %."""
+
+    cells: tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]
+    confidence = None
+
+    @property
+    def range_a(self) -> LearnedRange:
+        shape = self.cells[0].shape[:2]
+        return LearnedRange(
+            np.full(shape, np.log(3.0), np.float32), np.full(shape, 0.09, np.float32)
+        )
+
+    @property
+    def range_b(self) -> LearnedRange:
+        return self.range_a

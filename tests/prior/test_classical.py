@@ -8,7 +8,7 @@ import pytest
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.prior import flow_pair, homography
+from aquaflow.prior import homography
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.flow import CONFIDENCE_SIGMA_PX, pixel_grid, sample
 from aquaflow.prior.flow_pair import FlowPair
@@ -90,70 +90,18 @@ def test_the_confidence_is_one_for_a_perfect_match_and_zero_for_none(relief: Rel
     assert (by_error + 1e-6 >= pair.C).all()  # edges of the flow take away more
 
 
-def test_the_pointmap_is_the_scene_up_to_scale(relief: Relief) -> None:
+def test_flow_alone_knows_no_ranges(relief: Relief) -> None:
     pair, _ = relief
-    truth = CAMERA.unproject(pixel_centres()) * relief_depth()[..., None]
-    known = np.isfinite(pair.X_a).all(-1)
-    assert known.mean() > 0.5
-    assert not (known & ~pair.valid).any()
-    ratio = pair.X_a[known][:, 2] / truth[known][:, 2]
-    scale = float(np.median(ratio))
-    assert np.median(np.abs(ratio / scale - 1.0)) < 0.03
-    assert scale == pytest.approx(1.0 / np.linalg.norm(T_BA.t), rel=0.1)
-
-
-def test_the_point_confidence_says_how_far_off_the_points_are(relief: Relief) -> None:
-    """Q is 1 / relative variance for a noise of half a pixel; these matches have less."""
-    pair, _ = relief
-    known = pair.Q_a > 0.0
-    np.testing.assert_array_equal(known, np.isfinite(pair.X_a).all(-1))
-    depth = relief_depth()[known]
-    ratio = pair.X_a[known][:, 2] / depth
-    error = np.abs(ratio / np.median(ratio) - 1.0)
-    stated = 1.0 / np.sqrt(pair.Q_a[known])
-    assert np.mean(error < 2.0 * stated) > 0.9
-    assert len(np.unique(pair.Q_a[known])) > 1000
-
-
-def test_the_second_pointmap_gives_matching_pixels_the_same_point(relief: Relief) -> None:
-    pair, _ = relief
-    known = np.isfinite(pair.X_b).all(-1)
-    np.testing.assert_array_equal(pair.Q_b > 0.0, known)
-    assert not (known & ~pair.valid_back).any()
-    assert known.mean() > 0.5
-    unit = Sim3(T_BA.R, T_BA.t / np.linalg.norm(T_BA.t))
-    seen = CAMERA.project(unit.apply(pair.X_b[known].astype(np.float64)))
-    error = np.linalg.norm(seen - pixel_centres()[known], axis=-1)
-    assert np.median(error) < 1.0
-
-
-def test_without_motion_there_is_no_pointmap() -> None:
-    a, _ = moved_pair(shift(0.0, 0.0))
-    pair = pair_of(a, a)
-    assert pair.valid.mean() > 0.8
-    assert not pair.Q_a.any()
-    assert np.isnan(pair.X_a).all()
-    assert not pair.Q_b.any()
-
-
-def test_with_too_few_matches_for_a_pose_there_is_no_pointmap(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(flow_pair, "relative_pose", lambda *_: None)
-    pair = pair_of(*moved_pair(shift(5.0, 0.0)))
-    assert pair.valid.any()
-    assert not pair.Q_a.any()
+    assert not ClassicalPrior.ranged
+    assert pair.X_a is pair.X_b is pair.Q_a is pair.Q_b is None
 
 
 @pytest.mark.parametrize("value", [0, 128, 255])
-def test_pictures_of_one_colour_give_no_matches_and_no_points(value: int) -> None:
+def test_pictures_of_one_colour_give_no_matches(value: int) -> None:
     flat = np.full((HEIGHT, WIDTH, 3), value, np.uint8)
     pair = pair_of(flat, flat)
     assert not pair.valid.any()
     assert not pair.C.any()
-    assert np.isnan(pair.X_a).all()
-    assert np.isnan(pair.X_b).all()
-    assert not pair.Q_a.any()
     assert np.isfinite(pair.matches).all()
 
 

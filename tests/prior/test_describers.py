@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from aquaflow.errors import InputError
+from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior import describers
 from aquaflow.prior.describers import CompactDescriber, describer_in
 from aquaflow.prior.runtime import Precision, RuntimeSettings
@@ -52,7 +53,8 @@ def test_a_size_that_was_exported_fixed_is_kept_to(tmp_path: Path) -> None:
 def test_every_cell_has_a_descriptor_of_length_one(describer: CompactDescriber) -> None:
     features = describer.features(picture(48, 64))
     assert features.shape == (6, 8, 64)
-    cells, _ = describer.cells(features, features)
+    camera = CameraModel(64, 48, 64.0, 64.0, 32.0, 24.0)
+    cells, _ = describer.compared(features, features, camera, camera).cells
     np.testing.assert_allclose(np.linalg.norm(cells, axis=-1), 1.0, atol=2e-3)
 
 

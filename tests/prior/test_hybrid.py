@@ -151,12 +151,24 @@ def test_pictures_of_one_colour_give_no_matches(value: int) -> None:
     assert np.isfinite(pair.matches).all()
 
 
-def test_points_are_triangulated_where_there_is_parallax_and_learned_elsewhere() -> None:
+def test_ranges_of_both_pictures_are_the_networks() -> None:
     prior = HybridPrior(PatchDescriber())
-    still = moved_pair(shift(0.0, 0.0))[0]
-    pair = prior.decode(*encoded(prior, (still, still)))
-    np.testing.assert_allclose(np.linalg.norm(pair.X_a, axis=-1), 3.0, rtol=1e-4)
-    np.testing.assert_allclose(pair.Q_a, 1.0 / 0.09, rtol=1e-3)
-    known = np.isfinite(pair.X_b).all(-1)
-    assert known.mean() > 0.8
-    np.testing.assert_allclose(pair.X_b[known], pair.X_a[known], atol=0.02)
+    pair = prior.decode(*encoded(prior, moved_pair(shift(*FAR))))
+    assert prior.ranged
+    for X, Q in ((pair.X_a, pair.Q_a), (pair.X_b, pair.Q_b)):
+        assert X is not None
+        assert Q is not None
+        np.testing.assert_allclose(np.linalg.norm(X, axis=-1), 3.0, rtol=1e-4)
+        np.testing.assert_allclose(Q, 1.0 / 0.09, rtol=1e-3)
+
+
+def test_ranges_are_asked_for_once_and_only_when_needed() -> None:
+    describer = PatchDescriber()
+    prior = HybridPrior(describer)
+    predicted = (pixel_centres() + FAR).astype(np.float32)
+    pair = prior.decode(*encoded(prior, moved_pair(shift(*FAR))), predicted)
+    assert describer.compared_pairs == 0
+    for _ in range(2):
+        assert pair.X_a is not None
+        assert pair.X_b is not None
+    assert describer.compared_pairs == 1

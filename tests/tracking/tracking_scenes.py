@@ -87,8 +87,7 @@ class KnownPair:
         if a.blind or b.blind:
             self.valid, self.valid_back = np.zeros_like(self.valid), np.zeros_like(self.valid)
         self.C = self.valid.astype(np.float32)
-        self.X_a = self.X_b = np.full((*a.depth.shape, 3), np.nan, np.float32)
-        self.Q_a = self.Q_b = np.zeros(a.depth.shape, np.float32)
+        self.X_a = self.X_b = self.Q_a = self.Q_b = None
 
 
 def _seen(view: KnownView, T: Sim3, camera: CameraModel) -> tuple[npt.NDArray[np.float32], Mask]:
@@ -102,7 +101,7 @@ def _seen(view: KnownView, T: Sim3, camera: CameraModel) -> tuple[npt.NDArray[np
 class KnownPrior:
     """A prior that is told the truth through the frames' indices."""
 
-    name, metric = "known", False
+    name, ranged, metric = "known", False, False
 
     def __init__(self, views: list[KnownView], true: CameraModel, noise_px: float = 0.1) -> None:
         self.views, self.true, self.noise_px = views, true, noise_px

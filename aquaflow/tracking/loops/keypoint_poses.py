@@ -11,12 +11,13 @@ from __future__ import annotations
 import numpy as np
 
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.pixels import at_pixels
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe
 from aquaflow.prior.contract import Encoding
 from aquaflow.tracking.loops.keypoints import match_keypoints
 from aquaflow.tracking.pose.pnp import pose_from_scratch
-from aquaflow.tracking.pose.problem import at_pixels, pose_problem
+from aquaflow.tracking.pose.problem import pose_problem
 
 HYPOTHESES = 2
 """Each costs one dense matching."""

@@ -13,12 +13,13 @@ import numpy as np
 
 from aquaflow.config import VerificationConfig
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.pixels import at_pixels
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, Pointmap
 from aquaflow.prior.contract import Encoding
 from aquaflow.tracking.loops.keypoints import match_keypoints
 from aquaflow.tracking.pose.pnp import pose_from_scratch
-from aquaflow.tracking.pose.problem import Array, at_pixels, pose_problem
+from aquaflow.tracking.pose.problem import Array, pose_problem
 from aquaflow.tracking.pose.solver import PoseEstimate, solve_pose
 
 GRID = (8, 6)

@@ -13,6 +13,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe
 from aquaflow.prior.contract import Encoding, Float, Mask, PairGeometry
 from aquaflow.tracking.frames import Quality
+from aquaflow.tracking.learned.own_points import own_points
 from aquaflow.tracking.pose.pnp import pose_from_scratch
 from aquaflow.tracking.pose.problem import pose_problem
 from aquaflow.tracking.pose.solver import PoseEstimate, PoseProblem, solve_pose
@@ -74,7 +75,7 @@ class KeyframeMatcher:
         """The pose from ``predicted``; from the matches alone, or from ``fallback``, where that
         fails; None where too few matches support one."""
         config = self._config
-        around, known = surroundings(keyframe.pointmap, config.known_sigma)
+        around, known = self._depths(keyframe, pair)
         problem, pixels_k = self._problem(keyframe, pair, camera, around, known)
         if len(problem.points) < config.min_matches:
             return None
@@ -95,8 +96,24 @@ class KeyframeMatcher:
         known_share = float((pair.valid & known).sum() / max(pair.valid.sum(), 1))
         return Matched(estimate, pair, share, parallax_px, problem.points, visible, known_share)
 
+    def _depths(self, keyframe: Keyframe, pair: PairGeometry) -> tuple[Float, Mask]:
+        """Inverse depth around every pixel [H, W], and the pixels [H, W] that poses are solved
+        from. Learned depths, whose errors are alike, take part where few others are matched."""
+        config, pointmap = self._config, keyframe.pointmap
+        triangulated = surroundings(pointmap, config.known_sigma)
+        if pointmap.learned is None:
+            return triangulated
+        every = surroundings(pointmap, config.known_sigma, learned=True)
+        enough = config.learned.least_triangulated * (pair.valid & every[1]).sum()
+        return triangulated if (pair.valid & triangulated[1]).sum() >= enough else every
+
     def _solve(self, problem: PoseProblem, initial: Sim3) -> PoseEstimate | None:
-        return solve_pose(problem, initial, self._config.stop_converged, self._config.residual)
+        """By the residual that was asked for; between pictures whose own points have no common unit
+        yet, by pixels."""
+        residual = self._config.residual
+        if residual == "point" and problem.frame_points is None:
+            residual = "pixel"
+        return solve_pose(problem, initial, self._config.stop_converged, residual)
 
     def _problem(
         self,
@@ -116,7 +133,15 @@ class KeyframeMatcher:
         sigma_px = self._config.sigma_px
         problem = pose_problem(keyframe.pointmap, pixels_k, pixels, camera, sigma_px, weights)
         around_rho = around[rows, columns].astype(np.float64)
-        return replace(problem, around_rho=around_rho), pixels_k
+        problem = replace(problem, around_rho=around_rho)
+        if self._config.residual == "point":
+            known_sigma = self._config.known_sigma
+            own = own_points(keyframe.pointmap, pair, pixels, camera, known_sigma)
+            if own is not None:
+                problem = replace(
+                    problem, frame_points=own.points, frame_rho_variance=own.rho_variance
+                )
+        return problem, pixels_k
 
 
 def matched_share(encoding: Encoding, pair: PairGeometry) -> float:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
-
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.pixels import at_pixels
 from aquaflow.keyframes import Pointmap
 from aquaflow.tracking.pose.solver import PoseProblem
 
 Array = npt.NDArray[np.float64]
-Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 def pose_problem(
@@ -33,14 +31,3 @@ def pose_problem(
         camera,
         sigma_px,
     )
-
-
-def at_pixels(
-    field: npt.NDArray[Scalar],  # [H, W]
-    pixels: Array,  # [M, 2] px
-) -> npt.NDArray[Scalar]:
-    """[M] values of the pixels' own cells."""
-    height, width = field.shape
-    column = np.clip(np.floor(pixels[:, 0]).astype(np.int64), 0, width - 1)
-    row = np.clip(np.floor(pixels[:, 1]).astype(np.int64), 0, height - 1)
-    return field[row, column]

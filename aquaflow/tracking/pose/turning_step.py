@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.pixels import at_pixels
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.two_view import (
     MIN_MATCHES,
@@ -20,7 +21,6 @@ from aquaflow.geometry.two_view import (
 )
 from aquaflow.keyframes import Pointmap
 from aquaflow.prior.contract import Mask, PairGeometry
-from aquaflow.tracking.pose.problem import at_pixels
 
 Array = npt.NDArray[np.float64]
 

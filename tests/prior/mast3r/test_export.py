@@ -76,10 +76,14 @@ def test_the_papers_network_tells_cells_apart_behind_the_hybrid_prior(folder: Pa
     image = np.random.default_rng(0).integers(0, 256, (64, 96, 3)).astype(np.uint8)
     a, b = prior.encode(image, camera), prior.encode(image, camera)
     assert isinstance(a, HybridEncoding)
-    cells, same = a.describer.cells(a.features, b.features)
+    cells, same = a.describer.compared(a.features, b.features, camera, camera).cells
     assert cells.shape == same.shape == (HEIGHT // 8, WIDTH // 8, TINY.descriptor)
     np.testing.assert_allclose(np.linalg.norm(cells, axis=-1), 1.0, atol=1e-4)
-    assert prior.decode(a, b).matches.shape == (64, 96, 2)
+    pair = prior.decode(a, b)
+    assert pair.matches.shape == (64, 96, 2)
+    for X in (pair.X_a, pair.X_b):
+        assert X is not None
+        assert np.isfinite(X).all()
 
 
 def test_other_weights_are_found_out(folder: Path) -> None:
