@@ -39,6 +39,8 @@ class Pointmap:
     """Frames whose depths were fused into it."""
     learned: Mask | None = None
     """[H, W] pixels whose depth is the prior's and was not triangulated yet; None: no pixel."""
+    learned_scale: tuple[float, float] | None = None
+    """Logarithm of this pointmap's unit over the prior's, and its standard deviation."""
 
     @staticmethod
     def unknown(camera: CameraModel) -> Pointmap:
@@ -85,7 +87,8 @@ class Pointmap:
     def copy(self) -> Pointmap:
         """With arrays of its own."""
         learned = None if self.learned is None else self.learned.copy()
-        return Pointmap(self.camera, self.rho.copy(), self.variance.copy(), self.fused, learned)
+        rho, variance = self.rho.copy(), self.variance.copy()
+        return replace(self, rho=rho, variance=variance, learned=learned)
 
 
 @dataclass(frozen=True)
@@ -257,6 +260,8 @@ class KeyframeStore:
         arrays["fused"] = np.array([pointmap.fused])
         if pointmap.learned is not None:
             arrays["learned"] = pointmap.learned
+        if pointmap.learned_scale is not None:
+            arrays["learned_scale"] = np.array(pointmap.learned_scale)
         packed = self._prior.pack(content.encoding)
         return arrays | {f"encoding.{name}": array for name, array in packed.items()}
 
@@ -269,7 +274,9 @@ class KeyframeStore:
         encoding_camera, pointmap_camera = self._cameras[number]
         rho, variance, fused = (arrays.pop(name) for name in ("rho", "variance", "fused"))
         learned = arrays.pop("learned", None)
-        pointmap = Pointmap(pointmap_camera, rho, variance, int(fused[0]), learned)
+        scale = arrays.pop("learned_scale", None)
+        learned_scale = None if scale is None else (float(scale[0]), float(scale[1]))
+        pointmap = Pointmap(pointmap_camera, rho, variance, int(fused[0]), learned, learned_scale)
         _set_writable(pointmap, False)
         packed = {name.removeprefix("encoding."): array for name, array in arrays.items()}
         return _Content(self._prior.unpack(packed, encoding_camera), pointmap)

@@ -117,6 +117,9 @@ def ablate(
     data: Data = None,
     suite: Suite = None,
     scene: Scenes = None,
+    part: Annotated[
+        list[str] | None, typer.Option(help="Word in a row's name; may be repeated. All rows.")
+    ] = None,
     out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("out/ablation"),
     as_json: Json = False,
 ) -> None:
@@ -124,11 +127,12 @@ def ablate(
     from aquaflow.evaluation.bench import ablation
     from aquaflow.evaluation.bench.benchmark import scenes_of
 
+    parts = ablation.parts_called(part or [])
     with progress_bars(as_json) as progress:
         scenes = scenes_of(suite, data, scene or [], out, progress)
         if suite == "ci":
             scenes = [s for s in scenes if s.name in ablation.CI_SCENES] or scenes
-        result = ablation.ablate(scenes, out, progress)
+        result = ablation.ablate(scenes, out, progress, parts)
     (out / "ablate.json").write_text(json.dumps(result, indent=2) + "\n")
     if as_json:
         typer.echo(json.dumps(result))

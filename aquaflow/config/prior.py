@@ -23,6 +23,13 @@ class PriorConfig(Stage):
         None,
         description="what `aquaflow prior export` or `prior train` wrote; None: what ships",
     )
+    confidence: bool = Field(
+        True, description="C weighs matches; False: all count the same (`aquaflow ablate`)"
+    )
+    learned_matches: bool = Field(
+        True,
+        description="flow starts at the network's matches; False: at keypoints', as without one",
+    )
     device: Literal["auto", "cpu", "cuda", "tensorrt"] = Field(
         "auto", description="auto: the fastest that onnxruntime has; any other is that or an error"
     )

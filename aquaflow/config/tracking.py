@@ -218,6 +218,11 @@ class LearnedConfig(Stage):
         description="of the matches of known depth, those triangulated, below which learned depths "
         "take part in poses",
     )
+    scale: bool = Field(
+        True,
+        description="the network's unit holds the map's where it drifts by more than the network "
+        "errs, and no telemetry knows it",
+    )
     start: bool = Field(
         True, description="a map starts at the second picture where ranges are certain enough"
     )

@@ -12,6 +12,7 @@ from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.contract import Prior
 from aquaflow.prior.folder import CARD
 from aquaflow.prior.runtime import RuntimeSettings
+from aquaflow.prior.unweighted import UnweightedPrior
 
 log = logging.getLogger(__name__)
 
@@ -26,6 +27,11 @@ def make_prior(config: PriorConfig) -> Prior:
         InputError: the asked-for folder is no prior, or a file in it was changed.
         AquaFlowError: the processor asked for is not there.
     """
+    prior = _chosen(config)
+    return prior if config.confidence else UnweightedPrior(prior)
+
+
+def _chosen(config: PriorConfig) -> Prior:
     if config.kind == "classical":
         return ClassicalPrior()
     folder = config.folder or SHIPPED
@@ -39,7 +45,7 @@ def make_prior(config: PriorConfig) -> Prior:
     settings = RuntimeSettings(
         config.device, config.precision, min(config.threads, core_count()), config.engine_cache
     )
-    return HybridPrior(describer_in(folder, settings))
+    return HybridPrior(describer_in(folder, settings), config.learned_matches)
 
 
 def _missing(folder: Path) -> str | None:

@@ -168,8 +168,10 @@ class HybridPrior:
 
     ranged = True
 
-    def __init__(self, describer: Describer) -> None:
+    def __init__(self, describer: Describer, learned_matches: bool = True) -> None:
+        """Without ``learned_matches`` flow starts at keypoints where a prediction fails."""
         self.name, self.metric = describer.name, describer.metric
+        self._learned_matches = learned_matches
         self._describer = describer
         self._matcher = dense.FlowMatcher()
 
@@ -213,7 +215,8 @@ class HybridPrior:
         assert isinstance(a, HybridEncoding)
         assert isinstance(b, HybridEncoding)
         comparison, only = Comparison(a, b), alone and predicted is not None
-        starts = from_prediction(predicted) if only else _starts(a, b, predicted, comparison)
+        with_network = comparison if self._learned_matches else None
+        starts = from_prediction(predicted) if only else _starts(a, b, predicted, with_network)
         return HybridPair(a, b, best_flow(self._matcher, a, b, starts), comparison)
 
     def warm_up(self) -> None:
@@ -229,12 +232,12 @@ def _starts(
     a: HybridEncoding,
     b: HybridEncoding,
     predicted: Float | None,  # [H, W, 2] px, expected matches of a in b
-    comparison: Comparison,
+    comparison: Comparison | None,
 ) -> Iterator[Float | None]:
     yield from from_prediction(predicted)
-    height, width = a.grey.shape
-    flow = coarse_flow(*comparison.found.cells, height, width)
-    if flow is not None:
-        yield flow
+    if comparison is not None:
+        flow = coarse_flow(*comparison.found.cells, *a.grey.shape)
+        if flow is not None:
+            yield flow
     yield from from_homography(a, b)
     yield None

@@ -28,6 +28,7 @@ from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.tracking.gate.gate import FrameGate, GateKind, Verdict
 from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph
 from aquaflow.tracking.loops.relocaliser import Places
+from aquaflow.tracking.metric.learned_scales import LearnedScales
 from aquaflow.tracking.metric.metric_frames import MetricFrames
 from aquaflow.tracking.overlay.finder import OverlayFinder
 from aquaflow.tracking.tracker import Tracker
@@ -88,6 +89,7 @@ class Slam:
         self.graph = KeyframeGraph(
             self.keyframes, places, config.tracking, self.failures, self.metric,
             self.adjuster if adjustment.enabled else None,
+            LearnedScales(self.keyframes) if config.tracking.learned.scale else None,
         )  # fmt: skip
         self.renderer = select_renderer(config.mapping.renderer, config.threads or os.cpu_count())
         self.maps: MapWork = maps or Maps(config, self.renderer, self.profiler, work, self.failures)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
@@ -11,13 +12,19 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from aquaflow.config.presets import merged
+from aquaflow.errors import AquaFlowError, InputError
 from aquaflow.evaluation.bench import machine
 from aquaflow.evaluation.bench.job import Job
 from aquaflow.evaluation.bench.runner import Perform, Progress, Row, in_process, row_of
 from aquaflow.evaluation.bench.scene import BenchmarkScene
+from aquaflow.evaluation.oracle_views import make_oracle
+from aquaflow.prior.folder import CARD
 
 PRESET = "balanced"
 """The preset whose parts are left out, one at a time."""
+ORACLE_SIGMA = 0.05
+"""Relative error of an oracle's ranges: what the best monocular networks reach in air."""
 CI_SCENES = ("reef, loop", "wall, murky, slow")
 """Of the ci suite: relief and much water; the others would double the time."""
 
@@ -29,6 +36,8 @@ class AblatedPart:
     name: str
     overrides: dict[str, Any] = field(default_factory=dict)
     built: bool = True
+    oracle: bool = False
+    """True if it tracks with an oracle of the scene (docs/prior.md#oracle)."""
 
 
 def _medium(**settings: object) -> dict[str, Any]:
@@ -51,6 +60,22 @@ def _gate(**settings: object) -> dict[str, Any]:
     return _tracking(gate=settings)
 
 
+LEARNED: tuple[tuple[str, dict[str, Any], bool], ...] = (
+    ("the compact prior", {"kind": "compact"}, False),
+    (f"an oracle of {100 * ORACLE_SIGMA:.0f} %", {"kind": "folder"}, True),
+)
+"""Priors that know ranges: name, settings, and whether each scene needs one of its own."""
+WITHOUT: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("", {}),
+    (", without learned depth", _tracking(learned={"depth": False})),
+    (", without learned start", _tracking(learned={"start": False})),
+    (", without learned matches", {"prior": {"learned_matches": False}}),
+    (", without confidence of matches", {"prior": {"confidence": False}}),
+    (", residual ray", _tracking(residual="ray")),
+    (", residual point", _tracking(residual="point")),
+)
+"""What is left out of each."""
+
 NEVER_AGREES = 1e-9
 """Relative range difference: no map is this close, so no ray counts as explained."""
 
@@ -69,7 +94,12 @@ PARTS = (
     AblatedPart("with neural Gaussians, base held as inserted", _decoder(optimise_initial=False)),
     AblatedPart("with neural Gaussians, without distance embedding", _decoder(distance=False)),
     AblatedPart("with neural Gaussians, an MLP instead of LGPD", _decoder(variant="mlp")),
-    AblatedPart("without learned prior", built=False),
+    *(
+        AblatedPart(f"with {name}{without}", merged({"prior": prior}, overrides), oracle=oracle)
+        for name, prior, oracle in LEARNED
+        for without, overrides in WITHOUT
+    ),
+    AblatedPart("without confidence of matches", {"prior": {"confidence": False}}),
     AblatedPart(
         "skip off: insertion only where the map is wrong", _insertion(agreement=NEVER_AGREES)
     ),
@@ -106,6 +136,19 @@ PARTS = (
 """In the order of the table; a part lights up once it has a switch in the config."""
 
 
+def parts_called(names: Sequence[str]) -> list[AblatedPart]:
+    """The full system, and the parts whose names contain one of ``names``; all without any.
+
+    Raises:
+        InputError: a name is of no part.
+    """
+    for name in names:
+        if not any(name in part.name for part in PARTS):
+            raise InputError(f"no part is called '{name}'; give a word of the table's first column")
+    chosen = [part for part in PARTS[1:] if any(name in part.name for name in names)]
+    return [PARTS[0], *(chosen if names else PARTS[1:])]
+
+
 def ablate(
     scenes: Sequence[BenchmarkScene],
     out: Path,
@@ -120,11 +163,23 @@ def ablate(
     for scene in scenes:
         for part in built:
             folder = str(out / "ablation" / f"dive_{done:03d}")
-            job = Job(scene, PRESET, folder, overrides=part.overrides)
+            overrides = part.overrides
+            if part.oracle:
+                overrides = merged(overrides, {"prior": {"folder": str(_oracle(scene, out))}})
+            job = Job(scene, PRESET, folder, overrides=overrides)
             found[part.name].append(row_of(job, machine.load(), perform(job)))
             done += 1
             progress("runs", done, total)
     return {"rows": [_row(part, found[part.name]) for part in parts]}
+
+
+def _oracle(scene: BenchmarkScene, out: Path) -> Path:
+    """The scene's oracle, written once; without true ranges the job itself says what is missing."""
+    folder = out / "oracles" / scene.name.replace(", ", "_").replace(" ", "_")
+    if not (folder / CARD).is_file():
+        with suppress(AquaFlowError):
+            make_oracle(Path(scene.recording), folder, ORACLE_SIGMA, lambda *_: None)
+    return folder
 
 
 def _row(part: AblatedPart, runs: list[Row]) -> dict[str, Any]:
@@ -139,6 +194,10 @@ def _row(part: AblatedPart, runs: list[Row]) -> dict[str, Any]:
     return {
         "part": part.name,
         "psnr": mean([run["psnr"] for run in whole]),
+        "ssim": mean([run.get("ssim") for run in whole]),
+        "lpips": mean([run.get("lpips") for run in whole]),
+        "gaussians": mean([run.get("gaussians") for run in whole]),
+        "posed_pct": mean([_posed_pct(run) for run in whole]),
         "ate_pct": mean([run["ate_pct_sim3"] for run in whole]),
         "ms_per_frame": mean([run["ms_per_frame"]["total"] for run in whole]),
         "cpu_ms_per_frame": mean([_cpu_ms(run) for run in whole]),
@@ -146,6 +205,10 @@ def _row(part: AblatedPart, runs: list[Row]) -> dict[str, Any]:
         "built": part.built,
         "failed": failed,
     }
+
+
+def _posed_pct(run: Row) -> float | None:
+    return 100.0 * float(run["tracked"]) / max(run["frames"], 1) if "tracked" in run else None
 
 
 def _cpu_ms(run: Row) -> float | None:
@@ -156,6 +219,10 @@ def _cpu_ms(run: Row) -> float | None:
 
 SHOWN = (
     ("psnr", "PSNR dB", ".2f"),
+    ("ssim", "SSIM", ".3f"),
+    ("lpips", "LPIPS", ".3f"),
+    ("gaussians", "Gaussians", ".0f"),
+    ("posed_pct", "posed %", ".0f"),
     ("restored_psnr", "restored dB", ".2f"),
     ("ate_pct", "ATE %", ".3f"),
     ("ms_per_frame", "ms/frame", ".0f"),

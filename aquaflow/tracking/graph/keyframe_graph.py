@@ -37,7 +37,7 @@ class Correction:
     """Sub-maps that became part of another: from, into."""
 
 
-class Telemetry(Protocol):
+class Measurements(Protocol):
     """What else than links and loops takes part in an optimisation (``tracking/metric``)."""
 
     @property
@@ -95,13 +95,15 @@ class KeyframeGraph:
         places: Places,
         config: TrackingConfig,
         failures: Failures | None = None,
-        telemetry: Telemetry | None = None,
+        telemetry: Measurements | None = None,
         adjustments: Adjustments | None = None,
+        scales: Measurements | None = None,
     ) -> None:
-        """``telemetry`` takes part in the optimisations, once there is some; ``adjustments`` come
-        before them, and of all keyframes after those that closed loops."""
+        """``telemetry`` takes part in the optimisations, once there is some, and until then
+        ``scales``; ``adjustments`` come before them, and of all keyframes after those that closed
+        loops."""
         self.graph = PoseGraph(config.graph)
-        self._telemetry = telemetry
+        self._telemetry, self._scales = telemetry, scales
         self._failures = failures or Failures()
         self._keyframes, self._places, self._config = keyframes, places, config.graph
         self._adjustment_config = config.adjustment
@@ -158,10 +160,11 @@ class KeyframeGraph:
                 self._close_loops(keyframe)
         with self._failures.contain("place index", keyframe.frame_index):
             self._places.add(keyframe)
-        if self._telemetry is not None:
-            parent = None if link is None else link.keyframe
-            with self._failures.contain("metric frames", keyframe.frame_index):
-                self._due |= self._telemetry.keyframe(number, parent)
+        for measurements in (self._telemetry, self._scales):
+            if measurements is not None:
+                parent = None if link is None else link.keyframe
+                with self._failures.contain("metric frames", keyframe.frame_index):
+                    self._due |= measurements.keyframe(number, parent)
         self._optimise()
 
     def adjust_everything(self) -> None:
@@ -246,6 +249,8 @@ class KeyframeGraph:
         with_telemetry = self._telemetry is not None and self._telemetry.present
         if self._telemetry is not None and with_telemetry and self._due:
             optimise = self._telemetry.job(snapshot)
+        elif not with_telemetry and self._scales is not None and self._scales.present:
+            optimise = self._scales.job(snapshot)
         elif not with_telemetry:
             optimise = solve
         self._due = False

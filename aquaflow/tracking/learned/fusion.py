@@ -24,6 +24,7 @@ def add_learned(
     depth = learned_depth(pointmap, X, Q, known_sigma)
     if depth is not None:
         fuse_learned(pointmap, depth)
+        pointmap.learned_scale = (depth.log_scale, depth.log_scale_sigma)
     return depth
 
 
