@@ -26,21 +26,31 @@ RESIDENT_KEYFRAMES = 32
 adjustment takes, and some candidates of loop closures. About 5 MB each at 480 x 270 px."""
 
 
+@dataclass(frozen=True)
+class LearnedDepths:
+    """What a prior knows of a keyframe's depths without parallax, in the keyframe's unit."""
+
+    rho: Array
+    """[H, W] 1 / z; 0 where unknown."""
+    variance: Array
+    """[H, W] variance of ``rho``."""
+    log_scale: float
+    """Logarithm of the keyframe's unit over the prior's."""
+    log_scale_sigma: float
+
+
 @dataclass
 class Pointmap:
     """Inverse depth of every pixel with its variance, in the camera frame (paper: X_k^k with Q)."""
 
     camera: CameraModel
     rho: Array
-    """[H, W] 1 / z; 0 where unknown."""
+    """[H, W] 1 / z, triangulated; 0 where unknown."""
     variance: Array
     """[H, W] variance of ``rho``."""
     fused: int = 0
     """Frames whose depths were fused into it."""
-    learned: Mask | None = None
-    """[H, W] pixels whose depth is the prior's and was not triangulated yet; None: no pixel."""
-    learned_scale: tuple[float, float] | None = None
-    """Logarithm of this pointmap's unit over the prior's, and its standard deviation."""
+    learned: LearnedDepths | None = None
 
     @staticmethod
     def unknown(camera: CameraModel) -> Pointmap:
@@ -52,25 +62,22 @@ class Pointmap:
         self,
         relative_sigma: float,
     ) -> Mask:
-        """[H, W] pixels triangulated to better than ``relative_sigma``."""
-        known = self.known_or_learned(relative_sigma)
-        return known if self.learned is None else known & ~self.learned
-
-    def known_or_learned(
-        self,
-        relative_sigma: float,
-    ) -> Mask:
-        """[H, W] pixels whose inverse depth is known to better than ``relative_sigma``, by
-        whatever: errors of learned depths are alike in large parts of the picture."""
+        """[H, W] pixels whose inverse depth is known to better than ``relative_sigma``."""
         return (self.rho > 1e-6) & (self.variance < (relative_sigma * self.rho) ** 2)
 
-    def triangulated(
+    def completed(
         self,
-        rows: npt.NDArray[np.integer],  # [M]
-        columns: npt.NDArray[np.integer],  # [M]
-    ) -> Mask:
-        """[M] pixels whose depth, if they have one, is not the prior's."""
-        return np.ones(len(rows), bool) if self.learned is None else ~self.learned[rows, columns]
+        relative_sigma: float,
+    ) -> Pointmap:
+        """Itself, or a copy with the learned depths wherever it does not know its own to
+        ``relative_sigma``."""
+        learned = self.learned
+        if learned is None:
+            return self
+        instead = (learned.rho > 0.0) & ~self.known(relative_sigma)
+        rho = np.where(instead, learned.rho, self.rho)
+        variance = np.where(instead, learned.variance, self.variance)
+        return replace(self, rho=rho, variance=variance, learned=None)
 
     @property
     def Q(self) -> Array:
@@ -85,10 +92,8 @@ class Pointmap:
             return np.where(self.rho[..., None] > 1e-6, rays / self.rho[..., None], np.nan)
 
     def copy(self) -> Pointmap:
-        """With arrays of its own."""
-        learned = None if self.learned is None else self.learned.copy()
-        rho, variance = self.rho.copy(), self.variance.copy()
-        return replace(self, rho=rho, variance=variance, learned=learned)
+        """With arrays of its own; learned depths are never changed in place."""
+        return replace(self, rho=self.rho.copy(), variance=self.variance.copy())
 
 
 @dataclass(frozen=True)
@@ -259,9 +264,9 @@ class KeyframeStore:
         arrays: Arrays = {"rho": pointmap.rho, "variance": pointmap.variance}
         arrays["fused"] = np.array([pointmap.fused])
         if pointmap.learned is not None:
-            arrays["learned"] = pointmap.learned
-        if pointmap.learned_scale is not None:
-            arrays["learned_scale"] = np.array(pointmap.learned_scale)
+            learned = pointmap.learned
+            arrays["learned"] = np.stack([learned.rho, learned.variance]).astype(np.float32)
+            arrays["learned_scale"] = np.array([learned.log_scale, learned.log_scale_sigma])
         packed = self._prior.pack(content.encoding)
         return arrays | {f"encoding.{name}": array for name, array in packed.items()}
 
@@ -273,10 +278,7 @@ class KeyframeStore:
         assert self._prior is not None
         encoding_camera, pointmap_camera = self._cameras[number]
         rho, variance, fused = (arrays.pop(name) for name in ("rho", "variance", "fused"))
-        learned = arrays.pop("learned", None)
-        scale = arrays.pop("learned_scale", None)
-        learned_scale = None if scale is None else (float(scale[0]), float(scale[1]))
-        pointmap = Pointmap(pointmap_camera, rho, variance, int(fused[0]), learned, learned_scale)
+        pointmap = Pointmap(pointmap_camera, rho, variance, int(fused[0]), _learned(arrays))
         _set_writable(pointmap, False)
         packed = {name.removeprefix("encoding."): array for name, array in arrays.items()}
         return _Content(self._prior.unpack(packed, encoding_camera), pointmap)
@@ -286,5 +288,14 @@ def _set_writable(pointmap: Pointmap, writable: bool) -> None:
     """A change that would be lost with the file's next reading is refused by numpy."""
     pointmap.rho.setflags(write=writable)
     pointmap.variance.setflags(write=writable)
-    if pointmap.learned is not None:
-        pointmap.learned.setflags(write=writable)
+
+
+def _learned(
+    arrays: Arrays,  # as from _pack
+) -> LearnedDepths | None:
+    """What ``_pack`` wrote, taken out of ``arrays``; None for a pointmap without."""
+    if "learned" not in arrays:
+        return None
+    rho, variance = arrays.pop("learned").astype(np.float64)
+    log_scale, sigma = arrays.pop("learned_scale").tolist()
+    return LearnedDepths(rho, variance, log_scale, sigma)

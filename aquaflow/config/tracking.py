@@ -223,6 +223,11 @@ class LearnedConfig(Stage):
         description="the network's unit holds the map's where it drifts by more than the network "
         "errs, and no telemetry knows it",
     )
+    moving: bool = Field(
+        True,
+        description="regions whose triangulated depth the learned one contradicts move by "
+        "themselves and are kept from the map",
+    )
     start: bool = Field(
         True, description="a map starts at the second picture where ranges are certain enough"
     )

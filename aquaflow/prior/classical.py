@@ -24,6 +24,7 @@ class ClassicalPrior:
     name = "classical"
     ranged = False
     metric = False
+    unit_sigma = float("inf")
 
     def __init__(self) -> None:
         self._matcher = dense.FlowMatcher()

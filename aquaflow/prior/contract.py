@@ -116,6 +116,9 @@ class Prior(Protocol):
     """True if it knows pointmaps (X, Q) of single pictures or still cameras."""
     metric: bool
     """True if its pointmaps are in metres."""
+    unit_sigma: float
+    """Relative error of the unit of its pointmaps from one part of a dive to another; infinite
+    where each pair has a unit of its own."""
 
     def encode(
         self,

@@ -34,6 +34,9 @@ CELL_PX = 8
 MIDDLE = slice(CELL_PX // 2, None, CELL_PX)
 """Pixels next to the cells' centres."""
 
+METRIC_SIGMA = 0.1
+"""Relative error of the metre of the paper's network; assumed, its weights were never run here."""
+
 POINTS_ALPHA = 0.2
 """Metres: the reward of log Q in the loss that the paper's network was trained with."""
 
@@ -45,6 +48,9 @@ class CompactDescriber:
     """The compact network: descriptors of a picture's cells, whatever the other picture is."""
 
     metric = False
+    unit_sigma = float("inf")
+    """It was trained on pairs whose scale was taken out: where the scene is twice as far, its range
+    stays nearly the same (docs/measurements.md#learned-depth)."""
 
     def __init__(self, folder: Path, settings: RuntimeSettings) -> None:
         """Load the exported ``folder``.
@@ -155,6 +161,7 @@ class Mast3rDescriber:
     """The paper's network: descriptors of both pictures, after each has looked at the other."""
 
     metric = True
+    unit_sigma = METRIC_SIGMA
 
     def __init__(self, folder: Path, settings: RuntimeSettings) -> None:
         """Load the exported ``folder``; raises as the compact one."""

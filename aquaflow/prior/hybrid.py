@@ -60,6 +60,8 @@ class Describer(Protocol):
 
     name: str
     metric: bool
+    unit_sigma: float
+    """As of the prior."""
 
     def fitted(
         self,
@@ -171,6 +173,7 @@ class HybridPrior:
     def __init__(self, describer: Describer, learned_matches: bool = True) -> None:
         """Without ``learned_matches`` flow starts at keypoints where a prediction fails."""
         self.name, self.metric = describer.name, describer.metric
+        self.unit_sigma = describer.unit_sigma
         self._learned_matches = learned_matches
         self._describer = describer
         self._matcher = dense.FlowMatcher()

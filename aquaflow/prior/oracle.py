@@ -97,6 +97,8 @@ class OracleDescriber:
     """Looks pictures up; of one that it does not know, it says nothing."""
 
     name, metric = "oracle", False
+    unit_sigma = 0.0
+    """Its unit is the same in all pictures."""
 
     def __init__(self, folder: Path) -> None:
         """Load what :func:`write_oracle` wrote.

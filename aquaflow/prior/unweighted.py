@@ -33,6 +33,7 @@ class UnweightedPrior:
     def __init__(self, prior: Prior) -> None:
         self._prior = prior
         self.name, self.ranged, self.metric = prior.name, prior.ranged, prior.metric
+        self.unit_sigma = prior.unit_sigma
 
     def encode(
         self,

@@ -43,5 +43,8 @@ def _pointmap(pointmap: Pointmap, small: View) -> Pointmap:
     rows = slice(1, 2 * small.camera.height, 2)
     columns = slice(1, 2 * small.camera.width, 2)
     rho, variance = pointmap.rho[rows, columns], pointmap.variance[rows, columns]
-    learned = None if pointmap.learned is None else pointmap.learned[rows, columns].copy()
+    learned = pointmap.learned
+    if learned is not None:
+        half_rho, half_variance = learned.rho[rows, columns], learned.variance[rows, columns]
+        learned = replace(learned, rho=half_rho, variance=half_variance)
     return Pointmap(small.camera, rho.copy(), variance.copy(), learned=learned)

@@ -86,10 +86,12 @@ class Slam:
         adjustment = config.tracking.adjustment
         self.adjuster = Adjuster(self.keyframes, adjustment)
         """Joint adjustments of keyframes."""
+        unit_sigma = self.prior.unit_sigma
+        steady = config.tracking.learned.scale and unit_sigma < float("inf")
         self.graph = KeyframeGraph(
             self.keyframes, places, config.tracking, self.failures, self.metric,
             self.adjuster if adjustment.enabled else None,
-            LearnedScales(self.keyframes) if config.tracking.learned.scale else None,
+            LearnedScales(self.keyframes, unit_sigma) if steady else None,
         )  # fmt: skip
         self.renderer = select_renderer(config.mapping.renderer, config.threads or os.cpu_count())
         self.maps: MapWork = maps or Maps(config, self.renderer, self.profiler, work, self.failures)

@@ -79,6 +79,14 @@ class CurrentKeyframe:
         return Tracked(frame, frame_class, sub_map, number, self.T_wc, quality, pointmap, link=link)
 
 
+def only_where(
+    frame: Frame,
+    shown: Mask,  # [H, W]
+) -> Frame:
+    """The frame with its mask limited to ``shown``."""
+    return replace(frame, mask=shown if frame.mask is None else shown & frame.mask)
+
+
 class KeyframeTracker:
     """Tracks frames against keyframes and classifies them."""
 
@@ -162,13 +170,20 @@ class KeyframeTracker:
             return FrameClass.MAPPING
         return FrameClass.COMMON
 
-    def pointmap(self, at: CurrentKeyframe, solved: Matched, camera: CameraModel) -> Pointmap:
-        """The keyframe's depths in the frame's own pixels, and the prior's where it knows them."""
+    def pointmap(
+        self, at: CurrentKeyframe, solved: Matched, camera: CameraModel
+    ) -> tuple[Pointmap, Mask | None]:
+        """The keyframe's depths in the frame's own pixels, and the prior's where it knows them; and
+        the pixels [H, W] that move by themselves, if it can say."""
         pair, T_fk, pointmap = solved.pair, solved.estimate.T, at.keyframe.pointmap
         reliable = self.shown(at, solved, camera) if self.hidden(solved) else pair.valid_back
         own = transfer(pointmap, pair.matches_back, reliable, T_fk, camera)
-        add_learned(own, pair.X_b, pair.Q_b, self._config.known_sigma, self._config.learned)
-        return own
+        config, unit = self._config, None
+        if pointmap.learned is not None:
+            completed = pointmap.completed(config.known_sigma)
+            unit = transfer(completed, pair.matches_back, reliable, T_fk, camera)
+        learned = config.learned
+        return own, add_learned(own, pair.X_b, pair.Q_b, config.known_sigma, learned, unit)
 
     def shown(self, at: CurrentKeyframe, solved: Matched, camera: CameraModel) -> Mask:
         """[H, W] pixels of the frame that show what the keyframe shows."""
@@ -179,8 +194,7 @@ class KeyframeTracker:
         self, frame: Frame, at: CurrentKeyframe, solved: Matched, camera: CameraModel
     ) -> Frame:
         """The frame with its mask limited to pixels that the keyframe shows too."""
-        shown = self.shown(at, solved, camera)
-        return replace(frame, mask=shown if frame.mask is None else shown & frame.mask)
+        return only_where(frame, self.shown(at, solved, camera))
 
     def at_new_keyframe(
         self,

@@ -46,7 +46,7 @@ def depth_ratio(
     inside = ((pixels > 0.0) & (pixels < (camera.width, camera.height))).all(-1)
     X, (u, v) = X[inside], np.floor(pixels[inside]).astype(np.intp).T
     rho, variance = pointmap.rho[v, u], pointmap.variance[v, u]
-    known = (rho > 1e-6) & (variance < (known_sigma * rho) ** 2) & pointmap.triangulated(v, u)
+    known = (rho > 1e-6) & (variance < (known_sigma * rho) ** 2)
     if known.sum() < MIN_POINTS:
         return None
     logs = -np.log(X[known, 2] * rho[known])

@@ -74,7 +74,7 @@ class Repairs:
                 continue
             revisit = None
             if aside:
-                pointmap = tracker.pointmap(at, frame.solved, frame.camera)
+                pointmap, _ = tracker.pointmap(at, frame.solved, frame.camera)
                 revisit = revisited(at, frame.solved, back[0], back[1], pointmap)
                 tracker.neighbours.set_aside(at.keyframe)
             tracker.take_up(back[0])
@@ -94,10 +94,11 @@ def rescale(at: CurrentKeyframe, ratio: float) -> None:
     by 2 to 8 % within ten frames).
     """
     pointmap = at.keyframe.pointmap
-    known = pointmap.known_or_learned(1.0)
+    known = pointmap.known(1.0)
     pointmap.rho *= ratio
     pointmap.variance[known] *= ratio**2
     pointmap.fused = MOST_FUSED
+    pointmap.learned = None  # of the unit as it was
     at.T_fk = Sim3(at.T_fk.R, at.T_fk.t / ratio, at.T_fk.scale)
     at.motion = Sim3(at.motion.R, at.motion.t / ratio, at.motion.scale)
 

@@ -14,7 +14,7 @@ from aquaflow.keyframes import Keyframe, KeyframeStore
 from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, PairGeometry, Prior
 from aquaflow.tracking.consistency import ConsistencyMonitor
-from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
+from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker, only_where
 from aquaflow.tracking.frames import FrameClass, Link, Quality, Revisit, Tracked
 from aquaflow.tracking.initialisation.back_fill import BackFills
 from aquaflow.tracking.loops.relocaliser import Places
@@ -223,7 +223,7 @@ class Tracker:
         if pair[0] == pair[1] or pair in self._joined:
             return
         self._joined.add(pair)
-        pointmap = self._keyframe_tracker.pointmap(at, solved, camera)
+        pointmap, _ = self._keyframe_tracker.pointmap(at, solved, camera)
         revisit = revisited(at, solved, back, solved_back, pointmap)
         self.revisits += [] if revisit is None else [revisit]
 
@@ -313,7 +313,8 @@ class Tracker:
         self._solved = solved
         if frame_class is FrameClass.COMMON:
             return self._at.tracked(frame, frame_class, solved.quality)
-        pointmap = keyframe_tracker.pointmap(at, solved, camera)
+        pointmap, moves = keyframe_tracker.pointmap(at, solved, camera)
+        frame = frame if moves is None or not moves.any() else only_where(frame, ~moves)
         if frame_class is FrameClass.MAPPING:
             at.mapped_parallax_px = solved.parallax_px
             return at.tracked(frame, frame_class, solved.quality, pointmap.copy())

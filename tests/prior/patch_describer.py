@@ -21,6 +21,7 @@ class PatchDescriber:
 
     name = "patches"
     metric = False
+    unit_sigma = 0.2
 
     def __init__(self) -> None:
         self.asked = 0

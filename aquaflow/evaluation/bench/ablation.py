@@ -62,7 +62,11 @@ def _gate(**settings: object) -> dict[str, Any]:
 
 LEARNED: tuple[tuple[str, dict[str, Any], bool], ...] = (
     ("the compact prior", {"kind": "compact"}, False),
-    (f"an oracle of {100 * ORACLE_SIGMA:.0f} %", {"kind": "folder"}, True),
+    (
+        f"an oracle of {100 * ORACLE_SIGMA:.0f} %",
+        {"kind": "folder", "folder": "oracle of the scene"},
+        True,
+    ),
 )
 """Priors that know ranges: name, settings, and whether each scene needs one of its own."""
 WITHOUT: tuple[tuple[str, dict[str, Any]], ...] = (

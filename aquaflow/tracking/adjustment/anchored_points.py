@@ -53,8 +53,7 @@ class AnchoredPoints:
 
     def take_depths(self, pointmap: Pointmap) -> None:
         """The depths that the keyframe's pointmap has now."""
-        rho = pointmap.rho[self.rows, self.columns].astype(np.float32)
-        self.rho = np.where(pointmap.triangulated(self.rows, self.columns), rho, np.float32(0.0))
+        self.rho = pointmap.rho[self.rows, self.columns].astype(np.float32)
         self.variance = pointmap.variance[self.rows, self.columns].astype(np.float32)
 
     def see(

@@ -34,7 +34,7 @@ class _Placed:
     ) -> tuple[CurrentKeyframe, Sim3]:
         """The frame as a keyframe with the transferred depths, against which others are posed;
         T_fk."""
-        pointmap = keyframe_tracker.pointmap(self.at, self.solved, camera)
+        pointmap, _ = keyframe_tracker.pointmap(self.at, self.solved, camera)
         frame, sub_map = self.frame, self.at.keyframe.sub_map
         # In a store of its own: the dive's keyframes are others.
         keyframe = KeyframeStore().add(

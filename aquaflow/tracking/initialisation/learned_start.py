@@ -7,7 +7,7 @@ camera has moved.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
 from aquaflow.prior.contract import PairGeometry
-from aquaflow.tracking.learned.fusion import fuse_learned
 from aquaflow.tracking.learned.scaling import LearnedDepth, agreement, unscaled_depth
 from aquaflow.tracking.pose.problem import pose_problem
 from aquaflow.tracking.pose.solver import PoseEstimate, solve_pose
@@ -53,9 +52,7 @@ def learned_start(
     honest = unscaled_depth(camera, pair.X_a, pair.Q_a, max(honesty, 1.0))
     if honest is None or _sigma(honest) > config.learned.start_sigma:
         return None
-    pointmap = Pointmap.unknown(camera)
-    fuse_learned(pointmap, honest)
-    return LearnedStart(pointmap, estimate.T)
+    return LearnedStart(replace(Pointmap.unknown(camera), learned=honest.kept), estimate.T)
 
 
 def _sigma(depth: LearnedDepth) -> float:
@@ -76,8 +73,7 @@ def _posed(
         return None, 1.0
     step = -(-len(rows) // MATCHES)
     rows, columns = rows[::step], columns[::step]
-    pointmap = Pointmap.unknown(camera)
-    fuse_learned(pointmap, depth_a)
+    pointmap = replace(Pointmap.unknown(camera), learned=depth_a.kept).completed(1.0)
     pixels_a = np.stack([columns + 0.5, rows + 0.5], -1)
     pixels_b = pair.matches[rows, columns].astype(np.float64)
     weights = pair.C[rows, columns].astype(np.float64)

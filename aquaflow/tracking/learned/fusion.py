@@ -1,13 +1,12 @@
-"""Learned depths in a keyframe's pointmap, with those that were triangulated (paper: X and Q)."""
+"""What a prior knows of a keyframe's depths, kept with those that are triangulated."""
 
 from __future__ import annotations
 
-import numpy as np
-
 from aquaflow.config.tracking import LearnedConfig
-from aquaflow.keyframes import UNKNOWN_VARIANCE, Pointmap
-from aquaflow.prior.contract import Float
-from aquaflow.tracking.learned.scaling import LearnedDepth, learned_depth
+from aquaflow.keyframes import Pointmap
+from aquaflow.prior.contract import Float, Mask
+from aquaflow.tracking.learned.moving import moving
+from aquaflow.tracking.learned.scaling import learned_depth
 
 
 def add_learned(
@@ -16,27 +15,23 @@ def add_learned(
     Q: Float | None,  # [H, W] 1 / relative variance; 0 where unknown
     known_sigma: float,
     config: LearnedConfig,
-) -> LearnedDepth | None:
-    """Fuse what the prior knows of the picture into ``pointmap`` (in place); returns that in the
-    pointmap's unit. None, and no change, without ranges or a unit for them."""
+    unit: Pointmap | None = None,
+) -> Mask | None:
+    """Set what the prior knows of the picture in ``pointmap``; returns the pixels [H, W] that move
+    by themselves. None, and no change, without ranges or a unit for them.
+
+    The unit is that of the triangulated depths; where these are too few, because the camera only
+    turned, that of ``unit``, the depths that the keyframe before had learned.
+
+    Both are kept, and no mean is taken of them: the network's error is that of a whole part of the
+    picture, so that depths which are better one by one would all be moved the same way.
+    """
     if not config.depth or X is None or Q is None:
         return None
     depth = learned_depth(pointmap, X, Q, known_sigma)
-    if depth is not None:
-        fuse_learned(pointmap, depth)
-        pointmap.learned_scale = (depth.log_scale, depth.log_scale_sigma)
-    return depth
-
-
-def fuse_learned(pointmap: Pointmap, depth: LearnedDepth) -> None:
-    """Take the learned depth (in place) where none was triangulated, or with a larger variance.
-
-    No mean is taken of the two: the network's error is that of a whole part of the picture, so
-    that depths which are better one by one would all be moved the same way.
-    """
-    rho, variance = pointmap.rho, pointmap.variance
-    triangulated = (rho > 1e-6) & (variance < UNKNOWN_VARIANCE)
-    learned = np.where(depth.known, depth.variance, 0.0) * depth.rho**2
-    take = depth.known & (~triangulated | (learned < variance))
-    rho[take], variance[take] = depth.rho[take], learned[take]
-    pointmap.learned = take if pointmap.learned is None else pointmap.learned | take
+    if depth is None and unit is not None:
+        depth = learned_depth(unit, X, Q, known_sigma)
+    if depth is None:
+        return None
+    pointmap.learned = depth.kept
+    return moving(pointmap, depth) if config.moving else None

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.pixels import at_pixels
-from aquaflow.keyframes import Pointmap
+from aquaflow.keyframes import LearnedDepths, Pointmap
 from aquaflow.prior.contract import Float, Mask
 
 Array = npt.NDArray[np.float64]
@@ -60,6 +60,12 @@ class LearnedDepth:
         """[H, W]"""
         return self.rho > 0.0
 
+    @property
+    def kept(self) -> LearnedDepths:
+        """What a pointmap keeps of it."""
+        variance = np.where(self.known, self.variance, 0.0) * self.rho**2
+        return LearnedDepths(self.rho, variance, self.log_scale, self.log_scale_sigma)
+
 
 def learned_depth(
     pointmap: Pointmap,
@@ -68,12 +74,9 @@ def learned_depth(
     known_sigma: float,
 ) -> LearnedDepth | None:
     """The learned range in the unit of ``pointmap``, by the pixels that it knows to better than
-    ``known_sigma``: those triangulated, else those learned before, where the camera only turned;
-    None if they are too few."""
+    ``known_sigma``; None if they are too few."""
     learned = _learned(X, Q)
     rows, columns = np.nonzero(learned & pointmap.known(known_sigma))
-    if len(rows) < LEAST_COMMON:
-        rows, columns = np.nonzero(learned & pointmap.known_or_learned(known_sigma))
     if len(rows) < LEAST_COMMON:
         return None
     step = -(-len(rows) // COMPARED)

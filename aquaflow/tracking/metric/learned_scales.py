@@ -1,7 +1,8 @@
 """A learned prior against drift of scale: its unit is the same from the first picture to the last.
 
 The unit of a keyframe's depths drifts along a dive by a little at every link. A network errs by
-much more, but by as much in the last picture as in the first. So what it says of the unit of every
+much more, but one whose unit is the same everywhere by as much in the last picture as in the first.
+So what it says of the unit of every
 keyframe is an edge to a world whose unit is the network's (``world_edges``), with the error that
 the differences between keyframes a few links apart show. Only a drift beyond that error moves
 anything; where telemetry knows the scale, the network is not asked.
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import hypot
 
 import numpy as np
 import numpy.typing as npt
@@ -66,9 +68,10 @@ class _Scales:
 class LearnedScales:
     """Takes part in the graph's optimisations, as telemetry does."""
 
-    def __init__(self, keyframes: KeyframeStore) -> None:
-        """Of keyframes whose pointmaps say what the network's unit is."""
-        self._keyframes = keyframes
+    def __init__(self, keyframes: KeyframeStore, unit_sigma: float) -> None:
+        """Of keyframes whose pointmaps say what the network's unit is; ``unit_sigma`` is what that
+        may differ by from one part of a dive to another (`Prior.unit_sigma`)."""
+        self._keyframes, self._unit_sigma = keyframes, unit_sigma
         self._known: dict[int, tuple[float, float]] = {}
         """By keyframe: logarithm of its unit over the network's, and 1 sigma."""
         self._since = 0
@@ -80,9 +83,9 @@ class LearnedScales:
 
     def keyframe(self, number: int, parent: int | None) -> bool:
         """A new keyframe; True if it is time to look at the scales."""
-        found = self._keyframes[number].pointmap.learned_scale
+        found = self._keyframes[number].pointmap.learned
         if found is not None:
-            self._known[number] = found
+            self._known[number] = found.log_scale, found.log_scale_sigma
         self._since += 1
         if self._since < EVERY or not self.present:
             return False
@@ -91,7 +94,7 @@ class LearnedScales:
 
     def job(self, snapshot: Snapshot) -> Callable[[Snapshot], GraphResult]:
         """The optimisation of a snapshot with the scales, to be called in any thread."""
-        known = dict(self._known)
+        known = {n: (log, hypot(s, self._unit_sigma)) for n, (log, s) in self._known.items()}
         return lambda better: solve_with_worlds(better, worlds_of(better, known))[0]
 
     def applied(self) -> None:

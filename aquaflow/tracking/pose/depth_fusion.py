@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import numpy.typing as npt
 
@@ -52,9 +50,6 @@ def fuse(
 ) -> float:
     """Inverse-variance fusion of the pair's triangulated depths into ``pointmap`` (in place).
 
-    A learned depth is replaced by the first triangulated one that is better: its error is that of
-    the whole neighbourhood, which a mean would keep (docs/measurements.md#learned-depth).
-
     Returns the share of the picture that got a usable measurement; 0 for a pointmap that has had
     enough of them.
     """
@@ -71,8 +66,6 @@ def fuse(
     fresh = (old_variance >= UNKNOWN_VARIANCE) | (
         old_variance > (FORGETTING_VARIANCE_SIGMAS * old_rho) ** 2
     )
-    learned = ~pointmap.triangulated(rows, columns)
-    fresh |= learned
     expected = np.where(fresh, 0.0, old_rho)
     new = triangulate(rays, matched, T_ba, camera_b, sigma_px, expected)
     confidence = np.maximum(pair.C[rows, columns].astype(np.float64), LEAST_CONFIDENCE)
@@ -88,13 +81,11 @@ def fuse(
     merged_variance = np.maximum(merged_variance, (FUSED_FLOOR * merged) ** 2)
 
     sound = new.good & np.isfinite(merged) & np.isfinite(merged_variance)
-    use = sound & agrees & (~learned | (merged_variance < old_variance))
+    use = sound & agrees
     distrust = sound & ~agrees
     pointmap.rho[rows, columns] = np.where(use, merged, old_rho)
     kept = np.where(distrust, old_variance * DISAGREEMENT_INFLATION, old_variance)
     pointmap.variance[rows, columns] = np.where(use, merged_variance, kept)
-    if pointmap.learned is not None:
-        pointmap.learned[rows[use], columns[use]] = False
     return float(new.good.sum()) / camera.width / camera.height
 
 
@@ -107,7 +98,7 @@ def transfer(
 ) -> Pointmap:
     """The pointmap seen from b: every reliable pixel of b takes the depth of its match in a."""
     source = source_pixels[reliable].astype(np.float64)
-    rho_a, variance_a, learned = _source(pointmap, source)
+    rho_a, variance_a = _interpolated(pointmap, source)
     known = rho_a > 1e-6
     rays = pointmap.camera.unproject(source)
     depth_b = T_ba.apply(rays / np.where(known, rho_a, 1.0)[:, None])[:, 2]
@@ -118,25 +109,7 @@ def transfer(
     moved = Pointmap.unknown(camera_b)
     moved.rho[reliable] = rho_b
     moved.variance[reliable] = np.where(seen, variance_a * gain, UNKNOWN_VARIANCE)
-    if learned is not None:
-        moved.learned = np.zeros(moved.rho.shape, bool)
-        moved.learned[reliable] = learned & seen
     return moved
-
-
-def _source(
-    pointmap: Pointmap,
-    pixels: Array,  # [M, 2] px
-) -> tuple[Array, Array, npt.NDArray[np.bool_] | None]:
-    """Inverse depth [M] at ``pixels`` and its variance, 0 where unknown, and where it is learned:
-    where no triangulated depth is around; None where none is."""
-    if pointmap.learned is None:
-        return (*_interpolated(pointmap, pixels), None)
-    triangulated = replace(pointmap, rho=np.where(pointmap.learned, 0.0, pointmap.rho))
-    rho, variance = _interpolated(triangulated, pixels)
-    any_rho, any_variance = _interpolated(pointmap, pixels)
-    learned = (rho <= 1e-6) & (any_rho > 1e-6)
-    return np.where(learned, any_rho, rho), np.where(learned, any_variance, variance), learned
 
 
 def _interpolated(

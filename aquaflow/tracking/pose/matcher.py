@@ -10,7 +10,7 @@ import numpy.typing as npt
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes import Keyframe
+from aquaflow.keyframes import Keyframe, Pointmap
 from aquaflow.prior.contract import Encoding, Float, Mask, PairGeometry
 from aquaflow.tracking.frames import Quality
 from aquaflow.tracking.learned.own_points import own_points
@@ -36,7 +36,7 @@ class Matched:
     """[M, 3] of the keyframe that the pose was solved from."""
     visibility: Visibility
     known_share: float
-    """Of the matches, those whose depth is known."""
+    """Of the matches, those whose depth is triangulated."""
 
     @property
     def support(self) -> float:
@@ -74,9 +74,9 @@ class KeyframeMatcher:
     ) -> Matched | None:
         """The pose from ``predicted``; from the matches alone, or from ``fallback``, where that
         fails; None where too few matches support one."""
-        config = self._config
-        around, known = self._depths(keyframe, pair)
-        problem, pixels_k = self._problem(keyframe, pair, camera, around, known)
+        config, pointmap = self._config, self._depths(keyframe.pointmap, pair)
+        around, known = surroundings(pointmap, config.known_sigma)
+        problem, pixels_k = self._problem(pointmap, pair, camera, around, known)
         if len(problem.points) < config.min_matches:
             return None
         estimate = self._solve(problem, predicted)
@@ -88,24 +88,32 @@ class KeyframeMatcher:
         if share * estimate.inlier_share < config.min_support:
             return None
         displacement = np.linalg.norm(problem.pixels - pixels_k, axis=1)
-        looked_at = keyframe.encoding.interesting & known
+        # What is hidden shows against depths that are right: learned ones put points elsewhere.
+        triangulated = keyframe.pointmap
+        exact = known if pointmap is triangulated else triangulated.known(config.known_sigma)
         visible = visibility(
-            keyframe.pointmap, looked_at, pair.matches, pair.valid, estimate.T, camera
+            triangulated,
+            keyframe.encoding.interesting & exact,
+            pair.matches,
+            pair.valid,
+            estimate.T,
+            camera,
         )
         parallax_px = float(displacement.mean())
-        known_share = float((pair.valid & known).sum() / max(pair.valid.sum(), 1))
+        known_share = float((pair.valid & exact).sum() / max(pair.valid.sum(), 1))
         return Matched(estimate, pair, share, parallax_px, problem.points, visible, known_share)
 
-    def _depths(self, keyframe: Keyframe, pair: PairGeometry) -> tuple[Float, Mask]:
-        """Inverse depth around every pixel [H, W], and the pixels [H, W] that poses are solved
-        from. Learned depths, whose errors are alike, take part where few others are matched."""
-        config, pointmap = self._config, keyframe.pointmap
-        triangulated = surroundings(pointmap, config.known_sigma)
+    def _depths(self, pointmap: Pointmap, pair: PairGeometry) -> Pointmap:
+        """The depths that poses are solved from: triangulated ones, and learned ones only where few
+        of the matches have others. A network's error is that of whole parts of a picture."""
         if pointmap.learned is None:
-            return triangulated
-        every = surroundings(pointmap, config.known_sigma, learned=True)
-        enough = config.learned.least_triangulated * (pair.valid & every[1]).sum()
-        return triangulated if (pair.valid & triangulated[1]).sum() >= enough else every
+            return pointmap
+        config = self._config
+        completed = pointmap.completed(config.known_sigma)
+        triangulated = (pair.valid & pointmap.known(config.known_sigma)).sum()
+        every = (pair.valid & completed.known(config.known_sigma)).sum()
+        few = triangulated < config.learned.least_triangulated * every
+        return completed if few else pointmap
 
     def _solve(self, problem: PoseProblem, initial: Sim3) -> PoseEstimate | None:
         """By the residual that was asked for; between pictures whose own points have no common unit
@@ -117,7 +125,7 @@ class KeyframeMatcher:
 
     def _problem(
         self,
-        keyframe: Keyframe,
+        pointmap: Pointmap,
         pair: PairGeometry,
         camera: CameraModel,
         around: Float,  # [H, W]
@@ -131,12 +139,12 @@ class KeyframeMatcher:
         pixels = pair.matches[rows, columns].astype(np.float64)
         weights = pair.C[rows, columns].astype(np.float64)
         sigma_px = self._config.sigma_px
-        problem = pose_problem(keyframe.pointmap, pixels_k, pixels, camera, sigma_px, weights)
+        problem = pose_problem(pointmap, pixels_k, pixels, camera, sigma_px, weights)
         around_rho = around[rows, columns].astype(np.float64)
         problem = replace(problem, around_rho=around_rho)
         if self._config.residual == "point":
             known_sigma = self._config.known_sigma
-            own = own_points(keyframe.pointmap, pair, pixels, camera, known_sigma)
+            own = own_points(pointmap, pair, pixels, camera, known_sigma)
             if own is not None:
                 problem = replace(
                     problem, frame_points=own.points, frame_rho_variance=own.rho_variance

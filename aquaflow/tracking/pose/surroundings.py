@@ -32,20 +32,11 @@ LEAST_CELLS = 2.5
 def surroundings(
     pointmap: Pointmap,
     relative_sigma: float,
-    learned: bool = False,
 ) -> tuple[Float, Mask]:
     """Inverse depth around every pixel, [H, W]; and the pixels, [H, W], whose own is known to
-    better than ``relative_sigma`` of that. Where nothing is known around, it is the pixel's own.
-
-    With ``learned``, depths that were not triangulated count too.
-    """
-    rho, variance = pointmap.rho, pointmap.variance
-    if learned or pointmap.learned is None:
-        good = pointmap.known_or_learned(relative_sigma)
-        around = _mean_around(rho.astype(np.float32), good)
-        return around, (rho > 1e-6) & (variance < (relative_sigma * around) ** 2)
-    around = _mean_around(rho.astype(np.float32), pointmap.known(relative_sigma))
-    known = (rho > 1e-6) & (variance < (relative_sigma * around) ** 2) & ~pointmap.learned
+    better than ``relative_sigma`` of that. Where nothing is known around, it is the pixel's own."""
+    around = _mean_around(pointmap.rho.astype(np.float32), pointmap.known(relative_sigma))
+    known = (pointmap.rho > 1e-6) & (pointmap.variance < (relative_sigma * around) ** 2)
     return around, known
 
 

@@ -21,6 +21,7 @@ from aquaflow.evaluation.bench.scene import BenchmarkScene, scene_at
 from aquaflow.evaluation.bench.summary import ATE_PCT, PSNR, lines_of
 from aquaflow.evaluation.bench.table import failures, markdown
 from aquaflow.evaluation.water_peers.contract import NAMES
+from aquaflow.prior.folder import CARD
 from tests.command_line import run_aquaflow
 
 REEF, WALL = BenchmarkScene("reef", "/reef", refine_share=0.1), BenchmarkScene("wall", "/wall")
@@ -150,9 +151,39 @@ def test_ablation_has_a_row_for_every_part_built_or_not(tmp_path: Path) -> None:
     for row in rows.values():
         assert {"part", "psnr", "ate_pct", "ms_per_frame", "built"} <= set(row)
         assert (row["psnr"] is not None) == row["built"]
-    assert not rows["without learned prior"]["built"]
+    assert not rows["skip off: retrieval only at keyframes"]["built"]
     for part in ("distance embedding", "an MLP instead of LGPD"):
         assert any(part in name and row["built"] for name, row in rows.items())
+
+
+def test_rows_are_chosen_by_a_word_of_their_name() -> None:
+    chosen = [part.name for part in ablation.parts_called(["joint adjustment", "overlays"])]
+    assert chosen == ["full", "without masking of overlays", "without joint adjustment"]
+    assert ablation.parts_called([]) == list(ablation.PARTS)
+    with pytest.raises(InputError, match="no part is called 'magic'"):
+        ablation.parts_called(["overlays", "magic"])
+
+
+def test_an_oracle_is_written_once_for_each_scene(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written, folders = [], []
+
+    def write(recording: Path, folder: Path, sigma: float, _: object) -> None:
+        folder.mkdir(parents=True)
+        (folder / CARD).write_text("{}")
+        written.append((recording, sigma))
+
+    def noted(job: Job) -> dict[str, object]:
+        folders.append(job.config().prior.folder)
+        return pretended(job)
+
+    monkeypatch.setattr(ablation, "make_oracle", write)
+    parts = [part for part in ablation.PARTS if part.oracle][:2]
+    ablation.ablate([REEF], tmp_path, quiet, parts, noted)
+    assert written == [(Path(REEF.recording), ablation.ORACLE_SIGMA)]
+    assert folders[0] == folders[1]
+    assert (folders[0] / CARD).is_file()
 
 
 def test_every_part_that_is_built_changes_the_config() -> None:

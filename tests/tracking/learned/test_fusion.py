@@ -8,10 +8,9 @@ import pytest
 from aquaflow.config import TrackingConfig
 from aquaflow.config.tracking import LearnedConfig
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
-from aquaflow.tracking.learned.fusion import add_learned, fuse_learned
-from aquaflow.tracking.learned.scaling import LearnedDepth
-from aquaflow.tracking.pose.depth_fusion import fuse, transfer
+from aquaflow.keyframes import UNKNOWN_VARIANCE, Keyframe, KeyframeStore, Pointmap
+from aquaflow.tracking.learned.fusion import add_learned
+from aquaflow.tracking.pose.depth_fusion import fuse
 from aquaflow.tracking.pose.matcher import KeyframeMatcher
 from tests.tracking.learned.learned_scenes import KNOWN_SIGMA, TRUTH, measured, network
 from tests.tracking.tracking_scenes import CAMERA, KnownPair, KnownView, pose
@@ -36,26 +35,24 @@ def keyframe(pointmap: Pointmap) -> Keyframe:
     return KeyframeStore().add(0, 0, view, Sim3.identity(), pointmap, 0)
 
 
-def test_what_was_not_triangulated_gets_the_learned_depth() -> None:
+def test_what_was_not_triangulated_is_completed_by_the_learned_depth() -> None:
     pointmap = filled()
-    assert pointmap.learned is not None
-    assert pointmap.learned[:, HALF:].all()
-    assert not pointmap.learned[:, :HALF].any()
-    np.testing.assert_array_equal(pointmap.rho[:, :HALF], 1.0 / TRUTH[:, :HALF])
-    error = np.abs(np.log(pointmap.rho * TRUTH))[:, HALF:]
+    np.testing.assert_array_equal(pointmap.rho, measured().rho)
+    whole = pointmap.completed(KNOWN_SIGMA)
+    np.testing.assert_array_equal(whole.rho[:, :HALF], 1.0 / TRUTH[:, :HALF])
+    error = np.abs(np.log(whole.rho * TRUTH))[:, HALF:]
     assert np.median(error) < 0.08
-    assert pointmap.known_or_learned(KNOWN_SIGMA).mean() > 0.9
+    assert whole.known(KNOWN_SIGMA).mean() > 0.9
     assert not pointmap.known(KNOWN_SIGMA)[:, HALF:].any()
 
 
-def test_of_a_bad_triangulation_the_learned_depth_takes_the_place() -> None:
-    pointmap = filled(sigma=0.01)
-    worse = measured(share=1.0, sigma=0.12)
-    fuse_learned(worse, LearnedDepth(1.0 / TRUTH, np.full(TRUTH.shape, 0.05**2), 0.0, 0.0, 1.0))
-    assert worse.learned is not None
-    assert worse.learned.all()
+def test_a_triangulation_that_is_not_good_enough_is_completed_and_not_lost() -> None:
+    pointmap = filled(share=0.5)
+    pointmap.variance[:, :HALF] = (0.3 * pointmap.rho[:, :HALF]) ** 2
+    whole = pointmap.completed(KNOWN_SIGMA)
     assert pointmap.learned is not None
-    assert not pointmap.learned[:, :HALF].any()
+    np.testing.assert_array_equal(whole.rho, pointmap.learned.rho)
+    np.testing.assert_array_equal(pointmap.rho[:, :HALF], 1.0 / TRUTH[:, :HALF])
 
 
 @pytest.mark.parametrize("config", [LearnedConfig(depth=False), LearnedConfig()])
@@ -64,26 +61,15 @@ def test_nothing_changes_without_ranges_or_where_they_are_not_wanted(config: Lea
     given = (None, None) if config.depth else (X, Q)
     assert add_learned(pointmap, *given, KNOWN_SIGMA, config) is None
     assert pointmap.learned is None
-    np.testing.assert_array_equal(pointmap.rho, measured().rho)
+    assert pointmap.completed(KNOWN_SIGMA) is pointmap
 
 
-def test_triangulation_replaces_a_learned_depth_and_takes_no_mean() -> None:
-    pointmap = filled()
-    fuse(pointmap, pair(), MOVED, CAMERA, 0.2)
-    assert pointmap.learned is not None
-    now = ~pointmap.learned
-    now[:, :HALF] = False
-    assert now.sum() > 0.5 * HALF * CAMERA.height
-    assert np.median(np.abs(np.log(pointmap.rho * TRUTH))[now]) < 0.02
-
-
-def test_a_learned_depth_stays_where_triangulation_is_worse() -> None:
-    """Of a step of a thousandth of the depth."""
-    short = pose((0.0, 0.0, 0.0), (0.0015, 0.0, 0.0))
-    pointmap = filled()
-    fuse(pointmap, pair(short), short, CAMERA, 0.2)
-    assert pointmap.learned is not None
-    assert pointmap.learned[:, HALF:].mean() > 0.95
+def test_triangulation_does_not_see_what_was_learned() -> None:
+    pointmap, alone = filled(), measured()
+    for each in (pointmap, alone):
+        fuse(each, pair(), MOVED, CAMERA, 0.2)
+    np.testing.assert_array_equal(pointmap.rho, alone.rho)
+    np.testing.assert_array_equal(pointmap.variance, alone.variance)
 
 
 def test_poses_are_solved_from_triangulated_depths_where_there_are_enough() -> None:
@@ -100,7 +86,7 @@ def test_poses_are_solved_from_triangulated_depths_where_there_are_enough() -> N
 
 def test_poses_are_solved_from_learned_depths_where_nothing_else_is_known() -> None:
     pointmap = filled()
-    pointmap.learned = pointmap.rho > 0.0
+    pointmap.rho[:], pointmap.variance[:] = 0.0, UNKNOWN_VARIANCE
     found = matched(pointmap, pair())
     assert found is not None
     assert np.linalg.norm(found.estimate.T.t - MOVED.t) < 0.02 * np.linalg.norm(MOVED.t) + 0.01
@@ -111,16 +97,14 @@ def matched(pointmap: Pointmap, seen: KnownPair):  # type: ignore[no-untyped-def
     return KeyframeMatcher(TrackingConfig()).pose(keyframe(pointmap), CAMERA, seen, start, start)
 
 
-def test_the_next_keyframe_knows_which_depths_were_learned() -> None:
-    pointmap, seen = filled(), pair()
-    moved = transfer(pointmap, seen.matches_back, seen.valid_back, MOVED, CAMERA)
-    assert moved.learned is not None
-    assert moved.learned.any()
-    assert (~moved.learned & (moved.rho > 0.0)).any()
-    plain = transfer(measured(), seen.matches_back, seen.valid_back, MOVED, CAMERA)
-    assert plain.learned is None
-    both = (plain.rho > 0.0) & ~moved.learned
-    np.testing.assert_allclose(moved.rho[both], plain.rho[both])
+def test_where_the_camera_only_turned_the_unit_is_that_of_what_was_learned_before() -> None:
+    before, X, Q = filled(), *network(unit=5.0)
+    now = Pointmap.unknown(CAMERA)
+    assert add_learned(now, X, Q, KNOWN_SIGMA, LearnedConfig()) is None
+    unit = before.completed(KNOWN_SIGMA)
+    assert add_learned(now, X, Q, KNOWN_SIGMA, LearnedConfig(), unit) is not None
+    assert now.learned is not None
+    assert np.median(np.abs(np.log(now.learned.rho * TRUTH))) < 0.08
 
 
 def test_a_pointmap_comes_back_from_its_file_with_what_was_learned(tmp_path) -> None:  # type: ignore[no-untyped-def]
@@ -136,5 +120,7 @@ def test_a_pointmap_comes_back_from_its_file_with_what_was_learned(tmp_path) -> 
     found = store[0].pointmap
     assert found.learned is not None
     assert kept.learned is not None
-    np.testing.assert_array_equal(found.learned, kept.learned)
+    np.testing.assert_allclose(found.learned.rho, kept.learned.rho, rtol=1e-6)
+    np.testing.assert_allclose(found.learned.variance, kept.learned.variance, rtol=1e-6)
+    assert found.learned.log_scale == kept.learned.log_scale
     np.testing.assert_array_equal(found.rho, kept.rho)

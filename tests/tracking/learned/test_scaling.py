@@ -63,15 +63,6 @@ def test_too_few_common_pixels_give_no_unit() -> None:
     assert learned_depth(pointmap, *network(), KNOWN_SIGMA) is None
 
 
-def test_where_nothing_is_triangulated_depths_learned_before_give_the_unit() -> None:
-    """The camera only turned since the first pictures: their unit goes on."""
-    pointmap = measured()
-    pointmap.learned = pointmap.rho > 0.0
-    found = learned_depth(pointmap, *network(), KNOWN_SIGMA)
-    assert found is not None
-    assert found.log_scale == pytest.approx(-np.log(3.0), abs=0.05)
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0, 0.0])
 def test_pixels_without_a_sound_point_stay_unknown(bad: float) -> None:
     X, Q = network()

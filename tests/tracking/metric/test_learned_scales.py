@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes import KeyframeStore, Pointmap
+from aquaflow.keyframes import KeyframeStore, LearnedDepths, Pointmap
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph
 from aquaflow.tracking.metric.learned_scales import (
     EVERY,
@@ -46,7 +46,7 @@ def scales(graph: PoseGraph) -> np.ndarray:
 def solved(graph: PoseGraph, known: dict[int, tuple[float, float]]) -> bool:
     """True if the scales took part."""
     store = KeyframeStore()
-    learned = LearnedScales(store)
+    learned = LearnedScales(store, 0.0)
     learned._known = known
     snapshot = graph.snapshot()
     graph.apply(learned.job(snapshot)(snapshot))
@@ -91,10 +91,11 @@ def test_components_that_never_met_are_looked_at_one_by_one() -> None:
 
 def test_it_is_asked_for_every_few_keyframes_once_there_are_enough() -> None:
     store = KeyframeStore()
-    learned, due = LearnedScales(store), []
+    learned, due = LearnedScales(store, 0.0), []
     for k in range(LEAST_KEYFRAMES + EVERY + 1):
         pointmap = Pointmap.unknown(CAMERA)
-        pointmap.learned_scale = (0.1, 0.02) if k else None
+        nothing = np.zeros((CAMERA.height, CAMERA.width))
+        pointmap.learned = LearnedDepths(nothing, nothing, 0.1, 0.02) if k else None
         view = KnownView(CAMERA, Sim3.identity(), np.ones((CAMERA.height, CAMERA.width)))
         store.add(k, 0, view, Sim3.identity(), pointmap, 0)
         due.append(learned.keyframe(k, None))
@@ -104,7 +105,7 @@ def test_it_is_asked_for_every_few_keyframes_once_there_are_enough() -> None:
 
 def test_keyframes_of_a_prior_without_ranges_have_no_scale() -> None:
     store = KeyframeStore()
-    learned = LearnedScales(store)
+    learned = LearnedScales(store, 0.0)
     for k in range(2 * LEAST_KEYFRAMES):
         view = KnownView(CAMERA, Sim3.identity(), np.ones((CAMERA.height, CAMERA.width)))
         store.add(k, 0, view, Sim3.identity(), Pointmap.unknown(CAMERA), 0)
