@@ -1,4 +1,4 @@
-"""The commands of the two-view prior: export, verify, bench, train. Thin, like all of cli/."""
+"""The commands of the two-view prior, thin like all of cli/."""
 
 from __future__ import annotations
 
@@ -40,12 +40,13 @@ class Exported(str, Enum):
 def register(app: typer.Typer) -> None:
     """Add the commands to ``app``."""
     prior = typer.Typer(
-        help="The two-view prior: export, verify, bench, train.", no_args_is_help=True
+        help="The two-view prior: export, verify, bench, compare, train.", no_args_is_help=True
     )
     prior.command()(export)
     prior.command()(verify)
     prior.command()(bench)
     prior.command()(oracle)
+    prior.command()(compare)
     train = typer.Typer(help="Train a network.", no_args_is_help=True)
     train.command("mast3r")(train_mast3r)
     train.command("compact")(train_compact)
@@ -137,6 +138,41 @@ def bench(
         typer.echo(json.dumps(result))
     else:
         print_result(result, table_console())
+
+
+def compare(
+    pictures: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder of pictures to warp and match; may be repeated."),
+    ] = None,
+    clip: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder of a clip with poses_sfm.tum and camera.yaml; may be repeated."),
+    ] = None,
+    pairs: Annotated[int, typer.Option(min=1, help="Of each kind.")] = 16,
+    pool: Annotated[
+        Path | None, typer.Option(help="Keep generated scenes in this folder, for the next time.")
+    ] = None,
+    device: Annotated[str, typer.Option(help="auto | cpu | cuda")] = "cpu",
+    as_json: Json = False,
+) -> None:
+    """Priors and keypoint networks of others on the same pairs: how right, and at what cost."""
+    import torch
+
+    from aquaflow.evaluation.prior_bench.benchmark import pictures_in
+    from aquaflow.evaluation.prior_bench.comparison import compare as compared
+    from aquaflow.evaluation.prior_bench.comparison import methods_here, pairs_of
+    from aquaflow.evaluation.prior_bench.table import print_comparison
+
+    torch.set_num_threads(1)
+    seen = [picture for folder in pictures or [] for picture in pictures_in(folder)]
+    with progress_bars(as_json) as advance:
+        known = pairs_of(seen, clip or [], pairs, pool)
+        result = compared(methods_here(device), known, advance)
+    if as_json:
+        typer.echo(json.dumps(result))
+    else:
+        print_comparison(result, table_console())
 
 
 def train_mast3r(

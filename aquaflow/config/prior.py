@@ -13,11 +13,12 @@ from aquaflow.config.stage import Stage
 class PriorConfig(Stage):
     """Which prior tracks, and where its network runs (paper, Sec. 3.1)."""
 
-    kind: Literal["compact", "classical", "folder"] = Field(
+    kind: Literal["compact", "classical", "folder", "xfeat", "aliked"] = Field(
         "classical",
         description="compact: learned coarse matches, refined by flow; without its weights or "
         "onnxruntime, classical replaces it, with a warning. classical: SIFT homography and flow, "
-        "no network. folder: the exported prior in `folder`, or an error",
+        "no network. folder: the exported prior in `folder`, or an error. xfeat, aliked: flow from "
+        "the matches of XFeat or of ALIKED and LightGlue, which are installed apart, or an error",
     )
     folder: Path | None = Field(
         None,

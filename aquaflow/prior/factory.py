@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 from aquaflow.config.prior import PriorConfig
 from aquaflow.cores import core_count
@@ -13,6 +14,12 @@ from aquaflow.prior.contract import Prior
 from aquaflow.prior.folder import CARD
 from aquaflow.prior.runtime import RuntimeSettings
 from aquaflow.prior.unweighted import UnweightedPrior
+
+if TYPE_CHECKING:
+    from aquaflow.prior.keypoint_networks.network import KeypointNetwork
+
+NetworkKind = Literal["xfeat", "aliked"]
+"""Networks of others, by their kind of prior."""
 
 log = logging.getLogger(__name__)
 
@@ -25,7 +32,7 @@ def make_prior(config: PriorConfig) -> Prior:
 
     Raises:
         InputError: the asked-for folder is no prior, or a file in it was changed.
-        AquaFlowError: the processor asked for is not there.
+        AquaFlowError: the processor asked for, or a keypoint network's package, is not there.
     """
     prior = _chosen(config)
     return prior if config.confidence else UnweightedPrior(prior)
@@ -34,6 +41,11 @@ def make_prior(config: PriorConfig) -> Prior:
 def _chosen(config: PriorConfig) -> Prior:
     if config.kind == "classical":
         return ClassicalPrior()
+    if config.kind in ("xfeat", "aliked"):
+        from aquaflow.prior.keypoint_networks.keypoint_prior import KeypointPrior
+
+        network = keypoint_network(config.kind, config.device)
+        return KeypointPrior(network, config.learned_matches)
     folder = config.folder or SHIPPED
     missing = _missing(folder) if config.kind == "compact" else None
     if missing is not None:
@@ -46,6 +58,21 @@ def _chosen(config: PriorConfig) -> Prior:
         config.device, config.precision, min(config.threads, core_count()), config.engine_cache
     )
     return HybridPrior(describer_in(folder, settings), config.learned_matches)
+
+
+def keypoint_network(kind: NetworkKind, device: str) -> KeypointNetwork:
+    """A network of others; their packages are imported here and nowhere else.
+
+    Raises:
+        AquaFlowError: a package or the device is not there.
+    """
+    if kind == "xfeat":
+        from aquaflow.prior.keypoint_networks.xfeat import XFeat
+
+        return XFeat(device)
+    from aquaflow.prior.keypoint_networks.aliked import AlikedLightGlue
+
+    return AlikedLightGlue(device)
 
 
 def _missing(folder: Path) -> str | None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from aquaflow.errors import InputError, reason_of
 from aquaflow.evaluation.bench.summary import NOTES
-from aquaflow.evaluation.bench.table import failures, markdown
+from aquaflow.evaluation.bench.table import failures, features, markdown
 from aquaflow.storage.atomic import atomic_write
 
 BEGIN, END = "<!-- bench: begin -->", "<!-- bench: end -->"
@@ -58,7 +58,7 @@ def section(picture: str, machine: dict[str, Any], rows: Sequence[dict[str, Any]
     parts = [
         f"![Run time per frame against trajectory error and against picture quality]({picture})",
         markdown(rows),
-        " ".join(NOTES),
+        " ".join((*features(rows), *NOTES)),
         "\n".join(failed),
         describe_machine(machine, rows),
     ]

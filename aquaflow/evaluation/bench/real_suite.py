@@ -31,14 +31,15 @@ def real_scenes(data: Path) -> list[BenchmarkScene]:
     """
     if not data.is_dir():
         raise InputError(f"there is no data folder at {data}; give one with a folder for each clip")
-    found = [_scene(folder) for folder in sorted(data.iterdir()) if folder.is_dir()]
+    found = [scene_of_clip(folder) for folder in sorted(data.iterdir()) if folder.is_dir()]
     scenes = [scene for scene in found if scene is not None]
     if not scenes:
         raise InputError(f"no folder in {data} holds a video or pictures; give a folder of clips")
     return scenes
 
 
-def _scene(folder: Path) -> BenchmarkScene | None:
+def scene_of_clip(folder: Path) -> BenchmarkScene | None:
+    """The clip of a folder with what lies next to it; None without a video or pictures."""
     videos = sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEOS)
     pictures = any(path.suffix.lower() in PICTURES for path in folder.iterdir())
     if not videos and not pictures:

@@ -32,7 +32,7 @@ KEYS = (
     "ate_pct_sim3", "rpe", "drift_pct", "depth_absrel", "medium_error", "hue_shift_deg",
     "chroma_difference", "lightness_ratio", "restored_psnr", "raw_psnr",
     *(f"restored_psnr_{name}" for name in NAMES), "restored_peer_reasons",
-    "ms_per_frame", "time_to_first_pose_s",
+    "ms_per_frame", "time_to_first_pose_s", "features",
 )  # fmt: skip
 """In every row; null where the run has no such thing."""
 

@@ -28,7 +28,7 @@ def print_table(rows: Sequence[Row], console: Console) -> None:
         scene, before = ("" if line.scene == before else line.scene), line.scene
         table.add_row(scene, line.contender, *_cells(line, columns))
     console.print(table)
-    for sentence in (*failures(rows), *NOTES):
+    for sentence in (*failures(rows), *features(rows), *NOTES):
         console.print(sentence, highlight=False, markup=False)
 
 
@@ -59,6 +59,12 @@ def failures(rows: Sequence[Row]) -> list[str]:
                 f"failed: {reason}."
             )
     return said
+
+
+def features(rows: Sequence[Row]) -> list[str]:
+    """One sentence for every peer that says what it matched."""
+    said = {row["peer"]: row["features"] for row in rows if row.get("features")}
+    return [f"{peer} ran with {found}." for peer, found in said.items()]
 
 
 def markdown(rows: Sequence[Row]) -> str:

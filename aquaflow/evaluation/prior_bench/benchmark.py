@@ -47,7 +47,7 @@ def bench_prior(
         InputError: a folder is no prior, or there is no picture in ``pictures``.
         AquaFlowError: the device is not there.
     """
-    seen = _pictures(pictures)
+    seen = [sea_floor(640, 480)] if pictures is None else pictures_in(pictures)
     contenders = [
         BenchmarkedPrior("classical", "none", 1, make_prior(PriorConfig(kind="classical")))
     ]
@@ -98,10 +98,12 @@ def _recall(
     return found
 
 
-def _pictures(folder: Path | None) -> list[Picture]:
-    """Those of the folder; without one, a textured plane."""
-    if folder is None:
-        return [sea_floor(640, 480)]
+def pictures_in(folder: Path) -> list[Picture]:
+    """[H, W, 3] RGB each.
+
+    Raises:
+        InputError: there is none.
+    """
     paths = sorted(p for p in folder.glob("*") if p.suffix.lower() in SUFFIXES)
     found = [cv2.imread(str(path), cv2.IMREAD_COLOR) for path in paths]
     pictures = [

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from aquaflow.config import Config
 from aquaflow.errors import AquaFlowError
 from aquaflow.evaluation.bench.peers import run_peer
+from aquaflow.evaluation.bench.peers.sequential_sfm import features_of
 from aquaflow.evaluation.bench.scene import scene_at
 from aquaflow.evaluation.protocol import evaluate_dive
 
@@ -30,8 +33,24 @@ def test_colmap_recovers_the_path(small_recording: Path, tmp_path: Path) -> None
     out = tmp_path / "dive"
     metrics = run_peer("colmap", scene_at(small_recording), Config(), out)
     assert metrics["tracked"] > 20
+    assert metrics["features"].startswith("SIFT")
     assert metrics["ms_per_frame"]["p50"] is None
     assert evaluate_dive(out, small_recording).error.sim3.pct < 2.0
+
+
+def test_colmap_says_which_features_and_matcher_it_ran_with() -> None:
+    def options(kind: str) -> Callable[[], SimpleNamespace]:
+        return lambda: SimpleNamespace(type=SimpleNamespace(name=kind))
+
+    newest = SimpleNamespace(
+        FeatureExtractionOptions=options("ALIKED_N32"),
+        FeatureMatchingOptions=options("ALIKED_LIGHTGLUE"),
+    )
+    before = SimpleNamespace(
+        FeatureExtractionOptions=SimpleNamespace, FeatureMatchingOptions=SimpleNamespace
+    )
+    assert features_of(newest) == "ALIKED_N32 matched by ALIKED_LIGHTGLUE"
+    assert features_of(before) == features_of(SimpleNamespace()) == "SIFT"
 
 
 def test_a_missing_peer_says_how_to_get_it(

@@ -15,11 +15,11 @@ from aquaflow.evaluation.bench import ablation
 from aquaflow.evaluation.bench.benchmark import benchmark, contenders_of, scenes_of
 from aquaflow.evaluation.bench.job import Job
 from aquaflow.evaluation.bench.pareto import pareto_front
-from aquaflow.evaluation.bench.readme import BEGIN, END, write_readme
+from aquaflow.evaluation.bench.readme import BEGIN, END, section, write_readme
 from aquaflow.evaluation.bench.runner import KEYS, Contender, in_process, jobs_for
 from aquaflow.evaluation.bench.scene import BenchmarkScene, scene_at
 from aquaflow.evaluation.bench.summary import ATE_PCT, PSNR, lines_of
-from aquaflow.evaluation.bench.table import failures, markdown
+from aquaflow.evaluation.bench.table import failures, features, markdown
 from aquaflow.evaluation.water_peers.contract import NAMES
 from aquaflow.prior.folder import CARD
 from tests.command_line import run_aquaflow
@@ -100,6 +100,17 @@ def test_a_benchmark_writes_all_its_results_and_marks_failures(tmp_path: Path) -
         "wall, fast: 2 of 2 runs failed: none of 10 frames could be placed."
     )
     assert markdown(result["runs"]).count("failed") == 3
+
+
+def test_what_a_peer_matched_is_said_below_the_table(tmp_path: Path) -> None:
+    def colmap(job: Job) -> dict[str, Any]:
+        return pretended(job) | ({"features": "SIFT"} if job.peer else {})
+
+    contenders = [Contender("fast"), Contender("balanced", "colmap")]
+    result = benchmark([REEF], contenders, 1, tmp_path, quiet, colmap)
+    assert features(result["runs"]) == ["colmap ran with SIFT."]
+    assert [row["features"] for row in result["runs"]] == [None, "SIFT"]
+    assert "colmap ran with SIFT." in section("x.png", result["machine"], result["runs"])
 
 
 @pytest.mark.parametrize("name", ["README.md", "docs/benchmarks.md", "out/page.md"])

@@ -66,5 +66,5 @@ def test_pictures_of_a_folder_are_those_that_are_matched(tmp_path: Path) -> None
     picture = sea_floor(32, 24)
     cv2.imwrite(str(tmp_path / "a.png"), picture[..., ::-1])
     (tmp_path / "notes.txt").write_text("no picture")
-    [found] = benchmark._pictures(tmp_path)
+    [found] = benchmark.pictures_in(tmp_path)
     np.testing.assert_array_equal(found, picture)

@@ -44,6 +44,8 @@ class PeerResult:
     first_pose_s: float
     frame_ms: list[float] = field(default_factory=list)
     """Empty for a peer that needs all frames before it places any."""
+    features: str | None = None
+    """What the peer matched, where it can do so in several ways."""
 
 
 def prepared_frames(scene: BenchmarkScene, config: Config) -> Prepared:
@@ -99,4 +101,5 @@ def _metrics(count: int, result: PeerResult) -> dict[str, Any]:
         "lost": count - len(result.poses),
         "wall_s": round(result.wall_s, 3),
         "fps": round(count / max(result.wall_s, 1e-9), 3),
+        "features": result.features,
     } | pace(result.frame_ms, count, result.first_pose_s, result.wall_s)

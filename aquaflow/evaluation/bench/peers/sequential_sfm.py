@@ -51,7 +51,7 @@ def solve(frames: list[Frame]) -> PeerResult:
             R, t = cam_from_world[:, :3], cam_from_world[:, 3]
             poses[number[image.name]] = Sim3(R.T, -R.T @ t, 1.0)
     # It places no frame before it has seen all: the first pose comes with the last.
-    return PeerResult(poses, wall_s, wall_s)
+    return PeerResult(poses, wall_s, wall_s, features=features_of(pycolmap))
 
 
 def _reconstruct(pycolmap: Any, folder: Path, frame: Frame) -> Any:
@@ -72,6 +72,18 @@ def _reconstruct(pycolmap: Any, folder: Path, frame: Frame) -> Any:
     if not models:
         raise NotMappedError("COLMAP found no reconstruction of these frames")
     return max(models.values(), key=lambda model: model.num_reg_images())
+
+
+def features_of(pycolmap: Any) -> str:
+    """Kind of features and of matcher that this pycolmap runs with default settings.
+
+    Since COLMAP 4 learned features are a choice; before there was SIFT alone.
+    """
+    if not hasattr(pycolmap, "FeatureExtractionOptions"):
+        return "SIFT"
+    kinds = (pycolmap.FeatureExtractionOptions(), pycolmap.FeatureMatchingOptions())
+    names = [kind.type.name if hasattr(kind, "type") else "SIFT" for kind in kinds]
+    return " matched by ".join(dict.fromkeys(names))
 
 
 def _file(index: int) -> str:
