@@ -167,7 +167,9 @@ class KeyframeTracker:
         pair, T_fk, pointmap = solved.pair, solved.estimate.T, at.keyframe.pointmap
         reliable = self.shown(at, solved, camera) if self.hidden(solved) else pair.valid_back
         own = transfer(pointmap, pair.matches_back, reliable, T_fk, camera)
-        add_learned(own, pair.X_b, pair.Q_b, self._config.known_sigma, self._config.learned)
+        config = self._config
+        known, unit = config.known_sigma, pair.range_unit
+        add_learned(own, pair.X_b, pair.Q_b, known, config.learned, unit)
         return own
 
     def shown(self, at: CurrentKeyframe, solved: Matched, camera: CameraModel) -> Mask:

@@ -6,7 +6,7 @@ import numpy as np
 
 from aquaflow.config.tracking import LearnedConfig
 from aquaflow.keyframes import UNKNOWN_VARIANCE, Pointmap
-from aquaflow.prior.contract import Float
+from aquaflow.prior.contract import Float, RangeUnit
 from aquaflow.tracking.learned.scaling import LearnedDepth, learned_depth
 
 
@@ -16,12 +16,13 @@ def add_learned(
     Q: Float | None,  # [H, W] 1 / relative variance; 0 where unknown
     known_sigma: float,
     config: LearnedConfig,
+    unit: RangeUnit = "shared",
 ) -> LearnedDepth | None:
     """Fuse what the prior knows of the picture into ``pointmap`` (in place); returns that in the
     pointmap's unit. None, and no change, without ranges or a unit for them."""
     if not config.depth or X is None or Q is None:
         return None
-    depth = learned_depth(pointmap, X, Q, known_sigma)
+    depth = learned_depth(pointmap, X, Q, known_sigma, unit)
     if depth is not None:
         fuse_learned(pointmap, depth)
         pointmap.learned_scale = (depth.log_scale, depth.log_scale_sigma)

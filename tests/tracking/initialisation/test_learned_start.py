@@ -99,6 +99,12 @@ def test_a_prior_without_ranges_starts_no_map() -> None:
     assert learned_start(plain, SMALL, TrackingConfig()) is None
 
 
+def test_ranges_that_are_known_up_to_a_shift_start_no_map() -> None:
+    affine = pair()
+    affine.range_unit = "affine"
+    assert learned_start(affine, SMALL, TrackingConfig()) is None
+
+
 def test_a_still_camera_has_poses_from_the_first_picture_on() -> None:
     """Then it moves, and triangulation takes over."""
     still = [pose((0.0, 0.0, 0.0), (0.0003 * i, 0.0, 0.0)) for i in range(6)]
