@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -85,11 +85,17 @@ class NetworkSession:
         inputs: Mapping[str, npt.NDArray[Any]],  # by name, shapes as the network's
     ) -> dict[str, npt.NDArray[np.float32]]:
         """All outputs by name, in the processor's own memory."""
+        return dict(self.outputs_of(inputs))
+
+    def outputs_of(
+        self,
+        inputs: Mapping[str, npt.NDArray[Any]],  # by name, shapes as the network's
+    ) -> Mapping[str, npt.NDArray[np.float32]]:
+        """All outputs by name; what is on a GPU is copied from there when it is first asked for."""
         if self.device == "cpu":
             values = self._session.run(self.outputs, dict(inputs))
-        else:
-            values = [value.numpy() for value in self.on_device(inputs).values()]
-        return dict(zip(self.outputs, values, strict=True))
+            return dict(zip(self.outputs, values, strict=True))
+        return OutputsOnDevice(self.on_device(inputs))
 
     def on_device(self, inputs: Mapping[str, Any]) -> dict[str, Any]:
         """All outputs by name, left where they were computed, as onnxruntime's own values.
@@ -108,6 +114,25 @@ class NetworkSession:
             binding.bind_output(name, memory)
         self._session.run_with_iobinding(binding)
         return dict(zip(self.outputs, binding.get_outputs(), strict=True))
+
+
+class OutputsOnDevice(Mapping[str, npt.NDArray[np.float32]]):
+    """Outputs that lie where they were computed; each is copied at most once."""
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self._values = values
+        self._copied: dict[str, npt.NDArray[np.float32]] = {}
+
+    def __getitem__(self, name: str) -> npt.NDArray[np.float32]:
+        if name not in self._copied:
+            self._copied[name] = self._values[name].numpy()
+        return self._copied[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
 
 
 def _onnxruntime() -> Any:
