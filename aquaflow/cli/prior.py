@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from aquaflow.cli.console import Json, progress_bars, table_console
+from aquaflow.cli.prior_describe import describe
 from aquaflow.cores import usable_threads
 from aquaflow.errors import AquaFlowError
 
@@ -43,6 +44,7 @@ def register(app: typer.Typer) -> None:
         help="The two-view prior: export, verify, bench, train.", no_args_is_help=True
     )
     prior.command()(export)
+    prior.command()(describe)
     prior.command()(verify)
     prior.command()(bench)
     prior.command()(oracle)

@@ -13,6 +13,7 @@ from aquaflow.errors import InputError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.compact.quantise import INT8_ENCODER
 from aquaflow.prior.contract import Float, RangeUnit
+from aquaflow.prior.depth_describer import DepthDescriber
 from aquaflow.prior.folder import DECODER, ENCODER, read_card
 from aquaflow.prior.framing import as_input, multiple_of, resized
 from aquaflow.prior.learned_range import MOST_LOG, LearnedRange, cell_rays
@@ -155,6 +156,7 @@ def describer_in(folder: Path, settings: RuntimeSettings) -> Describer:
         return OracleDescriber(folder)
     kinds: dict[str, Any] = {
         "compact": CompactDescriber,
+        "depth": DepthDescriber,
         "mast3r": Mast3rDescriber,
     }
     describer: Describer = kinds[name](folder, settings)
