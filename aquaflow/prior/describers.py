@@ -141,7 +141,7 @@ def _encoder(folder: Path, has_int8: bool, settings: RuntimeSettings) -> Network
     """In 8 bits where that was asked for, or nothing was and it runs on a processor."""
     if settings.precision == "int8" and not has_int8:
         raise InputError(f"{folder} has no {INT8_ENCODER}; use precision: fp32")
-    if not has_int8 or settings.precision == "fp32":
+    if not has_int8 or settings.precision in ("fp32", "fp16"):
         return NetworkSession(folder / ENCODER, settings)
     encoder = NetworkSession(folder / INT8_ENCODER, settings)
     if settings.precision == "auto" and encoder.device != "cpu":
@@ -151,9 +151,12 @@ def _encoder(folder: Path, has_int8: bool, settings: RuntimeSettings) -> Network
 
 def describer_in(folder: Path, settings: RuntimeSettings) -> Describer:
     """The describer for the network that ``folder`` holds; raises as they do."""
-    name = read_card(folder).name
+    card = read_card(folder)
+    name = card.name
     if name == "oracle":
         return OracleDescriber(folder)
+    if settings.precision == "int8" and INT8_ENCODER not in card.files:
+        raise InputError(f"{folder} has no {INT8_ENCODER}; use precision: fp32")
     kinds: dict[str, Any] = {
         "compact": CompactDescriber,
         "depth": DepthDescriber,
