@@ -25,7 +25,8 @@ def add_learned(
     depth = learned_depth(pointmap, X, Q, known_sigma, unit)
     if depth is not None:
         fuse_learned(pointmap, depth)
-        pointmap.learned_scale = (depth.log_scale, depth.log_scale_sigma)
+        if unit == "shared":  # any other is of no meaning in the next keyframe
+            pointmap.learned_scale = (depth.log_scale, depth.log_scale_sigma)
     return depth
 
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from aquaflow.config.tracking import LearnedConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
+from aquaflow.prior.contract import RangeUnit
 from aquaflow.tracking.learned.affine import FARTHEST, shift_of, shifted_depth
+from aquaflow.tracking.learned.fusion import add_learned
 from aquaflow.tracking.learned.own_points import own_points
 from aquaflow.tracking.learned.scaling import LearnedDepth, learned_depth
 from tests.tracking.learned.learned_scenes import KNOWN_SIGMA, TRUTH, affine_network, measured
@@ -93,13 +96,22 @@ def test_what_the_shift_puts_at_infinity_is_unknown() -> None:
     assert np.isnan(shifted_depth(z, -2.0)).all()
 
 
+@pytest.mark.parametrize("unit", ["shared", "own", "affine"])
+def test_only_a_unit_that_pictures_share_says_something_of_the_next_keyframe(
+    unit: RangeUnit,
+) -> None:
+    pointmap = measured()
+    assert add_learned(pointmap, *affine_network(), KNOWN_SIGMA, LearnedConfig(), unit) is not None
+    assert (pointmap.learned_scale is not None) == (unit == "shared")
+
+
 @pytest.mark.parametrize("unit", ["own", "affine"])
-def test_pictures_without_a_common_unit_give_no_points_of_the_frame(unit: str) -> None:
+def test_pictures_without_a_common_unit_give_no_points_of_the_frame(unit: RangeUnit) -> None:
     view = KnownView(CAMERA, Sim3.identity(), TRUTH)
     pair = KnownPair(view, view, 0.0, CAMERA)
     pair.X_a, pair.Q_a = pair.X_b, pair.Q_b = affine_network()
     pixels = np.full((3, 2), 50.5)
     pair.range_unit = "shared"
     assert own_points(measured(), pair, pixels, CAMERA, KNOWN_SIGMA) is not None
-    pair.range_unit = unit  # type: ignore[assignment]
+    pair.range_unit = unit
     assert own_points(measured(), pair, pixels, CAMERA, KNOWN_SIGMA) is None
