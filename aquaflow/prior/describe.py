@@ -46,7 +46,7 @@ def names_of(network: Path) -> tuple[dict[str, tuple[int | str, ...]], list[str]
         InputError: the file is missing or no network.
     """
     if not network.is_file():
-        raise InputError(f"{network} does not exist; give an ONNX file")
+        raise InputError(f"{network} is no file; give an ONNX file")
     session = NetworkSession(network, CPU)
     return session.inputs, session.outputs
 

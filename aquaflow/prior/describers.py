@@ -102,7 +102,7 @@ class CompactDescriber:
 @dataclass
 class CompactPair:
     """Two pictures that the compact network compared. Ranges are nearly monocular, and up to a
-    factor (docs/measurements.md#compact-prior)."""
+    factor; its C makes poses no better (docs/measurements.md#compact-prior)."""
 
     describer: CompactDescriber
     a: Half

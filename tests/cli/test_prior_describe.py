@@ -85,4 +85,4 @@ def test_a_folder_that_is_not_empty_is_left_alone(tmp_path: Path) -> None:
 def test_a_file_that_is_no_network_or_not_there_is_a_sentence(tmp_path: Path) -> None:
     (tmp_path / "net.onnx").write_bytes(b"no network")
     assert "cannot be run" in str(run(tmp_path / "net.onnx", *USUAL).exception)
-    assert "does not exist" in str(run(tmp_path / "other.onnx", *USUAL).exception)
+    assert "is no file" in str(run(tmp_path / "other.onnx", *USUAL).exception)

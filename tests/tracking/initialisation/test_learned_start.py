@@ -47,6 +47,17 @@ class RangedPrior(KnownPrior):
         return RangedPair(a, b, self.sigma, self.sigma)
 
 
+class AffinePrior(RangedPrior):
+    """A prior that knows poses, and inverse depths up to a scale and shift of each picture."""
+
+    def decode(self, a, b, predicted=None, alone=False):  # type: ignore[no-untyped-def]
+        found = RangedPair(a, b, self.sigma, self.sigma)
+        found.range_unit = "affine"
+        found.X_a = found.X_a / (1.0 + 0.05 * found.X_a[..., 2:])  # 1 / z becomes 1 / z + 0.05
+        found.X_b = found.X_b / (1.0 + 0.15 * found.X_b[..., 2:])
+        return found
+
+
 def pair(sigma: float = 0.05, stated: float = 0.05, T_ba: Sim3 = STILL) -> RangedPair:
     first, T_wc = Sim3.identity(), T_ba.inverse()
     return RangedPair(
@@ -122,3 +133,20 @@ def test_a_still_camera_has_poses_from_the_first_picture_on() -> None:
     learned = tracked.store[0].pointmap.learned
     assert learned is not None
     assert learned.mean() < 0.5, "most of it is triangulated by then"
+
+
+def test_ranges_up_to_a_shift_fill_the_map_once_something_is_triangulated() -> None:
+    poses = [
+        pose((0.01 * i, 0.02 * i, -0.03 * i), (0.05 * i, 0.06 * np.sin(0.9 * i), 0.02 * i))
+        for i in range(12)
+    ]
+    prior = AffinePrior(poses, 0.02)
+    tracked = run(prior.frames(SMALL), prior=prior)
+    assert all(each.frame_class in PLACED for each in tracked.tracked)
+    assert error_share(tracked.tracked, poses) < 0.02
+    first = tracked.store[0].pointmap
+    assert first.learned is not None
+    assert 0.0 < first.learned.mean() < 0.5
+    depth = plane_depth(Sim3.identity())
+    ratio = first.rho * depth
+    assert abs(np.log(np.median(ratio[first.learned]) / np.median(ratio))) < 0.05
