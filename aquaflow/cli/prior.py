@@ -5,30 +5,14 @@ from __future__ import annotations
 import json
 from enum import Enum
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from aquaflow.cli.console import Json, progress_bars, table_console
+from aquaflow.cli.prior_describe import describe
+from aquaflow.cli.prior_verify import print_parity, verify
 from aquaflow.cores import usable_threads
-from aquaflow.errors import AquaFlowError
-
-if TYPE_CHECKING:
-    from aquaflow.prior.folder import PriorCard
-
-MOST_RELATIVE = 1e-4
-"""Difference between ONNX and torch, relative to an output's largest value, that is parity."""
-
-Folder = Annotated[
-    Path | None, typer.Argument(help="Exported prior; default: a tiny one, exported on the spot.")
-]
-
-
-Checkpoint = Annotated[
-    Path | None,
-    typer.Option(help="Weights to compare with; without, what was measured at export is shown."),
-]
 
 
 class Exported(str, Enum):
@@ -43,6 +27,7 @@ def register(app: typer.Typer) -> None:
         help="The two-view prior: export, verify, bench, compare, train.", no_args_is_help=True
     )
     prior.command()(export)
+    prior.command()(describe)
     prior.command()(verify)
     prior.command()(bench)
     prior.command()(oracle)
@@ -71,31 +56,9 @@ def export(
     with progress_bars(as_json) as advance:
         model = load_checkpoint(checkpoint)
         card = export_mast3r(model, out, width, height, LICENCE_NOTICE, advance)
-    _report(card.name, card.parity, as_json)
+    print_parity(card.name, card.parity, {}, as_json)
     if not as_json:
         typer.echo(f"written to {out}")
-
-
-def verify(folder: Folder = None, checkpoint: Checkpoint = None, as_json: Json = False) -> None:
-    """Compare every output of the ONNX files with torch's; exit code 1 beyond 1e-4."""
-    from aquaflow.prior.folder import read_card
-    from aquaflow.prior.mast3r.export import verify_tiny
-
-    if folder is None:
-        with TemporaryDirectory() as scratch, progress_bars(as_json) as advance:
-            name, parity = "mast3r (tiny)", verify_tiny(Path(scratch) / "prior", advance)
-    else:
-        card = read_card(folder)
-        name, parity = card.name, card.parity
-        if checkpoint is not None:
-            parity = _parity_with(checkpoint, folder, card)
-    _report(name, parity, as_json)
-    worst = max(parity.values())
-    if not worst <= MOST_RELATIVE:
-        raise AquaFlowError(
-            f"prior {name} differs from torch by {worst:.1e}, more than {MOST_RELATIVE:.0e}; "
-            "export it again"
-        )
 
 
 def oracle(
@@ -241,28 +204,3 @@ def train_compact(
         typer.echo(json.dumps(card.training))
     else:
         typer.echo(f"written to {out / PRIOR}: {json.dumps((card.training or {})['held_out'])}")
-
-
-def _parity_with(checkpoint: Path, folder: Path, card: PriorCard) -> dict[str, float]:
-    from aquaflow.prior.compact import export as compact
-    from aquaflow.prior.mast3r import export as mast3r
-    from aquaflow.prior.mast3r.weights import load_checkpoint
-
-    if card.name == "compact":
-        return compact.parity_of(compact.load_checkpoint(checkpoint), folder)
-    return mast3r.parity_of(load_checkpoint(checkpoint), folder, card.width, card.height)
-
-
-def _report(name: str, parity: dict[str, float], as_json: bool) -> None:
-    if as_json:
-        outputs = [{"prior": name, "name": output, "max_rel": x} for output, x in parity.items()]
-        typer.echo(json.dumps({"outputs": outputs}))
-        return
-    from rich.table import Table
-
-    table = Table(title=f"{name}: ONNX against torch")
-    table.add_column("output")
-    table.add_column("largest relative difference", justify="right")
-    for output, difference in parity.items():
-        table.add_row(output, f"{difference:.1e}")
-    table_console().print(table)

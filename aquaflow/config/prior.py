@@ -34,16 +34,18 @@ class PriorConfig(Stage):
     device: Literal["auto", "cpu", "cuda", "tensorrt"] = Field(
         "auto", description="auto: the fastest that onnxruntime has; any other is that or an error"
     )
-    precision: Literal["auto", "fp32", "int8"] = Field(
+    precision: Literal["auto", "fp32", "fp16", "int8"] = Field(
         "auto",
-        description="of the compact network; auto: int8 on a processor, fp32 on a GPU, where "
-        "TensorRT makes it fp16 itself",
+        description="auto: of the compact network int8 on a processor, else fp16 on TensorRT and "
+        "fp32; fp16: TensorRT or an error",
     )
     threads: int = Field(
         1, ge=1, description="of the network; mapping runs in parallel and needs the other cores"
     )
     engine_cache: Path | None = Field(
-        None, description="folder that TensorRT keeps its engines in; building one takes minutes"
+        None,
+        description="folder that TensorRT keeps its engines in, for building one takes minutes; "
+        "None: aquaflow/tensorrt in the user's cache directory",
     )
 
     @model_validator(mode="after")

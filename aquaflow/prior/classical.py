@@ -69,15 +69,16 @@ class ClassicalPrior:
         assert isinstance(a, FlowEncoding)
         assert isinstance(b, FlowEncoding)
         only = alone and predicted is not None
-        starts = from_prediction(predicted) if only else _starts(a, b, predicted)
+        starts = from_prediction(predicted) if only else classical_starts(a, b, predicted)
         return FlowPair(a, b, best_flow(self._matcher, a, b, starts))
 
 
-def _starts(
+def classical_starts(
     a: FlowEncoding,
     b: FlowEncoding,
     predicted: Float | None,  # [H, W, 2] px, expected matches of a in b
 ) -> Iterator[Float | None]:
+    """[H, W, 2] px flows to start from, the likeliest first, without any network."""
     yield from from_prediction(predicted)
     if predicted is None:
         yield None

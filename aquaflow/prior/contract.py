@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,10 @@ from aquaflow.geometry.camera import CameraModel
 
 Float = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
+
+RangeUnit: TypeAlias = Literal["shared", "own", "affine"]
+"""shared: the ranges of both pictures of a pair are in one unit; own: each picture's are in a unit
+of its own; affine: and their inverse depths are off by a constant of that picture, too."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,11 @@ class PairGeometry(Protocol):
     @property
     def Q_b(self) -> Float | None:
         """[H, W] confidence of X_b, as Q_a."""
+        ...
+
+    @property
+    def range_unit(self) -> RangeUnit:
+        """What X_a and X_b have in common; of no meaning where there are none."""
         ...
 
     @property

@@ -1,8 +1,4 @@
-"""Exported networks as describers of pictures' cells: the compact one, and the paper's.
-
-The compact one describes a picture without looking at the other; the paper's looks at both, so that
-what it keeps of a picture are tokens, and descriptors come with the pair.
-"""
+"""Exported networks as describers of pictures: the compact one, and which one a folder holds."""
 
 from __future__ import annotations
 
@@ -11,43 +7,30 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-import numpy.typing as npt
 
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.compact.quantise import INT8_ENCODER
-from aquaflow.prior.contract import Float
+from aquaflow.prior.contract import Float, RangeUnit
+from aquaflow.prior.depth_describer import DepthDescriber
 from aquaflow.prior.folder import DECODER, ENCODER, read_card
-from aquaflow.prior.hybrid import Describer, Half, Picture
-from aquaflow.prior.learned_range import MOST_LOG, LearnedRange
+from aquaflow.prior.framing import as_input, multiple_of, resized
+from aquaflow.prior.learned_range import MOST_LOG, LearnedRange, cell_rays
+from aquaflow.prior.mast3r.describer import Mast3rDescriber
+from aquaflow.prior.network import Describer, Half, Picture, unit
 from aquaflow.prior.oracle import OracleDescriber
 from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
 
 MULTIPLE_PX = 16
 """Sides of the pictures that the compact network takes."""
 
-CELL_PX = 8
-"""Pixels of a cell, across and down, in the pictures that the networks take."""
-
-MIDDLE = slice(CELL_PX // 2, None, CELL_PX)
-"""Pixels next to the cells' centres."""
-
-METRIC_SIGMA = 0.1
-"""Relative error of the metre of the paper's network; assumed, its weights were never run here."""
-
-POINTS_ALPHA = 0.2
-"""Metres: the reward of log Q in the loss that the paper's network was trained with."""
-
-SHORTEST = 1e-6
-"""Length below which a descriptor has no direction."""
-
 
 class CompactDescriber:
     """The compact network: descriptors of a picture's cells, whatever the other picture is."""
 
-    metric = False
+    metric, describes = False, True
+    range_unit: RangeUnit = "shared"
     unit_sigma = float("inf")
     """It was trained on pairs whose scale was taken out: where the scene is twice as far, its range
     stays nearly the same (docs/measurements.md#learned-depth)."""
@@ -76,7 +59,7 @@ class CompactDescriber:
             height, width = self._fixed
         else:
             scale = min((self._pixels / (height * width)) ** 0.5, 1.0)
-            height, width = (_multiple(scale * side) for side in (height, width))
+            height, width = (multiple_of(scale * side, MULTIPLE_PX) for side in (height, width))
         return resized(image, height, width)
 
     def features(
@@ -122,7 +105,7 @@ class CompactDescriber:
 @dataclass
 class CompactPair:
     """Two pictures that the compact network compared. Ranges are nearly monocular, and up to a
-    factor (docs/measurements.md#compact-prior)."""
+    factor; its C makes poses no better (docs/measurements.md#compact-prior)."""
 
     describer: CompactDescriber
     a: Half
@@ -157,103 +140,11 @@ class CompactPair:
         return self.describer.decoded(self.a, self.b, self.camera_a, self.camera_b)
 
 
-class Mast3rDescriber:
-    """The paper's network: descriptors of both pictures, after each has looked at the other."""
-
-    metric = True
-    unit_sigma = METRIC_SIGMA
-
-    def __init__(self, folder: Path, settings: RuntimeSettings) -> None:
-        """Load the exported ``folder``; raises as the compact one."""
-        card = read_card(folder)
-        self.name, self._size = card.name, (card.height, card.width)
-        self._encoder = NetworkSession(folder / ENCODER, settings)
-        self._decoder = NetworkSession(folder / DECODER, settings)
-
-    def fitted(
-        self,
-        image: Picture,  # [H, W, 3] RGB
-    ) -> Picture:
-        """[h, w, 3] of the size that was exported."""
-        return resized(image, *self._size)
-
-    def features(
-        self,
-        picture: Picture,  # [h, w, 3] as fitted
-    ) -> Half:
-        """[1, N, D] tokens."""
-        return self._encoder({"image": as_input(picture)})["tokens"].astype(np.float16)
-
-    def compared(
-        self,
-        a: Half,  # [1, N, D]
-        b: Half,  # [1, N, D]
-        camera_a: CameraModel,
-        camera_b: CameraModel,
-    ) -> Mast3rPair:
-        """The cameras are not asked for: the network finds its own."""
-        return Mast3rPair(self, a, b)
-
-    def decoded(
-        self,
-        a: Half,  # [1, N, D]
-        b: Half,  # [1, N, D]
-    ) -> dict[str, Float]:
-        """The decoder's outputs; points of both are in the first one's frame."""
-        tokens = {"tokens_a": a.astype(np.float32), "tokens_b": b.astype(np.float32)}
-        return self._decoder(tokens)
-
-
-@dataclass
-class Mast3rPair:
-    """Two pictures after each has looked at the other; decoded once for each way."""
-
-    describer: Mast3rDescriber
-    a: Half
-    """[1, N, D]"""
-    b: Half
-    """[1, N, D]"""
-
-    @property
-    def cells(self) -> tuple[Float, Float]:
-        """[h / 8, w / 8, d] the descriptors at the cells' centres."""
-        found = self._decoded
-        return found["D_a"][0, MIDDLE, MIDDLE], found["D_b"][0, MIDDLE, MIDDLE]
-
-    @property
-    def range_a(self) -> LearnedRange:
-        return _range_of_points(self._decoded)
-
-    @cached_property
-    def range_b(self) -> LearnedRange:
-        """From the pair the other way round: that has its points in b's own frame."""
-        return _range_of_points(self.describer.decoded(self.b, self.a))
-
-    @property
-    def confidence(self) -> Float | None:
-        return None
-
-    @cached_property
-    def _decoded(self) -> dict[str, Float]:
-        return self.describer.decoded(self.a, self.b)
-
-
-def _range_of_points(
-    found: dict[str, Float],  # outputs of the decoder by name
-) -> LearnedRange:
-    """Distances of the first picture's points, in metres. Their confidence Q weighed errors in
-    training, so that the network expects an error of POINTS_ALPHA / Q metres."""
-    distance = np.linalg.norm(found["X_a"][0, MIDDLE, MIDDLE], axis=-1)
-    distance = np.maximum(distance, SHORTEST)
-    expected = POINTS_ALPHA / found["Q_a"][0, MIDDLE, MIDDLE]
-    return LearnedRange(np.log(distance), (expected / distance) ** 2)
-
-
 def _encoder(folder: Path, has_int8: bool, settings: RuntimeSettings) -> NetworkSession:
     """In 8 bits where that was asked for, or nothing was and it runs on a processor."""
     if settings.precision == "int8" and not has_int8:
         raise InputError(f"{folder} has no {INT8_ENCODER}; use precision: fp32")
-    if not has_int8 or settings.precision == "fp32":
+    if not has_int8 or settings.precision in ("fp32", "fp16"):
         return NetworkSession(folder / ENCODER, settings)
     encoder = NetworkSession(folder / INT8_ENCODER, settings)
     if settings.precision == "auto" and encoder.device != "cpu":
@@ -263,19 +154,19 @@ def _encoder(folder: Path, has_int8: bool, settings: RuntimeSettings) -> Network
 
 def describer_in(folder: Path, settings: RuntimeSettings) -> Describer:
     """The describer for the network that ``folder`` holds; raises as they do."""
-    name = read_card(folder).name
+    card = read_card(folder)
+    name = card.name
     if name == "oracle":
         return OracleDescriber(folder)
-    kinds: dict[str, Any] = {"compact": CompactDescriber, "mast3r": Mast3rDescriber}
+    if settings.precision == "int8" and INT8_ENCODER not in card.files:
+        raise InputError(f"{folder} has no {INT8_ENCODER}; use precision: fp32")
+    kinds: dict[str, Any] = {
+        "compact": CompactDescriber,
+        "depth": DepthDescriber,
+        "mast3r": Mast3rDescriber,
+    }
     describer: Describer = kinds[name](folder, settings)
     return describer
-
-
-def cell_rays(camera: CameraModel, rows: int, columns: int) -> Float:
-    """[rows, columns, 2] x / z and y / z of the centres of cells that cover the picture."""
-    v, u = np.mgrid[:rows, :columns] + 0.5
-    pixels = np.stack([u * camera.width / columns, v * camera.height / rows], -1)
-    return camera.unproject(pixels)[..., :2].astype(np.float32)
 
 
 def _channels_first(
@@ -283,35 +174,3 @@ def _channels_first(
 ) -> Float:
     """[1, c, h, w]"""
     return np.ascontiguousarray(field.transpose(2, 0, 1)[None])
-
-
-def as_input(
-    picture: Picture,  # [h, w, 3]
-) -> npt.NDArray[np.float32]:
-    """[1, 3, h, w] in [0, 1]"""
-    return np.ascontiguousarray(picture.transpose(2, 0, 1)[None], dtype=np.float32) / 255.0
-
-
-def resized(
-    image: Picture,  # [H, W, 3]
-    height: int,
-    width: int,
-) -> Picture:
-    """[height, width, 3]; pixels are averaged where it becomes smaller."""
-    if image.shape[:2] == (height, width):
-        return image
-    shrinks = height < image.shape[0]
-    way = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(image, (width, height), interpolation=way), dtype=np.uint8)
-
-
-def unit(
-    descriptors: Float,  # [..., d]
-) -> Float:
-    """[..., d] of length 1."""
-    length = np.linalg.norm(descriptors, axis=-1, keepdims=True)
-    return np.asarray(descriptors / np.maximum(length, SHORTEST), dtype=np.float32)
-
-
-def _multiple(side: float) -> int:
-    return max(MULTIPLE_PX, round(side / MULTIPLE_PX) * MULTIPLE_PX)

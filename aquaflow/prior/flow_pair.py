@@ -13,7 +13,7 @@ import numpy.typing as npt
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior import flow as dense
 from aquaflow.prior import homography as sparse
-from aquaflow.prior.contract import Float, Keypoints, Mask
+from aquaflow.prior.contract import Float, Keypoints, Mask, RangeUnit
 
 
 @dataclass
@@ -88,6 +88,10 @@ class FlowPair:
     @cached_property
     def C(self) -> Float:
         return dense.confidence(self.flow)
+
+    @property
+    def range_unit(self) -> RangeUnit:
+        return "shared"
 
     @property
     def X_a(self) -> Float | None:

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from aquaflow.config.stage import Stage
 from aquaflow.errors import InputError, path_of_key
+from aquaflow.prior.depth_card import DepthCard
 
 CARD = "prior.json"
 """Names the network, its inputs and its licence."""
@@ -22,7 +23,7 @@ READ_BYTES = 1 << 20
 class PriorCard(Stage):
     """What a prior is, where it comes from, and how its files are known to be whole."""
 
-    name: Literal["compact", "mast3r", "oracle"]
+    name: Literal["compact", "depth", "mast3r", "oracle"]
     width: int
     """px of the pictures it takes"""
     height: int
@@ -39,6 +40,8 @@ class PriorCard(Stage):
     """Largest difference of each output from torch's, relative to that output's largest value."""
     training: dict[str, Any] | None = None
     """Seeds, steps, hardware and validation figures of the weights; None: not trained by us."""
+    depth: DepthCard | None = None
+    """Of a network that gives depth: what it takes and gives."""
 
 
 def write_card(folder: Path, card: PriorCard) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,73 +19,15 @@ import numpy.typing as npt
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior import flow as dense
 from aquaflow.prior.candidates import best_flow, from_homography, from_prediction
+from aquaflow.prior.classical import classical_starts
 from aquaflow.prior.coarse import coarse_flow
-from aquaflow.prior.contract import Encoding, Float, Mask
+from aquaflow.prior.contract import Encoding, Float, Mask, RangeUnit
 from aquaflow.prior.flow_pair import FlowEncoding, FlowPair
-from aquaflow.prior.learned_range import LearnedRange
-
-Picture = npt.NDArray[np.uint8]
-Half = npt.NDArray[np.float16]
+from aquaflow.prior.learned_range import spread_over
+from aquaflow.prior.network import ComparedPair, Describer, Half, Picture
 
 WARM_UP = (240, 320, 3)
 """Shape of a picture to warm up with."""
-
-
-class ComparedPair(Protocol):
-    """What a network says of two pictures; computed when first asked for, and kept."""
-
-    @property
-    def cells(self) -> tuple[Float, Float]:
-        """[rows, columns, d] unit descriptors of cells that cover each picture."""
-        ...
-
-    @property
-    def range_a(self) -> LearnedRange:
-        """Distances in the first picture, from its own camera."""
-        ...
-
-    @property
-    def range_b(self) -> LearnedRange:
-        """Distances in the second picture, from its own camera."""
-        ...
-
-    @property
-    def confidence(self) -> Float | None:
-        """[rows, columns] in [0, 1] of matches of the first picture's cells; None: it has none."""
-        ...
-
-
-class Describer(Protocol):
-    """A network whose descriptors distinguish the cells of pictures."""
-
-    name: str
-    metric: bool
-    unit_sigma: float
-    """As of the prior."""
-
-    def fitted(
-        self,
-        image: Picture,  # [H, W, 3] RGB
-    ) -> Picture:
-        """[h, w, 3] the picture at a size that the network takes."""
-        ...
-
-    def features(
-        self,
-        picture: Picture,  # [h, w, 3] as fitted
-    ) -> Half:
-        """What is computed once for a picture and kept with it."""
-        ...
-
-    def compared(
-        self,
-        a: Half,  # [...] features of one picture
-        b: Half,  # [...] of the other
-        camera_a: CameraModel,
-        camera_b: CameraModel,
-    ) -> ComparedPair:
-        """What it says of the pair; cameras are those of the pictures before fitting."""
-        ...
 
 
 @dataclass
@@ -128,15 +70,29 @@ class Comparison:
         a, b = self._a, self._b
         return a.describer.compared(a.features, b.features, a.camera, b.camera)
 
+    @property
+    def asked(self) -> bool:
+        """True if the network has looked at the pair."""
+        return "found" in vars(self)
+
 
 class HybridPair(FlowPair):
-    """Matches of flow; ranges and their confidence are the network's."""
+    """Matches of flow; ranges and their confidence are the network's, that of matches is both's."""
 
     def __init__(
         self, a: HybridEncoding, b: HybridEncoding, flow: dense.Flow, comparison: Comparison
     ) -> None:
         super().__init__(a, b, flow)
-        self._comparison = comparison
+        self._describer, self._comparison = a.describer, comparison
+        self._asked = comparison.asked
+
+    @cached_property
+    def C(self) -> Float:
+        """The flow's, times the network's where the matches come from it: flow that only confirms
+        a prediction needs no second opinion, and asking for one costs more than the flow."""
+        certain = dense.confidence(self.flow)
+        cells = self._comparison.found.confidence if self._asked else None
+        return certain if cells is None else certain * spread_over(cells, *certain.shape)
 
     @cached_property
     def _in_a(self) -> tuple[Float, Float]:
@@ -147,6 +103,10 @@ class HybridPair(FlowPair):
     def _in_b(self) -> tuple[Float, Float]:
         """(X_b, Q_b)"""
         return self._comparison.found.range_b.pointmap(self._b.camera)
+
+    @property
+    def range_unit(self) -> RangeUnit:
+        return self._describer.range_unit
 
     @property
     def X_a(self) -> Float | None:
@@ -214,7 +174,7 @@ class HybridPrior:
         alone: bool = False,
     ) -> HybridPair:
         """Flow from the prediction; where it fails, unless it stands ``alone``, from the
-        descriptors, then from keypoints."""
+        descriptors, if the network has any, then from keypoints."""
         assert isinstance(a, HybridEncoding)
         assert isinstance(b, HybridEncoding)
         comparison, only = Comparison(a, b), alone and predicted is not None
@@ -237,10 +197,13 @@ def _starts(
     predicted: Float | None,  # [H, W, 2] px, expected matches of a in b
     comparison: Comparison | None,
 ) -> Iterator[Float | None]:
+    if not a.describer.describes:
+        yield from classical_starts(a, b, predicted)
+        return
     yield from from_prediction(predicted)
-    if comparison is not None:
-        flow = coarse_flow(*comparison.found.cells, *a.grey.shape)
-        if flow is not None:
-            yield flow
+    cells = None if comparison is None else comparison.found.cells
+    flow = None if cells is None else coarse_flow(*cells, *a.grey.shape)
+    if flow is not None:
+        yield flow
     yield from from_homography(a, b)
     yield None

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
-from aquaflow.prior.contract import Float
+from aquaflow.prior.contract import Float, Mask
 
 LEAST_VARIANCE = 1e-4
 """Of the logarithm of a range: no network knows it better than to a hundredth."""
@@ -36,11 +36,11 @@ class LearnedRange:
         sound = np.isfinite(self.log_range) & np.isfinite(self.variance)
         sound &= (np.abs(np.where(sound, self.log_range, 0.0)) < MOST_LOG) & (self.variance > 0.0)
         variance = np.clip(self.variance, LEAST_VARIANCE, np.exp(MOST_LOG))
-        weight = _spread(sound.astype(np.float32), height, width)
+        weight = spread_over(sound, height, width).astype(np.float64)
         known = weight > LEAST_WEIGHT
         weight = np.where(known, weight, 1.0)
-        log_range = _spread(np.where(sound, self.log_range, 0.0), height, width) / weight
-        log_variance = _spread(np.log(np.where(sound, variance, 1.0)), height, width) / weight
+        log_range = spread_over(np.where(sound, self.log_range, 0.0), height, width) / weight
+        log_variance = spread_over(np.log(np.where(sound, variance, 1.0)), height, width) / weight
         Q = np.exp(-np.where(known, log_variance, 0.0))
         rays = camera.unproject(camera.pixel_centres())
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -49,10 +49,17 @@ class LearnedRange:
         return X.astype(np.float32), np.where(known, Q, 0.0).astype(np.float32)
 
 
-def _spread(
-    cells: npt.NDArray[np.floating],  # [rows, columns]
+def cell_rays(camera: CameraModel, rows: int, columns: int) -> Float:
+    """[rows, columns, 2] x / z and y / z of the centres of cells that cover the picture."""
+    v, u = np.mgrid[:rows, :columns] + 0.5
+    pixels = np.stack([u * camera.width / columns, v * camera.height / rows], -1)
+    return camera.unproject(pixels)[..., :2].astype(np.float32)
+
+
+def spread_over(
+    cells: npt.NDArray[np.floating] | Mask,  # [rows, columns]
     height: int,
     width: int,
-) -> npt.NDArray[np.float64]:
+) -> Float:
     """[height, width] linear between the cells' centres."""
-    return np.asarray(cv2.resize(cells.astype(np.float32), (width, height)), dtype=np.float64)
+    return np.asarray(cv2.resize(cells.astype(np.float32), (width, height)), dtype=np.float32)

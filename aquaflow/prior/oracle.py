@@ -16,10 +16,10 @@ import numpy.typing as npt
 
 from aquaflow.errors import InputError, reason_of
 from aquaflow.geometry.camera import CameraModel
-from aquaflow.prior.contract import Float
+from aquaflow.prior.contract import Float, RangeUnit
 from aquaflow.prior.folder import PriorCard, read_card, sha256_of, write_card
-from aquaflow.prior.hybrid import Half, Picture
 from aquaflow.prior.learned_range import LearnedRange
+from aquaflow.prior.network import Half, Picture
 
 TRUTH = "truth.npz"
 """File of the folder: pictures by their checksum, and what each cell shows."""
@@ -96,7 +96,8 @@ def write_oracle(
 class OracleDescriber:
     """Looks pictures up; of one that it does not know, it says nothing."""
 
-    name, metric = "oracle", False
+    name, metric, describes = "oracle", False, True
+    range_unit: RangeUnit = "shared"
     unit_sigma = 0.0
     """Its unit is the same in all pictures."""
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -22,7 +22,7 @@ from aquaflow.errors import AquaFlowError, InputError, reason_of
 log = logging.getLogger(__name__)
 
 Device: TypeAlias = Literal["auto", "cpu", "cuda", "tensorrt"]
-Precision: TypeAlias = Literal["auto", "fp32", "int8"]
+Precision: TypeAlias = Literal["auto", "fp32", "fp16", "int8"]
 
 PROVIDERS: dict[str, str] = {
     "cpu": "CPUExecutionProvider",
@@ -47,7 +47,8 @@ class RuntimeSettings:
     precision: Precision = "auto"
     threads: int = 1
     engine_cache: Path | None = None
-    """Folder that TensorRT keeps its engines in: building one takes minutes."""
+    """Folder that TensorRT keeps its engines in, for building one takes minutes; None: the one in
+    the user's cache directory."""
 
 
 class NetworkSession:
@@ -62,6 +63,11 @@ class NetworkSession:
         """
         ort = _onnxruntime()
         device = _device(ort, settings.device)
+        if settings.precision == "fp16" and device != "tensorrt":
+            raise AquaFlowError(
+                f"precision fp16 is TensorRT's and {path.name} was to run on {device}; use device: "
+                "tensorrt or precision: auto"
+            )
         options = ort.SessionOptions()
         options.intra_op_num_threads = settings.threads
         options.inter_op_num_threads = 1
@@ -69,7 +75,7 @@ class NetworkSession:
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
             self._session = ort.InferenceSession(
-                str(path), options, providers=_providers(device, settings.engine_cache)
+                str(path), options, providers=_providers(device, settings)
             )
         except Exception as error:  # onnxruntime's errors share no base of their own
             raise InputError(
@@ -85,11 +91,17 @@ class NetworkSession:
         inputs: Mapping[str, npt.NDArray[Any]],  # by name, shapes as the network's
     ) -> dict[str, npt.NDArray[np.float32]]:
         """All outputs by name, in the processor's own memory."""
+        return dict(self.outputs_of(inputs))
+
+    def outputs_of(
+        self,
+        inputs: Mapping[str, npt.NDArray[Any]],  # by name, shapes as the network's
+    ) -> Mapping[str, npt.NDArray[np.float32]]:
+        """All outputs by name; what is on a GPU is copied from there when it is first asked for."""
         if self.device == "cpu":
             values = self._session.run(self.outputs, dict(inputs))
-        else:
-            values = [value.numpy() for value in self.on_device(inputs).values()]
-        return dict(zip(self.outputs, values, strict=True))
+            return dict(zip(self.outputs, values, strict=True))
+        return OutputsOnDevice(self.on_device(inputs))
 
     def on_device(self, inputs: Mapping[str, Any]) -> dict[str, Any]:
         """All outputs by name, left where they were computed, as onnxruntime's own values.
@@ -108,6 +120,25 @@ class NetworkSession:
             binding.bind_output(name, memory)
         self._session.run_with_iobinding(binding)
         return dict(zip(self.outputs, binding.get_outputs(), strict=True))
+
+
+class OutputsOnDevice(Mapping[str, npt.NDArray[np.float32]]):
+    """Outputs that lie where they were computed; each is copied at most once."""
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self._values = values
+        self._copied: dict[str, npt.NDArray[np.float32]] = {}
+
+    def __getitem__(self, name: str) -> npt.NDArray[np.float32]:
+        if name not in self._copied:
+            self._copied[name] = self._values[name].numpy()
+        return self._copied[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
 
 
 def _onnxruntime() -> Any:
@@ -154,26 +185,48 @@ def _obtained(session: Any, wanted: str, asked: Device, what: str) -> str:
     return device
 
 
-def _providers(device: str, engine_cache: Path | None) -> list[Any]:
+def _providers(device: str, settings: RuntimeSettings) -> list[Any]:
     """The chosen one first; what it cannot do falls to the next slower one.
 
     An engine fits one GPU and one TensorRT: onnxruntime names its file after both, so a folder may
     serve several machines.
     """
-    settings: dict[str, dict[str, Any]] = {
+    options: dict[str, dict[str, Any]] = {
         "tensorrt": {
-            "trt_fp16_enable": True,
+            "trt_fp16_enable": settings.precision != "fp32",
             "trt_max_workspace_size": TENSORRT_WORKSPACE_BYTES,
         },
-        "cuda": {"device_id": 0, "cudnn_conv_algo_search": "HEURISTIC"},
+        "cuda": {
+            "device_id": 0,
+            "cudnn_conv_algo_search": "HEURISTIC",
+            "use_tf32": settings.precision != "fp32",
+        },
         "cpu": {},
     }
-    if engine_cache is not None:
-        settings["tensorrt"] |= {
+    folder = _engine_folder(settings.engine_cache) if device == "tensorrt" else None
+    if folder is not None:
+        options["tensorrt"] |= {
             "trt_engine_cache_enable": True,
-            "trt_engine_cache_path": str(engine_cache),
+            "trt_engine_cache_path": str(folder),
             "trt_timing_cache_enable": True,
-            "trt_timing_cache_path": str(engine_cache),
+            "trt_timing_cache_path": str(folder),
         }
     slower = FASTEST_FIRST[FASTEST_FIRST.index(device) :]
-    return [(PROVIDERS[name], settings[name]) for name in slower]
+    return [(PROVIDERS[name], options[name]) for name in slower]
+
+
+def _engine_folder(asked: Path | None) -> Path | None:
+    """The folder for engines; None, with a warning, where it cannot be made."""
+    caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = asked or Path(caches) / "aquaflow" / "tensorrt"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        log.warning(
+            "TensorRT builds its engines at every start: %s cannot be made (%s); set "
+            "prior.engine_cache",
+            folder,
+            reason_of(error),
+        )
+        return None
+    return folder

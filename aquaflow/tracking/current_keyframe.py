@@ -178,12 +178,12 @@ class KeyframeTracker:
         pair, T_fk, pointmap = solved.pair, solved.estimate.T, at.keyframe.pointmap
         reliable = self.shown(at, solved, camera) if self.hidden(solved) else pair.valid_back
         own = transfer(pointmap, pair.matches_back, reliable, T_fk, camera)
-        config, unit = self._config, None
+        config, before = self._config, None
         if pointmap.learned is not None:
             completed = pointmap.completed(config.known_sigma)
-            unit = transfer(completed, pair.matches_back, reliable, T_fk, camera)
-        learned = config.learned
-        return own, add_learned(own, pair.X_b, pair.Q_b, config.known_sigma, learned, unit)
+            before = transfer(completed, pair.matches_back, reliable, T_fk, camera)
+        known, unit = config.known_sigma, pair.range_unit
+        return own, add_learned(own, pair.X_b, pair.Q_b, known, config.learned, unit, before)
 
     def shown(self, at: CurrentKeyframe, solved: Matched, camera: CameraModel) -> Mask:
         """[H, W] pixels of the frame that show what the keyframe shows."""

@@ -118,7 +118,9 @@ class MapStart:
         encoding = self._prior.encode(reference.image, camera, reference.mask)
         pointmap = fused_pointmap(solution, camera, self._config.sigma_px)
         pair = max(solution.waiting, key=lambda waiting: waiting.parallax_px).pair
-        add_learned(pointmap, pair.X_a, pair.Q_a, self._config.known_sigma, self._config.learned)
+        config = self._config
+        known, unit = config.known_sigma, pair.range_unit
+        add_learned(pointmap, pair.X_a, pair.Q_a, known, config.learned, unit)
         posed = [
             PosedFrame(waiting.frame, T, waiting.pair)
             for waiting, T in zip(solution.waiting, solution.T, strict=True)

@@ -9,8 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
-from aquaflow.prior.describers import CELL_PX, unit
+from aquaflow.prior.contract import RangeUnit
 from aquaflow.prior.learned_range import LearnedRange
+from aquaflow.prior.mast3r.describer import CELL_PX
+from aquaflow.prior.network import unit
 
 SIDE_PX = 24
 """Of the square around a cell's centre that describes it."""
@@ -20,7 +22,8 @@ class PatchDescriber:
     """Describes a cell by the grey values around it, smoothed; counts how often it is asked."""
 
     name = "patches"
-    metric = False
+    metric, describes = False, True
+    range_unit: RangeUnit = "shared"
     unit_sigma = 0.2
 
     def __init__(self) -> None:

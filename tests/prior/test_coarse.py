@@ -9,7 +9,7 @@ import pytest
 
 from aquaflow.prior import coarse
 from aquaflow.prior.coarse import coarse_flow, mutual_matches
-from aquaflow.prior.describers import unit
+from aquaflow.prior.network import unit
 
 Float = npt.NDArray[np.float32]
 

@@ -90,6 +90,11 @@ class Pretended:
         return self.bindings[-1]
 
 
+@pytest.fixture(autouse=True)
+def no_cache_of_the_users(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
 def session(
     monkeypatch: pytest.MonkeyPatch, pretended: Pretended, **settings: Any
 ) -> NetworkSession:
@@ -136,10 +141,67 @@ def test_tensorrt_runs_in_half_precision_in_bounded_memory_and_keeps_what_it_bui
     assert options["trt_engine_cache_path"] == options["trt_timing_cache_path"] == str(tmp_path)
 
 
-def test_without_a_folder_no_engine_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_folder_engines_are_kept_in_the_users_cache(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     pretended = Pretended(GPU, PROVIDERS["tensorrt"])
     session(monkeypatch, pretended)
+    folder = tmp_path / "aquaflow" / "tensorrt"
+    assert dict(pretended.providers)[PROVIDERS["tensorrt"]]["trt_engine_cache_path"] == str(folder)
+    assert folder.is_dir()
+
+
+def test_without_a_cache_that_can_be_written_no_engine_is_kept_and_that_is_said(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    pretended = Pretended(GPU, PROVIDERS["tensorrt"])
+    with caplog.at_level(logging.WARNING):
+        session(monkeypatch, pretended)
     assert not any("cache" in key for key in dict(pretended.providers)[PROVIDERS["tensorrt"]])
+    assert "set prior.engine_cache" in caplog.text
+
+
+def test_no_folder_for_engines_is_made_where_there_are_none(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    session(monkeypatch, Pretended(GPU, PROVIDERS["cuda"]), device="cuda")
+    assert not list(tmp_path.iterdir())
+
+
+def test_32_bits_that_are_asked_for_are_not_rounded(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    pretended = Pretended(GPU, PROVIDERS["tensorrt"])
+    session(monkeypatch, pretended, precision="fp32", engine_cache=tmp_path)
+    options = dict(pretended.providers)
+    assert options[PROVIDERS["tensorrt"]]["trt_fp16_enable"] is False
+    assert options[PROVIDERS["cuda"]]["use_tf32"] is False
+
+
+@pytest.mark.parametrize("device", ["cuda", "cpu"])
+def test_16_bits_that_cannot_be_had_are_an_error(
+    monkeypatch: pytest.MonkeyPatch, device: str
+) -> None:
+    with pytest.raises(AquaFlowError, match=r"fp16 is TensorRT's and encoder\.onnx"):
+        session(monkeypatch, Pretended(GPU, PROVIDERS[device]), device=device, precision="fp16")
+
+
+def test_only_what_is_asked_for_is_copied_from_a_gpu_and_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    copies = []
+    copied = OnGpu.numpy
+    monkeypatch.setattr(OnGpu, "numpy", lambda self: copies.append(1) or copied(self))
+    network = session(monkeypatch, Pretended(GPU, PROVIDERS["cuda"]), device="cuda")
+    outputs = network.outputs_of({"x": np.float32([1.0])})
+    assert (list(outputs), len(outputs), copies) == (["y"], 1, [])
+    for _ in range(2):
+        np.testing.assert_array_equal(outputs["y"], [2.0])
+    assert len(copies) == 1
 
 
 def test_threads_are_as_asked_and_never_spin(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.messages import Frame
-from aquaflow.prior.contract import Keypoints
+from aquaflow.prior.contract import Keypoints, RangeUnit
 from aquaflow.tracking.pose.solver import PoseProblem
 
 Array = npt.NDArray[np.float64]
@@ -75,6 +75,7 @@ class KnownPair:
     """Matches of two known views, with noise; only a's side is exact, b's is by nearest pixel."""
 
     D_a = D_b = None
+    range_unit: RangeUnit = "shared"
 
     def __init__(self, a: KnownView, b: KnownView, noise_px: float, true: CameraModel) -> None:
         T_ba = b.T_wc.inverse() @ a.T_wc

@@ -75,6 +75,7 @@ class KeypointPrior:
 
     ranged = False
     metric = False
+    unit_sigma = float("inf")
 
     def __init__(self, network: KeypointNetwork, learned_matches: bool = True) -> None:
         """Without ``learned_matches`` flow starts at SIFT's where a prediction fails."""

@@ -36,9 +36,9 @@ class LearnedStart:
 def learned_start(
     pair: PairGeometry, camera: CameraModel, config: TrackingConfig
 ) -> LearnedStart | None:
-    """A map from ``pair``; None where the prior knows no ranges, states that they are less certain
-    than ``learned.start_sigma``, or contradicts itself or the matches."""
-    if not (config.learned.start and camera.calibrated):
+    """A map from ``pair``; None where the prior knows no ranges, or only up to a shift, states that
+    they are less certain than ``learned.start_sigma``, or contradicts itself or the matches."""
+    if not (config.learned.start and camera.calibrated) or pair.range_unit == "affine":
         return None
     if pair.X_a is None or pair.Q_a is None or pair.X_b is None or pair.Q_b is None:
         return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from aquaflow.config.tracking import LearnedConfig
 from aquaflow.keyframes import Pointmap
-from aquaflow.prior.contract import Float, Mask
+from aquaflow.prior.contract import Float, Mask, RangeUnit
 from aquaflow.tracking.learned.moving import moving
 from aquaflow.tracking.learned.scaling import learned_depth
 
@@ -15,22 +15,23 @@ def add_learned(
     Q: Float | None,  # [H, W] 1 / relative variance; 0 where unknown
     known_sigma: float,
     config: LearnedConfig,
-    unit: Pointmap | None = None,
+    unit: RangeUnit = "shared",
+    before: Pointmap | None = None,
 ) -> Mask | None:
     """Set what the prior knows of the picture in ``pointmap``; returns the pixels [H, W] that move
     by themselves. None, and no change, without ranges or a unit for them.
 
     The unit is that of the triangulated depths; where these are too few, because the camera only
-    turned, that of ``unit``, the depths that the keyframe before had learned.
+    turned, that of ``before``, what the keyframe before had learned, seen from here.
 
     Both are kept, and no mean is taken of them: the network's error is that of a whole part of the
     picture, so that depths which are better one by one would all be moved the same way.
     """
     if not config.depth or X is None or Q is None:
         return None
-    depth = learned_depth(pointmap, X, Q, known_sigma)
-    if depth is None and unit is not None:
-        depth = learned_depth(unit, X, Q, known_sigma)
+    depth = learned_depth(pointmap, X, Q, known_sigma, unit)
+    if depth is None and before is not None:
+        depth = learned_depth(before, X, Q, known_sigma, unit)
     if depth is None:
         return None
     pointmap.learned = depth.kept

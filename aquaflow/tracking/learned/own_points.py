@@ -35,6 +35,8 @@ def own_points(
 ) -> OwnPoints | None:
     """X of the frame, seen by ``camera``, at ``pixels``. The prior has both pictures' points in one
     unit, and the keyframe's ``pointmap`` says which; None without ranges, or without that unit."""
+    if pair.range_unit != "shared":
+        return None
     if pair.X_a is None or pair.Q_a is None or pair.X_b is None or pair.Q_b is None:
         return None
     keyframe = learned_depth(pointmap, pair.X_a, pair.Q_a, known_sigma)

@@ -4,6 +4,8 @@ A network's ranges have a unit of their own, are off by a slope across the pictu
 the error that it states. All three are found where the keyframe's depths are triangulated: scale
 and slope by robust least squares, and the factor of the error by the spread that is left. Errors of
 neighbours are alike, so that however many pixels are compared, they count as few.
+
+Networks that know inverse depth up to scale and shift get their shift there as well (affine.py).
 """
 
 from __future__ import annotations
@@ -16,7 +18,8 @@ import numpy.typing as npt
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.pixels import at_pixels
 from aquaflow.keyframes import LearnedDepths, Pointmap
-from aquaflow.prior.contract import Float, Mask
+from aquaflow.prior.contract import Float, Mask, RangeUnit
+from aquaflow.tracking.learned.affine import shift_of, shifted_depth
 
 Array = npt.NDArray[np.float64]
 
@@ -30,6 +33,9 @@ INDEPENDENT = 48
 SLOPE_SIGMA = 0.1
 """Of the logarithm from the picture's middle to its edge: a slope of 6 degrees over a floor seen
 straight down; a network that sees the floor's tilt errs by less."""
+SHIFT_SIGMA = 0.1
+"""Of what is left of a shift, over the median inverse depth: the most error that affine.py allows.
+"""
 TUKEY = 4.685
 """Standard deviations beyond which a difference does not count (biweight, 95 % efficiency under
 Gaussian noise): false depths lie on one side, and the unit would follow any part of them."""
@@ -72,22 +78,35 @@ def learned_depth(
     X: Float,  # [H, W, 3] in the pointmap's camera; NaN where unknown
     Q: Float,  # [H, W] 1 / relative variance; 0 where unknown
     known_sigma: float,
+    unit: RangeUnit = "shared",
 ) -> LearnedDepth | None:
     """The learned range in the unit of ``pointmap``, by the pixels that it knows to better than
-    ``known_sigma``; None if they are too few."""
+    ``known_sigma``; None if they are too few, or contradict a range that is known up to a
+    shift."""
     learned = _learned(X, Q)
     rows, columns = np.nonzero(learned & pointmap.known(known_sigma))
     if len(rows) < LEAST_COMMON:
         return None
     step = -(-len(rows) // COMPARED)
-    rows, columns = rows[::step], columns[::step]
-    rho = pointmap.rho[rows, columns]
-    log_ratio = -np.log(rho * X[rows, columns, 2].astype(np.float64))
-    stated = 1.0 / Q[rows, columns].astype(np.float64)
-    own = pointmap.variance[rows, columns] / rho**2
-    A = _positions(pointmap.camera)[rows, columns]
-    found, covariance, honesty = _fitted(A, log_ratio, stated, own)
-    return _applied(pointmap.camera, X, Q, learned, found, covariance, honesty)
+    common = rows[::step], columns[::step]
+    network = _network(pointmap.camera, X, Q, learned)
+    if unit == "affine":
+        shift = shift_of(1.0 / network.z[common], pointmap.rho[common])
+        if shift is None:
+            return None
+        network = _shifted(network, shift)
+        near = network.known[common]
+        common = common[0][near], common[1][near]
+        if len(common[0]) < LEAST_COMMON:
+            return None
+    rho = pointmap.rho[common]
+    log_ratio = -np.log(rho * network.z[common])
+    stated, own = network.variance[common], pointmap.variance[common] / rho**2
+    A = network.A[common]
+    if unit == "affine":  # by the keyframe's depths, whose errors make the line less flat
+        A[:, -1] *= np.exp(log_ratio - np.median(log_ratio))
+    found, covariance, honesty = _fitted(network.sigmas, A, log_ratio, stated, own)
+    return _applied(network, found, covariance, honesty)
 
 
 def unscaled_depth(
@@ -100,8 +119,9 @@ def unscaled_depth(
     learned = _learned(X, Q)
     if learned.sum() < LEAST_COMMON:
         return None
-    found = np.array([-np.log(float(np.median(X[learned][:, 2]))), 0.0, 0.0])
-    return _applied(camera, X, Q, learned, found, np.zeros((3, 3)), honesty)
+    network = _network(camera, X, Q, learned)
+    found = np.array([-np.log(float(np.median(network.z[learned]))), 0.0, 0.0])
+    return _applied(network, found, np.zeros((3, 3)), honesty)
 
 
 def agreement(
@@ -131,6 +151,46 @@ def _learned(
     return np.asarray(sound & (np.where(sound, X[..., 2], 0.0) > 0.0) & (Q > 0.0))
 
 
+@dataclass(frozen=True)
+class _Network:
+    """What the network says of a picture, and what its logarithm of depth may be off by."""
+
+    z: Array
+    """[H, W] in its own unit; NaN where unknown"""
+    variance: Array
+    """[H, W] of the logarithm of z, as it states"""
+    A: Array
+    """[H, W, k] change of log z for each correction: scale, slopes, and what a shift is off by"""
+    sigmas: tuple[float, ...]
+    """[k] of the corrections before anything is compared"""
+
+    @property
+    def known(self) -> Mask:
+        """[H, W]"""
+        return np.isfinite(self.z)
+
+
+def _network(
+    camera: CameraModel,
+    X: Float,  # [H, W, 3]
+    Q: Float,  # [H, W]
+    learned: Mask,  # [H, W]
+) -> _Network:
+    z = np.where(learned, X[..., 2], np.nan).astype(np.float64)
+    variance = 1.0 / np.where(learned, Q, 1.0).astype(np.float64)
+    return _Network(z, variance, _positions(camera), (np.inf, SLOPE_SIGMA, SLOPE_SIGMA))
+
+
+def _shifted(network: _Network, shift: float) -> _Network:
+    """With inverse depths moved by ``shift``. Such networks err by as much of the inverse depth
+    near and far, so that beyond the median depth the relative error grows with depth."""
+    z = shifted_depth(network.z, shift)
+    relative = np.where(np.isfinite(z), z, 1.0) / float(np.nanmedian(z))
+    A = np.concatenate([network.A, -relative[..., None]], -1)
+    variance = network.variance * np.maximum(relative, 1.0) ** 2
+    return _Network(z, variance, A, (*network.sigmas, SHIFT_SIGMA))
+
+
 def _positions(camera: CameraModel) -> Array:
     """[H, W, 3]: 1, and the pixel's place from -1 to 1 across and down."""
     across = (np.arange(camera.width) + 0.5) * (2.0 / camera.width) - 1.0
@@ -140,43 +200,41 @@ def _positions(camera: CameraModel) -> Array:
 
 
 def _fitted(
-    A: Array,  # [M, 3]
-    log_ratio: Array,  # [M]
+    sigmas: tuple[float, ...],  # [k] of the corrections before
+    A: Array,  # [M, k]
+    log_ratio: Array,  # [M] of the keyframe's depth over the network's
     stated: Array,  # [M] variance that the network states
     own: Array,  # [M] relative variance of the keyframe's depth
 ) -> tuple[Array, Array, float]:
-    """Scale and slopes [3], their covariance [3, 3], and the factor of the stated error."""
-    found = np.array([float(np.median(log_ratio)), 0.0, 0.0])
+    """Corrections [k], their covariance [k, k], and the factor of the stated error."""
+    found = np.zeros(A.shape[1])
+    found[0] = float(np.median(log_ratio))
     honesty, share = 1.0, min(INDEPENDENT / len(A), 1.0)
-    slopes = np.diag([0.0, SLOPE_SIGMA**-2, SLOPE_SIGMA**-2])
-    covariance = np.eye(3)
+    before = np.diag(np.array(sigmas) ** -2.0)
+    covariance = np.eye(len(found))
     for _ in range(ITERATIONS):
         left = log_ratio - A @ found
         excess = MAD_TO_SIGMA * float(np.median(np.abs(left) / np.sqrt(stated + own)))
         honesty = float(np.clip(excess, *HONESTY))
         sigma = np.sqrt(honesty**2 * stated + own)
         weight = share * np.clip(1.0 - (left / (TUKEY * sigma)) ** 2, 0.0, None) ** 2 / sigma**2
-        covariance = np.linalg.inv((A.T * weight) @ A + slopes)
+        covariance = np.linalg.inv((A.T * weight) @ A + before)
         found = covariance @ ((A.T * weight) @ log_ratio)
     return found, covariance, honesty
 
 
 def _applied(
-    camera: CameraModel,
-    X: Float,  # [H, W, 3]
-    Q: Float,  # [H, W]
-    learned: Mask,  # [H, W]
-    found: Array,  # [3] scale and slopes
-    covariance: Array,  # [3, 3] of them
+    network: _Network,
+    found: Array,  # [k] corrections
+    covariance: Array,  # [k, k] of them
     honesty: float,
 ) -> LearnedDepth:
-    A = _positions(camera)
-    z = np.where(learned, X[..., 2], 1.0).astype(np.float64) * np.exp(A @ found)
-    stated = 1.0 / np.where(learned, Q, 1.0).astype(np.float64)
-    variance = honesty**2 * stated + ((A @ covariance) * A).sum(-1)
+    A, known = network.A, network.known
+    z = np.where(known, network.z, 1.0) * np.exp(A @ found)
+    variance = honesty**2 * network.variance + ((A @ covariance) * A).sum(-1)
     return LearnedDepth(
-        np.where(learned, 1.0 / z, 0.0),
-        np.where(learned, variance, np.inf),
+        np.where(known, 1.0 / z, 0.0),
+        np.where(known, variance, np.inf),
         float(found[0]),
         float(np.sqrt(covariance[0, 0])),
         honesty,

@@ -141,9 +141,11 @@ def test_a_silent_fall_back_to_the_cpu_is_an_error(
 
 
 def test_tensorrt_keeps_its_engines_and_slower_providers_follow(tmp_path: Path) -> None:
-    names = [name for name, _ in runtime._providers("tensorrt", tmp_path)]
-    assert names == [runtime.PROVIDERS[name] for name in ("tensorrt", "cuda", "cpu")]
-    assert runtime._providers("tensorrt", tmp_path)[0][1]["trt_engine_cache_path"] == str(tmp_path)
+    providers = runtime._providers("tensorrt", RuntimeSettings(engine_cache=tmp_path))
+    assert [name for name, _ in providers] == [
+        runtime.PROVIDERS[name] for name in ("tensorrt", "cuda", "cpu")
+    ]
+    assert providers[0][1]["trt_engine_cache_path"] == str(tmp_path)
 
 
 def test_a_file_that_is_no_network_is_refused(tmp_path: Path) -> None:

@@ -47,6 +47,17 @@ class RangedPrior(KnownPrior):
         return RangedPair(a, b, self.sigma, self.sigma)
 
 
+class AffinePrior(RangedPrior):
+    """A prior that knows poses, and inverse depths up to a scale and shift of each picture."""
+
+    def decode(self, a, b, predicted=None, alone=False):  # type: ignore[no-untyped-def]
+        found = RangedPair(a, b, self.sigma, self.sigma)
+        found.range_unit = "affine"
+        found.X_a = found.X_a / (1.0 + 0.05 * found.X_a[..., 2:])  # 1 / z becomes 1 / z + 0.05
+        found.X_b = found.X_b / (1.0 + 0.15 * found.X_b[..., 2:])
+        return found
+
+
 def pair(sigma: float = 0.05, stated: float = 0.05, T_ba: Sim3 = STILL) -> RangedPair:
     first, T_wc = Sim3.identity(), T_ba.inverse()
     return RangedPair(
@@ -98,6 +109,12 @@ def test_a_prior_without_ranges_starts_no_map() -> None:
     assert learned_start(plain, SMALL, TrackingConfig()) is None
 
 
+def test_ranges_that_are_known_up_to_a_shift_start_no_map() -> None:
+    affine = pair()
+    affine.range_unit = "affine"
+    assert learned_start(affine, SMALL, TrackingConfig()) is None
+
+
 def test_a_still_camera_has_poses_from_the_first_picture_on() -> None:
     """Then it moves, and triangulation takes over."""
     still = [pose((0.0, 0.0, 0.0), (0.0003 * i, 0.0, 0.0)) for i in range(6)]
@@ -113,3 +130,20 @@ def test_a_still_camera_has_poses_from_the_first_picture_on() -> None:
     assert tracked.store[0].frame_index == 0
     assert error_share(tracked.tracked, poses) < 0.02
     assert tracked.store[0].pointmap.known(0.15).mean() > 0.5, "most of it is triangulated by then"
+
+
+def test_ranges_up_to_a_shift_fill_the_map_once_something_is_triangulated() -> None:
+    poses = [
+        pose((0.01 * i, 0.02 * i, -0.03 * i), (0.05 * i, 0.06 * np.sin(0.9 * i), 0.02 * i))
+        for i in range(12)
+    ]
+    prior = AffinePrior(poses, 0.02)
+    tracked = run(prior.frames(SMALL), prior=prior)
+    assert all(each.frame_class in PLACED for each in tracked.tracked)
+    assert error_share(tracked.tracked, poses) < 0.02
+    first = tracked.store[0].pointmap
+    assert first.learned is not None
+    depth = plane_depth(Sim3.identity())
+    known, learned = first.known(0.15), first.learned.rho > 0.0
+    ratio = np.median((first.learned.rho * depth)[learned]) / np.median((first.rho * depth)[known])
+    assert abs(np.log(ratio)) < 0.05

@@ -32,3 +32,13 @@ def network(
     rays = CAMERA.unproject(CAMERA.pixel_centres())
     X = (rays * z[..., None]).astype(np.float32)
     return X, np.full(z.shape, 1.0 / stated**2, np.float32)
+
+
+def affine_network(
+    scale: float = 3.0, shift: float = 0.3, sigma: float = 0.05, stated: float = 0.05, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """X and Q of a network whose inverse depths are ``scale`` (true + ``shift``)."""
+    X, Q = network(1.0, sigma, stated, seed=seed)
+    z = 1.0 / (scale * (1.0 / X[..., 2].astype(np.float64) + shift))
+    rays = CAMERA.unproject(CAMERA.pixel_centres())
+    return (rays * z[..., None]).astype(np.float32), Q

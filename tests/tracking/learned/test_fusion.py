@@ -101,8 +101,8 @@ def test_where_the_camera_only_turned_the_unit_is_that_of_what_was_learned_befor
     before, X, Q = filled(), *network(unit=5.0)
     now = Pointmap.unknown(CAMERA)
     assert add_learned(now, X, Q, KNOWN_SIGMA, LearnedConfig()) is None
-    unit = before.completed(KNOWN_SIGMA)
-    assert add_learned(now, X, Q, KNOWN_SIGMA, LearnedConfig(), unit) is not None
+    seen = before.completed(KNOWN_SIGMA)
+    assert add_learned(now, X, Q, KNOWN_SIGMA, LearnedConfig(), before=seen) is not None
     assert now.learned is not None
     assert np.median(np.abs(np.log(now.learned.rho * TRUTH))) < 0.08
 

@@ -1,0 +1,148 @@
+"""The paper's network behind the hybrid prior: it looks at both pictures of a pair.
+
+What it keeps of a picture are tokens; descriptors, points and confidences come with the pair.
+Pictures keep their aspect ratio: they lie in a frame of the exported size, and what lies around
+them is cut off from all that comes back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.prior.contract import Float, RangeUnit
+from aquaflow.prior.folder import DECODER, ENCODER, read_card
+from aquaflow.prior.framing import Framing, as_input
+from aquaflow.prior.learned_range import LearnedRange
+from aquaflow.prior.network import METRIC_SIGMA, SHORTEST, Half, Picture
+from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
+
+CELL_PX = 8
+"""Pixels of a cell, across and down, in the pictures that the network takes."""
+
+MIDDLE = slice(CELL_PX // 2, None, CELL_PX)
+"""Pixels next to the cells' centres."""
+
+POINTS_ALPHA = 0.2
+"""Metres: the reward of log Q in the loss that the paper's network was trained with."""
+
+
+class Mast3rDescriber:
+    """The paper's network: descriptors of both pictures, after each has looked at the other."""
+
+    metric, describes = True, True
+    unit_sigma = METRIC_SIGMA
+    range_unit: RangeUnit = "shared"
+
+    def __init__(self, folder: Path, settings: RuntimeSettings) -> None:
+        """Load the exported ``folder``; raises as the compact one."""
+        card = read_card(folder)
+        self.name, self._size = card.name, (card.height, card.width)
+        self._encoder = NetworkSession(folder / ENCODER, settings)
+        self._decoder = NetworkSession(folder / DECODER, settings)
+
+    def fitted(
+        self,
+        image: Picture,  # [H, W, 3] RGB
+    ) -> Picture:
+        """[h, w, 3] of the size that was exported, with the picture in its middle."""
+        return self._framing(*image.shape[:2]).framed(image)
+
+    def features(
+        self,
+        picture: Picture,  # [h, w, 3] as fitted
+    ) -> Half:
+        """[1, N, D] tokens."""
+        return self._encoder({"image": as_input(picture)})["tokens"].astype(np.float16)
+
+    def compared(
+        self,
+        a: Half,  # [1, N, D]
+        b: Half,  # [1, N, D]
+        camera_a: CameraModel,
+        camera_b: CameraModel,
+    ) -> Mast3rPair:
+        """Of the cameras only the pictures' sizes: the network finds the rest itself."""
+        framings = (self._framing(camera.height, camera.width) for camera in (camera_a, camera_b))
+        return Mast3rPair(self, a, b, *framings)
+
+    def decoded(
+        self,
+        a: Half,  # [1, N, D]
+        b: Half,  # [1, N, D]
+    ) -> Mapping[str, Float]:
+        """The decoder's outputs, each copied from a GPU when it is asked for: few of them are.
+        Points of both are in the first one's frame."""
+        tokens = {"tokens_a": a.astype(np.float32), "tokens_b": b.astype(np.float32)}
+        return self._decoder.outputs_of(tokens)
+
+    def _framing(self, height: int, width: int) -> Framing:
+        return Framing.of(height, width, self._size, CELL_PX)
+
+
+@dataclass
+class Mast3rPair:
+    """Two pictures after each has looked at the other; decoded once for each way."""
+
+    describer: Mast3rDescriber
+    a: Half
+    """[1, N, D]"""
+    b: Half
+    """[1, N, D]"""
+    framing_a: Framing
+    framing_b: Framing
+
+    @property
+    def cells(self) -> tuple[Float, Float]:
+        """[h / 8, w / 8, d] the descriptors at the cells' centres."""
+        found = self._decoded
+        return _at_cells(found["D_a"], self.framing_a), _at_cells(found["D_b"], self.framing_b)
+
+    @property
+    def range_a(self) -> LearnedRange:
+        return _range_of_points(self._decoded, self.framing_a)
+
+    @cached_property
+    def range_b(self) -> LearnedRange:
+        """From the pair the other way round: that has its points in b's own frame."""
+        return _range_of_points(self.describer.decoded(self.b, self.a), self.framing_b)
+
+    @cached_property
+    def confidence(self) -> Float:
+        """C of the descriptors weighed matching errors in training, up to a factor without meaning:
+        what is as sure as the picture's median or surer keeps its weight."""
+        C = _at_cells(self._decoded["C_a"], self.framing_a)
+        sound = np.isfinite(C)
+        if not sound.any():
+            return np.ones_like(C)
+        usual = max(float(np.median(C[sound])), SHORTEST)
+        return np.asarray(np.where(sound, np.clip(C / usual, 0.0, 1.0), 1.0), dtype=np.float32)
+
+    @cached_property
+    def _decoded(self) -> Mapping[str, Float]:
+        return self.describer.decoded(self.a, self.b)
+
+
+def _at_cells(
+    field: Float,  # [1, h, w, ...] of the frame's pixels
+    framing: Framing,
+) -> Float:
+    """[h', w', ...] at the centres of the cells that show the picture."""
+    return framing.cut(field[0, MIDDLE, MIDDLE])
+
+
+def _range_of_points(
+    found: Mapping[str, Float],  # outputs of the decoder by name
+    framing: Framing,
+) -> LearnedRange:
+    """Distances of the first picture's points, in metres. Their confidence Q weighed errors in
+    training, so that the network expects an error of POINTS_ALPHA / Q metres."""
+    distance = np.linalg.norm(_at_cells(found["X_a"], framing), axis=-1)
+    distance = np.maximum(distance, SHORTEST)
+    expected = POINTS_ALPHA / _at_cells(found["Q_a"], framing)
+    return LearnedRange(np.log(distance), (expected / distance) ** 2)
