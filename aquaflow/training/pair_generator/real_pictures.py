@@ -95,7 +95,11 @@ def _frames(path: Path) -> Iterator[Picture]:
     clip.release()
 
 
-def _crops(picture: Picture, width: int, height: int) -> list[Picture]:
+def _crops(
+    picture: Picture,  # [H, W, 3]
+    width: int,
+    height: int,
+) -> list[Picture]:
     """[height, width, 3] of the whole and, where none has to be enlarged, of its quarters, cut to
     shape; what shows open water is left out."""
     rows, columns = picture.shape[:2]
@@ -107,12 +111,19 @@ def _crops(picture: Picture, width: int, height: int) -> list[Picture]:
     return [cut for cut in cuts if _detail(cut) >= LEAST_DETAIL]
 
 
-def _detail(picture: Picture) -> float:
+def _detail(
+    picture: Picture,  # [H, W, 3]
+) -> float:
+    """Deviation of grey about its surroundings."""
     grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32)
     return float((grey - cv2.blur(grey, (SURROUNDINGS_PX, SURROUNDINGS_PX))).std())
 
 
-def _cut(picture: Picture, width: int, height: int) -> Picture:
+def _cut(
+    picture: Picture,  # [H, W, 3]
+    width: int,
+    height: int,
+) -> Picture:
     """The largest middle part of the shape, reduced."""
     rows, columns = picture.shape[:2]
     scale = min(rows / height, columns / width)
