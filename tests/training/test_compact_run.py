@@ -105,6 +105,16 @@ def test_windows_grow_when_the_rate_falls() -> None:
     assert run.looks_at(70).width == run.late_looks.width > run.looks.width
 
 
+@pytest.mark.usefixtures("small")
+def test_the_command_stops_when_its_hours_are_over(tmp_path: Path) -> None:
+    options = ["--scenes", "8", "--batch", "2", "--steps", "3", "--out", str(tmp_path)]
+    result = CliRunner().invoke(cli.app, ["prior", "train", "compact", *options, "--hours", "0"])
+    assert result.exit_code == 0, result.output
+    assert "give the same command to go on" in result.stdout
+    assert (tmp_path / "checkpoint.pt").is_file()
+    assert not (tmp_path / compact_run.PRIOR).exists()
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_the_command_trains_exports_and_goes_on_where_it_stopped(tmp_path: Path) -> None:

@@ -27,7 +27,8 @@ from aquaflow.prior.onnx_file import OPSET, relative_difference, write_onnx
 from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
 
 LICENCE = "Apache-2.0; trained on generated pictures only"
-"""Of the exported network, as its card says."""
+LICENCE_WITH_PICTURES = "Apache-2.0; trained on generated pictures and those that training names"
+"""Of the exported network, as its card says; the second where real pictures were learned from."""
 WIDTH, HEIGHT = 320, 240
 """Size that parity is measured at, and as many pixels as larger pictures are brought down to."""
 MOST_CELLS = 512
@@ -90,7 +91,7 @@ def export(
         height=HEIGHT,
         descriptor=network.size.fine,
         metric=False,
-        licence=LICENCE,
+        licence=LICENCE_WITH_PICTURES if training.get("pictures") else LICENCE,
         opset=OPSET,
         files={name: sha256_of(folder / name) for name in (ENCODER, DECODER, INT8_ENCODER)},
         parity=parity_of(network, folder),
