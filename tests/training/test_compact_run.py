@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from functools import partial
 from pathlib import Path
 
@@ -14,9 +15,11 @@ from torch import Tensor
 from typer.testing import CliRunner
 
 from aquaflow import cli
+from aquaflow.prior.compact import network as compact_network
 from aquaflow.prior.compact.network import CompactPrior, Encoded, NetworkSize
 from aquaflow.prior.folder import read_card
-from aquaflow.training import compact_run, held_out
+from aquaflow.training import compact_figures, compact_run, held_out
+from aquaflow.training.compact_figures import LEAST_FACTOR, with_honest_range
 from aquaflow.training.compact_recall import tracked_recall
 from aquaflow.training.compact_run import CompactRun, calibration, hardware_of, training_record
 from aquaflow.training.correspondences import overlap
@@ -105,6 +108,21 @@ def test_windows_grow_when_the_rate_falls() -> None:
     assert run.looks_at(70).width == run.late_looks.width > run.looks.width
 
 
+@pytest.mark.parametrize(("spread", "factor"), [(0.5, LEAST_FACTOR), (1.5, 2.25)])
+def test_a_variance_is_widened_where_errors_are_larger_and_never_narrowed(
+    spread: float, factor: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    errors = torch.tensor([-spread, spread])
+    monkeypatch.setattr(compact_figures, "onnx_encoder", lambda path: None)
+    monkeypatch.setattr(compact_figures, "onnx_comparison", lambda path: None)
+    monkeypatch.setattr(compact_figures, "normalised_errors", lambda *inputs: errors)
+    shipped = Path(compact_network.__file__).parents[1] / "weights" / "compact"
+    folder = Path(shutil.copytree(shipped, tmp_path / "prior"))
+    card = with_honest_range(folder, read_card(folder), [])
+    assert card.range_variance_factor == pytest.approx(factor)
+    assert read_card(folder) == card
+
+
 @pytest.mark.usefixtures("small")
 def test_the_command_stops_when_its_hours_are_over(tmp_path: Path) -> None:
     options = ["--scenes", "8", "--batch", "2", "--steps", "3", "--out", str(tmp_path)]
@@ -129,7 +147,7 @@ def test_the_command_trains_exports_and_goes_on_where_it_stopped(tmp_path: Path)
     assert json.loads(first.stdout) == card.training
     assert max(card.parity.values()) <= 1e-4
     assert set(card.training["figures"]) == {"wide", "wider", "hard"}
-    assert card.range_variance_factor != 1.0
+    assert card.range_variance_factor >= LEAST_FACTOR
     again = CliRunner().invoke(cli.app, [*command, "--steps", "3"])
     assert json.loads(again.stdout)["steps"] == 3
 
