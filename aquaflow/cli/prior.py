@@ -176,10 +176,17 @@ def train_compact(
     out: Annotated[Path, typer.Option(help="Folder of scenes, checkpoint, curve and prior.")] = (
         Path("out/compact")
     ),
-    steps: Annotated[int, typer.Option(min=1, help="Of the whole training.")] = 20_000,
-    scenes: Annotated[int, typer.Option(min=8, help="Generated pairs; 3 a second.")] = 1600,
+    steps: Annotated[int, typer.Option(min=1, help="Of the whole training.")] = 36_000,
+    scenes: Annotated[int, typer.Option(min=8, help="Generated pairs; 3 a second.")] = 2400,
     batch: Annotated[int, typer.Option(min=2, help="Pairs of a step.")] = 8,
     seed: Annotated[int, typer.Option(help="Of scenes, water and order.")] = 1,
+    pictures: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder of real pictures or clips to learn from too; may be repeated."),
+    ] = None,
+    hours: Annotated[
+        float | None, typer.Option(min=0.0, help="Stop after so many; the same command goes on.")
+    ] = None,
     threads: Annotated[int, typer.Option(min=1, help="Of torch.")] = 1,
     device: Annotated[str, typer.Option(help="cpu | cuda")] = "cpu",
     as_json: Json = False,
@@ -197,10 +204,13 @@ def train_compact(
 
     torch.set_num_threads(usable_threads(threads))
     settings = CompactSettings(batch=batch, scenes=scenes, first_scenes=min(160, scenes))
-    run = CompactRun(seed=seed, steps=steps, settings=settings)
+    run = CompactRun(seed=seed, steps=steps, settings=settings, pictures=tuple(pictures or ()))
     with progress_bars(as_json) as advance:
-        card = run_training(run, out, advance, device)
+        card = run_training(run, out, advance, device, hours)
+    record = {} if card is None else card.training or {}
     if as_json:
-        typer.echo(json.dumps(card.training))
+        typer.echo(json.dumps(record))
+    elif card is None:
+        typer.echo(f"stopped after {hours} hours; give the same command to go on")
     else:
-        typer.echo(f"written to {out / PRIOR}: {json.dumps((card.training or {})['held_out'])}")
+        typer.echo(f"written to {out / PRIOR}: {json.dumps(record['held_out'])}")

@@ -44,6 +44,7 @@ class CompactDescriber:
         """
         card = read_card(folder)
         self.name, self._pixels = card.name, card.width * card.height
+        self.variance_factor = card.range_variance_factor
         self._folder, self._settings = folder, settings
         self._encoder = _encoder(folder, INT8_ENCODER in card.files, settings)
         [(self._input, shape)] = self._encoder.inputs.items()
@@ -133,7 +134,8 @@ class CompactPair:
 
     def _range(self, way: str) -> LearnedRange:
         log_variance = np.clip(self._decoded[f"log_variance_{way}"][0], -MOST_LOG, MOST_LOG)
-        return LearnedRange(self._decoded[f"log_range_{way}"][0], np.exp(log_variance))
+        variance = np.float32(self.describer.variance_factor) * np.exp(log_variance)
+        return LearnedRange(self._decoded[f"log_range_{way}"][0], variance)
 
     @cached_property
     def _decoded(self) -> dict[str, Float]:

@@ -38,6 +38,8 @@ class PriorCard(Stage):
     """sha256 of each file of the folder."""
     parity: dict[str, float]
     """Largest difference of each output from torch's, relative to that output's largest value."""
+    range_variance_factor: float = 1.0
+    """By which the variance of the learned range is multiplied: fitted on held-out pairs."""
     training: dict[str, Any] | None = None
     """Seeds, steps, hardware and validation figures of the weights; None: not trained by us."""
     depth: DepthCard | None = None

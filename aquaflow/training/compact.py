@@ -6,7 +6,8 @@ dominates; ranges are regressed by |error| / b + log b, which is L_conf with Q =
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -18,16 +19,18 @@ from aquaflow.prior.compact.network import (
     FINE,
     SHARPEST,
     CompactPrior,
-    Compared,
     Encoded,
     cell_rays,
 )
+from aquaflow.training.compact_range import range_loss
 from aquaflow.training.compact_recall import drawn_matches, mean_recall
 from aquaflow.training.correspondences import Correspondences, correspondences
+from aquaflow.training.pair_generator.conditions import Conditions
 from aquaflow.training.pair_generator.draw import Draw
 from aquaflow.training.pair_generator.drawing import WindowVariation, training_pair
 from aquaflow.training.pair_generator.pool import SHARD, STRIDE, Pool
-from aquaflow.training.pairs import Pair
+from aquaflow.training.pair_generator.real_pictures import RealPictures
+from aquaflow.training.pairs import Pair, joined
 
 
 @dataclass(frozen=True)
@@ -47,8 +50,14 @@ class CompactSettings:
     steps_per_shard: int = 10
     """Steps after which another shard of pairs joins; none is used before its step, so that a
     run is the same whether its pool existed before or is rendered during the run."""
-    scenes: int = 1600
+    scenes: int = 2400
     """Pairs of the whole pool."""
+    real_share: float = 0.25
+    """Of a batch's pairs, if there are pictures to take them from."""
+    conditions: Conditions = field(default_factory=Conditions)
+    calm_steps: int = 2000
+    """Steps over which the conditions become as hard as they are meant to be: under hard ones from
+    the start, descriptors stay at chance for longer."""
     coarse_weight: float = 0.5
     trust_weight: float = 0.1
     range_weight: float = 0.3
@@ -63,14 +72,16 @@ class CompactTask:
         pool: Pool,
         held_out: list[Pair],
         settings: CompactSettings,
-        looks: WindowVariation,
+        looks_at: Callable[[int], WindowVariation],
         seed: int,
+        real: RealPictures | None = None,
     ) -> None:
         # A tenth to a fifth faster on a CPU in bfloat16 (40 to 48 against 47 to 54 ms a pair).
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.network = network
         self.pool, self.held_out = pool, held_out
-        self.settings, self.looks, self.seed = settings, looks, seed
+        self.settings, self.looks_at, self.seed = settings, looks_at, seed
+        self.real = real
 
     @property
     def device(self) -> torch.device:
@@ -82,9 +93,15 @@ class CompactTask:
         draw = Draw(self.seed * STRIDE + step, self.device)
         settings = self.settings
         known = settings.first_scenes + step // settings.steps_per_shard * SHARD
-        numbers = draw.whole(settings.batch, below=min(known, settings.scenes))
-        pair = training_pair(draw, self.pool.pairs(numbers.cpu()).to(self.device), self.looks)
-        terms = compact_losses(self.network, pair, settings, draw)
+        count = 0 if self.real is None else round(settings.real_share * settings.batch)
+        numbers = draw.whole(settings.batch - count, below=min(known, settings.scenes))
+        clear = self.pool.pairs(numbers.cpu()).to(self.device)
+        if self.real is not None:
+            clear = joined([clear, self.real.pairs(draw, count)])
+        conditions = settings.conditions.scaled(min(step / max(settings.calm_steps, 1), 1.0))
+        pair = training_pair(draw, clear, self.looks_at(step), conditions)
+        ranged = torch.arange(settings.batch, device=self.device) < len(numbers)
+        terms = compact_losses(self.network, pair, settings, draw, ranged)
         total = (
             settings.coarse_weight * terms["coarse"]
             + terms["among"]
@@ -102,9 +119,13 @@ class CompactTask:
 
 
 def compact_losses(
-    network: CompactPrior, pair: Pair, settings: CompactSettings, draw: Draw
+    network: CompactPrior,
+    pair: Pair,
+    settings: CompactSettings,
+    draw: Draw,
+    ranged: Tensor | None = None,  # [B] bool, None: all
 ) -> dict[str, Tensor]:
-    """The terms of a batch."""
+    """The terms of a batch; ranges are learnt from those that are ``ranged``."""
     images = torch.cat([pair.a.image, pair.b.image])
     with torch.autocast(images.device.type, torch.bfloat16):
         encoded = network.encode(images)
@@ -113,9 +134,11 @@ def compact_losses(
     size = (pair.a.depth.shape[-2], pair.a.depth.shape[-1])
     coarse = coarse_loss(network.comparison.scores(a.Dc, b.Dc), found, size)
     fine = fine_losses(network, a, b, found, settings, draw)
+    nothing = covered_trust(a.C, pair.a.depth, settings.matches // 4, draw)
+    fine["trust"] = fine["trust"] + nothing
     rays = [cell_rays(view.K, *size) for view in (pair.a, pair.b)]
     one, other = network.comparison(a.Dc.detach(), b.Dc.detach(), *rays)
-    return {"coarse": coarse, **fine, "range": range_loss(pair, one, other)}
+    return {"coarse": coarse, **fine, "range": range_loss(pair, one, other, ranged)}
 
 
 def coarse_loss(
@@ -195,22 +218,19 @@ def _around(
     return loss, best.norm(dim=-1) < 2.0
 
 
-def range_loss(pair: Pair, one: Compared, other: Compared) -> Tensor:
-    """|error| / b + log b of log-ranges, after the pair's scale was taken from both views."""
-    errors, known, log_b = [], [], []
-    for view, said in ((pair.a, one), (pair.b, other)):
-        height, width = view.depth.shape[-2:]
-        middle = slice(COARSE // 2, None, COARSE)
-        distance = view.depth * view.rays(height, width).norm(dim=-1)
-        truth = distance[:, middle, middle].clamp_min(1e-2).log()
-        errors.append((said.log_range - truth).flatten(1))
-        known.append(view.valid[:, middle, middle].flatten(1))
-        log_b.append((0.5 * said.log_variance - 0.3466).flatten(1))  # variance = 2 b^2
-    error, valid, spread = torch.cat(errors, 1), torch.cat(known, 1), torch.cat(log_b, 1)
-    scale = torch.where(valid, error.detach(), torch.nan).nanmedian(1, keepdim=True).values
-    spread = spread.clamp(-4.0, 2.0)
-    loss = (error - scale.nan_to_num()).abs() * torch.exp(-spread) + spread
-    return torch.where(valid, loss, 0.0).sum() / valid.sum().clamp_min(1)
+def covered_trust(
+    C: Tensor,  # [B, H/2, W/2]
+    depth: Tensor,  # [B, H, W]
+    count: int,
+    draw: Draw,
+) -> Tensor:
+    """Mean -log(1 - C) where a picture shows open water, text, or what moves on its own."""
+    covered = F.max_pool2d(-depth[:, None], FINE)[:, 0] >= 0.0
+    weights = covered.flatten(1).float()
+    index = torch.multinomial(weights + 1e-9, count, generator=draw.generator)
+    use = covered.flatten(1).gather(1, index)
+    loss = -torch.log1p(-C.flatten(1).gather(1, index).clamp_max(1.0 - 1e-6))
+    return torch.where(use, loss, 0.0).sum() / max(use.numel(), 1)
 
 
 def _trust_at(

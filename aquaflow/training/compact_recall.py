@@ -12,53 +12,32 @@ from torch import Tensor
 from aquaflow.prior import flow as dense
 from aquaflow.prior.candidates import reverse
 from aquaflow.prior.coarse import coarse_flow
+from aquaflow.prior.compact.export import INPUTS
 from aquaflow.prior.compact.matching import coarse_at, descriptors_at, fine_around
-from aquaflow.prior.compact.network import COARSE, FINE, Compared, Comparison, Encoded, cell_rays
+from aquaflow.prior.compact.network import FINE, Compared, Encoded, cell_rays
 from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
-from aquaflow.training.correspondences import Correspondences, correspondences, overlap
-from aquaflow.training.pair_generator.cameras import WIDE, Motion
+from aquaflow.training.compact_range import Compare, range_error
+from aquaflow.training.correspondences import Correspondences, correspondences
 from aquaflow.training.pair_generator.draw import Draw
-from aquaflow.training.pair_generator.drawing import through_water
-from aquaflow.training.pair_generator.pool import SHARD, Pool
 from aquaflow.training.pairs import Pair
 
 SEED = 1000
-"""Of the scenes that are never trained on, of their water, and of the matches looked up."""
-LEAST_OVERLAP = 0.3
-"""As in the paper's pair mining."""
-COUNT = 64
-"""Pairs."""
-TOGETHER = 8
-"""Pairs of a batch."""
+"""Of the matches looked up."""
 PLACES = 400
 """Matches looked up in each pair."""
 
 
-def held_out_pairs(folder: Path, motion: Motion = WIDE, count: int = COUNT) -> list[Pair]:
-    """Batches of pairs that overlap enough, rendered where ``folder`` lacks them."""
-    pool = Pool(folder, SEED, motion=motion)
-    chosen: list[int] = []
-    number = 0
-    while len(chosen) < count:
-        pair = pool.pairs(torch.arange(number, number + SHARD))
-        chosen += [number + int(i) for i in torch.nonzero(overlap(pair) >= LEAST_OVERLAP)]
-        number += SHARD
-    draw = Draw(SEED)
-    parts = [chosen[i : min(i + TOGETHER, count)] for i in range(0, count, TOGETHER)]
-    return [through_water(draw, pool.pairs(torch.tensor(part))) for part in parts]
-
-
 def mean_recall(
-    encode: Callable[[Tensor], Encoded], comparison: Comparison, pairs: list[Pair]
+    encode: Callable[[Tensor], Encoded], compare: Compare, pairs: Sequence[Pair]
 ) -> dict[str, float]:
     """The figures of ``recall_of``, means over batches."""
-    rows = [recall_of(encode, comparison, pair) for pair in pairs]
+    rows = [recall_of(encode, compare, pair) for pair in pairs]
     return {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
 
 
 @torch.no_grad()
 def recall_of(
-    encode: Callable[[Tensor], Encoded], comparison: Comparison, pair: Pair
+    encode: Callable[[Tensor], Encoded], compare: Compare, pair: Pair
 ) -> dict[str, float]:
     """Shares of true matches that are found: by the whole picture's nearest fine descriptor, by
     the coarse cell (8 px), and from coarse to fine within 1, 2 and 4 px; and the log-range error.
@@ -66,7 +45,7 @@ def recall_of(
     a, b = encode(pair.a.image), encode(pair.b.image)
     height, width = pair.a.depth.shape[-2:]
     rays = [cell_rays(view.K, height, width) for view in (pair.a, pair.b)]
-    one, _ = comparison(a.Dc, b.Dc, *rays)
+    one, _ = compare(a.Dc, b.Dc, *rays)
     draw = Draw(SEED, pair.a.image.device)
     here, there, use = drawn_matches(correspondences(pair), PLACES, draw)
     expected = coarse_at(one.pixels, here)
@@ -124,6 +103,31 @@ def onnx_encoder(path: Path) -> Callable[[Tensor], Encoded]:
     return encode
 
 
+def onnx_comparison(path: Path) -> Compare:
+    """An exported decoder in the place of the network's comparison."""
+    session = NetworkSession(path, RuntimeSettings(device="cpu"))
+
+    def compare(*inputs: Tensor) -> tuple[Compared, Compared]:
+        rows = []
+        for item in range(len(inputs[0])):
+            given = {
+                name: x[item : item + 1].numpy() for name, x in zip(INPUTS, inputs, strict=True)
+            }
+            rows.append(session(given))
+        one, other = (
+            Compared(
+                *(
+                    torch.from_numpy(np.concatenate([row[f"{name}_{way}"] for row in rows]))
+                    for name in Compared._fields
+                )
+            )
+            for way in ("ab", "ba")
+        )
+        return one, other
+
+    return compare
+
+
 def drawn_matches(found: Correspondences, count: int, draw: Draw) -> tuple[Tensor, Tensor, Tensor]:
     """[B, N, 2] px in a, [B, N, 2] px in b, [B, N] bool: false for pairs with too few matches."""
     batch, _, width = found.visible.shape
@@ -137,11 +141,8 @@ def drawn_matches(found: Correspondences, count: int, draw: Draw) -> tuple[Tenso
 
 def _range_error(pair: Pair, said: Compared) -> float:
     """Mean over pairs of the median |error| after the median was taken away."""
-    height, width = pair.a.depth.shape[-2:]
-    middle = slice(COARSE // 2, None, COARSE)
-    distance = pair.a.depth * pair.a.rays(height, width).norm(dim=-1)
-    error = said.log_range - distance[:, middle, middle].clamp_min(1e-2).log()
-    error = torch.where(pair.a.valid[:, middle, middle], error, torch.nan).flatten(1)
+    error, known = range_error(pair.a, said)
+    error = torch.where(known, error, torch.nan)
     error = error - error.nanmedian(1, keepdim=True).values
     return float(error.abs().nanmedian(1).values.nanmean())
 

@@ -11,29 +11,28 @@ from typing import Any
 import torch
 
 from aquaflow.errors import InputError
-from aquaflow.prior.compact.export import export, folded
+from aquaflow.prior.compact.export import export
 from aquaflow.prior.compact.network import CompactPrior
-from aquaflow.prior.compact.quantise import INT8_ENCODER
-from aquaflow.prior.folder import ENCODER, PriorCard, write_card
+from aquaflow.prior.folder import PriorCard
 from aquaflow.training.compact import CompactSettings, CompactTask
-from aquaflow.training.compact_recall import SEED as HELD_OUT_SEED
-from aquaflow.training.compact_recall import (
-    held_out_pairs,
-    mean_recall,
-    onnx_encoder,
-    tracked_recall,
-)
+from aquaflow.training.compact_figures import with_figures, with_honest_range
 from aquaflow.training.curve import NOT_FIGURES
-from aquaflow.training.pair_generator.cameras import WIDER
+from aquaflow.training.held_out import RANGE_SET, SETS, held_out_pairs
+from aquaflow.training.held_out import SEED as HELD_OUT_SEED
 from aquaflow.training.pair_generator.draw import Draw
 from aquaflow.training.pair_generator.drawing import WindowVariation, through_water
 from aquaflow.training.pair_generator.pool import SHARD, Pool
-from aquaflow.training.pairs import Pair
+from aquaflow.training.pair_generator.real_pictures import RealPictures
+from aquaflow.training.pair_generator.scene import Detail
 from aquaflow.training.schedule import Schedule
-from aquaflow.training.trainer import Progress, TrainingPlan, train
+from aquaflow.training.trainer import Progress, TrainingPlan, has_ended, train
 
-POOL, HELD_OUT, HELD_OUT_WIDER, PRIOR = "pool", "held_out", "held_out_wider", "prior"
-"""Folders of a run: training pairs, two sets of held-out ones, the exported prior."""
+POOL, PRIOR = "pool", "prior"
+"""Folders of a run: training pairs, the exported prior."""
+REGULAR_SHARE = 0.2
+"""Of the pool's scenes: tiles and nets."""
+VALIDATE_EVERY = 1000
+"""Steps: a validation takes as long as 60 of them."""
 CALIBRATION_SEED = 2000
 """Of the water over the pictures that 8-bit ranges are taken from."""
 CALIBRATION_SHARDS = 2
@@ -45,14 +44,19 @@ class CompactRun:
     """All that a run's result follows from, together with the code."""
 
     seed: int = 1
-    steps: int = 20_000
+    steps: int = 36_000
     hold: float = 0.7
-    """Share of the steps at the highest rate; the rest anneals."""
+    """Share of the steps at the highest rate; the rest anneals, on larger windows."""
     warm_up: int = 100
     rate: float = 2e-3
     lowest_rate: float = 2e-5
     settings: CompactSettings = field(default_factory=CompactSettings)
     looks: WindowVariation = field(default_factory=WindowVariation)
+    late_looks: WindowVariation = field(
+        default_factory=lambda: WindowVariation(width=160, height=112)
+    )
+    pictures: tuple[Path, ...] = ()
+    """Folders of real pictures and clips; none: generated pairs only."""
 
     @property
     def schedule(self) -> Schedule:
@@ -60,29 +64,42 @@ class CompactRun:
         hold = round(self.hold * self.steps)
         return Schedule(self.steps, self.warm_up, self.rate, self.lowest_rate, hold)
 
+    def looks_at(self, step: int) -> WindowVariation:
+        """Small windows first: most is learnt there, in half the time."""
+        return self.looks if step < self.schedule.hold else self.late_looks
 
-def train_compact(run: CompactRun, out: Path, progress: Progress, device: str = "cpu") -> PriorCard:
+
+def train_compact(
+    run: CompactRun, out: Path, progress: Progress, device: str = "cpu", hours: float | None = None
+) -> PriorCard | None:
     """Train on ``device`` in ``out``, continuing an earlier run there; export to ``out``/prior.
 
+    None if ``hours`` were over before the training was: the same call goes on.
+
     Raises:
-        InputError: ``out`` holds the checkpoint of another network, or there is no such device.
+        InputError: ``out`` holds the checkpoint of another network, there is no such device, or
+            a folder of pictures holds none.
     """
     place = device_called(device)
     torch.manual_seed(run.seed)
     network = CompactPrior().to(place)
-    pool = Pool(out / POOL, run.seed)
+    pool = Pool(out / POOL, run.seed, detail=Detail(regular=REGULAR_SHARE))
+    real = RealPictures(run.pictures, pool.width, pool.height) if run.pictures else None
     first = -(-min(run.settings.first_scenes, run.settings.scenes) // SHARD)
     for shard in range(first):
         pool.ensure(shard)
         progress("scenes", shard + 1, first)
-    held_out = held_out_pairs(out / HELD_OUT)
-    task = CompactTask(network, pool, held_out, run.settings, run.looks, run.seed)
-    history = train(task, TrainingPlan(run.schedule), out, progress)
+    held_out = held_out_pairs(out, SETS["wide"])
+    task = CompactTask(network, pool, held_out, run.settings, run.looks_at, run.seed, real)
+    plan = TrainingPlan(run.schedule, validate_every=VALIDATE_EVERY, hours=hours)
+    history = train(task, plan, out, progress)
+    if not has_ended(history, run.schedule):
+        return None
     record = training_record(run, history, hardware_of(device))
-    network = network.cpu()
-    card = export(network, out / PRIOR, record, calibration(pool), progress)
-    wider = held_out_pairs(out / HELD_OUT_WIDER, WIDER)
-    return with_figures(out / PRIOR, card, network, {"wide": held_out, "wider": wider})
+    card = export(network.cpu(), out / PRIOR, record, calibration(pool), progress)
+    card = with_honest_range(out / PRIOR, card, held_out_pairs(out, RANGE_SET))
+    sets = {name: held_out_pairs(out, chosen) for name, chosen in SETS.items()}
+    return with_figures(out / PRIOR, card, sets)
 
 
 def device_called(name: str) -> torch.device:
@@ -107,7 +124,8 @@ def training_record(
 ) -> dict[str, Any]:
     """What prior.json keeps of a training."""
     return {
-        "data": "generated pictures only (aquaflow.training.pair_generator)",
+        "data": "generated pictures (aquaflow.training.pair_generator)",
+        "pictures": [folder.name for folder in run.pictures],
         "seed": run.seed,
         "pool_seed": run.seed,
         "held_out_seed": HELD_OUT_SEED,
@@ -117,13 +135,11 @@ def training_record(
         "hardware": hardware,
         "torch": torch.__version__,
         "cpu_s": history[-1]["cpu_s"],
-        "held_out": _rounded(
-            {
-                name: value
-                for name, value in history[-1].items()
-                if name not in NOT_FIGURES and not name.startswith("loss_")
-            }
-        ),
+        "held_out": {
+            name: round(value, 4)
+            for name, value in history[-1].items()
+            if name not in NOT_FIGURES and not name.startswith("loss_")
+        },
     }
 
 
@@ -135,31 +151,8 @@ def hardware_of(device: str) -> str:
     return f"{platform.machine()} CPU, {threads} of {cores} cores, bfloat16"
 
 
-def with_figures(
-    folder: Path, card: PriorCard, network: CompactPrior, sets: dict[str, list[Pair]]
-) -> PriorCard:
-    """The card of ``folder``, extended by what its encoders find of several sets of pairs."""
-    comparison = folded(network).comparison
-    encoders = {"32_bit": ENCODER, "8_bit": INT8_ENCODER}
-    figures: dict[str, Any] = {}
-    for name, pairs in sets.items():
-        alone = tracked_recall(None, pairs)["flow_2px"]
-        figures[name] = {"pairs": sum(len(pair.a.K) for pair in pairs), "flow_alone_2px": alone}
-        for bits, file in encoders.items():
-            encode = onnx_encoder(folder / file)
-            found = mean_recall(encode, comparison, pairs) | tracked_recall(encode, pairs)
-            figures[name][bits] = _rounded(found)
-    card = card.model_copy(update={"training": (card.training or {}) | {"figures": figures}})
-    write_card(folder, card)
-    return card
-
-
 def calibration(pool: Pool) -> list[Any]:
     """[1, 3, H, W] pictures of the pool, through water, for the 8-bit encoder."""
     pairs = pool.pairs(torch.arange(CALIBRATION_SHARDS * SHARD))
     seen = through_water(Draw(CALIBRATION_SEED), pairs)
     return [image[None].numpy() for image in seen.a.image]
-
-
-def _rounded(figures: dict[str, float]) -> dict[str, float]:
-    return {name: round(value, 4) for name, value in figures.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import torch
@@ -44,6 +45,10 @@ class ViewBatch:
         return ViewBatch(*(getattr(self, field.name).to(device) for field in fields(self)))
 
 
+FIELDS = fields(ViewBatch)
+"""Of a view, by which batches are taken apart and joined."""
+
+
 @dataclass(frozen=True)
 class Pair:
     """Two views of one scene; a is the reference."""
@@ -58,6 +63,16 @@ class Pair:
     def to(self, device: torch.device) -> Pair:
         """The same on another device."""
         return Pair(self.a.to(device), self.b.to(device))
+
+
+def joined(pairs: Sequence[Pair]) -> Pair:
+    """One batch of several, of pictures of one size."""
+    views = []
+    for side in ("a", "b"):
+        parts = [getattr(pair, side) for pair in pairs]
+        values = (torch.cat([getattr(part, field.name) for part in parts]) for field in FIELDS)
+        views.append(ViewBatch(*values))
+    return Pair(*views)
 
 
 def seen_from(

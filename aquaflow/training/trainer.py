@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -62,6 +63,8 @@ class TrainingPlan:
     """Steps."""
     save_every: int = 250
     """Steps; a checkpoint holds all that is needed to go on."""
+    hours: float | None = None
+    """After which a call stops, to be continued by another; None: when the schedule ends."""
 
 
 @dataclass
@@ -80,7 +83,7 @@ def train(
     progress: Progress,
     process: TrainingProcess | None = None,
 ) -> list[dict[str, float]]:
-    """Train until the schedule ends, from ``out``'s checkpoint if there is one.
+    """Train until the schedule or the plan's hours end, from ``out``'s checkpoint if there is one.
 
     Gradients are averaged over all processes, and the one that leads writes files.
 
@@ -98,11 +101,12 @@ def train(
     run = _resumed(task.network, optimiser, out / CHECKPOINT)
     began, steps = time.process_time() - run.cpu_s, plan.schedule.steps
     sums: dict[str, list[float]] = {}
+    until = math.inf if plan.hours is None else time.monotonic() + 3600.0 * plan.hours
     while run.step < steps:
         for name, value in _step(task, optimiser, plan, run.step, process).items():
             sums.setdefault(name, []).append(value)
         run.step += 1
-        last = run.step == steps
+        last, over = run.step == steps, time.monotonic() >= until
         if process.leads and (last or run.step % plan.validate_every == 0):
             run.cpu_s = time.process_time() - began
             run.history.append(_row(task, plan, run, sums))
@@ -110,11 +114,18 @@ def train(
             (out / HISTORY).write_text(json.dumps(run.history, indent=1) + "\n")
             draw_curve(run.history, out / CURVE)
             log.info("%s", json.dumps(run.history[-1]))
-        if process.leads and (last or run.step % plan.save_every == 0):
+        if process.leads and (last or over or run.step % plan.save_every == 0):
             run.cpu_s = time.process_time() - began
             _save(task.network, optimiser, run, out / CHECKPOINT)
         progress("train", run.step, steps)
+        if over:
+            break
     return run.history
+
+
+def has_ended(history: list[dict[str, float]], schedule: Schedule) -> bool:
+    """Whether the last validation came after the schedule's last step."""
+    return bool(history) and history[-1]["step"] >= schedule.steps
 
 
 def _step(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from aquaflow.errors import InputError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior import describers
 from aquaflow.prior.describers import CompactDescriber, describer_in
+from aquaflow.prior.folder import read_card, write_card
 from aquaflow.prior.runtime import Precision, RuntimeSettings
 from tests.prior.stub_prior import write_stub
 
@@ -98,3 +100,18 @@ def test_on_a_gpu_eight_bits_are_not_the_choice(
 
 def test_the_card_says_which_network_it_is(tmp_path: Path) -> None:
     assert describer_in(write_stub(tmp_path / "stub"), CPU).name == "compact"
+
+
+def test_the_range_s_variance_is_what_the_card_makes_of_it(tmp_path: Path) -> None:
+    shipped = Path(describers.__file__).parent / "weights" / "compact"
+    folder = Path(shutil.copytree(shipped, tmp_path / "copy"))
+    card = read_card(folder)
+    variances = []
+    for factor in (1.0, 4.0):
+        write_card(folder, card.model_copy(update={"range_variance_factor": factor}))
+        describer = CompactDescriber(folder, CPU)
+        features = describer.features(picture(48, 64))
+        camera = CameraModel(64, 48, 60.0, 60.0, 32.0, 24.0)
+        pair = describer.compared(features, features, camera, camera)
+        variances.append((pair.range_a.variance, pair.range_b.variance))
+    np.testing.assert_allclose(variances[1], 4.0 * np.array(variances[0]), rtol=1e-5)

@@ -7,6 +7,8 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
@@ -20,11 +22,12 @@ from aquaflow.training.pair_generator.cameras import TRAINING
 from aquaflow.training.pair_generator.draw import Draw
 from aquaflow.training.pair_generator.drawing import WindowVariation, training_pair
 from aquaflow.training.pair_generator.pool import Pool
+from aquaflow.training.pair_generator.real_pictures import RealPictures
 from aquaflow.training.pair_generator.render import render_pairs
 from aquaflow.training.pair_generator.scene import Detail
 from aquaflow.training.pairs import Pair
 from aquaflow.training.schedule import Schedule
-from aquaflow.training.trainer import CHECKPOINT, CURVE, HISTORY, TrainingPlan, train
+from aquaflow.training.trainer import CHECKPOINT, CURVE, HISTORY, TrainingPlan, has_ended, train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -58,7 +61,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def task(folder: Path) -> CompactTask:
     pool = Pool(folder, 1, 48, 36, detail=DETAIL)
-    return CompactTask(network(), pool, [], SETTINGS, replace(LOOKS, width=32, height=32), 1)
+    looks = replace(LOOKS, width=32, height=32)
+    return CompactTask(network(), pool, [], SETTINGS, lambda step: looks, 1)
 
 
 class Recorded(CompactTask):
@@ -156,6 +160,35 @@ def test_a_run_that_was_stopped_ends_with_the_same_weights(folder: Path, tmp_pat
     ):
         assert torch.equal(one, other)
     assert [row["loss_coarse"] for row in again] == [row["loss_coarse"] for row in history]
+
+
+def test_hours_stop_a_run_that_then_goes_on_to_the_same_weights(
+    folder: Path, tmp_path: Path
+) -> None:
+    whole = recorded(folder)
+    train(whole, PLAN, tmp_path / "whole", silent)
+    calls = 0
+    while True:
+        part = recorded(folder)
+        history = train(part, replace(PLAN, hours=0.0), tmp_path / "parts", silent)
+        calls += 1
+        if has_ended(history, PLAN.schedule):
+            break
+    assert calls == PLAN.schedule.steps
+    for one, other in zip(
+        whole.network.state_dict().values(), part.network.state_dict().values(), strict=True
+    ):
+        assert torch.equal(one, other)
+
+
+def test_real_pictures_join_a_batch(folder: Path, tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (36, 48, 3), np.uint8)
+    cv2.imwrite(str(tmp_path / "noise.png"), noise)
+    learner = task(folder)
+    plain = learner.loss(0)[1]
+    learner.real = RealPictures([tmp_path], 48, 36)
+    learner.settings = replace(SETTINGS, real_share=0.5)
+    assert learner.loss(0)[1]["coarse"] != plain["coarse"]
 
 
 def test_a_run_leaves_a_curve_and_its_figures(folder: Path, tmp_path: Path) -> None:

@@ -13,8 +13,8 @@ from aquaflow.evaluation.matching import HEIGHT, LEVELS, WIDTH, homography_pair
 from aquaflow.evaluation.prior_bench.pair import KnownPair, Picture
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.training.compact_recall import LEAST_OVERLAP, SEED
 from aquaflow.training.correspondences import correspondences, overlap
+from aquaflow.training.held_out import LEAST_OVERLAP, SEED
 from aquaflow.training.pair_generator.cameras import WIDE, WIDER, Motion
 from aquaflow.training.pair_generator.draw import Draw
 from aquaflow.training.pair_generator.drawing import through_water

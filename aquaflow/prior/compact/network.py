@@ -21,6 +21,8 @@ FINE, COARSE = 2, 8
 """Pixels between descriptors along a side."""
 SHARPEST = 4.6
 """Largest logarithm of an inverse temperature."""
+SMALLEST = 1e-30
+"""Sum of exponentials below which a cell is like no other; far above what 32 bits can hold."""
 
 
 @dataclass(frozen=True)
@@ -145,37 +147,41 @@ class Comparison(nn.Module):
         rays_b: Tensor,  # [B, 2, h, w]
     ) -> tuple[Compared, Compared]:
         """From a to b, and from b to a."""
-        scores = self.scores(Dc_a, Dc_b)
-        one, other = torch.softmax(scores, 2), torch.softmax(scores, 1)
-        both = one * other
+        # Products of unit descriptors are at most 1, so no exponential is above 1.
+        sharpness = self.sharpness.clamp_max(SHARPEST).exp()
+        alike = torch.exp(self.scores(Dc_a, Dc_b) - sharpness)
+        of_a = alike.sum(2, keepdim=True).clamp_min(SMALLEST)
+        of_b = alike.sum(1, keepdim=True).clamp_min(SMALLEST)
+        # The mutual probability is alike^2 / (of_a of_b); its largest place needs one of the two.
+        best_b = (alike * of_b.rsqrt()).argmax(2)
+        best_a = (alike * of_a.rsqrt()).argmax(1)
         return (
-            self._one_way(Dc_a, rays_a, rays_b, one, both),
-            self._one_way(Dc_b, rays_b, rays_a, other.mT, both.mT),
+            self._one_way(Dc_a, rays_a, rays_b, alike, of_a[..., 0], best_b),
+            self._one_way(Dc_b, rays_b, rays_a, alike.mT, of_b[:, 0], best_a),
         )
 
     def _one_way(
         self,
         Dc: Tensor,  # [B, d, h, w]
         rays: Tensor,  # [B, 2, h, w]
-        rays_other: Tensor,  # [B, 2, h, w]
-        one: Tensor,  # [B, cells, cells of the other] probabilities
-        both: Tensor,  # [B, cells, cells of the other] mutual ones
+        rays_other: Tensor,  # [B, 2, h', w']
+        alike: Tensor,  # [B, cells, cells of the other]
+        total: Tensor,  # [B, cells] its sums
+        best: Tensor,  # [B, cells] the best cell of the other
     ) -> Compared:
-        height, width = rays_other.shape[-2:]
-        column, row = _cells(height, width, Dc)
-        best = both.argmax(2, keepdim=True)
-        near = ((column - column[best]).abs() < 1.5) & ((row - row[best]).abs() < 1.5)
-        weight = torch.where(near, one, 0.0)
-        score = weight.sum(2, keepdim=True)
-        weight = weight / score.clamp_min(1e-6)
-        pixels = torch.stack([(column + 0.5) * COARSE, (row + 0.5) * COARSE], -1)
-        places = torch.cat([pixels.expand(len(Dc), -1, -1), rays_other.flatten(2).mT], -1)
-        shape = (len(Dc), -1, *rays.shape[-2:])
-        pixels, ray = (weight @ places).mT.reshape(shape).chunk(2, 1)
-        score = score.mT.reshape(shape)
-        known = torch.cat([Dc, ray - rays, rays, score], 1).detach()
+        cells, place, inside = _around(best, rays_other.shape[-2], rays_other.shape[-1])
+        weight = torch.where(inside, alike.gather(2, cells), 0.0) / total[..., None]
+        score = weight.sum(2)
+        weight = weight / score[..., None].clamp_min(1e-6)
+        flat = cells.flatten(1)[:, None].expand(-1, 2, -1)
+        there = rays_other.flatten(2).gather(2, flat).view_as(place)
+        shape = (len(Dc), 2, *rays.shape[-2:])
+        pixels = (COARSE * (weight[:, None] * place).sum(3)).view(shape)
+        ray = (weight[:, None] * there).sum(3).view(shape)
+        score = score.view(len(Dc), *rays.shape[-2:])
+        known = torch.cat([Dc, ray - rays, rays, score[:, None]], 1).detach()
         log_range, log_variance = self.range(known).float().unbind(1)
-        return Compared(pixels, ray, score[:, 0], log_range, log_variance)
+        return Compared(pixels, ray, score, log_range, log_variance)
 
 
 def cell_rays(
@@ -192,12 +198,17 @@ def cell_rays(
     return torch.stack([x[:, None].expand(-1, rows, -1), y[:, :, None].expand(-1, -1, columns)], 1)
 
 
-def _cells(
+def _around(
+    best: Tensor,  # [B, N] int64
     height: int,
     width: int,
-    like: Tensor,  # [...], for its device and type
-) -> tuple[Tensor, Tensor]:
-    """[height * width] column and row of each cell, as numbers that can be averaged."""
-    column = torch.arange(width, device=like.device, dtype=like.dtype)
-    row = torch.arange(height, device=like.device, dtype=like.dtype)
-    return column.expand(height, width).flatten(), row[:, None].expand(height, width).flatten()
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The 3 x 3 cells around each, held in the picture: [B, N, 9] their numbers, [B, 2, N, 9] the
+    column and row of their middles, and [B, N, 9] bool: inside."""
+    row = best // width
+    column = best - row * width  # a remainder by a size that is not fixed cannot be exported
+    step = torch.arange(9, device=best.device)
+    x, y = column[..., None] + step % 3 - 1, row[..., None] + step // 3 - 1
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    x, y = x.clamp(0, width - 1), y.clamp(0, height - 1)
+    return y * width + x, torch.stack([x, y], 1) + 0.5, inside

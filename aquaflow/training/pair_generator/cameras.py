@@ -25,10 +25,12 @@ class Motion:
     """Radians, deviation about either axis of the picture."""
     roll: float = 0.15
     """Radians, deviation about the optical axis."""
+    forward: float = 0.0
+    """Share of the pairs that move along the optical axis, to the front or back."""
 
 
-TRAINING = Motion()
-"""Of the pairs that are learned from: all of the defaults."""
+TRAINING = Motion(baseline=0.8, forward=0.25)
+"""Of the pairs that are learned from: wider than what is held out, and a quarter along the axis."""
 WIDE = Motion(baseline=0.45, power=1.5, tilt=0.07, roll=0.12)
 """Of the held-out pairs: the motion of the prototypes' measurements (docs/measurements.md)."""
 WIDER = Motion(baseline=0.45, power=1.0, tilt=0.1, roll=0.2)
@@ -44,6 +46,10 @@ CLEARANCE_M = 0.25
 """Of the second camera above the floor."""
 LOOKS_BACK = 0.6
 """Share of the second cameras that turn towards what the first one looks at."""
+OFF_AXIS = 0.15
+"""Length across the optical axis of a motion along it, as a share of its length, deviation."""
+MOST_FORWARD = 0.5
+"""Of the scene's median depth, towards it: twice as near shows everything twice as large."""
 
 
 def intrinsics(draw: Draw, batch: int, width: int, height: int) -> Tensor:
@@ -87,6 +93,9 @@ def second_camera(
     batch = len(T_wc)
     length = draw.uniform(batch, 1) ** motion.power * motion.baseline * depth[:, None]
     step = F.normalize(draw.normal(batch, 3), dim=-1) * length
+    if motion.forward > 0.0:
+        along = _along_axis(draw, length).clamp_max(MOST_FORWARD * depth[:, None])
+        step = torch.where(draw.chance(motion.forward, batch, 1), along, step)
     sigma = torch.tensor([motion.tilt, motion.tilt, motion.roll], device=draw.device)
     turn = draw.normal(batch, 3) * sigma
     towards = torch.stack([step[:, 1], -step[:, 0], torch.zeros_like(depth)], -1)
@@ -96,6 +105,16 @@ def second_camera(
     floor = terrain.height(centre[:, None, :2])[:, 0] + CLEARANCE_M
     centre = torch.cat([centre[:, :2], torch.maximum(centre[:, 2], floor)[:, None]], -1)
     return _pose(R @ rotation(turn), centre)
+
+
+def _along_axis(
+    draw: Draw,
+    length: Tensor,  # [B, 1] m
+) -> Tensor:
+    """[B, 3] m in the camera's frame, half of them to the back."""
+    across = draw.normal(len(length), 2, sigma=OFF_AXIS)
+    way = torch.where(draw.chance(0.5, len(length), 1), 1.0, -1.0)
+    return torch.cat([across, way], -1) * length
 
 
 def _pose(

@@ -9,12 +9,13 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from aquaflow.training.correspondences import project
+from aquaflow.training.pair_generator.conditions import CALM, Conditions
 from aquaflow.training.pair_generator.draw import Draw
 from aquaflow.training.pair_generator.render import median_depth
 from aquaflow.training.pair_generator.scene import rotation
 from aquaflow.training.pair_generator.second_view import turned_view
 from aquaflow.training.pair_generator.sensor import taken
-from aquaflow.training.pair_generator.water import random_water
+from aquaflow.training.pair_generator.water import random_water, turbidity
 from aquaflow.training.pairs import Pair, ViewBatch, seen_from
 
 
@@ -38,25 +39,42 @@ class WindowVariation:
     """Share of batches whose channels change places: colour is what water takes first."""
 
 
-def through_water(draw: Draw, pair: Pair) -> Pair:
-    """The pair with images as taken through one water, each with its own exposure."""
+def through_water(draw: Draw, pair: Pair, conditions: Conditions = CALM) -> Pair:
+    """The pair with images as taken through one water, each with its own exposure.
+
+    What covers the scene is not valid, and has no depth when the pair is done.
+    """
+    bare = pair
+    pair = conditions.before_water(draw, pair)
     water = random_water(draw, median_depth(pair.a))
-    a, b = (replace(view, image=taken(draw, water.through(view))) for view in (pair.a, pair.b))
-    return Pair(a, b)
+    water = water.denser(turbidity(draw, conditions.turbid, len(pair.a.K)))
+    a, b = (
+        replace(view, image=taken(draw, conditions.before_lens(draw, water.through(view))))
+        for view in (pair.a, pair.b)
+    )
+    pair = conditions.after_sensor(draw, Pair(a, b))
+    return Pair(_uncovered(pair.a, bare.a), _uncovered(pair.b, bare.b))
 
 
-def training_pair(draw: Draw, clear: Pair, looks: WindowVariation) -> Pair:
+def training_pair(
+    draw: Draw, clear: Pair, looks: WindowVariation, conditions: Conditions = CALM
+) -> Pair:
     """One use of pairs without water: other windows, another water, another camera."""
     if bool(draw.chance(0.5)):
         clear = clear.swapped()
     same = draw.chance(looks.same_place, len(clear.a.K))
     clear = Pair(clear.a, _chosen(same, clear.a, clear.b))
-    pair = through_water(draw, windows(draw, clear, looks))
+    pair = through_water(draw, windows(draw, clear, looks), conditions)
     if bool(draw.chance(looks.recoloured)):
         order = torch.randperm(3, generator=draw.generator, device=draw.device)
         a, b = (replace(view, image=view.image[:, order]) for view in (pair.a, pair.b))
         pair = Pair(a, b)
     return pair
+
+
+def _uncovered(view: ViewBatch, bare: ViewBatch) -> ViewBatch:
+    """``view`` without the depth of what covers ``bare``."""
+    return replace(view, depth=torch.where(bare.valid & ~view.valid, 0.0, view.depth))
 
 
 def windows(draw: Draw, pair: Pair, looks: WindowVariation) -> Pair:

@@ -10,20 +10,25 @@ from torch.nn import functional as F
 
 from aquaflow.training.pair_generator.draw import Draw
 from aquaflow.training.pair_generator.noise import periodic, spectral, wrapped
+from aquaflow.training.pair_generator.regular import regular_albedo
 from aquaflow.training.pair_generator.texture import Atlas, albedo, atlas
 
 ROCKS = 10
 """Stamps on the floor, at most."""
 SOLIDS = 8
 """Bodies that stand or float about, at most."""
+FLATTENED = 0.05
+"""Factor of the relief, and of the rocks, where the floor is laid or a net is hung."""
 
 
 @dataclass(frozen=True)
 class Detail:
-    """Texels along a side of what is periodic."""
+    """Texels along a side of what is periodic, and how much of it repeats itself."""
 
     terrain: int = 256
     texture: int = 512
+    regular: float = 0.0
+    """Share of scenes with a tiled floor or a net."""
 
 
 @dataclass(frozen=True)
@@ -107,10 +112,17 @@ class SceneBatch:
 
 def random_scenes(draw: Draw, batch: int, detail: Detail) -> SceneBatch:
     """``batch`` scenes, each unlike the others."""
+    terrain, solids = _terrain(draw, batch, detail.terrain), _solids(draw, batch)
+    floor, rock, bodies = (albedo(draw, batch, detail.texture) for _ in range(3))
+    if detail.regular > 0.0:
+        chosen = draw.chance(detail.regular, batch)[:, None, None, None]
+        floor = torch.where(chosen, regular_albedo(draw, batch, detail.texture), floor)
+        field = torch.where(chosen, FLATTENED * terrain.field, terrain.field)
+        terrain = Terrain(field, terrain.period)
     return SceneBatch(
-        _terrain(draw, batch, detail.terrain),
-        _solids(draw, batch),
-        atlas([albedo(draw, batch, detail.texture) for _ in range(3)]),
+        terrain,
+        solids,
+        atlas([floor, rock, bodies]),
         draw.log_uniform(batch, low=1.2, high=5.0),
         draw.uniform(batch, 2, low=-1.0, high=1.0),
         _light(draw, batch, detail.terrain),

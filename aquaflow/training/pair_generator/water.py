@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -15,6 +15,8 @@ MEDIAN_RANGE_M = (0.6, 6.0)
 """How far away the scene is taken to be: scenes are as large as one likes."""
 MOST_ATTENUATION = 1.2
 """Optical depth of the clearest channel at the median range: more, and nothing is seen."""
+TURBID = (1.5, 3.5)
+"""Factor of turbid water's attenuation: two to four optical depths at the median range."""
 FAR_M = 1e3
 """Range of the open water."""
 
@@ -34,6 +36,14 @@ class WaterBatch:
     d: Tensor
     """[B, 3] 1/m"""
 
+    def denser(
+        self,
+        factor: Tensor,  # [B]
+    ) -> WaterBatch:
+        """The same water with ``factor`` times as much in it."""
+        factor = factor[:, None]
+        return replace(self, beta_a=factor * self.beta_a, b=factor * self.b, d=factor * self.d)
+
     def through(self, view: ViewBatch) -> Tensor:
         """[B, 3, H, W] the radiance that reaches the camera."""
         height, width = view.depth.shape[-2:]
@@ -44,6 +54,14 @@ class WaterBatch:
         )
         direct = view.image * torch.exp(-beta_a * z)
         return direct + B_inf * (1.0 - torch.exp(-b * z)) + B_res * torch.exp(-d * z)
+
+
+def turbidity(draw: Draw, share: float, batch: int) -> Tensor:
+    """[B] factors of ``WaterBatch.denser``: 1 but for ``share`` of them."""
+    if share == 0.0:
+        return torch.ones(batch, device=draw.device)
+    factor = draw.uniform(batch, low=TURBID[0], high=TURBID[1])
+    return torch.where(draw.chance(share, batch), factor, 1.0)
 
 
 def random_water(

@@ -16,6 +16,8 @@ from aquaflow.cli import prior
 from aquaflow.errors import AquaFlowError, InputError
 from aquaflow.prior.compact.export import (
     INPUTS,
+    LICENCE,
+    LICENCE_WITH_PICTURES,
     OUTPUTS,
     export,
     folded,
@@ -85,8 +87,11 @@ def test_a_fresh_export_is_torchs_to_1e_4_at_every_size_and_close_in_8_bits(
     for name in ("D", "Dc"):
         one, other = (session({"image": pictures[0]})[name] for session in (exact, rounded))
         assert float((one * other).sum(1).mean()) > 0.98
-    export(network, tmp_path, {"steps": 1}, pictures[:1], silent)  # replaces the one that is there
-    assert read_card(tmp_path).training == {"steps": 1}
+    assert card.licence == LICENCE
+    training = {"steps": 1, "pictures": ["reef"]}
+    export(network, tmp_path, training, pictures[:1], silent)  # replaces the one that is there
+    assert read_card(tmp_path).training == training
+    assert read_card(tmp_path).licence == LICENCE_WITH_PICTURES
 
 
 def test_a_folder_of_something_else_is_not_written_to(tmp_path: Path) -> None:
