@@ -184,6 +184,10 @@ def train_compact(
         list[Path] | None,
         typer.Option(help="Folder of real pictures or clips to learn from too; may be repeated."),
     ] = None,
+    held_out: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder of others, to give figures for; may be repeated."),
+    ] = None,
     hours: Annotated[
         float | None, typer.Option(min=0.0, help="Stop after so many; the same command goes on.")
     ] = None,
@@ -204,7 +208,13 @@ def train_compact(
 
     torch.set_num_threads(usable_threads(threads))
     settings = CompactSettings(batch=batch, scenes=scenes, first_scenes=min(160, scenes))
-    run = CompactRun(seed=seed, steps=steps, settings=settings, pictures=tuple(pictures or ()))
+    run = CompactRun(
+        seed=seed,
+        steps=steps,
+        settings=settings,
+        pictures=tuple(pictures or ()),
+        held_out=tuple(held_out or ()),
+    )
     with progress_bars(as_json) as advance:
         card = run_training(run, out, advance, device, hours)
     record = {} if card is None else card.training or {}

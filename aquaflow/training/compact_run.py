@@ -17,7 +17,7 @@ from aquaflow.prior.folder import PriorCard
 from aquaflow.training.compact import CompactSettings, CompactTask
 from aquaflow.training.compact_figures import with_figures, with_honest_range
 from aquaflow.training.curve import NOT_FIGURES
-from aquaflow.training.held_out import RANGE_SET, SETS, held_out_pairs
+from aquaflow.training.held_out import RANGE_SET, SETS, held_out_pairs, turned_pictures
 from aquaflow.training.held_out import SEED as HELD_OUT_SEED
 from aquaflow.training.pair_generator.draw import Draw
 from aquaflow.training.pair_generator.drawing import WindowVariation, through_water
@@ -57,6 +57,8 @@ class CompactRun:
     )
     pictures: tuple[Path, ...] = ()
     """Folders of real pictures and clips; none: generated pairs only."""
+    held_out: tuple[Path, ...] = ()
+    """Folders of others, for figures of turned real pictures."""
 
     @property
     def schedule(self) -> Schedule:
@@ -99,6 +101,8 @@ def train_compact(
     card = export(network.cpu(), out / PRIOR, record, calibration(pool), progress)
     card = with_honest_range(out / PRIOR, card, held_out_pairs(out, RANGE_SET))
     sets = {name: held_out_pairs(out, chosen) for name, chosen in SETS.items()}
+    if run.held_out:
+        sets["real"] = turned_pictures(run.held_out)
     return with_figures(out / PRIOR, card, sets)
 
 
