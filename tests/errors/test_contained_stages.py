@@ -119,7 +119,7 @@ def test_frames_that_a_failing_tracker_held_are_accounted_for(
 ) -> None:
     begin = Tracker._begin
 
-    def lose_all(self: Tracker) -> Any:
+    def lose_all(self: Tracker, *_: object) -> Any:
         monkeypatch.setattr(Tracker, "_begin", begin)
         self._start._initialiser = None
         raise FloatingPointError("planted")

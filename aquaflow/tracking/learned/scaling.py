@@ -41,8 +41,9 @@ TUKEY = 4.685
 Gaussian noise): false depths lie on one side, and the unit would follow any part of them."""
 ITERATIONS = 8
 """Of reweighting; each divides the remaining error by five or more."""
-HONESTY = (0.5, 10.0)
-"""Bounds of the factor of the stated error: a tenth of the picture may happen to fit too well."""
+HONESTY = (0.5, np.inf)
+"""Bounds of the factor of the stated error. A tenth of the picture may happen to fit too well; an
+upper bound could leave no point within the fit's reach, and so no fit."""
 MAD_TO_SIGMA = 1.4826
 """Of a normal distribution."""
 
@@ -214,8 +215,9 @@ def _fitted(
     covariance = np.eye(len(found))
     for _ in range(ITERATIONS):
         left = log_ratio - A @ found
-        excess = MAD_TO_SIGMA * float(np.median(np.abs(left) / np.sqrt(stated + own)))
-        honesty = float(np.clip(excess, *HONESTY))
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(left) / np.sqrt(stated)))
+        excess = spread**2 - float(np.median(own / stated))
+        honesty = float(np.clip(np.sqrt(max(excess, 0.0)), *HONESTY))
         sigma = np.sqrt(honesty**2 * stated + own)
         weight = share * np.clip(1.0 - (left / (TUKEY * sigma)) ** 2, 0.0, None) ** 2 / sigma**2
         covariance = np.linalg.inv((A.T * weight) @ A + before)

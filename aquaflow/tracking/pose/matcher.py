@@ -108,12 +108,13 @@ class KeyframeMatcher:
         of the matches have others. A network's error is that of whole parts of a picture."""
         if pointmap.learned is None:
             return pointmap
-        config = self._config
-        completed = pointmap.completed(config.known_sigma)
-        triangulated = (pair.valid & pointmap.known(config.known_sigma)).sum()
-        every = (pair.valid & completed.known(config.known_sigma)).sum()
-        few = triangulated < config.learned.least_triangulated * every
-        return completed if few else pointmap
+        known_sigma, least = self._config.known_sigma, self._config.learned.least_triangulated
+        triangulated = (pair.valid & pointmap.known(known_sigma)).sum()
+        if triangulated >= least * pair.valid.sum():
+            return pointmap
+        completed = pointmap.completed(known_sigma)
+        every = (pair.valid & completed.known(known_sigma)).sum()
+        return completed if triangulated < least * every else pointmap
 
     def _solve(self, problem: PoseProblem, initial: Sim3) -> PoseEstimate | None:
         """By the residual that was asked for; between pictures whose own points have no common unit

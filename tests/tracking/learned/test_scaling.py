@@ -47,6 +47,15 @@ def test_the_error_is_the_one_that_was_found_and_not_the_one_stated(stated: floa
     assert 0.64 < np.mean(normalised) < 1.56  # the 0.8 to 1.25, squared
 
 
+@pytest.mark.parametrize("stated", [1e-7, 1e-3, 30.0])
+def test_an_error_that_is_stated_far_too_small_or_large_costs_nothing(stated: float) -> None:
+    found = learned_depth(measured(), *network(stated=stated), KNOWN_SIGMA)
+    assert found is not None
+    assert found.log_scale == pytest.approx(-np.log(3.0), abs=0.05)
+    assert np.isfinite(found.variance[found.known]).all()
+    assert np.median(found.variance[found.known]) > 0.03**2
+
+
 def test_a_third_of_false_depths_does_not_move_the_unit() -> None:
     pointmap = measured()
     pointmap.rho[::3, : CAMERA.width // 2] *= 3.0

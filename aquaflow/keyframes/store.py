@@ -11,6 +11,7 @@ import numpy.typing as npt
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes.pointmap import LearnedDepths, Pointmap
 from aquaflow.prior.contract import Encoding, Prior
 from aquaflow.storage.array_file import Arrays
 from aquaflow.storage.spill import Spill
@@ -18,82 +19,9 @@ from aquaflow.storage.spill import Spill
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
-UNKNOWN_VARIANCE = 1e6
-"""Variance of an inverse depth that nothing has been measured about."""
-
 RESIDENT_KEYFRAMES = 32
 """Keyframes in memory while the others wait in files: the current one, the last ones that a bundle
 adjustment takes, and some candidates of loop closures. About 5 MB each at 480 x 270 px."""
-
-
-@dataclass(frozen=True)
-class LearnedDepths:
-    """What a prior knows of a keyframe's depths without parallax, in the keyframe's unit."""
-
-    rho: Array
-    """[H, W] 1 / z; 0 where unknown."""
-    variance: Array
-    """[H, W] variance of ``rho``."""
-    log_scale: float
-    """Logarithm of the keyframe's unit over the prior's."""
-    log_scale_sigma: float
-
-
-@dataclass
-class Pointmap:
-    """Inverse depth of every pixel with its variance, in the camera frame (paper: X_k^k with Q)."""
-
-    camera: CameraModel
-    rho: Array
-    """[H, W] 1 / z, triangulated; 0 where unknown."""
-    variance: Array
-    """[H, W] variance of ``rho``."""
-    fused: int = 0
-    """Frames whose depths were fused into it."""
-    learned: LearnedDepths | None = None
-
-    @staticmethod
-    def unknown(camera: CameraModel) -> Pointmap:
-        """One that knows nothing of any pixel."""
-        shape = (camera.height, camera.width)
-        return Pointmap(camera, np.zeros(shape), np.full(shape, UNKNOWN_VARIANCE))
-
-    def known(
-        self,
-        relative_sigma: float,
-    ) -> Mask:
-        """[H, W] pixels whose inverse depth is known to better than ``relative_sigma``."""
-        return (self.rho > 1e-6) & (self.variance < (relative_sigma * self.rho) ** 2)
-
-    def completed(
-        self,
-        relative_sigma: float,
-    ) -> Pointmap:
-        """Itself, or a copy with the learned depths wherever it does not know its own to
-        ``relative_sigma``."""
-        learned = self.learned
-        if learned is None:
-            return self
-        instead = (learned.rho > 0.0) & ~self.known(relative_sigma)
-        rho = np.where(instead, learned.rho, self.rho)
-        variance = np.where(instead, learned.variance, self.variance)
-        return replace(self, rho=rho, variance=variance, learned=None)
-
-    @property
-    def Q(self) -> Array:
-        """[H, W] point confidence: 1 / relative variance; 0 where unknown."""
-        known = (self.rho > 1e-6) & (self.variance < UNKNOWN_VARIANCE)
-        return np.where(known, self.rho**2 / np.maximum(self.variance, 1e-12), 0.0)
-
-    def points(self) -> Array:
-        """[H, W, 3] pointmap in the camera frame; NaN where unknown."""
-        rays = self.camera.unproject(self.camera.pixel_centres())
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(self.rho[..., None] > 1e-6, rays / self.rho[..., None], np.nan)
-
-    def copy(self) -> Pointmap:
-        """With arrays of its own; learned depths are never changed in place."""
-        return replace(self, rho=self.rho.copy(), variance=self.variance.copy())
 
 
 @dataclass(frozen=True)
