@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from aquaflow.config import PriorConfig
+from aquaflow.config.stage import validated
 from aquaflow.errors import AquaFlowError
 from aquaflow.evaluation.bench import machine
 from aquaflow.evaluation.prior_bench.clip_pairs import clip_pairs
@@ -51,11 +52,13 @@ def methods_here(device: str) -> Methods:
     """The classical and the compact prior, and either keypoint network, alone and with flow.
 
     Raises:
+        ConfigError: there is no device of that name.
         AquaFlowError: the device is not there.
     """
     usable: list[Method] = [DenseMethod("classical", make_prior(PriorConfig(kind="classical")))]
     missing = []
-    compact = make_prior(PriorConfig.model_validate({"kind": "compact", "device": device}))
+    settings = {"kind": "compact", "device": device}
+    compact = make_prior(validated(PriorConfig, settings, "command line"))
     if compact.name == "compact":
         usable.append(DenseMethod("compact", compact))
     else:

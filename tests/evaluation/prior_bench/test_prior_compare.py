@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from aquaflow import cli
-from aquaflow.errors import AquaFlowError, InputError
+from aquaflow.errors import AquaFlowError, ConfigError, InputError
 from aquaflow.evaluation.matching import HEIGHT, WIDTH
 from aquaflow.evaluation.prior_bench import clip_pairs, comparison, known_pairs
 from aquaflow.evaluation.prior_bench.comparison import compare, methods_here
@@ -243,3 +243,8 @@ def test_the_command_compares_on_all_kinds_of_pairs(
     assert "generated, wide (1)" in shown.stdout
     assert "XFeat: it is not installed" in shown.stdout
     assert "Times are of the processor." in shown.stdout
+
+
+def test_a_device_that_has_no_such_name_is_refused_in_a_sentence() -> None:
+    with pytest.raises(ConfigError, match=r"command line: .*device"):
+        methods_here("é")
