@@ -178,11 +178,11 @@ class KeyframeTracker:
         pair, T_fk, pointmap = solved.pair, solved.estimate.T, at.keyframe.pointmap
         reliable = self.shown(at, solved, camera) if self.hidden(solved) else pair.valid_back
         own = transfer(pointmap, pair.matches_back, reliable, T_fk, camera)
-        config, before = self._config, None
-        if pointmap.learned is not None:
-            completed = pointmap.completed(config.known_sigma)
-            before = transfer(completed, pair.matches_back, reliable, T_fk, camera)
-        known, unit = config.known_sigma, pair.range_unit
+        config, known, unit = self._config, self._config.known_sigma, pair.range_unit
+
+        def before() -> Pointmap:
+            return transfer(pointmap.completed(known), pair.matches_back, reliable, T_fk, camera)
+
         return own, add_learned(own, pair.X_b, pair.Q_b, known, config.learned, unit, before)
 
     def shown(self, at: CurrentKeyframe, solved: Matched, camera: CameraModel) -> Mask:

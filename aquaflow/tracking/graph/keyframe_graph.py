@@ -160,9 +160,9 @@ class KeyframeGraph:
                 self._close_loops(keyframe)
         with self._failures.contain("place index", keyframe.frame_index):
             self._places.add(keyframe)
+        parent = None if link is None else link.keyframe
         for measurements in (self._telemetry, self._scales):
             if measurements is not None:
-                parent = None if link is None else link.keyframe
                 with self._failures.contain("metric frames", keyframe.frame_index):
                     self._due |= measurements.keyframe(number, parent)
         self._optimise()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from aquaflow.config.tracking import LearnedConfig
 from aquaflow.keyframes import Pointmap
 from aquaflow.prior.contract import Float, Mask, RangeUnit
@@ -16,13 +18,13 @@ def add_learned(
     known_sigma: float,
     config: LearnedConfig,
     unit: RangeUnit = "shared",
-    before: Pointmap | None = None,
+    before: Callable[[], Pointmap] | None = None,
 ) -> Mask | None:
     """Set what the prior knows of the picture in ``pointmap``; returns the pixels [H, W] that move
     by themselves. None, and no change, without ranges or a unit for them.
 
     The unit is that of the triangulated depths; where these are too few, because the camera only
-    turned, that of ``before``, what the keyframe before had learned, seen from here.
+    turned, that of what ``before`` gives: what the keyframe before had learned, seen from here.
 
     Both are kept, and no mean is taken of them: the network's error is that of a whole part of the
     picture, so that depths which are better one by one would all be moved the same way.
@@ -31,7 +33,7 @@ def add_learned(
         return None
     depth = learned_depth(pointmap, X, Q, known_sigma, unit)
     if depth is None and before is not None:
-        depth = learned_depth(before, X, Q, known_sigma, unit)
+        depth = learned_depth(before(), X, Q, known_sigma, unit)
     if depth is None:
         return None
     pointmap.learned = depth.kept

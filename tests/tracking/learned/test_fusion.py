@@ -102,7 +102,7 @@ def test_where_the_camera_only_turned_the_unit_is_that_of_what_was_learned_befor
     now = Pointmap.unknown(CAMERA)
     assert add_learned(now, X, Q, KNOWN_SIGMA, LearnedConfig()) is None
     seen = before.completed(KNOWN_SIGMA)
-    assert add_learned(now, X, Q, KNOWN_SIGMA, LearnedConfig(), before=seen) is not None
+    assert add_learned(now, X, Q, KNOWN_SIGMA, LearnedConfig(), before=lambda: seen) is not None
     assert now.learned is not None
     assert np.median(np.abs(np.log(now.learned.rho * TRUTH))) < 0.08
 
