@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow.fusion.offset_search import COVERED, Cells, Peak
 from aquaflow.fusion.turns import Turns, smoothing
+from aquaflow.geometry.robust import MAD_TO_SIGMA
 
 Array: TypeAlias = npt.NDArray[np.float64]
 Mask: TypeAlias = npt.NDArray[np.bool_]
@@ -40,8 +41,6 @@ OWN_INTERVALS = 1.0
 of interpolated samples depends on where between two of them one looks, and draws the offset."""
 HUBER = 1.345
 """Residuals beyond so many sigma count linearly: 95 % efficient where the noise is Gaussian."""
-MAD_SIGMA = 1.4826
-"""1 sigma of a Gaussian over its median absolute value."""
 ITERATIONS = 12
 """Of Gauss-Newton; the search starts it within 0.025 s, where 5 are enough."""
 DERIVATIVE_S = 0.01
@@ -119,7 +118,7 @@ class Refinement:
         x[OFFSET] = peak.offset_s
         for _ in range(ITERATIONS):
             residual, J = self._linearised(x, R_cb, middle_s, smooth, at_s, seen)
-            sigma = max(MAD_SIGMA * float(np.median(np.abs(residual))), 1e-9)
+            sigma = max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), 1e-9)
             weight = np.minimum(1.0, HUBER * sigma / np.maximum(np.abs(residual), 1e-12))
             H = np.einsum("gip,gi,giq->pq", J, weight, J) / sigma**2 + self._prior
             pull = np.einsum("gip,gi->p", J, weight * residual) / sigma**2

@@ -17,6 +17,7 @@ from scipy.linalg import cho_solve, cholesky, solve_triangular
 from aquaflow.fusion.factors.factor import Factor
 from aquaflow.fusion.noise import Noise, likeliest
 from aquaflow.fusion.state import P, State
+from aquaflow.geometry.robust import MAD_TO_SIGMA
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -95,7 +96,7 @@ class _Robust:
         r: Array,  # [N, D]
     ) -> None:
         size = np.linalg.norm(r, axis=1) / np.sqrt(r.shape[1])
-        sigma = np.maximum(factor.sigma, 1.4826 * np.median(size) if len(size) else 0.0)
+        sigma = np.maximum(factor.sigma, MAD_TO_SIGMA * np.median(size) if len(size) else 0.0)
         self._weights = 1.0 / (sigma * np.sqrt(1.0 + (size / (CAUCHY * sigma)) ** 2))
 
     def __call__(
@@ -196,5 +197,5 @@ def _gated(
     width = min(9, 2 * (len(r) // 2) + 1)
     apart = np.linalg.norm(r - median_filter(r, size=(width, 1), mode="nearest"), axis=1)
     apart /= factor.sigma * np.sqrt(r.shape[1])
-    spread = max(1.0, 1.4826 * float(np.median(apart))) if len(r) else 1.0
+    spread = max(1.0, MAD_TO_SIGMA * float(np.median(apart))) if len(r) else 1.0
     return np.asarray(apart <= GATE * spread)

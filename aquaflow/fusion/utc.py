@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.clocks.wall import JUMP_NS
+from aquaflow.geometry.robust import MAD_TO_SIGMA
 from aquaflow.messages import UtcTime
 
 Array = npt.NDArray[np.float64]
@@ -59,8 +60,6 @@ LASTING_SHARE = 0.05
 """Of a source's samples: a setting kept for less is a damaged message, or one that came late."""
 HUBER = 1.345
 """Residuals beyond so many sigma count linearly: 95 % efficient where the noise is Gaussian."""
-MAD_SIGMA = 1.4826
-"""1 sigma of a Gaussian over its median absolute value."""
 ITERATIONS = 10
 """Of the reweighted fit; 4 are enough where one sample in ten is late."""
 
@@ -168,7 +167,7 @@ def _line(source: str, stated: Sequence[UtcTime]) -> UtcClock:
     x = np.array([np.median(offset), 0.0])
     for _ in range(ITERATIONS):
         residual = offset - J @ x
-        sigma = max(MAD_SIGMA * float(np.median(np.abs(residual))), LEAST_SIGMA_S)
+        sigma = max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), LEAST_SIGMA_S)
         weight = np.minimum(1.0, HUBER * sigma / np.maximum(np.abs(residual), 1e-12)) / sigma**2
         H = J.T @ (weight[:, None] * J) + prior
         x = np.linalg.solve(H, J.T @ (weight * offset))

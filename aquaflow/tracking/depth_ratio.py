@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.geometry.robust import MAD_TO_SIGMA
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
 
@@ -14,8 +15,6 @@ Array = npt.NDArray[np.float64]
 
 MIN_POINTS = 16
 """Points in common below which nothing is said: a quarter of a sketch."""
-GAUSSIAN = 1.4826
-"""Standard deviation over median absolute deviation of Gaussian noise."""
 MEDIAN = 1.2533
 """Standard deviation of a median over that of a mean."""
 
@@ -51,6 +50,6 @@ def depth_ratio(
         return None
     logs = -np.log(X[known, 2] * rho[known])
     middle = float(np.median(logs))
-    spread = GAUSSIAN * float(np.median(np.abs(logs - middle)))
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(logs - middle)))
     count = len(logs)
     return DepthRatio(middle, MEDIAN * spread / float(np.sqrt(count)), count)

@@ -11,6 +11,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.geometry.robust import MAD_TO_SIGMA, biweight
+
 Array = npt.NDArray[np.float64]
 
 LAGS = (2, 3, 5, 7)
@@ -22,13 +24,10 @@ MOST_ERROR = 0.1
 """Standard error of the shift over the median of d - c beyond which it is not known: depths half as
 large and twice as large as the median's are then 5 and 20 % off."""
 INDEPENDENT = 48
-"""Errors of a network that count as independent in a picture, as in scaling.py."""
-TUKEY = 4.685
-"""As in scaling.py."""
+"""Errors of a network that count as independent in a picture (8 x 6 cells), as those of matches
+(tracking/pose/covariance.py)."""
 ITERATIONS = 8
-"""As in scaling.py."""
-MAD_TO_SIGMA = 1.4826
-"""Of a normal distribution."""
+"""Of reweighting; each divides the remaining error by five or more."""
 FARTHEST = 50.0
 """Depth over the median depth beyond which nothing is known: there the shift decides all."""
 
@@ -49,7 +48,7 @@ def shift_of(
     for _ in range(ITERATIONS):
         left = y - A @ line
         sigma = MAD_TO_SIGMA * float(np.median(np.abs(left))) + 1e-9 * start
-        weight = np.clip(1.0 - (left / (TUKEY * sigma)) ** 2, 0.0, None) ** 2
+        weight = biweight(left, sigma)
         share = min(INDEPENDENT / len(rho), 1.0)
         covariance = np.linalg.inv((A.T * weight) @ A + 1e-12 * np.eye(2))
         line = covariance @ ((A.T * weight) @ y)

@@ -17,9 +17,10 @@ import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.pixels import at_pixels
+from aquaflow.geometry.robust import MAD_TO_SIGMA, biweight
 from aquaflow.keyframes import LearnedDepths, Pointmap
 from aquaflow.prior.contract import Float, Mask, RangeUnit
-from aquaflow.tracking.learned.affine import shift_of, shifted_depth
+from aquaflow.tracking.learned.affine import INDEPENDENT, ITERATIONS, shift_of, shifted_depth
 
 Array = npt.NDArray[np.float64]
 
@@ -27,25 +28,15 @@ COMPARED = 4000
 """Most pixels that learned and triangulated depths are compared at."""
 LEAST_COMMON = 200
 """Pixels known to both below which a unit is not found: two cells of a small picture."""
-INDEPENDENT = 48
-"""Errors of a network that count as independent in a picture (8 x 6 cells), as those of matches
-(tracking/pose/covariance.py)."""
 SLOPE_SIGMA = 0.1
 """Of the logarithm from the picture's middle to its edge: a slope of 6 degrees over a floor seen
 straight down; a network that sees the floor's tilt errs by less."""
 SHIFT_SIGMA = 0.1
 """Of what is left of a shift, over the median inverse depth: the most error that affine.py allows.
 """
-TUKEY = 4.685
-"""Standard deviations beyond which a difference does not count (biweight, 95 % efficiency under
-Gaussian noise): false depths lie on one side, and the unit would follow any part of them."""
-ITERATIONS = 8
-"""Of reweighting; each divides the remaining error by five or more."""
 HONESTY = (0.5, np.inf)
 """Bounds of the factor of the stated error. A tenth of the picture may happen to fit too well; an
 upper bound could leave no point within the fit's reach, and so no fit."""
-MAD_TO_SIGMA = 1.4826
-"""Of a normal distribution."""
 
 
 @dataclass(frozen=True)
@@ -219,7 +210,8 @@ def _fitted(
         excess = spread**2 - float(np.median(own / stated))
         honesty = float(np.clip(np.sqrt(max(excess, 0.0)), *HONESTY))
         sigma = np.sqrt(honesty**2 * stated + own)
-        weight = share * np.clip(1.0 - (left / (TUKEY * sigma)) ** 2, 0.0, None) ** 2 / sigma**2
+        # False depths lie on one side: the unit would follow any part of them.
+        weight = share * biweight(left, sigma) / sigma**2
         covariance = np.linalg.inv((A.T * weight) @ A + before)
         found = covariance @ ((A.T * weight) @ log_ratio)
     return found, covariance, honesty

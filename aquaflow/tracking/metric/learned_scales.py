@@ -17,6 +17,7 @@ from math import hypot
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.geometry.robust import MAD_TO_SIGMA
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.keyframes import KeyframeStore
@@ -39,8 +40,6 @@ STRAIN = 1.5
 (``straightening``)."""
 HELD = 1e-3
 """rad, and units of the first keyframe, that it is held to: the network knows no place."""
-MAD_TO_SIGMA = 1.4826
-"""Of a normal distribution."""
 
 
 @dataclass(frozen=True)
