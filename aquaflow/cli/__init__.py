@@ -160,6 +160,10 @@ def synth(
     display: Annotated[
         str | None, typer.Option(help="Burned in: clock | clock_and_crosshair | panel")
     ] = None,
+    fish: Annotated[int, typer.Option(help="Fish that cross the view, each once.")] = 0,
+    arm: Annotated[
+        bool, typer.Option("--arm", help="The vehicle's arm is in the picture.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Write a synthetic dive with its ground truth."""
@@ -170,7 +174,7 @@ def synth(
 
     asked = {
         "scene": scene, "water": water, "frames": frames, "width": width, "height": height,
-        "seed": seed, "display": display,
+        "seed": seed, "display": display, "fish": fish, "arm": arm,
     }  # fmt: skip
     try:
         config = SyntheticConfig.model_validate({k: v for k, v in asked.items() if v is not None})

@@ -138,6 +138,10 @@ class SyntheticConfig(BaseModel):
     display: Display | None = Field(
         None, description="what the recorder burns into the pictures; none by default"
     )
+    fish: int = Field(
+        0, ge=0, le=200, description="fish that cross the view, each at a time of its own"
+    )
+    arm: bool = Field(False, description="true: an arm of the vehicle reaches into the picture")
     telemetry: TelemetryNoise = TelemetryNoise.model_validate({})
 
     @model_validator(mode="before")

@@ -18,6 +18,7 @@ from aquaflow.errors import InputError, reason_of
 from aquaflow.storage.camera_file import save_camera
 from aquaflow.synthetic import objects, radiance, render
 from aquaflow.synthetic import path as paths
+from aquaflow.synthetic.bodies import Bodies
 from aquaflow.synthetic.config import SyntheticConfig
 from aquaflow.synthetic.display import burn_in
 from aquaflow.synthetic.march import HeightField
@@ -149,11 +150,14 @@ def _write_pictures(
     noise_rng = stream(config.seed, "sensor")
     snow = Snow(config, centres, stream(config.seed, "snow"))
     shade = vignette(camera, config.vignette)
+    bodies = Bodies(config, t, R_sc, centres)
     with ThreadPoolExecutor(1) as pool:
         # Compressing a picture overlaps with rendering the next; one is waited for at a time.
         pending: Future[None] | None = None
         for k in range(config.frames):
-            view = render.render(scene, camera, R_sc[k], centres[k], medium, config.supersampling)
+            view = render.render(
+                scene, camera, R_sc[k], centres[k], medium, config.supersampling, bodies.at(k)
+            )
             water = view.water.copy()
             snow.draw(water, view.range_m, camera, R_sc[k], centres[k], float(t[k]), medium)
             picture = expose(water, shade, config.noise_sigma, noise_rng)
@@ -179,7 +183,8 @@ def _save(
     _save_png(out / "clean" / f"{name}.png", quantised(view.clean))
     hit = np.isfinite(view.range_m)
     stored = np.where(hit, view.range_m, 0.0).astype(np.float32)
-    np.savez(out / "range" / f"{name}.npz", range_m=stored, hit=hit)
+    masks = {"hit": hit, "moving": view.moving} if view.moving.any() else {"hit": hit}
+    np.savez(out / "range" / f"{name}.npz", allow_pickle=False, range_m=stored, **masks)
 
 
 def _save_png(

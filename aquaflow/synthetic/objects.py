@@ -37,7 +37,7 @@ GRAIN, GLAZE_GRAIN = 0.16, 0.04
 class Shape:
     """One solid; its axes are the columns of ``R``."""
 
-    kind: Literal["cylinder", "box", "sphere", "net"]
+    kind: Literal["cylinder", "box", "sphere", "ellipsoid", "net"]
     centre: Array
     """[3] m"""
     R: Array
@@ -56,6 +56,8 @@ class Shape:
     """Edge of a net's meshes."""
     twine_m: float = 0.0
     """Thickness of a net's twine; what is between is open."""
+    pattern_m: float | None = None
+    """Where in the paint's texture it begins; None: where its place says, which must not move."""
 
     @property
     def reach(self) -> float:
@@ -98,6 +100,9 @@ def hit(
     o, d = _local(shape, origin, rays)
     if shape.kind == "sphere":
         return _quadratic(torch.ones_like(d[0]), _dot(o, d), (o * o).sum(0) - shape.size[0] ** 2)
+    if shape.kind == "ellipsoid":
+        o, d = _as_ball(shape, o), _as_ball(shape, d)
+        return _quadratic((d * d).sum(0), _dot(o, d), (o * o).sum(0) - 1.0)
     if shape.kind == "net":
         return _meet_twine(shape, o, d)
     if shape.kind == "box":
@@ -110,6 +115,15 @@ def hit(
     near, far = _slabs(o, d, shape.size, (0,))
     enter, leave = torch.maximum(near, (-b - root) / a), torch.minimum(far, (-b + root) / a)
     return torch.where((disc > 0.0) & (enter < leave) & (enter > 0.0), enter, torch.inf)
+
+
+def _as_ball(
+    shape: Shape,
+    vectors: torch.Tensor,  # [3] or [3, N] m, in the shape's axes
+) -> torch.Tensor:
+    """The same where the ellipsoid is a ball of radius 1."""
+    size = torch.tensor(shape.size, dtype=torch.float32)
+    return vectors / (size if vectors.dim() == 1 else size[:, None])
 
 
 def _meet_twine(
@@ -177,7 +191,8 @@ def radiance(
     normal, u, v = _surface(shape, p)
     facing = -(normal * d).sum(0).clamp(-1.0, -0.05)
     footprint = t * pixel * facing.rsqrt() / TEXEL_M
-    shift = 311.0 * float(shape.centre[0]) % TEXELS
+    place = 311.0 * float(shape.centre[0])
+    shift = (place if shape.pattern_m is None else shape.pattern_m / TEXEL_M) % TEXELS
     noise = texture.mirrored(u / TEXEL_M + shift, v / TEXEL_M + 2.0 * shift, footprint)
     grown = torch.sigmoid(5.0 * (noise[1] + 2.4 * (shape.covered - 0.5)))
     grain = GRAIN if shape.tile_m == 0.0 else GLAZE_GRAIN
@@ -212,6 +227,9 @@ def _surface(
         up = torch.zeros_like(p)
         up[2] = 1.0
         return up, p[0], p[1]
+    if shape.kind == "ellipsoid":
+        steep = p / half**2
+        return steep / steep.norm(dim=0), p[0], p[2]
     normal = p / shape.size[0] if shape.kind == "sphere" else face
     # Each pair of faces reads its own part of the texture.
     apart = 0.7 * axis + 0.23 * (face.sum(0) > 0)

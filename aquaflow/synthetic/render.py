@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -55,6 +56,8 @@ class RenderedView:
     """[H, W, 3] radiance J, mean over the pixel; 0 where nothing is hit."""
     water: npt.NDArray[np.float32]
     """[H, W, 3] colour through the water, mean over the pixel."""
+    moving: npt.NDArray[np.bool_]
+    """[H, W] the pixel's centre sees one of ``bodies``."""
 
 
 def render(
@@ -64,8 +67,12 @@ def render(
     centre: Array,  # [3] m, survey frame (z down)
     medium: Medium,
     supersampling: int,
+    bodies: Sequence[objects.Shape] = (),
 ) -> RenderedView:
-    """Render with ``supersampling`` x ``supersampling`` rays per pixel."""
+    """Render with ``supersampling`` x ``supersampling`` rays per pixel; ``bodies`` move by
+    themselves, and are where they are now."""
+    still = len(scene.shapes)
+    scene = replace(scene, shapes=[*scene.shapes, *bodies])
     up = np.diag([1.0, 1.0, -1.0])
     rotation, origin = up @ R_sc, torch.tensor(up @ centre, dtype=torch.float32)
     height, width = camera.height, camera.width
@@ -73,17 +80,20 @@ def render(
         np.empty((height, width), np.float32),
         np.empty((height, width, 3), np.float32),
         np.empty((height, width, 3), np.float32),
+        np.empty((height, width), np.bool_),
     )
     rows = max(1, CHUNK_RAYS // (width * supersampling**2))
 
     def draw(top: int) -> None:
         part = slice(top, min(top + rows, height))
-        t, J = _trace(scene, camera, rotation, origin, part, supersampling)
+        t, what, J = _trace(scene, camera, rotation, origin, part, supersampling)
         view.clean[part] = _pixel_mean(J, supersampling)
-        view.water[part] = _pixel_mean(medium.compose(J, t), supersampling)
+        colours = medium.compose(J, t.reshape(J.shape[:2]).numpy())
+        view.water[part] = _pixel_mean(colours, supersampling)
         if supersampling > 1:
-            t = _ranges(scene, camera, rotation, origin, part, 1)[2].reshape(-1, width).numpy()
-        view.range_m[part] = t
+            t, what = _ranges(scene, camera, rotation, origin, part, 1)[2:]
+        view.range_m[part] = t.reshape(-1, width).numpy()
+        view.moving[part] = what.reshape(-1, width).numpy() >= still
 
     # Each worker computes alone: parts need not wait for each other inside every operation, and
     # the result does not depend on the number of threads.
@@ -186,8 +196,9 @@ def _trace(
     centre: torch.Tensor,  # [3] m
     part: slice,
     k: int,
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Ranges [k R, k W] and clean radiances [k R, k W, 3] of all rays of some rows."""
+) -> tuple[torch.Tensor, torch.Tensor, npt.NDArray[np.float32]]:
+    """Ranges [N] of all rays of some rows, what they hit [N], and their clean radiances
+    [k R, k W, 3]."""
     origin, rays, t, what = _ranges(scene, camera, rotation, centre, part, k)
     pixel = 1.0 / (camera.fx * k)
     shape = ((part.stop - part.start) * k, camera.width * k)
@@ -213,7 +224,7 @@ def _trace(
             pixel,
         )
     J = torch.where(t.isfinite(), J.clamp_max(0.98), 0.0)
-    return t.reshape(shape).numpy(), J.reshape(3, *shape).permute(1, 2, 0).numpy()
+    return t, what, J.reshape(3, *shape).permute(1, 2, 0).numpy()
 
 
 def _picked(

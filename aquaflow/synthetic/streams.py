@@ -12,7 +12,7 @@ import numpy as np
 __all__ = ["Instrument", "Part", "instrument_stream", "stream"]
 
 Part: TypeAlias = Literal[
-    "terrain", "objects", "colours", "sway", "telemetry", "snow", "sensor", "mounting"
+    "terrain", "objects", "colours", "sway", "telemetry", "snow", "sensor", "mounting", "bodies"
 ]
 """In the order of their streams: a new one comes last, so that the others stay as they are."""
 

@@ -5,7 +5,8 @@ The folder of a dive:
 - ``images/000000.png``: the pictures, 8 bit RGB, linear radiance;
 - ``clean/000000.png``: the same without water, snow, vignette and noise (J), 8 bit, linear;
 - ``range/000000.npz``: ``range_m`` float32 [H, W] along the ray of each pixel's centre (0 where
-  nothing is hit) and ``hit`` bool [H, W];
+  nothing is hit) and ``hit`` bool [H, W]; ``moving`` bool [H, W] where fish or an arm are seen, if
+  any are;
 - ``camera.yaml``, ``timestamps.txt`` (s, a line per picture), ``poses.tum`` (t_s tx ty tz qx qy qz
   qw, camera to world), ``medium.yaml`` (the water), ``telemetry.csv``, ``synth.yaml`` (the config,
   the version, how the camera is mounted as a user believes it, and under ``truth`` the true
@@ -59,14 +60,13 @@ class Truth:
 
     def range_m(self, index: int) -> npt.NDArray[np.float32]:
         """[H, W] range along the ray of each pixel's centre; inf where nothing is hit."""
-        path = self.folder / "range" / f"{index:06d}.npz"
-        try:
-            with np.load(path) as data:
-                return np.where(data["hit"], data["range_m"], np.float32(np.inf))
-        except (OSError, KeyError, ValueError) as error:
-            raise InputError(
-                f"cannot read the ranges {path}: {reason_of(error)}; write the dive again"
-            ) from error
+        found = self._ranges(index)
+        return np.where(found["hit"], found["range_m"], np.float32(np.inf))
+
+    def moving(self, index: int) -> npt.NDArray[np.bool_]:
+        """[H, W] where something is seen that moves by itself: fish, an arm."""
+        found = self._ranges(index)
+        return np.asarray(found.get("moving", np.zeros(found["hit"].shape, bool)))
 
     def clean(self, index: int) -> npt.NDArray[np.float32]:
         """[H, W, 3] radiance without water, in [0, 1]."""
@@ -83,6 +83,17 @@ class Truth:
         T = self.T_wc[index]
         points = self.range_m(index)[..., None].astype(np.float64) * rays
         return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+
+    def _ranges(self, index: int) -> dict[str, npt.NDArray[Any]]:
+        path = self.folder / "range" / f"{index:06d}.npz"
+        try:
+            with np.load(path) as data:
+                found = dict(data)
+            return {**found, "hit": found["hit"], "range_m": found["range_m"]}
+        except (OSError, KeyError, ValueError) as error:
+            raise InputError(
+                f"cannot read the ranges {path}: {reason_of(error)}; write the dive again"
+            ) from error
 
     def _picture(self, kind: str, index: int) -> npt.NDArray[np.float32]:
         import cv2
