@@ -69,6 +69,16 @@ class Pointmap:
         variance = np.where(instead, learned.variance, self.variance)
         return replace(self, rho=rho, variance=variance, learned=None)
 
+    def not_learned(
+        self,
+        pixels: Mask,  # [H, W]
+    ) -> Pointmap:
+        """The same, but of ``pixels`` nothing is learned."""
+        if self.learned is None:
+            return self
+        rho = np.where(pixels, 0.0, self.learned.rho)
+        return replace(self, learned=replace(self.learned, rho=rho))
+
     @property
     def Q(self) -> Array:
         """[H, W] point confidence: 1 / relative variance; 0 where unknown."""

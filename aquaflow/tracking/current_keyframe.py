@@ -23,6 +23,8 @@ from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, Float, Mask, PairGeometry, Prior
 from aquaflow.tracking.frames import FrameClass, Link, Quality, Tracked
 from aquaflow.tracking.learned.fusion import add_learned
+from aquaflow.tracking.learned.moving import SeenBefore, moving
+from aquaflow.tracking.learned.scaling import LearnedDepth
 from aquaflow.tracking.loops.neighbours import Neighbour, Neighbours
 from aquaflow.tracking.pose.depth_fusion import fuse, transfer
 from aquaflow.tracking.pose.expected_matches import expected_matches, is_wide
@@ -172,9 +174,8 @@ class KeyframeTracker:
 
     def pointmap(
         self, at: CurrentKeyframe, solved: Matched, camera: CameraModel
-    ) -> tuple[Pointmap, Mask | None]:
-        """The keyframe's depths in the frame's own pixels, and the prior's where it knows them; and
-        the pixels [H, W] that move by themselves, if it can say."""
+    ) -> tuple[Pointmap, LearnedDepth | None]:
+        """The keyframe's depths in the frame's own pixels, and the prior's where it knows them."""
         pair, T_fk, pointmap = solved.pair, solved.estimate.T, at.keyframe.pointmap
         reliable = self.shown(at, solved, camera) if self.hidden(solved) else pair.valid_back
         own = transfer(pointmap, pair.matches_back, reliable, T_fk, camera)
@@ -184,6 +185,24 @@ class KeyframeTracker:
             return transfer(pointmap.completed(known), pair.matches_back, reliable, T_fk, camera)
 
         return own, add_learned(own, pair.X_b, pair.Q_b, known, config.learned, unit, before)
+
+    def without_moving(
+        self,
+        frame: Frame,
+        at: CurrentKeyframe,
+        solved: Matched,
+        pointmap: Pointmap,
+        depth: LearnedDepth,
+    ) -> tuple[Frame, Pointmap]:
+        """The frame and its pointmap without the pixels that move by themselves: masked, and
+        without a learned depth."""
+        if not self._config.learned.moving:
+            return frame, pointmap
+        pair, T_kf = solved.pair, solved.estimate.T.inverse()
+        camera = at.keyframe.pointmap.camera
+        seen = SeenBefore(camera, T_kf, pair.matches_back, pair.valid_back, at.image, frame.image)
+        moves = moving(pointmap, depth, seen)
+        return only_where(frame, ~moves), pointmap.not_learned(moves)
 
     def shown(self, at: CurrentKeyframe, solved: Matched, camera: CameraModel) -> Mask:
         """[H, W] pixels of the frame that show what the keyframe shows."""

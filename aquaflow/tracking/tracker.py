@@ -14,7 +14,7 @@ from aquaflow.keyframes import Keyframe, KeyframeStore
 from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, PairGeometry, Prior
 from aquaflow.tracking.consistency import ConsistencyMonitor
-from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker, only_where
+from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
 from aquaflow.tracking.frames import FrameClass, Link, Quality, Revisit, Tracked
 from aquaflow.tracking.initialisation.back_fill import BackFills
 from aquaflow.tracking.loops.relocaliser import Places
@@ -313,8 +313,9 @@ class Tracker:
         self._solved = solved
         if frame_class is FrameClass.COMMON:
             return self._at.tracked(frame, frame_class, solved.quality)
-        pointmap, moves = keyframe_tracker.pointmap(at, solved, camera)
-        frame = frame if moves is None or not moves.any() else only_where(frame, ~moves)
+        pointmap, depth = keyframe_tracker.pointmap(at, solved, camera)
+        if depth is not None:
+            frame, pointmap = keyframe_tracker.without_moving(frame, at, solved, pointmap, depth)
         if frame_class is FrameClass.MAPPING:
             at.mapped_parallax_px = solved.parallax_px
             return at.tracked(frame, frame_class, solved.quality, pointmap.copy())

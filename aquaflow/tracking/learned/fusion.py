@@ -6,9 +6,8 @@ from collections.abc import Callable
 
 from aquaflow.config.tracking import LearnedConfig
 from aquaflow.keyframes import Pointmap
-from aquaflow.prior.contract import Float, Mask, RangeUnit
-from aquaflow.tracking.learned.moving import moving
-from aquaflow.tracking.learned.scaling import learned_depth
+from aquaflow.prior.contract import Float, RangeUnit
+from aquaflow.tracking.learned.scaling import LearnedDepth, learned_depth
 
 
 def add_learned(
@@ -19,9 +18,9 @@ def add_learned(
     config: LearnedConfig,
     unit: RangeUnit = "shared",
     before: Callable[[], Pointmap] | None = None,
-) -> Mask | None:
-    """Set what the prior knows of the picture in ``pointmap``; returns the pixels [H, W] that move
-    by themselves. None, and no change, without ranges or a unit for them.
+) -> LearnedDepth | None:
+    """Set what the prior knows of the picture in ``pointmap``, and return it; None, and no change,
+    without ranges or a unit for them.
 
     The unit is that of the triangulated depths; where these are too few, because the camera only
     turned, that of what ``before`` gives: what the keyframe before had learned, seen from here.
@@ -34,7 +33,6 @@ def add_learned(
     depth = learned_depth(pointmap, X, Q, known_sigma, unit)
     if depth is None and before is not None:
         depth = learned_depth(before(), X, Q, known_sigma, unit)
-    if depth is None:
-        return None
-    pointmap.learned = depth.kept
-    return moving(pointmap, depth) if config.moving else None
+    if depth is not None:
+        pointmap.learned = depth.kept
+    return depth
