@@ -28,8 +28,9 @@ from aquaflow.training.correspondences import Correspondences, correspondences
 from aquaflow.training.pair_generator.conditions import Conditions
 from aquaflow.training.pair_generator.draw import Draw
 from aquaflow.training.pair_generator.drawing import WindowVariation, training_pair
-from aquaflow.training.pair_generator.pool import SHARD, STRIDE, Pool
+from aquaflow.training.pair_generator.pool import Pool
 from aquaflow.training.pair_generator.real_pictures import RealPictures
+from aquaflow.training.pair_generator.stored_pairs import SHARD, STRIDE
 from aquaflow.training.pairs import Pair, joined
 
 

@@ -21,9 +21,10 @@ from aquaflow.training.held_out import RANGE_SET, SETS, held_out_pairs, turned_p
 from aquaflow.training.held_out import SEED as HELD_OUT_SEED
 from aquaflow.training.pair_generator.draw import Draw
 from aquaflow.training.pair_generator.drawing import WindowVariation, through_water
-from aquaflow.training.pair_generator.pool import SHARD, Pool
+from aquaflow.training.pair_generator.pool import Pool
 from aquaflow.training.pair_generator.real_pictures import RealPictures
 from aquaflow.training.pair_generator.scene import Detail
+from aquaflow.training.pair_generator.stored_pairs import SHARD
 from aquaflow.training.schedule import Schedule
 from aquaflow.training.trainer import Progress, TrainingPlan, has_ended, train
 

@@ -13,10 +13,11 @@ from aquaflow.training.pair_generator.cameras import TRAINING, WIDE, WIDER, Moti
 from aquaflow.training.pair_generator.conditions import CALM, Conditions
 from aquaflow.training.pair_generator.draw import Draw
 from aquaflow.training.pair_generator.drawing import WindowVariation, through_water, windows
-from aquaflow.training.pair_generator.pool import SHARD, Pool
+from aquaflow.training.pair_generator.pool import Pool
 from aquaflow.training.pair_generator.real_pictures import RealPictures
 from aquaflow.training.pair_generator.scene import Detail
 from aquaflow.training.pair_generator.sensor import taken
+from aquaflow.training.pair_generator.stored_pairs import SHARD
 from aquaflow.training.pairs import Pair
 
 SEED = 1000

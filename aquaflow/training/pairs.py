@@ -67,12 +67,13 @@ class Pair:
 
 def joined(pairs: Sequence[Pair]) -> Pair:
     """One batch of several, of pictures of one size."""
-    views = []
-    for side in ("a", "b"):
-        parts = [getattr(pair, side) for pair in pairs]
-        values = (torch.cat([getattr(part, field.name) for part in parts]) for field in FIELDS)
-        views.append(ViewBatch(*values))
-    return Pair(*views)
+    return Pair(joined_views([pair.a for pair in pairs]), joined_views([pair.b for pair in pairs]))
+
+
+def joined_views(views: Sequence[ViewBatch]) -> ViewBatch:
+    """One batch of several, of pictures of one size."""
+    parts = ([getattr(view, field.name) for view in views] for field in FIELDS)
+    return ViewBatch(*map(torch.cat, parts))
 
 
 def seen_from(

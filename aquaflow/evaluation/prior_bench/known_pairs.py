@@ -18,7 +18,8 @@ from aquaflow.training.held_out import LEAST_OVERLAP, SEED
 from aquaflow.training.pair_generator.cameras import WIDE, WIDER, Motion
 from aquaflow.training.pair_generator.draw import Draw
 from aquaflow.training.pair_generator.drawing import through_water
-from aquaflow.training.pair_generator.pool import SHARD, Pool
+from aquaflow.training.pair_generator.pool import Pool
+from aquaflow.training.pair_generator.stored_pairs import SHARD
 from aquaflow.training.pairs import Pair, ViewBatch
 
 GENERATED: dict[str, Motion] = {"generated, wide": WIDE, "generated, wider": WIDER}

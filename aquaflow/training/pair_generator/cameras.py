@@ -52,9 +52,15 @@ MOST_FORWARD = 0.5
 """Of the scene's median depth, towards it: twice as near shows everything twice as large."""
 
 
-def intrinsics(draw: Draw, batch: int, width: int, height: int) -> Tensor:
+def intrinsics(
+    draw: Draw,
+    batch: int,
+    width: int,
+    height: int,
+    fov_deg: tuple[float, float] = FIELD_OF_VIEW_DEG,
+) -> Tensor:
     """[B, 3, 3] px, pixel centres at half-integers."""
-    fov = torch.deg2rad(draw.uniform(batch, low=FIELD_OF_VIEW_DEG[0], high=FIELD_OF_VIEW_DEG[1]))
+    fov = torch.deg2rad(draw.uniform(batch, low=fov_deg[0], high=fov_deg[1]))
     focal = width / 2.0 / torch.tan(fov / 2.0)
     K = torch.zeros(batch, 3, 3, device=draw.device)
     K[:, 0, 0], K[:, 1, 1] = focal, focal * draw.uniform(batch, low=0.97, high=1.03)
@@ -90,6 +96,20 @@ def second_camera(
     motion: Motion,
 ) -> Tensor:
     """[B, 4, 4] camera to world."""
+    T = moved_camera(draw, T_wc, depth, motion)
+    centre = T[:, :3, 3]
+    floor = terrain.height(centre[:, None, :2])[:, 0] + CLEARANCE_M
+    centre = torch.cat([centre[:, :2], torch.maximum(centre[:, 2], floor)[:, None]], -1)
+    return _pose(T[:, :3, :3], centre)
+
+
+def moved_camera(
+    draw: Draw,
+    T_wc: Tensor,  # [B, 4, 4] of the first
+    depth: Tensor,  # [B] m, median of what the first sees
+    motion: Motion,
+) -> Tensor:
+    """[B, 4, 4] camera to world, wherever that is."""
     batch = len(T_wc)
     length = draw.uniform(batch, 1) ** motion.power * motion.baseline * depth[:, None]
     step = F.normalize(draw.normal(batch, 3), dim=-1) * length
@@ -102,8 +122,6 @@ def second_camera(
     turn = turn + towards / depth[:, None] * draw.chance(LOOKS_BACK, batch, 1)
     R = T_wc[:, :3, :3]
     centre = T_wc[:, :3, 3] + (R @ step[..., None])[..., 0]
-    floor = terrain.height(centre[:, None, :2])[:, 0] + CLEARANCE_M
-    centre = torch.cat([centre[:, :2], torch.maximum(centre[:, 2], floor)[:, None]], -1)
     return _pose(R @ rotation(turn), centre)
 
 

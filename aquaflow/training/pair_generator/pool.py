@@ -1,94 +1,31 @@
-"""Rendered pairs on disk: geometry costs 50 times what water and sensor cost, and is kept.
-
-A shard's content follows from the pool's seed and the shard's number alone, so that a second
-process may make shards ahead of the one that trains, and a pool that was cut short is continued.
-"""
+"""The pool of generated scenes, each rendered once and used many times."""
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
-from pathlib import Path
-
-import torch
-from torch import Tensor
 
 from aquaflow.training.pair_generator.cameras import TRAINING, Motion
 from aquaflow.training.pair_generator.draw import Draw
-from aquaflow.training.pair_generator.render import BRIGHTEST, render_pairs
+from aquaflow.training.pair_generator.render import render_pairs
 from aquaflow.training.pair_generator.scene import Detail
-from aquaflow.training.pairs import Pair, ViewBatch
-
-SHARD = 8
-"""Pairs of a file."""
-STRIDE = 1_000_003
-"""Between the seeds of pools: shards of different pools never share a seed."""
+from aquaflow.training.pair_generator.stored_pairs import SHARD, STRIDE, StoredPairs
+from aquaflow.training.pairs import Pair
 
 
 @dataclass
-class Pool:
-    """Pairs by number, rendered when first asked for."""
+class Pool(StoredPairs):
+    """Generated pairs; a shard's content follows from the pool's seed and its number."""
 
-    folder: Path
     seed: int
     width: int = 192
     height: int = 144
     motion: Motion = TRAINING
     detail: Detail = field(default_factory=Detail)
-    _loaded: dict[int, dict[str, Tensor]] = field(default_factory=dict)
 
-    def pairs(
-        self,
-        numbers: Tensor,  # [B] int64
-    ) -> Pair:
-        """Pairs of radiances without water."""
-        rows = [self._shard(n // SHARD) for n in numbers.tolist()]
-        places = (numbers % SHARD).tolist()
-        stacked = {
-            name: torch.stack([row[name][place] for row, place in zip(rows, places, strict=True)])
-            for name in rows[0]
-        }
-        return Pair(_view(stacked, "a"), _view(stacked, "b"))
+    @property
+    def name(self) -> str:
+        return f"pairs_{self.width}x{self.height}_{self.seed}"
 
-    def ensure(self, shard: int) -> bool:
-        """Render the shard if it is not on disk; true if it was rendered."""
-        path = self._path(shard)
-        if path.is_file():
-            return False
-        self.folder.mkdir(parents=True, exist_ok=True)
+    def rendered(self, shard: int) -> Pair:
         draw = Draw(self.seed * STRIDE + shard)
-        with torch.no_grad():
-            pair = render_pairs(draw, SHARD, self.width, self.height, self.motion, self.detail)
-        part = path.with_suffix(f".{os.getpid()}.part")
-        torch.save(_packed(pair.a, "a") | _packed(pair.b, "b"), part)
-        part.replace(path)
-        return True
-
-    def _shard(self, shard: int) -> dict[str, Tensor]:
-        if shard not in self._loaded:
-            self.ensure(shard)
-            self._loaded[shard] = torch.load(self._path(shard), weights_only=True)
-        return self._loaded[shard]
-
-    def _path(self, shard: int) -> Path:
-        size = f"{self.width}x{self.height}"
-        return self.folder / f"pairs_{size}_{self.seed}_{shard:05d}.pt"
-
-
-def _packed(view: ViewBatch, name: str) -> dict[str, Tensor]:
-    """Radiance in 8 bits, depth in 16: a twentieth of a pixel at the widest parallax."""
-    return {
-        f"image_{name}": (view.image * (255.0 / BRIGHTEST)).round().byte(),
-        f"depth_{name}": view.depth.half(),
-        f"K_{name}": view.K,
-        f"T_wc_{name}": view.T_wc,
-    }
-
-
-def _view(
-    stacked: dict[str, Tensor],  # as from _packed
-    name: str,
-) -> ViewBatch:
-    depth = stacked[f"depth_{name}"].float()
-    image = stacked[f"image_{name}"].float() * (BRIGHTEST / 255.0)
-    return ViewBatch(image, depth, stacked[f"K_{name}"], stacked[f"T_wc_{name}"], depth > 0)
+        return render_pairs(draw, SHARD, self.width, self.height, self.motion, self.detail)

@@ -12,10 +12,11 @@ from aquaflow.training.correspondences import overlap
 from aquaflow.training.pair_generator.cameras import TRAINING
 from aquaflow.training.pair_generator.draw import Draw
 from aquaflow.training.pair_generator.drawing import WindowVariation, through_water, training_pair
-from aquaflow.training.pair_generator.pool import SHARD, STRIDE, Pool
+from aquaflow.training.pair_generator.pool import Pool
 from aquaflow.training.pair_generator.render import BRIGHTEST, median_depth, render_pairs
 from aquaflow.training.pair_generator.scene import Detail
 from aquaflow.training.pair_generator.sensor import taken
+from aquaflow.training.pair_generator.stored_pairs import SHARD, STRIDE
 from aquaflow.training.pair_generator.water import MOST_ATTENUATION, random_water
 from aquaflow.training.pairs import Pair
 
