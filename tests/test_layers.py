@@ -14,9 +14,9 @@ ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
     {"cli", "api"},
     {"evaluation", "service", "doctor"},
-    {"dive", "viewer"},
+    {"dive", "viewer", "training"},
     {"slam", "export", "sim_drivers"},
-    {"tracking", "mapping", "training", "recording", "drivers", "calibration"},
+    {"tracking", "mapping", "recording", "drivers", "calibration"},
     {"keyframes", "sources", "synthetic", "fusion"},
     {"prior", "messages", "storage", "access"},
     {"config", "geometry", "render"},

@@ -184,6 +184,10 @@ def train_compact(
         list[Path] | None,
         typer.Option(help="Folder of real pictures or clips to learn from too; may be repeated."),
     ] = None,
+    maps: Annotated[
+        list[Path] | None,
+        typer.Option(help="Dive folder whose map to learn from too, last; may be repeated."),
+    ] = None,
     held_out: Annotated[
         list[Path] | None,
         typer.Option(help="Folder of others, to give figures for; may be repeated."),
@@ -213,6 +217,7 @@ def train_compact(
         steps=steps,
         settings=settings,
         pictures=tuple(pictures or ()),
+        maps=tuple(maps or ()),
         held_out=tuple(held_out or ()),
     )
     with progress_bars(as_json) as advance:

@@ -28,6 +28,7 @@ from aquaflow.training.correspondences import Correspondences, correspondences
 from aquaflow.training.pair_generator.conditions import Conditions
 from aquaflow.training.pair_generator.draw import Draw
 from aquaflow.training.pair_generator.drawing import WindowVariation, training_pair
+from aquaflow.training.pair_generator.map_pairs import MapPairs
 from aquaflow.training.pair_generator.pool import Pool
 from aquaflow.training.pair_generator.real_pictures import RealPictures
 from aquaflow.training.pair_generator.stored_pairs import SHARD, STRIDE
@@ -55,6 +56,10 @@ class CompactSettings:
     """Pairs of the whole pool."""
     real_share: float = 0.25
     """Of a batch's pairs, if there are pictures to take them from."""
+    map_share: float = 0.25
+    """Of a batch's pairs, if there are maps, once they take part; one pair at least."""
+    map_pairs: int = 240
+    """Of each map."""
     conditions: Conditions = field(default_factory=Conditions)
     calm_steps: int = 2000
     """Steps over which the conditions become as hard as they are meant to be: under hard ones from
@@ -76,13 +81,17 @@ class CompactTask:
         looks_at: Callable[[int], WindowVariation],
         seed: int,
         real: RealPictures | None = None,
+        maps: MapPairs | None = None,
+        maps_from: int = 0,
     ) -> None:
+        """Pairs of ``maps`` take part from step ``maps_from`` on."""
         # A tenth to a fifth faster on a CPU in bfloat16 (40 to 48 against 47 to 54 ms a pair).
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.network = network
         self.pool, self.held_out = pool, held_out
         self.settings, self.looks_at, self.seed = settings, looks_at, seed
         self.real = real
+        self.maps, self.maps_from = maps, maps_from
 
     @property
     def device(self) -> torch.device:
@@ -94,14 +103,19 @@ class CompactTask:
         draw = Draw(self.seed * STRIDE + step, self.device)
         settings = self.settings
         known = settings.first_scenes + step // settings.steps_per_shard * SHARD
-        count = 0 if self.real is None else round(settings.real_share * settings.batch)
-        numbers = draw.whole(settings.batch - count, below=min(known, settings.scenes))
-        clear = self.pool.pairs(numbers.cpu()).to(self.device)
+        real = 0 if self.real is None else round(settings.real_share * settings.batch)
+        maps = self.maps if step >= self.maps_from else None
+        mapped = 0 if maps is None else max(round(settings.map_share * settings.batch), 1)
+        numbers = draw.whole(settings.batch - real - mapped, below=min(known, settings.scenes))
+        parts = [self.pool.pairs(numbers.cpu()).to(self.device)]
+        if maps is not None:
+            parts.append(maps.pairs(draw, mapped))
         if self.real is not None:
-            clear = joined([clear, self.real.pairs(draw, count)])
+            parts.append(self.real.pairs(draw, real))
+        clear = joined(parts)
         conditions = settings.conditions.scaled(min(step / max(settings.calm_steps, 1), 1.0))
         pair = training_pair(draw, clear, self.looks_at(step), conditions)
-        ranged = torch.arange(settings.batch, device=self.device) < len(numbers)
+        ranged = torch.arange(settings.batch, device=self.device) < settings.batch - real
         terms = compact_losses(self.network, pair, settings, draw, ranged)
         total = (
             settings.coarse_weight * terms["coarse"]

@@ -21,6 +21,7 @@ from aquaflow.training.held_out import RANGE_SET, SETS, held_out_pairs, turned_p
 from aquaflow.training.held_out import SEED as HELD_OUT_SEED
 from aquaflow.training.pair_generator.draw import Draw
 from aquaflow.training.pair_generator.drawing import WindowVariation, through_water
+from aquaflow.training.pair_generator.map_pairs import MapPairs
 from aquaflow.training.pair_generator.pool import Pool
 from aquaflow.training.pair_generator.real_pictures import RealPictures
 from aquaflow.training.pair_generator.scene import Detail
@@ -47,7 +48,7 @@ class CompactRun:
     seed: int = 1
     steps: int = 36_000
     hold: float = 0.7
-    """Share of the steps at the highest rate; the rest anneals, on larger windows."""
+    """Share of the steps at the highest rate; the rest anneals, on larger windows and with maps."""
     warm_up: int = 100
     rate: float = 2e-3
     lowest_rate: float = 2e-5
@@ -58,6 +59,9 @@ class CompactRun:
     )
     pictures: tuple[Path, ...] = ()
     """Folders of real pictures and clips; none: generated pairs only."""
+    maps: tuple[Path, ...] = ()
+    """Dive folders whose maps give pairs too, once the rate falls: up to there a run is the same
+    with and without them, and a map may be made by the weights of that time."""
     held_out: tuple[Path, ...] = ()
     """Folders of others, for figures of turned real pictures."""
 
@@ -80,20 +84,31 @@ def train_compact(
     None if ``hours`` were over before the training was: the same call goes on.
 
     Raises:
-        InputError: ``out`` holds the checkpoint of another network, there is no such device, or
-            a folder of pictures holds none.
+        InputError: ``out`` holds the checkpoint of another network, there is no such device, a
+            folder of pictures holds none, or a dive no map that can be learnt from.
     """
     place = device_called(device)
     torch.manual_seed(run.seed)
     network = CompactPrior().to(place)
     pool = Pool(out / POOL, run.seed, detail=Detail(regular=REGULAR_SHARE))
     real = RealPictures(run.pictures, pool.width, pool.height) if run.pictures else None
+    maps = map_pairs(run, pool, progress) if run.maps else None
     first = -(-min(run.settings.first_scenes, run.settings.scenes) // SHARD)
     for shard in range(first):
         pool.ensure(shard)
         progress("scenes", shard + 1, first)
     held_out = held_out_pairs(out, SETS["wide"])
-    task = CompactTask(network, pool, held_out, run.settings, run.looks_at, run.seed, real)
+    task = CompactTask(
+        network,
+        pool,
+        held_out,
+        run.settings,
+        run.looks_at,
+        run.seed,
+        real,
+        maps,
+        run.schedule.hold,
+    )
     plan = TrainingPlan(run.schedule, validate_every=VALIDATE_EVERY, hours=hours)
     history = train(task, plan, out, progress)
     if not has_ended(history, run.schedule):
@@ -105,6 +120,14 @@ def train_compact(
     if run.held_out:
         sets["real"] = turned_pictures(run.held_out)
     return with_figures(out / PRIOR, card, sets)
+
+
+def map_pairs(run: CompactRun, pool: Pool, progress: Progress) -> MapPairs:
+    """Pairs of the run's maps, rendered into the pool's folder."""
+    count = run.settings.map_pairs
+    pairs = MapPairs(run.maps, pool.folder, run.seed, pool.width, pool.height, count)
+    pairs.render(progress)
+    return pairs
 
 
 def device_called(name: str) -> torch.device:
@@ -131,6 +154,7 @@ def training_record(
     return {
         "data": "generated pictures (aquaflow.training.pair_generator)",
         "pictures": [folder.name for folder in run.pictures],
+        "maps": [folder.name for folder in run.maps],
         "seed": run.seed,
         "pool_seed": run.seed,
         "held_out_seed": HELD_OUT_SEED,

@@ -18,7 +18,8 @@ from aquaflow import cli
 from aquaflow.prior.compact import network as compact_network
 from aquaflow.prior.compact.network import CompactPrior, Encoded, NetworkSize
 from aquaflow.prior.folder import read_card
-from aquaflow.training import compact_figures, compact_run, held_out
+from aquaflow.training import compact, compact_figures, compact_run, held_out
+from aquaflow.training.compact import CompactSettings
 from aquaflow.training.compact_figures import LEAST_FACTOR, with_honest_range
 from aquaflow.training.compact_recall import tracked_recall
 from aquaflow.training.compact_run import CompactRun, calibration, hardware_of, training_record
@@ -27,6 +28,7 @@ from aquaflow.training.held_out import SETS, held_out_pairs, turned_pictures
 from aquaflow.training.pair_generator.cameras import TRAINING, Motion
 from aquaflow.training.pair_generator.pool import Pool
 from aquaflow.training.pair_generator.scene import Detail
+from tests.training.small_maps import small_dive
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -78,10 +80,11 @@ def test_flow_from_good_cells_finds_more_than_from_none(tmp_path: Path) -> None:
 
 
 def test_the_record_holds_seeds_work_hardware_and_figures() -> None:
-    run = CompactRun(seed=3, steps=10)
+    run = CompactRun(seed=3, steps=10, maps=(Path("dives/reef"),))
     rows = [{"step": 10.0, "cpu_s": 1.0, "rate": 0.1, "loss_coarse": 2.0, "fine_2px": 0.51239}]
     record = training_record(run, rows, hardware_of("cpu"))
     assert (record["seed"], record["steps"], record["pairs"]) == (3, 10, 80)
+    assert record["maps"] == ["reef"]
     assert record["held_out"] == {"fine_2px": 0.5124}
     assert "CPU" in record["hardware"]
 
@@ -131,6 +134,21 @@ def test_the_command_stops_when_its_hours_are_over(tmp_path: Path) -> None:
     assert "give the same command to go on" in result.stdout
     assert (tmp_path / "checkpoint.pt").is_file()
     assert not (tmp_path / compact_run.PRIOR).exists()
+
+
+@pytest.mark.usefixtures("small")
+def test_the_command_takes_maps_of_dives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    dive = small_dive(tmp_path / "dive")
+    out = tmp_path / "out"
+    options = ["--scenes", "8", "--batch", "2", "--steps", "3", "--out", str(out), "--hours", "0"]
+    command = ["prior", "train", "compact", *options, "--maps", str(dive)]
+    monkeypatch.setattr(compact, "CompactSettings", partial(CompactSettings, map_pairs=16))
+    result = CliRunner().invoke(cli.app, command)
+    assert result.exit_code == 0, result.output
+    assert len(list((out / compact_run.POOL).glob("map_*.pt"))) == 2
+    missing = CliRunner().invoke(cli.app, [*command, "--maps", str(tmp_path / "missing")])
+    assert missing.exit_code != 0
+    assert "finished dive" in str(missing.exception or missing.output)
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,12 +16,14 @@ from torch import Tensor, nn
 
 from aquaflow.errors import InputError
 from aquaflow.prior.compact.network import COARSE, CompactPrior, NetworkSize
+from aquaflow.training import compact
 from aquaflow.training.compact import CompactSettings, CompactTask, coarse_loss, compact_losses
 from aquaflow.training.compact_recall import mean_recall
 from aquaflow.training.correspondences import Correspondences
 from aquaflow.training.pair_generator.cameras import TRAINING
 from aquaflow.training.pair_generator.draw import Draw
 from aquaflow.training.pair_generator.drawing import WindowVariation, training_pair
+from aquaflow.training.pair_generator.map_pairs import MapPairs
 from aquaflow.training.pair_generator.pool import Pool
 from aquaflow.training.pair_generator.real_pictures import RealPictures
 from aquaflow.training.pair_generator.render import render_pairs
@@ -28,6 +31,7 @@ from aquaflow.training.pair_generator.scene import Detail
 from aquaflow.training.pairs import Pair
 from aquaflow.training.schedule import Schedule
 from aquaflow.training.trainer import CHECKPOINT, CURVE, HISTORY, TrainingPlan, has_ended, train
+from tests.training.small_maps import small_dive
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -189,6 +193,64 @@ def test_real_pictures_join_a_batch(folder: Path, tmp_path: Path) -> None:
     learner.real = RealPictures([tmp_path], 48, 36)
     learner.settings = replace(SETTINGS, real_share=0.5)
     assert learner.loss(0)[1]["coarse"] != plain["coarse"]
+
+
+def with_maps(folder: Path, dive: Path, first_step: int) -> Recorded:
+    """A task whose batches are a quarter pairs of a map, from ``first_step`` on."""
+    learner = recorded(folder)
+    learner.settings = replace(SETTINGS, batch=4)
+    learner.maps = MapPairs([dive], folder, 1, 48, 36, count=8)
+    learner.maps_from = first_step
+    return learner
+
+
+def test_a_run_may_be_given_its_maps_when_they_take_part(folder: Path, tmp_path: Path) -> None:
+    dive = small_dive(tmp_path / "dive")
+    whole = with_maps(folder, dive, 2)
+    train(whole, PLAN, tmp_path / "whole", silent)
+    for _ in range(2):
+        before = with_maps(folder, dive, 2)
+        before.maps = None
+        train(before, replace(PLAN, hours=0.0), tmp_path / "parts", silent)
+    resumed, without = with_maps(folder, dive, 2), with_maps(folder, dive, 4)
+    shutil.copytree(tmp_path / "parts", tmp_path / "without")
+    train(resumed, PLAN, tmp_path / "parts", silent)
+    train(without, PLAN, tmp_path / "without", silent)
+    weights = [list(each.network.state_dict().values()) for each in (whole, resumed, without)]
+    assert all(map(torch.equal, weights[0], weights[1]))
+    assert not all(map(torch.equal, weights[0], weights[2]))
+
+
+def test_the_smallest_batch_has_a_pair_of_a_map(folder: Path, tmp_path: Path) -> None:
+    learner = with_maps(folder, small_dive(tmp_path / "dive"), 1)
+    learner.settings = SETTINGS
+    plain, early = recorded(folder), learner.loss(0)[1]
+    assert early == plain.loss(0)[1]
+    assert learner.loss(1)[1]["coarse"] != plain.loss(1)[1]["coarse"]
+
+
+def test_ranges_are_learnt_from_maps_and_not_from_pictures(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (36, 48, 3), np.uint8)
+    cv2.imwrite(str(tmp_path / "noise.png"), noise)
+    learner = with_maps(folder, small_dive(tmp_path / "dive"), 0)
+    learner.real = RealPictures([tmp_path], 48, 36)
+    seen: list[Tensor] = []
+
+    def losses(
+        network: CompactPrior,
+        pair: Pair,
+        settings: CompactSettings,
+        draw: Draw,
+        ranged: Tensor,  # [B] bool
+    ) -> dict[str, Tensor]:
+        seen.append(ranged)
+        return compact_losses(network, pair, settings, draw, ranged)
+
+    monkeypatch.setattr(compact, "compact_losses", losses)
+    learner.loss(0)
+    assert seen[0].tolist() == [True, True, True, False]
 
 
 def test_a_run_leaves_a_curve_and_its_figures(folder: Path, tmp_path: Path) -> None:
