@@ -30,12 +30,19 @@ def tile_box(
     counts for the first.
     """
     rows, columns = tile_grid(width, height)
-    last = torch.tensor([columns - 1, rows - 1], device=low.device)
     first, final = (
-        torch.minimum(((edge - 0.5) / TILE_PX).nan_to_num().floor().clamp(min=0), last).long()
-        for edge in (low, high)
+        torch.stack([_tile_of(x, columns), _tile_of(y, rows)], dim=1)
+        for x, y in (low.unbind(1), high.unbind(1))
     )
     return first, final
+
+
+def _tile_of(
+    edge: Tensor,  # [M] px
+    tiles: int,
+) -> Tensor:
+    """[M] the tile that an edge reaches, of those along one axis."""
+    return ((edge - 0.5) / TILE_PX).nan_to_num().floor().clamp(0, tiles - 1).long()
 
 
 def touches_active(
@@ -47,8 +54,8 @@ def touches_active(
 ) -> Tensor:
     """[M] bool: whether a box touches an active tile; four reads of a summed-area table each."""
     first, final = tile_box(low, high, width, height)
-    table = torch.zeros(active.shape[0] + 1, active.shape[1] + 1, dtype=torch.long)
-    table = table.to(active.device)
+    size = (active.shape[0] + 1, active.shape[1] + 1)
+    table = torch.zeros(size, dtype=torch.long, device=active.device)
     table[1:, 1:] = active.long().cumsum(0).cumsum(1)
     (x0, y0), (x1, y1) = first.unbind(1), (final + 1).unbind(1)
     return table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0] > 0

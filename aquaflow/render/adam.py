@@ -63,7 +63,7 @@ class SelectiveAdam:
         self.steps = torch.zeros(len(first), dtype=torch.int32, device=first.device)
         self.first_moments = {k: torch.zeros_like(v.detach()) for k, v in self.params.items()}
         self.second_moments = {k: torch.zeros_like(v.detach()) for k, v in self.params.items()}
-        self._bias = _bias_table(betas).to(first.device)
+        self._bias = _bias_table(betas, first.device)
         self._check_params(self.params)
 
     def step(
@@ -122,6 +122,11 @@ class SelectiveAdam:
                     f"SelectiveAdam tensor {name} has shape {tuple(tensor.shape)}, not the "
                     f"{len(self.steps)} rows of the state; call extend or keep before bind."
                 )
+            if tensor.device != self.steps.device:
+                raise AquaFlowError(
+                    f"SelectiveAdam tensor {name} is on {tensor.device} and its state on "
+                    f"{self.steps.device}; keep a map and its optimiser on one device."
+                )
             if tensor.dtype != torch.float32 or not tensor.is_contiguous():
                 raise AquaFlowError(
                     f"SelectiveAdam tensor {name} is not contiguous float32; pass a plain tensor."
@@ -167,8 +172,8 @@ class SelectiveAdam:
             len(plain),
             ctypes.addressof(groups),
             len(self.steps),
-            pointer(seen),
-            pointer(self.steps),
+            pointer(seen, torch.bool),
+            pointer(self.steps, torch.int32),
             *self.betas,
             self.eps,
             pointer(self._bias),
@@ -207,10 +212,10 @@ def sound_rows(
     return torch.stack(sound).all(0) if sound else torch.ones(rows, dtype=torch.bool)
 
 
-def _bias_table(betas: tuple[float, float]) -> Tensor:
+def _bias_table(betas: tuple[float, float], device: torch.device) -> Tensor:
     """[T, 2]: 1 / (1 - beta1^t) and 1 / sqrt(1 - beta2^t) for t = 1 ... T; one afterwards."""
     beta1, beta2 = betas
     slowest = min(max(beta1, beta2, 0.5), 1 - 1e-5)
     length = math.ceil(math.log(SETTLED) / math.log(slowest))
-    t = torch.arange(1, length + 1, dtype=torch.float64)
+    t = torch.arange(1, length + 1, dtype=torch.float64, device=device)
     return torch.stack([1 / (1 - beta1**t), (1 - beta2**t).rsqrt()], 1).float().contiguous()

@@ -40,6 +40,9 @@ MAX_SIGMA_PX = 1e5
 """Footprints wider than this along their long axis are culled: their determinant would leave
 float32."""
 
+CPU = torch.device("cpu")
+"""Where everything is unless a renderer draws elsewhere."""
+
 TILE_PX = 16
 """Side of the square tiles that a picture is cut into, from its top left corner."""
 
@@ -82,6 +85,9 @@ class Renderer(Protocol):
 
     threads: int
 
+    device: torch.device
+    """Where inputs have to be and results are; the map that is drawn lives there."""
+
     def __call__(
         self,
         means: Tensor,  # [N, 3] m, world
@@ -103,7 +109,8 @@ class Renderer(Protocol):
 
         A Gaussian that is not finite, has a zero quaternion, a scale or opacity that is not
         positive, or lies behind the near plane is culled: it draws nothing and its gradient is
-        zero. A camera that is not finite culls all. Raises AquaFlowError for wrong shapes.
+        zero. A camera that is not finite culls all. Raises AquaFlowError for wrong shapes and for
+        tensors on another device: a renderer moves nothing.
         """
         ...
 
@@ -147,3 +154,16 @@ def check_inputs(
             f"Renderer input active is {active.dtype} {tuple(active.shape)}; "
             f"pass torch.bool {grid}, one element per tile of {TILE_PX} pixels."
         )
+
+
+def check_devices(
+    device: torch.device,
+    *tensors: Tensor | None,  # [...] inputs of a renderer
+) -> None:
+    """Raise AquaFlowError where one of ``tensors`` is not on ``device``."""
+    for tensor in tensors:
+        if tensor is not None and tensor.device.type != device.type:
+            raise AquaFlowError(
+                f"The renderer draws on {device} and was given a tensor on {tensor.device}; "
+                "move the map to the renderer's device first."
+            )

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from aquaflow.render.contract import Rendering, check_inputs
+from aquaflow.render.contract import CPU, Rendering, check_devices, check_inputs
 from aquaflow.render.library import STAGES, Library, load_library, pointer
 
 
@@ -54,6 +54,7 @@ class CpuRenderer:
     thread count, bit for bit."""
 
     name = "cpu"
+    device = CPU
 
     def __init__(self, threads: int | None = None, isa: str | None = None) -> None:
         """``threads`` defaults to torch's; ``isa`` to the fastest that this processor runs.
@@ -78,15 +79,13 @@ class CpuRenderer:
         height: int,
         active: Tensor | None = None,  # [ceil(H/16), ceil(W/16)] bool, tiles to draw
     ) -> Rendering:
-        """Draw as the contract says; inputs of other types are converted to float32 on the CPU."""
+        """Draw as the contract says; inputs of other types are converted to float32."""
         check_inputs(means, quats, scales, opacities, colours, viewmat, K, width, height, active)
-        inputs = [
-            tensor.to(device="cpu", dtype=torch.float32).contiguous()
-            for tensor in (means, quats, scales, opacities, colours, viewmat)
-        ]
-        focal_and_centre = K.detach()[[0, 1, 0, 1], [0, 1, 2, 2]]
-        intrinsics = focal_and_centre.to(device="cpu", dtype=torch.float32)
-        drawn_tiles = None if active is None else active.to(device="cpu").contiguous()
+        given = (means, quats, scales, opacities, colours, viewmat)
+        check_devices(self.device, *given, K, active)
+        inputs = [tensor.to(torch.float32).contiguous() for tensor in given]
+        intrinsics = K.detach()[[0, 1, 0, 1], [0, 1, 2, 2]].to(torch.float32)
+        drawn_tiles = None if active is None else active.contiguous()
         image, alpha, visible, radius_px = _Rasterise.apply(  # type: ignore[no-untyped-call]
             *inputs, intrinsics, drawn_tiles, self._pool, self.threads, width, height
         )
@@ -126,9 +125,10 @@ class _Rasterise(torch.autograd.Function):
         gaussians = (means, quats, scales, opacities, colours)
         lease = _Lease(pool)
         sizes = (n, channels, width, height, threads)
-        tensors = (*gaussians, viewmat, intrinsics, image, alpha, visible, radius_px)
-        mask = None if active is None else pointer(active)
-        lease.call("aq_forward", *sizes, *map(pointer, tensors), mask)
+        inputs = map(pointer, (*gaussians, viewmat, intrinsics))
+        outputs = (pointer(image), pointer(alpha), pointer(visible, torch.bool), pointer(radius_px))
+        mask = None if active is None else pointer(active, torch.bool)
+        lease.call("aq_forward", *sizes, *inputs, *outputs, mask)
         ctx.save_for_backward(*gaussians, image)
         ctx.lease = lease
         ctx.mark_non_differentiable(visible, radius_px)

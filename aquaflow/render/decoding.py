@@ -155,5 +155,6 @@ def _inputs(
     fixed: tuple[Tensor, Tensor, Tensor, Tensor],  # rows [V], places [V], means [N, 3], centre [3]
 ) -> _NativeView:
     rows, places, means, centre = fixed
-    tensors = (rows, places, means, centre, trunk, view, heads, bias, limits, quats)
-    return _NativeView(len(rows), *view.shape, *map(pointer, tensors))
+    numbers = (pointer(each, torch.int64) for each in (rows, places))
+    tensors = map(pointer, (means, centre, trunk, view, heads, bias, limits, quats))
+    return _NativeView(len(rows), *view.shape, *numbers, *tensors)

@@ -10,7 +10,15 @@ from torch import Tensor
 
 from aquaflow.errors import AquaFlowError
 from aquaflow.render.activity import active_pixels, touches_active
-from aquaflow.render.contract import DILATION_PX2, NEAR_PLANE_M, Rendering, check_inputs
+from aquaflow.render.contract import (
+    DILATION_PX2,
+    NEAR_PLANE_M,
+    TILE_PX,
+    Rendering,
+    check_devices,
+    check_inputs,
+    tile_grid,
+)
 
 OLDEST = (1, 5)
 """The first version with the features used here."""
@@ -55,17 +63,20 @@ def available() -> bool:
 
 
 class GsplatRenderer:
-    """Draws on the CUDA device; inputs are moved there, the result stays there.
+    """Draws a map that lives on the CUDA device, with gsplat's four steps and their backward.
+
+    Colours, range and alpha come from one pass. Tiles that are not active are neither sorted for
+    nor drawn nor differentiated.
 
     Two differences to the contract, both within one grey level: gsplat stops before the Gaussian
     that would take the transmittance below 1e-4, and clamps alpha at 0.999. ``radius_px`` is
-    gsplat's rounded extent. An activity mask is laid over the
-    finished picture and saves nothing: gsplat's public ``rasterization`` takes none.
+    gsplat's rounded extent.
     """
 
     name = "gsplat"
     isa = "cuda"
     threads = 1
+    device = torch.device("cuda")
 
     def __init__(self) -> None:
         """Raises AquaFlowError, saying what to do, when something is missing."""
@@ -87,42 +98,59 @@ class GsplatRenderer:
         active: Tensor | None = None,  # [ceil(H/16), ceil(W/16)] bool, tiles to draw
     ) -> Rendering:
         """Draw as the contract says."""
-        from gsplat import rasterization
-
         check_inputs(means, quats, scales, opacities, colours, viewmat, K, width, height, active)
-        inputs = (means, quats, scales, opacities, colours, viewmat, K.detach())
-        on_device = [tensor.to(device="cuda", dtype=torch.float32) for tensor in inputs]
-        *gaussians, view, intrinsics = on_device
+        given = (means, quats, scales, opacities, colours, viewmat, K.detach())
+        check_devices(self.device, *given, active)
+        *gaussians, view, intrinsics = (tensor.to(torch.float32) for tensor in given)
         sound = _sound(*gaussians) & torch.isfinite(view).all()
         kept = torch.nonzero(sound)[:, 0]
-        visible = torch.zeros(len(means), dtype=torch.bool, device="cuda")
-        radius_px = torch.zeros(len(means), device="cuda")
+        visible = torch.zeros_like(sound)
+        radius_px = torch.zeros_like(gaussians[0][:, 0].detach())
         if len(kept) == 0:  # gsplat does not take empty scenes
-            image = torch.zeros(height, width, colours.shape[1], device="cuda")
+            image = gaussians[4].new_zeros(height, width, colours.shape[1])
             return Rendering(image, image[..., 0].clone(), visible, radius_px)
-        image, alpha, meta = rasterization(
-            *(tensor[kept] for tensor in gaussians),
-            view[None],
-            intrinsics[None],
-            width,
-            height,
-            near_plane=NEAR_PLANE_M,
-            eps2d=DILATION_PX2,
-            sh_degree=None,
-            packed=False,
-        )
-        radii = meta["radii"][0].detach().float()  # [M] or, since 1.5, [M, 2]
-        extent = radii[:, None].expand(-1, 2) if radii.dim() == 1 else radii
-        image, alpha = image[0], alpha[0, ..., 0]
-        if active is not None:
-            active = active.to("cuda")
-            centre = meta["means2d"][0].detach()
-            box = (centre - extent, centre + extent)
-            extent = extent * touches_active(*box, active, width, height)[:, None]
-            pixels = active_pixels(active, width, height)
-            image, alpha = image * pixels[..., None], alpha * pixels
+        chosen = [tensor[kept] for tensor in gaussians]
+        image, alpha, extent = _rasterised(chosen, view, intrinsics, width, height, active)
         radius_px[kept] = extent.amax(1)
         return Rendering(image, alpha, radius_px > 0, radius_px)
+
+
+def _rasterised(
+    gaussians: list[Tensor],  # means [M, 3], quats [M, 4], scales [M, 3], opacities [M], colours
+    view: Tensor,  # [4, 4] world -> camera
+    intrinsics: Tensor,  # [3, 3] px
+    width: int,
+    height: int,
+    active: Tensor | None,  # [rows, columns] bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Image [H, W, C], alpha [H, W] and half sizes [M, 2] px, 0 for what is not seen."""
+    import gsplat
+
+    means, quats, scales, opacities, colours = gaussians
+    rows, columns = tile_grid(width, height)
+    radii, centres, depths, conics, _ = gsplat.fully_fused_projection(
+        means, None, quats, scales, view[None], intrinsics[None], width, height,
+        eps2d=DILATION_PX2, near_plane=NEAR_PLANE_M, packed=False, opacities=opacities,
+    )  # fmt: skip
+    extent = radii[0].detach().float()
+    if active is not None:
+        box = (centres[0].detach() - extent, centres[0].detach() + extent)
+        touching = touches_active(*box, active, width, height)[:, None]
+        extent, radii = extent * touching, radii * touching
+    _, tile_ids, order = gsplat.isect_tiles(
+        centres, radii, depths, TILE_PX, columns, rows, packed=False
+    )
+    offsets = gsplat.isect_offset_encode(tile_ids, 1, columns, rows).reshape(1, rows, columns)
+    image, alpha = gsplat.rasterize_to_pixels(
+        centres, conics, colours[None], opacities[None], width, height, TILE_PX, offsets, order,
+        masks=None if active is None else active[None], packed=False,
+    )  # fmt: skip
+    image, alpha = image[0], alpha[0, ..., 0]
+    if active is not None:  # gsplat leaves the alpha of the other tiles as the memory was
+        drawn = active_pixels(active, width, height)
+        image = torch.where(drawn[..., None], image, 0.0)
+        alpha = torch.where(drawn, alpha, 0.0)
+    return image, alpha, extent
 
 
 def _sound(

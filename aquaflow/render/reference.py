@@ -14,6 +14,7 @@ from torch import Tensor
 
 from aquaflow.render.activity import active_pixels, touches_active
 from aquaflow.render.contract import (
+    CPU,
     DILATION_PX2,
     MAX_ALPHA,
     MAX_SIGMA_PX,
@@ -24,6 +25,7 @@ from aquaflow.render.contract import (
     RADIUS_SIGMAS,
     TANGENT_MARGIN,
     Rendering,
+    check_devices,
     check_inputs,
 )
 
@@ -88,7 +90,7 @@ def jacobian(
     height: int,
 ) -> Tensor:
     """[M, 2, 3] of the projection at camera-frame means t, its ray clamped near the image."""
-    (fx, _, cx), (_, fy, cy) = K[0].tolist(), K[1].tolist()
+    fx, fy, cx, cy = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
     margin_x, margin_y = TANGENT_MARGIN * 0.5 * width / fx, TANGENT_MARGIN * 0.5 * height / fy
     z = t[:, 2]
     tan_x = (t[:, 0] / z).clamp(-cx / fx - margin_x, (width - cx) / fx + margin_x)
@@ -151,12 +153,12 @@ def project(
     with torch.no_grad():
         index = find_sound(means, quats, scales, opacities, colours, viewmat)
         draft = footprints_of(index, *inputs)
-        size = torch.tensor([width, height], dtype=means.dtype, device=means.device)
         low, high = draft.centre - draft.extent, draft.centre + draft.extent
         bounded = draft.radius_px < RADIUS_SIGMAS * MAX_SIGMA_PX
-        seen = ((high > 0) & (low < size)).all(1) & bounded
+        inside = (high > 0).all(1) & (low[:, 0] < width) & (low[:, 1] < height)
+        seen = inside & bounded
         if active is not None:
-            seen &= touches_active(low, high, active.to(low.device), width, height)
+            seen &= touches_active(low, high, active, width, height)
         index = index[seen]
         z = means[index] @ viewmat[2, :3] + viewmat[2, 3]
         index = index[torch.argsort(z.float(), stable=True)]  # ties as in float32
@@ -195,6 +197,9 @@ class ReferenceRenderer:
     isa = "torch"
     threads = 1
 
+    def __init__(self, device: torch.device = CPU) -> None:
+        self.device = device
+
     def __call__(
         self,
         means: Tensor,  # [N, 3] m, world
@@ -210,12 +215,13 @@ class ReferenceRenderer:
     ) -> Rendering:
         """Draw as the contract says; the result is float64."""
         check_inputs(means, quats, scales, opacities, colours, viewmat, K, width, height, active)
+        check_devices(self.device, means, quats, scales, opacities, colours, viewmat, K, active)
         colours = colours.double()
         gaussians = (means.double(), quats.double(), scales.double(), opacities.double(), colours)
         camera = (viewmat.double(), K.detach().double())
         footprints = project(*gaussians, *camera, width, height, active)
-        x = torch.arange(width, dtype=torch.float64) + 0.5
-        y = torch.arange(height, dtype=torch.float64) + 0.5
+        x = torch.arange(width, dtype=torch.float64, device=self.device) + 0.5
+        y = torch.arange(height, dtype=torch.float64, device=self.device) + 0.5
         pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), 2).view(-1, 2)
         offset = pixels[None] - footprints.centre[:, None]
         alpha = alpha_at(offset, footprints.conic, footprints.opacity)

@@ -12,7 +12,14 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from aquaflow.render.activity import tile_box
-from aquaflow.render.contract import TILE_PX, Rendering, check_inputs, tile_grid
+from aquaflow.render.contract import (
+    CPU,
+    TILE_PX,
+    Rendering,
+    check_devices,
+    check_inputs,
+    tile_grid,
+)
 from aquaflow.render.reference import Footprints, alpha_at, blend_weights, project
 
 BATCH_ELEMENTS = 4_000_000
@@ -23,6 +30,7 @@ class TileRenderer:
     """Tiles as a batch dimension, padded to the longest list of the batch."""
 
     name = "tiles"
+    device = CPU
     isa = "torch"
 
     def __init__(self, threads: int | None = None) -> None:
@@ -44,13 +52,13 @@ class TileRenderer:
     ) -> Rendering:
         """Draw as the contract says, in the dtype of ``means``."""
         check_inputs(means, quats, scales, opacities, colours, viewmat, K, width, height, active)
+        check_devices(self.device, means, quats, scales, opacities, colours, viewmat, K, active)
         dtype = means.dtype
         colours = colours.to(dtype)
         gaussians = (means, quats.to(dtype), scales.to(dtype), opacities.to(dtype), colours)
         camera = (viewmat.to(dtype), K.detach().to(dtype))
         if active is None:
             active = torch.ones(tile_grid(width, height), dtype=torch.bool)
-        active = active.to(means.device)
         footprints = project(*gaussians, *camera, width, height, active)
         drawn = _draw(footprints, colours, width, height, active)
         visible, radius_px = footprints.scatter(len(means))

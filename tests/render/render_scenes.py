@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from aquaflow.render.contract import Renderer, Rendering
+from aquaflow.render.contract import CPU, Renderer, Rendering
 from aquaflow.render.reference import ReferenceRenderer
 
 WIDTH, HEIGHT = 52, 39  # no multiple of a tile or block
@@ -24,9 +24,12 @@ class Scene:
     viewmat: Tensor
     K: Tensor
 
-    def leaves(self, dtype: torch.dtype = torch.float32) -> list[Tensor]:
+    def leaves(
+        self, dtype: torch.dtype = torch.float32, device: torch.device = CPU
+    ) -> list[Tensor]:
         """Copies in field order, all but K requiring gradients."""
-        tensors = [getattr(self, field.name).detach().clone().to(dtype) for field in fields(self)]
+        named = [getattr(self, field.name) for field in fields(self)]
+        tensors = [tensor.detach().clone().to(device, dtype) for tensor in named]
         return [tensor.requires_grad_(i < 6) for i, tensor in enumerate(tensors)]
 
 
@@ -83,10 +86,10 @@ def draw_and_differentiate(
 ) -> tuple[Rendering, list[Tensor]]:
     """The rendering and the gradients of a random linear function of image and alpha."""
     rng = torch.Generator().manual_seed(7)
-    leaves = scene.leaves(dtype)
+    leaves = scene.leaves(dtype, renderer.device)
     out = renderer(*leaves, WIDTH, HEIGHT, active)
-    g_image = torch.randn(out.image.shape, generator=rng).to(dtype)
-    g_alpha = torch.randn(out.alpha.shape, generator=rng).to(dtype)
+    g_image = torch.randn(out.image.shape, generator=rng).to(renderer.device, dtype)
+    g_alpha = torch.randn(out.alpha.shape, generator=rng).to(renderer.device, dtype)
     if seen is not None:
         g_image, g_alpha = g_image * seen[..., None], g_alpha * seen
     ((out.image * g_image).sum() + (out.alpha * g_alpha).sum()).backward()

@@ -78,7 +78,8 @@ class SplatScene:
         """The picture, with ``leaves`` in place of the inputs."""
         means, quats, scales, opacities, colours, viewmat = leaves
         gaussians = (means, quats, scales, opacities, colours)
-        return renderer(*gaussians, viewmat, self.K, self.size.width, self.size.height)
+        K = self.K.to(viewmat.device)
+        return renderer(*gaussians, viewmat, K, self.size.width, self.size.height)
 
 
 def height_field(size: Size, seed: int = 0) -> SplatScene:
