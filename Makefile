@@ -33,6 +33,8 @@ setup: $(INSTALLED) ## Make .venv and install AquaFlow with the tested versions.
 $(INSTALLED): pyproject.toml constraints.txt setup.py $(KERNELS)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet -c constraints.txt -e '.[dev]'
+	# Its signatures are tested on every machine; what it asks for would bring a compiler.
+	$(BIN)/pip install --quiet -c constraints.txt --no-deps gsplat
 	@touch $@
 
 ifdef CLIP
