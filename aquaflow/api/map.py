@@ -20,6 +20,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.gaussians.gaussians import radiance
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.state import NO_PIXELS
+from aquaflow.mapping.transfers import map_out, picture_out, water_out
 from aquaflow.mapping.views import View, in_time
 from aquaflow.render import RendererName, select_renderer
 from aquaflow.synthetic.water import Medium, Rgb
@@ -94,11 +95,11 @@ class Map:
         with torch.no_grad():
             plain = self._mapper.scene.baked(self._mapper.views)
             splats = PlyGaussians(
-                means=plain["means"].numpy().copy(),
-                wxyz=torch.nn.functional.normalize(plain["quats"], dim=-1).numpy().copy(),
-                scales=torch.exp(plain["log_scales"]).numpy(),
-                opacities=torch.sigmoid(plain["opacity_logits"][:, 0]).numpy(),
-                colours=radiance(plain["raw_colours"]).numpy(),
+                means=map_out(plain["means"]),
+                wxyz=map_out(torch.nn.functional.normalize(plain["quats"], dim=-1)),
+                scales=map_out(torch.exp(plain["log_scales"])),
+                opacities=map_out(torch.sigmoid(plain["opacity_logits"][:, 0])),
+                colours=map_out(radiance(plain["raw_colours"])),
             )
         frame = self.metric_frame
         return splats if frame.is_identity else splats.transformed(frame.T_nm)
@@ -139,10 +140,10 @@ class Map:
         view = View(0, NO_PIXELS, camera, T_mc, keyframe=0, robust=False)
         shown = self._mapper.show(view)
         return Picture(
-            image=shown.image.clamp(0.0, 1.0).numpy(),
-            clean=shown.radiance.numpy(),
-            alpha=shown.alpha.numpy(),
-            range=(shown.z * T_nm.scale).numpy(),
+            image=picture_out(shown.image.clamp(0.0, 1.0)),
+            clean=picture_out(shown.radiance),
+            alpha=picture_out(shown.alpha),
+            range=picture_out(shown.z * T_nm.scale),
         )
 
 
@@ -173,5 +174,5 @@ def load_map(
 def _rgb(
     values: torch.Tensor,  # [3]
 ) -> Rgb:
-    red, green, blue = values.tolist()
+    red, green, blue = water_out(values).tolist()
     return red, green, blue

@@ -34,6 +34,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.gaussians.gaussians import radiance
 from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.transfers import map_out, water_in
 from aquaflow.recording.telemetry_lines import NAME as TELEMETRY
 from aquaflow.storage.atomic import atomic_write, write_json, write_yaml
 from aquaflow.storage.camera_file import save_camera
@@ -218,10 +219,10 @@ class DiveFolder:
             clear = radiance(plain["raw_colours"])
             seen = clear
             if water is not None:
-                medium = water_of(water)
-                z = torch.full((len(clear),), water.range_median)
+                medium = water_of(water, clear.device)
+                z = torch.full((len(clear),), water.range_median, device=clear.device)
                 seen = clear * medium.transmission(z) + medium.backscatter(z)
-                clear = clear * torch.tensor(water.white_gain)
+                clear = clear * water_in(water.white_gain, clear.device)
             for name, colours in (("map", seen), ("map_clear", clear)):
                 splats = _splats(plain, colours)
                 if not frame.is_identity:
@@ -272,9 +273,9 @@ def _splats(
     colours: torch.Tensor,  # [N, 3]
 ) -> PlyGaussians:
     return PlyGaussians(
-        parameters["means"].numpy(),
-        torch.nn.functional.normalize(parameters["quats"], dim=-1).numpy(),
-        torch.exp(parameters["log_scales"]).numpy(),
-        torch.sigmoid(parameters["opacity_logits"][:, 0]).numpy(),
-        colours.numpy(),
+        map_out(parameters["means"]),
+        map_out(torch.nn.functional.normalize(parameters["quats"], dim=-1)),
+        map_out(torch.exp(parameters["log_scales"])),
+        map_out(torch.sigmoid(parameters["opacity_logits"][:, 0])),
+        map_out(colours),
     )

@@ -16,6 +16,7 @@ from aquaflow.mapping.restoration import (
     restored_picture,
     to_bytes,
 )
+from aquaflow.mapping.transfers import picture_out
 from aquaflow.mapping.views import View
 from aquaflow.mapping.water.posed_picture import SOLID
 from aquaflow.render.image_metrics import lpips, psnr, ssim
@@ -68,8 +69,8 @@ def examine_held_out(slam: Slam, sub_map: int) -> list[HeldOut]:
 
 def _examine(mapper: Mapper, view: View, exposure: float) -> HeldOut:
     shown = mapper.show(view)
-    real = view.target().numpy()
-    rendered = shown.image.clamp(0.0, 1.0).numpy()
+    real = picture_out(view.target())
+    rendered = picture_out(shown.image.clamp(0.0, 1.0))
     restored: RestoredPicture | None = None
     if mapper.medium.active:
         restored = restored_picture(mapper.scene, view, shown)
@@ -83,9 +84,9 @@ def _examine(mapper: Mapper, view: View, exposure: float) -> HeldOut:
         psnr(rendered, real),
         ssim(rendered, real),
         perceptual,
-        torch.where(shown.alpha > SOLID, shown.z, 0.0).to(torch.float32).numpy(),
+        picture_out(torch.where(shown.alpha > SOLID, shown.z, 0.0).to(torch.float32)),
         None if restored is None else restored.confidence_bytes(),
-        None if amplification is None else amplification.numpy(),
+        None if amplification is None else picture_out(amplification),
     )
 
 

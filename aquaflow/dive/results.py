@@ -13,10 +13,12 @@ from aquaflow import __version__
 from aquaflow.dive.held_out import HeldOut
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.transfers import picture_out, water_in, water_out
 from aquaflow.mapping.views import View
 from aquaflow.mapping.water.image_formation import Water
 from aquaflow.mapping.water.posed_picture import SOLID
 from aquaflow.messages import Dropped
+from aquaflow.render.contract import CPU
 from aquaflow.render.image_metrics import lpips_network
 from aquaflow.slam import Slam
 from aquaflow.tracking.frames import FrameClass, Tracked
@@ -93,23 +95,23 @@ def summarise_water(mapper: Mapper) -> WaterSummary | None:
     z = torch.cat([_solid_ranges(mapper, view) for view in mapper.views[::10]])
     if len(z) == 0:
         return None
-    low, high = np.percentile(z.numpy(), RANGE_PERCENTILES)
+    low, high = np.percentile(picture_out(z), RANGE_PERCENTILES)
     first = waters[0]
     summary = WaterSummary(
-        torch.stack([water.beta_a for water in waters]).mean(0).tolist(),
-        first.b.tolist(),
-        first.B_inf.tolist(),
-        first.B_res.tolist(),
-        first.d.tolist(),
+        water_out(torch.stack([water.beta_a for water in waters]).mean(0)).tolist(),
+        water_out(first.b).tolist(),
+        water_out(first.B_inf).tolist(),
+        water_out(first.B_res).tolist(),
+        water_out(first.d).tolist(),
         float(low),
         float(z.median()),
         float(high),
-        mapper.scene.white_gain().tolist(),
+        water_out(mapper.scene.white_gain()).tolist(),
         None if mapper.scene.balance is None else mapper.scene.balance.near_range,
         mapper.scene.range_variance,
         mapper.scene.beta_a_sigma,
         mapper.scene.shading.tolist(),
-        mapper.medium.unevenness.tolist(),
+        mapper.scene.unevenness().tolist(),
     )
     numbers = (low, high, summary.range_median, *summary.beta_a, *summary.B_inf, *summary.b)
     if not np.isfinite(numbers).all():
@@ -122,10 +124,10 @@ def _solid_ranges(mapper: Mapper, view: View) -> torch.Tensor:
     return shown.z[shown.alpha > SOLID]
 
 
-def water_of(summary: WaterSummary) -> Water:
+def water_of(summary: WaterSummary, device: torch.device = CPU) -> Water:
     """The summary as tensors."""
     fields = (summary.beta_a, summary.B_inf, summary.b, summary.B_res, summary.d)
-    return Water(*(torch.tensor(values) for values in fields))
+    return Water(*(water_in(values, device) for values in fields))
 
 
 def metrics(
@@ -171,7 +173,7 @@ def metrics(
         "rpe": None,
         "renderer": f"{slam.renderer.name} ({slam.renderer.isa}, {slam.renderer.threads} threads)",
         "prior": slam.prior.name,
-        "device": "cuda" if slam.renderer.isa == "cuda" else "cpu",
+        "device": slam.renderer.device.type,
         "seed": slam.config.seed,
         "version": __version__,
         "protocol": PROTOCOL,

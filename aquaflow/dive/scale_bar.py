@@ -20,6 +20,7 @@ from aquaflow.export.map_file import SUFFIX, read_map_file
 from aquaflow.fusion.known_lengths.known_length import KnownLength
 from aquaflow.fusion.metric_file import read_frame_of_map
 from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.transfers import picture_out
 from aquaflow.mapping.views import View
 from aquaflow.render import select_renderer
 
@@ -148,7 +149,7 @@ def _seen(
     pixels: Array,  # [2, 2]
 ) -> list[_Point]:
     shown = mapper.show(view)
-    ranges, alpha = shown.z.detach().numpy(), shown.alpha.detach().numpy()
+    ranges, alpha = picture_out(shown.z), picture_out(shown.alpha)
     points = []
     for u, v in pixels:
         column, row = int(u), int(v)

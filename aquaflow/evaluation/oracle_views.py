@@ -65,6 +65,7 @@ def _synthetic(recording: Path) -> Iterator[tuple[TrueView, CameraModel]]:
 def _mapped(recording: Path, dive: Path) -> Iterator[tuple[TrueView, CameraModel]]:
     """The frames that the map's own sub-map placed, with the ranges that the map shows."""
     from aquaflow.export.map_file import SUFFIX, read_map_file  # torch, which no other kind needs
+    from aquaflow.mapping.transfers import picture_out
     from aquaflow.mapping.views import View
     from aquaflow.render import select_renderer
 
@@ -80,7 +81,7 @@ def _mapped(recording: Path, dive: Path) -> Iterator[tuple[TrueView, CameraModel
             continue
         T_mc = T_nm.inverse() @ Sim3(*pose)
         seen = mapper.show(View(0, NO_PIXELS, frame.camera, T_mc, keyframe=0, robust=False))
-        ranges = np.where(seen.alpha.numpy() > COVERED, seen.z.numpy(), np.inf)
+        ranges = np.where(picture_out(seen.alpha) > COVERED, picture_out(seen.z), np.inf)
         yield _view(frame, ranges, T_mc)
 
 

@@ -52,6 +52,8 @@ class Mapper:
     ) -> None:
         """What a fit or a step raises is counted in ``failures`` and skipped."""
         self.config, self.renderer = config, renderer
+        self.device = renderer.device
+        """Where everything that the map is made of lives."""
         self.failures = failures or Failures()
         self._random = torch.Generator().manual_seed(seed)
         self.scene = Scene(config.medium, renderer, self._random, config.sunlight)
@@ -71,20 +73,28 @@ class Mapper:
 
     def add_view(self, view: View) -> None:
         """Let later optimisation steps use ``view``."""
+        self._take(view)
         if self.views:
             view.log_gain, view.light = self.views[-1].log_gain, self.views[-1].light
         self.views.append(view)
         if self.water_fitting.go_on(self.views):
             self.scene.sunlight.judge(in_time(self.views))
 
+    def _take(self, view: View) -> None:
+        """Let the view's tensors be where the map is."""
+        if view.device.type != self.device.type:
+            view.begin_on(self.device)
+
     @torch.no_grad()
     def insert(self, view: View, pointmap: Pointmap) -> int:
         """Medium-guided insertion (paper, Sec. 3.3.3); returns the number of new Gaussians."""
         config = self.config.insertion
+        self._take(view)
 
         # The range of every pixel as tracked; the view keeps it for the depth loss (Eq. 21).
         tracked = tracked_range(pointmap, config.known_sigma)
         tracked.keep_in(view)
+        tracked = tracked.on(self.device)
         tracked_z = tracked.z * view.T_wc.scale
 
         # J-tilde, alpha and range of the map as it is, drawn from the view.
@@ -147,7 +157,7 @@ class Mapper:
     ) -> int:
         count = len(new["means"])
         self.gaussians.extend(new, view.keyframe)
-        self.optimiser.extend(count, torch.from_numpy(view.T_wc.t).to(torch.float32))
+        self.optimiser.extend(count, view.centre())
         return count
 
     # --- following the keyframes --------------------------------------------------------------
@@ -228,10 +238,12 @@ class Mapper:
 
     def show(self, view: View) -> Shown:
         """The map from ``view``."""
+        self._take(view)
         return self.scene.show(view)
 
     def register(self, view: View) -> None:
         """Refine the pose of a held-out view photometrically against the frozen map."""
+        self._take(view)
         register(view, self.scene, in_time(self.views), self._objective, self.config.optimiser)
 
     @property

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from aquaflow.mapping.rendering import Shown
 from aquaflow.mapping.scene import Scene
+from aquaflow.mapping.transfers import picture_out, water_in
 from aquaflow.mapping.views import View
 from aquaflow.mapping.water.posed_picture import SOLID
 
@@ -39,14 +40,14 @@ class RestoredPicture:
 
     def picture_bytes(self, exposure: float) -> npt.NDArray[np.uint8]:
         """[H, W, 3], or [H, W, 4] with alpha where open water was removed."""
-        colours = to_bytes(exposure * self.image.numpy())
+        colours = to_bytes(exposure * picture_out(self.image))
         if self.opaque is None:
             return colours
-        return np.dstack([colours, to_bytes(self.opaque.numpy().astype(np.float32))])
+        return np.dstack([colours, to_bytes(picture_out(self.opaque).astype(np.float32))])
 
     def confidence_bytes(self) -> npt.NDArray[np.uint8]:
         """[H, W], 255 is 1."""
-        return to_bytes(self.confidence.numpy())
+        return to_bytes(picture_out(self.confidence))
 
 
 @torch.no_grad()
@@ -83,8 +84,8 @@ def _with_soft_edge(
     area: Tensor,  # [H, W] bool
 ) -> Tensor:
     """[H, W] 1 inside, falling to 0 over a few pixels."""
-    share = cv2.GaussianBlur(area.numpy().astype(np.float32), (0, 0), EDGE_PX)
-    return torch.from_numpy(np.asarray(share, np.float32))
+    share = cv2.GaussianBlur(picture_out(area).astype(np.float32), (0, 0), EDGE_PX)
+    return water_in(np.asarray(share, np.float32), area.device)
 
 
 @torch.no_grad()
@@ -104,7 +105,9 @@ def common_exposure(
 
     Without water a scene may be brighter than the camera's white; 1 where it is not.
     """
-    brightest = max((float(np.quantile(p.numpy(), BRIGHT_QUANTILE)) for p in pictures), default=0.0)
+    brightest = max(
+        (float(np.quantile(picture_out(p), BRIGHT_QUANTILE)) for p in pictures), default=0.0
+    )
     return min(1.0, BRIGHT_LEVEL / max(brightest, 1e-6))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -15,6 +15,7 @@ from aquaflow.config import MediumConfig, SunlightConfig
 from aquaflow.mapping.decoder.neural import NeuralGaussians
 from aquaflow.mapping.gaussians.gaussians import GaussianMap
 from aquaflow.mapping.rendering import Shown, show
+from aquaflow.mapping.transfers import picture_out, pose_in, water_in, water_out, weights_in
 from aquaflow.mapping.views import View
 from aquaflow.mapping.water.exposure import gain_of, learn_gain
 from aquaflow.mapping.water.image_formation import Water
@@ -37,11 +38,11 @@ class Scene:
         generator: torch.Generator,
         sunlight: SunlightConfig | None = None,
     ) -> None:
-        self.config, self.renderer = config, renderer
-        self.gaussians = GaussianMap()
+        self.config, self.renderer, self.device = config, renderer, renderer.device
+        self.gaussians = GaussianMap(device=self.device)
         self.neural: NeuralGaussians | None = None
         """What is added to the Gaussians by where they are seen from; None: nothing is."""
-        self.medium = Medium(config, generator)
+        self.medium = weights_in(Medium(config, generator), self.device)
         self.shading = np.zeros(TERMS)
         """Coefficients of the log-gain over the picture."""
         self.exposes = False
@@ -57,36 +58,40 @@ class Scene:
         """What the views of the last fit showed nearest."""
         self.range_variance: tuple[float, float] | None = None
         """Of the points' colours in the last fit, with the water and without; None before it."""
-        self.gain_maps: dict[tuple[str, int, int], Tensor] = {}
+        self.gain_maps: dict[tuple[str, int, int], Tensor | None] = {}
 
     def water(self, view: View) -> Water | None:
         """The medium for this view, or None while it is switched off."""
         if not self.medium.active:
             return None
-        R_wc = torch.from_numpy(view.T_wc.R).to(torch.float32)
-        return self.medium(R_wc)  # type: ignore[no-any-return]
+        return self.medium(pose_in(view.T_wc.R, self.device))  # type: ignore[no-any-return]
 
     def gain(self, view: View) -> Tensor | None:
         """The shading [H, W] of this view's pictures; None where there is none."""
-        return self._gain_map("shading", self.shading, view)
+        return self._gain_map("shading", lambda: self.shading, view) if self.shading.any() else None
 
     def uneven(self, view: View) -> Tensor | None:
         """The gain [H, W] of the backscatter in this view's pictures; None where it is even."""
         if not self.medium.active:
             return None
-        return self._gain_map("uneven", self.medium.unevenness.double().numpy(), view)
+        return self._gain_map("uneven", self.unevenness, view)
+
+    def unevenness(self) -> npt.NDArray[np.float64]:
+        """[5] coefficients of the backscatter's log-gain over the picture."""
+        return water_out(self.medium.unevenness)
 
     def _gain_map(
         self,
         name: str,
-        coefficients: npt.NDArray[np.float64],  # [5]
+        coefficients: Callable[[], npt.NDArray[np.float64]],  # [5]
         view: View,
     ) -> Tensor | None:
-        if not coefficients.any():
-            return None
         key = (name, view.camera.height, view.camera.width)
         if key not in self.gain_maps:
-            self.gain_maps[key] = torch.from_numpy(gain_map(coefficients, *key[1:]))
+            found = coefficients()
+            is_even = not found.any()
+            gains = None if is_even else water_in(gain_map(found, *key[1:]), self.device)
+            self.gain_maps[key] = gains
         return self.gain_maps[key]
 
     def draw(
@@ -149,7 +154,7 @@ class Scene:
 
     def nearest_cameras(self, views: Sequence[View]) -> tuple[Tensor, Tensor, Tensor]:
         """Of the camera nearest to each Gaussian: centre [N, 3], distance [N], number [N]."""
-        centres = torch.from_numpy(np.stack([view.T_wc.t for view in views])).to(torch.float32)
+        centres = pose_in(np.stack([view.T_wc.t for view in views]), self.device)
         z, which = torch.cdist(self.gaussians.means, centres).min(dim=1)
         return centres[which], z, which
 
@@ -178,7 +183,7 @@ class Scene:
         """J-hat [H, W, 3] of the view's picture, and where it can be believed [H, W]."""
         image, water = self.evenly_lit(view), self.water(view)
         if water is None:
-            return image, torch.ones(image.shape[:2], dtype=torch.bool)
+            return image, torch.ones(image.shape[:2], dtype=torch.bool, device=self.device)
         return water.restore(image, z, self.uneven(view))
 
     @torch.no_grad()
@@ -219,12 +224,12 @@ class Scene:
         """[H, W] bool, True where the view's picture shows nothing but water."""
         water = self.water(view)
         if water is None:
-            return torch.zeros(lit.shape[:2], dtype=torch.bool)
+            return torch.zeros(lit.shape[:2], dtype=torch.bool, device=self.device)
         uneven = self.uneven(view)
         B_inf = water.B_inf.expand(lit.shape)
         B_inf = B_inf if uneven is None else B_inf * uneven[..., None]
-        found = torch.from_numpy(open_water(lit.numpy(), B_inf.contiguous().numpy()))
-        return found & view.scene_mask()
+        found = open_water(picture_out(lit), picture_out(B_inf.contiguous()))
+        return water_in(found, self.device, torch.bool) & view.scene_mask()
 
     @torch.no_grad()
     def balanced(
@@ -238,5 +243,5 @@ class Scene:
     def white_gain(self) -> Tensor:
         """[3] of J, by which it has the white balance of what is nearest."""
         if not self.medium.active or self.balance is None:
-            return torch.ones(3)
-        return torch.tensor(self.balance.gain)
+            return torch.ones(3, device=self.device)
+        return water_in(self.balance.gain, self.device)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -12,9 +11,10 @@ import torch
 
 from aquaflow.mapping.gaussians.gaussians import radiance, raw_colour
 from aquaflow.mapping.scene import Scene
+from aquaflow.mapping.transfers import pose_in, water_in, water_out
 from aquaflow.mapping.views import View
 from aquaflow.mapping.water.estimation import WaterEstimate, estimating, models_for
-from aquaflow.mapping.water.exposure import gain_of, set_log_gains
+from aquaflow.mapping.water.exposure import gain_of, log_gains_of, set_log_gains
 from aquaflow.mapping.water.nearest import kept_by
 from aquaflow.mapping.water.posed_picture import PosedPicture
 from aquaflow.mapping.water.shading import shading_basis
@@ -27,13 +27,13 @@ def rebalance(scene: Scene) -> None:
     if scene.balance is None or scene.seen_nearest is None or not scene.medium.active:
         return
     near, views = scene.seen_nearest
-    basis, water = shading_basis(near.xy), scene.medium(torch.eye(3))
+    basis, water = shading_basis(near.xy), scene.medium(pose_in(np.eye(3), scene.device))
     log_gain = (basis @ scene.shading)[:, None]
     if scene.exposes:
-        log_gain = log_gain + np.stack([view.log_gain for view in views])[near.view]
-    z = torch.from_numpy(near.z).to(torch.float32)
-    T, veil = (part.double().numpy() for part in (water.transmission(z), water.backscatter(z)))
-    veil = veil * np.exp(basis @ scene.medium.unevenness.double().numpy())[:, None]
+        log_gain = log_gain + log_gains_of(views)[near.view]
+    z = water_in(near.z, scene.device)
+    T, veil = (water_out(part) for part in (water.transmission(z), water.backscatter(z)))
+    veil = veil * np.exp(basis @ scene.unevenness())[:, None]
     clean = np.maximum(near.colour / np.exp(log_gain) - veil, 0.0) / T
     scene.balance = replace(scene.balance, gain=kept_by(near, clean.T))
 
@@ -61,8 +61,8 @@ def fitting_water(
     seen = yield from sighting(pictures, np.random.default_rng(seed))
     yield
     with torch.no_grad():
-        sea = scene.medium(torch.from_numpy(fitted[0].T_wc.R).to(torch.float32))
-    B_res, d = sea.B_res.double().numpy(), sea.d.double().numpy()
+        sea = scene.medium(pose_in(fitted[0].T_wc.R, scene.device))
+    B_res, d = water_out(sea.B_res), water_out(sea.d)
     models, priors = models_for(scene.config), scene.config.priors
     steps = estimating(seen, B_res, d, models, priors, pictures)
     return (yield from steps), fitted
@@ -82,7 +82,8 @@ def adopt_water(
 @contextmanager
 def _unchanged_by_failure(scene: Scene) -> Iterator[None]:
     """The water as it was, if the block raises: half of a new one fits no picture."""
-    medium, active = copy.deepcopy(scene.medium.state_dict()), scene.medium.active
+    active = scene.medium.active
+    medium = {name: each.clone() for name, each in scene.medium.state_dict().items()}
     before = vars(scene).copy()
     try:
         yield
@@ -107,7 +108,7 @@ def _adopt(
     scene.medium.active = estimate.model.water
     if estimate.model.water:
         found = (estimate.beta_a, estimate.B_inf, estimate.b, estimate.unevenness)
-        scene.medium.set_water(*(torch.from_numpy(v).to(torch.float32) for v in found))
+        scene.medium.set_water(*(water_in(v, scene.device) for v in found))
     scene.shading, scene.exposes = estimate.shading, estimate.model.exposure
     scene.beta_a_sigma, scene.water_evidence = estimate.beta_a_sigma, estimate.evidence
     scene.balance, scene.range_variance = estimate.balance, estimate.range_variance

@@ -12,7 +12,6 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -21,10 +20,12 @@ from aquaflow.errors import DamagedError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.mapping.decoder.neural import NeuralGaussians
 from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.transfers import checkpoint_in, checkpoint_out
 from aquaflow.mapping.views import View
+from aquaflow.mapping.water.exposure import log_gains_of, set_log_gain
 from aquaflow.mapping.water.white_balance import WhiteBalance
 from aquaflow.render.adam import SelectiveAdam
-from aquaflow.render.contract import Renderer
+from aquaflow.render.contract import CPU, Renderer
 from aquaflow.storage.arrays import Arrays, of_camera, of_sim3, prefixed, to_camera, to_sim3, under
 
 Facts = dict[str, Any]
@@ -33,6 +34,8 @@ NO_PIXELS = np.zeros((0, 0, 3), np.uint8)
 """A view's picture is no part of the map."""
 GROUPS = ("group", "slot", "table", "fill", "voxel", "features")
 """Tables of the voxel groups, in the order of their names in the file."""
+STEP = "step"
+"""Name of the count of steps in the state of torch's optimisers."""
 
 
 def serialise(mapper: Mapper, optimiser: bool = False) -> tuple[Facts, Arrays]:
@@ -54,7 +57,7 @@ def serialise(mapper: Mapper, optimiser: bool = False) -> tuple[Facts, Arrays]:
         "cameras": [of_camera(camera) for camera in cameras],
     }
     arrays = _prefixed("gaussians", mapper.gaussians.parameters)
-    arrays["keyframes"] = mapper.gaussians.keyframes.numpy().copy()
+    arrays["keyframes"] = checkpoint_out(mapper.gaussians.keyframes)
     arrays["shading"] = scene.shading.copy()
     arrays |= _prefixed("medium", mapper.medium.state_dict())
     arrays |= _views(mapper.views, cameras)
@@ -77,16 +80,17 @@ def deserialise(facts: Facts, arrays: Mapping[str, Any], renderer: Renderer) -> 
         KeyError, ValueError, TypeError, RuntimeError, AquaFlowError: these are no map's.
     """
     mapper = Mapper(MappingConfig.model_validate(facts["config"]), renderer, seed=0)
-    scene, gaussians = mapper.scene, mapper.gaussians
+    scene, gaussians, device = mapper.scene, mapper.gaussians, mapper.device
     for name, width in gaussians.WIDTHS.items():
-        gaussians.parameters[name] = _tensor(arrays[f"gaussians.{name}"]).reshape(-1, width)
-    gaussians.keyframes = _tensor(arrays["keyframes"])
+        values = checkpoint_in(arrays[f"gaussians.{name}"], device)
+        gaussians.parameters[name] = values.reshape(-1, width)
+    gaussians.keyframes = checkpoint_in(arrays["keyframes"], device)
     width = gaussians.local_features.shape[1]  # a decoder, if there is one, brings its own
-    gaussians.local_features = torch.zeros(len(gaussians.keyframes), width)
+    gaussians.local_features = torch.zeros(len(gaussians.keyframes), width, device=device)
     if any(len(tensor) != len(gaussians) for tensor in gaussians.parameters.values()):
         raise DamagedError("its Gaussians differ in number")
     scene.shading = np.array(arrays["shading"])
-    mapper.medium.load_state_dict(_under("medium", arrays))
+    mapper.medium.load_state_dict(_under("medium", arrays, device))
     mapper.medium.active, scene.exposes = bool(facts["medium_active"]), bool(facts["exposes"])
     scene.sunlight.plays = bool(facts["sunlight_plays"])
     scene.water_evidence, scene.beta_a_sigma = facts["water_evidence"], facts["beta_a_sigma"]
@@ -98,7 +102,8 @@ def deserialise(facts: Facts, arrays: Mapping[str, Any], renderer: Renderer) -> 
     mapper.optimiser.steps, mapper.optimiser.undone = int(facts["steps"]), int(facts["undone"])
     if len(facts["cameras"]) > len(arrays["views.numbers"]):
         raise DamagedError("it has more cameras than views")
-    mapper.views = _read_views(arrays, [to_camera(values) for values in facts["cameras"]])
+    cameras = [to_camera(values) for values in facts["cameras"]]
+    mapper.views = _read_views(arrays, cameras, device)
     mapper.optimiser.adam.extend(len(gaussians))
     mapper.optimiser.adam.bind(gaussians.parameters)
     if not facts["decoder"]:
@@ -123,28 +128,32 @@ def _views(views: Sequence[View], cameras: list[CameraModel]) -> Arrays:
     arrays = {
         "views.numbers": np.array(numbers, np.int64).reshape(-1, 6),
         "views.poses": of_sim3([view.T_wc for view in views]),
-        "views.log_gains": np.array([v.log_gain for v in views], np.float64).reshape(-1, 3),
+        "views.log_gains": log_gains_of(views) if views else np.zeros((0, 3)),
         "views.moments": np.array(moments, np.float64).reshape(-1, 12),
     }
     for i, view in enumerate(views):
         if view.light is not None:
-            arrays[f"views.light{i}"] = view.light.numpy().copy()
+            arrays[f"views.light{i}"] = checkpoint_out(view.light)
         if view.explained is not None:
-            arrays[f"views.explained{i}"] = view.explained.numpy().copy()
+            arrays[f"views.explained{i}"] = checkpoint_out(view.explained)
     return arrays
 
 
-def _read_views(arrays: Mapping[str, Any], cameras: Sequence[CameraModel]) -> list[View]:
+def _read_views(
+    arrays: Mapping[str, Any], cameras: Sequence[CameraModel], device: torch.device
+) -> list[View]:
     views = []
     rows = (arrays[f"views.{name}"] for name in ("numbers", "poses", "log_gains", "moments"))
     for i, (numbers, pose, log_gain, moments) in enumerate(zip(*rows, strict=True)):
         index, keyframe, robust, looks, count, camera = numbers.tolist()
-        view = View(index, NO_PIXELS, cameras[camera], to_sim3(pose), keyframe, bool(robust))
-        view.log_gain, view.looks = log_gain.copy(), looks
+        T_wc, of_outliers = to_sim3(pose), bool(robust)
+        view = View(index, NO_PIXELS, cameras[camera], T_wc, keyframe, of_outliers, device=device)
+        set_log_gain(view, log_gain.copy())
+        view.looks = looks
         view.moments = (moments[:6].copy(), moments[6:].copy(), count)
         for name in ("light", "explained"):
             if f"views.{name}{i}" in arrays:
-                setattr(view, name, _tensor(arrays[f"views.{name}{i}"]))
+                setattr(view, name, checkpoint_in(arrays[f"views.{name}{i}"], device))
         views.append(view)
     return views
 
@@ -157,16 +166,17 @@ def _decoder(neural: NeuralGaussians) -> Arrays:
     groups = neural.groups
     arrays = _prefixed("decoder", neural.decoder.state_dict())
     arrays |= _prefixed("groups", {name: getattr(groups, name) for name in GROUPS})
-    arrays["groups.order"] = groups.order().numpy()
-    arrays["local"] = neural.gaussians.local_features.numpy().copy()
+    arrays["groups.order"] = checkpoint_out(groups.order())
+    arrays["local"] = checkpoint_out(neural.gaussians.local_features)
     return arrays
 
 
 def _read_decoder(neural: NeuralGaussians, arrays: Mapping[str, Any]) -> None:
-    neural.decoder.load_state_dict(_under("decoder", arrays))
-    groups = {name: _tensor(arrays[f"groups.{name}"]) for name in (*GROUPS, "order")}
+    device = neural.device
+    neural.decoder.load_state_dict(_under("decoder", arrays, device))
+    groups = {name: checkpoint_in(arrays[f"groups.{name}"], device) for name in (*GROUPS, "order")}
     neural.groups.restore(**groups)
-    neural.restore(_tensor(arrays["local"]))
+    neural.restore(checkpoint_in(arrays["local"], device))
 
 
 # --- optimisers -----------------------------------------------------------------------------------
@@ -189,7 +199,7 @@ def _torch(mapper: Mapper) -> dict[str, torch.optim.Adam]:
 def _optimisers(mapper: Mapper) -> Arrays:
     arrays: Arrays = {"random": mapper._random.get_state().numpy().copy()}
     for name, adam in _adams(mapper).items():
-        arrays[f"{name}.steps"] = adam.steps.numpy().copy()
+        arrays[f"{name}.steps"] = checkpoint_out(adam.steps)
         arrays |= _prefixed(f"{name}.first", adam.first_moments)
         arrays |= _prefixed(f"{name}.second", adam.second_moments)
     for name, optimiser in _torch(mapper).items():
@@ -199,17 +209,20 @@ def _optimisers(mapper: Mapper) -> Arrays:
 
 
 def _read_optimisers(mapper: Mapper, arrays: Mapping[str, Any], rates: Facts) -> None:
-    mapper._random.set_state(_tensor(arrays["random"]))
+    mapper._random.set_state(torch.from_numpy(np.array(arrays["random"])))
+    device = mapper.device
     for name, adam in _adams(mapper).items():
-        adam.steps = _tensor(arrays[f"{name}.steps"])
-        adam.first_moments.update(_under(f"{name}.first", arrays))
-        adam.second_moments.update(_under(f"{name}.second", arrays))
+        adam.steps = checkpoint_in(arrays[f"{name}.steps"], device)
+        adam.first_moments.update(_under(f"{name}.first", arrays, device))
+        adam.second_moments.update(_under(f"{name}.second", arrays, device))
         adam.learning_rates.update(rates[name])
         adam.bind({})
     for name, optimiser in _torch(mapper).items():
         whole = optimiser.state_dict()
         for i in range(len(whole["param_groups"][0]["params"])):
-            state = _under(f"{name}.{i}", arrays)
+            state: dict[str, Any] = dict(under(f"{name}.{i}", arrays))
+            for part, array in state.items():  # torch keeps the count of steps on the host
+                state[part] = checkpoint_in(array, CPU if part == STEP else device)
             if state:
                 whole["state"][i] = state
         whole["param_groups"][0]["lr"] = float(rates[name])
@@ -224,15 +237,9 @@ def _prefixed(
     tensors: Mapping[str, Tensor],  # of any shape
 ) -> Arrays:
     """Copies, as arrays."""
-    return prefixed(prefix, {name: t.detach().numpy().copy() for name, t in tensors.items()})
+    return prefixed(prefix, {name: checkpoint_out(tensor) for name, tensor in tensors.items()})
 
 
-def _under(prefix: str, arrays: Mapping[str, Any]) -> dict[str, Tensor]:
+def _under(prefix: str, arrays: Mapping[str, Any], device: torch.device) -> dict[str, Tensor]:
     """What :func:`_prefixed` put there."""
-    return {name: _tensor(array) for name, array in under(prefix, arrays).items()}
-
-
-def _tensor(
-    array: npt.NDArray[Any],  # [...] of any shape
-) -> Tensor:
-    return torch.from_numpy(np.array(array))
+    return {name: checkpoint_in(array, device) for name, array in under(prefix, arrays).items()}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,8 @@ from torch import Tensor
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
+from aquaflow.mapping.transfers import frame_in, pointmap_in, pose_in, pose_out
+from aquaflow.render.contract import CPU
 from aquaflow.storage.array_file import Arrays
 from aquaflow.storage.spill import Spill
 
@@ -24,7 +26,7 @@ be the next to be optimised against, so that more of them save few reads."""
 
 @dataclass(frozen=True)
 class Pixels:
-    """The per-pixel data of a view."""
+    """The per-pixel data of a view, on the host."""
 
     image: npt.NDArray[np.uint8]
     """[H, W, 3] RGB."""
@@ -34,6 +36,21 @@ class Pixels:
     """[H, W] 1 / range."""
     range_confidence: Tensor | None = None
     """[H, W] in [0, 1]."""
+    copies: dict[str, Tensor] = field(default_factory=dict, repr=False, compare=False)
+    """Of the above by name, on the map's device, made when first asked for; none on the CPU."""
+
+    def on(self, device: torch.device, name: str) -> Tensor | None:
+        """The array ``name`` on ``device``; None where there is none."""
+        host = getattr(self, name)
+        if host is None:
+            return None
+        if device.type == "cpu":
+            self.copies.clear()
+            return torch.from_numpy(host) if isinstance(host, np.ndarray) else host
+        if name not in self.copies:
+            moved = frame_in if isinstance(host, np.ndarray) else pointmap_in
+            self.copies[name] = moved(host, device)
+        return self.copies[name]
 
 
 class View:
@@ -48,23 +65,31 @@ class View:
         keyframe: int,
         robust: bool,
         mask: npt.NDArray[np.bool_] | None = None,  # [H, W]
+        device: torch.device = CPU,
     ) -> None:
+        """``device``: that of the map which the view is drawn from; ``begin_on`` changes it."""
         self.frame_index, self.camera, self.T_wc = frame_index, camera, T_wc
         self.keyframe = keyframe
         """Number of the keyframe that the pose is relative to."""
         self.robust = robust
         """True for common frames, whose outliers are masked (paper, M)."""
-        self.log_gain = np.zeros(3)
-        """How much brighter than the mean of the views, RGB (see water/exposure.py)."""
-        self.light: Tensor | None = None
-        """[3, rows, columns] log-gain of the sunlight over the picture (see water/sunlight.py)."""
         self.looks = 0
         """Optimiser steps on this view."""
-        self.explained: Tensor | None = None
-        """[rows, columns] bool, the tiles in which the last full look found nothing but noise."""
         self.moments = (np.zeros(6), np.zeros(6), 0)
         """Adam's first and second moments of the pose, and its step count."""
         self._store: dict[int, Pixels] | Spill[Pixels] = {frame_index: Pixels(image, mask)}
+        self.begin_on(device)
+
+    def begin_on(self, device: torch.device) -> None:
+        """Be a view of a map on ``device``, of whose light nothing was learned yet."""
+        self.device = device
+        """Where the tensors of this view are; its pictures are taken there as they are used."""
+        self.log_gain = torch.zeros(3, dtype=torch.float64, device=device)
+        """[3] how much brighter than the mean of the views, RGB (see water/exposure.py)."""
+        self.light: Tensor | None = None
+        """[3, rows, columns] log-gain of the sunlight over the picture (see water/sunlight.py)."""
+        self.explained: Tensor | None = None
+        """[rows, columns] bool, the tiles in which the last full look found nothing but noise."""
 
     def move_pixels(self, store: Spill[Pixels]) -> None:
         """Move the pixels into ``store``, under the frame's index."""
@@ -93,7 +118,9 @@ class View:
         return self._store[self.frame_index]
 
     def _change(self, **arrays: Any) -> None:
-        self._store[self.frame_index] = replace(self._pixels, **arrays)
+        pixels = self._pixels
+        unchanged = {name: copy for name, copy in pixels.copies.items() if name not in arrays}
+        self._store[self.frame_index] = replace(pixels, copies=unchanged, **arrays)
 
     @property
     def image(self) -> npt.NDArray[np.uint8]:
@@ -119,8 +146,8 @@ class View:
         self,
     ) -> Tensor | None:
         """[H, W] 1 / range from tracking, in the keyframe's unit: T_wc.scale makes it the world's.
-        0 where unknown."""
-        return self._pixels.inverse_range
+        0 where unknown. On the map's device; it is set from the host."""
+        return self._pixels.on(self.device, "inverse_range")
 
     @inverse_range.setter
     def inverse_range(
@@ -133,8 +160,8 @@ class View:
     def range_confidence(
         self,
     ) -> Tensor | None:
-        """[H, W] in [0, 1]."""
-        return self._pixels.range_confidence
+        """[H, W] in [0, 1], as :attr:`inverse_range`."""
+        return self._pixels.on(self.device, "range_confidence")
 
     @range_confidence.setter
     def range_confidence(
@@ -145,24 +172,36 @@ class View:
 
     def target(self) -> Tensor:
         """[H, W, 3] float32 in [0, 1]."""
-        return torch.from_numpy(self.image).to(torch.float32).div_(255.0)
+        picture = self._pixels.on(self.device, "image")
+        assert picture is not None
+        return picture.to(torch.float32).div_(255.0)
 
     def scene_mask(self) -> Tensor:
         """[H, W] bool, a fresh one: True where the view shows the scene and not the vehicle."""
-        if self.mask is None:
-            return torch.ones(self.camera.height, self.camera.width, dtype=torch.bool)
-        return torch.from_numpy(self.mask.copy())
+        mask = self._pixels.on(self.device, "mask")
+        if mask is None:
+            size = (self.camera.height, self.camera.width)
+            return torch.ones(size, dtype=torch.bool, device=self.device)
+        return mask.clone()
 
-    def viewmat(self) -> Tensor:
-        """[4, 4] world to camera, rigid: the scale of a pose is the scale of its map."""
+    def world_to_camera(self) -> npt.NDArray[np.float64]:
+        """[4, 4] rigid: the scale of a pose is the scale of its map."""
         R = self.T_wc.R.T
         V = np.eye(4)
         V[:3, :3], V[:3, 3] = R, -R @ self.T_wc.t
-        return torch.from_numpy(V).to(torch.float32)
+        return V
+
+    def viewmat(self) -> Tensor:
+        """[4, 4] float32 :meth:`world_to_camera`, on the map's device."""
+        return pose_in(self.world_to_camera(), self.device)
+
+    def centre(self) -> Tensor:
+        """[3] float32 place of the camera in the world, on the map's device."""
+        return pose_in(self.T_wc.t, self.device)
 
     def K(self) -> Tensor:
-        """[3, 3] float32 intrinsics, px."""
-        return torch.from_numpy(self.camera.K).to(torch.float32)
+        """[3, 3] float32 intrinsics, px, on the map's device."""
+        return pose_in(self.camera.K, self.device)
 
 
 def in_time(views: Iterable[View]) -> list[View]:
@@ -225,11 +264,11 @@ def _unpack(
     number: int,
     arrays: Arrays,  # as from _pack
 ) -> Pixels:
-    ranges = {
-        name: torch.from_numpy(arrays[name]) if name in arrays else None
+    inverse_range, confidence = (
+        torch.from_numpy(arrays[name]) if name in arrays else None
         for name in ("inverse_range", "range_confidence")
-    }
-    return Pixels(arrays["image"], arrays.get("mask"), **ranges)
+    )
+    return Pixels(arrays["image"], arrays.get("mask"), inverse_range, confidence)
 
 
 BETAS = (0.8, 0.99)
@@ -252,8 +291,8 @@ def refine_pose(
 
     The view matrix V moves by the left tangent: dV = hat(xi) V, so dL/dxi_k = <G, E_k V>.
     """
-    V = view.viewmat().numpy().astype(np.float64)
-    G = gradient.numpy().astype(np.float64)
+    V = view.world_to_camera().astype(np.float32).astype(np.float64)  # as it was drawn
+    G = pose_out(gradient).astype(np.float64)
     if not is_usable(G):
         return
     M = G[:3] @ V.T

@@ -15,6 +15,7 @@ import torch
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.gaussians.gaussians import radiance
 from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.transfers import map_out
 from aquaflow.messages import CameraModel
 from aquaflow.viewer.splats import Splats, heat, splats
 
@@ -51,18 +52,17 @@ class MapCopy:
 def copied(mapper: Mapper) -> MapCopy:
     """In the mapping thread: a copy, and two colours; some milliseconds."""
     tensors = mapper.gaussians.parameters
-    plain = {name: tensor.detach().numpy().copy() for name, tensor in tensors.items()}
+    plain = {name: map_out(tensor) for name, tensor in tensors.items()}
     clear = radiance(mapper.gaussians.parameters["raw_colours"])
     seen = clear
     view = mapper.views[-1]
     water = mapper.scene.water(view)
     if water is not None:
-        centre = torch.from_numpy(view.T_wc.t).to(torch.float32)
-        z = torch.linalg.vector_norm(mapper.gaussians.means - centre, dim=-1)
+        z = torch.linalg.vector_norm(mapper.gaussians.means - view.centre(), dim=-1)
         seen = clear * water.transmission(z) + water.backscatter(z)
-    steps = mapper.optimiser.adam.steps.numpy().copy()
+    steps = map_out(mapper.optimiser.adam.steps)
     clear = mapper.scene.balanced(clear)
-    return MapCopy(plain, steps, seen.numpy().copy(), clear.numpy().copy())
+    return MapCopy(plain, steps, map_out(seen), map_out(clear))
 
 
 def shown(copy: MapCopy, budget: int) -> Splats:

@@ -44,7 +44,7 @@ def learned(kind: str = "dry") -> Mapper:
     mapper.scene.shading = np.array([0.0, 0.1, -0.1, 0.0, 0.05])
     mapper.scene.exposes = mapper.scene.sunlight.plays = True
     for i, view in enumerate(mapper.views):
-        view.log_gain = np.array([0.01, 0.0, -0.02]) * i
+        view.log_gain = torch.tensor([0.01, 0.0, -0.02], dtype=torch.float64) * i
     mapper.refine()
     return mapper
 

@@ -144,7 +144,7 @@ def test_restoring_takes_the_exposure_out_and_drawing_puts_it_in() -> None:
     lit.gaussians = floor()
     plain = lit.show(BLANK)
     dark = view_of(np.full((48, 64, 3), 51, np.uint8))
-    dark.log_gain = np.log([0.5, 0.5, 0.25])
+    dark.log_gain = torch.tensor([0.5, 0.5, 0.25], dtype=torch.float64).log()
     assert torch.equal(lit.show(dark).image, plain.image)  # no exposure has been found yet
     lit.exposes = True
     torch.testing.assert_close(
@@ -246,7 +246,7 @@ def test_views_whose_red_gain_drifted_do_not_turn_what_is_nearest_red() -> None:
     before = fitted.balance.gain
     fitted.exposes = True
     for view in views:
-        view.log_gain = np.array([-0.2, 0.0, 0.0])
+        view.log_gain = torch.tensor([-0.2, 0.0, 0.0], dtype=torch.float64)
     rebalance(fitted)
     assert fitted.balance.gain[0] < 0.95 * before[0]
 

@@ -53,7 +53,8 @@ def decoded(
     threads: int,
 ) -> dict[str, Tensor]:
     """The parameters with residuals on those in ``places``; differentiable but for the places."""
-    library = library_or_none() if takes(decoder.config.width) else None
+    on_cpu = trunk.hidden.device.type == "cpu"
+    library = library_or_none() if on_cpu and takes(decoder.config.width) else None
     if library is None:
         return decoded_torch(decoder, trunk, parameters, places, centre)
     if trunk.sound is not None:

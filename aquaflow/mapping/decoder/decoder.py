@@ -203,8 +203,9 @@ def _sound_groups(
 ) -> Tensor:
     """[B] bool: all features of the group are numbers of sensible size."""
     bad = (~(local.detach().abs() < LARGEST_FEATURE)).any(1).long()
-    group = torch.arange(len(shared)).repeat_interleave(tokens.places_of_groups)
-    count = torch.zeros(len(shared), dtype=torch.int64).index_add_(0, group, bad)
+    numbers = torch.arange(len(shared), device=shared.device)
+    group = numbers.repeat_interleave(tokens.places_of_groups)
+    count = torch.zeros_like(numbers).index_add_(0, group, bad)
     return (count == 0) & (shared.detach().abs() < LARGEST_FEATURE).all(1)
 
 

@@ -28,6 +28,7 @@ from aquaflow.mapping.decoder.regrouping import is_whole, regrouped
 from aquaflow.mapping.decoder.tokens import visible_tokens
 from aquaflow.mapping.decoder.voxel_groups import VoxelGroups
 from aquaflow.mapping.gaussians.gaussians import GaussianMap
+from aquaflow.mapping.transfers import weights_in
 from aquaflow.mapping.views import View
 from aquaflow.render.adam import SelectiveAdam
 
@@ -59,9 +60,11 @@ class NeuralGaussians:
         threads: int,
     ) -> None:
         self.config, self.gaussians, self.threads = config, gaussians, threads
-        gaussians.local_features = torch.zeros(len(gaussians), config.local_width)
-        self.groups = VoxelGroups(config.voxels, config.global_width)
-        self.decoder = Decoder(config, generator)
+        self.device = gaussians.device
+        size = (len(gaussians), config.local_width)
+        gaussians.local_features = torch.zeros(size, device=self.device)
+        self.groups = VoxelGroups(config.voxels, config.global_width, self.device)
+        self.decoder = weights_in(Decoder(config, generator), self.device)
         self._betas = betas
         self._local = self._feature_optimiser("local", gaussians.local_features)
         self._shared = self._feature_optimiser("shared", self.groups.features)
@@ -117,9 +120,9 @@ class NeuralGaussians:
         assert window.local.grad is not None
         assert window.shared.grad is not None
         tokens = window.trunk.tokens
-        rows = torch.zeros(len(window.local), dtype=torch.bool)
+        rows = torch.zeros(len(window.local), dtype=torch.bool, device=self.device)
         rows[tokens.rows] = True
-        groups = torch.zeros(len(window.shared), dtype=torch.bool)
+        groups = torch.zeros(len(window.shared), dtype=torch.bool, device=self.device)
         groups[tokens.groups] = True
         self._local.step(rows, {"local": window.local.grad})
         self._shared.step(groups, {"shared": window.shared.grad})
@@ -157,7 +160,7 @@ class NeuralGaussians:
     ) -> Tensor:
         """[N] bool: what a trunk is made of, for views that show ``seen`` (each [N] bool)."""
         if not self.config.visible_groups:
-            return torch.ones(len(self.gaussians), dtype=torch.bool)
+            return torch.ones(len(self.gaussians), dtype=torch.bool, device=self.device)
         return torch.stack(list(seen)).any(dim=0)
 
     def _decoded(
@@ -196,7 +199,7 @@ class NeuralGaussians:
         centres: Tensor,  # [N, 3] of the camera that each Gaussian is seen from
     ) -> dict[str, Tensor]:
         """All parameters as plain Gaussians, each as its own camera sees it."""
-        everyone = torch.ones(len(self.gaussians), dtype=torch.bool)
+        everyone = torch.ones(len(self.gaussians), dtype=torch.bool, device=self.device)
         trunk = self._trunk(everyone)
         places = trunk.tokens.places(everyone)
         rows = trunk.tokens.rows[places]
@@ -227,7 +230,7 @@ class NeuralGaussians:
         self.groups.insert(self.gaussians.means[-count:])
         self._local.extend(count)
         self._bind()
-        rows = torch.zeros(len(self.gaussians), dtype=torch.bool)
+        rows = torch.zeros(len(self.gaussians), dtype=torch.bool, device=self.device)
         rows[-count:] = True
         trunk = self._trunk(rows)
         places = trunk.tokens.places(rows)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from aquaflow.mapping.decoder.voxel_groups import EMPTY, VoxelGroups
+from aquaflow.mapping.transfers import groups_out
 
 
 def is_whole(
@@ -19,10 +20,12 @@ def is_whole(
     if not len(groups) == len(table) == len(groups.voxel) == len(groups.features):
         return False
     inside = (group >= 0) & (group < len(groups)) & (slot >= 0) & (slot < table.shape[1])
-    if not bool(inside.all()) or not torch.equal(table[group, slot], torch.arange(count)):
+    rows = torch.arange(count, device=groups.device)
+    if not bool(inside.all()) or not torch.equal(table[group, slot], rows):
         return False
     taken = (table != EMPTY).sum(1)
-    listed = torch.equal(torch.sort(groups.order()).values, torch.arange(len(groups)))
+    numbers = torch.arange(len(groups), device=groups.device)
+    listed = torch.equal(torch.sort(groups.order()).values, numbers)
     return listed and torch.equal(taken, groups.fill) and int(taken.sum()) == count
 
 
@@ -31,12 +34,12 @@ def regrouped(
     means: Tensor,  # [N, 3] of all Gaussians
 ) -> VoxelGroups:
     """All Gaussians placed anew; a voxel's first group keeps the feature known of that voxel."""
-    new = VoxelGroups(groups.config, groups.features.shape[1])
+    new = VoxelGroups(groups.config, groups.features.shape[1], groups.device)
     new.insert(means)
     known: dict[int, Tensor] = {}
-    for voxel, feature in zip(groups.voxel.tolist(), groups.features, strict=False):
+    for voxel, feature in zip(groups_out(groups.voxel), groups.features, strict=False):
         known.setdefault(voxel, feature)
-    for group, voxel in enumerate(new.voxel.tolist()):
+    for group, voxel in enumerate(groups_out(new.voxel)):
         feature = known.pop(voxel, None)
         if feature is not None and bool(torch.isfinite(feature).all()):
             new.features[group] = feature

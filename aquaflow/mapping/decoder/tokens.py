@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from aquaflow.mapping.decoder.voxel_groups import EMPTY, VoxelGroups
+from aquaflow.mapping.transfers import groups_in, groups_out
 
 BUCKET = 4
 """Places in a bucket's groups are a multiple of this; padding is 10 % of the tokens on real maps
@@ -35,7 +36,8 @@ class Tokens:
     @property
     def places_of_groups(self) -> Tensor:
         """[B] int64 places of each group."""
-        counts, widths = torch.tensor(self.buckets, dtype=torch.int64).reshape(-1, 2).unbind(1)
+        flat = groups_in([number for bucket in self.buckets for number in bucket], self.rows.device)
+        counts, widths = flat.reshape(-1, 2).unbind(1)
         return widths.repeat_interleave(counts)
 
     def places(
@@ -51,16 +53,17 @@ def visible_tokens(
     visible: Tensor,  # [N] bool
 ) -> Tokens:
     """All Gaussians of the groups of which one is visible: its neighbours are its context."""
-    seen = torch.zeros(len(groups), dtype=torch.bool)
+    seen = torch.zeros(len(groups), dtype=torch.bool, device=groups.device)
     seen[groups.group[visible]] = True
     chosen = torch.nonzero(seen)[:, 0]
     widths = (groups.fill[chosen] + BUCKET - 1).div(BUCKET, rounding_mode="floor") * BUCKET
     widths, order = torch.sort(widths, stable=True)
     chosen = chosen[order]
     lengths, counts = torch.unique_consecutive(widths, return_counts=True)
-    buckets = tuple(zip(counts.tolist(), lengths.tolist(), strict=True))
-    tables = [torch.zeros(0, dtype=torch.int64)]
-    for (_, width), members in zip(buckets, chosen.split_with_sizes(counts.tolist()), strict=True):
+    sizes = groups_out(counts)
+    buckets = tuple(zip(sizes, groups_out(lengths), strict=True))
+    tables = [chosen[:0]]
+    for (_, width), members in zip(buckets, chosen.split_with_sizes(sizes), strict=True):
         tables.append(_table(groups, members, width).reshape(-1))
     table = torch.cat(tables)
     first = groups.table[chosen, 0].repeat_interleave(widths)

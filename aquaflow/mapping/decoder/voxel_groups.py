@@ -12,6 +12,8 @@ from torch import Tensor
 
 from aquaflow.config.mapping import VoxelConfig
 from aquaflow.mapping.decoder.growable import GrowingRows
+from aquaflow.mapping.transfers import groups_in, groups_out
+from aquaflow.render.contract import CPU
 
 EMPTY = -1
 """Stands for no number in these tables."""
@@ -33,14 +35,13 @@ class VoxelGroups:
     afterwards they may drift (optimisation) or move together with it (loop closure).
     """
 
-    def __init__(self, config: VoxelConfig, feature_width: int) -> None:
-        self.config = config
-        self._group = GrowingRows(torch.zeros(0, dtype=torch.int64))
-        self._slot = GrowingRows(torch.zeros(0, dtype=torch.int64))
-        self._table = GrowingRows(torch.zeros(0, config.capacity, dtype=torch.int64))
-        self._fill = GrowingRows(torch.zeros(0, dtype=torch.int64))
-        self._voxel = GrowingRows(torch.zeros(0, dtype=torch.int64))
-        self._features = GrowingRows(torch.zeros(0, feature_width))
+    def __init__(self, config: VoxelConfig, feature_width: int, device: torch.device = CPU) -> None:
+        self.config, self.device = config, device
+        none = torch.zeros(0, dtype=torch.int64, device=device)
+        self._group, self._slot = GrowingRows(none), GrowingRows(none)
+        self._table = GrowingRows(none.new_zeros(0, config.capacity))
+        self._fill, self._voxel = GrowingRows(none), GrowingRows(none)
+        self._features = GrowingRows(torch.zeros(0, feature_width, device=device))
         self._groups_of: dict[int, list[int]] = {}
         """Voxel -> its groups, oldest first."""
 
@@ -96,10 +97,10 @@ class VoxelGroups:
         New groups come after the old ones, with features of zero. Cost grows with M.
         """
         first, count = len(self.group), len(means)
-        nowhere = torch.full((count,), EMPTY, dtype=torch.int64)
+        nowhere = torch.full((count,), EMPTY, dtype=torch.int64, device=self.device)
         self._group.extend(nowhere)
         self._slot.extend(nowhere)
-        rows = torch.arange(first, first + count)
+        rows = torch.arange(first, first + count, device=self.device)
         return self._place(rows, means, None)
 
     def keep(
@@ -111,7 +112,7 @@ class VoxelGroups:
         Groups stay, emptied ones too: what is inserted there again finds their feature.
         """
         self._take_out(torch.nonzero(~mask)[:, 0])
-        number = torch.cat([torch.cumsum(mask, 0) - 1, torch.tensor([EMPTY])])
+        number = torch.cat([torch.cumsum(mask, 0) - 1, self.group.new_full((1,), EMPTY)])
         self.table.copy_(number[self.table])  # EMPTY points at the last number, EMPTY itself
         self._group.keep(mask)
         self._slot.keep(mask)
@@ -144,20 +145,20 @@ class VoxelGroups:
         """[G] bool: the groups that were kept; drops the empty ones when they are many."""
         taken = self.fill > 0
         if int((~taken).sum()) <= MAX_EMPTY_SHARE * len(self):
-            return torch.ones(len(self), dtype=torch.bool)
+            return torch.ones(len(self), dtype=torch.bool, device=self.device)
         number = torch.cumsum(taken, 0) - 1
         self.group.copy_(number[self.group])
         for rows in (self._table, self._fill, self._voxel, self._features):
             rows.keep(taken)
         self._groups_of.clear()
-        for group, voxel in enumerate(self.voxel.tolist()):
+        for group, voxel in enumerate(groups_out(self.voxel)):
             self._groups_of.setdefault(voxel, []).append(group)
         return taken
 
     def order(self) -> Tensor:
         """[G] groups voxel by voxel, in the order in which each voxel's are filled."""
         listed = [group for groups in self._groups_of.values() for group in groups]
-        return torch.tensor(listed, dtype=torch.int64)
+        return groups_in(listed, self.device)
 
     def restore(
         self,
@@ -174,8 +175,9 @@ class VoxelGroups:
         self._table, self._fill = GrowingRows(table), GrowingRows(fill)
         self._voxel, self._features = GrowingRows(voxel), GrowingRows(features)
         self._groups_of = {}
-        for number in order.tolist():
-            self._groups_of.setdefault(int(voxel[number]), []).append(number)
+        voxels = groups_out(voxel)
+        for number in groups_out(order):
+            self._groups_of.setdefault(voxels[number], []).append(number)
 
     def _place(
         self,
@@ -187,10 +189,10 @@ class VoxelGroups:
         keys, order = torch.sort(self.voxel_of(means), stable=True)
         rows = rows[order]
         voxels, counts = torch.unique_consecutive(keys, return_counts=True)
-        old = [self._groups_of.get(voxel, []) for voxel in voxels.tolist()]
-        groups = torch.tensor([group for ids in old for group in ids], dtype=torch.int64)
-        place = torch.arange(len(voxels))
-        owner = place.repeat_interleave(torch.tensor([len(ids) for ids in old], dtype=torch.int64))
+        old = [self._groups_of.get(voxel, []) for voxel in groups_out(voxels)]
+        groups = groups_in([group for ids in old for group in ids], self.device)
+        place = torch.arange(len(voxels), device=self.device)
+        owner = place.repeat_interleave(groups_in([len(ids) for ids in old], self.device))
         room = self.config.capacity - self.fill[groups]
         missing = counts - torch.zeros_like(counts).index_add_(0, owner, room)
         capacity = self.config.capacity
@@ -218,7 +220,8 @@ class VoxelGroups:
         taken: Tensor,  # [B] rows each group takes, in order; M in all
     ) -> None:
         group = groups.repeat_interleave(taken)
-        slot = torch.arange(len(rows)) - _exclusive_sum(taken).repeat_interleave(taken)
+        slot = torch.arange(len(rows), device=self.device)
+        slot -= _exclusive_sum(taken).repeat_interleave(taken)
         slot += self.fill[group]
         self.table[group, slot] = rows
         self.group[rows], self.slot[rows] = group, slot
@@ -230,13 +233,13 @@ class VoxelGroups:
     ) -> Tensor:
         """[B] numbers of new, empty groups."""
         first, count = len(self), len(voxels)
-        self._table.extend(torch.full((count, self.config.capacity), EMPTY, dtype=torch.int64))
-        self._fill.extend(torch.zeros(count, dtype=torch.int64))
+        self._table.extend(self.table.new_full((count, self.config.capacity), EMPTY))
+        self._fill.extend(self.fill.new_zeros(count))
         self._voxel.extend(voxels)
         self._features.extend(self.features.new_zeros(count, self.features.shape[1]))
-        for group, voxel in enumerate(voxels.tolist(), first):
+        for group, voxel in enumerate(groups_out(voxels), first):
             self._groups_of.setdefault(voxel, []).append(group)
-        return torch.arange(first, first + count)
+        return torch.arange(first, first + count, device=self.device)
 
     def _enter(
         self,
@@ -247,7 +250,7 @@ class VoxelGroups:
         groups, voxels = groups[changed], voxels[changed]
         old = self.voxel[groups]
         self.voxel[groups] = voxels
-        for group, was, now in zip(groups.tolist(), old.tolist(), voxels.tolist(), strict=True):
+        for group, was, now in zip(*map(groups_out, (groups, old, voxels)), strict=True):
             self._groups_of[was].remove(group)
             if not self._groups_of[was]:
                 del self._groups_of[was]

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from aquaflow.render.contract import CPU
+
 COLOUR_SHARPNESS = 10.0
 """Softplus sharpness that keeps radiance positive and is the identity above about 0.3."""
 
@@ -30,11 +32,14 @@ class GaussianMap:
         "raw_colours": 3,
     }
 
-    def __init__(self, local_width: int = 0) -> None:
-        self.parameters = {name: torch.zeros(0, self.WIDTHS[name]) for name in self.NAMES}
-        self.keyframes = torch.zeros(0, dtype=torch.int64)
+    def __init__(self, local_width: int = 0, device: torch.device = CPU) -> None:
+        self.device = device
+        self.parameters = {
+            name: torch.zeros(0, self.WIDTHS[name], device=device) for name in self.NAMES
+        }
+        self.keyframes = torch.zeros(0, dtype=torch.int64, device=device)
         """[N] number of the keyframe each Gaussian belongs to."""
-        self.local_features = torch.zeros(0, local_width)
+        self.local_features = torch.zeros(0, local_width, device=device)
         """[N, F] what a decoder knows of each Gaussian, zero to begin with; F = 0 without one."""
 
     def __len__(self) -> int:
@@ -66,7 +71,8 @@ class GaussianMap:
         keyframe: int,
     ) -> None:
         """Append Gaussians (tensors by the names above) that ``keyframe`` saw."""
-        self._grow(new, torch.full((len(new["means"]),), keyframe, dtype=torch.int64))
+        size = (len(new["means"]),)
+        self._grow(new, torch.full(size, keyframe, dtype=torch.int64, device=self.device))
 
     def append(self, other: GaussianMap) -> None:
         """Append all Gaussians of ``other``, which keep their keyframes but not their features."""

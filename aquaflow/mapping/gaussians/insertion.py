@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,6 +12,7 @@ from torch import Tensor
 from aquaflow.config import InsertionConfig
 from aquaflow.keyframes import Pointmap
 from aquaflow.mapping.gaussians.gaussians import GaussianMap, raw_colour
+from aquaflow.mapping.transfers import insertion_in, insertion_out, picture_out, pointmap_in
 from aquaflow.mapping.views import View
 
 LOG_GAIN = 3.0
@@ -34,9 +35,14 @@ class TrackedRange:
         view.inverse_range = torch.where(self.known, 1.0 / self.z.clamp_min(1e-6), 0.0)
         view.range_confidence = self.confidence
 
+    def on(self, device: torch.device) -> TrackedRange:
+        """The same on the map's device."""
+        names = ("z", "known", "confidence")
+        return replace(self, **{name: pointmap_in(getattr(self, name), device) for name in names})
+
 
 def tracked_range(pointmap: Pointmap, known_sigma: float) -> TrackedRange:
-    """Known where the relative standard deviation is below ``known_sigma``."""
+    """Known where the relative standard deviation is below ``known_sigma``; on the host."""
     camera, pointmap = pointmap.camera, pointmap.completed(known_sigma)
     known = torch.from_numpy(pointmap.known(known_sigma))
     length = torch.from_numpy(camera.unproject(camera.pixel_centres())).norm(dim=-1)
@@ -72,11 +78,10 @@ def structure(
     The operator is scale-normalised by sigma^2; its response is averaged over the kernel's own
     width, so that both sides of an edge count and not the zero crossing on it.
     """
-    array = image.numpy()
-    smooth = cv2.GaussianBlur(array, (0, 0), sigma_px)
+    smooth = cv2.GaussianBlur(picture_out(image), (0, 0), sigma_px)
     response = np.abs(cv2.Laplacian(smooth, cv2.CV_32F)).sum(axis=-1) * sigma_px**2
     response = cv2.GaussianBlur(response, (0, 0), 2.0 * sigma_px)
-    return torch.from_numpy(np.clip(LOG_GAIN * response, 0.0, 1.0))
+    return insertion_in(torch.from_numpy(np.clip(LOG_GAIN * response, 0.0, 1.0)), image.device)
 
 
 def insertion_probability(
@@ -102,7 +107,7 @@ def select(
 ) -> tuple[Tensor, Tensor]:
     """Rows and columns drawn with probability ``P_a * density``, at least ``tau_a``."""
     chance = torch.where(probability > config.tau_a, probability * config.density, 0.0)
-    drawn = torch.rand(chance.shape, generator=generator) < chance
+    drawn = insertion_in(torch.rand(chance.shape, generator=generator), chance.device) < chance
     rows, columns = torch.nonzero(drawn & allowed, as_tuple=True)
     return rows, columns
 
@@ -117,6 +122,7 @@ def thin(
     if len(rows) <= room:
         return rows, columns
     chosen = torch.randperm(len(rows), generator=generator)[: max(room, 0)].sort().values
+    chosen = insertion_in(chosen, rows.device)
     return rows[chosen], columns[chosen]
 
 
@@ -127,7 +133,7 @@ def worth_keeping(gaussians: GaussianMap, count: int) -> Tensor:
     """
     scales = gaussians.scales
     worth = gaussians.opacities * scales.prod(dim=-1) / scales.amin(dim=-1)
-    keep = torch.ones(len(worth), dtype=torch.bool)
+    keep = torch.ones(len(worth), dtype=torch.bool, device=worth.device)
     keep[torch.argsort(worth, stable=True)[: len(worth) - count]] = False
     return keep
 
@@ -146,20 +152,20 @@ def new_gaussians(
 
     Pixels for which one of them is not finite get no Gaussian.
     """
-    pixels = torch.stack([columns, rows], dim=-1).numpy() + 0.5
+    pixels = insertion_out(torch.stack([columns, rows], dim=-1)) + 0.5
     rays = view.camera.unproject(pixels)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    distance = z[rows, columns].numpy().astype(np.float64)
+    distance = insertion_out(z[rows, columns]).astype(np.float64)
     means = (rays * distance[:, None]) @ view.T_wc.R.T + view.T_wc.t
     # Expected distance to the nearest neighbour when a share p of the pixels is drawn: 1 / sqrt(p).
     share = (probability[rows, columns] * config.density).clamp(1e-4, 1.0)
     spacing = share.rsqrt().clamp(1.0, config.max_spacing_widths * view.camera.width)
     scale = config.scale_of_spacing * spacing * z[rows, columns] / view.camera.fx
     opacity = (config.opacity * confidence[rows, columns]).clamp(0.05, 0.95)
-    quats = torch.zeros(len(rows), 4)
+    quats = torch.zeros(len(rows), 4, device=rows.device)
     quats[:, 0] = 1.0
     new = {
-        "means": torch.from_numpy(means).to(torch.float32),
+        "means": insertion_in(torch.from_numpy(means).to(torch.float32), rows.device),
         "quats": quats,
         "log_scales": torch.log(scale)[:, None].repeat(1, 3),
         "opacity_logits": torch.logit(opacity)[:, None],

@@ -9,6 +9,7 @@ import torch
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.gaussians.gaussians import GaussianMap
+from aquaflow.mapping.transfers import moves_in
 from aquaflow.mapping.views import View
 
 
@@ -23,15 +24,20 @@ def move_gaussians(gaussians: GaussianMap, moves: Mapping[int, Sim3]) -> torch.T
         ArithmeticError: where they go is not finite; nothing has moved then.
     """
     if not moves or len(gaussians) == 0:
-        return torch.zeros(0, dtype=torch.int64)
-    numbers = torch.tensor(sorted(moves), dtype=torch.int64)
+        return torch.zeros(0, dtype=torch.int64, device=gaussians.device)
+    ordered = [moves[number] for number in sorted(moves)]
+    columns = (
+        [S.R for S in ordered], [S.t for S in ordered], [S.quaternion for S in ordered],
+        [S.scale for S in ordered],
+    )  # fmt: skip
+    numbers, *tables = (
+        moves_in(torch.from_numpy(np.stack(column)), gaussians.device)
+        for column in (sorted(moves), *columns)
+    )
     rows = torch.nonzero(torch.isin(gaussians.keyframes, numbers))[:, 0]
     which = torch.searchsorted(numbers, gaussians.keyframes[rows])
-    ordered = [moves[int(number)] for number in numbers]
-    R = torch.from_numpy(np.stack([S.R for S in ordered]))[which]
-    t = torch.from_numpy(np.stack([S.t for S in ordered]))[which]
-    scale = torch.tensor([S.scale for S in ordered], dtype=torch.float64)[which, None]
-    turn = torch.from_numpy(np.stack([S.quaternion for S in ordered]))[which]
+    R, t, turn, scale = (table[which] for table in tables)
+    scale = scale[:, None]
     means, quats = (gaussians.parameters[name] for name in ("means", "quats"))
     turned = torch.einsum("nij,nj->ni", R, means[rows].double())
     moved = (scale * turned + t).float()

@@ -5,16 +5,18 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from aquaflow.render.contract import CPU
+
 RADIAL_VARIANCE = 5.0
 """sigma^2 of K_rad in units of the half picture: corner weight 0.82 (ARTDECO; docs/paper.md)."""
 MIN_RANGE = 1e-2
 """Map units; guards 1 / range."""
 
 
-def radial_weight(height: int, width: int) -> Tensor:
+def radial_weight(height: int, width: int, device: torch.device = CPU) -> Tensor:
     """K_rad [H, W] = exp(-r^2 / (2 sigma^2)), r in [-1, 1]^2 picture coordinates."""
-    y = torch.linspace(-1.0, 1.0, height)[:, None]
-    x = torch.linspace(-1.0, 1.0, width)[None, :]
+    y = torch.linspace(-1.0, 1.0, height, device=device)[:, None]
+    x = torch.linspace(-1.0, 1.0, width, device=device)[None, :]
     return torch.exp(-(x * x + y * y) / (2.0 * RADIAL_VARIANCE)).contiguous()
 
 

@@ -66,5 +66,5 @@ class Objective:
         """K_rad [H, W]."""
         size = (view.camera.height, view.camera.width)
         if size not in self._K_rad:
-            self._K_rad[size] = radial_weight(*size)
+            self._K_rad[size] = radial_weight(*size, view.device)
         return self._K_rad[size]

@@ -10,7 +10,7 @@ from aquaflow.config import OptimiserConfig
 from aquaflow.mapping.optimisation.objective import Objective
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.views import View, refine_pose
-from aquaflow.mapping.water.exposure import log_gain_at
+from aquaflow.mapping.water.exposure import log_gain_at, set_log_gain
 from aquaflow.mapping.water.sunlight import light_at
 
 
@@ -27,7 +27,7 @@ def register(
     its own picture (the peers do so for exposure).
     """
     if mapped:
-        view.log_gain = log_gain_at(view.frame_index, mapped)
+        set_log_gain(view, log_gain_at(view.frame_index, mapped))
         view.light = light_at(view.frame_index, mapped)
     for _ in range(config.heldout_steps if len(scene.gaussians) else 0):
         viewmat = view.viewmat().requires_grad_()

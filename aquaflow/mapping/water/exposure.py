@@ -14,6 +14,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from aquaflow.mapping.transfers import water_in, water_out
 from aquaflow.mapping.views import View
 
 Array = npt.NDArray[np.float64]
@@ -34,7 +35,12 @@ MAX_LOG_GAIN = 2.0
 
 def gain_of(view: View) -> Tensor:
     """[3] of a view."""
-    return torch.from_numpy(np.exp(view.log_gain)).to(torch.float32)
+    return view.log_gain.exp().to(torch.float32)
+
+
+def log_gains_of(views: Sequence[View]) -> Array:
+    """[V, 3] on the host."""
+    return water_out(torch.stack([view.log_gain for view in views]))
 
 
 @torch.no_grad()
@@ -52,9 +58,9 @@ def learn_gain(
         good = good & (colour > DARKEST) & (colour < BRIGHTEST)
     ratio = theirs.clamp_min(DARKEST) / ours.clamp_min(DARKEST)
     median = torch.where(good, ratio.log(), torch.nan).nanmedian(dim=0).values
-    found = (1.0 - TOWARDS_ONE) * median.double().numpy()
-    enough = (good.sum(dim=0).numpy() >= FEWEST) & np.isfinite(found)
-    view.log_gain = np.where(enough, found.clip(-MAX_LOG_GAIN, MAX_LOG_GAIN), view.log_gain)
+    found = (1.0 - TOWARDS_ONE) * median.double()
+    enough = (good.sum(dim=0) >= FEWEST) & torch.isfinite(found)
+    view.log_gain = torch.where(enough, found.clamp(-MAX_LOG_GAIN, MAX_LOG_GAIN), view.log_gain)
 
 
 def log_gain_at(
@@ -62,7 +68,7 @@ def log_gain_at(
     views: Sequence[View],  # in the order of their frames
 ) -> Array:
     """[3] between the views before and after, as a view that was never mapped is shown."""
-    return _between(frame_index, views, [view.log_gain for view in views])
+    return _between(frame_index, views, log_gains_of(views))
 
 
 def set_log_gains(
@@ -73,18 +79,30 @@ def set_log_gains(
     """Give the fitted views their gains, and all others what changes between them; so too the last
     of those fitted where nothing was sighted in them."""
     fitted = fitted[: len(log_gains)]
-    change = [new - view.log_gain for new, view in zip(log_gains, fitted, strict=True)]
-    moved = [view.log_gain + _between(view.frame_index, fitted, change) for view in views]
+    change = log_gains - log_gains_of(fitted)
+    before = log_gains_of(views)
+    moved = [
+        log_gain + _between(view.frame_index, fitted, change)
+        for view, log_gain in zip(views, before, strict=True)
+    ]
     if not np.isfinite(moved).all():
         raise ArithmeticError("an exposure is not finite")
     for view, log_gain in zip(views, moved, strict=True):
-        view.log_gain = log_gain
+        set_log_gain(view, log_gain)
+
+
+def set_log_gain(
+    view: View,
+    log_gain: Array,  # [3]
+) -> None:
+    """Give ``view`` this exposure."""
+    view.log_gain = water_in(log_gain, view.device, torch.float64)
 
 
 def _between(
     frame_index: int,
     views: Sequence[View],  # V, in the order of their frames
-    values: Sequence[Array],  # V times [3], log-gain of RGB
+    values: Array,  # [V, 3] log-gain of RGB
 ) -> Array:
     at = [view.frame_index for view in views]
-    return np.array([np.interp(frame_index, at, [v[c] for v in values]) for c in range(3)])
+    return np.array([np.interp(frame_index, at, values[:, c]) for c in range(3)])

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.mapping.transfers import picture_out
 from aquaflow.mapping.views import View
 
 Array = npt.NDArray[np.float64]
@@ -37,9 +38,9 @@ class PosedPicture:
         self.T_wc: Sim3 = view.T_wc
         self.focal = float(np.sqrt(view.camera.fx * view.camera.fy))
         """px"""
-        self._z = z.detach().numpy()
-        self._shows_scene = view.scene_mask().numpy()
-        self._solid = (alpha > SOLID).numpy() & self._shows_scene
+        self._z = picture_out(z)
+        self._shows_scene = picture_out(view.scene_mask())
+        self._solid = picture_out(alpha > SOLID) & self._shows_scene
         self._levels = [np.asarray(view.image, np.float32) / np.float32(255.0)]
         while len(self._levels) < LEVELS and min(self._levels[-1].shape[:2]) > LEVELS:
             self._levels.append(np.asarray(cv2.pyrDown(self._levels[-1]), np.float32))
@@ -69,7 +70,7 @@ class PosedPicture:
         """[up to count, 3] places in the world that the picture shows."""
         rows, columns = (random.integers(0, size, count) for size in self._z.shape)
         good = self._solid[rows, columns]
-        return self.lifted(np.stack([columns[good], rows[good]], axis=-1) + 0.5)
+        return self.lifted(np.stack([columns[good], rows[good]], axis=-1).astype(np.float64) + 0.5)
 
     def lifted(
         self,

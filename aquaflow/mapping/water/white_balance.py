@@ -37,6 +37,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from aquaflow.mapping.transfers import water_in
 from aquaflow.mapping.water.image_formation import MAX_RESTORED, Water
 
 PICTURE_NOISE = 0.01
@@ -86,7 +87,7 @@ class WhiteBalance:
         """The balanced picture without water; the module's text derives it."""
         T, veil = water.transmission(z), water.backscatter(z)
         veil = veil if uneven is None else veil * uneven[..., None]
-        mean, white = torch.tensor(self.mean), torch.tensor(self.gain)
+        mean, white = (water_in(each, z.device) for each in (self.mean, self.gain))
         depth = water.beta_a * (z[..., None] - self.near_range).clamp_min(0.0)
         noise = PICTURE_NOISE**2 + (VEIL_ERROR * veil).square()
         noise = noise + (self.attenuation_sigma * depth * mean * T).square()

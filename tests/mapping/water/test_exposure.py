@@ -33,7 +33,7 @@ def filmed_brighter(gain: np.ndarray = GAIN) -> View:
 def along(*log_gains: float) -> list[View]:
     views = [view_of(np.zeros((2, 2, 3), np.uint8), index=10 * i) for i in range(len(log_gains))]
     for view, log_gain in zip(views, log_gains, strict=True):
-        view.log_gain = np.full(3, log_gain)
+        view.log_gain = torch.full((3,), log_gain, dtype=torch.float64)
     return views
 
 
@@ -60,7 +60,7 @@ def test_the_gain_leans_towards_one() -> None:
 @pytest.mark.parametrize("what", ["bare", "vehicle", "black", "clipped", "not finite"])
 def test_a_picture_that_says_nothing_leaves_the_gain_as_it_was(what: str) -> None:
     view = filmed_brighter()
-    view.log_gain = np.array([0.1, 0.2, 0.3])
+    view.log_gain = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
     picture, alpha = drawn(), SOLID.clone()
     if what == "bare":
         alpha[:] = 0.5
