@@ -19,15 +19,19 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
+import aquaflow
+
 PRETENDED = torch.device("meta")
-OWN, TRANSFERS = "/aquaflow/", "mapping/transfers.py"
-"""Of the paths of our modules, and of the one that may move tensors."""
+OWN = str(Path(aquaflow.__file__).parent)
+TRANSFERS = str(Path(OWN, "mapping", "transfers.py"))
+"""Folder of our modules, and the one that may move tensors."""
 aten: Any = torch.ops.aten
 
 
@@ -45,8 +49,10 @@ class Device:
     moved_in: int = 0
     moved_out: int = 0
     """Tensors that crossed."""
+    named: int = 0
+    """Of them, those moved by the named functions of ``TRANSFERS``."""
     strays: Counter[str] = field(default_factory=Counter)
-    """Of them, those that another of our modules moved than ``TRANSFERS``: file and function."""
+    """Those that another of our modules moved: file and function. The others are the test's."""
     read: int = 0
     """Single numbers that Python asked for."""
     calls: int = 0
@@ -56,18 +62,16 @@ class Device:
     lost: bool = False
     """From then on every call fails."""
 
-    @property
-    def crossings(self) -> int:
-        return self.moved_in + self.moved_out
-
     def cross(self, moved_in: bool) -> None:
         """Count a tensor that moves, and whose doing it was."""
         self.moved_in += moved_in
         self.moved_out += not moved_in
         frame = sys._getframe()
-        while frame is not None and OWN not in frame.f_code.co_filename:
+        while frame is not None and not frame.f_code.co_filename.startswith(OWN):
             frame = frame.f_back  # type: ignore[assignment]
-        if frame is not None and not frame.f_code.co_filename.endswith(TRANSFERS):
+        if frame is not None and frame.f_code.co_filename == TRANSFERS:
+            self.named += 1
+        elif frame is not None:
             self.strays[f"{frame.f_code.co_filename}: {frame.f_code.co_name}"] += 1
 
     def call(self) -> None:

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from aquaflow.config import MappingConfig
+from aquaflow.mapping import state
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.transfers import transfers
-from aquaflow.render.contract import Rendering
+from aquaflow.render.contract import CPU, Rendering
 from aquaflow.render.reference import ReferenceRenderer
 from tests.mapping.mapping_scenes import (
     CAMERA,
@@ -25,6 +26,7 @@ from tests.mapping.mapping_scenes import (
     view_of,
     water,
 )
+from tests.pretended_device import PRETENDED
 
 FITTED = ("aquaflow.render.photometric", "aquaflow.render.water", "aquaflow.render.adam")
 DECODE = "aquaflow.mapping.decoder.decode"
@@ -41,6 +43,7 @@ ALL_PARTS: dict[str, dict[str, Any]] = {
 
 
 SMALL = CAMERA.scaled(32, 24)
+WHERE = (CPU, PRETENDED)
 
 
 class SinglePrecision:
@@ -80,6 +83,14 @@ def mapped(device: torch.device, config: MappingConfig | None = None) -> Mapper:
     mapper.move({0: pose((0.01, 0.0, 0.0))})
     mapper.optimise(2)
     return mapper
+
+
+def again(mapper: Mapper, device: torch.device) -> Mapper:
+    """A copy of the map, whose pictures are those of the original."""
+    copy = state.deserialise(*state.serialise(mapper, optimiser=True), SinglePrecision(device))
+    for view, original in zip(copy.views, mapper.views, strict=True):
+        view._store = original._store
+    return copy
 
 
 def on_host(mapper: Mapper) -> dict[str, Tensor]:

@@ -76,7 +76,7 @@ def test_assignments_reach_the_values(device: Device) -> None:
 
 def test_single_numbers_are_counted_as_read(device: Device) -> None:
     assert bool(torch.ones(2, device=PRETENDED).sum() == 2.0)
-    assert (device.read, device.crossings) == (1, 0)
+    assert (device.read, device.moved_in, device.moved_out) == (1, 0, 0)
 
 
 def test_threads_that_start_meanwhile_have_it_too(device: Device) -> None:

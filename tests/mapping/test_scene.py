@@ -10,46 +10,15 @@ from aquaflow.config import MediumConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.scene_water import rebalance
-from aquaflow.mapping.views import View
 from tests.mapping.mapping_scenes import (
-    filmed,
     fit_water,
     floor,
-    gaussians_at,
-    pose,
     renderer,
     view_of,
-    water,
 )
+from tests.mapping.water_scenes import in_clear_water, random, scene, submerged
 
-NEAR_AND_FAR = [pose((0.02 * i, 0.0, -0.35 * i)) for i in range(5)]
 BLANK = view_of(np.zeros((48, 64, 3), np.uint8))
-
-
-def scene(enabled: bool = True, exposure: bool = True) -> Scene:
-    config = MediumConfig(enabled=enabled, exposure=exposure)
-    return Scene(config, renderer(), torch.Generator().manual_seed(0))
-
-
-def random() -> torch.Generator:
-    return torch.Generator().manual_seed(0)
-
-
-def submerged() -> tuple[Scene, list[View]]:
-    """A map of a floor coloured as if there were little water, and pictures through more.
-
-    Every picture is of one range, so that light and water could not be told apart: it is even.
-    """
-    floating = scene(exposure=False)
-    floor_map = floor(columns=18, rows=14)
-    views = filmed(floor_map, NEAR_AND_FAR, water(beta=0.3, b=0.3))
-    murk, z = water(beta=0.3, b=0.3), floor_map.means.norm(dim=-1)
-    weak = floating.water(views[0])
-    assert weak is not None
-    seen = floor_map.colours * murk.transmission(z) + murk.backscatter(z)
-    coloured, _ = weak.restore(seen.detach(), z)
-    floating.gaussians = gaussians_at(floor_map.means, coloured.detach(), 0.09)
-    return floating, views
 
 
 def test_a_fit_takes_on_the_water_keeps_the_near_picture_and_improves_the_far_one() -> None:
@@ -82,20 +51,6 @@ def test_nothing_is_fitted_when_told_not_to_or_without_views_gaussians_or_points
     assert fit_water(ready, views, random()) is None
     assert torch.equal(ready.gaussians.parameters["raw_colours"], colours[:50])
     assert ready.beta_a_sigma is None
-
-
-def in_clear_water(dimmed_from: int | None = None) -> tuple[Scene, list[View]]:
-    """A map of a floor, and pictures through no water; the lamps may go down."""
-    dry = scene()
-    floor_map = floor(columns=18, rows=14)
-    views = filmed(floor_map, NEAR_AND_FAR)
-    if dimmed_from is not None:
-        views = [
-            view_of((v.image * (1.0 if i < dimmed_from else 0.6)).astype(np.uint8), v.T_wc, i)
-            for i, v in enumerate(views)
-        ]
-    dry.gaussians = gaussians_at(floor_map.means, floor_map.colours, 0.09)
-    return dry, views
 
 
 def test_in_clear_water_the_medium_goes_off_and_the_pictures_stay() -> None:
@@ -132,7 +87,7 @@ def test_lamps_that_go_down_are_exposure_and_neither_water_nor_colour() -> None:
     assert fit_water(dry, views, random(), [*views, between]) is not None
     assert dry.exposes
     assert not dry.medium.active
-    gains = [float(np.exp(view.log_gain).mean()) for view in views]
+    gains = [float(view.log_gain.exp().mean()) for view in views]
     np.testing.assert_allclose(np.array(gains[3:]) / gains[0], 0.6, rtol=0.05)
     np.testing.assert_allclose(between.log_gain, views[-1].log_gain)
     errors = [float((dry.show(view).image - view.target()).abs().mean()) for view in views]
@@ -163,7 +118,7 @@ def test_a_view_learns_its_exposure_only_when_it_is_told_to() -> None:
     lit.show(view)
     assert not view.log_gain.any()
     lit.show(view, learn=True)
-    np.testing.assert_allclose(np.exp(view.log_gain), 0.5, rtol=0.02)
+    np.testing.assert_allclose(view.log_gain.exp(), 0.5, rtol=0.02)
 
 
 def test_water_that_is_switched_off_is_not_there() -> None:
