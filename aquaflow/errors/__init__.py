@@ -49,11 +49,30 @@ _NO_MEMORY = (
 """How torch, OpenCV and onnxruntime word what is no MemoryError of theirs, in lower case."""
 
 
+_DEVICE_FAILED = (
+    "cuda error",
+    "cuda out of memory",
+    "cudnn error",
+    "cublas_status",
+    "cusolver error",
+)
+"""How torch words the failure of a GPU, in lower case; after most of them no call works."""
+
+
 def is_out_of_memory(error: BaseException) -> bool:
     """True for a MemoryError, and for what libraries raise in its place."""
     if isinstance(error, MemoryError):
         return True
     return isinstance(error, Exception) and any(each in str(error).lower() for each in _NO_MEMORY)
+
+
+def is_device_failure(error: BaseException | None) -> bool:
+    """True for what torch raises when a GPU has no memory left, or is gone."""
+    while error is not None:
+        if any(each in str(error).lower() for each in _DEVICE_FAILED):
+            return True
+        error = error.__cause__
+    return False
 
 
 def is_full_disk(error: BaseException | None) -> bool:

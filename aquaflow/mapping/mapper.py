@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from aquaflow.config import MappingConfig
+from aquaflow.errors import is_device_failure
 from aquaflow.errors.failures import Failures
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
@@ -74,9 +75,10 @@ class Mapper:
     def add_view(self, view: View) -> None:
         """Let later optimisation steps use ``view``."""
         self._take(view)
-        if self.views:
-            view.log_gain, view.light = self.views[-1].log_gain, self.views[-1].light
-        self.views.append(view)
+        if view not in self.views:  # it is, where the device failed on it and it comes again
+            if self.views:
+                view.log_gain, view.light = self.views[-1].log_gain, self.views[-1].light
+            self.views.append(view)
         if self.water_fitting.go_on(self.views):
             self.scene.sunlight.judge(in_time(self.views))
 
@@ -176,7 +178,7 @@ class Mapper:
         The water stays this map's own: it is the same water, and is fitted again to all views. So
         does the decoder: what the other's says of its Gaussians, seen from its own views, is kept.
         """
-        count, views = len(other.gaussians), in_time([*self.views, *other.views])
+        count, views = len(other.gaussians), in_time(dict.fromkeys([*self.views, *other.views]))
         # Only a decoder needs to know from where each is seen: cameras times Gaussians.
         centres = None if self.neural is None else other.scene.bake(other.views)
         self.gaussians.append(other.gaussians)
@@ -227,7 +229,9 @@ class Mapper:
         with self.failures.contain(stage, view.frame_index) as step:
             self.optimiser.step(view, refine_poses and view is not self.views[0])
         self._failed_in_a_row = self._failed_in_a_row + 1 if step.failed else 0
-        if step.failed:
+        if step.error is not None:
+            if self.device.type != "cpu" and is_device_failure(step.error):
+                raise step.error  # no later step would do better: the maps go on on the CPU
             self.make_whole()
 
     def make_whole(self) -> None:

@@ -120,9 +120,10 @@ def checkpoint_in(
 
 def weights_in(module: Module, device: torch.device) -> Module:
     """A network as it is made, with all its parameters and buffers."""
+    moved = module.to(device)
     if device.type != "cpu":
         _COUNTS.add("weights in", sum(1 for _ in (*module.parameters(), *module.buffers())))
-    return module.to(device)
+    return moved
 
 
 # --- out ------------------------------------------------------------------------------------------
@@ -188,8 +189,9 @@ def _into(
 ) -> Tensor:
     if device.type == "cpu":
         return host
+    moved = host.to(device)
     _COUNTS.add(name)
-    return host.to(device)
+    return moved
 
 
 def _out(
@@ -198,6 +200,6 @@ def _out(
 ) -> Array:
     tensor = tensor.detach()
     if tensor.device.type != "cpu":
-        _COUNTS.add(name)
         tensor = tensor.cpu()
+        _COUNTS.add(name)
     return tensor.numpy()

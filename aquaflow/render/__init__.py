@@ -32,10 +32,11 @@ def select_renderer(name: RendererName = "auto", threads: int | None = None) -> 
         return gsplat.GsplatRenderer()
     if name == "tiles":
         return TileRenderer(threads)
-    return _cpu_or_tiles(name == "auto", threads)
+    return cpu_renderer(threads, may_fall_back=name == "auto")
 
 
-def _cpu_or_tiles(may_fall_back: bool, threads: int | None) -> Renderer:
+def cpu_renderer(threads: int | None = None, may_fall_back: bool = True) -> Renderer:
+    """The CPU's renderer: compiled kernels, else, if it ``may_fall_back``, torch's tiles."""
     from aquaflow.render.cpu import CpuRenderer
     from aquaflow.render.library import NativeUnavailableError
     from aquaflow.render.tiles import TileRenderer
@@ -53,4 +54,4 @@ def _cpu_or_tiles(may_fall_back: bool, threads: int | None) -> Renderer:
         return TileRenderer(threads)
 
 
-__all__ = ["RendererName", "select_renderer"]
+__all__ = ["RendererName", "cpu_renderer", "select_renderer"]

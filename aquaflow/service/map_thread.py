@@ -21,6 +21,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.maps import Growth, Insertion, Maps, Progress
 from aquaflow.mapping.views import View
+from aquaflow.render.contract import Renderer
 from aquaflow.service.half_size import halved
 from aquaflow.service.health.degradation import DegradationLevel
 from aquaflow.service.health.heartbeats import Heartbeats
@@ -143,6 +144,10 @@ class MapThread:
         return self._maps.mappers
 
     @property
+    def renderer(self) -> Renderer:
+        return self._maps.renderer
+
+    @property
     def held_out(self) -> dict[int, list[View]]:
         return self._maps.held_out
 
@@ -226,10 +231,9 @@ class MapThread:
         return mapper if sum(view.looks for view in mapper.views) < wanted else None
 
     def _optimise(self, maps: Maps) -> None:
-        mapper = self._wanting()
-        if mapper is not None:
+        if self._newest is not None and self._wanting() is not None:
             with maps.profiler.stage("optimise"):
-                mapper.optimise(STEPS_AT_ONCE)
+                maps.optimise(self._newest, STEPS_AT_ONCE)
 
     def _beating(self, progress: Progress | None) -> Progress:
         def beat(done: int, total: int) -> None:

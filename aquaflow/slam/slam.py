@@ -20,6 +20,7 @@ from aquaflow.messages import Frame
 from aquaflow.prior.factory import make_prior
 from aquaflow.profiler import Profiler
 from aquaflow.render import select_renderer
+from aquaflow.render.contract import Renderer
 from aquaflow.slam.contributions import Contributions
 from aquaflow.tracking.adjustment.adjuster import Adjuster
 from aquaflow.tracking.anchored import Anchored, Anchors
@@ -93,8 +94,13 @@ class Slam:
             self.adjuster if adjustment.enabled else None,
             LearnedScales(self.keyframes, unit_sigma) if steady else None,
         )  # fmt: skip
-        self.renderer = select_renderer(config.mapping.renderer, config.threads or os.cpu_count())
-        self.maps: MapWork = maps or Maps(config, self.renderer, self.profiler, work, self.failures)
+        self.maps: MapWork = maps or Maps(
+            config,
+            select_renderer(config.mapping.renderer, config.threads or os.cpu_count()),
+            self.profiler,
+            work,
+            self.failures,
+        )
         self.skipped: Counter[str] = Counter()
         """Frames that the gate kept from tracking, by its reason's kind."""
         self._live = live
@@ -197,6 +203,11 @@ class Slam:
     def used(self) -> int:
         """Frames that passed the gate so far."""
         return self._contributions.used
+
+    @property
+    def renderer(self) -> Renderer:
+        """What the maps are drawn with; another one after a device failed."""
+        return self.maps.renderer
 
     @property
     def mappers(self) -> dict[int, Mapper]:

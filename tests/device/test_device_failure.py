@@ -1,0 +1,217 @@
+"""A device that fails in mid-dive costs neither map nor optimiser: both go on on the CPU."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from aquaflow.config import Config
+from aquaflow.errors.failures import Failures
+from aquaflow.mapping.decoder.regrouping import is_whole
+from aquaflow.mapping.host_copies import COPY_EVERY
+from aquaflow.mapping.maps import Growth, Maps
+from aquaflow.mapping.state import serialise
+from aquaflow.render.contract import CPU
+from tests.device.device_scenes import SMALL, SinglePrecision, again, everything
+from tests.mapping.mapping_scenes import flat_pointmap, floor, path, picture, pose, view_of
+from tests.pretended_device import PRETENDED, Device
+
+pytestmark = pytest.mark.usefixtures("nothing_strays")
+
+VIEWS = 4
+GROWN: dict[tuple[bool, int], Maps] = {}
+"""Maps by decoder and number of views, of which every test gets a copy."""
+SHIFT = {0: pose((0.5, 0.0, 0.0))}
+"""A correction that moves the whole map."""
+
+
+def growth(number: int, steps: int = 2) -> Growth:
+    T_wc = path(number + 1)[number]
+    view = view_of(picture(floor(), T_wc, camera=SMALL), T_wc, number, camera=SMALL)
+    pointmap = flat_pointmap(camera=SMALL) if number % 2 == 0 else None
+    return Growth(view, 0, steps, pointmap)
+
+
+def dive(decoder: bool = False, views: int = VIEWS) -> Maps:
+    """Maps on the device after some views, of which there is a copy on the host."""
+    if (decoder, views) not in GROWN:
+        GROWN[decoder, views] = grown(decoder, views)
+    whole = GROWN[decoder, views]
+    maps = Maps(whole.config, SinglePrecision(PRETENDED), failures=Failures(strict=False))
+    maps.mappers[0] = again(whole.mappers[0], PRETENDED)
+    maps._copies.take(0, maps.mappers[0])
+    return maps
+
+
+def grown(decoder: bool, views: int) -> Maps:
+    """Maps on the device after some views."""
+    mapping = everything(medium={"enabled": False}, decoder={"enabled": decoder})
+    config = Config(mapping=mapping, threads=1)
+    maps = Maps(config, SinglePrecision(PRETENDED), failures=Failures(strict=False))
+    for number in range(views):
+        maps.grow(growth(number))
+    assert maps.renderer.device == PRETENDED
+    return maps
+
+
+@pytest.fixture(autouse=True)
+def repaired(device: Device) -> Iterator[None]:
+    """Every test has a device that works to begin with."""
+    device.fails_at, device.lost = None, False
+    yield
+    device.fails_at, device.lost = None, False
+
+
+def state_of(maps: Maps) -> dict[str, np.ndarray]:
+    """All arrays of the map and its optimiser, on the host."""
+    return serialise(maps.mappers[0], optimiser=True)[1]
+
+
+def assert_goes_on_on_the_cpu(maps: Maps, views: int = VIEWS) -> None:
+    mapper = maps.mappers[0]
+    assert maps.renderer.device == mapper.device == CPU
+    assert {view.device for view in mapper.views} == {CPU}
+    assert {tensor.device for tensor in mapper.gaussians.parameters.values()} == {CPU}
+    assert [view.frame_index for view in mapper.views] == list(range(views))
+    assert all(view.has_pixels for view in mapper.views)
+    assert len(maps.failures.kinds) >= 1
+    before, looks = mapper.steps, len(mapper.views)
+    maps.grow(growth(views))
+    assert mapper.steps == before + 2
+    assert len(mapper.views) == looks + 1
+    assert all(bool(torch.isfinite(each).all()) for each in mapper.gaussians.parameters.values())
+    if mapper.neural is not None:
+        assert is_whole(mapper.neural.groups, len(mapper.gaussians))
+
+
+def test_out_of_memory_costs_nothing_of_map_and_optimiser(device: Device) -> None:
+    maps = dive()
+    before = state_of(maps)
+    device.fails_at = device.calls + 1
+    maps.optimise(0, 0)  # no call of the device, no failure
+    assert maps.renderer.device == PRETENDED
+    device.fails_at = device.calls + 40  # within the drawing of the step, before anything changes
+    maps.optimise(0, 1)
+    after = state_of(maps)
+    assert before.keys() == after.keys()
+    # The step was made on the CPU, from the state that the device had.
+    assert int(after["adam.steps"].max()) == int(before["adam.steps"].max()) + 1
+    moved = np.abs(after["gaussians.means"] - before["gaussians.means"]).max()
+    assert 0.0 < moved < 0.02
+    np.testing.assert_allclose(
+        after["adam.second.means"], before["adam.second.means"], rtol=0.1, atol=1e-3
+    )
+    assert_goes_on_on_the_cpu(maps)
+
+
+@pytest.mark.parametrize("decoder", [False, True])
+def test_a_device_that_is_gone_leaves_the_last_copy_of_map_and_optimiser(
+    device: Device, decoder: bool
+) -> None:
+    maps = dive(decoder)
+    copied = state_of(maps)
+    maps.optimise(0, 1)
+    device.fails_at, device.lost = device.calls + 1, True
+    maps.optimise(0, 0 if decoder else 1)
+    if decoder:
+        maps.optimise(0, 1)
+    after = state_of(maps)
+    assert after["gaussians.means"].shape == copied["gaussians.means"].shape
+    assert int(after["adam.steps"].max()) == int(copied["adam.steps"].max()) + 1
+    np.testing.assert_allclose(after["gaussians.means"], copied["gaussians.means"], atol=0.02)
+    assert_goes_on_on_the_cpu(maps)
+
+
+def test_a_copy_is_taken_now_and_then_as_the_map_grows(device: Device) -> None:
+    maps = dive(views=2)
+    size = len(state_of(maps))
+    copies = []
+    for number in range(2, 2 + COPY_EVERY + 2):
+        moved = device.moved_out
+        maps.grow(replace(growth(number, steps=0), pointmap=None))
+        copies.append(device.moved_out - moved > size // 2)
+    assert copies == [True, *[False] * (COPY_EVERY - 1), True, False]
+
+
+def test_corrections_since_the_copy_are_made_in_it_too(device: Device) -> None:
+    maps = dive(decoder=True, views=3)
+    before = state_of(maps)
+    for _ in range(2):
+        maps.correct(SHIFT, {})
+    device.fails_at, device.lost = device.calls + 1, True
+    maps.optimise(0, 1)
+    after = state_of(maps)
+    shift = np.median(after["gaussians.means"] - before["gaussians.means"], axis=0)
+    np.testing.assert_allclose(shift, [1.0, 0.0, 0.0], atol=0.01)
+    assert_goes_on_on_the_cpu(maps, 3)
+
+
+@pytest.mark.parametrize("lost", [False, True])
+@pytest.mark.parametrize("call", [1, 20, 40])
+def test_a_failure_within_a_correction_moves_the_map_exactly_once(
+    device: Device, lost: bool, call: int
+) -> None:
+    maps = dive(decoder=True, views=3)
+    before = state_of(maps)
+    device.fails_at, device.lost = device.calls + call, lost
+    maps.correct(SHIFT, {})
+    after = state_of(maps)
+    shift = after["gaussians.means"] - before["gaussians.means"]
+    np.testing.assert_allclose(shift, np.broadcast_to([0.5, 0.0, 0.0], shift.shape), atol=1e-5)
+    poses = after["views.poses"][:, 9:12] - before["views.poses"][:, 9:12]
+    np.testing.assert_allclose(poses, np.broadcast_to([0.5, 0.0, 0.0], poses.shape), atol=1e-9)
+    assert_goes_on_on_the_cpu(maps, 3)
+
+
+@pytest.mark.parametrize("call", [3, 400, 1000])
+@pytest.mark.parametrize("lost", [False, True])
+def test_wherever_the_device_fails_while_the_map_grows_the_view_is_in_it_once(
+    device: Device, lost: bool, call: int
+) -> None:
+    maps = dive(decoder=True, views=2)
+    device.fails_at, device.lost = device.calls + call, lost
+    maps.grow(growth(2))
+    assert_goes_on_on_the_cpu(maps, 3)
+    assert len(maps.mappers[0].gaussians) > 0
+
+
+def test_the_refinement_is_made_on_the_cpu_if_the_device_fails_in_it(device: Device) -> None:
+    maps = dive()
+    before = maps.mappers[0].steps
+    device.fails_at, device.lost = device.calls + 900, True
+    maps.refine()
+    assert device.calls >= device.fails_at
+    assert maps.renderer.device == CPU
+    assert maps.mappers[0].steps >= before
+    assert maps.mappers[0].views[0].looks > 0
+
+
+def test_maps_merge_even_if_the_device_fails_in_it(device: Device) -> None:
+    maps = dive(views=2)
+    other = growth(10)
+    maps.grow(Growth(other.view, 1, 1, other.pointmap))
+    count = sum(len(mapper.gaussians) for mapper in maps.mappers.values())
+    device.fails_at, device.lost = device.calls + 20, True
+    maps.correct({}, {1: 0})
+    assert maps.renderer.device == CPU
+    assert list(maps.mappers) == [0]
+    assert [view.frame_index for view in maps.mappers[0].views] == [0, 1, 10]
+    assert len(maps.mappers[0].gaussians) == count
+
+
+def test_another_error_leaves_the_map_on_its_device(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    maps = dive(views=2)
+
+    def broken(*_: object) -> None:
+        raise ValueError("no such pixel")
+
+    monkeypatch.setattr(maps.mappers[0], "insert", broken)
+    maps.grow(growth(2))
+    assert maps.renderer.device == PRETENDED
+    assert maps.failures.total == 1
