@@ -20,7 +20,7 @@ from tests.device.device_scenes import SMALL, SinglePrecision, again, everything
 from tests.mapping.mapping_scenes import flat_pointmap, floor, path, picture, pose, view_of
 from tests.pretended_device import PRETENDED, Device
 
-pytestmark = pytest.mark.usefixtures("nothing_strays")
+pytestmark = [pytest.mark.usefixtures("nothing_strays"), pytest.mark.ci]
 
 VIEWS = 4
 GROWN: dict[tuple[bool, int], Maps] = {}

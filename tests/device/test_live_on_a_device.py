@@ -1,0 +1,81 @@
+"""The mapping thread of a live run works on a device, and goes on where the device fails."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from aquaflow.config import Config
+from aquaflow.config.service import LiveMappingConfig
+from aquaflow.errors.failures import Failures
+from aquaflow.mapping.maps import Growth, Maps
+from aquaflow.render.contract import CPU
+from aquaflow.service.health.heartbeats import Heartbeats
+from aquaflow.service.map_thread import MapThread
+from aquaflow.viewer.snapshot import MapCopy, copied
+from tests.device.device_scenes import SMALL, SinglePrecision, everything
+from tests.mapping.mapping_scenes import flat_pointmap, floor, path, picture, view_of
+from tests.pretended_device import PRETENDED, Device
+
+pytestmark = pytest.mark.usefixtures("nothing_strays")
+
+GIVE_UP_S = 300.0
+
+
+def growth(number: int) -> Growth:
+    T_wc = path(number + 1)[number]
+    view = view_of(picture(floor(), T_wc, camera=SMALL), T_wc, number, camera=SMALL)
+    return Growth(view, 0, 1, flat_pointmap(camera=SMALL) if number == 0 else None)
+
+
+def thread_on_the_device() -> MapThread:
+    mapping = everything(medium={"enabled": False}, decoder={"enabled": False})
+    maps = Maps(
+        Config(mapping=mapping, threads=1), SinglePrecision(PRETENDED),
+        failures=Failures(strict=False),
+    )  # fmt: skip
+    config = LiveMappingConfig.model_validate({"backlog": 100, "steps_per_view": 0, "nice": 0})
+    return MapThread(maps, config, Heartbeats())
+
+
+def looked_at(thread: MapThread) -> MapCopy:
+    """What a live viewer gets, once all that was asked for is done."""
+    copies: list[MapCopy] = []
+    done = threading.Event()
+
+    def look(maps: Maps) -> None:
+        copies.append(copied(maps.mappers[0]))
+        done.set()
+
+    thread._post("look", look)
+    assert done.wait(GIVE_UP_S)
+    return copies[0]
+
+
+def test_a_live_map_grows_on_the_device_and_is_shown_from_there(device: Device) -> None:
+    thread = thread_on_the_device()
+    for number in range(3):
+        thread.grow(growth(number))
+    copy = looked_at(thread)
+    thread.close()
+    assert thread.renderer.device == PRETENDED
+    assert thread.failures == 0
+    assert len(copy.seen) == len(thread.mappers[0].gaussians) > 0
+
+
+def test_a_live_map_goes_on_when_its_device_is_lost(device: Device) -> None:
+    thread = thread_on_the_device()
+    for number in range(2):
+        thread.grow(growth(number))
+    before = looked_at(thread)
+    device.fails_at, device.lost = device.calls + 100, True
+    for number in range(2, 4):
+        thread.grow(growth(number))
+    after = looked_at(thread)
+    thread.close()
+    device.fails_at, device.lost = None, False
+    assert thread.renderer.device == CPU
+    assert not thread.failing
+    assert len(thread.mappers[0].views) == 4
+    assert len(after.seen) == len(before.seen) > 0
