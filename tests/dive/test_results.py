@@ -51,7 +51,7 @@ RESULTS = [
 
 def test_the_device_is_that_of_the_renderer(slam: Slam, monkeypatch: pytest.MonkeyPatch) -> None:
     assert metrics(slam, RESULTS, [], [], 1.0)["device"] == "cpu"
-    monkeypatch.setattr(slam.renderer, "isa", "cuda")
+    monkeypatch.setattr(slam.renderer, "device", torch.device("cuda"))
     assert metrics(slam, RESULTS, [], [], 1.0)["device"] == "cuda"
 
 
