@@ -29,12 +29,20 @@ class MediumConfig(Stage):
     """The water (paper, Sec. 3.3.2)."""
 
     enabled: bool = Field(True, description="False: the map is what the camera saw, water included")
+    directional: bool = Field(
+        False,
+        description="attenuation by the camera's orientation (the paper); False: isotropic",
+    )
+    directional_rate: float = Field(
+        1e-3, gt=0, description="Adam rate of MLP_a, where attenuation is directional"
+    )
     width: int = Field(32, ge=4, description="hidden units of MLP_a; paper silent, 32 cost nothing")
     rate: float = Field(
         1e-5,
         gt=0,
-        description="Adam rate of all medium parameters; beta_a of four known waters is 14 % wrong "
-        "at 5e-4, 7 % at 1e-4, 6 % at 1e-6, and no picture worse: it drifts off the fit",
+        description="Adam rate of all medium parameters but MLP_a's; beta_a of four known waters "
+        "is 14 % wrong at 5e-4, 7 % at 1e-4, 6 % at 1e-6, and no picture worse: it drifts off the "
+        "fit",
     )
     max_gradient: float = Field(
         0.01, gt=0, description="gradient norm kept (WaterSplatting clips at 0.001)"
@@ -100,6 +108,17 @@ class InsertionConfig(Stage):
         le=1,
         description="P_a above which a pixel may get a Gaussian; the paper's 1.0 "
         "never fires (docs/paper.md#deviations-mapping)",
+    )
+    selection: Literal["random", "threshold"] = Field(
+        "random",
+        description="random: pixels are drawn with probability P_a times density; threshold (the "
+        "paper): every pixel with P_a above tau_a gets one, and density has no say in which",
+    )
+    colour_range: Literal["tracked", "rendered"] = Field(
+        "tracked",
+        description="range over which the water is taken out of the picture: as tracked, and the "
+        "map's where nothing is; rendered (the paper): the map's, and as tracked where the map is "
+        "bare. Gaussians are placed at the first in both cases",
     )
     density: float = Field(
         1.0,
@@ -190,6 +209,11 @@ class VoxelConfig(Stage):
         description="map units (1 is the first keyframe's median range); paper: 0.2 m, which is "
         "this at a range of 4 m; measured: 13 to 23 Gaussians a group on three dives",
     )
+    size_m: float | None = Field(
+        None,
+        gt=0,
+        description="m, in place of size as soon as the map's unit is known in metres; paper: 0.2",
+    )
     capacity: int = Field(32, ge=1, description="Gaussians a group; paper: 32")
 
 
@@ -212,13 +236,19 @@ class DecoderConfig(Stage):
         4,
         ge=1,
         description="steps, of one view each, that share one pass over the groups; with 16 the "
-        "features learn too rarely (0.2 dB), 8 is not measurably faster than 4",
+        "features learn too rarely (0.2 dB), 8 is not measurably faster than 4; one step where the "
+        "observation enters before the attention",
     )
     visible_groups: bool = Field(True, description="False: the pass takes all groups of the map")
     variant: Literal["lgpd", "mlp"] = Field(
         "lgpd", description="mlp: as many weights without attention (the paper's w/o LGPD)"
     )
     distance: bool = Field(True, description="False: the decoder does not get the distance")
+    observation: Literal["after_attention", "before_attention"] = Field(
+        "after_attention",
+        description="where direction and distance enter; before_attention (the paper): in the "
+        "tokens, with a pass over the groups for every view",
+    )
     width: int = Field(32, ge=4, multiple_of=4, description="token width; paper silent")
     local_width: int = Field(16, ge=1, description="feature of a Gaussian (ARTDECO: 16)")
     global_width: int = Field(16, ge=1, description="feature of a group (ARTDECO: 16)")

@@ -17,6 +17,7 @@ from aquaflow.mapping.decoder.neural import NeuralGaussians
 from aquaflow.mapping.gaussians.gaussians import GaussianMap
 from aquaflow.mapping.gaussians.insertion import (
     alpha_where_agreed,
+    colour_range,
     insertion_probability,
     new_gaussians,
     select,
@@ -102,16 +103,16 @@ class Mapper:
         # J-tilde, alpha and range of the map as it is, drawn from the view.
         shown = self.scene.show(view, learn=True)
 
-        # Eq. 16: J-hat, the picture without the medium, over the tracked range or else the map's.
+        # Eq. 16: J-hat, the picture without the medium, over the tracked range or the map's.
         covered = shown.alpha > config.covered_alpha
         z = torch.where(tracked.known, tracked_z, torch.where(covered, shown.z, 0.0))
-        J_hat, recoverable = self._restore(view, z)
+        J_hat, recoverable = self._restore(view, colour_range(z, shown.z, covered, config))
 
         # Eq. 17: P_a, the structure of J-hat that J-tilde does not have yet.
         agreed_alpha = alpha_where_agreed(shown.alpha, shown.z, tracked_z, config)
         P_a = insertion_probability(J_hat, shown.radiance, agreed_alpha, config)
 
-        # Pixels drawn with that probability.
+        # Pixels where that is enough, or drawn with that probability.
         allowed = tracked.known & recoverable & view.scene_mask()
         rows, columns = select(P_a, allowed, config, self._random)
 
@@ -172,6 +173,11 @@ class Mapper:
         move_views(self.views, moves)
         self.water_fitting.moved(moves)
 
+    def use_unit(self, metres_per_unit: float) -> None:
+        """The map's unit is known in metres; a decoder's voxels may be given in them."""
+        if self.neural is not None:
+            self.neural.use_unit(metres_per_unit)
+
     def absorb(self, other: Mapper) -> None:
         """Take over another sub-map's Gaussians and views, already moved into this one's world.
 
@@ -196,6 +202,7 @@ class Mapper:
             return
         share = self.config.optimiser.newest_share
         chosen = sampled_views(self.views, steps, share, self._random)
+        self.scene.centre_water(self.views)
         with self.scene.learning_from(chosen):
             for view in chosen:
                 self._contained_step("optimisation", view, refine_poses=False)
@@ -212,6 +219,7 @@ class Mapper:
                     break
                 if step % len(self.views) == 0:  # light shows once the map has lost its errors
                     self.scene.sunlight.judge(in_time(self.views))
+                    self.scene.centre_water(self.views)
                 factor = self.config.optimiser.means_final ** (step / max(steps - 1, 1))
                 self.optimiser.adam.learning_rates["means"] = self.config.optimiser.means * factor
                 if self.neural is not None:

@@ -51,6 +51,8 @@ class Growth:
     """Depths of the view's own pixels, if new Gaussians may come from it."""
     retired: tuple[Insertion, ...] = ()
     """Keyframes that this one relieves, with their pointmaps as fused over their whole life."""
+    metres_per_unit: float | None = None
+    """Of the sub-map; None while it is unknown."""
 
 
 class MapWork(Protocol):
@@ -124,6 +126,11 @@ class Maps:
         view, number = growth.view, growth.sub_map
         with self.profiler.stage("view"):
             self._do("view", number, lambda mapper: self._add(view, mapper), view.frame_index)
+        metres = growth.metres_per_unit
+        if metres is not None and not self._do(
+            "voxels in metres", number, lambda mapper: mapper.use_unit(metres), view.frame_index
+        ):
+            self.mapper(number).make_whole()
 
         # Sec. 3.3.3: medium-guided insertion, from this frame and from the keyframe it retires.
         for retired in growth.retired:

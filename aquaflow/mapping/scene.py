@@ -64,7 +64,11 @@ class Scene:
         """The medium for this view, or None while it is switched off."""
         if not self.medium.active:
             return None
-        return self.medium(pose_in(view.T_wc.R, self.device))  # type: ignore[no-any-return]
+        return self.medium(orientations([view], self.device)[0])  # type: ignore[no-any-return]
+
+    def centre_water(self, views: Sequence[View]) -> None:
+        """Let the attenuation of ``views`` be on the mean that which the water fit found."""
+        self.medium.centre(orientations(views, self.device))
 
     def gain(self, view: View) -> Tensor | None:
         """The shading [H, W] of this view's pictures; None where there is none."""
@@ -245,3 +249,9 @@ class Scene:
         if not self.medium.active or self.balance is None:
             return torch.ones(3, device=self.device)
         return water_in(self.balance.gain, self.device)
+
+
+def orientations(views: Sequence[View], device: torch.device) -> Tensor:
+    """[V, 3, 3] camera to world."""
+    rotations = np.array([view.T_wc.R for view in views], np.float32).reshape(-1, 3, 3)
+    return pose_in(rotations, device)

@@ -10,11 +10,12 @@ import numpy as np
 import torch
 
 from aquaflow.mapping.gaussians.gaussians import radiance, raw_colour
-from aquaflow.mapping.scene import Scene
-from aquaflow.mapping.transfers import pose_in, water_in, water_out
+from aquaflow.mapping.scene import Scene, orientations
+from aquaflow.mapping.transfers import water_in, water_out
 from aquaflow.mapping.views import View
 from aquaflow.mapping.water.estimation import WaterEstimate, estimating, models_for
 from aquaflow.mapping.water.exposure import gain_of, log_gains_of, set_log_gains
+from aquaflow.mapping.water.image_formation import Water
 from aquaflow.mapping.water.nearest import kept_by
 from aquaflow.mapping.water.posed_picture import PosedPicture
 from aquaflow.mapping.water.shading import shading_basis
@@ -27,7 +28,8 @@ def rebalance(scene: Scene) -> None:
     if scene.balance is None or scene.seen_nearest is None or not scene.medium.active:
         return
     near, views = scene.seen_nearest
-    basis, water = shading_basis(near.xy), scene.medium(pose_in(np.eye(3), scene.device))
+    which = water_in(near.view, scene.device, torch.int64)
+    basis, water = shading_basis(near.xy), _water_of(scene, views, which)
     log_gain = (basis @ scene.shading)[:, None]
     if scene.exposes:
         log_gain = log_gain + log_gains_of(views)[near.view]
@@ -61,7 +63,7 @@ def fitting_water(
     seen = yield from sighting(pictures, np.random.default_rng(seed))
     yield
     with torch.no_grad():
-        sea = scene.medium(pose_in(fitted[0].T_wc.R, scene.device))
+        sea = scene.medium(orientations(fitted, scene.device))
     B_res, d = water_out(sea.B_res), water_out(sea.d)
     models, priors = models_for(scene.config), scene.config.priors
     steps = estimating(seen, B_res, d, models, priors, pictures)
@@ -104,11 +106,13 @@ def _adopt(
     The same from the camera nearest to it: where it is seen best.
     """
     shown, (_, z, nearest) = scene.baked(list(fitted))["raw_colours"], scene.nearest_cameras(fitted)
-    old, old_gains = scene.water(fitted[0]), torch.stack([gain_of(view) for view in fitted])
+    old = _water_of(scene, fitted, nearest) if scene.medium.active else None
+    old_gains = torch.stack([gain_of(view) for view in fitted])
     scene.medium.active = estimate.model.water
     if estimate.model.water:
         found = (estimate.beta_a, estimate.B_inf, estimate.b, estimate.unevenness)
         scene.medium.set_water(*(water_in(v, scene.device) for v in found))
+        scene.centre_water(fitted)
     scene.shading, scene.exposes = estimate.shading, estimate.model.exposure
     scene.beta_a_sigma, scene.water_evidence = estimate.beta_a_sigma, estimate.evidence
     scene.balance, scene.range_variance = estimate.balance, estimate.range_variance
@@ -117,7 +121,8 @@ def _adopt(
     scene.gain_maps.clear()
     set_log_gains(dive, fitted, estimate.exposure)
 
-    seen, new = radiance(shown), scene.water(fitted[0])
+    new = _water_of(scene, fitted, nearest) if scene.medium.active else None
+    seen = radiance(shown)
     if old is not None:
         seen = seen * old.transmission(z) + old.backscatter(z)
     new_gains = torch.stack([gain_of(view) for view in fitted])
@@ -126,3 +131,13 @@ def _adopt(
     raw = scene.gaussians.parameters["raw_colours"]
     # A decoder's residuals come on top again.
     raw.copy_(wanted if scene.neural is None else wanted + (raw - shown))
+
+
+def _water_of(
+    scene: Scene,
+    views: Sequence[View],
+    which: torch.Tensor,  # [N] int64
+) -> Water:
+    """The water for N points, each seen from its own view: beta_a is [N, 3]."""
+    water: Water = scene.medium(orientations(views, scene.device))
+    return replace(water, beta_a=water.beta_a[which])

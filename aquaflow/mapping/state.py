@@ -90,7 +90,9 @@ def deserialise(facts: Facts, arrays: Mapping[str, Any], renderer: Renderer) -> 
     if any(len(tensor) != len(gaussians) for tensor in gaussians.parameters.values()):
         raise DamagedError("its Gaussians differ in number")
     scene.shading = np.array(arrays["shading"])
-    mapper.medium.load_state_dict(_under("medium", arrays, device))
+    # Maps written before 2026-11-23 know no mean over the orientations.
+    medium = mapper.medium.state_dict() | _under("medium", arrays, device)
+    mapper.medium.load_state_dict(medium)
     mapper.medium.active, scene.exposes = bool(facts["medium_active"]), bool(facts["exposes"])
     scene.sunlight.plays = bool(facts["sunlight_plays"])
     scene.water_evidence, scene.beta_a_sigma = facts["water_evidence"], facts["beta_a_sigma"]
@@ -166,6 +168,7 @@ def _decoder(neural: NeuralGaussians) -> Arrays:
     groups = neural.groups
     arrays = _prefixed("decoder", neural.decoder.state_dict())
     arrays |= _prefixed("groups", {name: getattr(groups, name) for name in GROUPS})
+    arrays["voxel_size"] = np.array(groups.size)
     arrays["groups.order"] = checkpoint_out(groups.order())
     arrays["local"] = checkpoint_out(neural.gaussians.local_features)
     return arrays
@@ -176,6 +179,8 @@ def _read_decoder(neural: NeuralGaussians, arrays: Mapping[str, Any]) -> None:
     neural.decoder.load_state_dict(_under("decoder", arrays, device))
     groups = {name: checkpoint_in(arrays[f"groups.{name}"], device) for name in (*GROUPS, "order")}
     neural.groups.restore(**groups)
+    if "voxel_size" in arrays:  # not in maps written before 2026-11-23
+        neural.groups.size = float(arrays["voxel_size"])
     neural.restore(checkpoint_in(arrays["local"], device))
 
 
@@ -219,7 +224,7 @@ def _read_optimisers(mapper: Mapper, arrays: Mapping[str, Any], rates: Facts) ->
         adam.bind({})
     for name, optimiser in _torch(mapper).items():
         whole = optimiser.state_dict()
-        for i in range(len(whole["param_groups"][0]["params"])):
+        for i in range(sum(len(group["params"]) for group in whole["param_groups"])):
             state: dict[str, Any] = dict(under(f"{name}.{i}", arrays))
             for part, array in state.items():  # torch keeps the count of steps on the host
                 state[part] = checkpoint_in(array, CPU if part == STEP else device)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from aquaflow.config import MappingConfig
+from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.mapping.maps import Growth, Insertion, MapWork
@@ -13,8 +16,16 @@ from aquaflow.tracking.frames import FrameClass, Tracked
 class Contributions:
     """Hands posed frames to the maps."""
 
-    def __init__(self, maps: MapWork, keyframes: KeyframeStore, config: MappingConfig) -> None:
+    def __init__(
+        self,
+        maps: MapWork,
+        keyframes: KeyframeStore,
+        config: MappingConfig,
+        frame_of: Callable[[int], MetricFrame],
+    ) -> None:
+        """``frame_of`` a sub-map, as last estimated."""
         self._maps, self._keyframes, self._config = maps, keyframes, config
+        self._frame_of = frame_of
         self.used = 0
         """Frames that passed the gate so far."""
         self._to_hold_out: set[int] = set()
@@ -56,7 +67,9 @@ class Contributions:
             retired = self._retired()
             self._views = {view.keyframe: view}
         steps = self._steps(tracked.frame_class)
-        return Growth(view, tracked.sub_map, steps, tracked.pointmap, tuple(retired))
+        frame = self._frame_of(tracked.sub_map)
+        unit = frame.T_nm.scale if frame.metric else None
+        return Growth(view, tracked.sub_map, steps, tracked.pointmap, tuple(retired), unit)
 
     def _retired(self) -> list[Insertion]:
         """The keyframe in use, with its pointmap as fused until now; from here on it is not."""

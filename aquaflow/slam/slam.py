@@ -106,7 +106,9 @@ class Slam:
         self._live = live
         self.frames = FrameTable()
         """Finished frames, in completion order."""
-        self._contributions = Contributions(self.maps, self.keyframes, config.mapping)
+        self._contributions = Contributions(
+            self.maps, self.keyframes, config.mapping, self.metric_frame
+        )
         self._latest: int | None = None
         """The row of the frame linked last, if it has a pose."""
 

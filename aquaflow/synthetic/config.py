@@ -77,6 +77,13 @@ class SyntheticConfig(BaseModel):
     water: WaterType = Field(
         "coastal_1C", description="row of water.WATER_TYPES; blue-green, visibility about 8 m"
     )
+    directional_attenuation: float = Field(
+        0.0,
+        ge=0,
+        lt=1,
+        description="relative change of beta_a with the heading: that much more looking north, as "
+        "much less looking south; 0: the same all round, as in the water's table",
+    )
     supersampling: int = Field(2, ge=1, le=4, description="rays per pixel and axis; 2 is 4 rays")
     speed_m_s: float = Field(
         0.6,

@@ -145,8 +145,9 @@ def _write_pictures(
     progress: Callable[[int, int], None] | None,
 ) -> None:
     t = np.arange(config.frames) / config.fps
-    R_sc, centres = path.R_ws.T @ path.R_wc(t), path.centre_s(t)
-    camera, medium = camera_of(config), WATER_TYPES[config.water]
+    R_wc = path.R_wc(t)
+    R_sc, centres = path.R_ws.T @ R_wc, path.centre_s(t)
+    camera, mean = camera_of(config), WATER_TYPES[config.water]
     noise_rng = stream(config.seed, "sensor")
     snow = Snow(config, centres, stream(config.seed, "snow"))
     shade = vignette(camera, config.vignette)
@@ -155,6 +156,7 @@ def _write_pictures(
         # Compressing a picture overlaps with rendering the next; one is waited for at a time.
         pending: Future[None] | None = None
         for k in range(config.frames):
+            medium = mean.looking(R_wc[k, :, 2], config.directional_attenuation)
             view = render.render(
                 scene, camera, R_sc[k], centres[k], medium, config.supersampling, bodies.at(k)
             )

@@ -13,7 +13,7 @@ chosen: the colour of the open water follows the channel that travels furthest.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -51,6 +51,19 @@ class Medium:
     """Near residual of the backscatter, radiance in [0, 1]."""
     d: Rgb
     """Decay of the near residual, 1/m."""
+
+    def looking(
+        self,
+        axis: FloatArray,  # [3] unit, the optical axis in the world (x north, z down)
+        change: float,
+    ) -> Medium:
+        """The water of a camera that looks along ``axis``; ``change`` is config's
+        ``directional_attenuation``."""
+        if change == 0.0:
+            return self
+        factor = 1.0 + change * float(axis[0])
+        red, green, blue = self.beta_a
+        return replace(self, beta_a=(factor * red, factor * green, factor * blue))
 
     def transmission(
         self,

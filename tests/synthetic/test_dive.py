@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 from pathlib import Path
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -23,6 +24,7 @@ from aquaflow.synthetic import (
     read_truth,
     write_dive,
 )
+from aquaflow.synthetic.water import WATER_TYPES
 
 SMALL = SyntheticConfig(frames=20, width=160, height=120)
 BARE = {"supersampling": 1, "snow_per_m3": 0.0, "vignette": 0.0, "noise_sigma": 0.0}
@@ -257,3 +259,23 @@ def test_the_port_of_a_dive_is_in_its_camera_file(tmp_path: Path) -> None:
     asked = {"frames": 2, "width": 32, "height": 24, "port": FLAT_PORT, "focal_widths": 0.77}
     write_dive(tmp_path / "dive", SyntheticConfig.model_validate(asked))
     assert read_truth(tmp_path / "dive").camera.port == FlatPort(0.05, 0.01)
+
+
+def test_attenuation_follows_the_heading_where_it_is_asked_to() -> None:
+    water = WATER_TYPES["coastal_1C"]
+    north, south, down = np.array([[0.6, 0.0, 0.8], [-0.6, 0.0, 0.8], [0.0, 0.0, 1.0]])
+    found = [np.array(water.looking(axis, 0.5).beta_a) for axis in (north, south, down)]
+    for beta_a, factor in zip(found, (1.3, 0.7, 1.0), strict=True):
+        np.testing.assert_allclose(beta_a, factor * np.array(water.beta_a))
+    assert water.looking(north, 0.0) is water
+
+
+def test_a_dive_of_directional_water_differs_from_one_of_even_water(tmp_path: Path) -> None:
+    pictures = []
+    for change in (0.0, 0.5):
+        settings = {"frames": 3, "width": 64, "height": 48, "directional_attenuation": change}
+        write_dive(tmp_path / str(change), SyntheticConfig.model_validate({**BARE, **settings}))
+        picture = cv2.imread(str(tmp_path / str(change) / "images" / "000001.png"))
+        assert picture is not None
+        pictures.append(picture.astype(float))
+    assert np.abs(pictures[0] - pictures[1]).mean() > 1.0

@@ -60,7 +60,7 @@ def decoded(
     if trunk.sound is not None:
         places = places[trunk.sound[places]]
     weights = ViewWeights(
-        decoder.view.weight,
+        decoder.weight_in_heads(),
         torch.cat([decoder.geometry.weight, decoder.colour.weight]),
         torch.cat([decoder.geometry.bias, decoder.colour.bias]),
         decoder.limits,

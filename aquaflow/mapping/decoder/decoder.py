@@ -5,9 +5,9 @@ other; a geometry head and a colour head, conditioned on the camera's observatio
 added to its initial rotation, log-scale and colour. Place and opacity are not decoded.
 
 The paper adds gamma(o) to the tokens before the attention, which then has to be computed for every
-view. The first layer of the heads is linear in [z, gamma(o)], so gamma(o) enters there: what does
-not depend on the view, :class:`Trunk`, is computed once for all views of a step, and is exact for
-each.
+view (``observation: before_attention``). The first layer of the heads is linear in [z, gamma(o)],
+so by default gamma(o) enters there: what does not depend on the view, :class:`Trunk`, is computed
+once for all views of a step, and is exact for each.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ TURN, LOG_SCALE, COLOUR = 3, 3, 3
 
 @dataclass(frozen=True)
 class Trunk:
-    """The view-independent part of the decoder's result."""
+    """The decoder's result up to the first layer of the heads: what all views share, unless the
+    observation entered before the attention."""
 
     tokens: Tokens
     hidden: Tensor
@@ -75,8 +76,9 @@ class Decoder(nn.Module):
         tokens: Tokens,
         local: Tensor,  # [N, F_l] feature of each Gaussian
         shared: Tensor,  # [G, F_g] feature of each group
+        o: Tensor | None = None,  # [P, 4] observation in each place
     ) -> Trunk:
-        """The part that all views share."""
+        """Up to the first layer of the heads; with ``o``, the observation is in the tokens."""
         local = local.index_select(0, tokens.rows)
         shared = shared.index_select(0, tokens.groups)
         sizes, counts = tokens.sizes, [count for count, _ in tokens.buckets]
@@ -87,6 +89,8 @@ class Decoder(nn.Module):
             local = torch.where(sound[:, None], local, 0.0)
             shared = torch.where(per_group[:, None], shared, 0.0)
         own, common = self.local(local), self.shared(shared)
+        if o is not None:
+            own = own + self.view(encoded_observation(o, self.config.distance))
         mixed = []
         for (count, width), e, g, valid in zip(
             tokens.buckets,
@@ -100,6 +104,16 @@ class Decoder(nn.Module):
         z = torch.cat(mixed) if mixed else own
         return Trunk(tokens, self.first(z), sound)
 
+    @property
+    def observes_first(self) -> bool:
+        """True if the trunk takes the observation."""
+        return self.config.observation == "before_attention"
+
+    def weight_in_heads(self) -> Tensor:
+        """[d, E] of gamma(o) in the heads; zeros where the trunk has the observation."""
+        weight: Tensor = self.view.weight
+        return torch.zeros_like(weight) if self.observes_first else weight
+
     def residuals(
         self,
         trunk: Trunk,
@@ -110,7 +124,8 @@ class Decoder(nn.Module):
 
         Zeros for a group with a feature that is no number, and for such an observation.
         """
-        view_part = self.view(encoded_observation(o, self.config.distance))
+        encoded = encoded_observation(o, self.config.distance)
+        view_part = F.linear(encoded, self.weight_in_heads())
         hidden = torch.relu(trunk.hidden.index_select(0, places) + view_part)
         half = self.config.width // 2  # one product for both heads, each sees its own half
         heads = torch.cat(

@@ -1,6 +1,7 @@
 """Neural Gaussians: decoded residuals on explicit Gaussians, and their training (Sec. 3.3.1).
 
-One pass over the voxel groups, the trunk, serves a window of several steps, each on its own view.
+One pass over the voxel groups, the trunk, serves a window of several steps, each on its own view;
+of a single step where the observation enters before the attention.
 The window's gradients meet in the trunk's output; when it ends they go through the trunk at once,
 and features and weights take their step. Places and opacities, and the initial attributes if they
 are not frozen, take theirs at every view.
@@ -24,13 +25,18 @@ from aquaflow.mapping.decoder.decode import (
 )
 from aquaflow.mapping.decoder.decoder import Decoder, Trunk
 from aquaflow.mapping.decoder.observation import observation
-from aquaflow.mapping.decoder.regrouping import is_whole, regrouped
-from aquaflow.mapping.decoder.tokens import visible_tokens
+from aquaflow.mapping.decoder.regrouping import is_whole, regrouped, resized
+from aquaflow.mapping.decoder.tokens import Tokens, visible_tokens
 from aquaflow.mapping.decoder.voxel_groups import VoxelGroups
 from aquaflow.mapping.gaussians.gaussians import GaussianMap
 from aquaflow.mapping.transfers import weights_in
 from aquaflow.mapping.views import View
 from aquaflow.render.adam import SelectiveAdam
+
+OTHER_SIZE = 0.1
+"""Relative change of a voxel's size in map units from which on the Gaussians are grouped anew;
+judgement: the unit in metres gets better all the time, and each time the features begin to fit
+other neighbours."""
 
 
 @dataclass
@@ -71,8 +77,8 @@ class NeuralGaussians:
         self._weights = torch.optim.Adam(self.decoder.parameters(), lr=config.rate, betas=betas)
         self._expected: list[View] = []
         self._window: Window | None = None
-        self._looked: tuple[View, Trunk] | None = None
-        """The trunk that ``seen_from`` used last, while nothing has changed."""
+        self._looked: tuple[View, Tensor, Trunk] | None = None
+        """View, camera centre and trunk of ``seen_from``'s last look, while nothing has changed."""
         self.skipped = 0
         """Windows whose weights were not stepped, as a gradient was not finite."""
 
@@ -143,14 +149,16 @@ class NeuralGaussians:
         views = [view]
         if view in self._expected:
             begin = self._expected.index(view)  # what is before it was left out
-            views = self._expected[begin : begin + self.config.views_per_trunk]
+            most = 1 if self.decoder.observes_first else self.config.views_per_trunk
+            views = self._expected[begin : begin + most]
             del self._expected[: begin + len(views)]
         means = self.gaussians.means
         seen = [in_picture(means, each, each.viewmat()) for each in views]
         local = self.gaussians.local_features.detach().requires_grad_()
         shared = self.groups.features.detach().requires_grad_()
         tokens = visible_tokens(self.groups, self._context(seen))
-        trunk = self.decoder.trunk(tokens, local, shared)
+        o = self._observation(tokens, camera_centre(view.viewmat()))
+        trunk = self.decoder.trunk(tokens, local, shared, o)
         hidden = trunk.hidden.detach().requires_grad_()
         return Window(trunk, hidden, local, shared, list(zip(views, seen, strict=True)))
 
@@ -170,10 +178,19 @@ class NeuralGaussians:
         parameters: Mapping[str, Tensor],  # of a GaussianMap
         viewmat: Tensor,  # [4, 4]
     ) -> dict[str, Tensor]:
-        viewmat = viewmat.detach()
-        centre = -viewmat[:3, :3].T @ viewmat[:3, 3]
-        places = trunk.tokens.places(seen)
+        centre, places = camera_centre(viewmat), trunk.tokens.places(seen)
         return decoded(self.decoder, trunk, parameters, places, centre, self.threads)
+
+    def _observation(
+        self,
+        tokens: Tokens,
+        centres: Tensor,  # [3], or [N, 3] of the camera that each Gaussian is seen from
+    ) -> Tensor | None:
+        """[P, 4] what the trunk takes; None where the observation enters after the attention."""
+        if not self.decoder.observes_first:
+            return None
+        centre = centres if centres.dim() == 1 else centres[tokens.rows]
+        return observation(self.gaussians.means.detach()[tokens.rows], centre)
 
     # --- looking ------------------------------------------------------------------------------
 
@@ -187,11 +204,22 @@ class NeuralGaussians:
 
         The trunk is kept for further looks from the same view, until something changes.
         """
-        parameters = self.gaussians.parameters
+        parameters, centre = self.gaussians.parameters, camera_centre(viewmat)
         seen = in_picture(parameters["means"], view, viewmat)
+        if not self._looks_again(view, centre):
+            self._looked = (view, centre, self._trunk(self._context([seen]), centre))
+        assert self._looked is not None
+        return self._decoded(self._looked[2], seen, parameters, viewmat)
+
+    def _looks_again(
+        self,
+        view: View,
+        centre: Tensor,  # [3]
+    ) -> bool:
+        """True if the last look's trunk holds for this one: a pose that is being refined moves."""
         if self._window is not None or self._looked is None or self._looked[0] is not view:
-            self._looked = (view, self._trunk(self._context([seen])))
-        return self._decoded(self._looked[1], seen, parameters, viewmat)
+            return False
+        return not self.decoder.observes_first or torch.equal(self._looked[1], centre)
 
     @torch.no_grad()
     def baked(
@@ -200,7 +228,7 @@ class NeuralGaussians:
     ) -> dict[str, Tensor]:
         """All parameters as plain Gaussians, each as its own camera sees it."""
         everyone = torch.ones(len(self.gaussians), dtype=torch.bool, device=self.device)
-        trunk = self._trunk(everyone)
+        trunk = self._trunk(everyone, centres)
         places = trunk.tokens.places(everyone)
         rows = trunk.tokens.rows[places]
         return decoded_torch(self.decoder, trunk, self.gaussians.parameters, places, centres[rows])
@@ -208,11 +236,13 @@ class NeuralGaussians:
     def _trunk(
         self,
         seen: Tensor,  # [N] bool
+        centres: Tensor,  # [3] or [N, 3] of the cameras
     ) -> Trunk:
         """The trunk of the groups with a visible Gaussian, from the current state."""
         self.settle()
         tokens = visible_tokens(self.groups, seen)
-        return self.decoder.trunk(tokens, self.gaussians.local_features, self.groups.features)
+        features = (self.gaussians.local_features, self.groups.features)
+        return self.decoder.trunk(tokens, *features, self._observation(tokens, centres))
 
     # --- growing and following ----------------------------------------------------------------
 
@@ -232,7 +262,7 @@ class NeuralGaussians:
         self._bind()
         rows = torch.zeros(len(self.gaussians), dtype=torch.bool, device=self.device)
         rows[-count:] = True
-        trunk = self._trunk(rows)
+        trunk = self._trunk(rows, self._with_neighbours(centres, count))
         places = trunk.tokens.places(rows)
         new, first = trunk.tokens.rows[places], len(rows) - count
         parameters = self.gaussians.parameters
@@ -243,6 +273,17 @@ class NeuralGaussians:
         initial = without_residuals({name: parameters[name][new] for name in DECODED}, residuals)
         for name, values in initial.items():
             parameters[name][new] = values
+
+    def _with_neighbours(
+        self,
+        centres: Tensor,  # [3] or [M, 3]
+        count: int,  # M
+    ) -> Tensor:
+        """[3] or [N, 3]: the older Gaussians as seen from amid the cameras of the new ones."""
+        if centres.dim() == 1:
+            return centres
+        older = centres.mean(dim=0).expand(len(self.gaussians) - count, 3)
+        return torch.cat([older, centres])
 
     @torch.no_grad()
     def keep(
@@ -267,6 +308,18 @@ class NeuralGaussians:
         if len(rows):
             self.groups.move(rows, self.gaussians.means)
             self._bind()
+
+    @torch.no_grad()
+    def use_unit(self, metres_per_unit: float) -> None:
+        """Once the map's unit is known: voxels of the configured size in metres, if any."""
+        size_m = self.config.voxels.size_m
+        size = self.groups.size if size_m is None else size_m / metres_per_unit
+        if abs(size / self.groups.size - 1.0) <= OTHER_SIZE:
+            return
+        self.settle()
+        self.groups = resized(self.groups, self.gaussians.means, size)
+        self._shared = self._feature_optimiser("shared", self.groups.features)
+        self._bind()
 
     def restore(
         self,
@@ -298,3 +351,11 @@ class NeuralGaussians:
         self._shared.extend(len(self.groups) - len(self._shared.steps))
         self._shared.bind({"shared": self.groups.features})
         self._local.bind({"local": self.gaussians.local_features})
+
+
+def camera_centre(
+    viewmat: Tensor,  # [4, 4] world to camera
+) -> Tensor:
+    """[3] world; no gradient."""
+    viewmat = viewmat.detach()
+    return -viewmat[:3, :3].T @ viewmat[:3, 3]

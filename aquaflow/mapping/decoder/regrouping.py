@@ -1,4 +1,5 @@
-"""Voxel groups made anew after a failure that left their tables half changed."""
+"""Voxel groups made anew: after a failure that left their tables half changed, or in voxels of
+another size."""
 
 from __future__ import annotations
 
@@ -34,8 +35,7 @@ def regrouped(
     means: Tensor,  # [N, 3] of all Gaussians
 ) -> VoxelGroups:
     """All Gaussians placed anew; a voxel's first group keeps the feature known of that voxel."""
-    new = VoxelGroups(groups.config, groups.features.shape[1], groups.device)
-    new.insert(means)
+    new = _placed(groups, means, groups.size)
     known: dict[int, Tensor] = {}
     for voxel, feature in zip(groups_out(groups.voxel), groups.features, strict=False):
         known.setdefault(voxel, feature)
@@ -43,4 +43,28 @@ def regrouped(
         feature = known.pop(voxel, None)
         if feature is not None and bool(torch.isfinite(feature).all()):
             new.features[group] = feature
+    return new
+
+
+def resized(
+    groups: VoxelGroups,
+    means: Tensor,  # [N, 3] of all Gaussians
+    size: float,
+) -> VoxelGroups:
+    """All Gaussians in voxels of ``size`` map units; a new group takes over the feature that its
+    first Gaussian's had."""
+    new = _placed(groups, means, size)
+    if len(new):
+        new.features.copy_(groups.features[groups.group[new.table[:, 0]]])
+    return new
+
+
+def _placed(
+    groups: VoxelGroups,
+    means: Tensor,  # [N, 3]
+    size: float,
+) -> VoxelGroups:
+    new = VoxelGroups(groups.config, groups.features.shape[1], groups.device)
+    new.size = size
+    new.insert(means)
     return new

@@ -37,6 +37,8 @@ class VoxelGroups:
 
     def __init__(self, config: VoxelConfig, feature_width: int, device: torch.device = CPU) -> None:
         self.config, self.device = config, device
+        self.size = config.size
+        """Edge of a voxel, map units."""
         none = torch.zeros(0, dtype=torch.int64, device=device)
         self._group, self._slot = GrowingRows(none), GrowingRows(none)
         self._table = GrowingRows(none.new_zeros(0, config.capacity))
@@ -84,7 +86,7 @@ class VoxelGroups:
         means: Tensor,  # [M, 3] map units
     ) -> Tensor:
         """[M] int64 number of the voxel each point lies in; what is not a number counts as 0."""
-        cell = torch.floor(means.detach().double().nan_to_num() / self.config.size)
+        cell = torch.floor(means.detach().double().nan_to_num() / self.size)
         x, y, z = cell.clamp(-REACH, REACH - 1).long().add(REACH).unbind(1)
         return (x * (2 * REACH) + y) * (2 * REACH) + z
 
@@ -134,7 +136,7 @@ class VoxelGroups:
         points = means.detach()[self.table[touched].clamp_min(0)].double()
         low = torch.where(taken, points, torch.inf).amin(1)
         high = torch.where(taken, points, -torch.inf).amax(1)
-        whole = ((high - low) <= WHOLE * self.config.size).all(1)
+        whole = ((high - low) <= WHOLE * self.size).all(1)
         self._enter(touched[whole], self.voxel_of((low + high)[whole] / 2))
         torn = rows[~whole[which]]
         parents = self.group[torn]

@@ -69,6 +69,16 @@ def alpha_where_agreed(
     return torch.where(agree, alpha, 0.0)
 
 
+def colour_range(
+    z: Tensor,  # [H, W] range as tracked, and of the map where nothing was
+    shown_z: Tensor,  # [H, W] of the map
+    covered: Tensor,  # [H, W] bool: the map has a surface there
+    config: InsertionConfig,
+) -> Tensor:
+    """[H, W] range over which the water is taken out of the picture."""
+    return z if config.colour_range == "tracked" else torch.where(covered, shown_z, z)
+
+
 def structure(
     image: Tensor,  # [H, W, 3]
     sigma_px: float,
@@ -105,9 +115,14 @@ def select(
     config: InsertionConfig,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
-    """Rows and columns drawn with probability ``P_a * density``, at least ``tau_a``."""
-    chance = torch.where(probability > config.tau_a, probability * config.density, 0.0)
-    drawn = insertion_in(torch.rand(chance.shape, generator=generator), chance.device) < chance
+    """Rows and columns where P_a is above ``tau_a``: all of them, or drawn with probability
+    ``P_a * density``."""
+    above = probability > config.tau_a
+    if config.selection == "threshold":
+        drawn = above
+    else:
+        chance = torch.where(above, probability * config.density, 0.0)
+        drawn = insertion_in(torch.rand(chance.shape, generator=generator), chance.device) < chance
     rows, columns = torch.nonzero(drawn & allowed, as_tuple=True)
     return rows, columns
 
@@ -159,6 +174,8 @@ def new_gaussians(
     means = (rays * distance[:, None]) @ view.T_wc.R.T + view.T_wc.t
     # Expected distance to the nearest neighbour when a share p of the pixels is drawn: 1 / sqrt(p).
     share = (probability[rows, columns] * config.density).clamp(1e-4, 1.0)
+    if config.selection == "threshold":
+        share = torch.ones_like(share)  # neighbours are a pixel apart
     spacing = share.rsqrt().clamp(1.0, config.max_spacing_widths * view.camera.width)
     scale = config.scale_of_spacing * spacing * z[rows, columns] / view.camera.fx
     opacity = (config.opacity * confidence[rows, columns]).clamp(0.05, 0.95)

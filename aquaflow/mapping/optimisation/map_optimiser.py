@@ -39,7 +39,7 @@ class MapOptimiser:
         self._objective = objective
         self.adam = self._new_adam()
         """Optimiser of the Gaussians' parameters."""
-        self.medium_adam = torch.optim.Adam(scene.medium.parameters(), lr=config.medium.rate)
+        self.medium_adam = torch.optim.Adam(scene.medium.learned_at(config.medium))
         self.steps = 0
         """Steps taken."""
         self.undone = 0

@@ -23,7 +23,10 @@ MAX_RESTORED = 2.0
 
 @dataclass(frozen=True)
 class Water:
-    """The medium's parameters for one picture, each [3] RGB; rates per map unit."""
+    """The medium's parameters for one picture, each [3] RGB; rates per map unit.
+
+    For points that were seen from several views, beta_a is [N, 3].
+    """
 
     beta_a: Tensor
     B_inf: Tensor
@@ -67,7 +70,7 @@ class Water:
 
 
 def _optical_depth(
-    rate: Tensor,  # [3] 1 / map unit
+    rate: Tensor,  # [3], or [..., 3] where z is [...]; 1 / map unit
     z: Tensor,  # [...] map units
 ) -> Tensor:
     return (rate * z[..., None]).clamp(0.0, MAX_OPTICAL_DEPTH)

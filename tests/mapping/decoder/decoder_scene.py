@@ -55,7 +55,9 @@ class Scene:
         """[N, 9]"""
         everyone = torch.ones(ROWS, dtype=torch.bool)
         tokens = visible_tokens(self.groups, everyone) if tokens is None else tokens
-        trunk = self.decoder.trunk(tokens, self.local, self.shared)
+        early = observation(self.means[tokens.rows], centre)
+        early = early if self.decoder.observes_first else None
+        trunk = self.decoder.trunk(tokens, self.local, self.shared, early)
         places = tokens.places(everyone)
         rows = tokens.rows[places]
         o = observation(self.means[rows], centre)

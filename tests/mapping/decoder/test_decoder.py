@@ -20,6 +20,7 @@ from aquaflow.mapping.encoding import sinusoidal_encoding
 from tests.mapping.decoder.decoder_scene import CENTRE, ROWS, Scene
 
 VARIANTS = ("lgpd", "mlp")
+ENTRIES = ("after_attention", "before_attention")
 
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -30,10 +31,19 @@ def reference(scene: Scene, row: int) -> Tensor:
     weights = dict(scene.decoder.named_parameters())
     group = int(scene.groups.group[row])
     members = [int(i) for i in scene.groups.table[group] if i != EMPTY]
+    first = scene.config.observation == "before_attention"
+
+    def gamma(i: int) -> Tensor:
+        ray = scene.means[i] - CENTRE
+        d = torch.linalg.vector_norm(ray)
+        return sinusoidal_encoding(
+            torch.cat([ray / d, d[None]] if scene.config.distance else [ray / d])
+        )
 
     def token(i: int) -> Tensor:
         e = weights["local.weight"] @ scene.local[i] + weights["local.bias"]
-        return e + weights["shared.weight"] @ scene.shared[group]
+        e = e + weights["shared.weight"] @ scene.shared[group]
+        return e + weights["view.weight"] @ gamma(i) if first else e
 
     e = token(row)
     if scene.config.variant == "lgpd":
@@ -44,14 +54,10 @@ def reference(scene: Scene, row: int) -> Tensor:
         z = e + sum(w * v for w, v in zip(share, values, strict=True))
     else:
         z = e + weights["mixer.outer.weight"] @ torch.relu(weights["mixer.inner.weight"] @ e)
-    ray = scene.means[row] - CENTRE
-    d = torch.linalg.vector_norm(ray)
-    o = torch.cat([ray / d, d[None]] if scene.config.distance else [ray / d])
-    told = torch.cat([z, sinusoidal_encoding(o)])
-    hidden = torch.relu(
-        torch.cat([weights["first.weight"], weights["view.weight"]], 1) @ told
-        + weights["first.bias"]
-    )
+    hidden = weights["first.weight"] @ z + weights["first.bias"]
+    if not first:
+        hidden = hidden + weights["view.weight"] @ gamma(row)
+    hidden = torch.relu(hidden)
     half = len(hidden) // 2
     geometry = weights["geometry.weight"] @ hidden[:half] + weights["geometry.bias"]
     colour = weights["colour.weight"] @ hidden[half:] + weights["colour.bias"]
@@ -63,15 +69,19 @@ def reference(scene: Scene, row: int) -> Tensor:
 
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("distance", [True, False])
-def test_each_gaussian_is_decoded_as_the_reference_says(variant: str, distance: bool) -> None:
-    scene = Scene(variant=variant, distance=distance)
+@pytest.mark.parametrize("observation", ENTRIES)
+def test_each_gaussian_is_decoded_as_the_reference_says(
+    variant: str, distance: bool, observation: str
+) -> None:
+    scene = Scene(variant=variant, distance=distance, observation=observation)
     wanted = torch.stack([reference(scene, row) for row in range(ROWS)])
     torch.testing.assert_close(scene.residuals(), wanted, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_gradients_are_those_of_the_reference(variant: str) -> None:
-    scene = Scene(variant=variant)
+@pytest.mark.parametrize("observation", ENTRIES)
+def test_gradients_are_those_of_the_reference(variant: str, observation: str) -> None:
+    scene = Scene(variant=variant, observation=observation)
     scene.local.requires_grad_()
     scene.shared.requires_grad_()
     leaves = [scene.local, scene.shared, *scene.decoder.parameters()]

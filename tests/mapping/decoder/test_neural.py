@@ -62,8 +62,9 @@ def test_a_new_map_looks_as_it_would_without_a_decoder() -> None:
 
 
 @pytest.mark.parametrize("optimise_initial", [True, False])
-def test_steps_explain_the_views_better(optimise_initial: bool) -> None:
-    mapper = grown(neural(optimise_initial=optimise_initial))
+@pytest.mark.parametrize("observation", ["after_attention", "before_attention"])
+def test_steps_explain_the_views_better(optimise_initial: bool, observation: str) -> None:
+    mapper = grown(neural(optimise_initial=optimise_initial, observation=observation))
     before, initial = error(mapper), copied(mapper)
     mapper.optimise(24)
     assert error(mapper) < 0.9 * before
@@ -271,3 +272,52 @@ def test_a_sub_map_whose_groups_could_not_be_placed_comes_over_all_the_same(
     assert is_whole(mapper)
     assert len(mapper.gaussians) == count + len(other.gaussians)
     assert len(mapper.views) == views + len(other.views)
+
+
+def test_before_the_attention_a_pose_that_moves_is_observed_anew() -> None:
+    mapper = grown(neural(observation="before_attention"))
+    mapper.optimise(8)
+    view, decoder = mapper.views[0], decoder_of(mapper)
+    first = decoder.seen_from(view, view.viewmat())["raw_colours"].clone()
+    moved = view.viewmat()
+    moved[2, 3] += 0.4
+    there = decoder.seen_from(view, moved)["raw_colours"].clone()
+    decoder._looked = None
+    assert torch.equal(there, decoder.seen_from(view, moved)["raw_colours"])
+    assert not torch.equal(there, first)
+
+
+def test_before_the_attention_new_gaussians_look_as_they_were_inserted() -> None:
+    mapper = grown(neural(observation="before_attention"))
+    mapper.optimise(8)
+    view = mapper.views[1]
+    count = mapper.insert(view, flat_pointmap(1.0))
+    assert count > 0
+    seen = mapper.scene.seen_from(view, view.viewmat())
+    assert seen["quats"][-count:, 0].sub(1.0).abs().max() < 1e-5
+
+
+def test_voxels_in_metres_count_once_the_unit_is_known() -> None:
+    mapper = grown(neural(voxels={"size": 0.05, "size_m": 0.2}))
+    mapper.optimise(4)
+    decoder = decoder_of(mapper)
+    assert decoder.groups.size == 0.05
+    groups, features = len(decoder.groups), decoder.groups.features.clone()
+    mapper.use_unit(0.5)
+    assert decoder.groups.size == pytest.approx(0.4)
+    assert len(decoder.groups) < groups
+    assert is_whole(mapper)
+    known = {tuple(row) for row in features.tolist()}
+    assert all(tuple(row) in known for row in decoder.groups.features.tolist())
+    same_groups = decoder.groups
+    mapper.use_unit(0.52)
+    assert decoder.groups is same_groups  # 4 % is no other size
+    mapper.optimise(4)
+    assert is_whole(mapper)
+
+
+def test_voxels_in_map_units_stay_when_the_unit_is_known() -> None:
+    mapper = grown(neural())
+    before = decoder_of(mapper).groups
+    mapper.use_unit(3.0)
+    assert decoder_of(mapper).groups is before

@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from aquaflow.config import MediumConfig
-from aquaflow.mapping.water.medium import Medium, inverse_softplus
+from aquaflow.mapping.water.medium import MAX_LOG_FACTOR, Medium, inverse_softplus
 from tests.mapping.mapping_scenes import pose
 
 AHEAD, DOWN = torch.eye(3), torch.from_numpy(pose((0, 0, 0), (1.3, 0, 0)).R).float()
 
 
-def medium(**keys: float) -> Medium:
+def medium(**keys: float | bool) -> Medium:
     return Medium(MediumConfig.model_validate(keys), torch.Generator().manual_seed(0))
 
 
@@ -47,7 +47,7 @@ def test_it_starts_as_the_config_says_whichever_way_the_camera_looks() -> None:
 
 
 def test_it_learns_that_attenuation_depends_on_orientation() -> None:
-    learning = medium()
+    learning = medium(directional=True)
     optimiser = torch.optim.Adam(learning.parameters(), lr=5e-3)
     for _ in range(120):
         optimiser.zero_grad()
@@ -59,8 +59,53 @@ def test_it_learns_that_attenuation_depends_on_orientation() -> None:
     torch.testing.assert_close(learning(DOWN).beta_a, torch.full((3,), 0.3), atol=0.02, rtol=0.0)
 
 
+def test_isotropic_water_never_depends_on_orientation() -> None:
+    still = medium()
+    with torch.no_grad():
+        still.output.weight.fill_(0.5)
+    both = still(torch.stack([AHEAD, DOWN])).beta_a
+    assert torch.equal(both[0], both[1])
+    assert torch.equal(both[0], still(AHEAD).beta_a)
+    torch.autograd.backward(both.sum())
+    assert still.output.weight.grad is None
+
+
+def test_centred_the_factor_has_a_mean_of_one_over_the_dive() -> None:
+    turning = medium(directional=True)
+    with torch.no_grad():
+        turning.output.weight.fill_(0.05)
+    views = torch.stack([AHEAD, DOWN])
+    mean = turning(views).beta_a.log().mean(dim=0)
+    turning.centre(views)
+    both = turning(views).beta_a.log()
+    isotropic = torch.full((3,), MediumConfig().initial_attenuation).log()
+    torch.testing.assert_close(both.mean(dim=0), isotropic, rtol=0.0, atol=1e-3)
+    assert (mean - isotropic).abs().max() > 1e-2
+    assert (both[0] - both[1]).abs().max() > 1e-2
+
+
+def test_the_factor_stays_within_its_limit() -> None:
+    wild = medium(directional=True)
+    with torch.no_grad():
+        wild.output.weight.fill_(100.0)
+    for R in (AHEAD, DOWN):
+        log_factor = (wild(R).beta_a / MediumConfig().initial_attenuation).log()
+        assert log_factor.abs().max() <= MAX_LOG_FACTOR + 1e-5
+
+
+def test_each_part_of_the_medium_learns_at_its_own_rate() -> None:
+    config = MediumConfig(rate=1e-4, directional_rate=1e-2, directional=True)
+    learning = Medium(config, torch.Generator().manual_seed(0))
+    groups = learning.learned_at(config)
+    rates = {id(p): group["lr"] for group in groups for p in group["params"]}
+    assert rates == {
+        id(p): 1e-2 if name in ("hidden.weight", "hidden.bias", "output.weight") else 1e-4
+        for name, p in learning.named_parameters()
+    }
+
+
 def test_every_parameter_gets_a_gradient_once_the_output_layer_has_moved() -> None:
-    learning = medium()
+    learning = medium(directional=True)
     with torch.no_grad():
         learning.output.weight.fill_(0.01)
     torch.autograd.backward(learning(DOWN).stacked().square().sum())
@@ -69,16 +114,19 @@ def test_every_parameter_gets_a_gradient_once_the_output_layer_has_moved() -> No
         assert parameter.grad.abs().max() > 0.0, name
 
 
-def test_water_that_is_set_comes_back_in_every_direction() -> None:
+@pytest.mark.parametrize("directional", [False, True])
+def test_water_that_is_set_comes_back_from_every_orientation(directional: bool) -> None:
     beta_a, B_inf, b = torch.tensor([[0.6, 0.2, 0.01], [0.1, 0.4, 0.9], [2.0, 0.3, 5.0]])
-    told = medium()
+    told = medium(directional=directional)
     before = told(AHEAD)
     with torch.no_grad():
-        told.output.weight.fill_(0.5)
+        told.output.weight.fill_(0.02)
     told.set_water(beta_a, B_inf, b)
+    told.centre(torch.stack([AHEAD, DOWN]))
+    mean = told(torch.stack([AHEAD, DOWN])).beta_a.log().mean(dim=0).exp()
+    torch.testing.assert_close(mean, beta_a, rtol=1e-3, atol=1e-6)
     for R in (AHEAD, DOWN):
         seen = told(R)
-        torch.testing.assert_close(seen.beta_a, beta_a, rtol=1e-4, atol=1e-6)
         torch.testing.assert_close(seen.B_inf, B_inf)
         torch.testing.assert_close(seen.b, b, rtol=1e-4, atol=1e-6)
         assert torch.equal(seen.B_res, before.B_res)
