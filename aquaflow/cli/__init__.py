@@ -16,7 +16,7 @@ import typer
 from aquaflow import __version__
 from aquaflow.cli.bench import register as register_bench
 from aquaflow.cli.calibrate import register as register_calibrate
-from aquaflow.cli.console import Json, progress_bars, unit_in_words
+from aquaflow.cli.console import PRESETS, Json, progress_bars, unit_in_words
 from aquaflow.cli.devices import register as register_devices
 from aquaflow.cli.export import register as register_export
 from aquaflow.cli.prior import register as register_prior
@@ -73,7 +73,7 @@ def map_command(
         Path | None, typer.Option(help="Picture of the camera's size: white is used, black not.")
     ] = None,
     fps: Annotated[float | None, typer.Option(help="Frames/s of a folder.")] = None,
-    preset: Annotated[str | None, typer.Option(help="fast | balanced | accurate")] = None,
+    preset: Annotated[str | None, typer.Option(help=PRESETS)] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of every random draw.")] = None,
     threads: Annotated[int | None, typer.Option(help="Default: every core.")] = None,
     refine_steps: Annotated[int | None, typer.Option(help="Steps after the last frame.")] = None,

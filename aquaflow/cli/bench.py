@@ -46,7 +46,9 @@ def dives(
     data: Data = None,
     suite: Suite = None,
     scene: Scenes = None,
-    preset: Annotated[list[str] | None, typer.Option(help="May be repeated.")] = None,
+    preset: Annotated[
+        list[str] | None, typer.Option(help="May be repeated; default: the three for a CPU.")
+    ] = None,
     repeats: Annotated[int, typer.Option(min=1, help="Runs of each, interleaved.")] = 1,
     peers: Annotated[bool, typer.Option(help="Run COLMAP and two-view odometry too.")] = True,
     out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("out/bench"),
@@ -59,7 +61,7 @@ def dives(
 
     `aquaflow bench` alone does this too; `aquaflow bench render` times the renderer.
     """
-    from aquaflow.config.presets import PRESETS
+    from aquaflow.config.presets import BY_EFFORT
     from aquaflow.evaluation.bench import benchmark as bm
     from aquaflow.evaluation.bench.readme import around_section
 
@@ -71,7 +73,7 @@ def dives(
 
     if readme is not None:
         around_section(readme)
-    contenders = bm.contenders_of(preset or list(PRESETS), peers)
+    contenders = bm.contenders_of(preset or BY_EFFORT, peers)
     with progress_bars(as_json) as progress:
         scenes = bm.scenes_of(suite, data, scene or [], out, progress)
         result = bm.benchmark(scenes, contenders, repeats, out, progress)

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 
 Json = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON.")]
 
+PRESETS = "fast | balanced | accurate | onboard-gpu | paper; the last two never measured on a GPU"
+"""Help of --preset; a test holds it to the presets that there are."""
+
 
 def duration(value: float | None) -> float | None:
     """An option in seconds that a clock can wait for.

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from aquaflow.cli.console import (
+    PRESETS,
     Json,
     Seconds,
     progress_bars,
@@ -50,6 +51,7 @@ def run(
     out: Annotated[
         Path | None, typer.Option(help="Dive folder; else one in service.dives, named by time.")
     ] = None,
+    preset: Annotated[str | None, typer.Option(help=f"On top of --config: {PRESETS}")] = None,
     new: Annotated[bool, typer.Option("--new", help="Begin a new dive; resume nothing.")] = False,
     speed: Annotated[
         float,
@@ -59,12 +61,12 @@ def run(
     as_json: Json = False,
 ) -> None:
     """Map live: cameras and telemetry in, dive folder out; resumes what was interrupted."""
-    from aquaflow.config.vehicle import VehicleConfig, load_vehicle
+    from aquaflow.config.vehicle import load_vehicle
     from aquaflow.errors import InputError
     from aquaflow.geometry.camera import load_camera
     from aquaflow.service.sources import devices, recording
 
-    vehicle = VehicleConfig() if config is None else load_vehicle(config)
+    vehicle = load_vehicle(config, preset)
     if source is None and not vehicle.cameras:
         raise InputError("nothing to map: give --config with cameras, or --source")
     if source is None and calib is not None:

@@ -1,4 +1,4 @@
-"""Named settings: how much time a run may spend on being right."""
+"""Named settings: how much time a run may spend on being right, for a GPU, and the paper's."""
 
 from __future__ import annotations
 
@@ -30,11 +30,39 @@ PRESETS: dict[str, dict[str, Any]] = {
             },
         },
     },
+    "onboard-gpu": {
+        "prior": {"kind": "compact"},
+        "mapping": {
+            "max_gaussians": 600_000,
+            "optimiser": {"steps_keyframe": 30, "steps_mapping": 30, "steps_common": 10},
+        },
+    },
+    "paper": {
+        "prior": {"kind": "compact"},
+        "tracking": {"keyframe_share": 0.7, "mapping_parallax_widths": 30.0 / 512.0},
+        "mapping": {
+            "max_gaussians": 1_200_000,
+            "insertion": {
+                "selection": "threshold", "tau_a": 0.1, "colour_range": "rendered",
+            },
+            "loss": {"ssim": 0.2, "depth": 0.01, "scale": 0.01},
+            "optimiser": {"steps_keyframe": 20, "steps_mapping": 20, "steps_common": 10},
+            "medium": {"directional": True},
+            "decoder": {
+                "enabled": True, "optimise_initial": False, "observation": "before_attention",
+                "views_per_trunk": 1, "voxels": {"size_m": 0.2, "capacity": 32},
+            },
+        },
+    },
 }  # fmt: skip
 """What each preset changes of the defaults; `aquaflow bench` shows what that buys and costs.
 
 The width stays the same in all: errors in pictures of different widths cannot be compared.
 """
+BY_EFFORT = ("fast", "balanced", "accurate")
+"""Presets that were measured on a CPU, least effort first."""
+ON_A_GPU = ("onboard-gpu", "paper")
+"""Presets for a GPU; no figure of theirs was measured on one (docs/tuning.md#presets)."""
 
 
 def preset(name: str) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from pydantic import Field
 
 from aquaflow.config import Config, read_yaml
 from aquaflow.config.cameras import CameraConfig
+from aquaflow.config.presets import merged, preset
 from aquaflow.config.recording import RecordingConfig
 from aquaflow.config.service import ServiceConfig
 from aquaflow.config.stage import validated
@@ -25,11 +26,13 @@ class VehicleConfig(Config):
     viewer: ViewerConfig = ViewerConfig()
 
 
-def load_vehicle(path: Path) -> VehicleConfig:
-    """Read a YAML config.
+def load_vehicle(path: Path | None, preset_name: str | None = None) -> VehicleConfig:
+    """Read a YAML config, if one is given, with a preset on top of it.
 
     Raises:
         InputError: the file cannot be read, or is not YAML.
-        ConfigError: a key is unknown or a value out of range.
+        ConfigError: an unknown preset or key, or a value out of range.
     """
-    return validated(VehicleConfig, read_yaml(path), str(path))
+    written = {} if path is None else read_yaml(path)
+    changed = {} if preset_name is None else preset(preset_name)
+    return validated(VehicleConfig, merged(written, changed), str(path or preset_name))

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from aquaflow.cli.console import PRESETS as PRESETS_IN_HELP
 from aquaflow.config import Config, parse_config
-from aquaflow.config.presets import PRESETS, configured, merged, preset
+from aquaflow.config.presets import BY_EFFORT, ON_A_GPU, PRESETS, configured, merged, preset
+from aquaflow.config.vehicle import load_vehicle
 from aquaflow.errors import ConfigError
 
 
@@ -23,9 +25,45 @@ def test_balanced_is_the_default() -> None:
 def test_presets_are_ordered_by_effort() -> None:
     steps = [
         parse_config(merged(Config().model_dump(), preset(name)), name).mapping.optimiser
-        for name in ("fast", "balanced", "accurate")
+        for name in BY_EFFORT
     ]
     assert steps[0].refine_steps < steps[1].refine_steps < steps[2].refine_steps
+
+
+def test_every_preset_is_in_the_help_and_those_never_measured_say_so() -> None:
+    assert tuple(PRESETS) == BY_EFFORT + ON_A_GPU
+    listed, _, said = PRESETS_IN_HELP.partition(";")
+    assert listed.split(" | ") == list(PRESETS)
+    assert "never measured on a GPU" in said
+
+
+def test_the_paper_is_switched_on_by_its_preset() -> None:
+    found = configured(None, "paper", {}, "test").mapping
+    assert found.medium.directional
+    assert found.insertion.selection == "threshold"
+    assert found.insertion.colour_range == "rendered"
+    assert found.decoder.enabled
+    assert found.decoder.observation == "before_attention"
+    assert not found.decoder.optimise_initial
+    assert (found.decoder.voxels.size_m, found.decoder.voxels.capacity) == (0.2, 32)
+    assert 600_000 <= found.max_gaussians <= 1_200_000
+
+
+def test_a_learned_prior_of_ones_own_stays_under_a_preset_for_a_gpu(tmp_path: Path) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text(f"prior: {{kind: folder, folder: {tmp_path}}}\n")
+    for name in ON_A_GPU:
+        assert configured(file, name, {}, "test").prior.folder == tmp_path
+
+
+def test_a_vehicle_runs_with_a_preset_on_top_of_its_file(tmp_path: Path) -> None:
+    file = tmp_path / "vehicle.yaml"
+    file.write_text("seed: 5\nmapping: {max_gaussians: 1000}\n")
+    assert load_vehicle(file).mapping.max_gaussians == 1000
+    found = load_vehicle(file, "onboard-gpu")
+    assert (found.seed, found.mapping.max_gaussians) == (5, 600_000)
+    with pytest.raises(ConfigError, match="no preset 'gpu'"):
+        load_vehicle(None, "gpu")
 
 
 def test_an_unknown_preset_names_those_there_are() -> None:
