@@ -6,7 +6,8 @@ from collections import Counter
 from collections.abc import Sequence
 
 from aquaflow.config import Config
-from aquaflow.config.mapping import InsertionConfig
+from aquaflow.config.mapping import InsertionConfig, OptimiserConfig
+from aquaflow.config.stage import Stage
 from aquaflow.dive.frames_csv import FrameRow
 
 LEAST_POSED_SHARE = 0.5
@@ -24,7 +25,7 @@ def shortcomings(config: Config, rows: Sequence[FrameRow], gaussians: int) -> li
             "frames.csv for each frame"
         )
     if config.mapping.enabled and gaussians == 0:
-        found.append(f"the map is empty: no Gaussian was inserted; {_what_to_do(config)}")
+        found.append(f"the map is empty: it ends with 0 Gaussians; {_what_to_do(config)}")
     return found
 
 
@@ -37,14 +38,19 @@ def _most_common_reason(rows: Sequence[FrameRow]) -> str:
 
 
 def _what_to_do(config: Config) -> str:
-    asked, usual = config.mapping.insertion, InsertionConfig()
     changed = [
-        f"mapping.insertion.{name} is {getattr(asked, name)}, by default {getattr(usual, name)}"
-        for name in InsertionConfig.model_fields
-        if getattr(asked, name) != getattr(usual, name)
+        *_changed("insertion", config.mapping.insertion, InsertionConfig()),
+        *_changed("optimiser", config.mapping.optimiser, OptimiserConfig(), "prune_"),
     ]
-    if config.mapping.max_gaussians < 1:
-        changed.append(f"mapping.max_gaussians is {config.mapping.max_gaussians}")
     if changed:
         return f"{' and '.join(changed)}: set it back"
     return "the camera must move sideways, over texture, for depths to be known"
+
+
+def _changed(name: str, asked: Stage, usual: Stage, prefix: str = "") -> list[str]:
+    """Settings of a stage of the map that are not the default, those called ``prefix``..."""
+    return [
+        f"mapping.{name}.{key} is {getattr(asked, key)}, by default {getattr(usual, key)}"
+        for key in type(usual).model_fields
+        if key.startswith(prefix) and getattr(asked, key) != getattr(usual, key)
+    ]

@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from aquaflow.errors import AquaFlowError
+from aquaflow.errors import AquaFlowError, NotMappedError
 from aquaflow.evaluation.bench.job import Job
 from aquaflow.evaluation.bench.measure import measured
 from aquaflow.evaluation.bench.peers import run_peer
@@ -21,7 +21,7 @@ from aquaflow.sources import open_recording
 
 
 def perform(job: Job) -> dict[str, Any]:
-    """Run the job and measure what it wrote.
+    """Run the job and measure what it wrote; a map that ends with 0 Gaussians has failed.
 
     No run hears telemetry, also where the recording has it: the table compares monocular methods,
     and the peers have pictures alone. Trajectories are compared after a Sim(3) alignment.
@@ -40,6 +40,8 @@ def perform(job: Job) -> dict[str, Any]:
         metrics = map_recording(
             recording, scene.name, out, job.config(), calibration, overwrite=True
         ).metrics
+        if job.config().mapping.enabled and metrics["gaussians"] == 0:
+            raise NotMappedError(f"{scene.name}: {'; '.join(metrics['warnings'])}")
     peak_mb = peak_memory_mb()  # before the evaluation, whose memory is not the run's
     return {**metrics, **measured(scene, out), "peak_rss_mb": peak_mb}
 
