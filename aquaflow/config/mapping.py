@@ -34,7 +34,7 @@ class MediumConfig(Stage):
         description="attenuation by the camera's orientation (the paper); False: isotropic",
     )
     directional_rate: float = Field(
-        1e-3, gt=0, description="Adam rate of MLP_a, where attenuation is directional"
+        1e-4, gt=0, description="Adam rate of MLP_a, where attenuation is directional"
     )
     width: int = Field(32, ge=4, description="hidden units of MLP_a; paper silent, 32 cost nothing")
     rate: float = Field(
