@@ -68,7 +68,8 @@ class Scene:
 
     def centre_water(self, views: Sequence[View]) -> None:
         """Let the attenuation of ``views`` be on the mean that which the water fit found."""
-        self.medium.centre(orientations(views, self.device))
+        if self.medium.directional:
+            self.medium.centre(orientations(views, self.device))
 
     def gain(self, view: View) -> Tensor | None:
         """The shading [H, W] of this view's pictures; None where there is none."""

@@ -85,7 +85,7 @@ def test_what_the_orientation_says_survives_a_fit_of_the_water() -> None:
         mapper.medium.output.weight.fill_(0.02)
     assert fit_water(mapper.scene, mapper.views, torch.Generator().manual_seed(0)) is not None
     assert bool((mapper.medium.output.weight == 0.02).all())
-    found = mapper.medium(orientations(mapper.views)).beta_a
+    found = mapper.medium(orientations(mapper.views, mapper.scene.device)).beta_a
     assert (found[0] / found[-1]).log().abs().max() > 1e-3
 
 
