@@ -1,0 +1,84 @@
+"""constraints.txt: one set of wheels for every Python and processor that the README names."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PYTHONS = ("3.10", "3.11", "3.12", "3.13")
+TARGETS = [(python, machine) for python in PYTHONS for machine in ("x86_64", "aarch64")]
+EXTRAS = ("dev", "oak", "peers", "prior-peers")
+"""Everything but ``gpu``, whose gsplat is installed without what it asks for."""
+CUDA_BUILD_OF_TORCH = re.compile(r"nvidia-|cuda-|triton$")
+"""What the CUDA build of torch pins itself."""
+UV = (sys.executable, "-m", "uv")
+
+pytestmark = pytest.mark.ci
+
+
+def uv_compile(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*UV, "pip", "compile", "--quiet", "--no-header", "--no-annotate", *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "UV_NO_CONFIG": "1"},
+        cwd=folder,
+    )
+
+
+@pytest.fixture(scope="module")
+def index(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Skips where uv or a package index is missing."""
+    folder = tmp_path_factory.mktemp("index")
+    (folder / "one.in").write_text("threadpoolctl\n")
+    ran = uv_compile(folder, "one.in", "--refresh-package", "threadpoolctl")
+    if ran.returncode != 0:
+        reason = ran.stderr.strip().splitlines() or ["uv says nothing"]
+        pytest.skip(f"no package index to resolve from: {reason[-1].strip()}")
+
+
+def normal(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def pins() -> set[tuple[str, str]]:
+    """Every (name, version) in constraints.txt, whatever its marker."""
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    rows = (line.partition(";")[0].split("==") for line in lines if not line.startswith("#"))
+    return {(normal(name), version.strip()) for name, version in rows}
+
+
+def resolve(target: tuple[str, str]) -> subprocess.CompletedProcess[str]:
+    """What constraints.txt gives one (Python, processor), from wheels alone."""
+    python, machine = target
+    extras = [part for extra in EXTRAS for part in ("--extra", extra)]
+    wheels = ("--only-binary", ":all:", "-c", "constraints.txt")
+    platform = ("--python-version", python, "--python-platform", f"{machine}-manylinux_2_28")
+    return uv_compile(ROOT, "pyproject.toml", *extras, *wheels, *platform)
+
+
+@pytest.fixture(scope="module")
+def resolved(index: None) -> dict[tuple[str, str], subprocess.CompletedProcess[str]]:
+    """Every target's run; at once, because they wait for the index most of the time."""
+    with ThreadPoolExecutor(len(TARGETS)) as pool:
+        return dict(zip(TARGETS, pool.map(resolve, TARGETS), strict=True))
+
+
+@pytest.mark.parametrize("target", TARGETS, ids="-".join)
+def test_every_python_and_processor_gets_pinned_wheels(
+    resolved: dict[tuple[str, str], subprocess.CompletedProcess[str]], target: tuple[str, str]
+) -> None:
+    ran = resolved[target]
+    assert ran.returncode == 0, ran.stderr
+    rows = (line.partition(";")[0].split("==") for line in ran.stdout.splitlines())
+    found = {(normal(name), version.strip()) for name, version in rows}
+    assert ("torch", "2.13.0") in found
+    assert {row for row in found - pins() if not CUDA_BUILD_OF_TORCH.match(row[0])} == set()
