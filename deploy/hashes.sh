@@ -2,7 +2,7 @@
 # Fetch the wheels of an onboard install and write down their hashes, on a machine with a network and
 # of the same kind as the vehicle's computer.
 #
-#   deploy/hashes.sh WHEELHOUSE [EXTRAS]
+#   deploy/hashes.sh WHEELHOUSE [EXTRAS]      TORCH=cpu|cuda|system chooses the build of torch
 #
 # Then copy checkout and WHEELHOUSE, and run: sudo deploy/install.sh --wheelhouse WHEELHOUSE
 set -euo pipefail
@@ -12,9 +12,18 @@ checkout=$(dirname "$here")
 wheelhouse=${1:?give a folder for the wheels}
 extras=${2-prior,telemetry,recording,viewer}
 python=${PYTHON:-python3}
+# shellcheck source=deploy/torch.sh
+source "$here/torch.sh"
 
+build=$(choose_torch "$python" "${TORCH:-auto}")
+pins=$(mktemp)
+trap 'rm -f "$pins"' EXIT
+cp "$checkout/constraints.txt" "$pins"
+pin_torch "$build" "$python" "$pins"
+index=()
+[[ $build != cpu ]] || index=(--extra-index-url "$torch_cpu_index")
 mkdir -p "$wheelhouse"
-"$python" -m pip wheel --quiet --no-cache-dir --constraint "$checkout/constraints.txt" \
+"$python" -m pip wheel --quiet --no-cache-dir "${index[@]}" --constraint "$pins" \
   --wheel-dir "$wheelhouse" "${checkout}${extras:+[$extras]}"
 lock=$here/requirements.lock
 : >"$lock"

@@ -6,7 +6,8 @@
 #     --python PROGRAM   interpreter of the environment (default: python3)
 #     --wheelhouse DIR   install from these wheels only, without a network
 #     --extras LIST      optional parts (default: prior,telemetry,recording,viewer)
-#     --system-torch     use the torch of the system (Jetson), do not install another
+#     --torch BUILD      cpu, cuda, or system for the torch that --python has (default: auto, what
+#                        fits this machine: a Jetson's own, CUDA where a GPU answers, or cpu)
 #     --no-start         install, but neither enable nor start
 #     --root DIR         install under DIR instead of / (for images and tests); starts nothing
 set -euo pipefail
@@ -14,8 +15,10 @@ set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 checkout=$(dirname "$here")
 config='' python=python3 wheelhouse='' extras=prior,telemetry,recording,viewer
-system_torch='' start=yes root=''
+torch=auto start=yes root=''
 
+# shellcheck source=deploy/torch.sh
+source "$here/torch.sh"
 fail() { echo "install.sh: $*" >&2; exit 1; }
 
 while (($#)); do
@@ -24,15 +27,16 @@ while (($#)); do
     --python) python=${2:?--python needs a program}; shift ;;
     --wheelhouse) wheelhouse=${2:?--wheelhouse needs a folder}; shift ;;
     --extras) extras=${2?--extras needs a list}; shift ;;
-    --system-torch) system_torch=yes ;;
+    --torch) torch=${2:?--torch needs a build}; shift ;;
     --no-start) start='' ;;
     --root) root=${2:?--root needs a folder}; start=''; shift ;;
-    -h | --help) sed -n '2,13s/^# \{0,1\}//p' "${BASH_SOURCE[0]}"; exit 0 ;;
+    -h | --help) sed -n '2,14s/^# \{0,1\}//p' "${BASH_SOURCE[0]}"; exit 0 ;;
     *) fail "unknown option $1; see --help" ;;
   esac
   shift
 done
 
+case $torch in auto | cpu | cuda | system) ;; *) fail "--torch is auto, cpu, cuda or system, not $torch" ;; esac
 ((EUID == 0)) || fail 'run me as root: sudo deploy/install.sh'
 [[ -z $config || -f $config ]] || fail "there is no config at $config"
 [[ -z $wheelhouse || -d $wheelhouse ]] || fail "there is no wheelhouse at $wheelhouse"
@@ -40,6 +44,11 @@ done
 # --- the interpreter ------------------------------------------------------------------------------
 command -v "$python" >/dev/null || fail "$python is not installed"
 "$python" -c 'import sys; sys.exit(sys.version_info < (3, 10))' || fail "$python is older than 3.10"
+kind=$(interpreter_kind "$python")
+case $kind in
+  'x86_64 64' | 'aarch64 64') ;;
+  *) fail "AquaFlow needs a 64-bit system, x86_64 or aarch64, not '$kind', which $python is; a BlueROV2 with BlueOS's armv7 image needs a 64-bit image or a second computer" ;;
+esac
 "$python" -c 'import venv, ensurepip' 2>/dev/null || fail "$python has no venv: apt-get install python3-venv"
 base=$("$python" -c 'import sys; print(sys.base_prefix)')
 case $(readlink -f "$base")/ in
@@ -60,25 +69,36 @@ fi
 
 # --- program --------------------------------------------------------------------------------------
 program=$root/opt/aquaflow
+build=$(choose_torch "$python" "$torch")
+system_site=''
+if [[ $build == system ]]; then
+  "$python" -c 'import torch' 2>/dev/null || fail "$python has no torch to use; install one, or give --torch cpu"
+  system_site=yes
+fi
 install -d -m 0755 "$program" "$program/share"
 if [[ ! -x $program/venv/bin/python ]]; then
-  "$python" -m venv ${system_torch:+--system-site-packages} "$program/venv"
+  "$python" -m venv ${system_site:+--system-site-packages} "$program/venv"
 fi
 pip=("$program/venv/bin/python" -m pip --disable-pip-version-check --no-cache-dir install --quiet)
-[[ -z $wheelhouse ]] || pip+=(--no-index --find-links "$wheelhouse")
+if [[ -n $wheelhouse ]]; then
+  pip+=(--no-index --find-links "$wheelhouse")
+elif [[ $build == cpu ]]; then
+  pip+=(--extra-index-url "$torch_cpu_index")
+fi
 source=$checkout
 if compgen -G "$wheelhouse/aquaflow-*.whl" >/dev/null; then
   source=$(compgen -G "$wheelhouse/aquaflow-*.whl" | sort -V | tail -n 1)
 fi
 pins=$program/share/constraints.txt
 install -m 0644 "$checkout/constraints.txt" "$pins"
-[[ -z $system_torch ]] || sed -i '/^torch==/d; /^numpy==/d' "$pins"
+pin_torch "$build" "$python" "$pins"
 # Where hashes were written (deploy/hashes.sh), nothing else is let in.
 if [[ -f $checkout/deploy/requirements.lock ]]; then
   "${pip[@]}" --require-hashes -r "$checkout/deploy/requirements.lock"
   "${pip[@]}" --no-deps --force-reinstall "$source"
 else
-  "${pip[@]}" --constraint "$pins" --upgrade "${source}${extras:+[$extras]}"
+  "${pip[@]}" --constraint "$pins" --upgrade "${source}${extras:+[$extras]}" ||
+    fail "pip could not install it; pip's own words are above (torch: $build)"
 fi
 install -m 0644 "$here/README.md" "$program/share/README.md"
 

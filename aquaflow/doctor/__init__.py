@@ -20,6 +20,7 @@ def examine(machine: MachineProbes | None = None) -> list[Finding]:
     probes = (
         *(
             computer.processor,
+            computer.system,
             computer.memory,
             computer.compiler,
             computer.renderer,

@@ -8,6 +8,9 @@ from collections.abc import Iterator
 
 from aquaflow.doctor.machine import Finding, MachineProbes
 
+SUPPORTED = {("x86_64", 64), ("aarch64", 64)}
+"""Processors and pointer sizes that torch, onnxruntime and the compiled renderer exist for."""
+
 ISA_LEVELS = (
     ("x86-64-v4", {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}),
     ("x86-64-v3", {"avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe"}),
@@ -47,6 +50,21 @@ def processor(machine: MachineProbes) -> Finding:
     name = names[0] if names else board or "unknown processor"
     found = f"{name}, {cores or os.cpu_count() or 1} cores, {isa_level(cpuinfo)}"
     return Finding("processor", found, "runs tracking and mapping")
+
+
+def system(machine: MachineProbes) -> Finding:
+    """Whether the interpreter is one of a 64-bit system."""
+    architecture, bits = machine.architecture
+    found = f"{architecture}, {bits}-bit"
+    if machine.architecture in SUPPORTED:
+        return Finding("system", found, "supported: AquaFlow runs on 64-bit x86_64 and aarch64")
+    return Finding(
+        "system",
+        found,
+        "AquaFlow cannot run here: torch and onnxruntime have no builds for it",
+        "install a 64-bit system (a BlueROV2 with BlueOS's armv7 image needs a 64-bit one), or use "
+        "a 64-bit computer on the vehicle's network",
+    )
 
 
 def memory(machine: MachineProbes) -> Finding:

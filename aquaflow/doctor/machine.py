@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import platform
 import shutil
+import struct
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -28,9 +30,11 @@ class Finding:
 
 
 def _torch_gpu() -> str | None:
-    """Name and memory of the GPU that torch can use."""
-    import torch
-
+    """Name and memory of the GPU that torch can use; None without torch, as on a 32-bit system."""
+    try:
+        import torch
+    except ImportError:
+        return None
     if not torch.cuda.is_available():
         return None
     properties = torch.cuda.get_device_properties(0)
@@ -54,6 +58,10 @@ def renderer_name() -> str | None:
             return None
 
 
+def _architecture() -> tuple[str, int]:
+    return platform.machine(), 8 * struct.calcsize("P")
+
+
 def _native_folder() -> Path:
     return Path(__file__).parents[1] / "render" / "native"
 
@@ -67,6 +75,8 @@ class MachineProbes:
     """Folder whose file system dives are written to."""
     native: Path = field(default_factory=_native_folder)
     """Folder of the compiled rasterisers."""
+    architecture: tuple[str, int] = field(default_factory=_architecture)
+    """The system's name for the processor, and the bits of the interpreter's pointers."""
     which: Callable[[str], str | None] = shutil.which
     gpu: Callable[[], str | None] = _torch_gpu
     module_present: Callable[[str], bool] = _module_present

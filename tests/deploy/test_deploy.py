@@ -51,13 +51,15 @@ def test_the_unit_is_hardly_exposed(unit: Path) -> None:
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
 def test_scripts_parse_and_stop_at_the_first_error(script: Path) -> None:
     subprocess.run(["bash", "-n", str(script)], check=True)
-    assert "set -euo pipefail" in script.read_text()
+    # torch.sh is read by the others, under their settings.
+    assert script.name == "torch.sh" or "set -euo pipefail" in script.read_text()
 
 
 def test_an_interpreter_that_the_sandbox_hides_is_refused(tmp_path: Path) -> None:
     python = tmp_path / "python3"
     python.write_text(
-        "#!/bin/bash\n[[ $2 == *base_prefix* ]] && echo /root/.pyenv/versions/3.11.7\nexit 0\n"
+        "#!/bin/bash\n[[ $2 == *base_prefix* ]] && echo /root/.pyenv/versions/3.11.7\n"
+        "[[ $2 == *calcsize* ]] && echo x86_64 64\nexit 0\n"
     )
     python.chmod(0o755)
     command = [str(DEPLOY / "install.sh"), "--python", str(python), "--root", str(tmp_path)]

@@ -44,6 +44,7 @@ def bare(root: Path, **changes: object) -> MachineProbes:
         "gpu": lambda: None,
         "module_present": lambda name: False,
         "renderer": lambda: "tiles, torch",
+        "architecture": ("x86_64", 64),
     }
     return MachineProbes(**{**parts, **changes})  # type: ignore[arg-type]
 
@@ -61,6 +62,26 @@ def test_board_name_stands_in_for_a_processor_without_one(machine):
     put(machine.root, "proc/device-tree/model", "Raspberry Pi 5\0")
 
     assert named(machine, "processor").found == "Raspberry Pi 5, 1 cores, aarch64 with NEON"
+
+
+@pytest.mark.parametrize("architecture", [("x86_64", 64), ("aarch64", 64)])
+def test_64_bit_systems_are_supported(machine, architecture):
+    assert named(bare(machine.root, architecture=architecture), "system").ok
+
+
+@pytest.mark.parametrize("architecture", [("armv7l", 32), ("aarch64", 32), ("riscv64", 64)])
+def test_other_systems_are_said_not_to_be(machine, architecture):
+    finding = named(bare(machine.root, architecture=architecture), "system")
+
+    assert finding.found == f"{architecture[0]}, {architecture[1]}-bit"
+    assert "cannot run here" in finding.used_for
+    assert "BlueOS's armv7 image" in finding.advice
+
+
+def test_the_gpu_probe_needs_no_torch(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+
+    assert MachineProbes().gpu() is None
 
 
 @pytest.mark.parametrize(
@@ -209,4 +230,4 @@ def test_table_shows_every_finding_and_its_advice(machine):
 
 
 def test_this_machine_is_examined_without_an_error():
-    assert len(examine()) == 11
+    assert len(examine()) == 12

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
+import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -18,6 +20,7 @@ EXTRAS = ("dev", "oak", "peers", "prior-peers")
 """Everything but ``gpu``, whose gsplat is installed without what it asks for."""
 CUDA_BUILD_OF_TORCH = re.compile(r"nvidia-|cuda-|triton$")
 """What the CUDA build of torch pins itself."""
+CPU_TORCH = "torch-2.13.0+cpu-cp312-cp312-manylinux_2_28_aarch64.whl"
 UV = (sys.executable, "-m", "uv")
 
 pytestmark = pytest.mark.ci
@@ -82,3 +85,41 @@ def test_every_python_and_processor_gets_pinned_wheels(
     found = {(normal(name), version.strip()) for name, version in rows}
     assert ("torch", "2.13.0") in found
     assert {row for row in found - pins() if not CUDA_BUILD_OF_TORCH.match(row[0])} == set()
+
+
+def cpu_pins(folder: Path) -> Path:
+    """constraints.txt as install.sh pins it for a machine without a GPU."""
+    pins_file = folder / "pins.txt"
+    shutil.copy(ROOT / "constraints.txt", pins_file)
+    script = f'source "{ROOT}/deploy/torch.sh"; pin_torch cpu python3 "{pins_file}"'
+    subprocess.run(["bash", "-euc", script], check=True)
+    return pins_file
+
+
+def torch_for_cpu(folder: Path) -> Path:
+    """A folder with the name and metadata of PyTorch's wheel for processors, and nothing in it."""
+    wheels = folder / "wheels"
+    wheels.mkdir()
+    with zipfile.ZipFile(wheels / CPU_TORCH, "w") as wheel:
+        info = "torch-2.13.0+cpu.dist-info"
+        wheel.writestr(
+            f"{info}/METADATA", "Metadata-Version: 2.1\nName: torch\nVersion: 2.13.0+cpu\n"
+        )
+        wheel.writestr(
+            f"{info}/WHEEL", "Wheel-Version: 1.0\nTag: cp312-cp312-manylinux_2_28_aarch64\n"
+        )
+        wheel.writestr(f"{info}/RECORD", "")
+    return wheels
+
+
+@pytest.mark.usefixtures("index")
+def test_an_onboard_install_takes_no_cuda_whatever_the_index_holds(tmp_path: Path) -> None:
+    target = ("--python-version", "3.12", "--python-platform", "aarch64-manylinux_2_28")
+    pinned = ("pyproject.toml", "--only-binary", ":all:", "-c", str(cpu_pins(tmp_path)), *target)
+    without = uv_compile(ROOT, *pinned)
+    assert without.returncode != 0
+    assert "torch==2.13.0+cpu" in without.stderr
+    given = uv_compile(ROOT, *pinned, "--find-links", str(torch_for_cpu(tmp_path)))
+    assert given.returncode == 0, given.stderr
+    assert "torch==2.13.0+cpu" in given.stdout
+    assert not [row for row in given.stdout.splitlines() if CUDA_BUILD_OF_TORCH.match(row)]
