@@ -18,9 +18,9 @@ ROOT = Path(__file__).resolve().parent
 NATIVE = Path("aquaflow") / "render" / "native"
 
 
-def load_build_module() -> ModuleType:
-    """native/build.py by its path: the package itself may not be importable yet."""
-    spec = importlib.util.spec_from_file_location("aquaflow_build", ROOT / NATIVE / "build.py")
+def load_module(name: str) -> ModuleType:
+    """A module of native/ by its path: the package itself may not be importable yet."""
+    spec = importlib.util.spec_from_file_location(f"aquaflow_{name}", ROOT / NATIVE / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -28,7 +28,8 @@ def load_build_module() -> ModuleType:
     return module
 
 
-native = load_build_module()
+native = load_module("build")
+wheel_platform = load_module("wheel_platform")
 
 
 def kernel_isas() -> tuple[str, ...]:
@@ -60,7 +61,13 @@ class PlatformWheel(bdist_wheel):
 
     def get_tag(self) -> tuple[str, str, str]:
         _, _, platform = super().get_tag()
-        return "py3", "none", platform
+        compiler = native.find_compiler()
+        if self.root_is_pure or self.plat_name_supplied or compiler is None:
+            return "py3", "none", platform
+        build_lib = Path(self.get_finalized_command("build_py").build_lib)
+        libraries = sorted((build_lib / NATIVE).glob("*.so"))
+        machine = native.target_machine(compiler)
+        return "py3", "none", wheel_platform.platform_tag(machine, libraries)
 
 
 class DistributionWithKernels(Distribution):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from aquaflow.render.native import build as native
 
 ROOT = Path(__file__).resolve().parents[2]
 PARTS = ("pyproject.toml", "setup.py", "README.md", "LICENSE", "aquaflow", "drivers", "sim_drivers")
+CROSS_COMPILER = "aarch64-linux-gnu-g++"
 NO_COMPILER = {"PATH": "/nonexistent", "CXX": "/nonexistent/g++"}
 
 SHOW_RENDERER = """
@@ -85,6 +87,17 @@ def libraries(wheel: Path) -> set[str]:
         return {Path(name).name for name in archive.namelist() if name.endswith(".so")}
 
 
+def audited_platform(wheel: Path) -> str:
+    """The tag that auditwheel finds by the libraries' symbols, independently of ``setup.py``."""
+    audit = [sys.executable, "-m", "auditwheel", "show", str(wheel)]
+    done = subprocess.run(audit, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    said = " ".join(done.stdout.split())
+    found = re.search(r'following platform tag: "(\w+)"', said)
+    assert found is not None, said
+    return found[1]
+
+
 def renderer_of(wheel: Path, folder: Path) -> list[str]:
     """What an installed wheel renders with where there is no compiler."""
     installed = folder / "installed"
@@ -109,11 +122,22 @@ def test_wheel_holds_every_variant_and_is_installed_without_a_compiler(tmp_path:
     wheel, _ = build_wheel(tmp_path)
     _, python, abi, platform = wheel.stem.rsplit("-", 3)
     assert (python, abi) == ("py3", "none")
-    assert platform != "any"
+    assert re.fullmatch(rf"manylinux_2_\d+_{os.uname().machine}", platform)
+    assert platform == audited_platform(wheel)
     assert libraries(wheel) == {f"libaquaflow_{isa}.so" for isa in native.target_isas(compiler)}
     renderer, path = renderer_of(wheel, tmp_path)
     assert renderer == "cpu 0"
     assert Path(path).is_relative_to(tmp_path / "installed")
+
+
+def test_a_cross_built_wheel_is_tagged_with_the_target(tmp_path: Path) -> None:
+    if shutil.which(CROSS_COMPILER) is None:
+        pytest.skip(f"no {CROSS_COMPILER}: no wheel is built for another processor here")
+    wheel, _ = build_wheel(tmp_path, CXX=CROSS_COMPILER)
+    platform = wheel.stem.rsplit("-", 1)[1]
+    assert re.fullmatch(r"manylinux_2_\d+_aarch64", platform)
+    assert platform == audited_platform(wheel)
+    assert libraries(wheel) == {"libaquaflow_neon.so"}
 
 
 def test_without_a_compiler_the_wheel_fits_every_machine_and_torch_renders(tmp_path: Path) -> None:

@@ -88,8 +88,8 @@ class BuildError(RuntimeError):
     """The kernels cannot be compiled; the message is one sentence."""
 
 
-def target_isas(compiler: list[str]) -> tuple[str, ...]:
-    """Variants of the architecture that ``compiler`` builds for, fastest first.
+def target_machine(compiler: list[str]) -> str:
+    """Architecture that ``compiler`` builds for, as in x86_64 or aarch64.
 
     That is the machine's own unless it is a cross compiler such as ``aarch64-linux-gnu-g++``.
     """
@@ -97,7 +97,12 @@ def target_isas(compiler: list[str]) -> tuple[str, ...]:
         [*compiler, "-dumpmachine"], capture_output=True, text=True, errors="replace", check=False
     )
     triplet = asked.stdout.strip() if asked.returncode == 0 else platform.machine()
-    return ISAS.get(triplet.partition("-")[0].lower(), ())
+    return triplet.partition("-")[0].lower()
+
+
+def target_isas(compiler: list[str]) -> tuple[str, ...]:
+    """Variants of the architecture that ``compiler`` builds for, fastest first."""
+    return ISAS.get(target_machine(compiler), ())
 
 
 def supported_isas(cpuinfo: Path = Path("/proc/cpuinfo")) -> tuple[str, ...]:
