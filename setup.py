@@ -28,6 +28,12 @@ def load_module(name: str) -> ModuleType:
     return module
 
 
+for package in ("drivers", "sim_drivers"):
+    if not (ROOT / "aquaflow" / package / "__init__.py").is_file():
+        raise SystemExit(
+            f"aquaflow/{package} is no link to the folder {package}: this copy of the checkout "
+            "lost its symbolic links; copy it with `cp -a`, `rsync -a` or git, or install a wheel"
+        )
 native = load_module("build")
 wheel_platform = load_module("wheel_platform")
 

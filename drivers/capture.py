@@ -1,4 +1,4 @@
-"""The interface of a live camera's driver to :class:`drivers.live.LiveCamera`: an open device."""
+"""An open device: what a camera's driver gives :class:`aquaflow.drivers.live.LiveCamera`."""
 
 from __future__ import annotations
 

@@ -18,8 +18,8 @@ SERIAL_PORTS = ("ttyUSB*", "ttyACM*", "ttyAMA*", "ttyTHS*")
 
 def v4l2_cameras(root: Path = Path("/")) -> list[FoundDevice]:
     """Cameras of the kernel, one for each piece of hardware."""
-    from drivers.v4l2.discovery import camera_nodes, modes
-    from drivers.v4l2.system import Kernel
+    from aquaflow.drivers.v4l2.discovery import camera_nodes, modes
+    from aquaflow.drivers.v4l2.system import Kernel
 
     kernel = Kernel()
     found = {}
@@ -36,7 +36,7 @@ def oak_cameras(root: Path = Path("/")) -> list[FoundDevice]:
         count = len(_usb_devices(root, LUXONIS_USB_VENDOR))
         detail = "run `pip install 'aquaflow[oak]'` to use it"
         return [FoundDevice("oak", "?", "OAK", detail, {"kind": "oak"})] * count
-    from drivers.oak.dai_backend import depthai
+    from aquaflow.drivers.oak.dai_backend import depthai
 
     return [
         FoundDevice(

@@ -1,7 +1,7 @@
 """A live camera as a CameraSource: its thread, its state, and its reconnection.
 
-A driver brings a function that opens its device (:mod:`drivers.capture`); all else is here and
-the same for every kind of camera.
+A driver brings a function that opens its device (:mod:`aquaflow.drivers.capture`); all else is here
+and the same for every kind of camera.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from dataclasses import dataclass
 from enum import Enum
 
 from aquaflow.config.cameras import LiveCameraConfig
+from aquaflow.drivers.capture import Capture, OpenCapture, RawPicture, UnusablePictureError
+from aquaflow.drivers.exposure_clock import ExposureClock
+from aquaflow.drivers.sequence import SequenceGaps
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import guess_camera, load_camera
 from aquaflow.messages import CameraModel, Dropped, Frame
 from aquaflow.sources import is_asked
 from aquaflow.sources.newest import Newest
-from drivers.capture import Capture, OpenCapture, RawPicture, UnusablePictureError
-from drivers.exposure_clock import ExposureClock
-from drivers.sequence import SequenceGaps
 
 READ_S = 0.2
 """Longest wait for a picture before the thread checks whether it shall end."""

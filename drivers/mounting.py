@@ -6,6 +6,8 @@ import math
 from dataclasses import replace
 
 from aquaflow.config.telemetry import MountingConfig
+from aquaflow.drivers.fixes import moved
+from aquaflow.drivers.rotation import Vector, cross, from_euler, inverse, product, rotate
 from aquaflow.messages import (
     Acceleration,
     Altitude,
@@ -16,8 +18,6 @@ from aquaflow.messages import (
     TelemetrySample,
     Velocity,
 )
-from drivers.fixes import moved
-from drivers.rotation import Vector, cross, from_euler, inverse, product, rotate
 
 STATE_LIFE_NS = 500_000_000
 """An attitude or a rate older than this is not used: an ROV turns at up to 90 deg/s."""

@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.cameras import StreamConfig
+from aquaflow.drivers.capture import RawPicture, UnusablePictureError
+from aquaflow.drivers.live import LiveCamera
 from aquaflow.messages import CameraModel
-from drivers.capture import RawPicture, UnusablePictureError
-from drivers.live import LiveCamera
 
 # OpenCV reads this once, when it first meets a video; -8 is FFmpeg's AV_LOG_QUIET.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")

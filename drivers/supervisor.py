@@ -8,10 +8,10 @@ import time
 from collections.abc import Callable
 from typing import Protocol, TypeAlias, runtime_checkable
 
+from aquaflow.drivers.link import ByteLink, LinkCounters, LinkDecoder, LinkLostError
+from aquaflow.drivers.transport import OpenLink
 from aquaflow.messages import TelemetrySample
 from aquaflow.sources import RawTap
-from drivers.link import ByteLink, LinkCounters, LinkDecoder, LinkLostError
-from drivers.transport import OpenLink
 
 log = logging.getLogger(__name__)
 

@@ -10,15 +10,15 @@ from typing import NamedTuple
 
 from aquaflow.clocks.device import ClockReport, Learned
 from aquaflow.config.telemetry import AnyDevice, TelemetryConfig
+from aquaflow.drivers.link import LinkCounters
+from aquaflow.drivers.mounting import BodyFrame, Mounting
+from aquaflow.drivers.protocol.packets import PacketDecoder
+from aquaflow.drivers.supervisor import Deliver, Supervisor
+from aquaflow.drivers.transport import OpenLink, opener
 from aquaflow.messages import TelemetrySample
 from aquaflow.sources import RawTap
 from aquaflow.sources.newest import Newest
 from aquaflow.sources.outbound import AcceptsMessages, OutboundMessage
-from drivers.link import LinkCounters
-from drivers.mounting import BodyFrame, Mounting
-from drivers.protocol.packets import PacketDecoder
-from drivers.supervisor import Deliver, Supervisor
-from drivers.transport import OpenLink, opener
 
 log = logging.getLogger(__name__)
 
@@ -35,13 +35,13 @@ class _QueuedSample(NamedTuple):
 
 
 DECODERS = {
-    "mavlink": "drivers.protocol.mavlink:MavlinkDecoder",
-    "nmea0183": "drivers.protocol.nmea:NmeaDecoder",
-    "waterlinked_serial": "drivers.protocol.waterlinked_serial:WaterLinkedSerialDecoder",
-    "waterlinked_json": "drivers.protocol.waterlinked_json:WaterLinkedJsonDecoder",
-    "pd0": "drivers.protocol.pd0:Pd0Decoder",
-    "nmea2000": "drivers.protocol.nmea2000:Nmea2000Decoder",
-    "dbc": "drivers.protocol.dbc:DbcDecoder",
+    "mavlink": "aquaflow.drivers.protocol.mavlink:MavlinkDecoder",
+    "nmea0183": "aquaflow.drivers.protocol.nmea:NmeaDecoder",
+    "waterlinked_serial": "aquaflow.drivers.protocol.waterlinked_serial:WaterLinkedSerialDecoder",
+    "waterlinked_json": "aquaflow.drivers.protocol.waterlinked_json:WaterLinkedJsonDecoder",
+    "pd0": "aquaflow.drivers.protocol.pd0:Pd0Decoder",
+    "nmea2000": "aquaflow.drivers.protocol.nmea2000:Nmea2000Decoder",
+    "dbc": "aquaflow.drivers.protocol.dbc:DbcDecoder",
 }
 """By the device's ``kind``; imported when a device needs it."""
 

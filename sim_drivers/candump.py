@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 from aquaflow.config.link import CanConfig
 from aquaflow.config.telemetry import AnyDevice, Nmea2000Config
-from drivers.transport.can import EXTENDED, RECORD
-from sim_drivers.telemetry_log import ByteLog, LogTime, Read
+from aquaflow.drivers.transport.can import EXTENDED, RECORD
+from aquaflow.sim_drivers.telemetry_log import ByteLog, LogTime, Read
 
 LINE = re.compile(r"\((\d+)\.(\d{1,9})\)\s+(\S+)\s+([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#([0-9A-Fa-f]*)")
 """As candump -L writes it: seconds and their fraction, bus, identifier, data."""

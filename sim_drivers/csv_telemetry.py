@@ -1,5 +1,5 @@
 """Tables of telemetry: what ``aquaflow synth`` writes, ``rostopic echo -p``, GoPro extracts, and
-plain tables of a survey (:mod:`sim_drivers.survey_table`)."""
+plain tables of a survey (:mod:`aquaflow.sim_drivers.survey_table`)."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from aquaflow.messages import (
     TelemetrySample,
     Velocity,
 )
+from aquaflow.sim_drivers import survey_table
+from aquaflow.sim_drivers.telemetry_log import LoggedUtc, LogTime, TelemetryLog
 from aquaflow.synthetic.telemetry import HEADER, read_telemetry
-from sim_drivers import survey_table
-from sim_drivers.telemetry_log import LoggedUtc, LogTime, TelemetryLog
 
 Line: TypeAlias = dict[str, str]
 Convert: TypeAlias = Callable[[Line, int, int, str], list[TelemetrySample]]

@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from aquaflow.drivers.plausible import plausible
+from aquaflow.drivers.rotation import from_euler
 from aquaflow.messages import (
     Acceleration,
     Altitude,
@@ -20,10 +22,8 @@ from aquaflow.messages import (
     Depth,
     TelemetrySample,
 )
-from drivers.plausible import plausible
-from drivers.rotation import from_euler
-from sim_drivers.dataflash_gnss import GnssRecords
-from sim_drivers.telemetry_log import TelemetryLog
+from aquaflow.sim_drivers.dataflash_gnss import GnssRecords
+from aquaflow.sim_drivers.telemetry_log import TelemetryLog
 
 HEAD = b"\xa3\x95"
 """First bytes of a record; the third is its type."""

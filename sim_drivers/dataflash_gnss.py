@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from aquaflow.drivers.fixes import sigma_of
 from aquaflow.messages import Position, TelemetrySample, UtcTime
-from drivers.fixes import sigma_of
 
 FIRST = 0
 """The receiver that is used."""

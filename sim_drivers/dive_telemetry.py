@@ -8,7 +8,7 @@ from pathlib import Path
 
 from aquaflow.messages import TelemetrySample
 from aquaflow.recording.telemetry_lines import LONGEST_LINE, TelemetryLines, of_line
-from sim_drivers.telemetry_log import TelemetryLog
+from aquaflow.sim_drivers.telemetry_log import TelemetryLog
 
 LONGEST_LATENCY_NS = 60 * 1_000_000_000
 """From measurement to arrival; more is another clock: of a recording that was played back live."""

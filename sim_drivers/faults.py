@@ -13,8 +13,8 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.link import MAX_READ_BYTES, ByteLink, LinkLostError
-from drivers.transport import OpenLink
+from aquaflow.drivers.link import MAX_READ_BYTES, ByteLink, LinkLostError
+from aquaflow.drivers.transport import OpenLink
 
 OVERTAKEN_S = 0.05
 """A reordered read comes by so much later; at 50 Hz two others pass it."""

@@ -12,7 +12,7 @@ import numpy as np
 from aquaflow.errors import InputError, printable
 from aquaflow.geometry.camera import guess_camera, load_camera
 from aquaflow.messages import CameraModel, Dropped, Frame
-from sim_drivers.picture import (
+from aquaflow.sim_drivers.picture import (
     EXTENSIONS,
     UnreadablePictureError,
     decode_picture,

@@ -24,6 +24,7 @@ from aquaflow.config.telemetry import AnyDevice, MountingConfig
 from aquaflow.errors import ConfigError, InputError
 from aquaflow.errors.plain_yaml import read_mapping
 from aquaflow.messages import Dropped, Frame, TelemetrySample
+from aquaflow.sim_drivers.telemetry_log import ByteLog
 from aquaflow.sources import (
     RawTap,
     RecordedCamera,
@@ -31,7 +32,6 @@ from aquaflow.sources import (
     open_recorded_telemetry,
     open_recording,
 )
-from sim_drivers.telemetry_log import ByteLog
 
 MANIFEST = "replay.yaml"
 """File that makes a folder a recording of several files."""

@@ -20,12 +20,12 @@ from aquaflow.geometry.camera import (
     has_unmeasured_port,
 )
 from aquaflow.messages import Dropped, EncodedPicture, Frame
+from aquaflow.sim_drivers.h264 import decode_units, is_key
+from aquaflow.sim_drivers.mcap_messages import McapMessage, McapMessages, mcap_files
+from aquaflow.sim_drivers.mcap_payload import Payloads, UnreadablePayloadError
+from aquaflow.sim_drivers.picture import UnreadablePictureError, received_as
+from aquaflow.sim_drivers.picture_message import compressed_picture, raw_picture
 from aquaflow.sources import is_asked
-from sim_drivers.h264 import decode_units, is_key
-from sim_drivers.mcap_messages import McapMessage, McapMessages, mcap_files
-from sim_drivers.mcap_payload import Payloads, UnreadablePayloadError
-from sim_drivers.picture import UnreadablePictureError, received_as
-from sim_drivers.picture_message import compressed_picture, raw_picture
 
 COMPRESSED, RAW, VIDEO = "CompressedImage", "RawImage", "CompressedVideo"
 """Foxglove's messages."""

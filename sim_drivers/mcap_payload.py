@@ -9,7 +9,7 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-from sim_drivers.mcap_messages import McapMessage
+from aquaflow.sim_drivers.mcap_messages import McapMessage
 
 if TYPE_CHECKING:
     from mcap.records import Schema

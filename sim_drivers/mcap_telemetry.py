@@ -10,9 +10,9 @@ from aquaflow.config.telemetry import AnyDevice
 from aquaflow.errors import InputError
 from aquaflow.messages import KINDS, TelemetrySample
 from aquaflow.recording.telemetry_json import sample_from_json
-from sim_drivers.mcap_camera import McapCamera
-from sim_drivers.mcap_messages import McapMessages, mcap_files
-from sim_drivers.telemetry_log import DecodedReads, Read
+from aquaflow.sim_drivers.mcap_camera import McapCamera
+from aquaflow.sim_drivers.mcap_messages import McapMessages, mcap_files
+from aquaflow.sim_drivers.telemetry_log import DecodedReads, Read
 
 TELEMETRY = "/telemetry/"
 """The recorder writes samples to topics below this one."""

@@ -6,7 +6,7 @@ import threading
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
-from sim_drivers.camera_feed import CameraFeed, Shot
+from aquaflow.sim_drivers.camera_feed import CameraFeed, Shot
 
 BOUNDARY = "picture"
 """Separates the pictures of the stream; any word will do."""

@@ -12,7 +12,7 @@ from datetime import datetime, timezone
 
 from aquaflow.config.link import SerialConfig
 from aquaflow.config.telemetry import AnyDevice, NmeaConfig
-from sim_drivers.telemetry_log import ByteLog, LogTime, Read
+from aquaflow.sim_drivers.telemetry_log import ByteLog, LogTime, Read
 
 SENTENCE = re.compile(rb"[$!][^$!\r\n]*")
 """A sentence on a line, whatever stands before it."""

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.messages import CameraModel
-from sim_drivers.camera_feed import CameraFeed, Shot
+from aquaflow.sim_drivers.camera_feed import CameraFeed, Shot
 
 DEVICE_EPOCH_NS = 1_000_000_000_000
 """The device's clock started at another moment than the host's."""
@@ -29,7 +29,7 @@ GRAVITY_M_S2 = 9.80665
 
 @dataclass
 class ReplayPicture:
-    """See drivers.oak.backend.OakPicture."""
+    """See aquaflow.drivers.oak.backend.OakPicture."""
 
     shot: Shot
     exposed_ns: int
@@ -46,7 +46,7 @@ class ReplayPicture:
 
 @dataclass
 class ReplayImuReading:
-    """See drivers.oak.backend.ImuReading."""
+    """See aquaflow.drivers.oak.backend.ImuReading."""
 
     t_ns: int
     acceleration_m_s2: tuple[float, float, float]
@@ -80,7 +80,7 @@ class ReplayOak:
 
 
 class ReplayBackend:
-    """See drivers.oak.backend.OakBackend. The vehicle stands level and still."""
+    """See aquaflow.drivers.oak.backend.OakBackend. The vehicle stands level and still."""
 
     def __init__(self, device: ReplayOak, imu_rate_hz: int) -> None:
         self._device = device

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from sim_drivers.picture import (
+from aquaflow.sim_drivers.picture import (
     TWELVE_BITS,
     UnreadablePictureError,
     decode_picture,

@@ -12,10 +12,9 @@ import numpy.typing as npt
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import CameraModel, DistortionModel, guess_camera
 from aquaflow.messages import Dropped, EncodedPicture, Frame
-from aquaflow.sources import is_asked
-from sim_drivers.picture import UnreadablePictureError, received_as
-from sim_drivers.picture_message import compressed_picture, raw_picture
-from sim_drivers.rosbag import (
+from aquaflow.sim_drivers.picture import UnreadablePictureError, received_as
+from aquaflow.sim_drivers.picture_message import compressed_picture, raw_picture
+from aquaflow.sim_drivers.rosbag import (
     COMPRESSED,
     PICTURES,
     decoded,
@@ -26,6 +25,7 @@ from sim_drivers.rosbag import (
     picture_connections,
     stamp_of,
 )
+from aquaflow.sources import is_asked
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader

@@ -10,6 +10,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from aquaflow.drivers.fixes import sigma_of
+from aquaflow.drivers.plausible import plausible
+from aquaflow.drivers.rotation import Vector, normalised, product
 from aquaflow.messages import (
     Acceleration,
     Altitude,
@@ -20,11 +23,8 @@ from aquaflow.messages import (
     TelemetrySample,
     Velocity,
 )
-from drivers.fixes import sigma_of
-from drivers.plausible import plausible
-from drivers.rotation import Vector, normalised, product
-from sim_drivers.rosbag import decoded, is_bag, messages_in, opened, origin_of, stamp_of
-from sim_drivers.telemetry_log import LoggedUtc
+from aquaflow.sim_drivers.rosbag import decoded, is_bag, messages_in, opened, origin_of, stamp_of
+from aquaflow.sim_drivers.telemetry_log import LoggedUtc
 
 Convert: TypeAlias = Callable[[Any, int, int, str], list[TelemetrySample]]
 

@@ -25,11 +25,11 @@ from pathlib import Path
 from statistics import median
 from typing import NamedTuple
 
+from aquaflow.drivers.fixes import sigma_of
+from aquaflow.drivers.plausible import plausible
+from aquaflow.drivers.rotation import from_euler
 from aquaflow.messages import Altitude, Attitude, Depth, Position, TelemetrySample, UtcTime
-from drivers.fixes import sigma_of
-from drivers.plausible import plausible
-from drivers.rotation import from_euler
-from sim_drivers.telemetry_log import UTC_EVERY_NS, TelemetryLog
+from aquaflow.sim_drivers.telemetry_log import UTC_EVERY_NS, TelemetryLog
 
 TITLE = re.compile(r"^\s*Title: (QGroundControl|Cockpit) Subtitle Telemetry file")
 """Line of the header by which both are recognised."""

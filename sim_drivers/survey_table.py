@@ -10,10 +10,10 @@ import math
 from datetime import datetime, timezone
 from typing import TypeAlias
 
+from aquaflow.drivers.fixes import sigma_of
+from aquaflow.drivers.plausible import plausible
+from aquaflow.drivers.rotation import from_euler
 from aquaflow.messages import Altitude, Attitude, Depth, Position, TelemetrySample
-from drivers.fixes import sigma_of
-from drivers.plausible import plausible
-from drivers.rotation import from_euler
 
 SECONDS, UTC = "t_s", "utc"
 """Columns with a row's time; a table has one of them."""

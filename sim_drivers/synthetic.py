@@ -7,7 +7,7 @@ from pathlib import Path
 from aquaflow.config.telemetry import MountingConfig
 from aquaflow.errors import AquaFlowError
 from aquaflow.errors.plain_yaml import read_mapping
-from sim_drivers.images import SUBFOLDER, ImageFolder
+from aquaflow.sim_drivers.images import SUBFOLDER, ImageFolder
 
 MARK = "synth.yaml"
 """Only ``aquaflow synth`` writes this file."""

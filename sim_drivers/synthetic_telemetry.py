@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from aquaflow.messages import TelemetrySample
+from aquaflow.sim_drivers.synthetic import SyntheticDive
 from aquaflow.synthetic.telemetry import read_telemetry
-from sim_drivers.synthetic import SyntheticDive
 
 TELEMETRY = "telemetry.csv"
 """File of a synthetic dive."""

@@ -10,12 +10,12 @@ from typing import ClassVar, NamedTuple
 
 from aquaflow.clocks.wall import JUMP_NS
 from aquaflow.config.telemetry import AnyDevice
+from aquaflow.drivers.link import LinkCounters
+from aquaflow.drivers.mounting import BodyFrame, Mounting
+from aquaflow.drivers.plausible import plausible
+from aquaflow.drivers.telemetry import decoder_of
 from aquaflow.messages import TelemetrySample, UtcTime
 from aquaflow.sources import RawTap
-from drivers.link import LinkCounters
-from drivers.mounting import BodyFrame, Mounting
-from drivers.plausible import plausible
-from drivers.telemetry import decoder_of
 
 LONGEST_PAUSE_NS = 3600 * 1_000_000_000
 """Logs carry wall clock times; a longer step, or one back, is the clock being set."""

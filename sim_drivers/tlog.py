@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from aquaflow.config.link import SerialConfig
 from aquaflow.config.telemetry import AnyDevice, MavlinkConfig
-from sim_drivers.telemetry_log import LONGEST_PAUSE_NS, ByteLog, LogTime, Read
+from aquaflow.sim_drivers.telemetry_log import LONGEST_PAUSE_NS, ByteLog, LogTime, Read
 
 STAMP_BYTES = 8
 """Microseconds since 1970 before every packet, big-endian."""

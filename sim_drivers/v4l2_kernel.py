@@ -1,4 +1,4 @@
-"""A kernel with one V4L2 camera, as :class:`drivers.v4l2.system.KernelInterface` sees it.
+"""A kernel with one V4L2 camera, as :class:`aquaflow.drivers.v4l2.system.KernelInterface` sees it.
 
 It reads and writes the bytes of the ioctls' structures by the offsets of linux/videodev2.h, knows
 nothing of the driver, and refuses what the real one refuses: pictures before STREAMON, a buffer
@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sim_drivers.camera_feed import CameraFeed
-from sim_drivers.v4l2_buffers import PAGE_BITS, Buffers, refused
-from sim_drivers.v4l2_pixels import PixelFormat, encoded
+from aquaflow.sim_drivers.camera_feed import CameraFeed
+from aquaflow.sim_drivers.v4l2_buffers import PAGE_BITS, Buffers, refused
+from aquaflow.sim_drivers.v4l2_pixels import PixelFormat, encoded
 
 QUERYCAP, ENUM_FMT, S_FMT, REQBUFS, QUERYBUF, QBUF, DQBUF = 0, 2, 5, 8, 9, 15, 17
 STREAMON, STREAMOFF, S_PARM, G_CTRL, S_CTRL, QUERYCTRL, ENUM_FRAMESIZES = 18, 19, 22, 27, 28, 36, 74

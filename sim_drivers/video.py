@@ -13,8 +13,8 @@ import numpy as np
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import ASPECT_TOLERANCE, guess_camera, load_camera
 from aquaflow.messages import CameraModel, Dropped, Frame
+from aquaflow.sim_drivers.images import CALIBRATION, DEFAULT_FPS, NS_PER_S
 from aquaflow.sources import is_asked
-from sim_drivers.images import CALIBRATION, DEFAULT_FPS, NS_PER_S
 
 # OpenCV reads this once, when it first meets a video; -8 is FFmpeg's AV_LOG_QUIET.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")

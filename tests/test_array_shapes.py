@@ -52,6 +52,7 @@ def modules() -> dict[str, Module]:
     for path in chain.from_iterable((ROOT / package).rglob("*.py") for package in PACKAGES):
         parts = path.relative_to(ROOT).with_suffix("").parts
         text = path.read_text(encoding="utf-8")
+        parts = parts if parts[0] == "aquaflow" else ("aquaflow", *parts)  # linked into it
         name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
         found[name] = Module(path, text.splitlines(), ast.parse(text))
     return found

@@ -32,6 +32,8 @@ LOOSE_MODULES = {
 
 HEIGHT = {family: -level for level, floor in enumerate(FLOORS) for family in floor}
 OWN = ("aquaflow", "drivers", "sim_drivers")
+LINKED = ("drivers", "sim_drivers")
+"""At the repository's top, and linked into ``aquaflow``, under which they are imported."""
 PACKAGE = ("aquaflow",)
 """The package's own ``__init__``: it holds the version, which every floor may read."""
 Module = tuple[str, ...]
@@ -40,6 +42,8 @@ Graph = dict[Module, set[Module]]
 
 def dotted(path: Path) -> Module:
     parts = path.relative_to(ROOT).with_suffix("").parts
+    if parts[0] in LINKED:
+        parts = ("aquaflow", *parts)
     return parts[:-1] if parts[-1] == "__init__" else parts
 
 
@@ -48,7 +52,7 @@ TESTS = sorted((ROOT / "tests").rglob("*.py"))
 
 
 def family(module: Module) -> str:
-    """The folder or module right under ``aquaflow``, or the driver package."""
+    """The folder or module right under ``aquaflow``."""
     return module[1] if module[0] == "aquaflow" and len(module) > 1 else module[0]
 
 
@@ -86,7 +90,7 @@ def violations(source: str, path: Path) -> list[str]:
             continue
         if theirs not in HEIGHT:
             problems.append(f"{mine} imports {'.'.join(module)}, which has no floor")
-        elif theirs in {"drivers", "sim_drivers"} and mine not in {"cli", "sim_drivers"}:
+        elif theirs in LINKED and mine not in {"cli", "sim_drivers"}:
             problems.append(f"{mine} imports {'.'.join(module)}; only cli may import drivers")
         elif HEIGHT[theirs] >= HEIGHT[mine]:
             problems.append(f"{mine} imports {'.'.join(module)}, which is not on a floor below it")
@@ -156,8 +160,13 @@ def test_every_module_is_looked_at() -> None:
     assert {
         ("aquaflow", "slam"),
         ("aquaflow", "tracking", "tracker"),
-        ("sim_drivers", "images"),
+        ("aquaflow", "sim_drivers", "images"),
     } <= set(FILES)
+
+
+@pytest.mark.parametrize("package", LINKED)
+def test_drivers_are_imported_from_the_repositorys_top_by_way_of_the_package(package: str) -> None:
+    assert (ROOT / "aquaflow" / package).samefile(ROOT / package)
 
 
 def test_no_module_imports_itself_by_way_of_others() -> None:
@@ -192,8 +201,12 @@ def test_no_test_imports_another_test(path: Path) -> None:
         ("aquaflow/tracking/x.py", "import aquaflow.mapping.mapper", "not on a floor below"),
         ("aquaflow/slam.py", "def f():\n    from aquaflow import export", "not on a floor below"),
         ("aquaflow/geometry/x.py", "from ..prior import flow", "not on a floor below"),
-        ("aquaflow/dive/replay.py", "from drivers.can import Bus", "only cli may import drivers"),
-        ("drivers/x.py", "import sim_drivers.video", "only cli may import drivers"),
+        (
+            "aquaflow/dive/replay.py",
+            "from aquaflow.drivers.can import Bus",
+            "only cli may import drivers",
+        ),
+        ("drivers/x.py", "import aquaflow.sim_drivers.video", "only cli may import drivers"),
         ("sim_drivers/x.py", "import aquaflow.slam", "not on a floor below"),
         ("aquaflow/novelty.py", "", "novelty has no floor"),
         ("aquaflow/slam.py", "import aquaflow.novelty", "aquaflow.novelty, which has no floor"),
@@ -207,8 +220,8 @@ def test_an_import_from_above_or_the_side_is_found(path: str, source: str, probl
 @pytest.mark.parametrize(
     ("path", "source"),
     [
-        ("aquaflow/cli/__init__.py", "import drivers.can, sim_drivers.video"),
-        ("sim_drivers/x.py", "import drivers.can"),
+        ("aquaflow/cli/__init__.py", "import aquaflow.drivers.can, aquaflow.sim_drivers.video"),
+        ("sim_drivers/x.py", "import aquaflow.drivers.can"),
         ("aquaflow/tracking/tracker.py", "from . import frames\nfrom .frames import Tracked"),
         ("aquaflow/keyframes/store.py", "from aquaflow.prior.contract import Encoding"),
         ("aquaflow/signals.py", "from aquaflow import __version__\nimport numpy, re"),

@@ -21,7 +21,7 @@ from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation
 
 ROOT = Path(__file__).resolve().parents[1]
-OWN = tuple(str(ROOT / name) + "/" for name in ("aquaflow", "drivers", "sim_drivers"))
+OWN = f"{ROOT}/aquaflow/"
 
 
 def called_in_one_frame(recording: Path, number: int) -> dict[str, list[str]]:

@@ -47,9 +47,9 @@ DEFECTS = (
 ATTEMPTS = 2
 """Of a step at a dive's end: what made it fail may have passed, and nothing waits for it."""
 
-OWN_PACKAGES = ("aquaflow", "drivers", "sim_drivers")
+OWN_PACKAGE = "aquaflow"
 ROOT = Path(__file__).resolve().parents[2]
-"""Folders of this repository, and where they are; code elsewhere is another library's."""
+"""Our package, and the folder that holds it; code elsewhere is another library's."""
 
 
 T = TypeVar("T")
@@ -237,7 +237,7 @@ def _place_of(error: Exception) -> tuple[str, bool]:
     while step is not None:
         code = step.tb_frame.f_code
         path = Path(code.co_filename)
-        innermost = path.is_relative_to(ROOT) and path.relative_to(ROOT).parts[0] in OWN_PACKAGES
+        innermost = path.is_relative_to(ROOT) and path.relative_to(ROOT).parts[0] == OWN_PACKAGE
         if innermost:
             place = f"{path.relative_to(ROOT).as_posix()}: {code.co_name}"
         step = step.tb_next

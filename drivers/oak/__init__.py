@@ -1,5 +1,5 @@
 """Luxonis OAK cameras; the vendor's library is used through a small protocol."""
 
-from drivers.oak.camera import OakCamera
+from aquaflow.drivers.oak.camera import OakCamera
 
 __all__ = ["OakCamera"]

@@ -1,4 +1,4 @@
-"""The functions of an OAK camera that :class:`drivers.oak.camera.OakCamera` needs.
+"""The functions of an OAK camera that :class:`aquaflow.drivers.oak.camera.OakCamera` needs.
 
 ``DaiBackend`` speaks to the device; the replay backend in sim_drivers needs none.
 """

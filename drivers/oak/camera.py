@@ -11,14 +11,14 @@ import numpy.typing as npt
 
 from aquaflow.config.cameras import OakConfig
 from aquaflow.config.telemetry import MountingConfig
+from aquaflow.drivers.capture import RawPicture, UnusablePictureError
+from aquaflow.drivers.live import LiveCamera
+from aquaflow.drivers.mounting import BodyFrame, Mounting
+from aquaflow.drivers.oak.backend import ImuReading, OakBackend, OakPicture, OpenBackend
+from aquaflow.drivers.oak.dai_backend import DaiBackend
 from aquaflow.geometry.similarity import BODY_FROM_CAMERA
 from aquaflow.messages import Acceleration, AngularRate, CameraModel, TelemetrySample
 from aquaflow.sources.newest import Newest
-from drivers.capture import RawPicture, UnusablePictureError
-from drivers.live import LiveCamera
-from drivers.mounting import BodyFrame, Mounting
-from drivers.oak.backend import ImuReading, OakBackend, OakPicture, OpenBackend
-from drivers.oak.dai_backend import DaiBackend
 
 MAX_SAMPLES = 8_000
 """IMU samples kept until fetched, then the oldest go: 10 s of both sensors at 400 Hz."""

@@ -15,10 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.cameras import OakConfig
+from aquaflow.drivers.extra import load
+from aquaflow.drivers.oak.calibration import camera_model, imu_rotation
+from aquaflow.drivers.oak.messages import DaiImuReading, DaiPicture, imu_readings, picture_of
 from aquaflow.messages import CameraModel
-from drivers.extra import load
-from drivers.oak.calibration import camera_model, imu_rotation
-from drivers.oak.messages import DaiImuReading, DaiPicture, imu_readings, picture_of
 
 SEARCH_MS = 500
 """Longest search; the library's own 10 s are long if only the cable is missing."""

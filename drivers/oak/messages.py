@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 @dataclass
 class DaiPicture:
-    """See :class:`drivers.oak.backend.OakPicture`."""
+    """See :class:`aquaflow.drivers.oak.backend.OakPicture`."""
 
     message: Any
     exposed_ns: int
@@ -34,7 +34,7 @@ class DaiPicture:
 
 @dataclass
 class DaiImuReading:
-    """See :class:`drivers.oak.backend.ImuReading`."""
+    """See :class:`aquaflow.drivers.oak.backend.ImuReading`."""
 
     t_ns: int
     acceleration_m_s2: tuple[float, float, float]

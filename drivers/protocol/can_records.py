@@ -1,4 +1,4 @@
-"""CAN frames in a stream of bytes: the records that :mod:`drivers.transport.can` makes.
+"""CAN frames in a stream of bytes: the records that :mod:`aquaflow.drivers.transport.can` makes.
 
 A bus loses whole frames only. The checks are for recordings and for whatever else feeds a decoder.
 """
@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing
-from drivers.transport.can import EXTENDED, RECORD
+from aquaflow.drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing
+from aquaflow.drivers.transport.can import EXTENDED, RECORD
 
 MAX_STANDARD, MAX_EXTENDED = 0x7FF, 0x1FFF_FFFF
 """The largest identifiers of 11 and of 29 bits."""

@@ -9,6 +9,11 @@ from collections.abc import Callable
 from typing import Any
 
 from aquaflow.config.telemetry import DbcConfig, DbcSignal
+from aquaflow.drivers.extra import load
+from aquaflow.drivers.fixes import Fixes, sigma_of
+from aquaflow.drivers.protocol.can_records import CanFraming, frame_of
+from aquaflow.drivers.protocol.packets import PacketDecoder
+from aquaflow.drivers.rotation import Vector, from_euler, normalised
 from aquaflow.errors import ConfigError, reason_of
 from aquaflow.messages import (
     Acceleration,
@@ -20,11 +25,6 @@ from aquaflow.messages import (
     TelemetrySample,
     Velocity,
 )
-from drivers.extra import load
-from drivers.fixes import Fixes, sigma_of
-from drivers.protocol.can_records import CanFraming, frame_of
-from drivers.protocol.packets import PacketDecoder
-from drivers.rotation import Vector, from_euler, normalised
 
 SCALARS: dict[str, Callable[[int, int, str, float], TelemetrySample]] = {
     "depth": Depth,

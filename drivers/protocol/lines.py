@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 
-from drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing
+from aquaflow.drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing
 
 
 class LineFraming(Framing):

@@ -6,14 +6,14 @@ from collections import deque
 from typing import Any
 
 from aquaflow.config.telemetry import MavlinkConfig
+from aquaflow.drivers.device_clock import DeviceClock
+from aquaflow.drivers.extra import load
+from aquaflow.drivers.protocol.mavlink_frames import MavlinkFraming, header_of
+from aquaflow.drivers.protocol.mavlink_outbound import Receiver, message_of
+from aquaflow.drivers.protocol.mavlink_samples import SINCE_1970_US, MavlinkSamples, MessageTime
+from aquaflow.drivers.protocol.packets import PacketDecoder
 from aquaflow.messages import TelemetrySample
 from aquaflow.sources.outbound import OutboundMessage, StatusText
-from drivers.device_clock import DeviceClock
-from drivers.extra import load
-from drivers.protocol.mavlink_frames import MavlinkFraming, header_of
-from drivers.protocol.mavlink_outbound import Receiver, message_of
-from drivers.protocol.mavlink_samples import SINCE_1970_US, MavlinkSamples, MessageTime
-from drivers.protocol.packets import PacketDecoder
 
 DIALECT = "pymavlink.dialects.v20.ardupilotmega"
 """ArduPilot's messages; they include the common ones, which PX4 sends too."""

@@ -10,7 +10,7 @@ import re
 import struct
 from typing import Any, NamedTuple
 
-from drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing
+from aquaflow.drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing
 
 MARK_2 = 0xFD
 MARKS = re.compile(b"[\xfd\xfe]")

@@ -10,6 +10,8 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
 from aquaflow.config.telemetry import MavlinkConfig
+from aquaflow.drivers.fixes import Fixes, sigma_of
+from aquaflow.drivers.rotation import Quaternion, from_euler, inverse, normalised, rotate
 from aquaflow.messages import (
     Acceleration,
     Altitude,
@@ -22,8 +24,6 @@ from aquaflow.messages import (
     UtcTime,
     Velocity,
 )
-from drivers.fixes import Fixes, sigma_of
-from drivers.rotation import Quaternion, from_euler, inverse, normalised, rotate
 
 GRAVITY_M_S2 = 9.80665
 """Standard gravity: the g of MAVLink's milli-g, and what turns pressure into depth."""

@@ -10,11 +10,11 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 from aquaflow.config.telemetry import NmeaConfig
+from aquaflow.drivers.protocol.nmea_gnss import NmeaGnss
+from aquaflow.drivers.protocol.nmea_sentence import framing, number, parse
+from aquaflow.drivers.protocol.packets import PacketDecoder
+from aquaflow.drivers.protocol.partial import PartialMotion
 from aquaflow.messages import Altitude, Depth, TelemetrySample
-from drivers.protocol.nmea_gnss import NmeaGnss
-from drivers.protocol.nmea_sentence import framing, number, parse
-from drivers.protocol.packets import PacketDecoder
-from drivers.protocol.partial import PartialMotion
 
 KNOT_M_S = 1852.0 / 3600.0
 """m/s; a nautical mile of 1852 m in an hour."""

@@ -11,11 +11,11 @@ import struct
 from collections.abc import Callable
 
 from aquaflow.config.telemetry import Nmea2000Config
+from aquaflow.drivers.fixes import Fixes, sigma_of
+from aquaflow.drivers.protocol.can_records import CanFraming, frame_of
+from aquaflow.drivers.protocol.packets import PacketDecoder
+from aquaflow.drivers.protocol.partial import PartialMotion
 from aquaflow.messages import Altitude, TelemetrySample, UtcTime
-from drivers.fixes import Fixes, sigma_of
-from drivers.protocol.can_records import CanFraming, frame_of
-from drivers.protocol.packets import PacketDecoder
-from drivers.protocol.partial import PartialMotion
 
 HEADING, RATE_OF_TURN, ATTITUDE, SPEED, WATER_DEPTH = 127250, 127251, 127257, 128259, 128267
 SYSTEM_TIME, POSITION, DILUTION = 126992, 129025, 129539

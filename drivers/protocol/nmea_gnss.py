@@ -9,9 +9,9 @@ from __future__ import annotations
 from datetime import datetime, timezone
 
 from aquaflow.config.telemetry import NmeaConfig
+from aquaflow.drivers.fixes import Fixes, sigma_of
+from aquaflow.drivers.protocol.nmea_sentence import number
 from aquaflow.messages import TelemetrySample, UtcTime
-from drivers.fixes import Fixes, sigma_of
-from drivers.protocol.nmea_sentence import number
 
 GGA_FIXES = frozenset({1, 2, 3, 4, 5})
 """Qualities of GGA: autonomous, differential, PPS, RTK fixed and float; not: none (0), dead

@@ -1,7 +1,7 @@
 """NMEA 0183 sentences: ``$IIHDT,271.3,T*2C`` and a line end.
 
 Own framing, because a shared line brings half sentences; pynmea2 adds only names to what
-:mod:`drivers.protocol.nmea` reads.
+:mod:`aquaflow.drivers.protocol.nmea` reads.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from functools import reduce
 from operator import xor
 from typing import NamedTuple
 
-from drivers.protocol.lines import LineFraming
+from aquaflow.drivers.protocol.lines import LineFraming
 
 LONGEST = 256
 """Bytes. The standard has 82; proprietary sentences are longer."""

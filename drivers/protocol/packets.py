@@ -10,10 +10,10 @@ import logging
 import struct
 from abc import ABC, abstractmethod
 
+from aquaflow.drivers.device_clock import DeviceClock
+from aquaflow.drivers.link import LinkCounters
+from aquaflow.drivers.plausible import plausible
 from aquaflow.messages import TelemetrySample
-from drivers.device_clock import DeviceClock
-from drivers.link import LinkCounters
-from drivers.plausible import plausible
 
 log = logging.getLogger(__name__)
 
@@ -104,7 +104,7 @@ class PacketReader:
 
 
 class PacketDecoder(ABC):
-    """A decoder of :mod:`drivers.link` with a framing; a subclass decodes the packets."""
+    """A decoder of :mod:`aquaflow.drivers.link` with a framing; a subclass decodes the packets."""
 
     def __init__(self, name: str, framing: Framing) -> None:
         self.name = name

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from aquaflow.config.telemetry import Assumptions
+from aquaflow.drivers.rotation import from_euler
 from aquaflow.messages import AngularRate, Attitude, TelemetrySample, Velocity
-from drivers.rotation import from_euler
 
 TILT_LIFE_NS = 500_000_000
 """Roll and pitch older than this are not used: an ROV rocks within a second."""

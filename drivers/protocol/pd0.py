@@ -10,9 +10,9 @@ import struct
 from datetime import datetime
 
 from aquaflow.config.telemetry import Pd0Config
+from aquaflow.drivers.device_clock import DeviceClock
+from aquaflow.drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing, PacketDecoder
 from aquaflow.messages import Altitude, TelemetrySample, Velocity
-from drivers.device_clock import DeviceClock
-from drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing, PacketDecoder
 
 MARK = b"\x7f\x7f"
 """Header ID and data source ID."""

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 
+from aquaflow.drivers.rotation import from_euler
 from aquaflow.messages import Altitude, Attitude, TelemetrySample, Velocity
-from drivers.rotation import from_euler
 
 NO_BOTTOM_M = -1.0
 """Altitude where the DVL sees no bottom."""

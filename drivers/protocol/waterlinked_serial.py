@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 
 from aquaflow.config.telemetry import WaterLinkedSerialConfig
+from aquaflow.drivers.protocol.lines import LineFraming
+from aquaflow.drivers.protocol.packets import PacketDecoder
+from aquaflow.drivers.protocol.waterlinked import attitude, bottom_track, measured_ns
 from aquaflow.messages import TelemetrySample
-from drivers.protocol.lines import LineFraming
-from drivers.protocol.packets import PacketDecoder
-from drivers.protocol.waterlinked import attitude, bottom_track, measured_ns
 
 LONGEST = 512
 """Bytes; a velocity report with covariance has about 200."""

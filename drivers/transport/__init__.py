@@ -1,4 +1,4 @@
-"""Byte links: serial ports, sockets and CAN buses behind :class:`drivers.link.ByteLink`."""
+"""Serial ports, sockets and CAN buses behind :class:`aquaflow.drivers.link.ByteLink`."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 from aquaflow.config.link import CanConfig, SerialConfig, TcpConfig, UdpConfig
-from drivers.extra import load
-from drivers.link import ByteLink
-from drivers.transport.can import open_can
-from drivers.transport.serial import open_serial
-from drivers.transport.socket import open_tcp, open_udp
+from aquaflow.drivers.extra import load
+from aquaflow.drivers.link import ByteLink
+from aquaflow.drivers.transport.can import open_can
+from aquaflow.drivers.transport.serial import open_serial
+from aquaflow.drivers.transport.socket import open_tcp, open_udp
 
 OpenLink: TypeAlias = Callable[[], ByteLink]
 """Opens a link anew; raises LinkLostError where the device or its peer is not there."""

@@ -7,7 +7,7 @@ import socket
 from typing import Any
 
 from aquaflow.config.link import TcpConfig, UdpConfig
-from drivers.link import MAX_READ_BYTES, LinkLostError
+from aquaflow.drivers.link import MAX_READ_BYTES, LinkLostError
 
 CONNECT_TIMEOUT_S = 3.0
 """A device on the vehicle's own network answers in milliseconds, or is not there."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from aquaflow.config.cameras import V4l2Config
-from drivers.live import LiveCamera
-from drivers.v4l2.capture import V4l2Capture
-from drivers.v4l2.discovery import explained, find_camera
-from drivers.v4l2.system import Kernel, KernelInterface
+from aquaflow.drivers.live import LiveCamera
+from aquaflow.drivers.v4l2.capture import V4l2Capture
+from aquaflow.drivers.v4l2.discovery import explained, find_camera
+from aquaflow.drivers.v4l2.system import Kernel, KernelInterface
 
 
 class V4l2Camera(LiveCamera):

@@ -14,12 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.cameras import V4l2Config
+from aquaflow.drivers.capture import RawPicture, UnusablePictureError
+from aquaflow.drivers.v4l2 import abi
+from aquaflow.drivers.v4l2.controls import apply_controls
+from aquaflow.drivers.v4l2.pixels import JPEG_PIXELS, to_rgb
+from aquaflow.drivers.v4l2.system import KernelInterface, call, supported
 from aquaflow.messages import CameraModel, EncodedPicture
-from drivers.capture import RawPicture, UnusablePictureError
-from drivers.v4l2 import abi
-from drivers.v4l2.controls import apply_controls
-from drivers.v4l2.pixels import JPEG_PIXELS, to_rgb
-from drivers.v4l2.system import KernelInterface, call, supported
 
 
 class V4l2Capture:

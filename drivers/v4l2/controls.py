@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from aquaflow.config.cameras import V4l2Config
-from drivers.v4l2 import abi
-from drivers.v4l2.system import KernelInterface, call, supported
+from aquaflow.drivers.v4l2 import abi
+from aquaflow.drivers.v4l2.system import KernelInterface, call, supported
 
 
 @dataclass(frozen=True)

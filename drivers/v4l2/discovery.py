@@ -10,8 +10,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.v4l2 import abi
-from drivers.v4l2.system import KernelInterface, call, supported
+from aquaflow.drivers.v4l2 import abi
+from aquaflow.drivers.v4l2.system import KernelInterface, call, supported
 
 
 @dataclass(frozen=True)

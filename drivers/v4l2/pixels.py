@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from drivers.capture import UnusablePictureError
+from aquaflow.drivers.capture import UnusablePictureError
 
 BYTES_PER_PIXEL = {"YUYV": 2, "GREY": 1}
 """Of the formats that are not compressed."""

@@ -21,7 +21,7 @@ from aquaflow.messages import (
     UtcTime,
     Velocity,
 )
-from sim_drivers.devices.visual_odometry import VisualOdometry
+from aquaflow.sim_drivers.devices.visual_odometry import VisualOdometry
 
 GRAVITY_M_S2 = 9.80665
 """Standard gravity: MAVLink sends accelerations in milli-g."""

@@ -19,8 +19,8 @@ from aquaflow.messages import (
     UtcTime,
     Velocity,
 )
-from sim_drivers.devices.device import OneWayDevice
-from sim_drivers.devices.waterlinked import euler_deg
+from aquaflow.sim_drivers.devices.device import OneWayDevice
+from aquaflow.sim_drivers.devices.waterlinked import euler_deg
 
 if TYPE_CHECKING:
     from can import Message

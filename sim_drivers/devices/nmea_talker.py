@@ -16,8 +16,8 @@ from aquaflow.messages import (
     UtcTime,
     Velocity,
 )
-from sim_drivers.devices.device import OneWayDevice
-from sim_drivers.devices.waterlinked import euler_deg
+from aquaflow.sim_drivers.devices.device import OneWayDevice
+from aquaflow.sim_drivers.devices.waterlinked import euler_deg
 
 KNOT_M_S = 1852.0 / 3600.0
 """m/s; a nautical mile of 1852 m in an hour."""

@@ -6,7 +6,7 @@ import struct
 from datetime import datetime, timedelta, timezone
 
 from aquaflow.messages import Altitude, TelemetrySample, Velocity
-from sim_drivers.devices.device import OneWayDevice
+from aquaflow.sim_drivers.devices.device import OneWayDevice
 
 SHIP_COORDINATES = 2 << 3
 """Byte 25 of the fixed leader: bits 3 and 4 are 2 for ship axes."""

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from aquaflow.messages import Altitude, Attitude, TelemetrySample, Velocity
-from sim_drivers.devices.device import OneWayDevice
+from aquaflow.sim_drivers.devices.device import OneWayDevice
 
 NO_BOTTOM_M = -1.0
 """What a DVL sends as altitude while it has none."""

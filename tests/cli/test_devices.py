@@ -11,12 +11,12 @@ import pytest
 from aquaflow.cli import devices
 from aquaflow.config.cameras import OakConfig, V4l2Config
 from aquaflow.config.link import CanConfig, SerialConfig
+from aquaflow.drivers import discovery as drivers
+from aquaflow.sim_drivers.camera_feed import CameraFeed
+from aquaflow.sim_drivers.images import ImageFolder
+from aquaflow.sim_drivers.v4l2_kernel import V4l2Kernel
 from aquaflow.sources import discovery
 from aquaflow.sources.discovery import DiscoveryResult, FoundDevice, discover
-from drivers import discovery as drivers
-from sim_drivers.camera_feed import CameraFeed
-from sim_drivers.images import ImageFolder
-from sim_drivers.v4l2_kernel import V4l2Kernel
 from tests.command_line import Cli
 
 
@@ -31,7 +31,7 @@ def test_a_camera_is_listed_once_with_a_config_that_finds_it(
     tmp_path: Path, small_recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kernel = V4l2Kernel(tmp_path, CameraFeed(ImageFolder(small_recording)))
-    monkeypatch.setattr("drivers.v4l2.system.Kernel", lambda: kernel)
+    monkeypatch.setattr("aquaflow.drivers.v4l2.system.Kernel", lambda: kernel)
     (found,) = drivers.v4l2_cameras(tmp_path)
     assert found.id == "usb-SIM0001-video-index0"
     assert found.name == "Simulated USB camera"

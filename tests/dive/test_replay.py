@@ -15,10 +15,10 @@ from aquaflow.config import Config, SourceConfig
 from aquaflow.dive.replay import map_recording
 from aquaflow.errors import InputError, NotMappedError
 from aquaflow.messages import Frame
+from aquaflow.sim_drivers.synthetic import SyntheticDive
 from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation
-from sim_drivers.synthetic import SyntheticDive
 from tests.command_line import Cli
 from tests.small_recording import FRAMES, HASTY, HEIGHT, QUICK, WIDTH
 

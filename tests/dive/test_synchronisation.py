@@ -16,9 +16,9 @@ from aquaflow.errors import InputError
 from aquaflow.errors.failures import Failures
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.messages import AngularRate, Depth, TelemetrySample
+from aquaflow.sim_drivers.images import SUBFOLDER
 from aquaflow.sources import RecordedTelemetry
 from aquaflow.sources.telemetry_input import TelemetryInput, open_telemetry
-from sim_drivers.images import SUBFOLDER
 from tests.command_line import Cli, refused
 from tests.fusion.turning import random_rates
 from tests.small_recording import HASTY

@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from aquaflow.config.cameras import OakConfig, StreamConfig, V4l2Config
+from aquaflow.drivers.live import LiveCamera
+from aquaflow.drivers.oak import OakCamera
+from aquaflow.drivers.stream import StreamCamera
+from aquaflow.drivers.v4l2 import V4l2Camera
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.messages import CameraModel, Dropped, Frame
-from drivers.live import LiveCamera
-from drivers.oak import OakCamera
-from drivers.stream import StreamCamera
-from drivers.v4l2 import V4l2Camera
-from sim_drivers.camera_feed import CameraFaults, CameraFeed
-from sim_drivers.mjpeg_server import MjpegServer
-from sim_drivers.oak import ReplayOak
-from sim_drivers.v4l2_kernel import CameraSpec, V4l2Kernel
+from aquaflow.sim_drivers.camera_feed import CameraFaults, CameraFeed
+from aquaflow.sim_drivers.mjpeg_server import MjpegServer
+from aquaflow.sim_drivers.oak import ReplayOak
+from aquaflow.sim_drivers.v4l2_kernel import CameraSpec, V4l2Kernel
 from tests.small_recording import GIVE_UP_S
 
 WIDTH, HEIGHT, COUNT = 64, 48, 40

@@ -18,6 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow.config.link import CanConfig
 from aquaflow.config.telemetry import DbcSignal, TelemetryConfig, parse_telemetry
+from aquaflow.drivers.link import LinkCounters
+from aquaflow.drivers.telemetry import LinkTelemetry
+from aquaflow.drivers.transport import opener
 from aquaflow.messages import (
     Acceleration,
     Altitude,
@@ -30,17 +33,14 @@ from aquaflow.messages import (
     UtcTime,
     Velocity,
 )
-from drivers.link import LinkCounters
-from drivers.telemetry import LinkTelemetry
-from drivers.transport import opener
-from sim_drivers.devices.ardusub import ArduSub
-from sim_drivers.devices.can_nodes import DbcNode, Nmea2000Instruments
-from sim_drivers.devices.device import SimulatedDevice
-from sim_drivers.devices.nmea_talker import NmeaTalker
-from sim_drivers.devices.pd0 import Pd0Dvl
-from sim_drivers.devices.waterlinked import WaterLinkedJson, WaterLinkedSerial
-from sim_drivers.devices.wires import CanWire, PtyWire, TcpWire, UdpWire
-from sim_drivers.faults import Faults, faulty
+from aquaflow.sim_drivers.devices.ardusub import ArduSub
+from aquaflow.sim_drivers.devices.can_nodes import DbcNode, Nmea2000Instruments
+from aquaflow.sim_drivers.devices.device import SimulatedDevice
+from aquaflow.sim_drivers.devices.nmea_talker import NmeaTalker
+from aquaflow.sim_drivers.devices.pd0 import Pd0Dvl
+from aquaflow.sim_drivers.devices.waterlinked import WaterLinkedJson, WaterLinkedSerial
+from aquaflow.sim_drivers.devices.wires import CanWire, PtyWire, TcpWire, UdpWire
+from aquaflow.sim_drivers.faults import Faults, faulty
 from tests.small_recording import GIVE_UP_S
 
 SPEED = 4.0

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aquaflow.drivers.exposure_clock import MAX_LATENCY_NS
+from aquaflow.drivers.live import CameraState
 from aquaflow.messages import Dropped, Frame
-from drivers.exposure_clock import MAX_LATENCY_NS
-from drivers.live import CameraState
-from sim_drivers.camera_feed import CameraFaults, first_images
+from aquaflow.sim_drivers.camera_feed import CameraFaults, first_images
 from tests.drivers.camera_scenes import COUNT, KINDS, Pictures, live, settled, until
 
 every_kind = pytest.mark.parametrize("kind", KINDS)

@@ -10,11 +10,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from aquaflow.config.telemetry import DbcConfig, Nmea2000Config
+from aquaflow.drivers.protocol.dbc import DbcDecoder
+from aquaflow.drivers.protocol.nmea2000 import Nmea2000Decoder, group_of
+from aquaflow.drivers.transport.can import EXTENDED, RECORD
 from aquaflow.errors import ConfigError
 from aquaflow.messages import Altitude, Attitude, Depth, Position, UtcTime, Velocity
-from drivers.protocol.dbc import DbcDecoder
-from drivers.protocol.nmea2000 import Nmea2000Decoder, group_of
-from drivers.transport.can import EXTENDED, RECORD
 from tests.drivers.simulated_links import DBC, DBC_SIGNALS
 
 NOW = 9_000_000_000

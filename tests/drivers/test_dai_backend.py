@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from aquaflow.config.cameras import OakConfig
+from aquaflow.drivers.oak import OakCamera
+from aquaflow.drivers.oak.calibration import camera_model, imu_rotation
+from aquaflow.drivers.oak.dai_backend import DaiBackend, find_device
+from aquaflow.drivers.oak.messages import imu_readings, nanoseconds, picture_of
 from aquaflow.errors import InputError
-from drivers.oak import OakCamera
-from drivers.oak.calibration import camera_model, imu_rotation
-from drivers.oak.dai_backend import DaiBackend, find_device
-from drivers.oak.messages import imu_readings, nanoseconds, picture_of
 
 os.environ.setdefault("DEPTHAI_LEVEL", "off")
 dai = pytest.importorskip("depthai", reason="depthai is not installed: pip install aquaflow[oak]")

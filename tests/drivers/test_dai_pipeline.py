@@ -11,8 +11,8 @@ from unittest.mock import MagicMock
 import pytest
 
 from aquaflow.config.cameras import OakConfig
-from drivers.oak import dai_backend
-from drivers.oak.dai_backend import DaiBackend
+from aquaflow.drivers.oak import dai_backend
+from aquaflow.drivers.oak.dai_backend import DaiBackend
 
 
 class QueueError(Exception):

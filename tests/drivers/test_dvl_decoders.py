@@ -11,12 +11,12 @@ from aquaflow.config.telemetry import (
     WaterLinkedJsonConfig,
     WaterLinkedSerialConfig,
 )
+from aquaflow.drivers.protocol.pd0 import Pd0Decoder
+from aquaflow.drivers.protocol.waterlinked_json import WaterLinkedJsonDecoder
+from aquaflow.drivers.protocol.waterlinked_serial import WaterLinkedSerialDecoder, crc8
 from aquaflow.messages import Altitude, Attitude, Velocity
-from drivers.protocol.pd0 import Pd0Decoder
-from drivers.protocol.waterlinked_json import WaterLinkedJsonDecoder
-from drivers.protocol.waterlinked_serial import WaterLinkedSerialDecoder, crc8
-from sim_drivers.devices.pd0 import Pd0Dvl, ensemble
-from sim_drivers.devices.waterlinked import line
+from aquaflow.sim_drivers.devices.pd0 import Pd0Dvl, ensemble
+from aquaflow.sim_drivers.devices.waterlinked import line
 
 NOW = 90_000_000_000
 LINK = {"kind": "serial", "port": "/dev/null"}

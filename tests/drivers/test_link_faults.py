@@ -8,8 +8,8 @@ import threading
 import numpy as np
 import pytest
 
-from drivers.link import MAX_READ_BYTES
-from sim_drivers.faults import Faults
+from aquaflow.drivers.link import MAX_READ_BYTES
+from aquaflow.sim_drivers.faults import Faults
 from tests.drivers.simulated_links import RIGS, endless, motion, running, until, values
 from tests.small_recording import GIVE_UP_S
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from aquaflow.config.cameras import LiveCameraConfig
+from aquaflow.drivers.capture import Capture, RawPicture
+from aquaflow.drivers.live import CameraState, LiveCamera
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.messages import CameraModel, Dropped, Frame
 from aquaflow.storage.camera_file import save_camera
-from drivers.capture import Capture, RawPicture
-from drivers.live import CameraState, LiveCamera
 from tests.drivers.camera_scenes import QUICK, closing, settled
 
 SIZE = (32, 24)

@@ -10,6 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from aquaflow.config.telemetry import MavlinkConfig
+from aquaflow.drivers.protocol.mavlink import MavlinkDecoder
+from aquaflow.drivers.protocol.mavlink_frames import MavlinkFraming
 from aquaflow.messages import (
     Acceleration,
     Altitude,
@@ -21,8 +23,6 @@ from aquaflow.messages import (
     UtcTime,
     Velocity,
 )
-from drivers.protocol.mavlink import MavlinkDecoder
-from drivers.protocol.mavlink_frames import MavlinkFraming
 
 DIALECT = import_module("pymavlink.dialects.v20.ardupilotmega")
 G = 9.80665

@@ -9,9 +9,9 @@ from importlib import import_module
 
 import pytest
 
-from drivers.link import LinkCounters
-from drivers.protocol.mavlink_frames import MavlinkFraming, header_of
-from drivers.protocol.packets import PacketReader
+from aquaflow.drivers.link import LinkCounters
+from aquaflow.drivers.protocol.mavlink_frames import MavlinkFraming, header_of
+from aquaflow.drivers.protocol.packets import PacketReader
 
 DIALECT = import_module("pymavlink.dialects.v20.ardupilotmega")
 

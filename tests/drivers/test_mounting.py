@@ -7,6 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from aquaflow.config.telemetry import MountingConfig
+from aquaflow.drivers import rotation
+from aquaflow.drivers.mounting import BodyFrame, Mounting
+from aquaflow.drivers.plausible import plausible
 from aquaflow.messages import (
     Acceleration,
     Altitude,
@@ -18,9 +21,6 @@ from aquaflow.messages import (
     UtcTime,
     Velocity,
 )
-from drivers import rotation
-from drivers.mounting import BodyFrame, Mounting
-from drivers.plausible import plausible
 
 STAMP = (10**9, 10**9, "s")
 ANGLES = {"roll_deg": 20.0, "pitch_deg": -35.0, "yaw_deg": 120.0}

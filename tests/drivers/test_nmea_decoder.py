@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from aquaflow.config.telemetry import NmeaConfig
+from aquaflow.drivers.protocol.nmea import NmeaDecoder
 from aquaflow.messages import Altitude, AngularRate, Attitude, Depth, Position, UtcTime, Velocity
-from drivers.protocol.nmea import NmeaDecoder
-from sim_drivers.devices.nmea_talker import sentence
+from aquaflow.sim_drivers.devices.nmea_talker import sentence
 
 NOW = 9_000_000_000
 LINK = {"kind": "serial", "port": "/dev/null"}

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.link import LinkCounters
-from drivers.protocol.nmea_sentence import framing
-from drivers.protocol.packets import PacketReader
-from drivers.telemetry import decoder_of
-from drivers.transport.can import packed
-from sim_drivers.devices.nmea_talker import sentence
+from aquaflow.drivers.link import LinkCounters
+from aquaflow.drivers.protocol.nmea_sentence import framing
+from aquaflow.drivers.protocol.packets import PacketReader
+from aquaflow.drivers.telemetry import decoder_of
+from aquaflow.drivers.transport.can import packed
+from aquaflow.sim_drivers.devices.nmea_talker import sentence
 from tests.drivers.simulated_links import RIGS, motion, telemetry_config
 
 A, B = sentence("IIHDT,271.3,T"), sentence("SDDBT,9.8,f,3.0,M,1.6,F")

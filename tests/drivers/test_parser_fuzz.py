@@ -11,14 +11,14 @@ from pathlib import Path
 import can
 import pytest
 
-from drivers.link import LinkCounters
-from drivers.plausible import plausible
-from drivers.protocol.packets import PacketDecoder
-from drivers.telemetry import decoder_of
-from drivers.transport.can import EXTENDED, RECORD, packed
-from sim_drivers.devices.nmea_talker import sentence
-from sim_drivers.devices.pd0 import ensemble
-from sim_drivers.devices.waterlinked import line
+from aquaflow.drivers.link import LinkCounters
+from aquaflow.drivers.plausible import plausible
+from aquaflow.drivers.protocol.packets import PacketDecoder
+from aquaflow.drivers.telemetry import decoder_of
+from aquaflow.drivers.transport.can import EXTENDED, RECORD, packed
+from aquaflow.sim_drivers.devices.nmea_talker import sentence
+from aquaflow.sim_drivers.devices.pd0 import ensemble
+from aquaflow.sim_drivers.devices.waterlinked import line
 from tests.drivers.simulated_links import RIGS, motion, telemetry_config
 
 DIALECT = import_module("pymavlink.dialects.v20.ardupilotmega")

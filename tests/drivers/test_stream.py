@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aquaflow.drivers import stream as driver
+from aquaflow.drivers.stream import without_password
 from aquaflow.errors import InputError
 from aquaflow.messages import Frame
-from drivers import stream as driver
-from drivers.stream import without_password
-from sim_drivers.camera_feed import CameraFeed, first_images
-from sim_drivers.mjpeg_server import MjpegServer
-from sim_drivers.transport_stream import RtspCamera, UdpCamera
+from aquaflow.sim_drivers.camera_feed import CameraFeed, first_images
+from aquaflow.sim_drivers.mjpeg_server import MjpegServer
+from aquaflow.sim_drivers.transport_stream import RtspCamera, UdpCamera
 from tests.drivers.camera_scenes import (
     COUNT,
     HEIGHT,

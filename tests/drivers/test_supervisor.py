@@ -9,11 +9,11 @@ from contextlib import contextmanager
 import pytest
 
 from aquaflow.config.telemetry import NmeaConfig
-from drivers import supervisor
-from drivers.link import LinkLostError
-from drivers.protocol.nmea import NmeaDecoder
-from drivers.supervisor import Supervisor
-from sim_drivers.devices.nmea_talker import sentence
+from aquaflow.drivers import supervisor
+from aquaflow.drivers.link import LinkLostError
+from aquaflow.drivers.protocol.nmea import NmeaDecoder
+from aquaflow.drivers.supervisor import Supervisor
+from aquaflow.sim_drivers.devices.nmea_talker import sentence
 from tests.drivers.simulated_links import until
 
 DEPTH = sentence("SDDPT,4.25,0.5")

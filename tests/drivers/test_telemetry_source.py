@@ -8,14 +8,13 @@ from importlib.metadata import entry_points
 
 import pytest
 
-import drivers.telemetry
 from aquaflow.config.telemetry import parse_telemetry
+from aquaflow.drivers.telemetry import LinkTelemetry
 from aquaflow.errors import InputError
 from aquaflow.messages import Altitude, Depth, Velocity
+from aquaflow.sim_drivers.devices.device import SimulatedDevice, boot_clock
+from aquaflow.sim_drivers.faults import jumping_clock
 from aquaflow.sources import TELEMETRY
-from drivers.telemetry import LinkTelemetry
-from sim_drivers.devices.device import SimulatedDevice, boot_clock
-from sim_drivers.faults import jumping_clock
 from tests.drivers.simulated_links import (
     RIGS,
     endless,
@@ -169,7 +168,7 @@ def test_a_source_whose_devices_are_all_absent_closes(tmp_path):
 
 
 def test_closing_does_not_wait_for_a_link_that_is_stuck(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(drivers.telemetry, "CLOSE_TIMEOUT_S", 0.05)
+    monkeypatch.setattr("aquaflow.drivers.telemetry.CLOSE_TIMEOUT_S", 0.05)
     stuck = threading.Event()
 
     class StuckLink:

@@ -12,14 +12,14 @@ import can
 import pytest
 
 from aquaflow.config.link import CanConfig, SerialConfig, TcpConfig, UdpConfig
+from aquaflow.drivers.extra import load
+from aquaflow.drivers.link import MAX_READ_BYTES, LinkLostError
+from aquaflow.drivers.transport import opener
+from aquaflow.drivers.transport.can import EXTENDED, RECORD, open_can
+from aquaflow.drivers.transport.serial import open_serial
+from aquaflow.drivers.transport.socket import open_tcp, open_udp
 from aquaflow.errors import InputError
-from drivers.extra import load
-from drivers.link import MAX_READ_BYTES, LinkLostError
-from drivers.transport import opener
-from drivers.transport.can import EXTENDED, RECORD, open_can
-from drivers.transport.serial import open_serial
-from drivers.transport.socket import open_tcp, open_udp
-from sim_drivers.devices.wires import CanWire, PtyWire, TcpWire, UdpWire
+from aquaflow.sim_drivers.devices.wires import CanWire, PtyWire, TcpWire, UdpWire
 from tests.drivers.simulated_links import free_port, until
 
 WAIT_S = 10.0
@@ -243,7 +243,7 @@ def test_a_library_that_is_there_is_loaded():
 
 def test_the_drivers_load_their_libraries_only_when_a_device_needs_them():
     code = (
-        "import sys, drivers.telemetry;"
+        "import sys, aquaflow.drivers.telemetry;"
         "print(*{'serial', 'can', 'cantools', 'pymavlink', 'torch', 'cv2'} & set(sys.modules))"
     )
     ran = subprocess.run(

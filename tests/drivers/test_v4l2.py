@@ -14,15 +14,20 @@ import numpy as np
 import pytest
 
 from aquaflow.config.cameras import V4l2Config
+from aquaflow.drivers.capture import UnusablePictureError
+from aquaflow.drivers.v4l2 import abi
+from aquaflow.drivers.v4l2.capture import V4l2Capture
+from aquaflow.drivers.v4l2.discovery import camera_nodes, find_camera, modes
+from aquaflow.drivers.v4l2.pixels import to_rgb
 from aquaflow.errors import InputError
 from aquaflow.messages import Frame
-from drivers.capture import UnusablePictureError
-from drivers.v4l2 import abi
-from drivers.v4l2.capture import V4l2Capture
-from drivers.v4l2.discovery import camera_nodes, find_camera, modes
-from drivers.v4l2.pixels import to_rgb
-from sim_drivers.camera_feed import CameraFaults
-from sim_drivers.v4l2_kernel import EXPOSURE_ABSOLUTE, WHITE_BALANCE, CameraSpec, V4l2Kernel
+from aquaflow.sim_drivers.camera_feed import CameraFaults
+from aquaflow.sim_drivers.v4l2_kernel import (
+    EXPOSURE_ABSOLUTE,
+    WHITE_BALANCE,
+    CameraSpec,
+    V4l2Kernel,
+)
 from tests.drivers.camera_scenes import HEIGHT, WIDTH, closing, feed, until, v4l2
 
 

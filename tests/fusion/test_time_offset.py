@@ -23,7 +23,7 @@ from aquaflow.fusion.time_offset import (
 )
 from aquaflow.fusion.turns import Turns
 from aquaflow.messages import AngularRate, Attitude, Depth, UtcTime
-from sim_drivers.csv_telemetry import CsvTelemetry
+from aquaflow.sim_drivers.csv_telemetry import CsvTelemetry
 from tests.fusion.turning import (
     Case,
     dive,

@@ -38,7 +38,7 @@ def write_logs(root: Path) -> None:
 
 
 def _nmea() -> bytes:
-    from sim_drivers.devices.nmea_talker import sentence
+    from aquaflow.sim_drivers.devices.nmea_talker import sentence
 
     bodies = ("SDDBT,32.8,f,10.0,M,5.4,F", "GPHDT,90.0,T", "HEROT,1.5,A", "VDVBW,,,V,1.0,0.1,A")
     return b"".join(
@@ -49,7 +49,7 @@ def _nmea() -> bytes:
 def _tlog() -> bytes:
     """MAVLink packets with their times."""
     from aquaflow.messages import Acceleration, AngularRate, Attitude, Depth
-    from sim_drivers.devices.ardusub import ArduSub
+    from aquaflow.sim_drivers.devices.ardusub import ArduSub
 
     autopilot, log = ArduSub(), b""
     for k in range(LINES):

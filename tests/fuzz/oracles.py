@@ -34,7 +34,7 @@ NOTICES = ("The public MASt3R weights", "note: ")
 SILENT_FAILURES = frozenset({"status", "stress"})
 """Commands whose exit code 1 is an answer, which stands on stdout."""
 
-FRAME = re.compile(r'File "[^"]*?((?:aquaflow|drivers|sim_drivers)/[^"]+)", line (\d+)')
+FRAME = re.compile(r'File "[^"]*?(aquaflow/[^"]+)", line (\d+)')
 
 
 @dataclass(frozen=True)

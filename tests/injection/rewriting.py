@@ -12,7 +12,7 @@ from types import CodeType, ModuleType
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-OWN = ("aquaflow", "drivers", "sim_drivers")
+OWN = ("aquaflow",)
 
 CALLED, OPERATED = "__watched_call__", "__watched_operator__"
 """Names that the rewritten code finds among the builtins."""

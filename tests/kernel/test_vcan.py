@@ -14,9 +14,9 @@ import pytest
 
 from aquaflow.config.link import CanConfig
 from aquaflow.config.telemetry import parse_telemetry
+from aquaflow.drivers.telemetry import LinkTelemetry
+from aquaflow.drivers.transport import opener
 from aquaflow.messages import Altitude, TelemetrySample
-from drivers.telemetry import LinkTelemetry
-from drivers.transport import opener
 from tests.kernel.virtual_machine import in_guest
 
 pytest.importorskip("can", reason="python-can is not installed")

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from aquaflow.config.cameras import V4l2Config
+from aquaflow.drivers.live import CameraState
+from aquaflow.drivers.v4l2 import V4l2Camera
+from aquaflow.drivers.v4l2.discovery import camera_nodes, modes
+from aquaflow.drivers.v4l2.system import Kernel
 from aquaflow.errors import InputError
 from aquaflow.messages import Frame
-from drivers.live import CameraState
-from drivers.v4l2 import V4l2Camera
-from drivers.v4l2.discovery import camera_nodes, modes
-from drivers.v4l2.system import Kernel
 from tests.kernel.virtual_machine import in_guest
 
 BUS = "platform:vivid-000"

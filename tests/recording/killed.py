@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from aquaflow.messages import Dropped
-from sim_drivers.mcap_camera import McapCamera
-from sim_drivers.mcap_messages import McapMessages, mcap_files
-from sim_drivers.mcap_telemetry import McapTelemetry
+from aquaflow.sim_drivers.mcap_camera import McapCamera
+from aquaflow.sim_drivers.mcap_messages import McapMessages, mcap_files
+from aquaflow.sim_drivers.mcap_telemetry import McapTelemetry
 from tests.small_recording import GIVE_UP_S
 
 FPS = 30

@@ -13,8 +13,8 @@ from aquaflow.config.recording import RecordingConfig
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.messages import Depth, Dropped, Frame
 from aquaflow.recording import Recorder
-from sim_drivers.mcap_camera import McapCamera
-from sim_drivers.mcap_telemetry import McapTelemetry
+from aquaflow.sim_drivers.mcap_camera import McapCamera
+from aquaflow.sim_drivers.mcap_telemetry import McapTelemetry
 from tests.recording.killed import FPS, Killed, record_and_kill, write_source
 from tests.recording.simulated_time import simulated, written
 

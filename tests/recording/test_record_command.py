@@ -23,10 +23,10 @@ from aquaflow.messages import Depth, Dropped, Frame, TelemetrySample, UtcTime
 from aquaflow.recording import Recorder
 from aquaflow.recording import session as session_module
 from aquaflow.recording.session import RecordingSession
+from aquaflow.sim_drivers.mcap_camera import McapCamera
+from aquaflow.sim_drivers.mcap_messages import McapMessages, mcap_files
+from aquaflow.sim_drivers.mcap_telemetry import McapTelemetry
 from aquaflow.sources import open_links
-from sim_drivers.mcap_camera import McapCamera
-from sim_drivers.mcap_messages import McapMessages, mcap_files
-from sim_drivers.mcap_telemetry import McapTelemetry
 from tests.command_line import Cli, refused
 from tests.recording.killed import FPS, sentence, under_way, write_source
 from tests.small_recording import GIVE_UP_S

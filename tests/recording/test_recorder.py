@@ -37,10 +37,10 @@ from aquaflow.recording.dive_file import DiveFile
 from aquaflow.recording.pictures import encode
 from aquaflow.recording.playback import Playback
 from aquaflow.recording.session import RecordingSession
+from aquaflow.sim_drivers.mcap_camera import McapCamera
+from aquaflow.sim_drivers.mcap_messages import McapMessages, mcap_files
+from aquaflow.sim_drivers.mcap_telemetry import McapTelemetry
 from aquaflow.sources import mounting_of
-from sim_drivers.mcap_camera import McapCamera
-from sim_drivers.mcap_messages import McapMessages, mcap_files
-from sim_drivers.mcap_telemetry import McapTelemetry
 from tests.recording.simulated_time import SimulatedTime, simulated, written
 from tests.small_recording import GIVE_UP_S
 

@@ -9,8 +9,8 @@ import pytest
 
 from aquaflow.config.recording import RecordingConfig
 from aquaflow.recording import Recorder
+from aquaflow.sim_drivers.mcap_telemetry import McapTelemetry
 from aquaflow.sources import mounting_of, open_recorded_telemetry, open_recording
-from sim_drivers.mcap_telemetry import McapTelemetry
 from tests.command_line import Cli
 from tests.small_recording import QUICK
 

@@ -19,7 +19,7 @@ from aquaflow.messages import (
     Velocity,
 )
 from aquaflow.recording.telemetry_lines import LONGEST_LINE, TelemetryLines, TelemetryLog, of_line
-from sim_drivers.dive_telemetry import DiveTelemetry
+from aquaflow.sim_drivers.dive_telemetry import DiveTelemetry
 
 SECOND = 1_000_000_000
 STAMP = (5 * SECOND, 5 * SECOND + 7, "rov/x")

@@ -32,6 +32,15 @@ if renderer.name == "cpu":
     print(load_library().path)
 """
 
+SHOW_DRIVERS = """
+from importlib.metadata import entry_points
+from aquaflow.sources.discovery import discover
+print(discover().problems)
+for group, name in (("aquaflow.cameras", "video"), ("aquaflow.telemetry", "links")):
+    [entry] = entry_points(group=group, name=name)
+    print(entry.load().__name__)
+"""
+
 
 def build_requirements_are_here() -> bool:
     try:
@@ -71,7 +80,10 @@ def build_wheel(folder: Path, **environment: str) -> tuple[Path, str]:
         source = ROOT / part
         if source.is_dir():
             shutil.copytree(
-                source, folder / part, ignore=shutil.ignore_patterns("*.so", "__pycache__")
+                source,
+                folder / part,
+                symlinks=True,
+                ignore=shutil.ignore_patterns("*.so", "__pycache__"),
             )
         else:
             shutil.copy(source, folder / part)
@@ -146,3 +158,39 @@ def test_without_a_compiler_the_wheel_fits_every_machine_and_torch_renders(tmp_p
     assert libraries(wheel) == set()
     assert "torch renderer will be used" in log
     assert renderer_of(wheel, tmp_path) == ["tiles 1"]
+
+
+def test_another_projects_drivers_on_the_path_do_not_hide_ours(tmp_path: Path) -> None:
+    wheel, _ = build_wheel(tmp_path, CXX=NO_COMPILER["CXX"])
+    with zipfile.ZipFile(wheel) as archive:
+        folders = {name.partition("/")[0] for name in archive.namelist()}
+    assert folders == {"aquaflow", f"{wheel.name.partition('-py3')[0]}.dist-info"}
+    installed, foreign = tmp_path / "installed", tmp_path / "foreign"
+    pip("install", wheel, "--no-deps", "--no-index", "--target", installed, cwd=tmp_path)
+    for name in ("drivers", "sim_drivers"):
+        (foreign / name).mkdir(parents=True)
+        (foreign / name / "__init__.py").write_text("raise ImportError('of another project')\n")
+    done = subprocess.run(
+        [sys.executable, "-c", SHOW_DRIVERS],
+        cwd=foreign,
+        env={**os.environ, "PYTHONPATH": f"{foreign}:{installed}"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout.splitlines() == ["[]", "VideoFile", "LinkTelemetry"], done.stderr
+
+
+def test_a_checkout_that_lost_its_links_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    (tmp_path / "aquaflow").mkdir()
+    (tmp_path / "aquaflow" / "drivers").write_text("../drivers")  # as git leaves it without links
+    shutil.copy(ROOT / "setup.py", tmp_path)
+    done = subprocess.run(
+        [sys.executable, "setup.py", "--version"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith("aquaflow/drivers is no link")

@@ -21,21 +21,21 @@ from aquaflow.config import SourceConfig
 from aquaflow.config.cameras import V4l2Config
 from aquaflow.config.telemetry import parse_telemetry
 from aquaflow.dive.frames_csv import read_rows
+from aquaflow.drivers.live import CameraState
+from aquaflow.drivers.telemetry import LinkTelemetry
+from aquaflow.drivers.v4l2 import V4l2Camera
 from aquaflow.messages import CameraModel, Depth, Frame
 from aquaflow.service.checkpoint.resume import resumed
 from aquaflow.service.feed import LiveFeed
 from aquaflow.service.health.state import State
 from aquaflow.service.live_dive import LiveDive
 from aquaflow.service.loop import PATIENCE_S
+from aquaflow.sim_drivers.camera_feed import CameraFeed
+from aquaflow.sim_drivers.devices.ardusub import ArduSub
+from aquaflow.sim_drivers.devices.device import SimulatedDevice
+from aquaflow.sim_drivers.devices.wires import PtyWire
+from aquaflow.sim_drivers.v4l2_kernel import V4l2Kernel
 from aquaflow.sources import open_recording
-from drivers.live import CameraState
-from drivers.telemetry import LinkTelemetry
-from drivers.v4l2 import V4l2Camera
-from sim_drivers.camera_feed import CameraFeed
-from sim_drivers.devices.ardusub import ArduSub
-from sim_drivers.devices.device import SimulatedDevice
-from sim_drivers.devices.wires import PtyWire
-from sim_drivers.v4l2_kernel import V4l2Kernel
 from tests.service.live_scenes import VEHICLE, Clock
 from tests.small_recording import GIVE_UP_S
 

@@ -14,21 +14,21 @@ import pytest
 from aquaflow.config import SourceConfig
 from aquaflow.config.cameras import V4l2Config
 from aquaflow.config.telemetry import parse_telemetry
+from aquaflow.drivers.telemetry import LinkTelemetry
+from aquaflow.drivers.transport import opener
+from aquaflow.drivers.v4l2 import V4l2Camera
 from aquaflow.errors.failures import Failures
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.messages import CameraModel, Depth, Dropped, Frame, TelemetrySample, UtcTime
 from aquaflow.recording.playback import Playback
 from aquaflow.service.dive_clock import Continued
 from aquaflow.service.feed import LiveFeed, PlaybackFeed
-from drivers.telemetry import LinkTelemetry
-from drivers.transport import opener
-from drivers.v4l2 import V4l2Camera
-from sim_drivers.camera_feed import CameraFaults, CameraFeed
-from sim_drivers.devices.ardusub import ArduSub
-from sim_drivers.devices.device import SimulatedDevice
-from sim_drivers.devices.wires import UdpWire
-from sim_drivers.faults import Faults, faulty
-from sim_drivers.v4l2_kernel import V4l2Kernel
+from aquaflow.sim_drivers.camera_feed import CameraFaults, CameraFeed
+from aquaflow.sim_drivers.devices.ardusub import ArduSub
+from aquaflow.sim_drivers.devices.device import SimulatedDevice
+from aquaflow.sim_drivers.devices.wires import UdpWire
+from aquaflow.sim_drivers.faults import Faults, faulty
+from aquaflow.sim_drivers.v4l2_kernel import V4l2Kernel
 from tests.service.live_scenes import HEIGHT, WIDTH
 from tests.small_recording import GIVE_UP_S
 

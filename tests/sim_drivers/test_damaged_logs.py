@@ -15,12 +15,12 @@ from aquaflow.config.recording import RecordingConfig
 from aquaflow.errors import InputError
 from aquaflow.messages import Acceleration, Depth
 from aquaflow.recording.pictures import encode
+from aquaflow.sim_drivers.csv_telemetry import CsvTelemetry
+from aquaflow.sim_drivers.dataflash import Dataflash
+from aquaflow.sim_drivers.mcap_camera import OURS, McapCamera
+from aquaflow.sim_drivers.mcap_messages import McapMessages
+from aquaflow.sim_drivers.tlog import Tlog
 from aquaflow.synthetic.telemetry import HEADER
-from sim_drivers.csv_telemetry import CsvTelemetry
-from sim_drivers.dataflash import Dataflash
-from sim_drivers.mcap_camera import OURS, McapCamera
-from sim_drivers.mcap_messages import McapMessages
-from sim_drivers.tlog import Tlog
 
 ZEROS = bytes(1 << 22)
 

@@ -11,9 +11,9 @@ from PIL import Image
 from aquaflow.errors import ConfigError, InputError
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.messages import Dropped, Frame
+from aquaflow.sim_drivers.images import ImageFolder
+from aquaflow.sim_drivers.synthetic import SyntheticDive
 from aquaflow.storage.camera_file import save_camera
-from sim_drivers.images import ImageFolder
-from sim_drivers.synthetic import SyntheticDive
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 

@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from drivers.link import MAX_READ_BYTES, LinkLostError
-from sim_drivers.faults import Faults, corrupted, faulty, jumping_clock
+from aquaflow.drivers.link import MAX_READ_BYTES, LinkLostError
+from aquaflow.sim_drivers.faults import Faults, corrupted, faulty, jumping_clock
 
 CHUNKS = [bytes([k]) * 10 for k in range(200)]
 

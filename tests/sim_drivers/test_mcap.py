@@ -25,13 +25,13 @@ from aquaflow.geometry.camera import guess_camera
 from aquaflow.messages import Attitude, Depth, Dropped, EncodedPicture, Frame
 from aquaflow.recording import Recorder
 from aquaflow.recording.pictures import encode
+from aquaflow.sim_drivers import mcap_messages
+from aquaflow.sim_drivers.h264 import is_key
+from aquaflow.sim_drivers.mcap_camera import McapCamera
+from aquaflow.sim_drivers.mcap_messages import McapMessages
+from aquaflow.sim_drivers.mcap_telemetry import McapTelemetry
+from aquaflow.sim_drivers.video import VideoFile
 from aquaflow.sources import camera_reader, open_recorded_telemetry, open_recording
-from sim_drivers import mcap_messages
-from sim_drivers.h264 import is_key
-from sim_drivers.mcap_camera import McapCamera
-from sim_drivers.mcap_messages import McapMessages
-from sim_drivers.mcap_telemetry import McapTelemetry
-from sim_drivers.video import VideoFile
 
 Write = Callable[[Writer], None]
 RED = np.zeros((4, 6, 3), np.uint8) + np.array([200, 10, 30], np.uint8)

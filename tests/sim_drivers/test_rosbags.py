@@ -29,9 +29,9 @@ from aquaflow.messages import (
     Velocity,
 )
 from aquaflow.recording.pictures import encode
+from aquaflow.sim_drivers.rosbag import messages_in
+from aquaflow.sim_drivers.rosbag_camera import RosbagCamera
 from aquaflow.sources import open_recorded_telemetry, open_recording
-from sim_drivers.rosbag import messages_in
-from sim_drivers.rosbag_camera import RosbagCamera
 
 SECOND = 1_000_000_000
 BEGAN_NS = 1_700_000_000 * SECOND

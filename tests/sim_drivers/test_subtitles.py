@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from aquaflow.messages import Altitude, Attitude, Depth, Position, TelemetrySample, UtcTime
-from sim_drivers.subtitles import Subtitles
+from aquaflow.sim_drivers.subtitles import Subtitles
 
 SECOND = 1_000_000_000
 HEADER = """[Script Info]

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from aquaflow.messages import Altitude, Attitude, Depth, Position, UtcTime
+from aquaflow.sim_drivers.csv_telemetry import CsvTelemetry
 from aquaflow.sources import open_recorded_telemetry
-from sim_drivers.csv_telemetry import CsvTelemetry
 
 SECOND = 1_000_000_000
 

@@ -24,20 +24,20 @@ from aquaflow.messages import (
     UtcTime,
     Velocity,
 )
+from aquaflow.sim_drivers.candump import Candump
+from aquaflow.sim_drivers.csv_telemetry import CsvTelemetry
+from aquaflow.sim_drivers.dataflash import Dataflash
+from aquaflow.sim_drivers.images import ImageFolder
+from aquaflow.sim_drivers.manifest import ManifestTelemetry
+from aquaflow.sim_drivers.nmea_text import NmeaText
+from aquaflow.sim_drivers.telemetry_log import LogTime
+from aquaflow.sim_drivers.tlog import Tlog
 from aquaflow.sources import (
     mounting_of,
     open_recorded_telemetry,
     open_recording,
     telemetry_reader,
 )
-from sim_drivers.candump import Candump
-from sim_drivers.csv_telemetry import CsvTelemetry
-from sim_drivers.dataflash import Dataflash
-from sim_drivers.images import ImageFolder
-from sim_drivers.manifest import ManifestTelemetry
-from sim_drivers.nmea_text import NmeaText
-from sim_drivers.telemetry_log import LogTime
-from sim_drivers.tlog import Tlog
 
 SECOND = 1_000_000_000
 DEPTH_BELOW = "$SDDBT,32.8,f,10.0,M,5.4,F*0F"

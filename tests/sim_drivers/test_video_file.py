@@ -10,9 +10,9 @@ import pytest
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.messages import Dropped
+from aquaflow.sim_drivers import video
+from aquaflow.sim_drivers.video import VideoFile
 from aquaflow.storage.camera_file import save_camera
-from sim_drivers import video
-from sim_drivers.video import VideoFile
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from aquaflow.messages import Altitude, AngularRate, Attitude, Depth, Velocity
+from aquaflow.sim_drivers.synthetic import SyntheticDive
 from aquaflow.synthetic import (
     SimulatedDive,
     SyntheticConfig,
@@ -20,7 +21,6 @@ from aquaflow.synthetic import (
     simulate,
     write_dive,
 )
-from sim_drivers.synthetic import SyntheticDive
 from tests.synthetic.without_errors import WITHOUT_ERRORS
 
 Array = npt.NDArray[np.float64]

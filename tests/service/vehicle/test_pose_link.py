@@ -14,7 +14,7 @@ from aquaflow.config.service import PoseConfig
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import so3_log
 from aquaflow.service.vehicle.pose_output import PoseOutput
-from sim_drivers.devices.visual_odometry import VisualOdometry
+from aquaflow.sim_drivers.devices.visual_odometry import VisualOdometry
 from tests.drivers.simulated_links import (
     Rig,
     Running,

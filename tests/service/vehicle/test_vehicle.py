@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from aquaflow.config.telemetry import parse_telemetry
+from aquaflow.drivers.protocol.mavlink import MavlinkDecoder
+from aquaflow.drivers.protocol.mavlink_outbound import ARDUPILOT
 from aquaflow.geometry.similarity import so3_exp
 from aquaflow.service.vehicle.pilot_messages import PilotMessages
 from aquaflow.sources.outbound import BodyMotion, BodyPose, NamedValue, OutboundMessage, StatusText
-from drivers.protocol.mavlink import MavlinkDecoder
-from drivers.protocol.mavlink_outbound import ARDUPILOT
 from tests.service.live_scenes import Told
 
 pytest.importorskip("pymavlink", reason="pymavlink is not installed")
