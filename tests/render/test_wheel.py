@@ -74,24 +74,30 @@ def pip(*arguments: object, cwd: Path, **environment: str) -> str:
     return said
 
 
-def build_wheel(folder: Path, **environment: str) -> tuple[Path, str]:
-    """A wheel from a copy of the sources, which holds a library from elsewhere; and the log."""
+def copy_sources(folder: Path) -> None:
+    """What a wheel is built from, without compiled libraries."""
+    unwanted = shutil.ignore_patterns("*.so", "__pycache__")
     for part in PARTS:
         source = ROOT / part
         if source.is_dir():
-            shutil.copytree(
-                source,
-                folder / part,
-                symlinks=True,
-                ignore=shutil.ignore_patterns("*.so", "__pycache__"),
-            )
+            shutil.copytree(source, folder / part, symlinks=True, ignore=unwanted)
         else:
             shutil.copy(source, folder / part)
-    (folder / "aquaflow/render/native/libaquaflow_elsewhere.so").write_bytes(b"elsewhere")
+
+
+def built_wheel(folder: Path, **environment: str) -> tuple[Path, str]:
+    """The wheel of the sources in ``folder``, and the log."""
     options = ("--no-deps", "--no-build-isolation", "--no-index", "-v", "-w", folder / "dist")
     log = pip("wheel", ".", *options, cwd=folder, **environment)
     (wheel,) = (folder / "dist").iterdir()
     return wheel, log
+
+
+def build_wheel(folder: Path, **environment: str) -> tuple[Path, str]:
+    """A wheel from a copy of the sources, which holds a library from elsewhere; and the log."""
+    copy_sources(folder)
+    (folder / "aquaflow/render/native/libaquaflow_elsewhere.so").write_bytes(b"elsewhere")
+    return built_wheel(folder, **environment)
 
 
 def libraries(wheel: Path) -> set[str]:
@@ -179,6 +185,19 @@ def test_another_projects_drivers_on_the_path_do_not_hide_ours(tmp_path: Path) -
         check=False,
     )
     assert done.stdout.splitlines() == ["[]", "VideoFile", "LinkTelemetry"], done.stderr
+
+
+def test_a_checkout_of_git_is_built_with_its_drivers(tmp_path: Path) -> None:
+    if shutil.which("git") is None:
+        pytest.skip("no git: setuptools-scm lists no files here")
+    copy_sources(tmp_path)
+    author = ("-c", "user.name=one", "-c", "user.email=one@example.org")
+    for command in (("init", "-q"), ("add", "."), (*author, "commit", "-q", "-m", "one")):
+        subprocess.run(["git", *command], cwd=tmp_path, check=True)
+    wheel, _ = built_wheel(tmp_path, CXX=NO_COMPILER["CXX"])
+    with zipfile.ZipFile(wheel) as archive:
+        assert "aquaflow/drivers/v4l2/abi.py" in archive.namelist()
+        assert "aquaflow/sim_drivers/video.py" in archive.namelist()
 
 
 def test_a_checkout_that_lost_its_links_is_refused_in_a_sentence(tmp_path: Path) -> None:
