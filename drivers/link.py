@@ -29,6 +29,8 @@ class LinkCounters:
     """Bytes that belong to no packet, skipped to find the next one."""
     invalid_values: int = 0
     """Good packets whose values are impossible, or that the device itself calls invalid."""
+    unheard: int = 0
+    """Good packets of senders that the config does not name, which would have made samples."""
     dropped_samples: int = 0
     """Oldest samples dropped because they were not fetched in time."""
     reconnects: int = 0

@@ -91,7 +91,21 @@ MavlinkSource: TypeAlias = Literal[
     "GPS2_RAW",
     "GLOBAL_POSITION_INT",
     "SYSTEM_TIME",
+    "GPS_INPUT",
+    "VISION_POSITION_DELTA",
 ]
+
+
+class MavlinkSenderConfig(Stage):
+    """Another component on the autopilot's link, such as the sonar service of BlueOS."""
+
+    system_id: int | None = Field(None, ge=1, le=255, description="None: the autopilot's")
+    component_id: int = Field(ge=0, le=255, description="194: a Ping1D by BlueOS's Ping service")
+    messages: tuple[MavlinkSource, ...] = Field(
+        ("DISTANCE_SENSOR",),
+        min_length=1,
+        description="used from it, stamped at their arrival: its clock is not the autopilot's",
+    )
 
 
 class MavlinkConfig(PositioningConfig):
@@ -101,6 +115,9 @@ class MavlinkConfig(PositioningConfig):
     link: ByteLinkConfig
     system_id: int = Field(1, ge=1, le=255)
     component_id: int = Field(1, ge=0, le=255)
+    also: tuple[MavlinkSenderConfig, ...] = Field(
+        (), description="further systems and components whose messages are used"
+    )
     talk: bool = Field(True, description="send heartbeats and TIMESYNC; False: only listen")
     messages: tuple[MavlinkSource, ...] = Field(
         (
@@ -109,8 +126,8 @@ class MavlinkConfig(PositioningConfig):
         ),
         description="converted to samples, in addition to pressure and lights; with the default "
         "only the angular rate arrives twice from an ArduSub. GPS_RAW_INT is the receiver's fix, "
-        "also where an acoustic system sends GPS_INPUT; GLOBAL_POSITION_INT is the output of the "
-        "autopilot's filter, which holds the same fix once more",
+        "also where an acoustic system sends GPS_INPUT, which is the same once more; "
+        "GLOBAL_POSITION_INT is the output of the autopilot's filter, which holds it too",
     )
     external_pressure: Literal["SCALED_PRESSURE", "SCALED_PRESSURE2", "SCALED_PRESSURE3"] | None = (
         Field(
@@ -126,9 +143,20 @@ class MavlinkConfig(PositioningConfig):
         101_325.0, ge=50_000, le=120_000, description="Pa; read it at the surface before diving"
     )
     local_velocity_sigma_m_s: float = Field(
-        0.1, gt=0, description="m/s, 1 sigma of LOCAL_POSITION_NED, which has none (judgement)"
+        0.1,
+        gt=0,
+        description="m/s, 1 sigma of LOCAL_POSITION_NED and VISION_POSITION_DELTA, which have none "
+        "(judgement)",
     )
     lights: LightsConfig | None = None
+
+    @model_validator(mode="after")
+    def _names_each_sender_once(self) -> MavlinkConfig:
+        senders = [(self.system_id, self.component_id)]
+        senders += [(each.system_id or self.system_id, each.component_id) for each in self.also]
+        if len(set(senders)) < len(senders):
+            raise ValueError("'also' names each sender once, and not the autopilot itself")
+        return self
 
 
 class NmeaConfig(PositioningConfig):

@@ -8,9 +8,10 @@ from typing import Any
 from aquaflow.config.telemetry import MavlinkConfig
 from aquaflow.drivers.device_clock import DeviceClock
 from aquaflow.drivers.extra import load
-from aquaflow.drivers.protocol.mavlink_frames import MavlinkFraming, header_of
+from aquaflow.drivers.protocol.mavlink_frames import Header, MavlinkFraming, header_of
 from aquaflow.drivers.protocol.mavlink_outbound import Receiver, message_of
-from aquaflow.drivers.protocol.mavlink_samples import SINCE_1970_US, MavlinkSamples, MessageTime
+from aquaflow.drivers.protocol.mavlink_samples import SINCE_1970_US, MessageTime
+from aquaflow.drivers.protocol.mavlink_senders import MavlinkSenders
 from aquaflow.drivers.protocol.packets import PacketDecoder
 from aquaflow.messages import TelemetrySample
 from aquaflow.sources.outbound import OutboundMessage, StatusText
@@ -32,19 +33,19 @@ FIXES = ("GPS_RAW_INT", "GPS2_RAW")
 
 
 class MavlinkDecoder(PacketDecoder):
-    """The autopilot that ``config`` names; messages of others on the link are counted, not used."""
+    """The autopilot that ``config`` names, and the other components that it asks for."""
 
     def __init__(self, name: str, config: MavlinkConfig) -> None:
         self._dialect = load(DIALECT, f"the MAVLink device '{name}'")
         super().__init__(name, MavlinkFraming(self._dialect))
         self.clock: DeviceClock = DeviceClock(name)
         self._config = config
-        self._samples = MavlinkSamples(config)
+        self._senders = MavlinkSenders(name, config)
         # Numbers, since most packets are of no interest and need not be unpacked.
         self._wanted = {
             number: message.msgname
             for number, message in self._dialect.mavlink_map.items()
-            if message.msgname in self._samples.wanted | {"HEARTBEAT", "TIMESYNC", "SYSTEM_TIME"}
+            if message.msgname in self._senders.wanted | {"HEARTBEAT", "TIMESYNC", "SYSTEM_TIME"}
         }
         self._wire = self._dialect.MAVLink(None, config.system_id, OUR_COMPONENT)
         self._requests: deque[int] = deque(maxlen=OPEN_REQUESTS)
@@ -55,11 +56,12 @@ class MavlinkDecoder(PacketDecoder):
 
     def decode(self, packet: bytes, arrival_ns: int) -> list[TelemetrySample]:
         header = header_of(packet)
-        sender = (self._config.system_id, self._config.component_id)
-        if (header.system, header.component) != sender or header.message_id not in self._wanted:
+        if header.message_id not in self._wanted:
             return []
-        message = self._unpacked(packet)
         name = self._wanted[header.message_id]
+        if (header.system, header.component) != self._senders.autopilot:
+            return self._of_another(header, name, packet, arrival_ns)
+        message = self._unpacked(packet)
         if name == "HEARTBEAT":
             self._autopilot = message.autopilot
             return []
@@ -67,9 +69,21 @@ class MavlinkDecoder(PacketDecoder):
             self._synchronise(message, arrival_ns)
             return []
         t_ns = self._moment(name, message, arrival_ns)
-        if name not in self._samples.wanted:
+        samples = self._senders.of(header, name)
+        if samples is None:
             return []  # SYSTEM_TIME, for its time since boot
-        return self._samples.of(message, MessageTime(t_ns, arrival_ns, self.source(name)))
+        return samples.of(message, MessageTime(t_ns, arrival_ns, self.source(name)))
+
+    def _of_another(
+        self, header: Header, name: str, packet: bytes, arrival_ns: int
+    ) -> list[TelemetrySample]:
+        """Samples of a component that the config names; of others they are counted."""
+        samples = self._senders.of(header, name)
+        if samples is None:
+            self.counters.unheard += self._senders.unheard(header, name)
+            return []
+        source = self.source(f"{header.system}.{header.component}/{name}")
+        return samples.of(self._unpacked(packet), MessageTime(arrival_ns, arrival_ns, source))
 
     def outgoing(self, now_ns: int) -> bytes:
         """The bytes to write now: answers to TIMESYNC, and once a second our own request."""

@@ -6,7 +6,7 @@ mavlink.io/en/messages/common.html.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, TypeAlias
 
 from aquaflow.config.telemetry import MavlinkConfig
@@ -45,6 +45,8 @@ DEGREES = 1e-7
 """Of one count of latitude and longitude."""
 UNKNOWN_EPH = 0xFFFF
 """eph is HDOP times 100."""
+IGNORE_HDOP, IGNORE_ACCURACY = 2, 64
+"""Of GPS_INPUT_IGNORE_FLAGS: HDOP, and horizontal accuracy."""
 SINCE_1970_US = 1_000_000_000_000_000
 """A time_usec above is not the time since boot: that would be 31 years."""
 
@@ -61,9 +63,9 @@ Samples: TypeAlias = list[TelemetrySample]
 
 
 class MavlinkSamples:
-    """Samples of the messages that the config asks for."""
+    """Samples of the messages that the config asks one sender for."""
 
-    def __init__(self, config: MavlinkConfig) -> None:
+    def __init__(self, config: MavlinkConfig, messages: Iterable[str]) -> None:
         self._config = config
         self._attitude: tuple[int, Quaternion] | None = None
         self._fixes = Fixes(config)
@@ -81,12 +83,15 @@ class MavlinkSamples:
             "GPS2_RAW": self._fix,
             "GLOBAL_POSITION_INT": self._filtered_position,
             "SYSTEM_TIME": _utc,
+            "GPS_INPUT": self._fed_fix,
+            "VISION_POSITION_DELTA": self._motion,
+            "SCALED_PRESSURE": self._pressure,
+            "SCALED_PRESSURE2": self._pressure,
+            "SCALED_PRESSURE3": self._pressure,
+            "SERVO_OUTPUT_RAW": self._lights,
+            "RC_CHANNELS": self._lights,
         }
-        self._converters = {str(name): known[name] for name in config.messages}
-        if config.external_pressure is not None:
-            self._converters[config.external_pressure] = self._pressure
-        if config.lights is not None:
-            self._converters[config.lights.message] = self._lights
+        self._converters = {name: known[name] for name in messages}
 
     @property
     def wanted(self) -> frozenset[str]:
@@ -138,6 +143,32 @@ class MavlinkSamples:
             t_ns = self._fixes.dated(stamp.t_ns)
             found.append(UtcTime(t_ns, *stamp[1:], 1000 * message.time_usec))
         return found
+
+    def _fed_fix(self, message: Any, stamp: MessageTime) -> Samples:
+        """GPS_INPUT: a fix on its way to the autopilot, as acoustic systems send it."""
+        if message.fix_type < FIX_3D:
+            return []
+        stated = message.horiz_accuracy if not message.ignore_flags & IGNORE_ACCURACY else 0.0
+        hdop = None if message.ignore_flags & IGNORE_HDOP else message.hdop
+        sigma_m = stated or sigma_of(hdop)
+        return self._fixes.fix(*stamp, message.lat * DEGREES, message.lon * DEGREES, sigma_m)
+
+    def _motion(self, message: Any, stamp: MessageTime) -> Samples:
+        """VISION_POSITION_DELTA: what the body moved and turned by since the message before, in
+        its own axes; a DVL's extension of BlueOS sends it to the autopilot."""
+        if message.confidence <= 0.0 or message.time_delta_usec == 0:
+            raise ValueError("the odometry calls its motion invalid")
+        t_ns = stamp.t_ns - 500 * message.time_delta_usec  # the middle of the interval
+        dt_s = 1e-6 * message.time_delta_usec
+        (vx, vy, vz), (wx, wy, wz) = (
+            tuple(each / dt_s for each in delta)
+            for delta in (message.position_delta, message.angle_delta)
+        )
+        sigma_m_s = self._config.local_velocity_sigma_m_s
+        return [
+            Velocity(t_ns, *stamp[1:], (vx, vy, vz), sigma_m_s),
+            AngularRate(t_ns, *stamp[1:], (wx, wy, wz)),
+        ]
 
     def _filtered_position(self, message: Any, stamp: MessageTime) -> Samples:
         """The filter has the receiver's lag taken out, and states no accuracy."""
