@@ -171,6 +171,13 @@ class NmeaConfig(PositioningConfig):
         description="those that measure the vehicle's own depth, from a pressure sensor; "
         "the others measure the distance to the bottom",
     )
+    variation_deg: float | None = Field(
+        None,
+        ge=-180,
+        le=180,
+        description="deg from true to magnetic north, east positive, added to a heading that is "
+        "magnetic and states none (HDM, HDG); None: it stays magnetic (fusion.declination)",
+    )
     assume: Assumptions = Assumptions()
 
 

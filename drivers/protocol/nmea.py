@@ -5,16 +5,20 @@ They send no time of measurement, so ``t_ns`` is the arrival.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable
 from typing import TypeAlias
 
 from aquaflow.config.telemetry import NmeaConfig
+from aquaflow.drivers.protocol.nmea_acoustic import NmeaAcoustic
 from aquaflow.drivers.protocol.nmea_gnss import NmeaGnss
 from aquaflow.drivers.protocol.nmea_sentence import framing, number, parse
 from aquaflow.drivers.protocol.packets import PacketDecoder
 from aquaflow.drivers.protocol.partial import PartialMotion
 from aquaflow.messages import Altitude, Depth, TelemetrySample
+
+log = logging.getLogger(__name__)
 
 KNOT_M_S = 1852.0 / 3600.0
 """m/s; a nautical mile of 1852 m in an hour."""
@@ -26,21 +30,24 @@ Convert: TypeAlias = Callable[[Fields, int, str], list[TelemetrySample]]
 
 
 class NmeaDecoder(PacketDecoder):
-    """DBT DBS DBK DPT, HDT HDG, ROT, VBW, XDR, PRDID, PASHR, GGA RMC GST ZDA; other sentences are
-    counted."""
+    """DBT DBS DBK DPT, HDT THS HDG HDM, ROT, VBW, XDR, PRDID, PASHR, GGA RMC GST ZDA, PSIMSSB;
+    other sentences are counted."""
 
     def __init__(self, name: str, config: NmeaConfig) -> None:
         super().__init__(name, framing(config.require_checksum))
         self._config = config
         self._motion = PartialMotion(config.assume)
-        gnss = NmeaGnss(config)
+        self._said_magnetic = False
+        gnss, acoustic = NmeaGnss(config), NmeaAcoustic(name, config)
         self._sentences: dict[str, Convert] = {
             "DBT": self._below,
             "DBS": self._below,
             "DBK": self._below,
             "DPT": self._below,
             "HDT": self._true_heading,
+            "THS": self._heading_with_status,
             "HDG": self._magnetic_heading,
+            "HDM": self._compass_heading,
             "ROT": self._rate_of_turn,
             "VBW": self._ground_speed,
             "XDR": self._transducers,
@@ -50,6 +57,7 @@ class NmeaDecoder(PacketDecoder):
             "RMC": self._of_gnss(gnss.rmc),
             "GST": self._of_gnss(gnss.gst),
             "ZDA": self._of_gnss(gnss.zda),
+            "PSIMSSB": self._of_gnss(acoustic.fix),
         }
 
     def decode(self, packet: bytes, arrival_ns: int) -> list[TelemetrySample]:
@@ -73,10 +81,31 @@ class NmeaDecoder(PacketDecoder):
 
     def _magnetic_heading(self, fields: Fields, t_ns: int, kind: str) -> list[TelemetrySample]:
         """HDG: sensor heading, deviation and its E or W, variation and its E or W."""
-        deviation = _eastward(fields[1], fields[2])
-        variation = _eastward(fields[3], fields[4])
-        degrees = number(fields[0]) + deviation + variation
+        degrees = number(fields[0]) + _eastward(fields[1], fields[2])
+        degrees += _eastward(fields[3], fields[4]) if fields[3] else self._variation_deg(kind)
         return self._motion.heading(t_ns, self.source(kind), math.radians(degrees))
+
+    def _compass_heading(self, fields: Fields, t_ns: int, kind: str) -> list[TelemetrySample]:
+        """HDM: magnetic heading, M."""
+        degrees = number(fields[0]) + self._variation_deg(kind)
+        return self._motion.heading(t_ns, self.source(kind), math.radians(degrees))
+
+    def _variation_deg(self, kind: str) -> float:
+        """What a heading that states no variation lacks; a warning where nothing says it."""
+        if self._config.variation_deg is None and not self._said_magnetic:
+            self._said_magnetic = True
+            log.warning(
+                "%s: %s states no variation, so its heading is magnetic; set variation_deg of this "
+                "device, or fusion.declination",
+                self.name, kind,
+            )  # fmt: skip
+        return self._config.variation_deg or 0.0
+
+    def _heading_with_status(self, fields: Fields, t_ns: int, kind: str) -> list[TelemetrySample]:
+        """THS: true heading, and A where it is measured; not: estimated, typed in, simulated."""
+        if fields[1] != "A":
+            raise ValueError("the gyro calls its heading something else than measured")
+        return self._true_heading(fields, t_ns, kind)
 
     def _rate_of_turn(self, fields: Fields, t_ns: int, kind: str) -> list[TelemetrySample]:
         """ROT: degrees per minute, negative to port; A: valid."""

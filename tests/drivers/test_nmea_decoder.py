@@ -249,7 +249,7 @@ def test_a_receiver_without_a_fix_gives_nothing_and_is_not_at_fault(body):
 def test_sentences_that_tell_nothing_of_motion_are_counted():
     receiver = decoder()
 
-    assert receiver.feed(sentence("YXMTW,17.75,C") + sentence("PSIMSSB,,B01,A,,C"), NOW) == []
+    assert receiver.feed(sentence("YXMTW,17.75,C") + sentence("PSIMSNS,,B01,A,,C"), NOW) == []
     assert (receiver.counters.messages, receiver.counters.invalid_values) == (2, 0)
 
 
