@@ -1,8 +1,8 @@
 """Instruments on an NMEA 2000 bus.
 
-The groups read here fit into one frame each, so no fast packet has to be put together: of the
-position 129025 is read, with the accuracy from 129539, and not 129029. They send no time of
-measurement, so ``t_ns`` is the arrival.
+Of the position 129025 is read, several times a second, with the accuracy from 129539; where no
+129025 comes, the position of 129029, a fast packet. They send no time of measurement, so ``t_ns``
+is the arrival.
 """
 
 from __future__ import annotations
@@ -13,15 +13,18 @@ from collections.abc import Callable
 from aquaflow.config.telemetry import Nmea2000Config
 from aquaflow.drivers.fixes import Fixes, sigma_of
 from aquaflow.drivers.protocol.can_records import CanFraming, frame_of
+from aquaflow.drivers.protocol.fast_packet import FastPackets
 from aquaflow.drivers.protocol.packets import PacketDecoder
 from aquaflow.drivers.protocol.partial import PartialMotion
 from aquaflow.messages import Altitude, TelemetrySample, UtcTime
 
 HEADING, RATE_OF_TURN, ATTITUDE, SPEED, WATER_DEPTH = 127250, 127251, 127257, 128259, 128267
-SYSTEM_TIME, POSITION, DILUTION = 126992, 129025, 129539
+SYSTEM_TIME, POSITION, FIX, DILUTION = 126992, 129025, 129029, 129539
 """Parameter group numbers."""
 
-NOT_AVAILABLE = {"H": 0xFFFF, "h": 0x7FFF, "I": 0xFFFF_FFFF, "i": 0x7FFF_FFFF}
+NOT_AVAILABLE = {
+    "H": 0xFFFF, "h": 0x7FFF, "I": 0xFFFF_FFFF, "i": 0x7FFF_FFFF, "q": 0x7FFF_FFFF_FFFF_FFFF,
+}  # fmt: skip
 """The largest value of each type, by struct's letter."""
 RESERVED = 2
 """The two values below 'not available' mean 'out of range' and 'reserved'."""
@@ -30,6 +33,13 @@ TRUE, MAGNETIC = 0, 1
 ANGLE_RAD, RATE_RAD_S, SPEED_M_S, DEPTH_M = 1e-4, 3.125e-8, 0.01, 0.01
 PLACE_DEG, HDOP, DAY_NS, CLOCK_NS = 1e-7, 0.01, 86_400_000_000_000, 100_000
 """Value of one count of each field."""
+FINE_PLACE_DEG = 1e-16
+"""Likewise in 129029."""
+FIX_METHODS = (1, 2, 3, 4, 5)
+"""Methods of 129029: autonomous, differential, precise, RTK; not: none, reckoned, typed in,
+simulated."""
+POSITION_LIFE_NS = 5_000_000_000
+"""129029 places the vehicle where there was no 129025 for so long."""
 FIX_MODES = (1, 2)
 """Modes of 129539 with a fix, 2D and 3D; not: 1D (0) and error."""
 LOCAL_CRYSTAL = 5
@@ -52,7 +62,9 @@ class Nmea2000Decoder(PacketDecoder):
         super().__init__(name, CanFraming())
         self._motion = PartialMotion(config.assume)
         self._fixes = Fixes(config)
+        self._fast = FastPackets()
         self._dilution: tuple[int, bool, float | None] | None = None
+        self._position_ns: int | None = None
         self._groups: dict[int, Callable[[bytes, int], list[TelemetrySample]]] = {
             HEADING: self._heading,
             RATE_OF_TURN: self._rate_of_turn,
@@ -62,12 +74,17 @@ class Nmea2000Decoder(PacketDecoder):
             SYSTEM_TIME: self._utc,
             POSITION: self._position,
             DILUTION: self._accuracy,
+            FIX: self._whole_fix,
         }
 
     def decode(self, packet: bytes, arrival_ns: int) -> list[TelemetrySample]:
         frame = frame_of(packet)
-        convert = self._groups.get(group_of(frame.identifier)) if frame.extended else None
-        return convert(frame.data, arrival_ns) if convert else []
+        group = group_of(frame.identifier) if frame.extended else None
+        convert = None if group is None else self._groups.get(group)
+        if convert is None:
+            return []
+        data = self._fast.add(frame.identifier, frame.data) if group == FIX else frame.data
+        return [] if data is None else convert(data, arrival_ns)
 
     def _heading(self, data: bytes, t_ns: int) -> list[TelemetrySample]:
         yaw = _value("H", data, 1) * ANGLE_RAD
@@ -118,6 +135,7 @@ class Nmea2000Decoder(PacketDecoder):
     def _position(self, data: bytes, t_ns: int) -> list[TelemetrySample]:
         if _missing("i", data, 0) or _missing("i", data, 4):
             return []  # no fix
+        self._position_ns = t_ns
         fixed, hdop = True, None
         if self._dilution is not None and t_ns - self._dilution[0] <= DILUTION_LIFE_NS:
             _, fixed, hdop = self._dilution
@@ -126,6 +144,20 @@ class Nmea2000Decoder(PacketDecoder):
         degrees = [_value("i", data, at) * PLACE_DEG for at in (0, 4)]
         source = self.source(str(POSITION))
         return self._fixes.fix(t_ns, t_ns, source, degrees[0], degrees[1], sigma_of(hdop))
+
+    def _whole_fix(self, data: bytes, t_ns: int) -> list[TelemetrySample]:
+        """129029: date and time, latitude, longitude, height, and how they were found."""
+        if data[31] >> 4 not in FIX_METHODS:
+            return []
+        source = self.source(str(FIX))
+        days, clock = _value("H", data, 1), _value("I", data, 3)
+        utc_ns = days * DAY_NS + clock * CLOCK_NS
+        found: list[TelemetrySample] = [UtcTime(self._fixes.dated(t_ns), t_ns, source, utc_ns)]
+        if self._position_ns is not None and t_ns - self._position_ns <= POSITION_LIFE_NS:
+            return found
+        lat, lon = (_value("q", data, at) * FINE_PLACE_DEG for at in (7, 15))
+        hdop = None if _missing("h", data, 34) else _value("h", data, 34) * HDOP
+        return found + self._fixes.fix(t_ns, t_ns, source, lat, lon, sigma_of(hdop))
 
 
 def _missing(code: str, data: bytes, at: int) -> bool:
