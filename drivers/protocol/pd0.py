@@ -6,6 +6,7 @@ Ship and instrument axes are x starboard, y forward, z up.
 from __future__ import annotations
 
 import calendar
+import logging
 import struct
 from datetime import datetime
 
@@ -13,6 +14,8 @@ from aquaflow.config.telemetry import Pd0Config
 from aquaflow.drivers.device_clock import DeviceClock
 from aquaflow.drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing, PacketDecoder
 from aquaflow.messages import Altitude, TelemetrySample, Velocity
+
+log = logging.getLogger(__name__)
 
 MARK = b"\x7f\x7f"
 """Header ID and data source ID."""
@@ -27,7 +30,10 @@ MAX_TYPES = 16
 FIXED_LEADER, VARIABLE_LEADER, BOTTOM_TRACK = 0x0000, 0x0080, 0x0600
 """IDs of the data types that are read."""
 INSTRUMENT, SHIP = 1, 2
-"""Bits 3 and 4 of the fixed leader's byte 25; 0 is beam, 3 is earth coordinates."""
+"""Coordinates by bits 3 and 4 of the fixed leader's byte 25."""
+UNUSED = {0: "beam", 3: "earth"}
+"""Beam velocities need the head's geometry; of those in earth axes the attitude would have
+to be taken off again."""
 BAD_VELOCITY = -32_768
 """mm/s; what the DVL writes for a velocity that it could not measure."""
 MIN_BEAMS = 3
@@ -73,6 +79,7 @@ class Pd0Decoder(PacketDecoder):
         self.clock: DeviceClock = DeviceClock(name)
         self._sign = -1.0 if config.velocity_of == "bottom" else 1.0
         self._sigma_m_s = config.sigma_m_s
+        self._said_unused = False
 
     def decode(self, packet: bytes, arrival_ns: int) -> list[TelemetrySample]:
         parts = _parts(packet)
@@ -84,6 +91,8 @@ class Pd0Decoder(PacketDecoder):
         if (altitude_m := _altitude(bottom)) is not None:
             samples.append(Altitude(t_ns, arrival_ns, source, altitude_m))
         x, y, z, error = struct.unpack_from("<4h", bottom, 24)
+        if coordinates in UNUSED:
+            self._say_unused(UNUSED[coordinates])
         if coordinates not in (INSTRUMENT, SHIP) or BAD_VELOCITY in (x, y, z):
             self.counters.invalid_values += 1
             return samples
@@ -95,6 +104,15 @@ class Pd0Decoder(PacketDecoder):
             Velocity(t_ns, arrival_ns, source, (velocity[0], velocity[1], velocity[2]), merit),
             *samples,
         ]
+
+    def _say_unused(self, coordinates: str) -> None:
+        if not self._said_unused:
+            self._said_unused = True
+            log.warning(
+                "%s: its velocities are in %s coordinates, which are not used; set the DVL to ship "
+                "coordinates (EX10000 and the like), or to instrument coordinates (EX01000)",
+                self.name, coordinates,
+            )  # fmt: skip
 
     def _moment(self, leader: bytes, arrival_ns: int) -> int:
         """When the ensemble was pinged, by the clock of the DVL."""

@@ -218,14 +218,17 @@ def test_a_bad_velocity_is_counted_and_leaves_the_altitude(velocity):
     assert receiver.counters.invalid_values == 1
 
 
-@pytest.mark.parametrize("coordinates", [0 << 3, 3 << 3], ids=["beam", "earth"])
-def test_coordinates_that_are_not_the_vehicles_are_counted(coordinates):
+@pytest.mark.parametrize(("coordinates", "name"), [(0 << 3, "beam"), (3 << 3, "earth")])
+def test_coordinates_that_are_not_the_vehicles_are_counted_and_said_once(coordinates, name, caplog):
     parts = parts_of(said())
     parts[0][25] = coordinates
     receiver = pd0_dvl()
 
-    assert [type(s) for s in receiver.feed(ensemble(*map(bytes, parts)), NOW)] == [Altitude]
-    assert receiver.counters.invalid_values == 1
+    for _ in range(3):
+        assert [type(s) for s in receiver.feed(ensemble(*map(bytes, parts)), NOW)] == [Altitude]
+    assert receiver.counters.invalid_values == 3
+    [record] = caplog.records
+    assert f"its velocities are in {name} coordinates" in record.getMessage()
 
 
 def test_three_beams_tell_the_altitude_and_two_do_not():
