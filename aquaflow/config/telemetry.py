@@ -18,7 +18,10 @@ class MountingConfig(Stage):
     )
     roll_deg: float = Field(0.0, description="of the sensor's axes in the body, first roll")
     pitch_deg: float = Field(0.0, description="then pitch")
-    yaw_deg: float = Field(0.0, description="then yaw; 180: a DVL that points backwards")
+    yaw_deg: float = Field(
+        0.0,
+        description="then yaw; 180: a DVL that points backwards, unless it turns what it sends",
+    )
 
 
 class DeviceConfig(Stage):
