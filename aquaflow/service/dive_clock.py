@@ -1,4 +1,4 @@
-"""Frame indices and time of a run that resumes a dive: they continue those of the run before."""
+"""The dive's clock: it counts from the first frame, also in a run that resumes the dive."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from dataclasses import dataclass, field, replace
 
 from aquaflow.clocks.device import Learned
 from aquaflow.dive.frames_csv import FrameRow
-from aquaflow.messages import Dropped, Frame, TelemetrySample
+from aquaflow.messages import Dropped, Frame
 from aquaflow.service.moment import Moment
 
 
 @dataclass(frozen=True)
 class Continued:
-    """Nothing to continue, unless made by :meth:`after`."""
+    """A new dive, unless made by :meth:`after`."""
 
     first_index: int = 0
     """Frames before this one were finished, or lost, in the run before."""
-    shift_ns: int = 0
-    """From this boot's clock to the dive's."""
+    shift_ns: int | None = None
+    """From this boot's clock to the dive's; None until the first frame of a new dive."""
     clocks: Mapping[str, Learned] = field(default_factory=dict)
     """Learned clock mappings, by device."""
 
@@ -36,16 +36,18 @@ class Continued:
         known = clocks if moment.is_of_the_boot_of(now) else {}
         return Continued(first, moment.shift_ns(now), known)
 
-    def shifted(self, sample: TelemetrySample) -> TelemetrySample:
-        """A sample on the dive's clock."""
-        if self.shift_ns == 0:
-            return sample
-        t_ns, arrival_ns = sample.t_ns + self.shift_ns, sample.arrival_ns + self.shift_ns
-        return replace(sample, t_ns=t_ns, arrival_ns=arrival_ns)
+    @property
+    def known_shift_ns(self) -> int:
+        """The shift, or 0 where the devices' clock is still the dive's."""
+        return self.shift_ns or 0
+
+    def begun(self, t_ns: int) -> Continued:
+        """A dive that was not begun counts from ``t_ns``, its first frame."""
+        return self if self.shift_ns is not None else replace(self, shift_ns=-t_ns)
 
     def counted(self, frame: Frame | Dropped) -> Frame | Dropped:
         """A frame of a device that began to count anew."""
-        index, t_ns = frame.index + self.first_index, frame.t_ns + self.shift_ns
+        index, t_ns = frame.index + self.first_index, frame.t_ns + self.known_shift_ns
         if isinstance(frame, Dropped):
             return replace(frame, index=index, t_ns=t_ns)
         return replace(frame, index=index, t_ns=t_ns)

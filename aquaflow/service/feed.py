@@ -20,6 +20,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Protocol, runtime_checkable
 
@@ -53,6 +54,8 @@ class LatestSamples:
 
     def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
         self.samples = 0
+        self.shift_ns: int | None = 0
+        """From the sources' clock to the dive's; None keeps the samples waiting."""
         self._now_s = now_s
         self._latest: dict[tuple[str, str], tuple[TelemetrySample, float]] = {}
         self._new: deque[TelemetrySample] = deque(maxlen=MOST_SAMPLES)
@@ -64,13 +67,22 @@ class LatestSamples:
         self._new.append(sample)
 
     def taken(self) -> list[TelemetrySample]:
-        """Those that came since the last call, in the order of arrival."""
-        return [self._new.popleft() for _ in range(len(self._new))]
+        """Those that came since the last call, in the order of arrival, on the dive's clock."""
+        shift_ns = self.shift_ns
+        if shift_ns is None:
+            return []
+        return [_later(self._new.popleft(), shift_ns) for _ in range(len(self._new))]
 
     def latest(self) -> list[tuple[TelemetrySample, float]]:
         """The newest of each source and kind, and the seconds since it came."""
         now = self._now_s()
         return [(sample, now - came) for sample, came in list(self._latest.values())]
+
+
+def _later(sample: TelemetrySample, by_ns: int) -> TelemetrySample:
+    if by_ns == 0:
+        return sample
+    return replace(sample, t_ns=sample.t_ns + by_ns, arrival_ns=sample.arrival_ns + by_ns)
 
 
 @runtime_checkable
@@ -218,6 +230,7 @@ class LiveFeed(_Pumps):
 
     def continue_from(self, continued: Continued) -> None:
         super().continue_from(continued)
+        self.latest_samples.shift_ns = continued.shift_ns
         if isinstance(self._telemetry, HasDeviceClocks):
             self._telemetry.resume(continued.clocks)
 
@@ -256,6 +269,8 @@ class LiveFeed(_Pumps):
             if self._recorder is not None:
                 self._recorder.frame(name, frame)
             if mapped:
+                self.continued = self.continued.begun(frame.t_ns)
+                self.latest_samples.shift_ns = self.continued.shift_ns
                 self.newest.put(self.continued.counted(frame))
 
     def _when_asked(self, frames: Iterator[Frame | Dropped]) -> Iterator[Frame | Dropped]:
@@ -268,7 +283,7 @@ class LiveFeed(_Pumps):
 
     def _samples(self, source: HasSamples) -> None:
         for sample in source.samples():
-            self.latest_samples.take(self.continued.shifted(sample))
+            self.latest_samples.take(sample)
             if self._recorder is not None:
                 self._recorder.sample(sample)
 

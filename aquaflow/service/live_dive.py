@@ -135,7 +135,7 @@ class LiveDive:
         )  # fmt: skip
         checkpointer = Checkpointer(
             self.folder.path, run, slam, thread, service.checkpoint.every_s, feed.clocks,
-            continued.shift_ns,
+            lambda: feed.continued.known_shift_ns,
         )  # fmt: skip
         loop.watchers.append(
             lambda live: checkpointer.take_if_due(live.pressure.disk_is_full(service.limits))

@@ -90,6 +90,26 @@ def test_the_computers_clock_is_heard_as_a_recording_holds_it(tmp_path: Path) ->
     assert not any(thread.name == "wall clock" for thread in threading.enumerate())
 
 
+def test_a_new_dive_counts_from_its_first_frame_with_the_samples_before_it(tmp_path: Path) -> None:
+    front = camera(tmp_path, CameraFaults())
+    early = Depth(7, 8, "bar30", 1.0)
+    feed = LiveFeed("front", {"front": front}, None, SourceConfig())
+    feed.continue_from(Continued())
+    feed.latest_samples.take(early)
+    assert feed.latest_samples.taken() == []  # nothing says yet where the dive begins
+    feed.start()
+    try:
+        frames: list[Frame | Dropped] = []
+        until(lambda: (frame := feed.newest.take(1.0)) is not None and frames.append(frame) is None)
+        shift_ns = feed.continued.shift_ns
+        assert shift_ns is not None
+        assert frames[0].t_ns == 0
+        sample = feed.latest_samples.taken()[0]
+        assert (sample.t_ns, sample.arrival_ns) == (7 + shift_ns, 8 + shift_ns)
+    finally:
+        feed.close()
+
+
 def test_only_pictures_that_are_asked_for_are_decoded(tmp_path: Path) -> None:
     front = camera(tmp_path, CameraFaults())
     feed = LiveFeed("front", {"front": front}, None, SourceConfig())

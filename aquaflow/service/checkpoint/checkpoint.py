@@ -53,7 +53,7 @@ class Checkpointer:
         maps: MapThread,
         every_s: float,
         clocks: Callable[[], Mapping[str, Learned]],
-        shift_ns: int = 0,
+        shift_ns: Callable[[], int] = lambda: 0,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """``shift_ns``: from this boot's clock to the dive's."""
@@ -88,7 +88,7 @@ class Checkpointer:
             except OSError as error:  # what it would name is not there
                 self._failed(error)
                 return
-        moment = replace(Moment.now(), dive_shift_ns=self._shift_ns)
+        moment = replace(Moment.now(), dive_shift_ns=self._shift_ns())
         head = {"format": FORMAT, "version": __version__, "moment": moment.to_json()}
         head |= {"tracking": facts, "clocks": self._clocks()}
         arrays = prefixed("tracking", arrays)

@@ -113,7 +113,7 @@ class PoseOutput:
         reason = self._missing(frame)
         if reason is not None or T_bc is None:
             return reason or Withheld.NO_MOUNTING
-        t_ns = latest.frame.t_ns - self._feed.continued.shift_ns
+        t_ns = latest.frame.t_ns - self._feed.continued.known_shift_ns
         sighting = Sighting(t_ns, latest.sub_map, T_mc)
         self._follow(self._track.add(sighting, lambda T: body_pose(frame, T_bc, T)))
         if self._rate_hz() < LEAST_HZ:
