@@ -229,7 +229,9 @@ class LearnedConfig(Stage):
         "themselves and are kept from the map",
     )
     start: bool = Field(
-        True, description="a map starts at the second picture where ranges are certain enough"
+        False,
+        description="a map starts at the second picture where ranges are certain enough; the poses "
+        "until parallax decides are off by as much as the ranges, which costs accuracy",
     )
     start_sigma: float = Field(
         0.1,

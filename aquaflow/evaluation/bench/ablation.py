@@ -72,7 +72,7 @@ LEARNED: tuple[tuple[str, dict[str, Any], bool], ...] = (
 WITHOUT: tuple[tuple[str, dict[str, Any]], ...] = (
     ("", {}),
     (", without learned depth", _tracking(learned={"depth": False})),
-    (", without learned start", _tracking(learned={"start": False})),
+    (", with learned start", _tracking(learned={"start": True})),
     (", without learned matches", {"prior": {"learned_matches": False}}),
     (", without confidence of matches", {"prior": {"confidence": False}}),
     (", residual ray", _tracking(residual="ray")),

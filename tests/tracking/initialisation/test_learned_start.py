@@ -14,6 +14,7 @@ from aquaflow.tracking.initialisation.learned_start import learned_start
 from tests.tracking.tracked_clips import PLACED, SMALL, error_share, plane_depth, run
 from tests.tracking.tracking_scenes import KnownPair, KnownPrior, KnownView, pose
 
+STARTING = TrackingConfig(learned=LearnedConfig(start=True))
 STILL = pose((0.001, 0.002, -0.001), (0.004, 0.001, 0.0))
 """A step of 0.3 % of the depth: a quarter of a pixel."""
 
@@ -69,7 +70,7 @@ def pair(sigma: float = 0.05, stated: float = 0.05, T_ba: Sim3 = STILL) -> Range
 
 
 def test_two_pictures_without_parallax_give_a_map() -> None:
-    start = learned_start(pair(), SMALL, TrackingConfig())
+    start = learned_start(pair(), SMALL, STARTING)
     assert start is not None
     assert not start.pointmap.known(1.0).any(), "nothing is triangulated yet"
     depth = 1.0 / start.pointmap.completed(1.0).rho
@@ -89,30 +90,29 @@ def test_two_pictures_without_parallax_give_a_map() -> None:
     ],
 )
 def test_ranges_that_are_not_certain_enough_start_no_map(sigma: float, stated: float) -> None:
-    assert learned_start(pair(sigma, stated), SMALL, TrackingConfig()) is None
+    assert learned_start(pair(sigma, stated), SMALL, STARTING) is None
 
 
 def test_matches_that_no_motion_explains_start_no_map() -> None:
     wrong = pair()
     wrong.matches = wrong.matches[::-1, ::-1].copy()
-    assert learned_start(wrong, SMALL, TrackingConfig()) is None
+    assert learned_start(wrong, SMALL, STARTING) is None
 
 
 def test_no_map_starts_from_ranges_where_that_is_not_wanted() -> None:
-    config = TrackingConfig(learned=LearnedConfig(start=False))
-    assert learned_start(pair(), SMALL, config) is None
+    assert learned_start(pair(), SMALL, TrackingConfig()) is None
 
 
 def test_a_prior_without_ranges_starts_no_map() -> None:
     plain = pair()
     plain.X_b = None
-    assert learned_start(plain, SMALL, TrackingConfig()) is None
+    assert learned_start(plain, SMALL, STARTING) is None
 
 
 def test_ranges_that_are_known_up_to_a_shift_start_no_map() -> None:
     affine = pair()
     affine.range_unit = "affine"
-    assert learned_start(affine, SMALL, TrackingConfig()) is None
+    assert learned_start(affine, SMALL, STARTING) is None
 
 
 def test_a_still_camera_has_poses_from_the_first_picture_on() -> None:
@@ -124,7 +124,7 @@ def test_a_still_camera_has_poses_from_the_first_picture_on() -> None:
     ]
     poses = [*still, *swim]
     prior = RangedPrior(poses)
-    tracked = run(prior.frames(SMALL), prior=prior)
+    tracked = run(prior.frames(SMALL), prior=prior, config=STARTING)
     assert all(each.frame_class in PLACED for each in tracked.tracked)
     assert tracked.tracked[0].frame.index == 0
     assert tracked.store[0].frame_index == 0
