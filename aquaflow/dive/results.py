@@ -13,7 +13,7 @@ from aquaflow import __version__
 from aquaflow.dive.held_out import HeldOut
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.transfers import picture_out, water_in, water_out
+from aquaflow.mapping.transfers import picture_out, transfers, water_in, water_out
 from aquaflow.mapping.views import View
 from aquaflow.mapping.water.image_formation import Water
 from aquaflow.mapping.water.posed_picture import SOLID
@@ -174,6 +174,7 @@ def metrics(
         "renderer": f"{slam.renderer.name} ({slam.renderer.isa}, {slam.renderer.threads} threads)",
         "prior": slam.prior.name,
         "device": slam.renderer.device.type,
+        "transfers": transfers(),
         "seed": slam.config.seed,
         "version": __version__,
         "protocol": PROTOCOL,
