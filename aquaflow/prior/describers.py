@@ -144,8 +144,7 @@ class CompactPair:
 
 def _encoder(folder: Path, has_int8: bool, settings: RuntimeSettings) -> NetworkSession:
     """In 8 bits where that was asked for, or nothing was and it runs on a processor."""
-    if settings.precision == "int8" and not has_int8:
-        raise InputError(f"{folder} has no {INT8_ENCODER}; use precision: fp32")
+    _refuse_missing_int8(folder, has_int8, settings)
     if not has_int8 or settings.precision in ("fp32", "fp16"):
         return NetworkSession(folder / ENCODER, settings)
     encoder = NetworkSession(folder / INT8_ENCODER, settings)
@@ -154,14 +153,18 @@ def _encoder(folder: Path, has_int8: bool, settings: RuntimeSettings) -> Network
     return encoder
 
 
+def _refuse_missing_int8(folder: Path, has_int8: bool, settings: RuntimeSettings) -> None:
+    if settings.precision == "int8" and not has_int8:
+        raise InputError(f"{folder} has no {INT8_ENCODER}; use precision: fp32")
+
+
 def describer_in(folder: Path, settings: RuntimeSettings) -> Describer:
     """The describer for the network that ``folder`` holds; raises as they do."""
     card = read_card(folder)
     name = card.name
     if name == "oracle":
         return OracleDescriber(folder)
-    if settings.precision == "int8" and INT8_ENCODER not in card.files:
-        raise InputError(f"{folder} has no {INT8_ENCODER}; use precision: fp32")
+    _refuse_missing_int8(folder, INT8_ENCODER in card.files, settings)
     kinds: dict[str, Any] = {
         "compact": CompactDescriber,
         "depth": DepthDescriber,

@@ -21,7 +21,7 @@ from aquaflow.training.pair_generator.scene import rotation
 from aquaflow.training.pair_generator.second_view import turned_view
 from aquaflow.training.pairs import Pair, ViewBatch
 
-PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tif", ".bmp")
+PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 CLIPS = (".mp4", ".mov", ".avi", ".mkv")
 FRAMES_OF_A_CLIP = 48
 """Evenly over the clip: neighbours show the same."""
