@@ -29,7 +29,7 @@ from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.tracking.gate.gate import FrameGate, GateKind, Verdict
 from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph
 from aquaflow.tracking.loops.relocaliser import Places
-from aquaflow.tracking.metric.learned_scales import LearnedScales
+from aquaflow.tracking.metric.learned_scales import learned_scales
 from aquaflow.tracking.metric.metric_frames import MetricFrames
 from aquaflow.tracking.overlay.finder import OverlayFinder
 from aquaflow.tracking.tracker import Tracker
@@ -87,12 +87,10 @@ class Slam:
         adjustment = config.tracking.adjustment
         self.adjuster = Adjuster(self.keyframes, adjustment)
         """Joint adjustments of keyframes."""
-        unit_sigma = self.prior.unit_sigma
-        steady = config.tracking.learned.scale and unit_sigma < float("inf")
         self.graph = KeyframeGraph(
             self.keyframes, places, config.tracking, self.failures, self.metric,
             self.adjuster if adjustment.enabled else None,
-            LearnedScales(self.keyframes, unit_sigma) if steady else None,
+            learned_scales(self.keyframes, self.prior.unit_sigma, config.tracking.learned),
         )  # fmt: skip
         self.maps: MapWork = maps or Maps(
             config,

@@ -12,11 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import hypot
+from math import hypot, isfinite
 
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.config.tracking import LearnedConfig
 from aquaflow.geometry.robust import MAD_TO_SIGMA
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
@@ -98,6 +99,13 @@ class LearnedScales:
 
     def applied(self) -> None:
         """Nothing is kept of a result."""
+
+
+def learned_scales(
+    keyframes: KeyframeStore, unit_sigma: float, config: LearnedConfig
+) -> LearnedScales | None:
+    """None where they are not wanted, or the network has no unit that lasts."""
+    return LearnedScales(keyframes, unit_sigma) if config.scale and isfinite(unit_sigma) else None
 
 
 def worlds_of(
