@@ -7,13 +7,12 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 def at_pixels(
     field: npt.NDArray[Scalar],  # [H, W]
-    pixels: Array,  # [M, 2] px
+    pixels: npt.NDArray[np.float64] | npt.NDArray[np.float32],  # [M, 2] px
 ) -> npt.NDArray[Scalar]:
     """[M] values of the pixels' own cells."""
     height, width = field.shape

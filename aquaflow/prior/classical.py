@@ -13,21 +13,16 @@ import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior import flow as dense
-from aquaflow.prior.candidates import best_flow, from_homography, from_prediction
+from aquaflow.prior.candidates import from_homography, from_prediction
 from aquaflow.prior.contract import Encoding, Float, Mask
 from aquaflow.prior.flow_pair import FlowEncoding, FlowPair
+from aquaflow.prior.flow_prior import FlowPrior
 
 
-class ClassicalPrior:
+class ClassicalPrior(FlowPrior):
     """SIFT-homography-initialised DIS flow behind the prior contract."""
 
     name = "classical"
-    ranged = False
-    metric = False
-    unit_sigma = float("inf")
-
-    def __init__(self) -> None:
-        self._matcher = dense.FlowMatcher()
 
     def encode(
         self,
@@ -38,11 +33,6 @@ class ClassicalPrior:
         """Grey picture and texture, for dense flow."""
         grey = dense.normalised_grey(image, mask)
         return FlowEncoding(camera, grey, dense.texture(grey, mask), mask=mask)
-
-    def pack(self, encoding: Encoding) -> dict[str, npt.NDArray[Any]]:
-        """Grey and texture; keypoints only if they were detected."""
-        assert isinstance(encoding, FlowEncoding)
-        return encoding.pack()
 
     def unpack(
         self,
@@ -68,9 +58,8 @@ class ClassicalPrior:
         homography, then from nothing."""
         assert isinstance(a, FlowEncoding)
         assert isinstance(b, FlowEncoding)
-        only = alone and predicted is not None
-        starts = from_prediction(predicted) if only else classical_starts(a, b, predicted)
-        return FlowPair(a, b, best_flow(self._matcher, a, b, starts))
+        starts = classical_starts(a, b, predicted)
+        return FlowPair(a, b, self._flow(a, b, predicted, alone, starts))
 
 
 def classical_starts(

@@ -18,16 +18,14 @@ import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior import flow as dense
-from aquaflow.prior.candidates import best_flow, from_homography, from_prediction
+from aquaflow.prior.candidates import from_homography, from_prediction
 from aquaflow.prior.classical import classical_starts
 from aquaflow.prior.coarse import coarse_flow
 from aquaflow.prior.contract import Encoding, Float, Mask, RangeUnit
 from aquaflow.prior.flow_pair import FlowEncoding, FlowPair
+from aquaflow.prior.flow_prior import WARM_UP, FlowPrior
 from aquaflow.prior.learned_range import spread_over
 from aquaflow.prior.network import ComparedPair, Describer, Half, Picture
-
-WARM_UP = (240, 320, 3)
-"""Shape of a picture to warm up with."""
 
 
 @dataclass
@@ -125,18 +123,18 @@ class HybridPair(FlowPair):
         return self._in_b[1]
 
 
-class HybridPrior:
+class HybridPrior(FlowPrior):
     """Flow that starts from learned matches, behind the prior contract."""
 
     ranged = True
 
     def __init__(self, describer: Describer, learned_matches: bool = True) -> None:
         """Without ``learned_matches`` flow starts at keypoints where a prediction fails."""
+        super().__init__()
         self.name, self.metric = describer.name, describer.metric
         self.unit_sigma = describer.unit_sigma
         self._learned_matches = learned_matches
         self._describer = describer
-        self._matcher = dense.FlowMatcher()
 
     def encode(
         self,
@@ -148,11 +146,6 @@ class HybridPrior:
         grey = dense.normalised_grey(image, mask)
         fitted, texture = self._describer.fitted(image), dense.texture(grey, mask)
         return HybridEncoding(camera, grey, texture, fitted, self._describer, mask=mask)
-
-    def pack(self, encoding: Encoding) -> dict[str, npt.NDArray[Any]]:
-        """Grey, texture and the picture; keypoints and features only if they were computed."""
-        assert isinstance(encoding, HybridEncoding)
-        return encoding.pack()
 
     def unpack(
         self,
@@ -177,10 +170,9 @@ class HybridPrior:
         descriptors, if the network has any, then from keypoints."""
         assert isinstance(a, HybridEncoding)
         assert isinstance(b, HybridEncoding)
-        comparison, only = Comparison(a, b), alone and predicted is not None
-        with_network = comparison if self._learned_matches else None
-        starts = from_prediction(predicted) if only else _starts(a, b, predicted, with_network)
-        return HybridPair(a, b, best_flow(self._matcher, a, b, starts), comparison)
+        comparison = Comparison(a, b)
+        starts = _starts(a, b, predicted, comparison if self._learned_matches else None)
+        return HybridPair(a, b, self._flow(a, b, predicted, alone, starts), comparison)
 
     def warm_up(self) -> None:
         """Run the network once: the first picture of a dive then waits for no preparation."""

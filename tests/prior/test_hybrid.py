@@ -8,17 +8,22 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore, Pointmap
 from aquaflow.prior import homography
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.hybrid import HybridEncoding, HybridPrior
 from tests.prior.patch_describer import PatchDescriber
-from tests.prior.textured_pictures import HEIGHT, WIDTH, Picture, moved_pair, pixel_centres, shift
-
-CAMERA = CameraModel(WIDTH, HEIGHT, 200.0, 200.0, 120.0, 90.0)
-FAR = (0.4 * WIDTH, -20.0)
+from tests.prior.textured_pictures import (
+    CAMERA,
+    FAR,
+    HEIGHT,
+    WIDTH,
+    Picture,
+    moved_pair,
+    pixel_centres,
+    shift,
+)
 
 
 class Mute(PatchDescriber):
@@ -30,14 +35,6 @@ class Mute(PatchDescriber):
 
 def encoded(prior: HybridPrior, pictures: tuple[Picture, Picture]) -> tuple[HybridEncoding, ...]:
     return tuple(prior.encode(picture, CAMERA) for picture in pictures)
-
-
-@pytest.fixture
-def no_sift(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise AssertionError("SIFT ran though the descriptors were good")
-
-    monkeypatch.setattr(homography, "detect", refuse)
 
 
 @pytest.mark.usefixtures("no_sift")

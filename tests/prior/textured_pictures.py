@@ -6,10 +6,15 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.geometry.camera import CameraModel
+
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
 
 WIDTH, HEIGHT = 240, 180
+CAMERA = CameraModel(WIDTH, HEIGHT, 200.0, 200.0, 120.0, 90.0)
+FAR = (0.4 * WIDTH, -20.0)
+"""px: a shift that flow does not find from nothing."""
 MARGIN = 240
 """Pixels of texture around the picture, so that moved pictures stay inside it."""
 

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
-import numpy as np
-
 from aquaflow.evaluation.prior_bench.pair import FoundMatches, Picture
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.contract import Keypoints, Prior
 from aquaflow.prior.flow import pixel_grid
 from aquaflow.prior.hybrid import HybridEncoding
 from aquaflow.prior.keypoint_networks.keypoint_prior import KeypointEncoding
-from aquaflow.prior.keypoint_networks.network import KeypointNetwork, Size
+from aquaflow.prior.keypoint_networks.network import KeypointNetwork, Size, warm_up
 
 
 class Method(Protocol):
@@ -64,8 +62,7 @@ class SparseMethod:
 
     def __init__(self, name: str, network: KeypointNetwork) -> None:
         self.name, self._network = name, network
-        blank = network.detect(np.zeros((240, 320, 3), np.uint8))
-        network.match(blank, blank, (240, 320), (240, 320))
+        warm_up(network)
 
     def describe(
         self,

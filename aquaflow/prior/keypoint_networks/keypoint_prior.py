@@ -7,19 +7,18 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.pixels import at_pixels
 from aquaflow.prior import flow as dense
-from aquaflow.prior.candidates import best_flow, from_homography, from_prediction
+from aquaflow.prior.candidates import from_homography, from_prediction
 from aquaflow.prior.contract import Encoding, Float, Keypoints, Mask
 from aquaflow.prior.flow_pair import FlowEncoding, FlowPair
-from aquaflow.prior.keypoint_networks.network import KeypointNetwork, Picture, Size
+from aquaflow.prior.flow_prior import FlowPrior
+from aquaflow.prior.keypoint_networks.network import KeypointNetwork, Picture, Size, warm_up
 from aquaflow.prior.keypoint_networks.start import flow_from_matches
 
-WARM_UP = (240, 320, 3)
-"""Shape of a picture to warm up with."""
 FEATURE_PIXELS, FEATURE_DESCRIPTORS = "feature_pixels", "feature_descriptors"
 """Of a packed encoding; ``pixels`` and ``descriptors`` are SIFT's."""
 
@@ -43,10 +42,7 @@ class KeypointEncoding(FlowEncoding):
         found = self.network.detect(self.picture)
         if self.mask is None:
             return found
-        cells = np.floor(found.pixels).astype(int)
-        height, width = self.size
-        column, row = np.clip(cells[:, 0], 0, width - 1), np.clip(cells[:, 1], 0, height - 1)
-        seen = self.mask[row, column]
+        seen = at_pixels(self.mask, found.pixels)
         return Keypoints(found.pixels[seen], found.descriptors[seen])
 
     def pack(self) -> dict[str, npt.NDArray[Any]]:
@@ -70,18 +66,14 @@ class KeypointEncoding(FlowEncoding):
             self.features = Keypoints(arrays[FEATURE_PIXELS], arrays[FEATURE_DESCRIPTORS])
 
 
-class KeypointPrior:
+class KeypointPrior(FlowPrior):
     """Flow that starts from a keypoint network's matches, behind the prior contract."""
-
-    ranged = False
-    metric = False
-    unit_sigma = float("inf")
 
     def __init__(self, network: KeypointNetwork, learned_matches: bool = True) -> None:
         """Without ``learned_matches`` flow starts at SIFT's where a prediction fails."""
+        super().__init__()
         self.name, self._learned_matches = network.name, learned_matches
         self._network = network
-        self._matcher = dense.FlowMatcher()
 
     def encode(
         self,
@@ -93,11 +85,6 @@ class KeypointPrior:
         grey = dense.normalised_grey(image, mask)
         texture = dense.texture(grey, mask)
         return KeypointEncoding(camera, grey, texture, image, self._network, mask=mask)
-
-    def pack(self, encoding: Encoding) -> dict[str, npt.NDArray[Any]]:
-        """Grey, texture and the picture; keypoints only if they were computed."""
-        assert isinstance(encoding, KeypointEncoding)
-        return encoding.pack()
 
     def unpack(
         self,
@@ -122,14 +109,11 @@ class KeypointPrior:
         matches, then from SIFT's."""
         assert isinstance(a, KeypointEncoding)
         assert isinstance(b, KeypointEncoding)
-        only = alone and predicted is not None
-        starts = from_prediction(predicted) if only else self._starts(a, b, predicted)
-        return FlowPair(a, b, best_flow(self._matcher, a, b, starts))
+        return FlowPair(a, b, self._flow(a, b, predicted, alone, self._starts(a, b, predicted)))
 
     def warm_up(self) -> None:
         """Run the network once: the first picture of a dive then waits for no preparation."""
-        keypoints, size = self._network.detect(np.zeros(WARM_UP, np.uint8)), WARM_UP[:2]
-        self._network.match(keypoints, keypoints, size, size)
+        warm_up(self._network)
 
     def _starts(
         self,

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.prior.contract import Keypoints
+from aquaflow.prior.flow_prior import WARM_UP
 
 Picture = npt.NDArray[np.uint8]
 Index = npt.NDArray[np.int64]
@@ -39,3 +40,10 @@ NO_MATCHES = (np.zeros(0, np.int64), np.zeros(0, np.int64))
 def no_keypoints(dimension: int) -> Keypoints:
     """Those of a picture that shows nothing; descriptors have ``dimension`` entries."""
     return Keypoints(np.zeros((0, 2), np.float32), np.zeros((0, dimension), np.float32))
+
+
+def warm_up(network: KeypointNetwork) -> None:
+    """Run all of the network once, on a picture that shows nothing."""
+    size = WARM_UP[:2]
+    keypoints = network.detect(np.zeros(WARM_UP, np.uint8))
+    network.match(keypoints, keypoints, size, size)

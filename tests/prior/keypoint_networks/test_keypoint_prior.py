@@ -7,17 +7,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore, Pointmap
-from aquaflow.prior import homography
 from aquaflow.prior.contract import Keypoints
 from aquaflow.prior.keypoint_networks.keypoint_prior import KeypointEncoding, KeypointPrior
 from tests.prior.keypoint_networks.corner_network import CornerNetwork
-from tests.prior.textured_pictures import HEIGHT, WIDTH, Picture, moved_pair, pixel_centres, shift
-
-CAMERA = CameraModel(WIDTH, HEIGHT, 200.0, 200.0, 120.0, 90.0)
-FAR = (0.4 * WIDTH, -20.0)
+from tests.prior.textured_pictures import (
+    CAMERA,
+    FAR,
+    HEIGHT,
+    WIDTH,
+    Picture,
+    moved_pair,
+    pixel_centres,
+    shift,
+)
 
 
 class Blind(CornerNetwork):
@@ -29,14 +33,6 @@ class Blind(CornerNetwork):
 
 def encoded(prior: KeypointPrior, pictures: tuple[Picture, Picture]) -> list[KeypointEncoding]:
     return [prior.encode(picture, CAMERA) for picture in pictures]
-
-
-@pytest.fixture
-def no_sift(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise AssertionError("SIFT ran though the network's matches were good")
-
-    monkeypatch.setattr(homography, "detect", refuse)
 
 
 @pytest.mark.usefixtures("no_sift")
