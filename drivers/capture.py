@@ -40,6 +40,8 @@ class RawPicture:
     """The same moment on the device's own clock, whose zero is arbitrary."""
     sequence: int | None = None
     """The device's picture counter, which also counts pictures that were never delivered."""
+    stale: str = ""
+    """Why it shows the past and must not be used, for people; empty: it may be."""
     exposure_s: float | None = None
     gain: float | None = None
     received: Callable[[], EncodedPicture | None] = no_file
@@ -56,6 +58,9 @@ class Capture(Protocol):
 
     camera: CameraModel | None
     """Calibration that the device itself carries."""
+    format: str
+    """What was agreed on with the device, such as ``1280 x 720 MJPG, 30 pictures/s``; empty where
+    only its pictures tell."""
     notes: tuple[str, ...]
     """Requested settings that the device does not support; one sentence each."""
 

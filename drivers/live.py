@@ -10,12 +10,13 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from enum import Enum
 
 from aquaflow.config.cameras import LiveCameraConfig
+from aquaflow.drivers.camera_state import CameraCounters, CameraState
 from aquaflow.drivers.capture import Capture, OpenCapture, RawPicture, UnusablePictureError
+from aquaflow.drivers.events import Event, about
 from aquaflow.drivers.exposure_clock import ExposureClock
+from aquaflow.drivers.flow import Flow
 from aquaflow.drivers.sequence import SequenceGaps
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import guess_camera, load_camera
@@ -30,35 +31,6 @@ JOIN_S = 2.0
 """Longest wait for the thread; one that hangs in a device's library ends with the process."""
 
 log = logging.getLogger(__name__)
-
-
-class CameraState(Enum):
-    """States of a camera from unplugged to delivering pictures."""
-
-    CLOSED = "closed"
-    CONNECTING = "connecting"
-    STREAMING = "streaming"
-    LOST = "lost"
-
-
-@dataclass
-class CameraCounters:
-    """Pictures since the source was made; every received one ends in exactly one other counter,
-    but for the one that may be waiting or held by the consumer."""
-
-    received: int = 0
-    delivered: int = 0
-    overtaken: int = 0
-    """A newer one came before the consumer took it."""
-    passed_over: int = 0
-    """Not asked for: sub-sampling."""
-    unusable: int = 0
-    """Damaged, or of another size than those before."""
-    duplicates: int = 0
-    lost: int = 0
-    """Never received: gaps in the device's own counter."""
-    stamps_repaired: int = 0
-    reconnects: int = 0
 
 
 class LiveCamera:
@@ -86,11 +58,15 @@ class LiveCamera:
         self.state = CameraState.CLOSED
         self.reason = ""
         """Why the camera is lost, for people."""
+        self.flow = Flow(now_ns)
         self._config = config
         self._open_capture = open_capture
         self._now_ns = now_ns
         self._opened: Capture | None = None
+        self._opened_anew = False
+        """Pictures came before the device was opened this time."""
         self._size: tuple[int, int] | None = None
+        self._format = ""
         self._counts = CameraCounters()
         self._clock = ExposureClock()
         self._newest: Newest[RawPicture] = Newest(discard=lambda picture: picture.release())
@@ -205,15 +181,25 @@ class LiveCamera:
 
     def _lost(self, error: OSError) -> None:
         if str(error) != self.reason:
-            log.warning("camera '%s' is lost: %s", self.name, error)
+            if self.state in (CameraState.STREAMING, CameraState.LATE):
+                self._tell("lost", f"is lost: {error}")
+            else:
+                self._tell("waiting", f"is waited for: {error}")
         self.state, self.reason = CameraState.LOST, str(error)
+
+    def _tell(self, event: Event, text: str, level: int = logging.WARNING) -> None:
+        log.log(level, "camera '%s' %s", self.name, text, extra=about(self.name, event))
 
     def _open(self) -> Capture:
         self.state = CameraState.CONNECTING
+        self._opened_anew = self._counts.received > 0
         capture = self._open_capture()
         # Calibration is frozen: what is mapped with one camera model stays with it.
         self.camera = self.camera or capture.camera
         self.notes = [*dict.fromkeys([*self.notes, *capture.notes])]
+        if capture.format != self._format:
+            self._format = capture.format
+            self._tell("format", f"gives {capture.format}", logging.INFO)
         return capture
 
     def _stream(self) -> None:
@@ -224,26 +210,43 @@ class LiveCamera:
             heard_ns = self._now_ns()
             while not self._closing.is_set():
                 picture = capture.read(min(READ_S, self._config.stall_s))
-                if picture is not None:
+                if picture is not None and self._received(picture):
                     heard_ns = self._now_ns()
-                    self._received(picture)
                 elif self._now_ns() - heard_ns > self._config.stall_s * 1e9:
-                    raise TimeoutError(f"no picture for {self._config.stall_s:g} s")
+                    said = "no picture" if picture is None else picture.stale
+                    raise TimeoutError(f"{said} for {self._config.stall_s:g} s")
         finally:
             capture.close()
 
-    def _received(self, picture: RawPicture) -> None:
-        if self.state is not CameraState.STREAMING:
-            self._counts.reconnects += self._counts.received > 0
-            self.state, self.reason = CameraState.STREAMING, ""
+    def _received(self, picture: RawPicture) -> bool:
+        """Queue a picture; False if it is too old to count as a sign of life."""
         self._counts.received += 1
         lost = self._sequence.before(picture.sequence)
         if lost is None:
             self._counts.duplicates += 1
             picture.release()
-            return
+            return True
         self._counts.lost += lost
         picture.index = self._index + lost
         self._index = picture.index + 1
+        if picture.stale:
+            self._leave_out(picture)
+            return False
+        if self.state is not CameraState.STREAMING:
+            self.state, self.reason = CameraState.STREAMING, ""
+            event: Event = "reconnected" if self._opened_anew else "connected"
+            self._tell(event, f"is {event}", logging.INFO)
+            self._counts.reconnects += self._opened_anew
+            self._opened_anew = False
         picture.t_ns = self._clock.stamp(picture.exposed_ns, picture.device_ns, picture.arrival_ns)
+        self.flow.heard(picture.t_ns, picture.arrival_ns)
         self._newest.put(picture)
+        return True
+
+    def _leave_out(self, picture: RawPicture) -> None:
+        """A picture that would show the past as the present."""
+        if self.state is CameraState.STREAMING:
+            self._tell("late", f"is late: {picture.stale}")
+        self.state, self.reason = CameraState.LATE, picture.stale
+        self._counts.stale += 1
+        picture.release()

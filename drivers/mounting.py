@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from aquaflow.config.telemetry import MountingConfig
+from aquaflow.config.device import MountingConfig
 from aquaflow.drivers.fixes import moved
 from aquaflow.drivers.rotation import Vector, cross, from_euler, inverse, product, rotate
 from aquaflow.messages import (

@@ -6,8 +6,11 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from enum import Enum
 from typing import Protocol, TypeAlias, runtime_checkable
 
+from aquaflow.drivers.events import Event, about
+from aquaflow.drivers.flow import Flow
 from aquaflow.drivers.link import ByteLink, LinkCounters, LinkDecoder, LinkLostError
 from aquaflow.drivers.transport import OpenLink
 from aquaflow.messages import TelemetrySample
@@ -39,6 +42,17 @@ class Talker(Protocol):
         ...
 
 
+class LinkState(str, Enum):
+    """States of a link."""
+
+    WAITING = "waiting"
+    """Nothing was heard of it yet."""
+    CONNECTED = "connected"
+    LOST = "lost"
+    """It was heard, and is not any more."""
+    CLOSED = "closed"
+
+
 class Supervisor:
     """Runs :meth:`run` in its own thread until :meth:`stop`; no error leaves it."""
 
@@ -52,8 +66,10 @@ class Supervisor:
         silence_s: float | None = None,
     ) -> None:
         self.name = name
-        self.state = "nothing heard yet"
-        """For health reports: connected, or why not."""
+        self.state = LinkState.WAITING
+        self.reason = "nothing heard yet"
+        """Why it is not connected, for people."""
+        self.flow = Flow()
         self.is_open = False
         self._open_link = open_link
         self._decoder = decoder
@@ -79,14 +95,17 @@ class Supervisor:
             try:
                 self._serve_one_link()
             except LinkLostError as error:
-                self._note(str(error), logging.WARNING)
+                self._note_lost(str(error))
             # The thread has no caller to raise to, and the other links continue.
             except Exception as error:
-                log.exception("%s: the driver failed; the link is opened anew", self.name)
-                self._note(f"the driver failed: {error}", logging.ERROR)
+                log.exception(
+                    "%s: the driver failed; the link is opened anew", self.name,
+                    extra=about(self.name, "failed"),
+                )  # fmt: skip
+                self._note_lost(f"the driver failed: {error}")
             self._stopping.wait(self._pause_s)
             self._pause_s = min(2 * self._pause_s, LONGEST_PAUSE_S)
-        self.state = "closed"
+        self.state, self.reason = LinkState.CLOSED, ""
 
     def _serve_one_link(self) -> None:
         """Serve one link from opening it until it is lost, or until :meth:`stop`."""
@@ -112,12 +131,15 @@ class Supervisor:
                 self._take(data, arrival_ns)
             elif self._silence_s is not None and time.monotonic() - last_s > self._silence_s:
                 raise LinkLostError(f"no byte for {self._silence_s:g} s")
+        self._answer(link)  # what was to be sent before the end
 
     def _take(self, data: bytes, arrival_ns: int) -> None:
         if self._tap is not None:
             self._tap(self.name, arrival_ns, data)
         samples = self._decoder.feed(data, arrival_ns)
         if samples:
+            for sample in samples:
+                self.flow.heard(sample.t_ns, arrival_ns)
             self._deliver(samples)
 
     def _answer(self, link: ByteLink) -> None:
@@ -128,13 +150,22 @@ class Supervisor:
 
     def _note_heard(self) -> None:
         """The link is up; one that opens but stays silent is not."""
-        self.counters.reconnects += self._heard_before
+        again = self._heard_before
+        self.counters.reconnects += again
         self._heard_before = True
         self._pause_s = FIRST_PAUSE_S
-        self._note("connected", logging.INFO)
+        if self.state is not LinkState.CONNECTED:
+            self.state, self.reason = LinkState.CONNECTED, ""
+            event: Event = "reconnected" if again else "connected"
+            self._tell(event, event, logging.INFO)
 
-    def _note(self, state: str, level: int) -> None:
-        """Log a change of state; an unchanged state is not logged again."""
-        if state != self.state:
-            log.log(level, "%s: %s", self.name, state)
-        self.state = state
+    def _note_lost(self, reason: str) -> None:
+        """The link is down; a reason that was told already is not told again."""
+        event: Event = "lost" if self.state is LinkState.CONNECTED else "waiting"
+        self.state = LinkState.LOST if self._heard_before else LinkState.WAITING
+        if reason != self.reason:
+            self.reason = reason
+            self._tell(event, reason, logging.WARNING)
+
+    def _tell(self, event: Event, text: str, level: int) -> None:
+        log.log(level, "%s: %s", self.name, text, extra=about(self.name, event))

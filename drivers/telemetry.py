@@ -13,12 +13,14 @@ from aquaflow.config.telemetry import AnyDevice, TelemetryConfig
 from aquaflow.drivers.link import LinkCounters
 from aquaflow.drivers.mounting import BodyFrame, Mounting
 from aquaflow.drivers.protocol.packets import PacketDecoder
+from aquaflow.drivers.shared_ports import shared_ports
 from aquaflow.drivers.supervisor import Deliver, Supervisor
 from aquaflow.drivers.transport import OpenLink, opener
 from aquaflow.messages import TelemetrySample
 from aquaflow.sources import RawTap
 from aquaflow.sources.newest import Newest
 from aquaflow.sources.outbound import AcceptsMessages, OutboundMessage
+from aquaflow.sources.pilot import HearsPilot, Obey
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +42,9 @@ DECODERS = {
     "waterlinked_serial": "aquaflow.drivers.protocol.waterlinked_serial:WaterLinkedSerialDecoder",
     "waterlinked_json": "aquaflow.drivers.protocol.waterlinked_json:WaterLinkedJsonDecoder",
     "pd0": "aquaflow.drivers.protocol.pd0:Pd0Decoder",
+    "nucleus": "aquaflow.drivers.protocol.nucleus:NucleusDecoder",
+    "ping": "aquaflow.drivers.protocol.ping:PingDecoder",
+    "vectornav": "aquaflow.drivers.protocol.vectornav:VectorNavDecoder",
     "nmea2000": "aquaflow.drivers.protocol.nmea2000:Nmea2000Decoder",
     "dbc": "aquaflow.drivers.protocol.dbc:DbcDecoder",
 }
@@ -82,9 +87,11 @@ class LinkTelemetry:
         self._body = BodyFrame()
         self.decoders = {name: decoder_of(name, device) for name, device in config.devices.items()}
         self.links: dict[str, Supervisor] = {}
+        shared = shared_ports(config.devices, self.decoders)
         for name, device in config.devices.items():
             decoder = self.decoders[name]
-            open_link = (links or {}).get(name) or opener(name, device.link)
+            replaced = (links or {}).get(name) or shared.get(name)
+            open_link = replaced or opener(name, device.link, decoder)
             deliver = self._deliverer(Mounting(device.mounting), decoder.counters)
             self.links[name] = Supervisor(name, open_link, decoder, deliver, tap, device.silence_s)
         self._threads = [
@@ -131,6 +138,20 @@ class LinkTelemetry:
         ]
         queued = [decoder.send(message) for decoder in accepting]
         return any(queued)
+
+    @property
+    def armed(self) -> bool | None:
+        """Of the first autopilot that said so; None while none did."""
+        said = (decoder.armed for decoder in self._autopilots())
+        return next((each for each in said if each is not None), None)
+
+    def obey(self, asked: Obey) -> None:
+        """From now on pass the commands that come by any link to ``asked``."""
+        for decoder in self._autopilots():
+            decoder.obey(asked)
+
+    def _autopilots(self) -> list[HearsPilot]:
+        return [each for each in self.decoders.values() if isinstance(each, HearsPilot)]
 
     def close(self) -> None:
         """Stop all links; samples that wait can still be fetched. May be called again."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
+from aquaflow.config.can_devices import Nmea2000Config
 from aquaflow.config.link import CanConfig
-from aquaflow.config.telemetry import AnyDevice, Nmea2000Config
+from aquaflow.config.telemetry import AnyDevice
 from aquaflow.drivers.transport.can import EXTENDED, RECORD
 from aquaflow.sim_drivers.telemetry_log import ByteLog, LogTime, Read
 

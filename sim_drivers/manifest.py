@@ -19,8 +19,9 @@ from pathlib import Path
 
 from pydantic import Field
 
+from aquaflow.config.device import MountingConfig
 from aquaflow.config.stage import Stage, validated
-from aquaflow.config.telemetry import AnyDevice, MountingConfig
+from aquaflow.config.telemetry import AnyDevice
 from aquaflow.errors import ConfigError, InputError
 from aquaflow.errors.plain_yaml import read_mapping
 from aquaflow.messages import Dropped, Frame, TelemetrySample

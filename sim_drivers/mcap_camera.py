@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.config.telemetry import MountingConfig
+from aquaflow.config.device import MountingConfig
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import (
     CameraModel,

@@ -23,6 +23,9 @@ EXPOSURE_S = 0.008
 IMU_TO_CAMERA = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 """The simulated IMU has x forward, y right, z down."""
 
+GYRO_EARLIER_NS = 400_000
+"""A reading's gyroscope is so much older than its accelerometer: both run freely."""
+
 GRAVITY_M_S2 = 9.80665
 """Standard gravity; an IMU at rest feels it upwards."""
 
@@ -35,6 +38,7 @@ class ReplayPicture:
     exposed_ns: int
     device_ns: int
     sequence: int
+    encoding: str
     exposure_s: float | None = EXPOSURE_S
     iso: float | None = ISO
 
@@ -43,13 +47,21 @@ class ReplayPicture:
             raise ValueError("the data is shorter than the picture")
         return self.shot.image
 
+    def jpeg(self) -> bytes | None:
+        import cv2
+
+        if self.encoding != "mjpeg":
+            return None
+        return bytes(cv2.imencode(".jpg", cv2.cvtColor(self.shot.image, cv2.COLOR_RGB2BGR))[1])
+
 
 @dataclass
 class ReplayImuReading:
     """See aquaflow.drivers.oak.backend.ImuReading."""
 
-    t_ns: int
+    acceleration_ns: int
     acceleration_m_s2: tuple[float, float, float]
+    rate_ns: int
     rate_rad_s: tuple[float, float, float]
 
 
@@ -76,15 +88,16 @@ class ReplayOak:
         if not self.feed.plugged_in:
             raise FileNotFoundError("no OAK camera is plugged in; OAK cameras found: none")
         self.openings += 1
-        return ReplayBackend(self, config.imu_rate_hz)
+        return ReplayBackend(self, config)
 
 
 class ReplayBackend:
     """See aquaflow.drivers.oak.backend.OakBackend. The vehicle stands level and still."""
 
-    def __init__(self, device: ReplayOak, imu_rate_hz: int) -> None:
-        self._device = device
-        self._imu_period_ns = 0 if imu_rate_hz == 0 else round(1e9 / imu_rate_hz)
+    def __init__(self, device: ReplayOak, config: Any) -> None:
+        rate_hz = config.imu_rate_hz
+        self._device, self._encoding = device, config.encoding
+        self._imu_period_ns = 0 if rate_hz == 0 else round(1e9 / rate_hz)
         self._imu_ns = time.monotonic_ns()
         self._gone = False
 
@@ -102,14 +115,16 @@ class ReplayBackend:
         shot = self._device.feed.take()
         self._gone = shot.unplugged
         self._check()
-        return ReplayPicture(shot, shot.exposed_ns, shot.true_ns - DEVICE_EPOCH_NS, shot.sequence)
+        device_ns = shot.true_ns - DEVICE_EPOCH_NS
+        return ReplayPicture(shot, shot.exposed_ns, device_ns, shot.sequence, self._encoding)
 
     def imu(self) -> list[ReplayImuReading]:
         self._check()
         readings = []
         while self._imu_period_ns and self._imu_ns <= time.monotonic_ns():
+            rate_ns = self._imu_ns - GYRO_EARLIER_NS
             readings.append(
-                ReplayImuReading(self._imu_ns, (0.0, 0.0, -GRAVITY_M_S2), (0.0, 0.0, 0.0))
+                ReplayImuReading(self._imu_ns, (0.0, 0.0, -GRAVITY_M_S2), rate_ns, (0.0, 0.0, 0.0))
             )
             self._imu_ns += self._imu_period_ns
         return readings

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from aquaflow.config.telemetry import MountingConfig
+from aquaflow.config.device import MountingConfig
 from aquaflow.errors import AquaFlowError
 from aquaflow.errors.plain_yaml import read_mapping
 from aquaflow.sim_drivers.images import SUBFOLDER, ImageFolder

@@ -6,12 +6,13 @@ import errno
 import os
 import threading
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 PAGE_BITS = 12
-"""Buffer n is mapped at offset n << PAGE_BITS."""
+"""Piece n of the memory is mapped at offset n << PAGE_BITS."""
 
 
 def refused(number: int) -> OSError:
@@ -24,19 +25,22 @@ class Buffers:
 
     def __init__(self) -> None:
         self.memory: list[npt.NDArray[np.uint8]] = []
+        """The pieces of the first buffer, then those of the second."""
+        self._pieces = 1
         self._queued: deque[int] = deque()
         self._on = False
         self._lock = threading.Lock()
 
-    def request(self, count: int, size: int) -> None:
-        """VIDIOC_REQBUFS: make ``count`` buffers; EBUSY while streaming."""
+    def request(self, count: int, sizes: Sequence[int]) -> None:
+        """VIDIOC_REQBUFS: ``count`` buffers of pieces of these sizes; EBUSY while streaming."""
         if self._on:
             raise refused(errno.EBUSY)
-        self.memory = [np.zeros(size, np.uint8) for _ in range(count)]
+        self._pieces = len(sizes)
+        self.memory = [np.zeros(size, np.uint8) for _ in range(count) for size in sizes]
 
     def existing(self, index: int) -> int:
         """``index``, or EINVAL if there is no such buffer."""
-        if index >= len(self.memory):
+        if index * self._pieces >= len(self.memory):
             raise refused(errno.EINVAL)
         return index
 
@@ -64,9 +68,10 @@ class Buffers:
             raise refused(errno.EINVAL)
         return bool(self._queued)
 
-    def fill(self, payload: npt.NDArray[np.uint8]) -> int:  # [bytes]
-        """The buffer that holds ``payload`` now, and belongs to the program."""
+    def fill(self, payloads: Sequence[npt.NDArray[np.uint8]]) -> int:  # each [bytes]
+        """The buffer that holds ``payloads`` now, and belongs to the program."""
         with self._lock:
             index = self._queued.popleft()
-        self.memory[index][: payload.size] = payload
+        for piece, payload in enumerate(payloads, self._pieces * index):
+            self.memory[piece][: payload.size] = payload
         return index

@@ -12,6 +12,7 @@ import os
 import shutil
 import struct
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,10 +28,12 @@ QUERYCAP, ENUM_FMT, S_FMT, REQBUFS, QUERYBUF, QBUF, DQBUF = 0, 2, 5, 8, 9, 15, 1
 STREAMON, STREAMOFF, S_PARM, G_CTRL, S_CTRL, QUERYCTRL, ENUM_FRAMESIZES = 18, 19, 22, 27, 28, 36, 74
 """Numbers of the requests, VIDIOC_* of linux/videodev2.h."""
 
-CAPS = 0x80000000 | 0x04000000 | 0x00000001
-"""V4L2_CAP_*: of the device, with DEVICE_CAPS, STREAMING and VIDEO_CAPTURE."""
+CAPS = 0x80000000
+"""V4L2_CAP_DEVICE_CAPS: beside all, the device says what each node can."""
 CAPTURE_CAPS = 0x04000000 | 0x00000001
 """Of the node that takes pictures: STREAMING and VIDEO_CAPTURE."""
+VIDEO_CAPTURE = 1
+"""V4L2_BUF_TYPE_VIDEO_CAPTURE; every call that is about buffers names the type."""
 METADATA_CAPS = 0x04000000 | 0x00800000
 """Of the second node that UVC cameras have: STREAMING and META_CAPTURE."""
 MONOTONIC_START_OF_EXPOSURE = 0x2000 | 0x10000
@@ -49,7 +52,7 @@ class CameraSpec:
     name: str = "Simulated USB camera"
     serial: str = "SIM0001"
     bus: str = "usb-0000:00:14.0-1"
-    pixels: tuple[str, ...] = ("YUYV", "MJPG", "GREY")
+    pixels: tuple[str, ...] = ("YUYV", "MJPG", "GREY", "UYVY", "NV12", "H264")
     controls: tuple[int, ...] = (EXPOSURE_ABSOLUTE, WHITE_BALANCE)
     """Those that exist, each from 1 to 10000; all others are refused."""
     padding: int = 0
@@ -60,6 +63,9 @@ class CameraSpec:
 
 class V4l2Kernel:
     """Shows a feed as a camera; when the feed unplugs it, it returns under another number."""
+
+    capture_caps = CAPTURE_CAPS
+    buffer_type = VIDEO_CAPTURE
 
     def __init__(self, root: Path, feed: CameraFeed, spec: CameraSpec | None = None) -> None:
         self.root = root
@@ -129,11 +135,14 @@ class V4l2Kernel:
 
     def _querycap(self, fd: int, data: memoryview) -> None:
         capture = self._descriptors[fd] == f"video{self._number}"
-        node = CAPTURE_CAPS if capture else METADATA_CAPS
+        node = self.capture_caps if capture else METADATA_CAPS
         name, bus = self.spec.name.encode(), self.spec.bus.encode()
-        struct.pack_into("16s32s32sIII", data, 0, b"uvcvideo", name, bus, 0x060100, CAPS, node)
+        struct.pack_into(
+            "16s32s32sIII", data, 0, b"uvcvideo", name, bus, 0x060100, CAPS | node, node
+        )
 
     def _enum_format(self, fd: int, data: memoryview) -> None:
+        self._check_type(data, 4)
         (index,) = struct.unpack_from("I", data)
         if index >= len(self.spec.pixels):
             raise refused(errno.EINVAL)
@@ -147,6 +156,7 @@ class V4l2Kernel:
 
     def _set_format(self, fd: int, data: memoryview) -> None:
         """The size is the recording's, whatever was asked for; so is an unknown pixel format."""
+        self._check_type(data)
         if self._owner not in (None, fd):
             raise refused(errno.EBUSY)
         self._owner = fd
@@ -154,29 +164,52 @@ class V4l2Kernel:
         pixels = asked if asked in self.spec.pixels else self.spec.pixels[0]
         self._format = form = PixelFormat(pixels, *self._size(), self.spec.padding)
         struct.pack_into("II4s", data, 8, form.width, form.height, pixels.encode())
-        struct.pack_into("II", data, 24, form.stride, form.image_bytes)
+        self._show_layout(data)
+
+    def _show_layout(self, data: memoryview) -> None:
+        """Row and size of the settled format, into ``struct v4l2_format``."""
+        struct.pack_into("II", data, 24, self._format.stride, self._format.sizes[0])
 
     def _set_rate(self, fd: int, data: memoryview) -> None:
+        self._check_type(data)
         struct.pack_into("II", data, 12, 1, 30)
 
     def _request_buffers(self, fd: int, data: memoryview) -> None:
+        self._check_type(data, 4)
         (count,) = struct.unpack_from("I", data)
-        self._buffers.request(count, self._format.image_bytes)
+        self._buffers.request(count, self._format.sizes)
 
     def _query_buffer(self, fd: int, data: memoryview) -> None:
-        index = self._buffers.existing(_index(data))
-        struct.pack_into("QI", data, 64, index << PAGE_BITS, self._format.image_bytes)
+        self._check_type(data, 4)
+        self._show_places(data, self._buffers.existing(_index(data)))
+
+    def _show_places(self, data: memoryview, index: int) -> None:
+        """Where the buffer's memory is mapped, into ``struct v4l2_buffer``."""
+        struct.pack_into("QI", data, 64, index << PAGE_BITS, self._format.sizes[0])
+
+    def _show_used(self, data: memoryview, used: Sequence[int]) -> None:
+        """How much of it a picture takes."""
+        struct.pack_into("I", data, 8, used[0])
 
     def _queue(self, fd: int, data: memoryview) -> None:
+        self._check_type(data, 4)
         self._buffers.queue(_index(data))
 
+    def _check_type(self, data: memoryview, at: int = 0) -> None:
+        (kind,) = struct.unpack_from("I", data, at)
+        if kind != self.buffer_type:
+            raise refused(errno.EINVAL)
+
     def _stream_on(self, fd: int, data: memoryview) -> None:
+        self._check_type(data)
         self._buffers.start()
 
     def _stream_off(self, fd: int, data: memoryview) -> None:
+        self._check_type(data)
         self._buffers.stop()
 
     def _dequeue(self, fd: int, data: memoryview) -> None:
+        self._check_type(data, 4)
         if not self._buffers.ready() or not self.feed.wait(0.0):
             raise refused(errno.EAGAIN)
         shot = self.feed.take()
@@ -186,10 +219,11 @@ class V4l2Kernel:
             again.daemon = True
             again.start()
             raise refused(errno.ENODEV)
-        payload, damaged = encoded(shot.image, self._format, shot.corrupt)
-        index = self._buffers.fill(payload)
+        payloads, damaged = encoded(shot.image, self._format, shot.sequence, shot.corrupt)
         flags = MONOTONIC_START_OF_EXPOSURE | (ERROR if damaged else 0)
-        struct.pack_into("IIII", data, 0, index, 1, payload.size, flags)
+        struct.pack_into("I", data, 0, self._buffers.fill(payloads))
+        struct.pack_into("I", data, 12, flags)
+        self._show_used(data, [payload.size for payload in payloads])
         seconds, rest_ns = divmod(shot.exposed_ns, 1_000_000_000)
         struct.pack_into("qq", data, 24, seconds, rest_ns // 1000)
         struct.pack_into("I", data, 56, shot.sequence & 0xFFFFFFFF)

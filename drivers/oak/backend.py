@@ -19,7 +19,7 @@ class OakPicture(Protocol):
     """A picture as the device delivered it."""
 
     exposed_ns: int
-    """Moment of exposure, CLOCK_MONOTONIC, as the library's time synchronisation has it."""
+    """Middle of the exposure, CLOCK_MONOTONIC, as the library's time synchronisation has it."""
     device_ns: int
     """The same moment on the device's clock."""
     sequence: int
@@ -30,12 +30,17 @@ class OakPicture(Protocol):
         """[H, W, 3] RGB; raises ValueError if the data makes no picture."""
         ...
 
+    def jpeg(self) -> bytes | None:
+        """The file that the device made; None where it sends pixels."""
+        ...
+
 
 class ImuReading(Protocol):
-    """Accelerometer and gyroscope at one moment, in the axes of the IMU."""
+    """Accelerometer and gyroscope, each with its moment, in the axes of the IMU."""
 
-    t_ns: int
+    acceleration_ns: int
     acceleration_m_s2: tuple[float, float, float]
+    rate_ns: int
     rate_rad_s: tuple[float, float, float]
 
 

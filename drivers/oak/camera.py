@@ -5,19 +5,27 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Iterator, Sequence
+from operator import attrgetter
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.cameras import OakConfig
-from aquaflow.config.telemetry import MountingConfig
+from aquaflow.config.device import MountingConfig
 from aquaflow.drivers.capture import RawPicture, UnusablePictureError
+from aquaflow.drivers.events import about
 from aquaflow.drivers.live import LiveCamera
 from aquaflow.drivers.mounting import BodyFrame, Mounting
 from aquaflow.drivers.oak.backend import ImuReading, OakBackend, OakPicture, OpenBackend
 from aquaflow.drivers.oak.dai_backend import DaiBackend
 from aquaflow.geometry.similarity import BODY_FROM_CAMERA
-from aquaflow.messages import Acceleration, AngularRate, CameraModel, TelemetrySample
+from aquaflow.messages import (
+    Acceleration,
+    AngularRate,
+    CameraModel,
+    EncodedPicture,
+    TelemetrySample,
+)
 from aquaflow.sources.newest import Newest
 
 MAX_SAMPLES = 8_000
@@ -33,6 +41,7 @@ class OakCapture:
         self._owner = camera
         self._backend = backend
         self.camera: CameraModel | None = backend.calibration()
+        self.format = ""
         self._rotation = backend.imu_to_camera()
         # Samples in unknown axes are worse than none.
         self.notes: tuple[str, ...] = (
@@ -56,6 +65,7 @@ class OakCapture:
             sequence=picture.sequence,
             exposure_s=picture.exposure_s,
             gain=picture.iso,
+            received=lambda: _file(picture),
         )
 
     def close(self) -> None:
@@ -78,7 +88,7 @@ class OakCamera(LiveCamera):
         self._samples: Newest[TelemetrySample] = Newest(MAX_SAMPLES, self._drop)
         self.dropped_samples = 0
         """Oldest samples dropped because they were not fetched in time."""
-        self._last_imu_ns = -1
+        self._last_imu_ns: dict[type, int] = {Acceleration: -1, AngularRate: -1}
         super().__init__(name, config, self._open_device)
 
     @classmethod
@@ -108,38 +118,50 @@ class OakCamera(LiveCamera):
         """Queue ``readings`` as samples; those that go back in time are left out."""
         rotation = BODY_FROM_CAMERA @ imu_to_camera
         for reading in readings:
-            t_ns = min(reading.t_ns, arrival_ns)
-            if t_ns > self._last_imu_ns:
-                self._last_imu_ns = t_ns
-                self._queue_sample(reading, rotation, t_ns, arrival_ns)
+            rate_ns = min(reading.rate_ns, arrival_ns)
+            force_ns = min(reading.acceleration_ns, arrival_ns)
+            rate = _turned(rotation, reading.rate_rad_s)
+            force = _turned(rotation, reading.acceleration_m_s2)
+            samples: list[AngularRate | Acceleration] = [
+                AngularRate(rate_ns, arrival_ns, self.name, rate),
+                Acceleration(force_ns, arrival_ns, self.name, force),
+            ]
+            self._samples.put_all(self._newer(samples))
 
-    def _queue_sample(
-        self,
-        reading: ImuReading,
-        rotation: npt.NDArray[np.float64],  # [3, 3] IMU to body
-        t_ns: int,
-        arrival_ns: int,
-    ) -> None:
-        force, rate = (
-            tuple(float(each) for each in rotation @ np.array(vector))
-            for vector in (reading.acceleration_m_s2, reading.rate_rad_s)
-        )
-        samples: list[TelemetrySample] = [
-            AngularRate(t_ns, arrival_ns, self.name, (rate[0], rate[1], rate[2])),
-            Acceleration(t_ns, arrival_ns, self.name, (force[0], force[1], force[2])),
-        ]
-        self._samples.put_all([self._body.refer(sample, self._mounting) for sample in samples])
+    def _newer(self, samples: Sequence[AngularRate | Acceleration]) -> Iterator[TelemetrySample]:
+        """Those of the two sensors that go on in time, in their order, in body axes."""
+        for sample in sorted(samples, key=attrgetter("t_ns")):
+            kind = type(sample)
+            if sample.t_ns > self._last_imu_ns[kind]:
+                self._last_imu_ns[kind] = sample.t_ns
+                yield self._body.refer(sample, self._mounting)
 
     def _drop(self, sample: TelemetrySample) -> None:
         self.dropped_samples += 1
 
     def _open_device(self) -> OakCapture:
         capture = OakCapture(self, self._open_backend(self._oak))
+        # The camera takes or refuses a size, and never changes it.
+        capture.format = f"{self._oak.width} x {self._oak.height} RGB, {self._oak.fps:g} pictures/s"
         if self.camera is not None and capture.camera not in (None, self.camera):
             log.warning(
-                "camera '%s': its calibration differs from the one in use, which is kept", self.name
-            )
+                "camera '%s': its calibration differs from the one in use, which is kept",
+                self.name, extra=about(self.name, "unused"),
+            )  # fmt: skip
         return capture
+
+
+def _turned(
+    rotation: npt.NDArray[np.float64],  # [3, 3]
+    vector: tuple[float, float, float],
+) -> tuple[float, float, float]:
+    x, y, z = (float(each) for each in rotation @ np.array(vector))
+    return x, y, z
+
+
+def _file(picture: OakPicture) -> EncodedPicture | None:
+    data = picture.jpeg()
+    return None if data is None else EncodedPicture("jpeg", data)
 
 
 def _decoded(picture: OakPicture) -> npt.NDArray[np.uint8]:

@@ -7,6 +7,7 @@ messages made on the host.
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 from datetime import timedelta
 from typing import Any
@@ -17,6 +18,7 @@ import numpy.typing as npt
 from aquaflow.config.cameras import OakConfig
 from aquaflow.drivers.extra import load
 from aquaflow.drivers.oak.calibration import camera_model, imu_rotation
+from aquaflow.drivers.oak.encoding import JPEG_QUALITY, chosen, said
 from aquaflow.drivers.oak.messages import DaiImuReading, DaiPicture, imu_readings, picture_of
 from aquaflow.messages import CameraModel
 
@@ -31,6 +33,8 @@ IMU_QUEUE = 200
 TIMESYNC_PERIOD = timedelta(seconds=5)
 TIMESYNC_SAMPLES = 10
 """depthai's own defaults (DeviceBase.hpp), stated so that no later version changes them."""
+
+log = logging.getLogger(__name__)
 
 
 def depthai() -> Any:
@@ -68,6 +72,7 @@ class DaiBackend:
         """
         self._dai = dai = depthai()
         info = find_device(dai, config.device)
+        self._id = info.deviceId
         self._device: Any = None
         self._pipeline: Any = None
         try:
@@ -91,7 +96,7 @@ class DaiBackend:
             raise ConnectionError(f"the OAK is gone: {error}") from error
         if message is None and not self._pipeline.isRunning():
             raise ConnectionError("the OAK has stopped")
-        return None if message is None else picture_of(message)
+        return None if message is None else picture_of(message, self._encoding == "mjpeg")
 
     def imu(self) -> list[DaiImuReading]:
         if self._readings is None:
@@ -128,14 +133,31 @@ class DaiBackend:
         self._calibration = camera_model(handler, socket, size)
         self._imu_rotation = imu_rotation(handler, socket)
         camera = self._pipeline.create(dai.node.Camera).build(socket, sensorFps=config.fps)
-        output = camera.requestOutput(
-            size, dai.ImgFrame.Type.BGR888i, fps=config.fps, enableUndistortion=False
-        )
-        self._pictures = output.createOutputQueue(PICTURE_QUEUE, False)
+        self._pictures = self._output(camera, config).createOutputQueue(PICTURE_QUEUE, False)
         control = camera.inputControl.createInputQueue()
         self._readings = self._imu_queue(config.imu_rate_hz)
         self._pipeline.start()
         control.send(self._controls(config))
+
+    def _output(self, camera: Any, config: OakConfig) -> Any:
+        """The camera's pictures, encoded as its link demands."""
+        dai, speed = self._dai, self._device.getUsbSpeed().name
+        self._encoding = chosen(config, speed)
+        log.info("the OAK %s is %s", self._id, said(config, speed, self._encoding))
+        kinds = dai.ImgFrame.Type
+        output = camera.requestOutput(
+            (config.width, config.height),
+            kinds.BGR888i if self._encoding == "bgr" else kinds.NV12,
+            fps=config.fps,
+            enableUndistortion=False,
+        )
+        if self._encoding != "mjpeg":
+            return output
+        profile = dai.VideoEncoderProperties.Profile.MJPEG
+        encoder = self._pipeline.create(dai.node.VideoEncoder)
+        return encoder.build(
+            output, frameRate=config.fps, profile=profile, quality=JPEG_QUALITY
+        ).out
 
     def _imu_queue(self, rate_hz: int) -> Any:
         """The IMU's queue; None if not configured, or the camera has no IMU (OAK-1, OAK-D Lite)."""

@@ -20,10 +20,13 @@ class DaiPicture:
     sequence: int
     exposure_s: float | None
     iso: float | None
+    is_jpeg: bool = False
 
     def decode(self) -> npt.NDArray[np.uint8]:
         import cv2
 
+        if self.is_jpeg:
+            return self._unpacked()
         try:
             picture = self.message.getCvFrame()
         except RuntimeError as error:
@@ -31,26 +34,49 @@ class DaiPicture:
         code = cv2.COLOR_GRAY2RGB if picture.ndim == 2 else cv2.COLOR_BGR2RGB
         return np.asarray(cv2.cvtColor(picture, code), np.uint8)
 
+    def jpeg(self) -> bytes | None:
+        return bytes(self.message.getData()) if self.is_jpeg else None
+
+    def _unpacked(self) -> npt.NDArray[np.uint8]:
+        import cv2
+
+        data = np.asarray(self.message.getData(), np.uint8)
+        try:
+            picture = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB)
+        except cv2.error as error:
+            raise ValueError("it is a damaged JPEG") from error
+        if picture is None:
+            raise ValueError("it is a damaged JPEG")
+        return np.asarray(picture, np.uint8)
+
 
 @dataclass
 class DaiImuReading:
     """See :class:`aquaflow.drivers.oak.backend.ImuReading`."""
 
-    t_ns: int
+    acceleration_ns: int
     acceleration_m_s2: tuple[float, float, float]
+    rate_ns: int
     rate_rad_s: tuple[float, float, float]
 
 
-def picture_of(message: Any) -> DaiPicture:
-    """A ``dai.ImgFrame``; an exposure of 0 means that the device reported none."""
-    exposure_s = message.getExposureTime().total_seconds()
+def picture_of(message: Any, is_jpeg: bool = False) -> DaiPicture:
+    """A ``dai.ImgFrame``, or a ``dai.EncodedFrame``; an exposure of 0 means that none is reported.
+
+    Its times are those of the end of the exposure, of the first row where the shutter rolls
+    (luxonis/depthai#795; CameraExposureOffset.MIDDLE, which encoded frames lack, takes half the
+    exposure off it). What is seen was seen in the middle.
+    """
+    exposure = message.getExposureTime()
+    half_ns = nanoseconds(exposure) // 2
     return DaiPicture(
         message,
-        nanoseconds(message.getTimestamp()),
-        nanoseconds(message.getTimestampDevice()),
+        nanoseconds(message.getTimestamp()) - half_ns,
+        nanoseconds(message.getTimestampDevice()) - half_ns,
         int(message.getSequenceNum()),
-        exposure_s or None,
+        exposure.total_seconds() or None,
         float(message.getSensitivity()) or None,
+        is_jpeg,
     )
 
 
@@ -60,6 +86,7 @@ def imu_readings(message: Any) -> list[DaiImuReading]:
         DaiImuReading(
             nanoseconds(packet.acceleroMeter.getTimestamp()),
             (packet.acceleroMeter.x, packet.acceleroMeter.y, packet.acceleroMeter.z),
+            nanoseconds(packet.gyroscope.getTimestamp()),
             (packet.gyroscope.x, packet.gyroscope.y, packet.gyroscope.z),
         )
         for packet in message.packets

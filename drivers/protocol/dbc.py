@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from aquaflow.config.telemetry import DbcConfig, DbcSignal
+from aquaflow.config.can_devices import DbcConfig, DbcSignal
 from aquaflow.drivers.extra import load
 from aquaflow.drivers.fixes import Fixes, sigma_of
 from aquaflow.drivers.protocol.can_records import CanFraming, frame_of

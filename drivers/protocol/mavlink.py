@@ -7,17 +7,18 @@ from typing import Any
 
 from aquaflow.config.telemetry import MavlinkConfig
 from aquaflow.drivers.device_clock import DeviceClock
-from aquaflow.drivers.extra import load
+from aquaflow.drivers.mavlink_dialect import dialect
+from aquaflow.drivers.protocol.mavlink_commands import MESSAGES, MavlinkCommands
 from aquaflow.drivers.protocol.mavlink_frames import Header, MavlinkFraming, header_of
-from aquaflow.drivers.protocol.mavlink_outbound import Receiver, message_of
+from aquaflow.drivers.protocol.mavlink_outbound import Receiver, messages_of
 from aquaflow.drivers.protocol.mavlink_samples import SINCE_1970_US, MessageTime
 from aquaflow.drivers.protocol.mavlink_senders import MavlinkSenders
 from aquaflow.drivers.protocol.packets import PacketDecoder
+from aquaflow.drivers.transport.mavlink2rest import Wanted
 from aquaflow.messages import TelemetrySample
 from aquaflow.sources.outbound import OutboundMessage, StatusText
+from aquaflow.sources.pilot import Obey
 
-DIALECT = "pymavlink.dialects.v20.ardupilotmega"
-"""ArduPilot's messages; they include the common ones, which PX4 sends too."""
 OUR_COMPONENT = 197
 """MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY."""
 TALK_EVERY_NS = 1_000_000_000
@@ -25,9 +26,11 @@ TALK_EVERY_NS = 1_000_000_000
 OPEN_REQUESTS = 16
 """Most open TIMESYNC requests."""
 MAX_OUTGOING_BYTES = 1024
-"""Most bytes of TIMESYNC answers between two writes."""
+"""Most bytes of answers between two writes."""
 MOST_WAITING = 32
 """Messages that wait while a link is down; older ones are dropped."""
+ALWAYS = frozenset({"HEARTBEAT", "TIMESYNC", "SYSTEM_TIME"})
+"""Of the autopilot, for its kind and its clock."""
 FIXES = ("GPS_RAW_INT", "GPS2_RAW")
 """Stamped with the time of the fix, which is sent again while there is no newer one."""
 
@@ -36,7 +39,7 @@ class MavlinkDecoder(PacketDecoder):
     """The autopilot that ``config`` names, and the other components that it asks for."""
 
     def __init__(self, name: str, config: MavlinkConfig) -> None:
-        self._dialect = load(DIALECT, f"the MAVLink device '{name}'")
+        self._dialect = dialect(f"the MAVLink device '{name}'")
         super().__init__(name, MavlinkFraming(self._dialect))
         self.clock: DeviceClock = DeviceClock(name)
         self._config = config
@@ -45,25 +48,50 @@ class MavlinkDecoder(PacketDecoder):
         self._wanted = {
             number: message.msgname
             for number, message in self._dialect.mavlink_map.items()
-            if message.msgname in self._senders.wanted | {"HEARTBEAT", "TIMESYNC", "SYSTEM_TIME"}
+            if message.msgname in self._senders.wanted | ALWAYS | MESSAGES
         }
         self._wire = self._dialect.MAVLink(None, config.system_id, OUR_COMPONENT)
         self._requests: deque[int] = deque(maxlen=OPEN_REQUESTS)
         self._outgoing = b""
         self._outbound: deque[OutboundMessage] = deque(maxlen=MOST_WAITING)
+        self._sent = 0
+        """Messages of :meth:`send` so far."""
         self._talk_at_ns: int | None = None
         self._autopilot: int | None = None
+        self.armed: bool | None = None
+        self._commands = MavlinkCommands(self._dialect, config.system_id, OUR_COMPONENT)
+
+    def obey(self, asked: Obey) -> None:
+        """From now on pass commands to us to ``asked``; unheard where we only listen."""
+        self._commands.asked = asked if self._config.talk else None
+
+    @property
+    def wanted(self) -> Wanted:
+        """What a link need bring at the least."""
+        of = self._senders.asked
+        autopilot = self._senders.autopilot
+        names = frozenset(self._wanted.values())
+        return Wanted(names, {**of, autopilot: of[autopilot] | ALWAYS})
 
     def decode(self, packet: bytes, arrival_ns: int) -> list[TelemetrySample]:
         header = header_of(packet)
         if header.message_id not in self._wanted:
             return []
         name = self._wanted[header.message_id]
-        if (header.system, header.component) != self._senders.autopilot:
-            return self._of_another(header, name, packet, arrival_ns)
+        if name in MESSAGES:
+            self._answer(self._commands.acknowledged(header, self._unpacked(packet)))
+            return []
+        if (header.system, header.component) == self._senders.autopilot:
+            return self._of_autopilot(header, name, packet, arrival_ns)
+        return self._of_another(header, name, packet, arrival_ns)
+
+    def _of_autopilot(
+        self, header: Header, name: str, packet: bytes, arrival_ns: int
+    ) -> list[TelemetrySample]:
         message = self._unpacked(packet)
         if name == "HEARTBEAT":
             self._autopilot = message.autopilot
+            self.armed = bool(message.base_mode & self._dialect.MAV_MODE_FLAG_SAFETY_ARMED)
             return []
         if name == "TIMESYNC":
             self._synchronise(message, arrival_ns)
@@ -92,8 +120,10 @@ class MavlinkDecoder(PacketDecoder):
         data, self._outgoing = self._outgoing, b""
         while self._outbound:
             outbound = self._outbound.popleft()
-            message = message_of(self._dialect, outbound, self._receiver(outbound))
-            data += b"" if message is None else self._packed(message)
+            self._sent += 1
+            receiver = self._receiver(outbound)
+            for message in messages_of(self._dialect, outbound, receiver, self._sent):
+                data += self._packed(message)
         if self._talk_at_ns is not None and now_ns < self._talk_at_ns:
             return data
         self._talk_at_ns = now_ns + TALK_EVERY_NS
@@ -133,12 +163,14 @@ class MavlinkDecoder(PacketDecoder):
         self._wire.seq = (self._wire.seq + 1) % 256
         return data
 
+    def _answer(self, message: Any | None) -> None:
+        if message is not None and len(self._outgoing) < MAX_OUTGOING_BYTES:
+            self._outgoing += self._packed(message)
+
     def _synchronise(self, message: Any, arrival_ns: int) -> None:
         """mavlink.io/en/services/timesync.html: tc1 is 0 in requests, ts1 is the asker's clock."""
         if message.tc1 == 0:
-            answer = self._dialect.MAVLink_timesync_message(tc1=arrival_ns, ts1=message.ts1)
-            if len(self._outgoing) < MAX_OUTGOING_BYTES:
-                self._outgoing += self._packed(answer)
+            self._answer(self._dialect.MAVLink_timesync_message(tc1=arrival_ns, ts1=message.ts1))
         elif message.ts1 in self._requests:
             self._requests.remove(message.ts1)
             self.clock.mapping.add(message.tc1, arrival_ns, arrival_ns - message.ts1)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from aquaflow.drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing
@@ -69,6 +70,22 @@ class MavlinkFraming(Framing):
         (sent,) = struct.unpack_from("<H", packet, header.payload_end)
         seed = bytes([self._seeds[header.message_id]])
         return bool(self._crc(packet[1 : header.payload_end] + seed).crc == sent)
+
+    def pieces(self, data: bytes) -> Iterator[tuple[Header | None, bytes]]:
+        """The good packets of a datagram with their headers, and what lies between, without."""
+        begin = at = 0
+        while (at := self.find(data, at)) >= 0:
+            length = self.length(data, at)
+            whole = length > 0 and at + length <= len(data)
+            if whole and self.intact(packet := data[at : at + length]):
+                if at > begin:
+                    yield None, data[begin:at]
+                yield header_of(packet), packet
+                begin = at = at + length
+            else:
+                at += 1
+        if begin < len(data):
+            yield None, data[begin:]
 
 
 def header_of(buffer: bytes, at: int = 0) -> Header:

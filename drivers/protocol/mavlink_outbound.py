@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from aquaflow.drivers.protocol.mavlink_text import text_messages
 from aquaflow.sources.outbound import (
     LONGEST_NAME,
-    LONGEST_TEXT,
     BodyMotion,
     BodyPose,
     NamedValue,
@@ -21,8 +21,6 @@ from aquaflow.sources.outbound import (
 
 Array: TypeAlias = npt.NDArray[np.float64]
 
-SEVERITIES = {"error": 3, "warning": 4, "notice": 5, "info": 6}
-"""MAV_SEVERITY."""
 LOCAL_NED, LOCAL_FRD, BODY_FRD = 1, 20, 12
 """MAV_FRAME: of a world whose x points north, of one with any heading, and of the body."""
 ARDUPILOT = 3
@@ -32,6 +30,8 @@ ESTIMATOR_VISION = 2
 """MAV_ESTIMATOR_TYPE_VISION: a camera, without inertial sensors."""
 ROWS, COLUMNS = np.triu_indices(6)
 """The upper triangle row by row: 21 numbers of a 6 x 6 covariance."""
+MOST_NUMBERS = 65_535
+"""Numbers of texts, which are 1 to that many."""
 LARGEST = 1e6
 """Metres; beyond is no position."""
 
@@ -46,15 +46,25 @@ class Receiver:
     """MAV_AUTOPILOT of its heartbeats; None before the first."""
 
 
-def message_of(dialect: Any, outbound: OutboundMessage, receiver: Receiver) -> Any | None:
-    """The MAVLink message of ``outbound``.
+def messages_of(
+    dialect: Any, outbound: OutboundMessage, receiver: Receiver, number: int
+) -> list[Any]:
+    """The MAVLink messages of ``outbound``, of which ``number`` is told from the ones before; of a
+    text that is long several, else one, or none."""
+    if isinstance(outbound, StatusText):
+        return text_messages(dialect, outbound, number % MOST_NUMBERS + 1)
+    message = _message_of(dialect, outbound, receiver)
+    return [] if message is None else [message]
+
+
+def _message_of(
+    dialect: Any, outbound: NamedValue | BodyPose | BodyMotion, receiver: Receiver
+) -> Any | None:
+    """The message of a value, a pose or a motion.
 
     None for a pose or a motion that is not finite, or while the receiver's clock is unknown: its
     filter must not take a pose for one of another moment.
     """
-    if isinstance(outbound, StatusText):
-        text = outbound.text.encode("ascii", "replace")[:LONGEST_TEXT]
-        return dialect.MAVLink_statustext_message(severity=SEVERITIES[outbound.severity], text=text)
     boot_ns = receiver.boot_ns
     if isinstance(outbound, NamedValue):
         name = outbound.name.encode("ascii", "replace")[:LONGEST_NAME]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 
 from aquaflow.config.telemetry import MavlinkConfig
+from aquaflow.drivers.events import about
 from aquaflow.drivers.protocol.mavlink_frames import Header
 from aquaflow.drivers.protocol.mavlink_samples import MavlinkSamples
 
@@ -36,6 +37,11 @@ class MavlinkSenders:
         """Names of the messages that make samples, whoever sends them."""
         return frozenset().union(*(each.wanted for each in self._samples.values()))
 
+    @property
+    def asked(self) -> dict[tuple[int, int], frozenset[str]]:
+        """The same by system and component of the sender."""
+        return {sender: each.wanted for sender, each in self._samples.items()}
+
     def of(self, header: Header, message: str) -> MavlinkSamples | None:
         """What converts ``message`` of this sender; None if it is not asked for it."""
         samples = self._samples.get((header.system, header.component))
@@ -53,6 +59,6 @@ class MavlinkSenders:
             log.warning(
                 "%s: %s of system %d, component %d is not used; to use it, add "
                 "{system_id: %d, component_id: %d, messages: [%s]} under 'also'",
-                self._name, message, *sender[:2], *sender,
+                self._name, message, *sender[:2], *sender, extra=about(self._name, "unheard"),
             )  # fmt: skip
         return True

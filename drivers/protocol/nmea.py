@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 from aquaflow.config.telemetry import NmeaConfig
+from aquaflow.drivers.events import about
 from aquaflow.drivers.protocol.nmea_acoustic import NmeaAcoustic
 from aquaflow.drivers.protocol.nmea_gnss import NmeaGnss
 from aquaflow.drivers.protocol.nmea_sentence import framing, number, parse
@@ -97,7 +98,7 @@ class NmeaDecoder(PacketDecoder):
             log.warning(
                 "%s: %s states no variation, so its heading is magnetic; set variation_deg of this "
                 "device, or fusion.declination",
-                self.name, kind,
+                self.name, kind, extra=about(self.name, "unused"),
             )  # fmt: skip
         return self._config.variation_deg or 0.0
 

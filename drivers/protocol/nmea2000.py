@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 
-from aquaflow.config.telemetry import Nmea2000Config
+from aquaflow.config.can_devices import Nmea2000Config
 from aquaflow.drivers.fixes import Fixes, sigma_of
 from aquaflow.drivers.protocol.can_records import CanFraming, frame_of
 from aquaflow.drivers.protocol.fast_packet import FastPackets

@@ -12,6 +12,7 @@ import logging
 import math
 
 from aquaflow.config.telemetry import NmeaConfig
+from aquaflow.drivers.events import about
 from aquaflow.drivers.fixes import Fixes, sigma_of
 from aquaflow.drivers.protocol.nmea_sentence import number
 from aquaflow.messages import TelemetrySample
@@ -51,5 +52,5 @@ class NmeaAcoustic:
             log.warning(
                 "%s: PSIMSSB with coordinates '%s' does not place the vehicle on the earth; let "
                 "the acoustic system send radians (R), or GGA",
-                self._name, coordinates,
+                self._name, coordinates, extra=about(self._name, "unused"),
             )  # fmt: skip

@@ -138,6 +138,10 @@ class PacketDecoder(ABC):
         self.counters.samples += len(samples)
         return samples
 
+    def recognises(self, data: bytes) -> bool:
+        """Whether a good packet of this protocol is in ``data``; nothing is decoded or counted."""
+        return bool(PacketReader(self.reader.framing, LinkCounters()).feed(data))
+
     def reset(self) -> None:
         """The link was opened anew."""
         self.reader.reset()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from aquaflow.config.telemetry import Assumptions
+from aquaflow.config.device import Assumptions
 from aquaflow.drivers.rotation import from_euler
 from aquaflow.messages import AngularRate, Attitude, TelemetrySample, Velocity
 

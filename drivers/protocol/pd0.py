@@ -1,6 +1,7 @@
 """Bottom track of a Teledyne DVL that sends PD0 ensembles (Teledyne's PD0 output data format).
 
-Ship and instrument axes are x starboard, y forward, z up.
+Ship and instrument axes are x starboard, y forward, z up; those of beams and of the earth are
+brought into them where the ensemble tells how (:mod:`aquaflow.drivers.protocol.pd0_axes`).
 """
 
 from __future__ import annotations
@@ -10,9 +11,17 @@ import logging
 import struct
 from datetime import datetime
 
-from aquaflow.config.telemetry import Pd0Config
+from aquaflow.config.instruments import Pd0Config
 from aquaflow.drivers.device_clock import DeviceClock
+from aquaflow.drivers.events import about
 from aquaflow.drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing, PacketDecoder
+from aquaflow.drivers.protocol.pd0_axes import (
+    BAD_VELOCITY,
+    Head,
+    UnusableError,
+    from_beams,
+    from_earth,
+)
 from aquaflow.messages import Altitude, TelemetrySample, Velocity
 
 log = logging.getLogger(__name__)
@@ -29,13 +38,8 @@ MAX_TYPES = 16
 """Data types of an ensemble. A DVL sends seven or so; a larger number is damage."""
 FIXED_LEADER, VARIABLE_LEADER, BOTTOM_TRACK = 0x0000, 0x0080, 0x0600
 """IDs of the data types that are read."""
-INSTRUMENT, SHIP = 1, 2
-"""Coordinates by bits 3 and 4 of the fixed leader's byte 25."""
-UNUSED = {0: "beam", 3: "earth"}
-"""Beam velocities need the head's geometry; of those in earth axes the attitude would have
-to be taken off again."""
-BAD_VELOCITY = -32_768
-"""mm/s; what the DVL writes for a velocity that it could not measure."""
+COORDINATES = ("beam", "instrument", "ship", "earth")
+"""By bits 3 and 4 of the fixed leader's byte 25."""
 MIN_BEAMS = 3
 """With three of four beams the velocity and the mean range are still right."""
 
@@ -79,39 +83,54 @@ class Pd0Decoder(PacketDecoder):
         self.clock: DeviceClock = DeviceClock(name)
         self._sign = -1.0 if config.velocity_of == "bottom" else 1.0
         self._sigma_m_s = config.sigma_m_s
+        self._beam_angle_deg = config.beam_angle_deg
         self._said_unused = False
 
     def decode(self, packet: bytes, arrival_ns: int) -> list[TelemetrySample]:
         parts = _parts(packet)
         bottom = parts[BOTTOM_TRACK]
-        coordinates = parts[FIXED_LEADER][25] >> 3 & 0b11
         t_ns = self._moment(parts[VARIABLE_LEADER], arrival_ns)
         source = self.source("bottom_track")
         samples: list[TelemetrySample] = []
         if (altitude_m := _altitude(bottom)) is not None:
             samples.append(Altitude(t_ns, arrival_ns, source, altitude_m))
-        x, y, z, error = struct.unpack_from("<4h", bottom, 24)
-        if coordinates in UNUSED:
-            self._say_unused(UNUSED[coordinates])
-        if coordinates not in (INSTRUMENT, SHIP) or BAD_VELOCITY in (x, y, z):
+        try:
+            x, y, z, error = self._in_instrument_axes(parts)
+        except ValueError as problem:
             self.counters.invalid_values += 1
+            if isinstance(problem, UnusableError):
+                self._say_unused(parts[FIXED_LEADER], problem)
             return samples
         velocity = tuple(self._sign * 1e-3 * value for value in (y, x, -z))
         # The error velocity is scaled so that its spread is that of the horizontal velocity.
-        error_m_s = 0.0 if error == BAD_VELOCITY else error * 1e-3
-        merit = (self._sigma_m_s**2 + error_m_s**2) ** 0.5
+        merit = (self._sigma_m_s**2 + (1e-3 * error) ** 2) ** 0.5
         return [
             Velocity(t_ns, arrival_ns, source, (velocity[0], velocity[1], velocity[2]), merit),
             *samples,
         ]
 
-    def _say_unused(self, coordinates: str) -> None:
+    def _in_instrument_axes(self, parts: dict[int, bytes]) -> tuple[float, float, float, float]:
+        """x, y, z and error velocity, mm/s; ValueError where they were not measured."""
+        one, two, three, four = struct.unpack_from("<4h", parts[BOTTOM_TRACK], 24)
+        coordinates = _coordinates(parts[FIXED_LEADER])
+        if coordinates == "beam":
+            head = Head.of(parts[FIXED_LEADER])
+            return from_beams((one, two, three, four), head, self._beam_angle_deg)
+        if BAD_VELOCITY in (one, two, three):
+            raise ValueError("no velocity over ground")
+        error = 0.0 if four == BAD_VELOCITY else float(four)
+        if coordinates == "earth":
+            head, leader = Head.of(parts[FIXED_LEADER]), parts[VARIABLE_LEADER]
+            return (*from_earth((one, two, three), head, leader), error)
+        return one, two, three, error
+
+    def _say_unused(self, leader: bytes, problem: UnusableError) -> None:
         if not self._said_unused:
             self._said_unused = True
             log.warning(
-                "%s: its velocities are in %s coordinates, which are not used; set the DVL to ship "
-                "coordinates (EX10000 and the like), or to instrument coordinates (EX01000)",
-                self.name, coordinates,
+                "%s: its velocities, in %s coordinates, are not used: %s; set the DVL to ship "
+                "coordinates (EX10000 and the like)",
+                self.name, _coordinates(leader), problem, extra=about(self.name, "unused"),
             )  # fmt: skip
 
     def _moment(self, leader: bytes, arrival_ns: int) -> int:
@@ -123,6 +142,10 @@ class Pd0Decoder(PacketDecoder):
             return arrival_ns  # a clock that was never set need not cost the velocity
         device_ns = calendar.timegm(date.timetuple()) * 1_000_000_000 + hundredths * 10_000_000
         return self.clock.stamp(device_ns, arrival_ns)
+
+
+def _coordinates(leader: bytes) -> str:
+    return COORDINATES[leader[25] >> 3 & 0b11]
 
 
 def _parts(packet: bytes) -> dict[int, bytes]:

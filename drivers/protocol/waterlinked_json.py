@@ -6,7 +6,7 @@ import json
 import re
 from typing import Any
 
-from aquaflow.config.telemetry import WaterLinkedJsonConfig
+from aquaflow.config.instruments import WaterLinkedJsonConfig
 from aquaflow.drivers.protocol.lines import LineFraming
 from aquaflow.drivers.protocol.packets import PacketDecoder
 from aquaflow.drivers.protocol.waterlinked import attitude, bottom_track, measured_ns

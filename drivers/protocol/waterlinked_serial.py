@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from aquaflow.config.telemetry import WaterLinkedSerialConfig
+from aquaflow.config.instruments import WaterLinkedSerialConfig
 from aquaflow.drivers.protocol.lines import LineFraming
 from aquaflow.drivers.protocol.packets import PacketDecoder
 from aquaflow.drivers.protocol.waterlinked import attitude, bottom_track, measured_ns

@@ -15,6 +15,22 @@ WRITE_TIMEOUT_S = 1.0
 """A write waits only while the peer reads nothing; what is sent is worth no longer wait."""
 
 
+def send_datagram(udp: socket.socket, data: bytes, peer: Any) -> None:
+    """To ``peer``, an address, or nobody while there is no peer to answer (None).
+
+    Raises:
+        LinkLostError: the socket is gone; a peer that is not up yet loses the datagram.
+    """
+    if peer is None:
+        return
+    try:
+        udp.sendto(data, peer)
+    except ConnectionError:
+        return
+    except OSError as error:
+        raise LinkLostError(f"the socket was lost: {error}") from error
+
+
 class UdpLink:
     """Datagrams of one peer: the configured one, or the last sender."""
 
@@ -38,14 +54,7 @@ class UdpLink:
         return data
 
     def write(self, data: bytes) -> None:
-        if self._peer is None:
-            return  # no peer to answer yet
-        try:
-            self._socket.sendto(data, self._peer)
-        except ConnectionError:
-            return
-        except OSError as error:
-            raise LinkLostError(f"the socket was lost: {error}") from error
+        send_datagram(self._socket, data, self._peer)
 
     def close(self) -> None:
         self._socket.close()
@@ -85,18 +94,39 @@ def open_udp(name: str, config: UdpConfig) -> UdpLink:
     Raises:
         LinkLostError: the address cannot be used.
     """
-    family = socket.AF_INET6 if ":" in config.host else socket.AF_INET
-    sock = socket.socket(family, socket.SOCK_DGRAM)
+    if config.mode == "listen":
+        return UdpLink(name, bound(config.host, config.port))
+    sock = _udp_socket(config.host)
     try:
-        if config.mode == "send":
-            peer = socket.getaddrinfo(config.host, config.port, family, socket.SOCK_DGRAM)[0][4]
-            return UdpLink(name, sock, peer)
-        sock.bind((config.host, config.port))
+        peer = socket.getaddrinfo(config.host, config.port, sock.family, socket.SOCK_DGRAM)[0][4]
     except OSError as error:
         sock.close()
-        address = f"{config.host}:{config.port}"
-        raise LinkLostError(f"cannot use UDP {address}: {error}") from error
-    return UdpLink(name, sock)
+        raise _unusable(config.host, config.port, error) from error
+    return UdpLink(name, sock, peer)
+
+
+def bound(host: str, port: int) -> socket.socket:
+    """A socket that hears the port.
+
+    Raises:
+        LinkLostError: the address cannot be used.
+    """
+    sock = _udp_socket(host)
+    try:
+        sock.bind((host, port))
+    except OSError as error:
+        sock.close()
+        raise _unusable(host, port, error) from error
+    return sock
+
+
+def _udp_socket(host: str) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    return socket.socket(family, socket.SOCK_DGRAM)
+
+
+def _unusable(host: str, port: int, error: OSError) -> LinkLostError:
+    return LinkLostError(f"cannot use UDP {host}:{port}: {error}")
 
 
 def open_tcp(name: str, config: TcpConfig) -> TcpLink:

@@ -8,6 +8,8 @@ from __future__ import annotations
 import ctypes
 from ctypes import c_int32, c_uint8, c_uint32, c_uint64
 
+from aquaflow.drivers.v4l2.abi_planes import Plane
+
 VIDEO_CAPTURE = 1
 MEMORY_MMAP = 1
 """V4L2_BUF_TYPE_VIDEO_CAPTURE, V4L2_MEMORY_MMAP: pictures in buffers mapped from the kernel."""
@@ -46,6 +48,11 @@ EXPOSURE_UNIT_S = 100e-6
 def fourcc(name: str) -> int:
     """``YUYV`` as the kernel writes it."""
     return int.from_bytes(name.encode("ascii"), "little")
+
+
+def name_of(pixelformat: int) -> str:
+    """The four letters that :func:`fourcc` made a number of."""
+    return int(pixelformat).to_bytes(4, "little").decode("ascii", "replace")
 
 
 class Capability(ctypes.Structure):
@@ -118,6 +125,9 @@ class RequestBuffers(ctypes.Structure):
 class Buffer(ctypes.Structure):
     """``struct v4l2_buffer``."""
 
+    planes: ctypes.Array[Plane]
+    """What ``offset`` points to where a picture has several planes."""
+
     _fields_ = (
         ("index", c_uint32),
         ("type", c_uint32),
@@ -129,7 +139,8 @@ class Buffer(ctypes.Structure):
         ("timecode", c_uint8 * 16),
         ("sequence", c_uint32),
         ("memory", c_uint32),
-        ("offset", c_uint64),  # a union; its lower half is the offset of memory-mapped buffers
+        # A union: the lower half is the offset of memory-mapped buffers, or it is a pointer.
+        ("offset", c_uint64),
         ("length", c_uint32),
         ("reserved", c_uint32 * 2),
     )

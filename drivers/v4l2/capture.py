@@ -17,7 +17,9 @@ from aquaflow.config.cameras import V4l2Config
 from aquaflow.drivers.capture import RawPicture, UnusablePictureError
 from aquaflow.drivers.v4l2 import abi
 from aquaflow.drivers.v4l2.controls import apply_controls
-from aquaflow.drivers.v4l2.pixels import JPEG_PIXELS, to_rgb
+from aquaflow.drivers.v4l2.discovery import capabilities
+from aquaflow.drivers.v4l2.pixels import JPEG_PIXELS, STREAMED, to_rgb
+from aquaflow.drivers.v4l2.planes import Layout, SinglePlanar, layout_of
 from aquaflow.drivers.v4l2.system import KernelInterface, call, supported
 from aquaflow.messages import CameraModel, EncodedPicture
 
@@ -42,20 +44,25 @@ class V4l2Capture:
         self._system = system
         self._now_ns = now_ns
         self._lock = threading.Lock()
+        self._layout: Layout = SinglePlanar()
         self._fd = system.open(path)
         self._open = True
         try:
-            self._set_format(config)
+            self._layout = layout_of(capabilities(system, self._fd))
+            self.settled = self._layout.settled(system, self._fd, config)
+            fps, rate_notes = self._set_rate(config)
             controls = apply_controls(system, self._fd, config)
             self._maps = [self._map(index) for index in range(self._request(config.buffers))]
             for index in range(len(self._maps)):
                 self._queue(index)
-            call(system, self._fd, abi.STREAMON, ctypes.c_int32(abi.VIDEO_CAPTURE))
+            call(system, self._fd, abi.STREAMON, ctypes.c_int32(self._layout.kind))
         except BaseException:
             self.close()
             raise
         self._exposure_s, self._gain = controls.exposure_s, controls.gain
-        self.notes = (*self._format_notes(config), *controls.notes)
+        size = f"{self.settled.width} x {self.settled.height}"
+        self.format = f"{size} {self.settled.pixels}, {fps:.3g} pictures/s"
+        self.notes = (*self._format_notes(config), *rate_notes, *controls.notes)
 
     def read(self, timeout_s: float) -> RawPicture | None:
         """The next picture; None when ``timeout_s`` passed without one.
@@ -65,7 +72,7 @@ class V4l2Capture:
         """
         if not self._system.wait(self._fd, timeout_s):
             return None
-        buffer = abi.Buffer(type=abi.VIDEO_CAPTURE, memory=abi.MEMORY_MMAP)
+        buffer = self._layout.buffer()
         try:
             call(self._system, self._fd, abi.DQBUF, buffer)
         except BlockingIOError:
@@ -80,7 +87,7 @@ class V4l2Capture:
         if was_open:
             # An unplugged device has stopped already.
             with contextlib.suppress(OSError):
-                call(self._system, self._fd, abi.STREAMOFF, ctypes.c_int32(abi.VIDEO_CAPTURE))
+                call(self._system, self._fd, abi.STREAMOFF, ctypes.c_int32(self._layout.kind))
             self._system.close(self._fd)
 
     def _picture(self, buffer: abi.Buffer) -> RawPicture:
@@ -89,7 +96,8 @@ class V4l2Capture:
         starts = buffer.flags & abi.BUF_FLAG_TSTAMP_SRC_MASK == abi.BUF_FLAG_TSTAMP_SRC_SOE
         if not starts and self._exposure_s is not None:
             stamp_ns -= round(self._exposure_s * 1e9)
-        data = self._maps[buffer.index][: buffer.bytesused]
+        used = self._layout.used(buffer)
+        data = [place[part] for place, part in zip(self._maps[buffer.index], used, strict=True)]
         return RawPicture(
             arrival_ns=self._now_ns(),
             decode=partial(self._decode, data, int(buffer.flags)),
@@ -103,47 +111,48 @@ class V4l2Capture:
 
     def _decode(
         self,
-        data: npt.NDArray[np.uint8],  # [bytes used]
+        data: list[npt.NDArray[np.uint8]],  # of each piece of memory [bytes used]
         flags: int,
     ) -> npt.NDArray[np.uint8]:
         if flags & abi.BUF_FLAG_ERROR:
             raise UnusablePictureError("was damaged on its way from the camera")
-        pix = self._pix
-        return to_rgb(data, self.pixels, pix.width, pix.height, pix.bytesperline)
+        return to_rgb(data, self.settled)
 
     def _file(
         self,
-        data: npt.NDArray[np.uint8],  # [bytes used]
+        data: list[npt.NDArray[np.uint8]],  # of each piece of memory [bytes used]
     ) -> EncodedPicture | None:
-        return EncodedPicture("jpeg", data.tobytes()) if self.pixels in JPEG_PIXELS else None
+        if self.settled.pixels in JPEG_PIXELS:
+            return EncodedPicture("jpeg", data[0].tobytes())
+        return (
+            EncodedPicture("h264", data[0].tobytes()) if self.settled.pixels == STREAMED else None
+        )
 
     def _queue(self, index: int) -> None:
         """Give a buffer back to the kernel; nothing if the device is closed or gone."""
         with self._lock:
             if not self._open:
                 return
-            buffer = abi.Buffer(index=index, type=abi.VIDEO_CAPTURE, memory=abi.MEMORY_MMAP)
             try:
-                call(self._system, self._fd, abi.QBUF, buffer)
+                call(self._system, self._fd, abi.QBUF, self._layout.buffer(index))
             except OSError as error:
                 if error.errno != errno.ENODEV:  # the next read says that it is gone
                     raise
 
-    def _set_format(self, config: V4l2Config) -> None:
-        """Ask, and take what the driver makes of it: it changes sizes and formats as it likes."""
-        wanted = abi.Format(type=abi.VIDEO_CAPTURE)
-        wanted.fmt.pix.width, wanted.fmt.pix.height = config.width, config.height
-        wanted.fmt.pix.pixelformat = abi.fourcc(config.pixels)
-        call(self._system, self._fd, abi.S_FMT, wanted)
-        self._pix = wanted.fmt.pix
-        self.pixels = int(self._pix.pixelformat).to_bytes(4, "little").decode("ascii", "replace")
-        rate = abi.StreamParameters(type=abi.VIDEO_CAPTURE)
+    def _set_rate(self, config: V4l2Config) -> tuple[float, tuple[str, ...]]:
+        """Ask; the rate that it is, and for people, where it is another."""
+        rate = abi.StreamParameters(type=self._layout.kind)
         rate.timeperframe = abi.Fraction(1000, round(config.fps * 1000))
-        supported(self._system, self._fd, abi.S_PARM, rate)
-        self.fps = rate.timeperframe.denominator / max(1, rate.timeperframe.numerator)
+        if not supported(self._system, self._fd, abi.S_PARM, rate):
+            return config.fps, ()
+        period = rate.timeperframe
+        got = period.denominator / max(1, period.numerator)
+        if abs(got - config.fps) < 0.01 * config.fps:
+            return got, ()
+        return got, (f"the camera gives {got:.3g} pictures/s where {config.fps:g} were asked for",)
 
     def _format_notes(self, config: V4l2Config) -> tuple[str, ...]:
-        got = (int(self._pix.width), int(self._pix.height), self.pixels)
+        got = (self.settled.width, self.settled.height, self.settled.pixels)
         if got == (config.width, config.height, config.pixels):
             return ()
         return (
@@ -152,13 +161,14 @@ class V4l2Capture:
         )
 
     def _request(self, count: int) -> int:
-        request = abi.RequestBuffers(count=count, type=abi.VIDEO_CAPTURE, memory=abi.MEMORY_MMAP)
+        request = abi.RequestBuffers(count, self._layout.kind, abi.MEMORY_MMAP)
         call(self._system, self._fd, abi.REQBUFS, request)
         if request.count < 3:
             raise OSError(errno.ENOMEM, f"the camera has {request.count} buffers, needs 3", None)
         return int(request.count)
 
-    def _map(self, index: int) -> npt.NDArray[np.uint8]:
-        buffer = abi.Buffer(index=index, type=abi.VIDEO_CAPTURE, memory=abi.MEMORY_MMAP)
+    def _map(self, index: int) -> list[npt.NDArray[np.uint8]]:
+        buffer = self._layout.buffer(index)
         call(self._system, self._fd, abi.QUERYBUF, buffer)
-        return self._system.mmap(self._fd, buffer.length, buffer.offset & 0xFFFFFFFF)
+        places = self._layout.places(buffer)
+        return [self._system.mmap(self._fd, length, offset) for length, offset in places]

@@ -10,8 +10,12 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from aquaflow.drivers.v4l2 import abi
+from aquaflow.drivers.v4l2 import abi, abi_planes
+from aquaflow.drivers.v4l2.planes import layout_of
 from aquaflow.drivers.v4l2.system import KernelInterface, call, supported
+
+TAKES_PICTURES = abi.CAP_VIDEO_CAPTURE | abi_planes.CAP_VIDEO_CAPTURE_MPLANE
+"""In one piece or in several; codecs, which turn pictures into pictures, say otherwise."""
 
 
 @dataclass(frozen=True)
@@ -62,9 +66,9 @@ def modes(system: KernelInterface, path: Path) -> list[str]:
     fd = system.open(str(path))
     try:
         formats = []
-        form = abi.FormatDescription(type=abi.VIDEO_CAPTURE)
+        form = abi.FormatDescription(type=layout_of(capabilities(system, fd)).kind)
         while supported(system, fd, abi.ENUM_FMT, form):
-            name = int(form.pixelformat).to_bytes(4, "little").decode("ascii", "replace")
+            name = abi.name_of(form.pixelformat)
             size = _largest(system, fd, form.pixelformat)
             formats.append(f"{name} up to {size[0]} x {size[1]}" if size else name)
             form.index += 1
@@ -98,9 +102,24 @@ def _capability(system: KernelInterface, path: Path) -> abi.Capability | None:
         return None
     finally:
         system.close(fd)
-    whole = capability.capabilities
-    caps = capability.device_caps if whole & abi.CAP_DEVICE_CAPS else whole
-    return capability if caps & abi.CAP_VIDEO_CAPTURE and caps & abi.CAP_STREAMING else None
+    caps = _of_this_node(capability)
+    return capability if caps & TAKES_PICTURES and caps & abi.CAP_STREAMING else None
+
+
+def capabilities(system: KernelInterface, fd: int) -> int:
+    """What an open node can, as V4L2_CAP_*.
+
+    Raises:
+        OSError: the device is gone, or no video device.
+    """
+    capability = abi.Capability()
+    call(system, fd, abi.QUERYCAP, capability)
+    return _of_this_node(capability)
+
+
+def _of_this_node(capability: abi.Capability) -> int:
+    whole = int(capability.capabilities)
+    return int(capability.device_caps) if whole & abi.CAP_DEVICE_CAPS else whole
 
 
 def _links(root: Path, path: Path) -> list[str]:

@@ -42,10 +42,12 @@ class ArduSub:
     SYSTEM_TIME, position by GPS_RAW_INT with an HDOP of 1.6 and, in MAVLink 2, its accuracy.
     """
 
-    def __init__(self, mavlink_2: bool = True) -> None:
+    def __init__(self, mavlink_2: bool = True, sonar_component: int = 1) -> None:
+        """``sonar_component``: who sends DISTANCE_SENSOR; 194 is BlueOS's Ping service."""
         self._dialect: Any = import_module("pymavlink.dialects.v20.ardupilotmega")
         self._wire: Any = self._dialect.MAVLink(None, srcSystem=1, srcComponent=1)
         self._wire.robust_parsing = True
+        self._sonar: Any = self._dialect.MAVLink(None, srcSystem=1, srcComponent=sonar_component)
         self._mavlink_1 = not mavlink_2
         self._rate = (0.0, 0.0, 0.0)
         self._force = (0.0, 0.0, -GRAVITY_M_S2)
@@ -56,6 +58,13 @@ class ArduSub:
         """TIMESYNC requests of ours that were answered."""
         self.heartbeats = 0
         """Heartbeats heard."""
+        self.armed = False
+        """As its heartbeats say."""
+        self.acknowledged: list[tuple[int, int]] = []
+        """Command and result of each COMMAND_ACK heard."""
+        self.texts: list[str] = []
+        """Of each STATUSTEXT heard."""
+        self._commands: list[bytes] = []
         self.vision = VisualOdometry()
         """The poses that it was sent."""
 
@@ -94,28 +103,46 @@ class ArduSub:
             kind = message.get_type()
             self.vision.take(message, now_ns)
             self.heartbeats += kind == "HEARTBEAT"
+            if kind == "COMMAND_ACK":
+                self.acknowledged.append((message.command, message.result))
+            if kind == "STATUSTEXT":
+                self.texts.append(message.text)
             if kind == "TIMESYNC" and message.tc1 == 0:
                 answers.append(self._packed("timesync", now_ns, message.ts1))
             elif kind == "TIMESYNC":
                 self.answers += 1
         return answers
 
+    def command(self, number: int, component: int, confirmation: int = 0) -> None:
+        """Route a COMMAND_LONG of the ground station (system 255, component 190)."""
+        station = self._dialect.MAVLink(None, srcSystem=255, srcComponent=190)
+        command = self._dialect.MAVLink_command_long_message(
+            1, component, number, confirmation, *[0.0] * 7
+        )
+        self._commands.append(bytes(command.pack(station)))
+
     def unprompted(self, now_ns: int) -> list[bytes]:
+        routed, self._commands = self._commands, []
         if self._beat_ns is not None and now_ns < self._beat_ns:
-            return []
+            return routed
         self._beat_ns = now_ns + BEAT_NS
         dialect = self._dialect
         submarine, autopilot = dialect.MAV_TYPE_SUBMARINE, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
+        mode = 81 | (dialect.MAV_MODE_FLAG_SAFETY_ARMED if self.armed else 0)
         return [
-            self._packed("heartbeat", submarine, autopilot, 81, 19, dialect.MAV_STATE_ACTIVE, 3),
+            *routed,
+            self._packed("heartbeat", submarine, autopilot, mode, 19, dialect.MAV_STATE_ACTIVE, 3),
             self._packed("system_time", 0, now_ns // 1_000_000),
             self._packed("timesync", 0, now_ns),
         ]
 
     def _packed(self, message: str, *fields: float) -> bytes:
+        return self._packed_by(self._wire, message, *fields)
+
+    def _packed_by(self, wire: Any, message: str, *fields: float) -> bytes:
         built = getattr(self._dialect, f"MAVLink_{message}_message")(*fields)
-        data = bytes(built.pack(self._wire, force_mavlink1=self._mavlink_1))
-        self._wire.seq = (self._wire.seq + 1) % 256
+        data = bytes(built.pack(wire, force_mavlink1=self._mavlink_1))
+        wire.seq = (wire.seq + 1) % 256
         return data
 
     def _imu(self, time_us: int) -> bytes:
@@ -132,8 +159,9 @@ class ArduSub:
 
     def _range(self, altitude_m: float, boot_ms: int) -> bytes:
         down = self._dialect.MAV_SENSOR_ROTATION_PITCH_270
-        return self._packed(
-            "distance_sensor", boot_ms, 20, 5000, round(altitude_m * 100), 1, 0, down, 255
+        centimetres = round(altitude_m * 100)
+        return self._packed_by(
+            self._sonar, "distance_sensor", boot_ms, 20, 5000, centimetres, 1, 0, down, 255
         )
 
     def _fix(self, sample: Position, time_us: int) -> bytes:

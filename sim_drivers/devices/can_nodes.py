@@ -6,7 +6,7 @@ import math
 import struct
 from typing import TYPE_CHECKING, Any
 
-from aquaflow.config.telemetry import DbcSignal
+from aquaflow.config.can_devices import DbcSignal
 from aquaflow.messages import (
     Acceleration,
     Altitude,

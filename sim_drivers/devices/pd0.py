@@ -1,15 +1,27 @@
-"""A Teledyne DVL that sends PD0 ensembles in ship coordinates."""
+"""A Teledyne DVL that sends PD0 ensembles, in ship, beam or earth coordinates."""
 
 from __future__ import annotations
 
+import math
 import struct
 from datetime import datetime, timedelta, timezone
+from typing import Literal
 
-from aquaflow.messages import Altitude, TelemetrySample, Velocity
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from aquaflow.messages import Altitude, Attitude, TelemetrySample, Velocity
 from aquaflow.sim_drivers.devices.device import OneWayDevice
 
-SHIP_COORDINATES = 2 << 3
-"""Byte 25 of the fixed leader: bits 3 and 4 are 2 for ship axes."""
+COORDINATES = {"beam": 0 << 3, "ship": 2 << 3, "earth": 3 << 3 | 4}
+"""Byte 25 of the fixed leader; in earth axes the tilts are used."""
+CONFIGURATION = 0x424B
+"""600 kHz, convex, down, 30 degrees, four beams in Janus arrangement."""
+BEAM_DEG = 30.0
+"""From the head's axis."""
+BEAMS = {"port": (-1, 0), "starboard": (1, 0), "bow": (0, 1), "stern": (0, -1)}
+"""Where beams 1 to 4 lean, of a head that looks down: starboard and forward."""
 FIXED_BYTES, VARIABLE_BYTES, BOTTOM_BYTES = 58, 77, 81
 """Lengths of the fixed leader, the variable leader and the bottom track, as far as they are
 read."""
@@ -18,16 +30,21 @@ EPOCH = datetime(2026, 1, 1, tzinfo=timezone.utc)
 
 
 class Pd0Dvl(OneWayDevice[bytes]):
-    """Velocity of the bottom past the instrument, with the last altitude in all four beams."""
+    """Velocity of the bottom past the instrument, with the last altitude in all four beams, and
+    heading, pitch and roll of the last attitude."""
 
-    def __init__(self) -> None:
+    def __init__(self, coordinates: Literal["ship", "beam", "earth"] = "ship") -> None:
+        self._coordinates = coordinates
         self._altitude_m = 0.0
+        self._R_nb = Rotation.identity()
         self._ensemble = 0
 
     def encode(self, sample: TelemetrySample, measured_ns: int, now_ns: int) -> list[bytes]:
         match sample:
             case Altitude():
                 self._altitude_m = sample.altitude_m
+            case Attitude():
+                self._R_nb = Rotation.from_quat(np.roll(sample.wxyz, -1))
             case Velocity():
                 self._ensemble += 1
                 return [ensemble(self._fixed(), self._variable(measured_ns), self._bottom(sample))]
@@ -35,7 +52,8 @@ class Pd0Dvl(OneWayDevice[bytes]):
 
     def _fixed(self) -> bytes:
         leader = bytearray(FIXED_BYTES)
-        leader[25] = SHIP_COORDINATES
+        struct.pack_into("<H", leader, 4, CONFIGURATION)
+        leader[25] = COORDINATES[self._coordinates]
         return bytes(leader)
 
     def _variable(self, measured_ns: int) -> bytes:
@@ -45,17 +63,37 @@ class Pd0Dvl(OneWayDevice[bytes]):
             "<HH7B", leader, 0, 0x0080, self._ensemble % 65536, clock.year - 2000, clock.month,
             clock.day, clock.hour, clock.minute, clock.second, clock.microsecond // 10_000,
         )  # fmt: skip
+        yaw, pitch, roll = self._R_nb.as_euler("ZYX")
+        tilt = math.atan2(math.tan(pitch), math.cos(roll))  # what a pendulum in the head shows
+        angles = (math.degrees(yaw) % 360.0, math.degrees(tilt), math.degrees(roll))
+        struct.pack_into("<Hhh", leader, 18, *(round(100.0 * angle) for angle in angles))
         return bytes(leader)
 
     def _bottom(self, sample: Velocity) -> bytes:
-        forward, right, down = (round(1000 * value) for value in sample.velocity_m_s)
         track = bytearray(BOTTOM_BYTES)
         centimetres = round(self._altitude_m * 100)
         struct.pack_into("<H", track, 0, 0x0600)
         struct.pack_into("<4H", track, 16, *[centimetres & 0xFFFF] * 4)
-        struct.pack_into("<4h", track, 24, -right, -forward, down, 0)
+        told = (round(1000.0 * value) for value in self._told(np.array(sample.velocity_m_s)))
+        struct.pack_into("<4h", track, 24, *told)
         track[77:81] = bytes([centimetres >> 16] * 4)
         return bytes(track)
+
+    def _told(
+        self,
+        velocity: npt.NDArray[np.float64],  # [3] m/s, forward, right, down, of the vehicle
+    ) -> tuple[float, ...]:
+        """Four velocities of the bottom, m/s."""
+        if self._coordinates == "earth":
+            north, east, down = self._R_nb.apply(velocity)
+            return -east, -north, down, 0.0
+        forward, right, down = velocity
+        if self._coordinates == "ship":
+            return -right, -forward, down, 0.0
+        out, along = math.sin(math.radians(BEAM_DEG)), math.cos(math.radians(BEAM_DEG))
+        leans = np.array([(out * y, out * x, along) for x, y in BEAMS.values()])
+        # What the vehicle approaches along a beam comes towards that beam.
+        return tuple(float(value) for value in leans @ velocity)
 
 
 def ensemble(*parts: bytes) -> bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,6 +20,7 @@ from aquaflow.messages import CameraModel, Dropped, Frame
 from aquaflow.sim_drivers.camera_feed import CameraFaults, CameraFeed
 from aquaflow.sim_drivers.mjpeg_server import MjpegServer
 from aquaflow.sim_drivers.oak import ReplayOak
+from aquaflow.sim_drivers.rtp_camera import RtpCamera
 from aquaflow.sim_drivers.v4l2_kernel import CameraSpec, V4l2Kernel
 from tests.small_recording import GIVE_UP_S
 
@@ -27,7 +29,7 @@ WIDTH, HEIGHT, COUNT = 64, 48, 40
 QUICK = {"stall_s": 60.0, "first_retry_s": 0.02, "last_retry_s": 0.05}
 """A machine that is slow has no silent camera: what is silent says so by its own ``stall_s``."""
 
-KINDS = ("v4l2-YUYV", "v4l2-MJPG", "v4l2-GREY", "oak", "stream")
+KINDS = ("v4l2-YUYV", "v4l2-MJPG", "v4l2-GREY", "oak", "stream", "rtp")
 
 
 class Pictures:
@@ -76,12 +78,31 @@ def stream(url: str, **more: object) -> StreamCamera:
     return StreamCamera("front", config)
 
 
+def free_port() -> int:
+    """An even UDP port that is free, and the next one, which RTP needs as well, too."""
+    while True:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as first:
+            first.bind(("127.0.0.1", 0))
+            port = int(first.getsockname()[1])
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as second:
+                try:
+                    second.bind(("127.0.0.1", port + 1))
+                except OSError:
+                    continue
+            if port % 2 == 0:
+                return port
+
+
 @contextmanager
 def live(kind: str, faults: CameraFaults, root: Path, fps: float = 100.0) -> Iterator[LiveCamera]:
     """A camera of any kind in front of the same feed."""
     shots = feed(faults, fps)
     if kind == "stream":
         with MjpegServer(shots) as server, closing(stream(server.url)) as camera:
+            yield camera
+    elif kind == "rtp":
+        port = free_port()
+        with RtpCamera(port, shots), closing(stream(f"udp://127.0.0.1:{port}")) as camera:
             yield camera
     elif kind == "oak":
         with closing(oak(shots)[0]) as camera:
@@ -124,5 +145,5 @@ def until(
 def settled(camera: LiveCamera) -> bool:
     """Every picture that was received ended in exactly one counter."""
     n = camera.counters
-    ends = n.delivered + n.overtaken + n.passed_over + n.unusable + n.duplicates
+    ends = n.delivered + n.overtaken + n.passed_over + n.stale + n.unusable + n.duplicates
     return n.received == ends

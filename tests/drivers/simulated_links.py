@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from aquaflow.config.can_devices import DbcSignal
 from aquaflow.config.link import CanConfig
-from aquaflow.config.telemetry import DbcSignal, TelemetryConfig, parse_telemetry
+from aquaflow.config.telemetry import TelemetryConfig, parse_telemetry
 from aquaflow.drivers.link import LinkCounters
 from aquaflow.drivers.telemetry import LinkTelemetry
 from aquaflow.drivers.transport import opener
@@ -37,7 +38,10 @@ from aquaflow.sim_drivers.devices.ardusub import ArduSub
 from aquaflow.sim_drivers.devices.can_nodes import DbcNode, Nmea2000Instruments
 from aquaflow.sim_drivers.devices.device import SimulatedDevice
 from aquaflow.sim_drivers.devices.nmea_talker import NmeaTalker
+from aquaflow.sim_drivers.devices.nucleus import Nucleus
 from aquaflow.sim_drivers.devices.pd0 import Pd0Dvl
+from aquaflow.sim_drivers.devices.ping import Ping1D
+from aquaflow.sim_drivers.devices.vectornav import VectorNav
 from aquaflow.sim_drivers.devices.waterlinked import WaterLinkedJson, WaterLinkedSerial
 from aquaflow.sim_drivers.devices.wires import CanWire, PtyWire, TcpWire, UdpWire
 from aquaflow.sim_drivers.faults import Faults, faulty
@@ -181,6 +185,41 @@ def pd0_pty(tmp_path: Path) -> Rig:
     return Rig(Pd0Dvl(), wire, {"kind": "pd0", "link": link}, DVL)
 
 
+def pd0_beams_pty(tmp_path: Path) -> Rig:
+    wire, link = _pty(tmp_path)
+    return Rig(Pd0Dvl("beam"), wire, {"kind": "pd0", "link": link}, DVL)
+
+
+def pd0_earth_pty(tmp_path: Path) -> Rig:
+    wire, link = _pty(tmp_path)
+    return Rig(Pd0Dvl("earth"), wire, {"kind": "pd0", "link": link}, DVL)
+
+
+def nucleus_pty(tmp_path: Path) -> Rig:
+    wire, link = _pty(tmp_path)
+    kinds = DVL | {Acceleration, AngularRate, Attitude, Depth}
+    packets = ["bottom_track", "altimeter", "ahrs", "imu", "fast_pressure"]
+    return Rig(Nucleus(), wire, {"kind": "nucleus", "link": link, "packets": packets}, kinds)
+
+
+def ping_pty(tmp_path: Path) -> Rig:
+    wire, link = _pty(tmp_path)
+    config = {"kind": "ping", "link": link, "ask_for": "stream"}
+    return Rig(Ping1D(streams=True), wire, config, frozenset({Altitude}))
+
+
+def vectornav_pty(tmp_path: Path) -> Rig:
+    wire, link = _pty(tmp_path)
+    kinds = EARTH | {Acceleration, AngularRate, Attitude}
+    return Rig(VectorNav(), wire, {"kind": "vectornav", "link": link}, kinds)
+
+
+def vectornav_ascii_pty(tmp_path: Path) -> Rig:
+    wire, link = _pty(tmp_path)
+    kinds = frozenset({Acceleration, AngularRate, Attitude, Position})
+    return Rig(VectorNav(ascii_messages=True), wire, {"kind": "vectornav", "link": link}, kinds)
+
+
 def nmea2000_virtual(tmp_path: Path) -> Rig:
     wire, link = _can("virtual", str(tmp_path))
     config = {"kind": "nmea2000", "link": link, "assume": ASSUME}
@@ -207,6 +246,8 @@ RIGS: dict[str, Callable[[Path], Rig]] = {
     build.__name__: build
     for build in (
         mavlink_pty, mavlink_udp, nmea_pty, waterlinked_pty, waterlinked_tcp, pd0_pty,
+        pd0_beams_pty, pd0_earth_pty, nucleus_pty, ping_pty,
+        vectornav_pty, vectornav_ascii_pty,
         nmea2000_virtual, nmea2000_multicast, dbc_virtual,
     )
 }  # fmt: skip

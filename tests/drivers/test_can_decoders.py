@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from aquaflow.config.telemetry import DbcConfig, Nmea2000Config
+from aquaflow.config.can_devices import DbcConfig, Nmea2000Config
 from aquaflow.drivers.protocol.dbc import DbcDecoder
 from aquaflow.drivers.protocol.nmea2000 import Nmea2000Decoder, group_of
 from aquaflow.drivers.transport.can import EXTENDED, RECORD

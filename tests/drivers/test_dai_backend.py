@@ -18,6 +18,7 @@ from aquaflow.config.cameras import OakConfig
 from aquaflow.drivers.oak import OakCamera
 from aquaflow.drivers.oak.calibration import camera_model, imu_rotation
 from aquaflow.drivers.oak.dai_backend import DaiBackend, find_device
+from aquaflow.drivers.oak.encoding import LINK_BYTES_S
 from aquaflow.drivers.oak.messages import imu_readings, nanoseconds, picture_of
 from aquaflow.errors import InputError
 
@@ -81,6 +82,21 @@ def test_an_exposure_that_the_device_did_not_tell_is_unknown() -> None:
     assert (picture.exposure_s, picture.iso) == (None, None)
 
 
+def test_nv12_becomes_rgb() -> None:
+    smooth = np.full((16, 24, 3), (200, 90, 40), np.uint8)
+    picture = picture_of(message(dai.ImgFrame.Type.NV12, smooth))
+    assert np.abs(picture.decode().astype(int) - smooth[:, :, ::-1]).max() <= 3
+
+
+def test_the_library_takes_the_end_of_exposure_for_its_time() -> None:
+    """What ``picture_of`` takes off, since it has no such function for encoded frames."""
+    made = message(dai.ImgFrame.Type.BGR888i, image())
+    made.cam.exposureTimeUs = 8000
+    assert made.getTimestamp(dai.CameraExposureOffset.END) == made.getTimestamp()
+    middle = made.getTimestamp(dai.CameraExposureOffset.MIDDLE)
+    assert picture_of(made).exposed_ns == nanoseconds(middle)
+
+
 def test_data_shorter_than_the_picture_is_no_picture() -> None:
     cut = message(dai.ImgFrame.Type.BGR888i, image())
     cut.setData(np.zeros(10, np.uint8))
@@ -137,7 +153,7 @@ def test_imu_packets_are_read() -> None:
 
     packets = [SimpleNamespace(acceleroMeter=report(1.5, 0.1), gyroscope=report(1.5, 0.2))]
     (reading,) = imu_readings(SimpleNamespace(packets=packets))
-    assert reading.t_ns == 1_500_000_000
+    assert (reading.acceleration_ns, reading.rate_ns) == (1_500_000_000, 1_500_000_000)
     assert (reading.acceleration_m_s2[0], reading.rate_rad_s[0]) == (0.1, 0.2)
 
 
@@ -175,7 +191,22 @@ def test_a_device_is_chosen_by_its_id_or_address() -> None:
         (dai.node.IMU, ["enableIMUSensor", "setBatchReportThreshold", "setMaxBatchReports", "out"]),
         (dai.IMUSensor, ["ACCELEROMETER_RAW", "GYROSCOPE_RAW"]),
         (dai.MessageQueue, ["get", "tryGetAll", "QueueException"]),
-        (dai.Device, ["getConnectedIMU"]),
+        (dai.Device, ["getConnectedIMU", "getUsbSpeed"]),
+        (dai.UsbSpeed, list(LINK_BYTES_S)),
+        (dai.node.VideoEncoder, ["build", "out"]),
+        (dai.VideoEncoderProperties.Profile, ["MJPEG"]),
+        (dai.ImgFrame.Type, ["BGR888i", "NV12"]),
+        (
+            dai.EncodedFrame,
+            [
+                "getData",
+                "getTimestamp",
+                "getTimestampDevice",
+                "getExposureTime",
+                "getSensitivity",
+                "getSequenceNum",
+            ],
+        ),
     ],
 )
 def test_the_library_has_what_the_backend_calls(owner, names: list[str]) -> None:

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from datetime import timedelta
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
+import cv2
+import numpy as np
 import pytest
 
 from aquaflow.config.cameras import OakConfig
 from aquaflow.drivers.oak import dai_backend
 from aquaflow.drivers.oak.dai_backend import DaiBackend
+from aquaflow.drivers.oak.encoding import chosen
+from aquaflow.drivers.oak.messages import imu_readings, picture_of
 
 
 class QueueError(Exception):
@@ -27,6 +32,7 @@ def dai(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
     info = SimpleNamespace(deviceId="1444", name="1.2")
     library.Device.getAllAvailableDevices.return_value = [info]
     library.Device.return_value.getConnectedIMU.return_value = "BMI270"
+    library.Device.return_value.getUsbSpeed.return_value = SimpleNamespace(name="SUPER")
     handler = library.Device.return_value.readCalibration.return_value
     handler.getCameraIntrinsics.return_value = [[500.0, 0, 320], [0, 500.0, 240], [0, 0, 1]]
     handler.getDistortionCoefficients.return_value = [0.0] * 14
@@ -42,6 +48,19 @@ def backend(**settings: object) -> DaiBackend:
 def pictures(dai: MagicMock) -> MagicMock:
     camera = dai.Pipeline.return_value.create.return_value.build.return_value
     return camera.requestOutput.return_value.createOutputQueue.return_value
+
+
+def encoded_frame() -> SimpleNamespace:
+    """As ``dai.EncodedFrame``: exposed for 8 ms until 100 s, on the device's clock 7 s."""
+    _, data = cv2.imencode(".jpg", np.full((16, 24, 3), 90, np.uint8))
+    return SimpleNamespace(
+        getData=lambda: data.reshape(-1),
+        getExposureTime=lambda: timedelta(milliseconds=8),
+        getTimestamp=lambda: timedelta(seconds=100),
+        getTimestampDevice=lambda: timedelta(seconds=7),
+        getSequenceNum=lambda: 5,
+        getSensitivity=lambda: 400,
+    )
 
 
 def test_the_device_keeps_its_calibration_and_leaves_reconnecting_to_us(dai: MagicMock) -> None:
@@ -63,6 +82,76 @@ def test_pictures_are_asked_for_as_the_sensor_sees_them(dai: MagicMock) -> None:
     asked = built.return_value.requestOutput.call_args
     assert asked.args == ((640, 480), dai.ImgFrame.Type.BGR888i)
     assert asked.kwargs == {"fps": 10.0, "enableUndistortion": False}
+
+
+@pytest.mark.parametrize(
+    ("speed", "settings", "encoding"),
+    [
+        ("SUPER", {}, "bgr"),
+        ("SUPER", {"width": 3840, "height": 2160, "fps": 30}, "mjpeg"),
+        ("SUPER", {"width": 3840, "height": 2160, "fps": 15}, "nv12"),
+        ("HIGH", {}, "nv12"),
+        ("HIGH", {"width": 640, "height": 480}, "bgr"),
+        ("HIGH", {"fps": 30}, "mjpeg"),
+        ("UNKNOWN", {}, "bgr"),
+        ("UNKNOWN", {"width": 1920, "height": 1080, "fps": 15}, "nv12"),
+        ("FULL", {"width": 640, "height": 480}, "mjpeg"),
+        ("HIGH", {"encoding": "bgr"}, "bgr"),
+        ("SUPER", {"encoding": "mjpeg"}, "mjpeg"),
+    ],
+)
+def test_pictures_are_encoded_as_the_link_demands(
+    speed: str, settings: dict[str, object], encoding: str
+) -> None:
+    config = OakConfig.model_validate({"kind": "oak", **settings})
+    assert chosen(config, speed) == encoding
+
+
+def test_a_slow_link_gets_jpeg_from_the_device_and_the_log_says_so(
+    dai: MagicMock, caplog: pytest.LogCaptureFixture
+) -> None:
+    dai.Device.return_value.getUsbSpeed.return_value = SimpleNamespace(name="HIGH")
+    with caplog.at_level(logging.INFO):
+        opened = backend(width=1920, height=1080, fps=15)
+    assert "the OAK 1444 is on USB 2; pictures come as MJPEG (BGR would be 93 MB/s)" in caplog.text
+    node = dai.Pipeline.return_value.create.return_value
+    camera, encoder = node.build.call_args_list
+    assert node.build.return_value.requestOutput.call_args.args[1] == dai.ImgFrame.Type.NV12
+    assert encoder.args == (node.build.return_value.requestOutput.return_value,)
+    assert encoder.kwargs["profile"] == dai.VideoEncoderProperties.Profile.MJPEG
+    assert encoder.kwargs["frameRate"] == camera.kwargs["sensorFps"] == 15.0
+    shown = node.build.return_value.out.createOutputQueue.return_value
+    shown.get.return_value = encoded_frame()
+    picture = opened.read(0.2)
+    assert picture is not None
+    assert picture.decode().shape == (16, 24, 3)
+    file = picture.jpeg()
+    assert file is not None
+    assert file.startswith(b"\xff\xd8")
+
+
+def test_a_damaged_jpeg_is_no_picture() -> None:
+    cut = encoded_frame()
+    cut.getData = lambda: np.zeros(10, np.uint8)
+    with pytest.raises(ValueError, match="damaged JPEG"):
+        picture_of(cut, is_jpeg=True).decode()
+
+
+def test_a_picture_was_taken_in_the_middle_of_its_exposure() -> None:
+    picture = picture_of(encoded_frame(), is_jpeg=True)
+    assert picture.exposed_ns == 100_000_000_000 - 4_000_000
+    assert picture.device_ns == 7_000_000_000 - 4_000_000
+    assert picture.exposure_s == pytest.approx(0.008)
+
+
+def test_gyroscope_and_accelerometer_have_each_their_own_time() -> None:
+    def report(t_s: float) -> SimpleNamespace:
+        return SimpleNamespace(x=t_s, y=0.0, z=0.0, getTimestamp=lambda: timedelta(seconds=t_s))
+
+    packet = SimpleNamespace(acceleroMeter=report(1.5), gyroscope=report(1.502))
+    (reading,) = imu_readings(SimpleNamespace(packets=[packet]))
+    assert (reading.acceleration_ns, reading.rate_ns) == (1_500_000_000, 1_502_000_000)
+    assert (reading.acceleration_m_s2[0], reading.rate_rad_s[0]) == (1.5, 1.502)
 
 
 def test_fixed_exposure_is_sent_once_the_camera_runs(dai: MagicMock) -> None:

@@ -6,11 +6,7 @@ import json
 
 import pytest
 
-from aquaflow.config.telemetry import (
-    Pd0Config,
-    WaterLinkedJsonConfig,
-    WaterLinkedSerialConfig,
-)
+from aquaflow.config.instruments import Pd0Config, WaterLinkedJsonConfig, WaterLinkedSerialConfig
 from aquaflow.drivers.protocol.pd0 import Pd0Decoder
 from aquaflow.drivers.protocol.waterlinked_json import WaterLinkedJsonDecoder
 from aquaflow.drivers.protocol.waterlinked_serial import WaterLinkedSerialDecoder, crc8
@@ -216,19 +212,6 @@ def test_a_bad_velocity_is_counted_and_leaves_the_altitude(velocity):
 
     assert [type(s) for s in receiver.feed(ensemble(*map(bytes, parts)), NOW)] == [Altitude]
     assert receiver.counters.invalid_values == 1
-
-
-@pytest.mark.parametrize(("coordinates", "name"), [(0 << 3, "beam"), (3 << 3, "earth")])
-def test_coordinates_that_are_not_the_vehicles_are_counted_and_said_once(coordinates, name, caplog):
-    parts = parts_of(said())
-    parts[0][25] = coordinates
-    receiver = pd0_dvl()
-
-    for _ in range(3):
-        assert [type(s) for s in receiver.feed(ensemble(*map(bytes, parts)), NOW)] == [Altitude]
-    assert receiver.counters.invalid_values == 3
-    [record] = caplog.records
-    assert f"its velocities are in {name} coordinates" in record.getMessage()
 
 
 def test_three_beams_tell_the_altitude_and_two_do_not():

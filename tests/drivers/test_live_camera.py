@@ -5,14 +5,16 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from aquaflow.config.cameras import LiveCameraConfig
+from aquaflow.drivers.camera_state import CameraState
 from aquaflow.drivers.capture import Capture, RawPicture
-from aquaflow.drivers.live import CameraState, LiveCamera
+from aquaflow.drivers.live import LiveCamera
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.messages import CameraModel, Dropped, Frame
@@ -26,6 +28,7 @@ class Scripted:
     """A device that hands over what a test wrote down: pictures, None, or an error."""
 
     notes: tuple[str, ...] = ()
+    format = ""
 
     def __init__(self, *script: RawPicture | Exception | None, camera: CameraModel | None = None):
         self.camera = camera
@@ -163,6 +166,40 @@ def test_a_silent_device_is_opened_anew() -> None:
         assert [next(frames).index, next(frames).index] == [0, 1]
         assert silent.closed == 1
         assert stalled.counters.reconnects == 1
+
+
+def test_pictures_of_the_past_are_counted_and_show_nothing() -> None:
+    def shown(number: int) -> RawPicture:
+        return replace(picture(), stale="its pictures are 4.0 s old" if 0 < number < 4 else "")
+
+    with closing(camera(paced(5, shown))) as held:
+        frames = held.frames()
+        assert [next(frames).index, next(frames).index] == [0, 4]
+        assert (held.state, held.reason) == (CameraState.STREAMING, "")
+        assert (held.counters.stale, held.counters.reconnects) == (3, 0)
+    assert settled(held)
+
+
+def test_a_device_with_nothing_but_the_past_is_late_and_then_opened_anew() -> None:
+    clock = SimulatedClock()
+
+    class Late(Silent):
+        def read(self, timeout_s: float) -> RawPicture | None:
+            super().read(timeout_s)
+            return replace(picture(), stale="its pictures are 4.0 s old")
+
+    states: list[CameraState] = []
+
+    def leave(shown: RawPicture) -> None:
+        LiveCamera._leave_out(held, shown)
+        states.append(held.state)
+
+    with closing(camera(Late(clock, 0.3), Scripted(picture()), clock=clock, stall_s=1.0)) as held:
+        held._leave_out = leave  # type: ignore[method-assign]
+        assert isinstance(next(held.frames()), Frame)
+        assert set(states) == {CameraState.LATE}
+        assert held.counters.stale == 4
+        assert held.counters.reconnects == 1
 
 
 def test_a_lost_device_is_told_with_its_reason() -> None:

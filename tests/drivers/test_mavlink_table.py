@@ -60,6 +60,32 @@ def vision(draw: random.Random) -> tuple[dict[str, Any], list[tuple[Any, ...]]]:
     ]
 
 
+def gps_raw(draw: random.Random) -> tuple[dict[str, Any], list[tuple[Any, ...]]]:
+    lat, lon = draw.randint(-890_000_000, 890_000_000), draw.randint(-(10**9), 10**9)
+    fix, accuracy_mm = draw.randint(0, 8), draw.choice([0, draw.randint(1, 20_000)])
+    eph = draw.choice([0xFFFF, draw.randint(50, 900)])
+    fields = {"time_usec": draw.randint(1, 10**9), "fix_type": fix, "lat": lat, "lon": lon,
+              "alt": 0, "eph": eph, "epv": 0xFFFF, "vel": 0, "cog": 0, "satellites_visible": 7,
+              "h_acc": accuracy_mm}  # fmt: skip
+    of_hdop = (2.0 if eph == 0xFFFF else eph / 100.0) * UERE_M / 2**0.5
+    sigma_m = accuracy_mm / 1000.0 or of_hdop
+    expected = (Position, pytest.approx((lat / 1e7, lon / 1e7, sigma_m), rel=1e-9))
+    return fields, [expected] if fix >= 3 else []
+
+
+def gps2_raw(draw: random.Random) -> tuple[dict[str, Any], list[tuple[Any, ...]]]:
+    fields, expected = gps_raw(draw)
+    return {**fields, "dgps_numch": 0, "dgps_age": 0}, expected
+
+
+def global_position(draw: random.Random) -> tuple[dict[str, Any], list[tuple[Any, ...]]]:
+    lat, lon = draw.randint(-890_000_000, 890_000_000), draw.randint(-(10**9), 10**9)
+    fields = {"time_boot_ms": draw.randint(0, 2**32 - 1), "lat": lat, "lon": lon, "alt": 0,
+              "relative_alt": 0, "vx": 0, "vy": 0, "vz": 0, "hdg": 0}  # fmt: skip
+    sigma_m = 2.0 * UERE_M / 2**0.5
+    return fields, [(Position, pytest.approx((lat / 1e7, lon / 1e7, sigma_m), rel=1e-9))]
+
+
 def system_time(draw: random.Random) -> tuple[dict[str, Any], list[tuple[Any, ...]]]:
     us = draw.choice([0, draw.randint(10**15, 4 * 10**15)])
     fields = {"time_unix_usec": us, "time_boot_ms": draw.randint(1, 2**31)}
@@ -90,6 +116,10 @@ def value_of(sample: TelemetrySample) -> Any:
         ("gps_input", gps_input, (255, 220), 2),
         ("vision_position_delta", vision, (255, 0), 2),  # its number is beyond MAVLink 1
         ("system_time", system_time, (7, 3), 2),
+        ("gps_raw_int", gps_raw, (1, 220), 2),  # its accuracy is an extension of MAVLink 2
+        ("gps2_raw", gps2_raw, (1, 220), 2),
+        ("global_position_int", global_position, (2, 1), 1),
+        ("global_position_int", global_position, (2, 1), 2),
     ],
 )
 def test_every_message_of_a_named_sender_is_what_pymavlink_packed(
@@ -129,6 +159,8 @@ def test_a_sonar_that_the_config_does_not_name_is_counted_and_named_once(
     assert receiver.counters.unheard == 919
     [record] = caplog.records
     assert "{system_id: 1, component_id: 194, messages: [DISTANCE_SENSOR]}" in record.getMessage()
+    told = record.fields  # type: ignore[attr-defined]
+    assert told == {"event": "unheard", "source": receiver.name}
 
 
 @pytest.mark.parametrize("also", [[{"component_id": 1}], [{"component_id": 9}] * 2])

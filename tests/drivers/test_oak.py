@@ -33,6 +33,14 @@ def test_frames_carry_exposure_and_sensitivity() -> None:
     assert (frame.exposure_s, frame.gain) == (EXPOSURE_S, ISO)
 
 
+def test_a_jpeg_of_the_device_is_there_for_the_recorder() -> None:
+    for encoding, format in (("mjpeg", "jpeg"), ("nv12", None)):
+        with closing(oak(feed(), encoding=encoding)[0]) as camera:
+            frame = next(camera.frames())
+        assert isinstance(frame, Frame)
+        assert (None if frame.encoded is None else frame.encoded.format) == format
+
+
 def test_an_absent_device_is_told_at_once() -> None:
     shots = feed()
     shots.away_until_ns = 1 << 62
@@ -86,8 +94,8 @@ def test_the_imu_speaks_in_body_axes() -> None:
 
 
 def test_the_mounting_turns_the_imu() -> None:
-    down = samples(2, mounting={"pitch_deg": -90.0})[1]
-    assert isinstance(down, Acceleration)
+    first = samples(2, mounting={"pitch_deg": -90.0})
+    (down,) = (each for each in first if isinstance(each, Acceleration))
     # The camera's forward points down in the body: what it calls down is the body's backward.
     assert down.acceleration_m_s2 == pytest.approx((GRAVITY_M_S2, 0.0, 0.0))
 
@@ -118,7 +126,7 @@ def test_an_imu_whose_axes_are_unknown_is_left_out_and_told() -> None:
 def test_readings_nobody_fetches_stay_bounded_and_are_counted() -> None:
     camera, _ = oak(feed())
     count = MAX_SAMPLES // 2 + 100
-    readings = [ReplayImuReading(t, GRAVITY, (0.0, 0.0, 0.0)) for t in range(count)]
+    readings = [ReplayImuReading(t, GRAVITY, t, (0.0, 0.0, 0.0)) for t in range(count)]
     camera.take_imu(readings, np.eye(3), count)
     camera.close()
     assert len(list(camera.samples())) == MAX_SAMPLES
@@ -128,7 +136,10 @@ def test_readings_nobody_fetches_stay_bounded_and_are_counted() -> None:
 def test_readings_that_go_back_in_time_are_left_out() -> None:
     camera, _ = oak(feed())
     times = [10, 20, 15, 20, 30, 999]
-    readings = [ReplayImuReading(t, GRAVITY, (0.0, 0.0, 0.0)) for t in times]
+    readings = [ReplayImuReading(t, GRAVITY, t - 2, (0.0, 0.0, 0.0)) for t in times]
     camera.take_imu(readings, np.eye(3), 40)
     camera.close()
-    assert [sample.t_ns for sample in camera.samples()][::2] == [10, 20, 30, 40]
+    samples = list(camera.samples())
+    for kind, expected in ((Acceleration, [10, 20, 30, 40]), (AngularRate, [8, 18, 28, 40])):
+        assert [each.t_ns for each in samples if isinstance(each, kind)] == expected
+    assert [each.t_ns for each in samples] == sorted(each.t_ns for each in samples)

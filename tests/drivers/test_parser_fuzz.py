@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import struct
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -17,7 +18,11 @@ from aquaflow.drivers.protocol.packets import PacketDecoder
 from aquaflow.drivers.telemetry import decoder_of
 from aquaflow.drivers.transport.can import EXTENDED, RECORD, packed
 from aquaflow.sim_drivers.devices.nmea_talker import sentence
+from aquaflow.sim_drivers.devices.nucleus import packet as framed
 from aquaflow.sim_drivers.devices.pd0 import ensemble
+from aquaflow.sim_drivers.devices.ping import frame as ping_frame
+from aquaflow.sim_drivers.devices.vectornav import binary as vectornav_binary
+from aquaflow.sim_drivers.devices.vectornav import line as vectornav_line
 from aquaflow.sim_drivers.devices.waterlinked import line
 from tests.drivers.simulated_links import RIGS, motion, telemetry_config
 
@@ -124,6 +129,35 @@ def pd0_packet(rng: Rng) -> bytes:
     return ensemble(*parts)
 
 
+def nucleus_packet(rng: Rng) -> bytes:
+    number = rng.choice((0x82, 0x96, 0xAA, 0xB4, 0xD2, rng.randrange(256)))
+    body = rng.choice((bytes(160), b"\xff" * 160, struct.pack("<40f", *[rng.uniform(-9, 9)] * 40)))
+    return framed(
+        number, rng.randrange(1 << 40), rng.choice((0x7FFF, rng.randrange(1 << 32))),
+        bytes(rng.randrange(30)), body[: rng.randrange(161)],
+    )  # fmt: skip
+
+
+def ping_packet(rng: Rng) -> bytes:
+    number = rng.choice((2, 1211, 1212, 1300, rng.randrange(1 << 16)))
+    body = rng.choice((bytes(40), b"\xff" * 40, bytes([0, 9, 0, 0, 99, 0]) + rng.randbytes(300)))
+    return ping_frame(number, body[: rng.randrange(len(body))])
+
+
+def vectornav_packet(rng: Rng) -> bytes:
+    """Any groups and fields of any length, with the right checksum."""
+    if rng.random() < 0.3:
+        kind = rng.choice(("VNYMR", "VNINS", "VNQTN", "VNISL", "VNIMU", "VNACC", "VNGYR", "VN"))
+        return vectornav_line(f"{kind},{text(rng)}", rng.random() < 0.5)
+    body = rng.choice((bytes(80), b"\xff" * 80, struct.pack("<20f", *[rng.uniform(-9, 9)] * 20)))
+    groups = {
+        group: {bit: body[: rng.choice((12, 24, 8, 2))] for bit in rng.sample(range(15), 3)}
+        for group in rng.sample(range(1, 8), rng.randrange(1, 4))
+    }
+    fitting = {1: {8: body[:12], 5: body[12:24]}, 5: {1: body[:12]}}
+    return vectornav_binary(rng.choice((groups, fitting)))
+
+
 GROUPS = (126992, 127250, 127251, 127257, 128259, 128267, 129025, 129539)
 """Parameter groups that the driver reads."""
 
@@ -141,6 +175,12 @@ VALID: dict[str, Callable[[Rng], bytes]] = {
     "waterlinked_pty": waterlinked_packet,
     "waterlinked_tcp": json_packet,
     "pd0_pty": pd0_packet,
+    "pd0_beams_pty": pd0_packet,
+    "pd0_earth_pty": pd0_packet,
+    "nucleus_pty": nucleus_packet,
+    "ping_pty": ping_packet,
+    "vectornav_pty": vectornav_packet,
+    "vectornav_ascii_pty": vectornav_packet,
     "nmea2000_virtual": can_packet,
     "dbc_virtual": can_packet,
 }

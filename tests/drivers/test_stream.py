@@ -11,13 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aquaflow.drivers import stream as driver
-from aquaflow.drivers.stream import without_password
+from aquaflow.drivers import ffmpeg
+from aquaflow.drivers.camera_state import CameraState
+from aquaflow.drivers.stream.address import for_logs
 from aquaflow.errors import InputError
 from aquaflow.messages import Frame
 from aquaflow.sim_drivers.camera_feed import CameraFeed, first_images
 from aquaflow.sim_drivers.mjpeg_server import MjpegServer
-from aquaflow.sim_drivers.transport_stream import RtspCamera, UdpCamera
+from aquaflow.sim_drivers.rtp_camera import RtspCamera
+from aquaflow.sim_drivers.transport_stream import UdpCamera
 from tests.drivers.camera_scenes import (
     COUNT,
     HEIGHT,
@@ -25,36 +27,55 @@ from tests.drivers.camera_scenes import (
     Pictures,
     closing,
     feed,
+    free_port,
     settled,
     stream,
     until,
 )
 
 
-def free_port(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
+def nobody() -> int:
+    """A TCP port on which nobody listens."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
-@pytest.mark.parametrize("kind", ["rtsp", "udp"])
-def test_a_stream_is_shown_and_comes_back_when_it_broke(kind: str) -> None:
-    images = first_images(Pictures(), COUNT)
-    port = free_port(socket.SOCK_DGRAM)
-    server = RtspCamera(images) if kind == "rtsp" else UdpCamera(port, images)
-    url = server.url if isinstance(server, RtspCamera) else f"udp://127.0.0.1:{port}"
-    with server, closing(stream(url, stall_s=0.5)) as camera:
+def test_mpeg_ts_is_recognised_and_comes_back_when_it_broke() -> None:
+    """Its time begins anew with every round of the recording."""
+    port = free_port()
+    server = UdpCamera(port, first_images(Pictures(), COUNT))
+    with server, closing(stream(f"udp://127.0.0.1:{port}", stall_s=0.5)) as camera:
         frames = camera.frames()
         first = next(frames)
         assert isinstance(first, Frame)
         assert first.image.shape == (HEIGHT, WIDTH, 3)
         server.plugged_in.clear()
-        while not camera.reason:
+        while camera.state is not CameraState.LOST:
             assert not camera._closing.wait(0.02), "gave up"
         server.plugged_in.set()
         while camera.counters.reconnects == 0:
             next(frames)
     assert settled(camera)
+
+
+@pytest.mark.parametrize("transport", ["tcp", "udp"])
+def test_rtsp_is_shown_and_comes_back_when_it_broke(transport: str) -> None:
+    shots = feed(fps=50.0)
+    server = RtspCamera(shots)
+    with server, closing(stream(server.url, transport=transport, stall_s=0.5)) as camera:
+        frames = camera.frames()
+        first = next(frames)
+        assert isinstance(first, Frame)
+        assert first.image.shape == (HEIGHT, WIDTH, 3)
+        server.sending.clear()
+        while camera.state is not CameraState.LOST:
+            assert not camera._closing.wait(0.02), "gave up"
+        server.sending.set()
+        while camera.counters.reconnects == 0:
+            next(frames)
+    assert settled(camera)
+    assert server.clients == 2
 
 
 def test_a_picture_is_stamped_when_it_arrives_less_the_latency() -> None:
@@ -67,7 +88,7 @@ def test_a_picture_is_stamped_when_it_arrives_less_the_latency() -> None:
 
 
 def test_nobody_there_is_one_sentence_without_the_password() -> None:
-    port = free_port(socket.SOCK_STREAM)
+    port = nobody()
     with pytest.raises(InputError) as caught:
         stream(f"http://pilot:secret@127.0.0.1:{port}/video").connect()
     assert str(caught.value) == f"camera 'front': no video from http://127.0.0.1:{port}/video"
@@ -80,10 +101,11 @@ def test_nobody_there_is_one_sentence_without_the_password() -> None:
         ("rtsp://user@host/a", "rtsp://host/a"),
         ("udp://0.0.0.0:5600", "udp://0.0.0.0:5600"),
         ("/etc/camera.sdp", "/etc/camera.sdp"),
+        ("v=0\r\nm=video 5600 RTP/AVP 96\r\n", "the session description"),
     ],
 )
 def test_passwords_are_not_shown(url: str, shown: str) -> None:
-    assert without_password(url) == shown
+    assert for_logs(url) == shown
 
 
 def test_what_is_no_video_is_refused() -> None:
@@ -102,13 +124,13 @@ def test_what_is_no_video_is_refused() -> None:
 
 
 def test_options_of_ffmpeg_are_given_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    port = free_port(socket.SOCK_STREAM)
+    port = nobody()
     for before in (None, "hwaccel;none"):
         if before is not None:
-            monkeypatch.setenv(driver.OPTIONS, before)
+            monkeypatch.setenv(ffmpeg.OPTIONS, before)
         with pytest.raises(InputError):
             stream(f"http://127.0.0.1:{port}/").connect()
-        assert os.environ.get(driver.OPTIONS) == before
+        assert os.environ.get(ffmpeg.OPTIONS) == before
 
 
 def test_nothing_is_written_to_stderr(

@@ -217,3 +217,27 @@ def test_what_the_decoder_wants_said_is_written():
         until(lambda: len(heard) == 1)
 
     assert link.written == b"ping"
+
+
+def test_what_was_to_be_said_before_the_end_is_still_written():
+    class Last(ScriptedLink):
+        def read(self, timeout_s: float) -> bytes:
+            link.stop()
+            talking.words = b"goodbye"
+            return b""
+
+    class Talking(NmeaDecoder):
+        words = b""
+
+        def outgoing(self, now_ns: int) -> bytes:
+            words, self.words = self.words, b""
+            return words
+
+    wire = Last()
+    config = NmeaConfig.model_validate({"link": {"kind": "serial", "port": "/dev/null"}})
+    talking = Talking("box", config)
+    link = Supervisor("box", lambda: wire, talking, lambda samples: None)
+    link.run()
+
+    assert wire.written == b"goodbye"
+    assert wire.closed == 1

@@ -14,6 +14,7 @@ from aquaflow.errors import InputError
 from aquaflow.messages import Altitude, Depth, Velocity
 from aquaflow.sim_drivers.devices.device import SimulatedDevice, boot_clock
 from aquaflow.sim_drivers.faults import jumping_clock
+from aquaflow.sim_drivers.telemetry_log import DecodedReads, Read
 from aquaflow.sources import TELEMETRY
 from tests.drivers.simulated_links import (
     RIGS,
@@ -160,7 +161,7 @@ def test_a_source_whose_devices_are_all_absent_closes(tmp_path):
     nobody = {"kind": "serial", "port": str(tmp_path / "nothing")}
     config = {"devices": {"a": {"kind": "pd0", "link": nobody}}}
     telemetry = LinkTelemetry(parse_telemetry(config, "test"))
-    until(lambda: "cannot open" in telemetry.links["a"].state)
+    until(lambda: "cannot open" in telemetry.links["a"].reason)
 
     telemetry.close()
 
@@ -200,3 +201,23 @@ def test_a_missing_library_is_one_sentence_and_starts_no_thread(monkeypatch, tmp
     with pytest.raises(InputError, match=r"'rov' needs the library pymavlink.*aquaflow\[telemetry"):
         LinkTelemetry(parse_telemetry(config, "test"))
     assert threading.active_count() == before
+
+
+@pytest.mark.parametrize(
+    "name", ["ping_pty", "nucleus_pty", "vectornav_pty", "pd0_beams_pty", "pd0_earth_pty"]
+)
+def test_recorded_bytes_of_a_link_are_decoded_as_they_were_live(name, tmp_path):
+    rig, reads = RIGS[name](tmp_path), []
+    config = telemetry_config(rig)
+    telemetry = LinkTelemetry(config, lambda link, at, data: reads.append(Read(link, at, data)))
+    device = SimulatedDevice(rig.protocol, rig.wire, motion(), 4.0)
+    until(lambda: telemetry.links["device"].is_open)
+    device.start()
+    until(device.finished.is_set)
+    until(lambda: telemetry.counters()["device"].messages >= device.sent)
+    telemetry.close()
+    device.close()
+
+    live = list(telemetry.samples())
+    assert len(live) >= 20
+    assert list(DecodedReads(dict(config.devices)).samples(iter(reads))) == live

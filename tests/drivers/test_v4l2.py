@@ -15,20 +15,31 @@ import pytest
 
 from aquaflow.config.cameras import V4l2Config
 from aquaflow.drivers.capture import UnusablePictureError
-from aquaflow.drivers.v4l2 import abi
+from aquaflow.drivers.v4l2 import V4l2Camera, abi, abi_planes
 from aquaflow.drivers.v4l2.capture import V4l2Capture
 from aquaflow.drivers.v4l2.discovery import camera_nodes, find_camera, modes
 from aquaflow.drivers.v4l2.pixels import to_rgb
+from aquaflow.drivers.v4l2.planes import PictureFormat
 from aquaflow.errors import InputError
 from aquaflow.messages import Frame
-from aquaflow.sim_drivers.camera_feed import CameraFaults
+from aquaflow.sim_drivers.camera_feed import CameraFaults, first_images
 from aquaflow.sim_drivers.v4l2_kernel import (
     EXPOSURE_ABSOLUTE,
     WHITE_BALANCE,
     CameraSpec,
     V4l2Kernel,
 )
-from tests.drivers.camera_scenes import HEIGHT, WIDTH, closing, feed, until, v4l2
+from aquaflow.sim_drivers.v4l2_multiplanar import MultiPlanarKernel
+from tests.drivers.camera_scenes import (
+    HEIGHT,
+    QUICK,
+    WIDTH,
+    Pictures,
+    closing,
+    feed,
+    until,
+    v4l2,
+)
 
 
 @pytest.mark.parametrize(
@@ -36,7 +47,8 @@ from tests.drivers.camera_scenes import HEIGHT, WIDTH, closing, feed, until, v4l
     [
         (abi.Capability, 104), (abi.Format, 208), (abi.StreamParameters, 204),
         (abi.RequestBuffers, 20), (abi.Buffer, 88), (abi.Control, 8), (abi.QueryControl, 68),
-        (abi.FormatDescription, 64), (abi.FrameSize, 44),
+        (abi.FormatDescription, 64), (abi.FrameSize, 44), (abi_planes.Plane, 64),
+        (abi_planes.PlanePixFormat, 20), (abi_planes.PixFormatMplane, 192),
     ],
 )  # fmt: skip
 def test_structures_have_the_kernels_sizes(structure: type[ctypes.Structure], size: int) -> None:
@@ -50,9 +62,15 @@ def test_request_numbers_are_the_kernels() -> None:
     assert abi.STREAMON == 0x40045612
 
 
-def opened(root: Path, pixels: str = "YUYV", spec: CameraSpec | None = None, **more: object):
+def opened(
+    root: Path,
+    pixels: str = "YUYV",
+    spec: CameraSpec | None = None,
+    kernel_of: type[V4l2Kernel] = V4l2Kernel,
+    **more: object,
+):
     """An open capture and the kernel under it."""
-    kernel = V4l2Kernel(root, feed(), spec)
+    kernel = kernel_of(root, feed(), spec)
     config = V4l2Config.model_validate(
         {"kind": "v4l2", "pixels": pixels, "width": WIDTH, "height": HEIGHT, **more}
     )
@@ -60,16 +78,61 @@ def opened(root: Path, pixels: str = "YUYV", spec: CameraSpec | None = None, **m
 
 
 @pytest.mark.parametrize("padding", [0, 32])
-@pytest.mark.parametrize(("pixels", "tolerance"), [("YUYV", 3), ("GREY", 1), ("MJPG", 4)])
+@pytest.mark.parametrize(
+    ("pixels", "tolerance"),
+    [("YUYV", 3), ("UYVY", 3), ("NV12", 3), ("NM12", 3), ("GREY", 1), ("MJPG", 4)],
+)
+@pytest.mark.parametrize("kernel_of", [V4l2Kernel, MultiPlanarKernel])
 def test_pixels_become_those_that_were_filmed(
-    tmp_path: Path, pixels: str, tolerance: int, padding: int
+    tmp_path: Path, kernel_of: type[V4l2Kernel], pixels: str, tolerance: int, padding: int
 ) -> None:
-    capture, kernel = opened(tmp_path, pixels, CameraSpec(padding=padding))
+    if pixels == "NM12" and kernel_of is V4l2Kernel:
+        pytest.skip("two pieces of memory need the multi-planar API")
+    spec = CameraSpec(padding=padding, pixels=(pixels,))
+    capture, kernel = opened(tmp_path, pixels, spec, kernel_of)
     filmed = kernel.feed.peek().image.astype(int)
     picture = capture.read(1.0)
     assert picture is not None
     assert np.abs(picture.decode() - filmed).max() <= tolerance
     capture.close()
+
+
+def test_a_camera_with_planes_is_found_and_films_through_all_that_happens(tmp_path: Path) -> None:
+    shots = feed(CameraFaults(disconnect=frozenset({8}), away_s=0.05))
+    kernel = MultiPlanarKernel(tmp_path, shots, CameraSpec(pixels=("NM12",), interrupts=20))
+    (node,) = camera_nodes(kernel, tmp_path)
+    assert modes(kernel, node.path) == ["NM12 up to 64 x 48"]
+    size = {"width": WIDTH, "height": HEIGHT}
+    config = V4l2Config.model_validate({"kind": "v4l2", "pixels": "NV12", **size, **QUICK})
+    with closing(V4l2Camera("front", config, kernel, tmp_path)) as camera:
+        seen = until(camera, 15)
+    assert all(isinstance(frame, Frame) for frame in seen)
+    assert camera.notes == ["the camera gives 64 x 48 NM12 where 64 x 48 NV12 was asked for"]
+    assert camera.counters.reconnects == 1
+
+
+def test_h264_is_decoded_picture_by_picture_with_the_kernels_times(tmp_path: Path) -> None:
+    shots = feed(CameraFaults(corrupt=frozenset({4}), drop=frozenset({6})), fps=50.0)
+    with closing(v4l2(shots, tmp_path, "H264")[0]) as camera:
+        seen = until(camera, 12)
+    filmed = [image.astype(int) for image in first_images(Pictures(), 40)]
+    shown = [frame for frame in seen if isinstance(frame, Frame)]
+    assert len(shown) > 5
+    for frame in shown:
+        assert np.abs(frame.image.astype(int) - filmed[frame.index]).max() <= 4
+        assert frame.encoded is None
+    steps = np.diff([frame.t_ns for frame in shown]) / np.diff([frame.index for frame in shown])
+    assert steps == pytest.approx(20e6, abs=2e3)
+    assert camera.counters.lost == 1
+
+
+def test_h264_that_stops_is_a_silent_camera(tmp_path: Path) -> None:
+    shots = feed(CameraFaults(delay_s={5: 1e6}))
+    with closing(v4l2(shots, tmp_path, "H264", stall_s=0.3)[0]) as camera:
+        frames = camera.frames()
+        next(frames)
+        while "no picture for 0.3 s" not in camera.reason:
+            assert not camera._closing.wait(0.01), "gave up"
 
 
 def test_jpeg_comes_with_its_bytes_and_pixels_do_not(tmp_path: Path) -> None:
@@ -119,6 +182,12 @@ def test_what_the_driver_made_of_the_format_is_used_and_told(tmp_path: Path) -> 
         assert isinstance(frame, Frame)
         assert frame.image.shape == (HEIGHT, WIDTH, 3)
     assert camera.notes == ["the camera gives 64 x 48 YUYV where 1280 x 48 MJPG was asked for"]
+
+
+def test_another_rate_than_asked_for_is_told(tmp_path: Path) -> None:
+    with closing(v4l2(feed(), tmp_path, fps=15)[0]) as camera:
+        next(camera.frames())
+    assert camera.notes == ["the camera gives 30 pictures/s where 15 were asked for"]
 
 
 def test_signals_interrupt_nothing(tmp_path: Path) -> None:
@@ -245,12 +314,13 @@ def test_every_step_of_opening_survives_the_unplugging(tmp_path: Path) -> None:
         (b"\xff\xd8 but then no picture", "MJPG", "damaged JPEG"),
         (b"", "MJPG", "no JPEG"),
         (b"\0" * 100, "YUYV", "cut off after 100 of"),
-        (b"\0" * 9999, "H264", "of type H264"),
+        (b"\0" * 100, "NV12", "cut off after 100 of"),
+        (b"\0" * 9999, "BA81", "of type BA81"),
     ],
 )
 def test_bytes_that_make_no_picture_are_refused(data: bytes, pixels: str, problem: str) -> None:
     with pytest.raises(UnusablePictureError, match=problem):
-        to_rgb(np.frombuffer(data, np.uint8), pixels, WIDTH, HEIGHT, 2 * WIDTH)
+        to_rgb([np.frombuffer(data, np.uint8)], PictureFormat(pixels, WIDTH, HEIGHT, (2 * WIDTH,)))
 
 
 def test_a_jpeg_of_another_size_is_refused() -> None:
@@ -258,4 +328,4 @@ def test_a_jpeg_of_another_size_is_refused() -> None:
 
     _, jpeg = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))
     with pytest.raises(UnusablePictureError, match="8 x 8 px where the camera announced 64 x 48"):
-        to_rgb(jpeg, "MJPG", WIDTH, HEIGHT, 0)
+        to_rgb([jpeg], PictureFormat("MJPG", WIDTH, HEIGHT, (0,)))

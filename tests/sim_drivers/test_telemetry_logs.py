@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from aquaflow.config.device import MountingConfig
 from aquaflow.config.link import SerialConfig
-from aquaflow.config.telemetry import MountingConfig, NmeaConfig
+from aquaflow.config.telemetry import NmeaConfig
 from aquaflow.errors import ConfigError, InputError
 from aquaflow.messages import (
     Acceleration,

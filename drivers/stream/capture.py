@@ -1,0 +1,104 @@
+"""A video stream that FFmpeg reads: RTSP, HTTP, MPEG-TS, and RTP of other codecs than H.264."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.config.cameras import StreamConfig
+from aquaflow.drivers.capture import RawPicture
+from aquaflow.drivers.ffmpeg import rgb_of
+from aquaflow.drivers.stream.address import for_logs, is_at_a_port
+from aquaflow.drivers.stream.ages import Ages
+from aquaflow.drivers.stream.ffmpeg import OPEN_TIMEOUT_S, format_of, opened
+from aquaflow.messages import CameraModel
+
+MAX_DAMAGED = 30
+"""Pictures in a row that fail to decode before the stream counts as broken: 1 s."""
+
+
+class StreamCapture:
+    """One connection."""
+
+    camera: CameraModel | None = None
+    notes: tuple[str, ...] = ()
+
+    def __init__(self, name: str, config: StreamConfig, source: str) -> None:
+        """Connect to ``source``, which FFmpeg can open.
+
+        Raises:
+            ConnectionError: no server answers, or its data are no video.
+        """
+        self._stall_ns = round(config.stall_s * 1e9)
+        # The first picture comes with a key frame, which may be seconds away.
+        self._patience_ns = max(self._stall_ns, round(OPEN_TIMEOUT_S * 1e9))
+        self._ages = Ages(name, config)
+        self._stale = ""
+        self._damaged = 0
+        self._grabbed = False
+        self._capture = opened(source, config)
+        if not self._capture.isOpened() or not self._has_size():
+            self.close()
+            raise ConnectionError(f"no video from {for_logs(config.url)}{_advice(config)}")
+        self.format = format_of(self._capture)
+
+    def read(self, timeout_s: float) -> RawPicture | None:
+        """The next picture; FFmpeg waits up to the configured stall time."""
+        if not self._grabbed:
+            self._grab()
+        arrival_ns = time.monotonic_ns()
+        if self._damaged > 0:
+            self._damaged -= 1
+            return RawPicture(arrival_ns, rgb_of(None), stale=self._stale)
+        self._grabbed = False
+        exposed_ns, self._stale = self._ages.judged(self._stream_ns(), arrival_ns)
+        return RawPicture(
+            arrival_ns=arrival_ns,
+            decode=rgb_of(None if self._stale else self._retrieved()),
+            exposed_ns=exposed_ns,
+            stale=self._stale,
+        )
+
+    def close(self) -> None:
+        self._capture.release()
+
+    def _has_size(self) -> bool:
+        import cv2
+
+        return bool(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH) > 0.0)
+
+    def _grab(self) -> None:
+        """FFmpeg reports a damaged picture and the end alike; at the end no picture follows."""
+        deadline_ns = time.monotonic_ns() + self._patience_ns
+        since_ns = time.monotonic_ns()
+        while not self._capture.grab():
+            before_ns, since_ns = since_ns, time.monotonic_ns()
+            # A wait that the time limit ended is no damaged picture.
+            self._damaged += since_ns - before_ns < 0.9 * self._stall_ns
+            if self._damaged > MAX_DAMAGED or since_ns > deadline_ns:
+                raise ConnectionError("the stream ended or stalled")
+        self._grabbed = True
+        self._patience_ns = round(0.9 * self._stall_ns)
+
+    def _stream_ns(self) -> int:
+        """The stream's own time of the grabbed picture."""
+        import cv2
+
+        return round(1e6 * float(self._capture.get(cv2.CAP_PROP_POS_MSEC)))
+
+    def _retrieved(self) -> npt.NDArray[np.uint8] | None:
+        """[H, W, 3] BGR; must be fetched before the next picture is grabbed, used or not."""
+        decoded, bgr = self._capture.retrieve()
+        return bgr if decoded else None
+
+
+def _advice(config: StreamConfig) -> str:
+    """What may be wrong where packets come, but no picture."""
+    if not is_at_a_port(config.url):
+        return ""
+    return (
+        f" within {OPEN_TIMEOUT_S:g} s, though packets come; is its codec {config.codec}, and does "
+        f"it send key frames?"
+    )
