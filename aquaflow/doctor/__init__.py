@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from aquaflow.doctor import computer, devices
+from aquaflow.doctor import accelerator, computer, devices, packages
 from aquaflow.doctor.machine import Finding, MachineProbes
 
 if TYPE_CHECKING:
@@ -24,12 +24,13 @@ def examine(machine: MachineProbes | None = None) -> list[Finding]:
             computer.memory,
             computer.compiler,
             computer.renderer,
-            computer.gpu,
             devices.video,
         ),
         *(devices.cameras, devices.oak, devices.serial, devices.can, computer.disk),
     )
-    return [probe(machine) for probe in probes]
+    tried = accelerator.findings(machine)  # first: it times what the first use has to compile
+    found = [probe(machine) for probe in probes]
+    return [*found, *tried, *packages.findings(machine)]
 
 
 def to_json(findings: list[Finding]) -> dict[str, Any]:

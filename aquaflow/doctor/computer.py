@@ -1,4 +1,4 @@
-"""Processor, memory, compiler, renderer, GPU and disk."""
+"""Processor, memory, compiler, renderer and disk."""
 
 from __future__ import annotations
 
@@ -116,30 +116,6 @@ def renderer(machine: MachineProbes) -> Finding:
             "reinstall aquaflow: its renderers are missing",
         )
     return Finding("renderer", f"{chosen} (of {variants})", f"maps are rendered with: {chosen}")
-
-
-def gpu(machine: MachineProbes) -> Finding:
-    """Whether torch and gsplat can use a GPU."""
-    usable = machine.gpu()
-    gsplat = machine.module_present("gsplat")
-    if usable and gsplat:
-        return Finding("GPU", f"{usable}, gsplat", "the map is optimised on the GPU")
-    if usable:
-        return Finding(
-            "GPU",
-            f"{usable}, no gsplat",
-            "the GPU runs the prior; the map stays on the processor",
-            "run 'pip install --no-deps gsplat' to map on the GPU",
-        )
-    driver = machine.which("nvidia-smi") or machine.paths("proc/driver/nvidia/version")
-    if driver:
-        return Finding(
-            "GPU",
-            "an NVIDIA driver, but torch cannot use the GPU",
-            "everything runs on the processor",
-            "install a CUDA build of torch that fits the driver (see pytorch.org)",
-        )
-    return Finding("GPU", "none", "everything runs on the processor")
 
 
 def disk(machine: MachineProbes) -> Finding:

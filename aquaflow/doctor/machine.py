@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import importlib.util
 import platform
+import re
 import shutil
 import struct
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from aquaflow.doctor.attempts import Attempt, Figures, apart
+
+if TYPE_CHECKING:
+    from aquaflow.render.gpu import Gpu
 
 
 @dataclass(frozen=True)
@@ -22,6 +30,8 @@ class Finding:
     """What AquaFlow will therefore do."""
     advice: str = ""
     """What to do if it is wanted; empty if nothing is missing."""
+    figures: Figures = field(default_factory=dict)
+    """What was measured, for programs."""
 
     @property
     def ok(self) -> bool:
@@ -29,20 +39,33 @@ class Finding:
         return not self.advice
 
 
-def _torch_gpu() -> str | None:
-    """Name and memory of the GPU that torch can use; None without torch, as on a 32-bit system."""
+def _torch_gpu() -> Gpu | str:
+    """The GPU that torch sees, or why it sees none; there may be no torch, as on 32 bits."""
     try:
-        import torch
+        from aquaflow.render.gpu import gpu_here
     except ImportError:
-        return None
-    if not torch.cuda.is_available():
-        return None
-    properties = torch.cuda.get_device_properties(0)
-    return f"{properties.name}, {properties.total_memory / 1e9:.0f} GB"
+        return "torch is not installed"
+    return gpu_here()
+
+
+def _onnx_providers() -> list[str]:
+    """onnxruntime's own names of the processors that it was built for; none without it."""
+    try:
+        import onnxruntime
+    except ImportError:
+        return []
+    return list(onnxruntime.get_available_providers())
 
 
 def _module_present(name: str) -> bool:
     return importlib.util.find_spec(name) is not None
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 def renderer_name() -> str | None:
@@ -78,8 +101,14 @@ class MachineProbes:
     architecture: tuple[str, int] = field(default_factory=_architecture)
     """The system's name for the processor, and the bits of the interpreter's pointers."""
     which: Callable[[str], str | None] = shutil.which
-    gpu: Callable[[], str | None] = _torch_gpu
+    gpu: Callable[[], Gpu | str] = _torch_gpu
+    """The GPU, or half a sentence on why there is none."""
+    onnx_providers: Callable[[], list[str]] = _onnx_providers
+    attempt: Callable[[str], Attempt] = apart
+    """Tries something on the GPU (see ``attempts``)."""
     module_present: Callable[[str], bool] = _module_present
+    version: Callable[[str], str | None] = _version
+    """Of an installed distribution."""
     renderer: Callable[[], str | None] = renderer_name
 
     def text(self, path: str) -> str:
@@ -88,6 +117,11 @@ class MachineProbes:
             return (self.root / path).read_text(errors="replace").strip("\0\n ")
         except OSError:
             return ""
+
+    def driver(self) -> str:
+        """Version of NVIDIA's driver, as in 580.159.03; empty without one."""
+        found = re.search(r"\d{3,}\.\d+(\.\d+)?", self.text("proc/driver/nvidia/version"))
+        return "" if found is None else found[0]
 
     def paths(self, *patterns: str) -> list[Path]:
         """Paths below the root that match, sorted within each pattern."""

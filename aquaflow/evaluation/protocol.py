@@ -28,7 +28,9 @@ from aquaflow.fusion.metric_file import read_metric_file
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.synthetic.water import load_medium
 
-COPIED_METRICS = ("psnr", "ssim", "lpips", "lpips_reason")
+COPIED_METRICS = (
+    "psnr", "ssim", "psnr_as_tracked", "ssim_as_tracked", "lpips", "lpips_reason",
+)  # fmt: skip
 """Measured while mapping, on the held-out frames; the evaluation repeats them."""
 
 

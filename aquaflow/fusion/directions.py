@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from aquaflow.config import FusionConfig
-from aquaflow.config.telemetry import MountingConfig
+from aquaflow.config.device import MountingConfig
 from aquaflow.fusion import start as rough
 from aquaflow.fusion.camera_path import CameraPath
 from aquaflow.fusion.factors.attitude import ForceFactor, HeadingFactor, TiltFactor

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from aquaflow.config.telemetry import MountingConfig
+from aquaflow.config.device import MountingConfig
 from aquaflow.errors import InputError
 from aquaflow.fusion.camera_path import CameraPath
 from aquaflow.fusion.telemetry import Series

@@ -56,10 +56,10 @@ class State:
         return replace(
             self,
             log_scale=self.log_scale + float(step[SCALE][0]),
-            R_nm=so3_exp(step[TURN]) @ self.R_nm,
+            R_nm=_turned(self.R_nm, step[TURN]),
             t_n=self.t_n + step[SHIFT],
-            R_bc=so3_exp(step[CAMERA]) @ self.R_bc,
-            R_bd=so3_exp(step[DVL]) @ self.R_bd,
+            R_bc=_turned(self.R_bc, step[CAMERA]),
+            R_bd=_turned(self.R_bd, step[DVL]),
             log_dvl=self.log_dvl + float(step[DVL_SCALE][0]),
             heading=self.heading + float(step[HEADING][0]),
             lag_s=self.lag_s + float(step[LAG][0]),
@@ -73,3 +73,11 @@ class State:
         """Body in n at camera poses: rotations [N, 3, 3] and origins [N, 3] m."""
         R_nb = self.R_nm @ R_mc @ self.R_bc.T
         return R_nb, self.scale * p_m @ self.R_nm.T + self.t_n - R_nb @ self.c_b
+
+
+def _turned(
+    R: Array,  # [3, 3]
+    by: Array,  # [3] rad
+) -> Array:
+    """``R`` turned from the left; most steps turn none, and rotation vectors take their time."""
+    return so3_exp(by) @ R if by.any() else R

@@ -60,11 +60,12 @@ class HostCopies:
         moved = self._from_copy(number, mapper, renderer) if half_changed else None
         if moved is None:
             try:
-                moved = deserialise(*serialise(mapper, optimiser=True), renderer)
+                state = serialise(mapper, optimiser=True)
+                moved = deserialise(*state, renderer, mapper.failures)
             except Exception as error:  # the device is gone, or the map does not fit together
                 log.warning("map %d cannot be read from its device: %s", number, error)
                 moved = self._from_copy(number, mapper, renderer)
-        moved = moved or Mapper(mapper.config, renderer, number)
+        moved = moved or Mapper(mapper.config, renderer, number, mapper.failures)
         _take_over(moved, mapper)
         moved.make_whole()
         return moved
@@ -72,7 +73,7 @@ class HostCopies:
     def _from_copy(self, number: int, mapper: Mapper, renderer: Renderer) -> Mapper | None:
         if number not in self._copies:
             return None
-        copy = deserialise(*self._copies[number], renderer)
+        copy = deserialise(*self._copies[number], renderer, mapper.failures)
         for moves in self._moves[number]:
             copy.move(moves)
         return copy
@@ -87,5 +88,4 @@ def _take_over(moved: Mapper, mapper: Mapper) -> None:
         if known is not None:
             view.log_gain, view.light, view.explained = known.log_gain, known.light, known.explained
     moved.views = mapper.views
-    moved.failures = moved.water_fitting.failures = mapper.failures
     moved.scene.seen_nearest = mapper.scene.seen_nearest

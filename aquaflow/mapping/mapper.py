@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
 
+from aquaflow.clocks.deadline import Deadline
 from aquaflow.config import MappingConfig
-from aquaflow.errors import is_device_failure
+from aquaflow.errors import is_device_failure, is_device_full
 from aquaflow.errors.failures import Failures
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
@@ -28,8 +28,8 @@ from aquaflow.mapping.gaussians.insertion import (
 from aquaflow.mapping.gaussians.reanchoring import move_gaussians, move_views
 from aquaflow.mapping.optimisation.map_optimiser import MapOptimiser
 from aquaflow.mapping.optimisation.objective import Objective
-from aquaflow.mapping.optimisation.pose_refinement import register
-from aquaflow.mapping.optimisation.schedule import sampled_views, shuffled_views
+from aquaflow.mapping.optimisation.registration import register
+from aquaflow.mapping.optimisation.schedule import refining_rates, sampled_views, shuffled_views
 from aquaflow.mapping.rendering import Shown
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.scene_water import rebalance
@@ -37,9 +37,12 @@ from aquaflow.mapping.views import View, in_time
 from aquaflow.mapping.water.medium import Medium
 from aquaflow.mapping.water_fitting import WaterFitting
 from aquaflow.render.contract import Renderer
+from aquaflow.render.device_memory import give_back_after
 
 MOST_FAILED_STEPS = 10
 """Steps in a row that raise until the final refinement gives up: the next would, too."""
+MOST_FULL = 3
+"""Steps in a row that find the device's memory full until no further one is tried."""
 
 
 class Mapper:
@@ -81,7 +84,8 @@ class Mapper:
                 view.log_gain, view.light = self.views[-1].log_gain, self.views[-1].light
             self.views.append(view)
         if self.water_fitting.go_on(self.views):
-            self.scene.sunlight.judge(in_time(self.views))
+            with self.failures.contain("sunlight"):
+                self.scene.sunlight.judge(in_time(self.views))
 
     def _take(self, view: View) -> None:
         """Let the view's tensors be where the map is."""
@@ -207,23 +211,27 @@ class Mapper:
             for view in chosen:
                 self._contained_step("optimisation", view, refine_poses=False)
 
-    def refine(self, progress: Callable[[int, int], None] | None = None) -> None:
-        """The final refinement: all views in random order, rates falling, poses included."""
-        steps, limit = self.config.optimiser.refine_steps, self.config.optimiser.refine_seconds
-        started = time.monotonic()
-        self.water_fitting.at_once(self.views)
+    def refine(
+        self,
+        progress: Callable[[int, int], None] | None = None,
+        until: Deadline | None = None,
+    ) -> None:
+        """The final refinement: all views in random order, rates falling, poses included; as much
+        of it as there is time ``until`` then."""
+        steps, until = self.config.optimiser.refine_steps, until or Deadline()
+        if not until.over:
+            self.water_fitting.at_once(self.views)
         order = shuffled_views(self.views, steps, self._random) if len(self.gaussians) else []
         with self.scene.learning_from(order):
             for step, view in enumerate(order):
-                if limit is not None and time.monotonic() - started > limit:
+                passed = until.passed
+                if passed >= 1.0:
                     break
                 if step % len(self.views) == 0:  # light shows once the map has lost its errors
                     self.scene.sunlight.judge(in_time(self.views))
                     self.scene.centre_water(self.views)
-                factor = self.config.optimiser.means_final ** (step / max(steps - 1, 1))
-                self.optimiser.adam.learning_rates["means"] = self.config.optimiser.means * factor
-                if self.neural is not None:
-                    self.neural.slow_down(factor)
+                done = max(step / max(steps - 1, 1), passed)
+                self.optimiser.slow_down(refining_rates(done, self.config.optimiser))
                 self._contained_step("refinement", view, self.config.optimiser.poses > 0.0)
                 if self._failed_in_a_row == MOST_FAILED_STEPS:
                     break
@@ -238,9 +246,17 @@ class Mapper:
             self.optimiser.step(view, refine_poses and view is not self.views[0])
         self._failed_in_a_row = self._failed_in_a_row + 1 if step.failed else 0
         if step.error is not None:
-            if self.device.type != "cpu" and is_device_failure(step.error):
-                raise step.error  # no later step would do better: the maps go on on the CPU
+            if self._is_hopeless(step.error):
+                raise step.error
+            if is_device_full(step.error):
+                give_back_after(step.error, self.device)
             self.make_whole()
+
+    def _is_hopeless(self, error: Exception) -> bool:
+        """True if no later step would do better: the device is gone, or full again and again."""
+        if self.device.type == "cpu" or not is_device_failure(error):
+            return False
+        return not is_device_full(error) or self._failed_in_a_row >= MOST_FULL
 
     def make_whole(self) -> None:
         """After a failure: every Gaussian is finite and has its row in the optimisers."""
@@ -256,7 +272,7 @@ class Mapper:
     def register(self, view: View) -> None:
         """Refine the pose of a held-out view photometrically against the frozen map."""
         self._take(view)
-        register(view, self.scene, in_time(self.views), self._objective, self.config.optimiser)
+        register(view, self.scene, in_time(self.views), self.config.optimiser)
 
     @property
     def neural(self) -> NeuralGaussians | None:

@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from aquaflow.clocks.deadline import Deadline
 from aquaflow.config import Config
-from aquaflow.errors import first_line, is_device_failure
 from aquaflow.errors.failures import Failures
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
+from aquaflow.mapping.device_work import DeviceWork
 from aquaflow.mapping.gaussians.reanchoring import move_views
-from aquaflow.mapping.host_copies import HostCopies
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.view_budget import drop_surplus, same_group
 from aquaflow.mapping.views import View, ViewStore
 from aquaflow.profiler import Profiler
-from aquaflow.render import cpu_renderer, select_renderer
+from aquaflow.render import select_renderer
 from aquaflow.render.contract import Renderer
-
-log = logging.getLogger(__name__)
+from aquaflow.render.device_memory import give_back_idle
 
 MIN_VIEWS = 3
 """Fewer posed frames are not a map, and not worth refining."""
@@ -89,8 +87,13 @@ class MapWork(Protocol):
         """Move Gaussians and views with their keyframes; merge the maps of merged sub-maps."""
         ...
 
-    def refine(self, progress: Progress | None = None) -> None:
-        """After the last frame; the caller owns the maps from here on."""
+    def refine(self, progress: Progress | None = None, until: Deadline | None = None) -> None:
+        """After the last frame, as far as there is time; the caller owns the maps from here on."""
+        ...
+
+    def leave_device(self, why: str) -> bool:
+        """After ``refine``: the maps go on on the CPU, if they are not there; True if they were
+        elsewhere. They are as their device has them, or, if it is gone, as they were refined."""
         ...
 
     def close(self, keep: bool = False) -> None:
@@ -116,21 +119,29 @@ class Maps:
         """
         self.config, self.profiler = config, profiler or Profiler()
         self.failures = failures or Failures()
-        self.renderer = renderer or select_renderer(config.mapping.renderer, config.threads)
-        self.mappers: dict[int, Mapper] = {}
+        renderer = renderer or select_renderer(config.mapping.renderer, config.threads)
+        self._work = DeviceWork(config, renderer, self.failures)
         self.held_out: dict[int, list[View]] = {}
         self.views = ViewStore(work)
-        self._copies = HostCopies()
+
+    @property
+    def mappers(self) -> dict[int, Mapper]:
+        return self._work.mappers
+
+    @property
+    def renderer(self) -> Renderer:
+        return self._work.renderer
 
     def grow(self, growth: Growth) -> None:
         view, number = growth.view, growth.sub_map
         with self.profiler.stage("view"):
-            self._do("view", number, lambda mapper: self._add(view, mapper), view.frame_index)
+            self._work.do("view", number, lambda mapper: self._add(view, mapper), view.frame_index)
         metres = growth.metres_per_unit
-        if metres is not None and not self._do(
-            "voxels in metres", number, lambda mapper: mapper.use_unit(metres), view.frame_index
-        ):
-            self.mapper(number).make_whole()
+        if metres is not None:
+            self._work.do(
+                "voxels in metres", number, lambda mapper: mapper.use_unit(metres),
+                view.frame_index, may_be_left_out=True,
+            )  # fmt: skip
 
         # Sec. 3.3.3: medium-guided insertion, from this frame and from the keyframe it retires.
         for retired in growth.retired:
@@ -141,7 +152,10 @@ class Maps:
         # Sec. 3.4: joint optimisation of Gaussians and water.
         with self.profiler.stage("optimise"):
             self.optimise(number, growth.steps)
-        self._do("copy of the map", number, lambda mapper: self._copies.grown(number, mapper))
+        self._work.do(
+            "copy of the map", number, lambda mapper: self._work.copies.grown(number, mapper),
+            may_be_left_out=True,
+        )  # fmt: skip
 
     def _add(self, view: View, mapper: Mapper) -> None:
         self.views.keep(view)
@@ -151,7 +165,9 @@ class Maps:
 
     def optimise(self, sub_map: int, steps: int) -> None:
         """Steps of the optimiser on a sub-map's map."""
-        self._do("optimisation", sub_map, lambda mapper: mapper.optimise(steps))
+        self._work.do(
+            "optimisation", sub_map, lambda mapper: mapper.optimise(steps), may_be_left_out=True
+        )
 
     def hold_out(self, view: View, sub_map: int) -> None:
         views = self.held_out.setdefault(sub_map, [])
@@ -165,13 +181,15 @@ class Maps:
             mapper.insert(view, insertion.pointmap)
 
         with self.profiler.stage("insert"):
-            if not self._do("insertion", number, insert, view.frame_index):
-                self.mapper(number).make_whole()
+            self._work.do("insertion", number, insert, view.frame_index, may_be_left_out=True)
 
     def correct(self, moves: Mapping[int, Sim3], merged: Mapping[int, int]) -> None:
         for number in self.mappers:
-            if self._change("correction of the map", number, lambda mapper: mapper.move(moves)):
-                self._copies.moved(number, moves)
+            moved = self._work.change(
+                "correction of the map", number, lambda mapper: mapper.move(moves)
+            )
+            if moved:
+                self._work.copies.moved(number, moves)
         for views in self.held_out.values():
             move_views(views, moves)
         for source, target in merged.items():
@@ -184,87 +202,47 @@ class Maps:
         """Merge two maps; a failure before the Gaussians were moved leaves both unchanged."""
         if source not in self.mappers:
             return
-        before = len(self.mapper(target).gaussians)
-        merged = self._change(
+        before = len(self._work.mapper(target).gaussians)
+        merged = self._work.change(
             "merging of maps", target, lambda mapper: mapper.absorb(self.mappers[source])
         )
-        if merged or len(self.mapper(target).gaussians) > before:
+        if merged or len(self._work.mapper(target).gaussians) > before:
             del self.mappers[source]
-            self._do("copy of the map", target, lambda mapper: self._copies.take(target, mapper))
+            self._take_copy(target)
 
-    def _change(self, stage: str, number: int, work: Callable[[Mapper], None]) -> bool:
-        """A change that is made wholly, and once: a map that a failing device left half changed
-        goes on from its copy, which is of before."""
-        done = self._do(stage, number, work, changes=True)
-        if not done:
-            self.mapper(number).make_whole()
-        return done
+    def _take_copy(self, number: int) -> None:
+        self._work.do(
+            "copy of the map", number, lambda mapper: self._work.copies.take(number, mapper),
+            may_be_left_out=True,
+        )  # fmt: skip
 
-    def refine(self, progress: Progress | None = None) -> None:
+    def refine(self, progress: Progress | None = None, until: Deadline | None = None) -> None:
+        """Maps share the time by their views."""
+        limit = (until or Deadline()).within(self.config.mapping.optimiser.refine_seconds)
+        views = {number: len(mapper.views) for number, mapper in self.mappers.items()}
+        views = {number: count for number, count in views.items() if count >= MIN_VIEWS}
         with self.profiler.stage("refine"):
-            for number in self.mappers:
-                if len(self.mappers[number].views) >= MIN_VIEWS:
-                    self._do("refinement", number, lambda mapper: mapper.refine(progress))
-                self.mappers[number].make_whole()
+            for number in list(self.mappers):
+                if number in views:
+                    share = limit.share(views[number] / sum(views.values()))
+                    self._refine(number, progress, share)
+                    del views[number]
+                self._work.mend(number)
+                self._take_copy(number)
 
-    # --- a device that fails --------------------------------------------------------------------
+    def _refine(self, number: int, progress: Progress | None, until: Deadline) -> None:
+        self._work.do("refinement", number, lambda mapper: mapper.refine(progress, until))
 
-    def _do(
-        self,
-        stage: str,
-        number: int,
-        work: Callable[[Mapper], object],
-        frame: int | None = None,
-        changes: bool = False,
-    ) -> bool:
-        """Do ``work`` on map ``number``; what it raises is counted, and False returned.
+    def leave_device(self, why: str) -> bool:
+        if self.renderer.device.type == "cpu":
+            return False
+        self._work.leave_device(why)
+        return True
 
-        Where the map's device fails, all maps go on on the CPU, and the work is done there.
-        """
-        error = self._tried(stage, number, work, frame)
-        if error is not None and self._device_failed(error):
-            self._leave_device(error, number if changes else None)
-            error = self._tried(stage, number, work, frame)
-        return error is None
-
-    def _tried(
-        self, stage: str, number: int, work: Callable[[Mapper], object], frame: int | None
-    ) -> Exception | None:
-        """What ``work`` raised, if it was contained or the device's."""
-        try:
-            with self.failures.contain(stage, frame) as run:
-                work(self.mapper(number))
-        except Exception as error:
-            if not self._device_failed(error):
-                raise
-            self.failures.record(stage, error, frame)
-            return error
-        return run.error
-
-    def _device_failed(self, error: Exception) -> bool:
-        return self.renderer.device.type != "cpu" and is_device_failure(error)
-
-    def _leave_device(self, error: Exception, half_changed: int | None) -> None:
-        """From here on all maps are drawn and optimised on the CPU."""
-        log.warning(
-            "%s failed (%s); the map goes on on the CPU, more slowly",
-            self.renderer.device,
-            first_line(error),
-        )
-        self.renderer = cpu_renderer(self.config.threads)
-        for number, mapper in self.mappers.items():
-            half = number == half_changed
-            self.mappers[number] = self._copies.on_cpu(number, mapper, self.renderer, half)
-        for view in (view for views in self.held_out.values() for view in views):
-            view.begin_on(self.renderer.device)
-        self._copies = HostCopies()
-
-    def mapper(self, sub_map: int) -> Mapper:
-        """The map of a sub-map, made when first asked for."""
-        if sub_map not in self.mappers:
-            seed = self.config.seed + sub_map
-            self.mappers[sub_map] = Mapper(self.config.mapping, self.renderer, seed, self.failures)
-        return self.mappers[sub_map]
+    def give_back_memory(self) -> None:
+        """Free what the maps' device can do without: copies of pictures, and idle blocks."""
+        self.views.drop_copies()
+        give_back_idle(self.renderer.device)
 
     def close(self, keep: bool = False) -> None:
         self.views.close(keep)

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from aquaflow.mapping.gaussians.gaussians import radiance
 from aquaflow.mapping.views import View
 from aquaflow.mapping.water.image_formation import Water
+from aquaflow.render.activation import activate
 from aquaflow.render.contract import Renderer, Rendering
 from aquaflow.render.water import MIN_SOLID, compose_water
 
@@ -49,16 +49,19 @@ def show(
 
     Range rides as a fourth colour channel divided by alpha, the same on every renderer.
     """
-    means = parameters["means"]
     centre = -viewmat[:3, :3].T @ viewmat[:3, 3]
-    ranges = torch.linalg.vector_norm(means - centre.detach(), dim=-1, keepdim=True)
-    colours = torch.cat([radiance(parameters["raw_colours"]), ranges], dim=-1)
+    activated = activate(
+        parameters["means"],
+        parameters["log_scales"],
+        parameters["opacity_logits"],
+        parameters["raw_colours"],
+        centre,
+        renderer.threads,
+    )
     drawn = renderer(
-        means,
+        parameters["means"],
         parameters["quats"],
-        torch.exp(parameters["log_scales"]),
-        torch.sigmoid(parameters["opacity_logits"][:, 0]),
-        colours,
+        *activated,
         viewmat,
         view.K(),
         view.camera.width,

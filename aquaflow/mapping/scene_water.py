@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from aquaflow.mapping.gaussians.gaussians import radiance, raw_colour
+from aquaflow.mapping.gaussians.gaussians import raw_colour
 from aquaflow.mapping.scene import Scene, orientations
 from aquaflow.mapping.transfers import water_in, water_out
 from aquaflow.mapping.views import View
@@ -20,6 +20,7 @@ from aquaflow.mapping.water.nearest import kept_by
 from aquaflow.mapping.water.posed_picture import PosedPicture
 from aquaflow.mapping.water.shading import shading_basis
 from aquaflow.mapping.water.sightings import sighting
+from aquaflow.render.activation import radiance
 
 
 @torch.no_grad()

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from aquaflow.config import MappingConfig
 from aquaflow.errors import DamagedError
+from aquaflow.errors.failures import Failures
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.mapping.decoder.neural import NeuralGaussians
 from aquaflow.mapping.mapper import Mapper
@@ -26,6 +27,7 @@ from aquaflow.mapping.water.exposure import log_gains_of, set_log_gain
 from aquaflow.mapping.water.white_balance import WhiteBalance
 from aquaflow.render.adam import SelectiveAdam
 from aquaflow.render.contract import CPU, Renderer
+from aquaflow.render.dense_adam import STEP, DenseAdam
 from aquaflow.storage.arrays import Arrays, of_camera, of_sim3, prefixed, to_camera, to_sim3, under
 
 Facts = dict[str, Any]
@@ -34,8 +36,6 @@ NO_PIXELS = np.zeros((0, 0, 3), np.uint8)
 """A view's picture is no part of the map."""
 GROUPS = ("group", "slot", "table", "fill", "voxel", "features")
 """Tables of the voxel groups, in the order of their names in the file."""
-STEP = "step"
-"""Name of the count of steps in the state of torch's optimisers."""
 
 
 def serialise(mapper: Mapper, optimiser: bool = False) -> tuple[Facts, Arrays]:
@@ -66,20 +66,22 @@ def serialise(mapper: Mapper, optimiser: bool = False) -> tuple[Facts, Arrays]:
     if optimiser:
         facts["next_water_fit"] = mapper.water_fitting.next_fit
         facts["rates"] = {name: adam.learning_rates for name, adam in _adams(mapper).items()}
-        facts["rates"] |= {
-            name: each.param_groups[0]["lr"] for name, each in _torch(mapper).items()
-        }
+        facts["rates"] |= {name: each.rates[0] for name, each in _dense(mapper).items()}
         arrays |= _optimisers(mapper)
     return facts, arrays
 
 
-def deserialise(facts: Facts, arrays: Mapping[str, Any], renderer: Renderer) -> Mapper:
+def deserialise(
+    facts: Facts, arrays: Mapping[str, Any], renderer: Renderer, failures: Failures | None = None
+) -> Mapper:
     """The serialised map; its views have poses, exposures and light, but no pixels.
+
+    What its fits and steps raise is counted in ``failures``.
 
     Raises:
         KeyError, ValueError, TypeError, RuntimeError, AquaFlowError: these are no map's.
     """
-    mapper = Mapper(MappingConfig.model_validate(facts["config"]), renderer, seed=0)
+    mapper = Mapper(MappingConfig.model_validate(facts["config"]), renderer, 0, failures)
     scene, gaussians, device = mapper.scene, mapper.gaussians, mapper.device
     for name, width in gaussians.WIDTHS.items():
         values = checkpoint_in(arrays[f"gaussians.{name}"], device)
@@ -190,14 +192,15 @@ def _read_decoder(neural: NeuralGaussians, arrays: Mapping[str, Any]) -> None:
 def _adams(mapper: Mapper) -> dict[str, SelectiveAdam]:
     adams = {"adam": mapper.optimiser.adam}
     if mapper.neural is not None:
-        adams |= {"adam_local": mapper.neural._local, "adam_shared": mapper.neural._shared}
+        features = mapper.neural.optimisers
+        adams |= {"adam_local": features.local, "adam_shared": features.shared}
     return adams
 
 
-def _torch(mapper: Mapper) -> dict[str, torch.optim.Adam]:
+def _dense(mapper: Mapper) -> dict[str, DenseAdam]:
     optimisers = {"adam_medium": mapper.optimiser.medium_adam}
     if mapper.neural is not None:
-        optimisers["adam_decoder"] = mapper.neural._weights
+        optimisers["adam_decoder"] = mapper.neural.optimisers.weights
     return optimisers
 
 
@@ -207,8 +210,8 @@ def _optimisers(mapper: Mapper) -> Arrays:
         arrays[f"{name}.steps"] = checkpoint_out(adam.steps)
         arrays |= _prefixed(f"{name}.first", adam.first_moments)
         arrays |= _prefixed(f"{name}.second", adam.second_moments)
-    for name, optimiser in _torch(mapper).items():
-        for i, state in optimiser.state_dict()["state"].items():
+    for name, optimiser in _dense(mapper).items():
+        for i, state in optimiser.state.items():
             arrays |= _prefixed(f"{name}.{i}", state)
     return arrays
 
@@ -222,16 +225,15 @@ def _read_optimisers(mapper: Mapper, arrays: Mapping[str, Any], rates: Facts) ->
         adam.second_moments.update(_under(f"{name}.second", arrays, device))
         adam.learning_rates.update(rates[name])
         adam.bind({})
-    for name, optimiser in _torch(mapper).items():
-        whole = optimiser.state_dict()
-        for i in range(sum(len(group["params"]) for group in whole["param_groups"])):
-            state: dict[str, Any] = dict(under(f"{name}.{i}", arrays))
-            for part, array in state.items():  # torch keeps the count of steps on the host
-                state[part] = checkpoint_in(array, CPU if part == STEP else device)
+    for name, optimiser in _dense(mapper).items():
+        for i in range(len(optimiser.tensors)):
+            state = under(f"{name}.{i}", arrays)
             if state:
-                whole["state"][i] = state
-        whole["param_groups"][0]["lr"] = float(rates[name])
-        optimiser.load_state_dict(whole)
+                optimiser.state[i] = {
+                    part: checkpoint_in(array, CPU if part == STEP else device)
+                    for part, array in state.items()
+                }
+        optimiser.rates[0] = float(rates[name])
 
 
 # --- arrays ---------------------------------------------------------------------------------------

@@ -143,6 +143,13 @@ def pose_out(
     return _out("pose out", gradient)
 
 
+def registration_out(
+    sums: Tensor,  # [] or [6, 7]
+) -> Array:
+    """Sums over a held-out view's pixels; its pose is solved for on the host."""
+    return _out("registration out", sums)
+
+
 def insertion_out(
     chosen: Tensor,  # [M] or [M, ...] of the chosen pixels
 ) -> Array:
@@ -189,7 +196,8 @@ def _into(
 ) -> Tensor:
     if device.type == "cpu":
         return host
-    moved = host.to(device)
+    # Without waiting for the device; memory that is not pinned is read before this returns.
+    moved = host.to(device, non_blocking=True)
     _COUNTS.add(name)
     return moved
 

@@ -90,6 +90,8 @@ class View:
         """[3, rows, columns] log-gain of the sunlight over the picture (see water/sunlight.py)."""
         self.explained: Tensor | None = None
         """[rows, columns] bool, the tiles in which the last full look found nothing but noise."""
+        self.all_explained: bool | None = None
+        """Whether those are all that show the scene; None while nobody has asked."""
 
     def move_pixels(self, store: Spill[Pixels]) -> None:
         """Move the pixels into ``store``, under the frame's index."""
@@ -242,6 +244,11 @@ class ViewStore:
     def holds(self, view: View) -> bool:
         """True if this store has the view's pixels."""
         return view.is_stored_in(self._pixels)
+
+    def drop_copies(self) -> None:
+        """Free the copies on the map's device; they are made anew as they are used."""
+        for pixels in self._pixels.in_memory:
+            pixels.copies.clear()
 
     @property
     def resident_bytes(self) -> int:

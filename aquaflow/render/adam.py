@@ -10,11 +10,13 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from aquaflow.errors import AquaFlowError
+from aquaflow.render.adam_rows import Moved, fused_kernel, step_rows, step_rows_fused
 from aquaflow.render.library import Library, library_or_none, pointer
 
 LARGEST_GRADIENT = 1e18
@@ -57,9 +59,8 @@ class SelectiveAdam:
         self.learning_rates = {name: rate for name, (_, rate) in groups.items()}
         self.betas, self.eps = betas, eps
         self.threads = threads if threads is not None else torch.get_num_threads()
-        self.skipped = 0
-        """Visible rows not stepped so far because a gradient was not finite."""
         first = next(iter(self.params.values()))
+        self._skipped = torch.zeros((), dtype=torch.int64, device=first.device)
         self.steps = torch.zeros(len(first), dtype=torch.int32, device=first.device)
         self.first_moments = {k: torch.zeros_like(v.detach()) for k, v in self.params.items()}
         self.second_moments = {k: torch.zeros_like(v.detach()) for k, v in self.params.items()}
@@ -70,20 +71,26 @@ class SelectiveAdam:
         self,
         visible: Tensor,  # [N] bool
         grads: Mapping[str, Tensor],  # each [N, ...]
-    ) -> int:
-        """Step the visible rows of the tensors named in ``grads``; returns rows skipped.
+    ) -> None:
+        """Step the visible rows of the tensors named in ``grads``.
 
-        A row with a gradient that is not finite in any tensor is left as it is, in all tensors.
+        A row with a gradient that is not finite in any tensor is left as it is, in all tensors,
+        and counted in ``skipped``.
         """
         self._check_step(visible, grads)
         library = library_or_none() if self.steps.device.type == "cpu" else None
         with torch.no_grad():
-            if library is None:
-                skipped = self._step_torch(visible, grads)
-            else:
-                skipped = self._step_native(library, visible, grads)
-        self.skipped += skipped
-        return skipped
+            if library is not None:
+                self._skipped += self._step_native(library, visible, grads)
+                return
+            sound = sound_rows(grads, len(visible))
+            self._skipped += (visible & ~sound).sum()
+            self._step_torch(visible & sound, grads)
+
+    @property
+    def skipped(self) -> int:
+        """Visible rows not stepped so far because a gradient was not finite."""
+        return int(self._skipped)
 
     def extend(self, n_new: int) -> None:
         """Add state for ``n_new`` rows at the end, at step 0; then ``bind`` the grown tensors."""
@@ -94,7 +101,8 @@ class SelectiveAdam:
         mask: Tensor,  # [N] bool
     ) -> None:
         """Drop the state of rows where ``mask`` is False; then ``bind`` the pruned tensors."""
-        self._replace(lambda state: state[mask])
+        rows = torch.nonzero(mask)[:, 0]  # once for all tensors
+        self._replace(lambda state: state[rows])
 
     def _replace(self, change: Callable[[Tensor], Tensor]) -> None:
         """All state at once, when all of it is made: a failure leaves it as it was."""
@@ -183,24 +191,18 @@ class SelectiveAdam:
 
     def _step_torch(
         self,
-        visible: Tensor,  # [N] bool
+        rows: Tensor,  # [N] bool
         grads: Mapping[str, Tensor],  # each [N, ...]
-    ) -> int:
-        sound = sound_rows(grads, len(visible))
-        rows = torch.nonzero(visible & sound)[:, 0]
-        bias = self._bias[self.steps[rows].long().clamp(max=len(self._bias) - 1)]
-        self.steps[rows] += 1
-        beta1, beta2 = self.betas
+    ) -> None:
+        bias = self._bias[self.steps.long().clamp(max=len(self._bias) - 1)]
+        self.steps += rows
+        kernel = fused_kernel(self.steps.device.type)
+        step = step_rows if kernel is None else partial(step_rows_fused, kernel)
         for name, gradient in grads.items():
-            g = gradient[rows]
-            m = beta1 * self.first_moments[name][rows] + (1 - beta1) * g
-            v = beta2 * self.second_moments[name][rows] + (1 - beta2) * g * g
-            self.first_moments[name][rows] = m
-            self.second_moments[name][rows] = v
-            b1, b2 = (b.view(-1, *[1] * (g.dim() - 1)) for b in bias.unbind(1))
-            change = self.learning_rates[name] * b1 * m / (v.sqrt() * b2 + self.eps)
-            self.params[name].detach()[rows] -= change
-        return int((visible & ~sound).sum())
+            parameter, rate = self.params[name].detach(), self.learning_rates[name]
+            moments = (self.first_moments[name], self.second_moments[name])
+            moved = Moved(parameter, gradient.to(torch.float32), *moments, rate)
+            step(moved, rows, bias, self.betas, self.eps)
 
 
 def sound_rows(
@@ -208,8 +210,11 @@ def sound_rows(
     rows: int,
 ) -> Tensor:
     """[rows] bool: every gradient of the row is a number, and its square is one too."""
-    sound = [(g.abs() < LARGEST_GRADIENT).reshape(rows, -1).all(1) for g in grads.values()]
-    return torch.stack(sound).all(0) if sound else torch.ones(rows, dtype=torch.bool)
+    sound = [
+        (g.abs() < LARGEST_GRADIENT).reshape(rows, math.prod(g.shape[1:])).all(1)
+        for g in grads.values()
+    ]
+    return torch.stack(sound).all(0)
 
 
 def _bias_table(betas: tuple[float, float], device: torch.device) -> Tensor:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import sys
+from contextlib import redirect_stdout
 from importlib import metadata
 
 import torch
@@ -48,7 +50,8 @@ def _missing_kernels() -> str | None:
     """gsplat without a compiler imports all the same, and fails at the first picture."""
     remedy = "install the CUDA toolkit (nvcc) that fits torch, or use renderer cpu."
     try:
-        from gsplat.cuda._backend import _C
+        with redirect_stdout(sys.stderr):  # it tells there that it compiles, and --json is for us
+            from gsplat.cuda._backend import _C
     except Exception as error:  # the import runs compilers and linkers
         cause = str(error).strip().partition("\n")[0] or type(error).__name__
         return f"gsplat's CUDA kernels do not load ({cause}); {remedy}"

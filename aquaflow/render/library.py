@@ -29,6 +29,8 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "aq_photometric": (_INT, [_POINTER] * 4 + [_INT] * 2 + [_FLOAT, _INT] + [_POINTER] * 2),
     "aq_compose_water": (_INT, [_POINTER] * 3 + [_INT] * 2 + [_POINTER] * 2),
     "aq_compose_water_backward": (_INT, [_POINTER] * 3 + [_INT] * 2 + [_POINTER] * 5),
+    "aq_activate": (_INT, [_POINTER] * 5 + [_INT] * 2 + [_POINTER] * 3),
+    "aq_activate_backward": (_INT, [_POINTER] * 5 + [_INT] * 2 + [_POINTER] * 9),
     "aq_decode_view": (_INT, [_POINTER, _INT] + [_POINTER] * 3),
     "aq_decode_view_backward": (_INT, [_POINTER, _INT, _POINTER]),
     "aq_adam_step": (

@@ -9,6 +9,7 @@ import pytest
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.contract import CPU
 from tests.device.device_scenes import counted, mapped, without_kernels
+from tests.pretended_allocator import DEFAULT_BYTES
 from tests.pretended_device import PRETENDED, Device, pretended_device
 
 
@@ -43,3 +44,16 @@ def nothing_strays(device: Device) -> Iterator[None]:
     yield
     assert not device.strays
     assert device.named - named == counted() - began
+
+
+@pytest.fixture
+def repaired(device: Device) -> Iterator[None]:
+    """The test has a device that works to begin with, with memory enough."""
+    _repair(device)
+    yield
+    _repair(device)
+
+
+def _repair(device: Device) -> None:
+    device.fails_at, device.lost = None, False
+    device.memory.total = DEFAULT_BYTES

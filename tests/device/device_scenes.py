@@ -28,7 +28,7 @@ from tests.mapping.mapping_scenes import (
 )
 from tests.pretended_device import PRETENDED
 
-FITTED = ("aquaflow.render.photometric", "aquaflow.render.water", "aquaflow.render.adam")
+FITTED = tuple(f"aquaflow.render.{name}" for name in ("photometric", "water", "adam", "activation"))
 DECODE = "aquaflow.mapping.decoder.decode"
 """Modules that take the compiled kernels where there are any."""
 

@@ -2,110 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
-from aquaflow.config import Config
-from aquaflow.errors.failures import Failures
-from aquaflow.mapping.decoder.regrouping import is_whole
 from aquaflow.mapping.host_copies import COPY_EVERY
-from aquaflow.mapping.maps import Growth, Maps
-from aquaflow.mapping.state import serialise
+from aquaflow.mapping.maps import Growth
 from aquaflow.render.contract import CPU
-from tests.device.device_scenes import SMALL, SinglePrecision, again, everything
-from tests.mapping.mapping_scenes import flat_pointmap, floor, path, picture, pose, view_of
+from tests.device.failing_dives import (
+    SHIFT,
+    assert_goes_on_on_the_cpu,
+    dive,
+    growth,
+    state_of,
+)
 from tests.pretended_device import PRETENDED, Device
 
-pytestmark = [pytest.mark.usefixtures("nothing_strays"), pytest.mark.ci]
-
-VIEWS = 4
-GROWN: dict[tuple[bool, int], Maps] = {}
-"""Maps by decoder and number of views, of which every test gets a copy."""
-SHIFT = {0: pose((0.5, 0.0, 0.0))}
-"""A correction that moves the whole map."""
-
-
-def growth(number: int, steps: int = 2) -> Growth:
-    T_wc = path(number + 1)[number]
-    view = view_of(picture(floor(), T_wc, camera=SMALL), T_wc, number, camera=SMALL)
-    pointmap = flat_pointmap(camera=SMALL) if number % 2 == 0 else None
-    return Growth(view, 0, steps, pointmap)
-
-
-def dive(decoder: bool = False, views: int = VIEWS) -> Maps:
-    """Maps on the device after some views, of which there is a copy on the host."""
-    if (decoder, views) not in GROWN:
-        GROWN[decoder, views] = grown(decoder, views)
-    whole = GROWN[decoder, views]
-    maps = Maps(whole.config, SinglePrecision(PRETENDED), failures=Failures(strict=False))
-    maps.mappers[0] = again(whole.mappers[0], PRETENDED)
-    maps._copies.take(0, maps.mappers[0])
-    return maps
-
-
-def grown(decoder: bool, views: int) -> Maps:
-    """Maps on the device after some views."""
-    mapping = everything(medium={"enabled": False}, decoder={"enabled": decoder})
-    config = Config(mapping=mapping, threads=1)
-    maps = Maps(config, SinglePrecision(PRETENDED), failures=Failures(strict=False))
-    for number in range(views):
-        maps.grow(growth(number))
-    assert maps.renderer.device == PRETENDED
-    return maps
-
-
-@pytest.fixture(autouse=True)
-def repaired(device: Device) -> Iterator[None]:
-    """Every test has a device that works to begin with."""
-    device.fails_at, device.lost = None, False
-    yield
-    device.fails_at, device.lost = None, False
-
-
-def state_of(maps: Maps) -> dict[str, np.ndarray]:
-    """All arrays of the map and its optimiser, on the host."""
-    return serialise(maps.mappers[0], optimiser=True)[1]
-
-
-def assert_goes_on_on_the_cpu(maps: Maps, views: int = VIEWS) -> None:
-    mapper = maps.mappers[0]
-    assert maps.renderer.device == mapper.device == CPU
-    assert {view.device for view in mapper.views} == {CPU}
-    assert {tensor.device for tensor in mapper.gaussians.parameters.values()} == {CPU}
-    assert [view.frame_index for view in mapper.views] == list(range(views))
-    assert all(view.has_pixels for view in mapper.views)
-    assert len(maps.failures.kinds) >= 1
-    before, looks = mapper.steps, len(mapper.views)
-    maps.grow(growth(views))
-    assert mapper.steps == before + 2
-    assert len(mapper.views) == looks + 1
-    assert all(bool(torch.isfinite(each).all()) for each in mapper.gaussians.parameters.values())
-    if mapper.neural is not None:
-        assert is_whole(mapper.neural.groups, len(mapper.gaussians))
-
-
-def test_out_of_memory_costs_nothing_of_map_and_optimiser(device: Device) -> None:
-    maps = dive()
-    before = state_of(maps)
-    device.fails_at = device.calls + 1
-    maps.optimise(0, 0)  # no call of the device, no failure
-    assert maps.renderer.device == PRETENDED
-    device.fails_at = device.calls + 40  # within the drawing of the step, before anything changes
-    maps.optimise(0, 1)
-    after = state_of(maps)
-    assert before.keys() == after.keys()
-    # The step was made on the CPU, from the state that the device had.
-    assert int(after["adam.steps"].max()) == int(before["adam.steps"].max()) + 1
-    moved = np.abs(after["gaussians.means"] - before["gaussians.means"]).max()
-    assert 0.0 < moved < 0.02
-    np.testing.assert_allclose(
-        after["adam.second.means"], before["adam.second.means"], rtol=0.1, atol=1e-3
-    )
-    assert_goes_on_on_the_cpu(maps)
+pytestmark = [pytest.mark.usefixtures("nothing_strays", "repaired"), pytest.mark.ci]
 
 
 @pytest.mark.parametrize("decoder", [False, True])
@@ -168,12 +82,11 @@ def test_a_failure_within_a_correction_moves_the_map_exactly_once(
 
 
 @pytest.mark.parametrize("call", [3, 400, 1000])
-@pytest.mark.parametrize("lost", [False, True])
-def test_wherever_the_device_fails_while_the_map_grows_the_view_is_in_it_once(
-    device: Device, lost: bool, call: int
+def test_wherever_the_device_is_lost_while_the_map_grows_the_view_is_in_it_once(
+    device: Device, call: int
 ) -> None:
     maps = dive(decoder=True, views=2)
-    device.fails_at, device.lost = device.calls + call, lost
+    device.fails_at, device.lost = device.calls + call, True
     maps.grow(growth(2))
     assert_goes_on_on_the_cpu(maps, 3)
     assert len(maps.mappers[0].gaussians) > 0

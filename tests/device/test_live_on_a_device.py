@@ -11,14 +11,16 @@ from aquaflow.config.service import LiveMappingConfig
 from aquaflow.errors.failures import Failures
 from aquaflow.mapping.maps import Growth, Maps
 from aquaflow.render.contract import CPU
+from aquaflow.service.health.degradation import DegradationLevel
 from aquaflow.service.health.heartbeats import Heartbeats
 from aquaflow.service.map_thread import MapThread
 from aquaflow.viewer.snapshot import MapCopy, copied
 from tests.device.device_scenes import SMALL, SinglePrecision, everything
 from tests.mapping.mapping_scenes import flat_pointmap, floor, path, picture, view_of
+from tests.pretended_allocator import DEFAULT_BYTES
 from tests.pretended_device import PRETENDED, Device
 
-pytestmark = pytest.mark.usefixtures("nothing_strays")
+pytestmark = pytest.mark.usefixtures("nothing_strays", "repaired")
 
 GIVE_UP_S = 300.0
 
@@ -29,14 +31,24 @@ def growth(number: int) -> Growth:
     return Growth(view, 0, 1, flat_pointmap(camera=SMALL) if number == 0 else None)
 
 
-def thread_on_the_device() -> MapThread:
+class Level:
+    """The level of the service, as the test says."""
+
+    def __init__(self) -> None:
+        self.now = DegradationLevel.FULL
+
+    def __call__(self) -> DegradationLevel:
+        return self.now
+
+
+def thread_on_the_device(level: Level | None = None) -> MapThread:
     mapping = everything(medium={"enabled": False}, decoder={"enabled": False})
     maps = Maps(
         Config(mapping=mapping, threads=1), SinglePrecision(PRETENDED),
         failures=Failures(strict=False),
     )  # fmt: skip
     config = LiveMappingConfig.model_validate({"backlog": 100, "steps_per_view": 0, "nice": 0})
-    return MapThread(maps, config, Heartbeats())
+    return MapThread(maps, config, Heartbeats(), level or Level())
 
 
 def looked_at(thread: MapThread) -> MapCopy:
@@ -51,6 +63,20 @@ def looked_at(thread: MapThread) -> MapCopy:
     thread._post("look", look)
     assert done.wait(GIVE_UP_S)
     return copies[0]
+
+
+def said_after(thread: MapThread) -> tuple[bool, str]:
+    """Whether the last request failed, and of what."""
+    said: list[tuple[bool, str]] = []
+    done = threading.Event()
+
+    def look(maps: Maps) -> None:
+        said.append((thread.failing, thread.last_failure))
+        done.set()
+
+    thread._post("look", look)
+    assert done.wait(GIVE_UP_S)
+    return said[0]
 
 
 def test_a_live_map_grows_on_the_device_and_is_shown_from_there(device: Device) -> None:
@@ -79,3 +105,35 @@ def test_a_live_map_goes_on_when_its_device_is_lost(device: Device) -> None:
     assert not thread.failing
     assert len(thread.mappers[0].views) == 4
     assert len(after.seen) == len(before.seen) > 0
+
+
+def test_a_full_device_costs_a_live_map_what_it_was_asked_for_meanwhile(device: Device) -> None:
+    thread = thread_on_the_device()
+    for number in range(2):
+        thread.grow(growth(number))
+    before = looked_at(thread)
+    device.memory.total = device.memory.allocated + 8000
+    thread.grow(growth(2))
+    assert said_after(thread) == (True, "grow: the GPU's memory was full")
+    device.memory.total = DEFAULT_BYTES
+    thread.grow(growth(3))
+    after = looked_at(thread)
+    assert not said_after(thread)[0]
+    thread.close()
+    assert thread.renderer.device == PRETENDED
+    assert [view.frame_index for view in thread.mappers[0].views] == [0, 1, 2, 3]
+    assert len(after.seen) == len(before.seen) > 0
+
+
+def test_at_each_step_down_memory_is_given_back(device: Device) -> None:
+    level = Level()
+    thread = thread_on_the_device(level)
+    thread.grow(growth(0))
+    looked_at(thread)
+    emptied, taken = device.memory.emptied, device.memory.allocated
+    for level.now in (DegradationLevel.FEWER_STEPS, DegradationLevel.SMALLER_IMAGES):
+        looked_at(thread)
+    looked_at(thread)
+    thread.close()
+    assert device.memory.emptied == emptied + 2
+    assert device.memory.allocated < taken

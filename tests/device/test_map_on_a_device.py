@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 import pytest
 import torch
@@ -31,6 +33,10 @@ from tests.mapping.mapping_scenes import (
 from tests.pretended_device import PRETENDED, Device
 
 pytestmark = pytest.mark.usefixtures("nothing_strays")
+
+STEPS = 8
+IN_GSPLATS_PLACE = "render/reference.py"
+"""What gsplat's kernels do in its place does not wait."""
 
 
 def test_a_map_grown_on_a_device_is_that_of_the_cpu(twins: tuple[Mapper, Mapper]) -> None:
@@ -155,3 +161,31 @@ def test_the_compiled_kernels_refuse_a_map_on_a_device(twins: tuple[Mapper, Mapp
     away.scene.renderer = CpuRenderer(1)
     with pytest.raises(AquaFlowError, match="draws on cpu and was given a tensor on meta"):
         away.show(away.views[0])
+
+
+def waits_of(mapper: Mapper, device: Device) -> Counter[str]:
+    """Of ``STEPS`` steps, by file and function."""
+    mapper.optimiser.steps = 0  # none of them prunes
+    before = Counter(device.waits)
+    mapper.optimise(STEPS)
+    assert mapper.steps == STEPS
+    found = device.waits - before
+    return Counter({place: n for place, n in found.items() if IN_GSPLATS_PLACE not in place})
+
+
+def test_a_step_waits_for_the_loss_and_the_waters_gradient_alone(
+    twins: tuple[Mapper, Mapper], device: Device
+) -> None:
+    mapper = again(twins[1], PRETENDED)
+    mapper.scene.bake(mapper.views)
+    waits = waits_of(mapper, device)
+    checked = sum(n for place, n in waits.items() if place.endswith(": is_number"))
+    assert checked == 2 * STEPS
+    assert sum(waits.values()) <= 3 * STEPS, waits
+
+
+def test_with_a_decoder_it_waits_once_more_and_a_few_times_for_each_trunk(
+    twins: tuple[Mapper, Mapper], device: Device
+) -> None:
+    waits = waits_of(again(twins[1], PRETENDED), device)
+    assert sum(waits.values()) <= 6 * STEPS, waits

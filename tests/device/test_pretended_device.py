@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.pretended_allocator import DEFAULT_BYTES
 from tests.pretended_device import PRETENDED, Device, LostError, Pretended, pretended_device
 
 
@@ -101,3 +102,51 @@ def test_once_lost_it_stays_lost(device: Device) -> None:
     for _ in range(2):
         with pytest.raises(LostError):
             there.cpu()
+
+
+def test_its_memory_is_taken_by_a_storage_until_its_last_tensor_is_gone(device: Device) -> None:
+    before = device.memory.allocated
+    there = torch.ones(100, device=PRETENDED)
+    part = there[10:20]
+    there.add_(1.0)
+    assert device.memory.allocated == before + 400
+    del there
+    assert device.memory.allocated == before + 400
+    del part
+    assert device.memory.allocated == before
+    assert device.memory.reserved >= before + 400
+
+
+def test_what_does_not_fit_its_memory_is_refused_and_what_fits_is_not(device: Device) -> None:
+    device.memory.total = device.memory.allocated + 600
+    try:
+        there = torch.ones(100, device=PRETENDED)
+        with pytest.raises(torch.OutOfMemoryError, match="Tried to allocate 400 bytes"):
+            there + 1.0
+        assert there.add_(1.0).cpu()[0] == 2.0
+    finally:
+        device.memory.total = DEFAULT_BYTES
+
+
+@pytest.mark.parametrize(
+    ("ask", "waits"),
+    [
+        (lambda there: float(there[0]), 1),
+        (lambda there: there.cpu(), 1),
+        (lambda there: there[there > 0.0], 1),
+        (torch.nonzero, 1),
+        (lambda there: torch.equal(there, there), 1),
+        (lambda there: there.repeat_interleave((there > 0.0).long()), 1),
+        (lambda there: there.repeat_interleave((there > 0.0).long(), output_size=3), 0),
+        (lambda there: there.index_select(0, (there > 9.0).long()), 0),
+        (lambda there: torch.where(there > 0.0, there, 0.0).sum(), 0),
+        (lambda there: there.masked_fill_(there > 9.0, 1.0), 0),
+    ],
+)
+def test_what_makes_the_cpu_wait_is_counted(
+    device: Device, ask: Callable[[Tensor], object], waits: int
+) -> None:
+    there = torch.ones(3, device=PRETENDED)
+    before = sum(device.waits.values())
+    ask(there)
+    assert sum(device.waits.values()) == before + waits

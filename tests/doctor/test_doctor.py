@@ -13,8 +13,10 @@ import pytest
 from rich.console import Console
 
 from aquaflow.doctor import Finding, MachineProbes, examine, print_findings, to_json
+from aquaflow.doctor.attempts import Attempt
 from aquaflow.doctor.computer import isa_level
 from aquaflow.doctor.machine import renderer_name
+from aquaflow.doctor.packages import PACKAGES
 
 V4 = "avx512f avx512bw avx512cd avx512dq avx512vl"
 CPUINFO = f"processor\t: 0\nmodel name\t: Test CPU\nflags\t\t: fpu {V4}\nprocessor\t: 1\n"
@@ -41,8 +43,11 @@ def bare(root: Path, **changes: object) -> MachineProbes:
         "disk": root,
         "native": root / "native",
         "which": lambda name: None,
-        "gpu": lambda: None,
+        "gpu": lambda: "torch is a build for the processor",
+        "onnx_providers": lambda: ["CPUExecutionProvider"],
+        "attempt": lambda name: Attempt(failed=f"{name} is not to be tried"),
         "module_present": lambda name: False,
+        "version": lambda name: None,
         "renderer": lambda: "tiles, torch",
         "architecture": ("x86_64", 64),
     }
@@ -79,9 +84,16 @@ def test_other_systems_are_said_not_to_be(machine, architecture):
 
 
 def test_the_gpu_probe_needs_no_torch(monkeypatch):
-    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.setitem(sys.modules, "aquaflow.render.gpu", None)
 
-    assert MachineProbes().gpu() is None
+    assert MachineProbes().gpu() == "torch is not installed"
+
+
+def test_the_network_probe_needs_no_onnxruntime(monkeypatch):
+    assert "CPUExecutionProvider" in MachineProbes().onnx_providers()
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+
+    assert MachineProbes().onnx_providers() == []
 
 
 @pytest.mark.parametrize(
@@ -128,29 +140,6 @@ def test_absent_render_package_is_no_error(monkeypatch):
     monkeypatch.setitem(sys.modules, "aquaflow.render", None)
 
     assert renderer_name() is None
-
-
-@pytest.mark.parametrize(
-    ("gpu", "modules", "driver", "used", "advice"),
-    [
-        ("RTX, 24 GB", {"gsplat"}, True, "optimised on the GPU", ""),
-        ("RTX, 24 GB", set(), True, "stays on the processor", "gsplat"),
-        (None, set(), True, "runs on the processor", "CUDA build of torch"),
-        (None, set(), False, "runs on the processor", ""),
-    ],
-)
-def test_gpu_states(machine, gpu, modules, driver, used, advice):
-    there = bare(
-        machine.root,
-        gpu=lambda: gpu,
-        module_present=modules.__contains__,
-        which=lambda name: "/usr/bin/nvidia-smi" if driver and name == "nvidia-smi" else None,
-    )
-    finding = named(there, "GPU")
-
-    assert used in finding.used_for
-    assert advice in finding.advice
-    assert finding.ok == (advice == "")
 
 
 def test_video_support_is_that_of_the_installed_opencv(machine):
@@ -216,7 +205,7 @@ def test_full_disk_is_advised_on(machine, monkeypatch):
 def test_findings_as_json_have_stable_keys(machine):
     rows = to_json(examine(machine))["findings"]
 
-    assert all(set(row) == {"name", "found", "used_for", "advice", "ok"} for row in rows)
+    assert all(set(row) == {"name", "found", "used_for", "advice", "figures", "ok"} for row in rows)
     json.dumps(rows)
 
 
@@ -230,4 +219,4 @@ def test_table_shows_every_finding_and_its_advice(machine):
 
 
 def test_this_machine_is_examined_without_an_error():
-    assert len(examine()) == 12
+    assert len(examine()) == 12 + len(PACKAGES)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from aquaflow.config import FusionConfig
-from aquaflow.config.telemetry import MountingConfig
+from aquaflow.config.device import MountingConfig
 from aquaflow.fusion.camera_path import CameraPath
 from aquaflow.fusion.estimator import Estimate, estimate
 from aquaflow.fusion.telemetry import Telemetry

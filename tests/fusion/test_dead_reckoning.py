@@ -70,7 +70,7 @@ def carried(swum: Swum, telemetry: Telemetry | None = None) -> Carried | None:
 @pytest.mark.parametrize("heading", [True, False])
 @pytest.mark.parametrize(
     "seeds",
-    [range(1), pytest.param(range(1, 11), marks=pytest.mark.ci)],
+    [range(1), pytest.param(range(1, 11), marks=pytest.mark.slow)],
     ids=["one dive", "ten dives"],
 )
 def test_after_20_s_of_blackout_the_next_sub_map_lies_within_its_stated_3_sigma(

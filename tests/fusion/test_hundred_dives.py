@@ -18,11 +18,7 @@ from tests.fusion.simulated_dives import Swum, estimated, ground_of, swum, telem
 Array = npt.NDArray[np.float64]
 
 KINDS = ("depth", "attitude", "velocity", "altitude")
-COUNTS = [
-    3,
-    pytest.param(12, marks=pytest.mark.ci),
-    pytest.param(100, marks=pytest.mark.slow),
-]
+COUNTS = [3, pytest.param(100, marks=pytest.mark.slow)]
 LARGEST_SIGMAS = 4.0
 
 

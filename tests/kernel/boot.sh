@@ -3,8 +3,8 @@
 #
 #   boot.sh FOLDER COMMAND...
 #
-# The guest sees this machine's / read-only, has its own /run, /dev/shm and /var/tmp, a camera
-# (vivid) and a CAN bus (vcan0). Its emulated clock is uneven: test order and protocol in it, no times;
+# The guest sees this machine's / read-only, has its own /run, /dev/shm and /var/tmp, two cameras
+# (vivid; the second has the multi-planar API) and a CAN bus (vcan0). Its emulated clock is uneven: test order and protocol in it, no times;
 # on a busy host it is so uneven that the kernel would give up on its timer, hence no_timer_check.
 set -euo pipefail
 
@@ -18,7 +18,7 @@ mkdir -p /dev/shm /dev/pts
 for place in /run /dev/shm; do mount -t tmpfs tmpfs \$place; done
 mount -t devpts devpts /dev/pts
 ip link set lo up
-modprobe -d $folder/kernel vivid n_devs=1
+modprobe -d $folder/kernel vivid n_devs=2 multiplanar=1,2
 modprobe -d $folder/kernel vcan
 modprobe -d $folder/kernel can_raw
 ip link add vcan0 type vcan

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from aquaflow.config.cameras import V4l2Config
-from aquaflow.drivers.live import CameraState
+from aquaflow.drivers.camera_state import CameraState
 from aquaflow.drivers.v4l2 import V4l2Camera
 from aquaflow.drivers.v4l2.discovery import camera_nodes, modes
 from aquaflow.drivers.v4l2.system import Kernel
@@ -20,7 +20,8 @@ from aquaflow.errors import InputError
 from aquaflow.messages import Frame
 from tests.kernel.virtual_machine import in_guest
 
-BUS = "platform:vivid-000"
+BUS, PLANAR_BUS = "platform:vivid-000", "platform:vivid-001"
+"""Of the camera with pictures in one piece of memory, and of the one with the multi-planar API."""
 DRIVER = Path("/sys/bus/platform/drivers/vivid")
 SIZE = (320, 180)
 
@@ -66,11 +67,11 @@ def settled(camera: V4l2Camera) -> bool:
 
 @in_guest
 def test_of_vivids_many_nodes_only_one_is_a_camera() -> None:
-    assert len(list(Path("/dev").glob("video*"))) > 1
-    (node,) = camera_nodes(Kernel())
-    assert node.name == "vivid"
-    assert node.ids == (BUS,)
-    assert "YUYV up to 3840 x 2160" in modes(Kernel(), node.path)
+    assert len(list(Path("/dev").glob("video*"))) > 2
+    for node, bus in zip(camera_nodes(Kernel()), (BUS, PLANAR_BUS), strict=True):
+        assert node.name == "vivid"
+        assert node.ids == (bus,)
+        assert "YUYV up to 3840 x 2160" in modes(Kernel(), node.path)
 
 
 @in_guest
@@ -93,6 +94,27 @@ def test_a_format_that_it_has_not_is_told_and_replaced() -> None:
         (frame, *_) = received(camera, 3)
     assert frame.image.shape == (SIZE[1], SIZE[0], 3)
     assert "the camera gives 320 x 180" in camera.notes[0]
+
+
+@in_guest
+def test_every_arrangement_of_pixels_shows_the_same_picture() -> None:
+    """Colour bars, in one piece of memory, in one by the multi-planar API, and in two."""
+    shown = {}
+    for bus, pixels in [
+        *((BUS, each) for each in ("YUYV", "UYVY", "NV12")),
+        *((PLANAR_BUS, each) for each in ("YUYV", "NV12", "NM12")),
+    ]:
+        with vivid(device=bus, pixels=pixels) as camera:
+            frame = received(camera, 3)[-1]
+            assert camera.notes == [], (bus, pixels)
+        # Below the text, the bars stand still.
+        shown[bus, pixels] = frame.image[SIZE[1] // 2 :].astype(int)
+    first = shown[BUS, "YUYV"]
+    assert np.ptp(first) > 100
+    for which, image in shown.items():
+        # Where two bars meet, pixels share their colours differently.
+        assert np.median(np.abs(image - first)) <= 2, which
+        assert np.mean(np.abs(image - first) > 8) < 0.1, which
 
 
 @in_guest

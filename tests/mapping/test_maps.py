@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from typing import Any
 
 import numpy as np
 import pytest
 
+from aquaflow.clocks.deadline import Deadline
 from aquaflow.config import Config
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.gaussians.gaussians import GaussianMap
@@ -22,9 +24,9 @@ ASIDE = {0: Sim3(np.eye(3), np.array([1.0, 0.0, 0.0]))}
 """Moves of keyframes."""
 
 
-def two_maps() -> Maps:
-    maps = Maps(Config(mapping=settings()))
-    maps.mappers = {number: grown(settings()) for number in (0, 1)}
+def two_maps(config: Config | None = None) -> Maps:
+    maps = Maps(config or Config(mapping=settings()))
+    maps.mappers.update({number: grown(settings()) for number in (0, 1)})
     for mapper in maps.mappers.values():
         mapper.failures = maps.failures
     return maps
@@ -59,6 +61,27 @@ def test_two_sub_maps_become_one() -> None:
     assert list(maps.mappers) == [0]
     assert len(maps.mappers[0].gaussians) == count
     assert is_usable(maps.mappers[0])
+
+
+def test_maps_share_the_time_for_refining_by_their_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    maps, given = two_maps(), []
+    extra = [copy(view) for view in maps.mappers[1].views for _ in range(2)]
+    maps.mappers[1].views += extra  # three times as many
+
+    def refine(self: Mapper, progress: object, until: Deadline) -> None:
+        given.append(until.left_s)
+
+    monkeypatch.setattr(Mapper, "refine", refine)
+    maps.refine(until=Deadline(400.0, lambda: 7.0))
+    assert given == [100.0, 400.0]  # what the first leaves is the second's
+
+
+def test_the_configs_limit_is_for_all_maps_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = Config(mapping=settings(optimiser={"refine_seconds": 20.0}))
+    maps, given = two_maps(config), []
+    monkeypatch.setattr(Mapper, "refine", lambda self, _, until: given.append(until.left_s))
+    maps.refine()
+    assert 5.0 < given[0] <= 10.0
 
 
 def test_held_out_views_follow_their_keyframes() -> None:

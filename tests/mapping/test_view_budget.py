@@ -76,7 +76,7 @@ def test_a_place_that_is_seen_for_long_keeps_few_views_and_their_files(tmp_path:
     maps = Maps(SETTINGS, work=tmp_path)
     maps.views = ViewStore(tmp_path, resident=2)
     grown(maps, [view(i, keyframe=i // 40) for i in range(80)])
-    mapped = maps.mapper(0).views
+    mapped = maps.mappers[0].views
     assert len(mapped) == 2 * MOST
     assert [int(each.image[0, 0, 0]) for each in mapped] == indices(mapped)
     maps.views.save()

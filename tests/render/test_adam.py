@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 
 import pytest
@@ -9,7 +10,9 @@ import torch
 from torch import Tensor
 
 from aquaflow.errors import AquaFlowError
+from aquaflow.render import gsplat
 from aquaflow.render.adam import SelectiveAdam
+from aquaflow.render.adam_rows import fused_kernel
 
 
 class OneRow:
@@ -43,10 +46,33 @@ def gradients(groups: dict[str, tuple[Tensor, float]], seed: int) -> dict[str, T
     return {name: torch.randn(t.shape, generator=rng) for name, (t, _) in groups.items()}
 
 
-@pytest.fixture(params=["native", "torch"])
+def gsplats_kernel(
+    param: Tensor,
+    param_grad: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    valid: Tensor,
+    lr: float,
+    b1: float,
+    b2: float,
+    eps: float,
+) -> None:
+    """What gsplat's ``adam_kernel`` does, row by row."""
+    assert param.is_contiguous()
+    assert param_grad.is_contiguous()
+    assert len(valid) == len(param) > 0
+    g, m, v = param_grad[valid], exp_avg[valid], exp_avg_sq[valid]
+    m, v = b1 * m + (1 - b1) * g, b2 * v + (1 - b2) * g * g
+    param[valid] += -lr * m / (v.sqrt() + eps)
+    exp_avg[valid], exp_avg_sq[valid] = m, v
+
+
+@pytest.fixture(params=["native", "torch", "gsplat"])
 def implementation(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    if request.param == "torch":
+    if request.param != "native":
         monkeypatch.setattr("aquaflow.render.adam.library_or_none", lambda: None)
+    if request.param == "gsplat":
+        monkeypatch.setattr("aquaflow.render.adam.fused_kernel", lambda device: gsplats_kernel)
     return str(request.param)
 
 
@@ -54,14 +80,15 @@ def implementation(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPat
 def test_visible_rows_follow_adam_at_their_own_step_count() -> None:
     groups = tensors()
     rows = {k: [OneRow(r.flatten().tolist()) for r in t] for k, (t, _) in groups.items()}
-    adam = SelectiveAdam(groups, eps=1e-8)
+    adam = SelectiveAdam(groups)
     for it in range(12):
         visible = torch.rand(40, generator=torch.Generator().manual_seed(100 + it)) > 0.4
         grads = gradients(groups, it)
-        assert adam.step(visible, grads) == 0
+        adam.step(visible, grads)
+        assert adam.skipped == 0
         for name, (_, rate) in groups.items():
             for i in torch.nonzero(visible)[:, 0].tolist():
-                rows[name][i].step(grads[name][i].flatten().tolist(), rate, 1e-8)
+                rows[name][i].step(grads[name][i].flatten().tolist(), rate, adam.eps)
     for name, (tensor, _) in groups.items():
         wanted = torch.tensor([row.p for row in rows[name]]).view(tensor.shape)
         assert torch.allclose(tensor, wanted, rtol=1e-5, atol=1e-6)
@@ -89,7 +116,7 @@ def test_a_row_with_a_gradient_that_is_not_finite_is_left_alone_and_counted(bad:
     adam = SelectiveAdam(groups)
     grads = gradients(groups, 0)
     grads["features"][5, 1, 2] = bad
-    assert adam.step(torch.ones(40, dtype=torch.bool), grads) == 1
+    adam.step(torch.ones(40, dtype=torch.bool), grads)
     assert adam.skipped == 1
     assert adam.steps[5] == 0
     for name, (tensor, _) in groups.items():
@@ -128,7 +155,9 @@ def stepped(threads: int) -> tuple[dict[str, Tensor], Tensor]:
         grads = gradients(groups, it)
         broken = torch.randint(rows, (5,), generator=rng)
         grads["means"][broken, 1] = float("nan")
-        assert adam.step(seen, grads) == int(seen[broken].sum())
+        before = adam.skipped
+        adam.step(seen, grads)
+        assert adam.skipped - before == int(seen[broken].sum())
     return {name: tensor for name, (tensor, _) in groups.items()}, adam.steps
 
 
@@ -140,9 +169,13 @@ def test_the_result_does_not_depend_on_the_number_of_threads() -> None:
         assert all(torch.equal(got[name], wanted[name]) for name in wanted)
 
 
-def test_kernel_and_torch_take_the_same_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("kernel", [None, gsplats_kernel])
+def test_compiled_torch_and_gsplats_kernel_take_the_same_steps(
+    monkeypatch: pytest.MonkeyPatch, kernel: object
+) -> None:
     got, steps = stepped(2)
     monkeypatch.setattr("aquaflow.render.adam.library_or_none", lambda: None)
+    monkeypatch.setattr("aquaflow.render.adam.fused_kernel", lambda device: kernel)
     wanted, wanted_steps = stepped(2)
     assert torch.equal(steps, wanted_steps)
     for name in wanted:
@@ -163,3 +196,25 @@ def test_binding_tensors_of_another_length_is_refused() -> None:
         adam.bind({"means": torch.zeros(41, 3)})
     with pytest.raises(AquaFlowError, match="visible"):
         adam.step(torch.ones(41, dtype=torch.bool), {})
+
+
+def test_gsplats_kernel_has_the_signature_that_it_is_called_with() -> None:
+    wrapper = pytest.importorskip("gsplat.cuda._wrapper", reason="gsplat is not installed")
+    installed = inspect.signature(wrapper.adam).parameters
+    assert list(installed) == list(inspect.signature(gsplats_kernel).parameters)
+
+
+def test_without_cuda_there_is_no_fused_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gsplat, "available", lambda: False)
+    fused_kernel.cache_clear()
+    assert fused_kernel("cpu") is None
+    assert fused_kernel("cuda") is None
+    fused_kernel.cache_clear()
+
+
+def test_an_empty_map_takes_a_step_of_any_kind(
+    implementation: str,
+) -> None:
+    adam = SelectiveAdam({"means": (torch.zeros(0, 3), 1e-2)})
+    adam.step(torch.zeros(0, dtype=torch.bool), {"means": torch.zeros(0, 3)})
+    assert adam.skipped == 0

@@ -113,6 +113,21 @@ def test_kernels_that_do_not_compile_give_the_first_line_of_the_cause(
     assert "(ninja: build stopped)" in refusal()
 
 
+def test_what_the_package_says_while_it_compiles_is_not_among_our_output(
+    installed: Installed, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Compiling(ModuleType):
+        def __getattr__(self, name: str) -> object:
+            print("Setting up CUDA")
+            return object()
+
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", Compiling("gsplat.cuda._backend"))
+    assert gsplat.missing() is None
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert "Setting up CUDA" in printed.err
+
+
 @pytest.mark.skipif(native.find_compiler() is None, reason="no C++ compiler")
 def test_auto_takes_the_cpu_where_gsplat_cannot_draw(installed: Installed) -> None:
     installed.kernels(None)

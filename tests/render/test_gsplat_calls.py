@@ -19,6 +19,8 @@ from torch import Tensor
 from aquaflow.render import gsplat as ours
 from aquaflow.render.activity import active_pixels
 from aquaflow.render.contract import CPU, MIN_ALPHA, TILE_PX, Rendering, tile_grid
+from aquaflow.render.example_scene import SMALL, height_field
+from aquaflow.render.parity import differences, too_far
 from aquaflow.render.reference import alpha_at, blend_weights
 from tests.render.render_scenes import (
     HEIGHT,
@@ -146,6 +148,11 @@ def test_picture_alpha_and_gradients_are_those_of_the_reference(recorded: Record
     assert (got.image - wanted.image).abs().max() < 4 / 255  # ranges reach 4 m
     for key, gradient, expected in zip(NAMES, gradients, wanted_gradients, strict=True):
         assert relative_error(gradient, expected) < 0.05, key
+
+
+def test_the_doctors_scene_is_drawn_as_by_the_reference(recorded: Recorded) -> None:
+    assert too_far(differences(renderer(), height_field(SMALL))) is None
+    assert recorded.calls
 
 
 def drawn_with(active: Tensor | None) -> tuple[Rendering, list[Tensor]]:

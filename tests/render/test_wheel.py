@@ -17,6 +17,7 @@ from aquaflow.render.native import build as native
 
 ROOT = Path(__file__).resolve().parents[2]
 PARTS = ("pyproject.toml", "setup.py", "README.md", "LICENSE", "aquaflow", "drivers", "sim_drivers")
+PAGE = {".html", ".css", ".js", ".svg"}
 CROSS_COMPILER = "aarch64-linux-gnu-g++"
 NO_COMPILER = {"PATH": "/nonexistent", "CXX": "/nonexistent/g++"}
 
@@ -105,6 +106,12 @@ def libraries(wheel: Path) -> set[str]:
         return {Path(name).name for name in archive.namelist() if name.endswith(".so")}
 
 
+def page_files(wheel: Path) -> set[str]:
+    with zipfile.ZipFile(wheel) as archive:
+        names = {Path(name) for name in archive.namelist()}
+    return {name.name for name in names if name.parent.name == "page" and name.suffix != ".py"}
+
+
 def audited_platform(wheel: Path) -> str:
     """The tag that auditwheel finds by the libraries' symbols, independently of ``setup.py``."""
     audit = [sys.executable, "-m", "auditwheel", "show", str(wheel)]
@@ -143,6 +150,8 @@ def test_wheel_holds_every_variant_and_is_installed_without_a_compiler(tmp_path:
     assert re.fullmatch(rf"manylinux_2_\d+_{os.uname().machine}", platform)
     assert platform == audited_platform(wheel)
     assert libraries(wheel) == {f"libaquaflow_{isa}.so" for isa in native.target_isas(compiler)}
+    page = ROOT / "aquaflow" / "service" / "health" / "page"
+    assert page_files(wheel) == {file.name for file in page.iterdir() if file.suffix in PAGE}
     renderer, path = renderer_of(wheel, tmp_path)
     assert renderer == "cpu 0"
     assert Path(path).is_relative_to(tmp_path / "installed")

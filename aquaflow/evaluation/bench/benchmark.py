@@ -77,11 +77,15 @@ def benchmark(
     out: Path,
     progress: Progress,
     perform: Perform = in_process,
+    device: str | None = None,
 ) -> dict[str, Any]:
-    """Run everything; writes bench.json and bench.png into ``out`` and returns the former."""
+    """Run everything; writes bench.json and bench.png into ``out`` and returns the former.
+
+    Maps and learned priors run on ``device``, cpu or cuda, if it is given; peers have no say in it.
+    """
     out.mkdir(parents=True, exist_ok=True)
-    described = machine.describe()
-    rows = run_all(jobs_for(scenes, contenders, repeats, out), progress, perform)
+    described = machine.describe(device)
+    rows = run_all(jobs_for(scenes, contenders, repeats, out, device), progress, perform)
     result = {"machine": described, "runs": rows}
     write_json(out / JSON_FILE, result)
     draw(rows, out / PICTURE_FILE, caption(described))
@@ -91,7 +95,7 @@ def benchmark(
 def caption(described: dict[str, Any]) -> str:
     """What the picture says about where it comes from."""
     return (
-        f"AquaFlow {described['aquaflow']} on {described['processor']}, {described['cores']} "
-        f"cores, {described['date']}; every run is one marker; "
+        f"AquaFlow {described['aquaflow']} on {machine.in_words(described)}, "
+        f"{described['date']}; every run is one marker; "
         "peers find poses only, AquaFlow's time holds the map too"
     )

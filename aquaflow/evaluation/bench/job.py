@@ -10,6 +10,9 @@ from aquaflow.config import Config, parse_config
 from aquaflow.config.presets import merged, preset
 from aquaflow.evaluation.bench.scene import BenchmarkScene
 
+RENDERERS = {"cpu": "cpu", "cuda": "gsplat"}
+"""What draws on each device."""
+
 
 @dataclass(frozen=True)
 class Job:
@@ -24,12 +27,17 @@ class Job:
     overrides: dict[str, Any] | None = None
     """Of the config, on top of the preset."""
     repeat: int = 0
+    device: str | None = None
+    """cpu or cuda: map and learned prior run there or the run fails; None: as the preset says."""
 
     def config(self) -> Config:
         """The scene's settings, then the preset's, then this job's own."""
         wanted = merged(merged(Config().model_dump(), self.scene.overrides), preset(self.preset))
         steps = wanted["mapping"]["optimiser"]["refine_steps"]
         wanted["mapping"]["optimiser"]["refine_steps"] = round(self.scene.refine_share * steps)
+        if self.device is not None:
+            wanted["mapping"]["renderer"] = RENDERERS[self.device]
+            wanted["prior"]["device"] = self.device
         return parse_config(merged(wanted, self.overrides or {}), f"benchmark of {self.scene.name}")
 
     def to_text(self) -> str:

@@ -69,12 +69,13 @@ def describe_machine(machine: dict[str, Any], rows: Sequence[dict[str, Any]]) ->
     """One paragraph on the machine, its load, the versions and the date."""
     loads = [row["load"] for row in rows if row["load"] is not None]
     busy = f" Load while it ran: {min(loads):.1f} to {max(loads):.1f}." if loads else ""
+    gpu = f" GPU: {machine['gpu']}." if machine["gpu"] else ""
     packages = ", ".join(f"{name} {found}" for name, found in machine["packages"].items() if found)
     repeats = 1 + max(row["repeat"] for row in rows)
     times = "once" if repeats == 1 else f"{repeats} times, interleaved; medians ± half the range"
     return (
         f"Written by `aquaflow bench` on {machine['date']}; every run {times}. Machine: "
         f"{machine['processor']}, {machine['cores']} cores, {machine['memory_gb']} GB, "
-        f"{machine['system']}.{busy} AquaFlow {machine['aquaflow']}, Python {machine['python']}, "
-        f"{packages}."
+        f"{machine['system']}.{gpu}{busy} AquaFlow {machine['aquaflow']}, Python "
+        f"{machine['python']}, {packages}."
     )

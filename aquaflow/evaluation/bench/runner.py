@@ -27,12 +27,13 @@ LIMIT_S = 3600.0
 
 KEYS = (
     "frames", "tracked", "lost", "skipped", "keyframes", "mapping_frames", "common_frames",
-    "gaussians", "wall_s", "cpu_s", "fps", "stage_ms", "peak_rss_mb", "psnr", "ssim", "lpips",
-    "lpips_reason", "heldout_frames", "ate_rmse_m_se3", "ate_rmse_m_sim3", "ate_pct_se3",
-    "ate_pct_sim3", "rpe", "drift_pct", "depth_absrel", "medium_error", "hue_shift_deg",
+    "gaussians", "wall_s", "cpu_s", "fps", "stage_ms", "peak_rss_mb", "psnr", "ssim",
+    "psnr_as_tracked", "ssim_as_tracked", "lpips", "lpips_reason", "heldout_frames",
+    "ate_rmse_m_se3", "ate_rmse_m_sim3", "ate_pct_se3", "ate_pct_sim3",
+    "rpe", "drift_pct", "depth_absrel", "medium_error", "hue_shift_deg",
     "chroma_difference", "lightness_ratio", "restored_psnr", "raw_psnr",
     *(f"restored_psnr_{name}" for name in NAMES), "restored_peer_reasons",
-    "ms_per_frame", "time_to_first_pose_s", "features",
+    "ms_per_frame", "time_to_first_pose_s", "features", "renderer", "device", "gpu_mb",
 )  # fmt: skip
 """In every row; null where the run has no such thing."""
 
@@ -55,7 +56,11 @@ class Contender:
 
 
 def jobs_for(
-    scenes: Sequence[BenchmarkScene], contenders: Sequence[Contender], repeats: int, out: Path
+    scenes: Sequence[BenchmarkScene],
+    contenders: Sequence[Contender],
+    repeats: int,
+    out: Path,
+    device: str | None = None,
 ) -> list[Job]:
     """All runs in the order of running.
 
@@ -67,10 +72,9 @@ def jobs_for(
         for position, scene in enumerate(scenes):
             turn = (position + repeat) % len(contenders)
             for contender in [*contenders[turn:], *contenders[:turn]]:
-                folder = out / "dives" / f"{_file_name(scene.name)}_{contender.name}_{repeat}"
-                jobs.append(
-                    Job(scene, contender.preset, str(folder), contender.peer, repeat=repeat)
-                )
+                name, peer = f"{_file_name(scene.name)}_{contender.name}_{repeat}", contender.peer
+                folder = str(out / "dives" / name)
+                jobs.append(Job(scene, contender.preset, folder, peer, None, repeat, device))
     return jobs
 
 

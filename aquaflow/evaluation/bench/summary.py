@@ -115,6 +115,7 @@ COLUMNS = (
     ATE_PCT,
     Column("RPE %", _part("rpe", "translation_pct"), ".2f"),
     PSNR,
+    Column("as tracked dB", _number("psnr_as_tracked"), ".2f"),
     Column("SSIM", lambda row: row["ssim"], ".3f"),
     Column("depth %", lambda row: _times_100(row["depth_absrel"]), ".1f"),
     Column("water %", attenuation_error_pct, ".0f"),
@@ -127,6 +128,7 @@ COLUMNS = (
     ),
     Column("Gaussians", lambda row: row["gaussians"], ".0f"),
     Column("MB", lambda row: row["peak_rss_mb"], ".0f"),
+    Column("GPU MB", _number("gpu_mb"), ".0f"),
 )
 """Columns of the table; the three above are the axes of the picture too."""
 NOTES = (

@@ -33,13 +33,20 @@ def perform(job: Job) -> dict[str, Any]:
     if job.peer is not None:
         metrics = run_peer(job.peer, scene, job.config(), out)
     else:
-        from aquaflow.dive.replay import map_recording  # torch: two seconds that no peer needs
+        import torch  # two seconds that no peer needs
 
+        from aquaflow.dive.replay import map_recording
+        from aquaflow.evaluation.bench.meter import meter_of
+
+        meter = meter_of(torch.device(job.device or "cpu"))
         calibration = None if scene.calibration is None else load_camera(Path(scene.calibration))
         recording = open_recording(Path(scene.recording), fps=job.config().source.fps)
         metrics = map_recording(
-            recording, scene.name, out, job.config(), calibration, overwrite=True
+            recording, scene.name, out, job.config(), calibration, True, settle=meter.settle
         ).metrics
+        metrics["gpu_mb"] = meter.peak_mb()
+        if job.device == "cuda" and metrics["device"] == "cpu":
+            raise NotMappedError(f"{scene.name}: the GPU failed, and the map went on on the CPU")
         if job.config().mapping.enabled and metrics["gaussians"] == 0:
             raise NotMappedError(f"{scene.name}: {'; '.join(metrics['warnings'])}")
     peak_mb = peak_memory_mb()  # before the evaluation, whose memory is not the run's

@@ -23,9 +23,9 @@ def gradients_that_are_not_finite(check: Check, seed: int) -> None:
     optimiser = SelectiveAdam({"means": (tensor, 1e-2)}, threads=1)
     gradient = torch.ones(6, 3)
     gradient[0, 0], gradient[1, 1], gradient[2, 2] = float("nan"), float("inf"), 1e30
-    skipped = optimiser.step(torch.ones(6, dtype=torch.bool), {"means": gradient})
+    optimiser.step(torch.ones(6, dtype=torch.bool), {"means": gradient})
     check.finite("parameters", tensor, *optimiser.second_moments.values())
-    check.true("three rows are skipped", skipped == 3)
+    check.true("three rows are skipped", optimiser.skipped == 3)
     check.true("skipped rows stay", bool((tensor[:3] == before[:3]).all()))
     check.true("sound rows move", bool((tensor[3:] != before[3:]).all()))
 

@@ -9,10 +9,11 @@ from torch import Tensor
 
 from aquaflow.config import MediumConfig
 from aquaflow.evaluation.stress.case import Check, case
-from aquaflow.mapping.gaussians.gaussians import radiance, raw_colour
+from aquaflow.mapping.gaussians.gaussians import raw_colour
 from aquaflow.mapping.optimisation.losses import depth_loss
 from aquaflow.mapping.water.image_formation import Water
 from aquaflow.mapping.water.medium import Medium
+from aquaflow.render.activation import radiance
 from aquaflow.render.water import compose_water, compose_water_torch
 
 RATES = (0.0, 1e-8, 0.01, 0.5, 5.0, 50.0)

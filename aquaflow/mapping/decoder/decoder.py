@@ -83,7 +83,7 @@ class Decoder(nn.Module):
         shared = shared.index_select(0, tokens.groups)
         sizes, counts = tokens.sizes, [count for count, _ in tokens.buckets]
         sound = None
-        if not (_all_sound(local) and _all_sound(shared)):
+        if not _all_sound(local, shared):
             per_group = _sound_groups(tokens, local, shared)
             sound = per_group.repeat_interleave(tokens.places_of_groups)
             local = torch.where(sound[:, None], local, 0.0)
@@ -135,7 +135,7 @@ class Decoder(nn.Module):
         residuals = torch.tanh(raw) * self.limits
         seen = is_sound(o)
         sound = seen if trunk.sound is None else seen & trunk.sound[places]
-        return residuals if bool(sound.all()) else residuals * sound[:, None]
+        return residuals * sound[:, None]
 
 
 class GroupAttention(nn.Module):
@@ -202,13 +202,12 @@ def apply_residuals(
 
 
 def _all_sound(
-    features: Tensor,  # [N, F]
+    *features: Tensor,  # each [..., F]
 ) -> bool:
     """Every feature is a number of sensible size."""
-    if features.numel() == 0:
-        return True
-    low, high = torch.aminmax(features.detach())  # NaN if any is
-    return bool(torch.maximum(-low, high) < LARGEST_FEATURE)
+    ranges = [torch.aminmax(each.detach()) for each in features if each.numel()]  # NaN if any is
+    largest = [torch.maximum(-low, high) for low, high in ranges]
+    return not largest or bool((torch.stack(largest) < LARGEST_FEATURE).all())
 
 
 def _sound_groups(

@@ -53,22 +53,30 @@ def visible_tokens(
     visible: Tensor,  # [N] bool
 ) -> Tokens:
     """All Gaussians of the groups of which one is visible: its neighbours are its context."""
-    seen = torch.zeros(len(groups), dtype=torch.bool, device=groups.device)
-    seen[groups.group[visible]] = True
-    chosen = torch.nonzero(seen)[:, 0]
-    widths = (groups.fill[chosen] + BUCKET - 1).div(BUCKET, rounding_mode="floor") * BUCKET
-    widths, order = torch.sort(widths, stable=True)
-    chosen = chosen[order]
-    lengths, counts = torch.unique_consecutive(widths, return_counts=True)
-    sizes = groups_out(counts)
-    buckets = tuple(zip(sizes, groups_out(lengths), strict=True))
+    seen = torch.zeros(len(groups), dtype=torch.int64, device=groups.device)
+    chosen = torch.nonzero(seen.index_add_(0, groups.group, visible.long()))[:, 0]
+    units = (groups.fill[chosen] + BUCKET - 1).div(BUCKET, rounding_mode="floor")
+    units, order = torch.sort(units, stable=True)
+    chosen, buckets = chosen[order], _buckets(groups, units)
     tables = [chosen[:0]]
-    for (_, width), members in zip(buckets, chosen.split_with_sizes(sizes), strict=True):
-        tables.append(_table(groups, members, width).reshape(-1))
+    members = chosen.split_with_sizes([count for count, _ in buckets])
+    for (_, width), each in zip(buckets, members, strict=True):
+        tables.append(_table(groups, each, width).reshape(-1))
     table = torch.cat(tables)
-    first = groups.table[chosen, 0].repeat_interleave(widths)
+    first = groups.table[chosen, 0].repeat_interleave(units * BUCKET, output_size=len(table))
     valid = table != EMPTY
     return Tokens(torch.where(valid, table, first), valid, chosen, buckets)
+
+
+def _buckets(
+    groups: VoxelGroups,
+    units: Tensor,  # [B] int64 places of each group, in multiples of BUCKET
+) -> tuple[tuple[int, int], ...]:
+    """(groups, places a group), of the groups that are laid out; the host has to know."""
+    most = -(-groups.table.shape[1] // BUCKET)
+    counts = torch.zeros(most + 1, dtype=torch.int64, device=units.device)
+    counts.index_add_(0, units, torch.ones_like(units))
+    return tuple((n, BUCKET * unit) for unit, n in enumerate(groups_out(counts)) if n > 0)
 
 
 def _table(

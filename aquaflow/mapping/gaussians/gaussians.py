@@ -7,10 +7,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from aquaflow.render.activation import COLOUR_SHARPNESS, radiance
 from aquaflow.render.contract import CPU
-
-COLOUR_SHARPNESS = 10.0
-"""Softplus sharpness that keeps radiance positive and is the identity above about 0.3."""
 
 MIN_RADIANCE = 1e-3
 """Darker colours start here: black itself has no finite raw colour."""
@@ -83,10 +81,11 @@ class GaussianMap:
         mask: Tensor,  # [N] bool
     ) -> None:
         """Drop the Gaussians where ``mask`` is False."""
+        rows = torch.nonzero(mask)[:, 0]  # once for all tensors
         self._replace(
-            {name: self.parameters[name][mask].contiguous() for name in self.NAMES},
-            self.keyframes[mask],
-            self.local_features[mask].contiguous(),
+            {name: self.parameters[name][rows].contiguous() for name in self.NAMES},
+            self.keyframes[rows],
+            self.local_features[rows].contiguous(),
         )
 
     def _grow(
@@ -112,22 +111,16 @@ class GaussianMap:
         Raises:
             ArithmeticError: a Gaussian is not finite; one alone would spoil every later step.
         """
-        if not all(bool(torch.isfinite(tensor).all()) for tensor in parameters.values()):
+        finite = [torch.isfinite(tensor).all() for tensor in parameters.values()]
+        if not bool(torch.stack(finite).all()):
             raise ArithmeticError("a Gaussian is not finite")
         self.parameters, self.keyframes, self.local_features = parameters, keyframes, features
-
-
-def radiance(
-    raw: Tensor,  # [..., 3]
-) -> Tensor:
-    """Positive radiance of raw colours."""
-    return torch.nn.functional.softplus(raw, beta=COLOUR_SHARPNESS)
 
 
 def raw_colour(
     colour: Tensor,  # [..., 3] >= 0
 ) -> Tensor:
-    """Raw colours whose :func:`radiance` is ``colour``."""
+    """Raw colours whose :func:`~aquaflow.render.activation.radiance` is ``colour``."""
     # softplus_beta^-1(y) = y + log(1 - exp(-beta y)) / beta, with y kept off zero.
     y = colour.clamp_min(MIN_RADIANCE)
     return y + torch.log(-torch.expm1(-COLOUR_SHARPNESS * y)) / COLOUR_SHARPNESS

@@ -28,6 +28,21 @@ def tiles_to_draw(view: View, config: OptimiserConfig) -> Tensor | None:
     return scene if explained is None else scene & ~explained
 
 
+def is_nothing_to_draw(
+    view: View,
+    active: Tensor | None,  # [rows, columns] bool, from tiles_to_draw
+    config: OptimiserConfig,
+) -> bool:
+    """True if no tile is active; between two full looks the device is asked only once."""
+    if active is None:
+        return False
+    if view.looks % config.full_look_every == 0:
+        return not bool(active.any())
+    if view.all_explained is None:
+        view.all_explained = not bool(active.any())
+    return view.all_explained
+
+
 @torch.no_grad()
 def record_explained(
     view: View,
@@ -40,5 +55,5 @@ def record_explained(
         if view.mask is not None:
             error *= view.scene_mask()
         tiles = F.avg_pool2d(error[None], TILE_PX, ceil_mode=True)[0]
-        view.explained = tiles < config.noise_floor
+        view.explained, view.all_explained = tiles < config.noise_floor, None
     view.looks += 1

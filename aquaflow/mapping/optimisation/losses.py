@@ -43,7 +43,7 @@ def depth_loss(
 
 
 def scale_loss(
-    scales: Tensor,  # [N, 3]
+    log_scales: Tensor,  # [N, 3]
 ) -> Tensor:
     """L_scale: mean volume, which keeps Gaussians from growing over what they do not explain."""
-    return scales.prod(dim=-1).mean()
+    return torch.exp(log_scales.sum(dim=-1)).mean()

@@ -13,12 +13,18 @@ from torch import Tensor
 
 from aquaflow.config import MappingConfig
 from aquaflow.mapping.decoder.decode import DECODED
-from aquaflow.mapping.optimisation.active_tiles import record_explained, tiles_to_draw
+from aquaflow.mapping.optimisation.active_tiles import (
+    is_nothing_to_draw,
+    record_explained,
+    tiles_to_draw,
+)
 from aquaflow.mapping.optimisation.objective import Objective
+from aquaflow.mapping.optimisation.schedule import Rates
 from aquaflow.mapping.rendering import Shown
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.views import View, refine_pose
 from aquaflow.render.adam import SelectiveAdam
+from aquaflow.render.dense_adam import DenseAdam
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +45,7 @@ class MapOptimiser:
         self._objective = objective
         self.adam = self._new_adam()
         """Optimiser of the Gaussians' parameters."""
-        self.medium_adam = torch.optim.Adam(scene.medium.learned_at(config.medium))
+        self.medium_adam = DenseAdam(scene.medium.learned_at(config.medium))
         self.steps = 0
         """Steps taken."""
         self.undone = 0
@@ -49,6 +55,14 @@ class MapOptimiser:
         rates, parameters = self.config.optimiser, self.scene.gaussians.parameters
         groups = {name: (tensor, getattr(rates, name)) for name, tensor in parameters.items()}
         return SelectiveAdam(groups, rates.betas, threads=self.scene.renderer.threads)
+
+    def slow_down(self, rates: Rates) -> None:
+        """Let the following steps go so far."""
+        for name in self.scene.gaussians.NAMES:
+            factor = rates.means if name == "means" else rates.others
+            self.adam.learning_rates[name] = factor * float(getattr(self.config.optimiser, name))
+        if self.scene.neural is not None:
+            self.scene.neural.slow_down(rates.means)
 
     # --- one step -----------------------------------------------------------------------------
 
@@ -64,9 +78,10 @@ class MapOptimiser:
             for name, tensor in self.scene.gaussians.parameters.items()
         }
         viewmat = view.viewmat().requires_grad_(refine_pose)
-        self.medium_adam.zero_grad(set_to_none=True)
+        self.medium_adam.forget_gradients()
         active = tiles_to_draw(view, self.config.optimiser)
-        if self.config.optimiser.skip_explained and active is not None and not active.any():
+        config = self.config.optimiser
+        if config.skip_explained and is_nothing_to_draw(view, active, config):
             view.looks += 1
             return
         neural = self.scene.neural
@@ -156,7 +171,10 @@ class MapOptimiser:
         all Gaussians are finite."""
         if self.scene.neural is not None:
             self.scene.neural.make_whole()
-        if len(self.adam.steps) != len(self.scene.gaussians):
+        missing = len(self.scene.gaussians) - len(self.adam.steps)
+        if missing > 0:  # Gaussians are added before their rows, and dropped before them too
+            self.adam.extend(missing)
+        elif missing < 0:
             self.adam = self._new_adam()
         self.adam.bind(self.scene.gaussians.parameters)
         self.drop_unsound()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import torch
 from torch import Tensor
 
 from aquaflow.config import LossConfig
@@ -44,12 +43,8 @@ class Objective:
             expected = inverse_range / view.T_wc.scale
             loss = loss + config.depth * depth_loss(shown.z, shown.alpha, expected, trust)
         if config.scale > 0.0:
-            loss = loss + config.scale * scale_loss(torch.exp(parameters["log_scales"]))
+            loss = loss + config.scale * scale_loss(parameters["log_scales"])
         return loss
-
-    def photometric(self, view: View, shown: Shown) -> Tensor:
-        """L1 and SSIM alone, nothing masked but the vehicle."""
-        return self._pictures(view, shown, view.target(), view.scene_mask())
 
     def _pictures(
         self,

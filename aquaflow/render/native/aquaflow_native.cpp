@@ -7,6 +7,7 @@
 #include <new>
 #include <stdexcept>
 
+#include "activate.h"
 #include "adam.h"
 #include "blend.h"
 #include "constants.h"
@@ -154,6 +155,31 @@ AQ_EXPORT int aq_compose_water_backward(const float* drawn, const float* alpha, 
     compose_water_backward({drawn, alpha, water, pixels},
                            std::min(std::max(threads, 1), kMaxThreads), g_image, g_range, g_drawn,
                            g_alpha, g_water);
+  });
+}
+
+// See activate.h: the raw parameters of ``count`` Gaussians give what is drawn of them.
+AQ_EXPORT int aq_activate(const float* means, const float* log_scales, const float* opacity_logits,
+                          const float* raw_colours, const float* centre, int count, int threads,
+                          float* scales, float* opacities, float* colours) {
+  return guarded([&] {
+    activate({means, log_scales, opacity_logits, raw_colours, centre, count},
+             std::min(std::max(threads, 1), kMaxThreads), scales, opacities, colours);
+  });
+}
+
+AQ_EXPORT int aq_activate_backward(const float* means, const float* log_scales,
+                                   const float* opacity_logits, const float* raw_colours,
+                                   const float* centre, int count, int threads, const float* scales,
+                                   const float* colours, const float* g_scales,
+                                   const float* g_opacities, const float* g_colours, float* g_means,
+                                   float* g_log_scales, float* g_opacity_logits,
+                                   float* g_raw_colours) {
+  return guarded([&] {
+    activate_backward(
+        {means, log_scales, opacity_logits, raw_colours, centre, count},
+        std::min(std::max(threads, 1), kMaxThreads), scales, colours,
+        {g_scales, g_opacities, g_colours, g_means, g_log_scales, g_opacity_logits, g_raw_colours});
   });
 }
 

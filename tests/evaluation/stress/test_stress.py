@@ -37,10 +37,16 @@ def _few_threads() -> Iterator[None]:
 
 
 ALL = suite.cases(long=True)
-SHORT = [case for case in ALL if not case.long]
+SECONDS = {"half_a_minute_at_one_place", "tracked_frames", "snow"}
+"""Cases of the short form that take longer than all others together."""
+SHORT = [
+    pytest.param(case, id=case.name, marks=[pytest.mark.slow] if case.name in SECONDS else [])
+    for case in ALL
+    if not case.long
+]
 
 
-@pytest.mark.parametrize("case", SHORT, ids=lambda case: case.name)
+@pytest.mark.parametrize("case", SHORT)
 def test_a_case_of_the_short_form_passes(case: suite.Case) -> None:
     result = suite.run_case(case, seed=0)
     assert result.outcome.passed, f"{result.outcome.detail}; reproduce with: {result.command}"
@@ -122,7 +128,7 @@ GUARDS: list[tuple[str, list[tuple[object, str, object]]]] = [
     pytest.param(
         "snow",
         [(current_keyframe.KeyframeTracker, "hidden", lambda *_: False)],
-        marks=pytest.mark.ci,
+        marks=pytest.mark.slow,
     ),
 ]
 

@@ -90,6 +90,7 @@ def test_a_pose_of_another_scale_changes_nothing() -> None:
     assert other.metres_per_unit == pytest.approx(plain.metres_per_unit, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_stated_sigma_is_true() -> None:
     rng, cameras, squares = np.random.default_rng(5), around(5), []
     points = marker_corners(0.16)

@@ -50,9 +50,9 @@ def is_whole(mapper: Mapper) -> bool:
     decoder, count = decoder_of(mapper), len(mapper.gaussians)
     groups = decoder.groups
     placed = bool((groups.table[groups.group, groups.slot] == torch.arange(count)).all())
-    features = decoder._local.params["local"] is mapper.gaussians.local_features
-    rows = len(mapper.gaussians.local_features) == count == len(decoder._local.steps)
-    shared = len(groups) == len(decoder._shared.steps)
+    features = decoder.optimisers.local.params["local"] is mapper.gaussians.local_features
+    rows = len(mapper.gaussians.local_features) == count == len(decoder.optimisers.local.steps)
+    shared = len(groups) == len(decoder.optimisers.shared.steps)
     return placed and features and rows and shared and int((groups.table != EMPTY).sum()) == count
 
 
@@ -90,12 +90,12 @@ def test_a_window_of_views_learns_at_its_end_and_prunings_end_it() -> None:
     mapper.optimise(1)
     ahead = [mapper.views[i] for i in (0, 1, 2)]
     decoder.expect(ahead)
-    learned = decoder._local.steps.clone()
+    learned = decoder.optimisers.local.steps.clone()
     for view in ahead:
         mapper.optimiser.step(view, refine_pose=False)
-        assert torch.equal(decoder._local.steps, learned)
+        assert torch.equal(decoder.optimisers.local.steps, learned)
     decoder.settle()
-    assert bool((decoder._local.steps > learned).any())
+    assert bool((decoder.optimisers.local.steps > learned).any())
     mapper.gaussians.parameters["opacity_logits"][:7] = -8.0
     mapper.refine()
     assert len(mapper.gaussians) <= len(features) - 7
@@ -206,7 +206,7 @@ def test_a_gradient_that_is_no_number_does_not_reach_the_weights() -> None:
     assert window.hidden.grad is not None
     window.hidden.grad[0, 0] = math.nan
     decoder.settle()
-    assert decoder.skipped == 1
+    assert decoder.optimisers.skipped == 1
     after = decoder.decoder.parameters()
     assert all(torch.equal(a, b) for a, b in zip(after, before, strict=True))
     assert bool(torch.isfinite(mapper.gaussians.local_features).all())

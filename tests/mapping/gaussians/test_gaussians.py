@@ -6,7 +6,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aquaflow.mapping.gaussians.gaussians import GaussianMap, radiance, raw_colour
+from aquaflow.mapping.gaussians.gaussians import GaussianMap, raw_colour
+from aquaflow.render.activation import radiance
 
 
 def numbered(start: int, count: int) -> dict[str, torch.Tensor]:

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from aquaflow.config import InsertionConfig
-from aquaflow.mapping.gaussians.gaussians import radiance
 from aquaflow.mapping.gaussians.insertion import (
     insertion_probability,
     new_gaussians,
@@ -17,6 +16,7 @@ from aquaflow.mapping.gaussians.insertion import (
     structure,
     thin,
 )
+from aquaflow.render.activation import radiance
 from tests.mapping.mapping_scenes import CAMERA, pose, view_of
 
 SIZE = (CAMERA.height, CAMERA.width)

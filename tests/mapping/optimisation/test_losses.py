@@ -77,7 +77,7 @@ def test_a_range_of_zero_makes_the_depth_loss_large_and_not_infinite() -> None:
 
 
 def test_the_scale_loss_is_the_mean_volume_and_its_gradient_shrinks() -> None:
-    scales = torch.tensor([[0.1, 0.2, 0.3], [1.0, 1.0, 2.0]], requires_grad=True)
+    scales = torch.tensor([[0.1, 0.2, 0.3], [1.0, 1.0, 2.0]]).log().requires_grad_()
     loss = scale_loss(scales)
     torch.autograd.backward(loss)
     assert float(loss.detach()) == pytest.approx((0.006 + 2.0) / 2)

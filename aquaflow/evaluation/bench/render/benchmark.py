@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from aquaflow.errors import AquaFlowError, InputError
 from aquaflow.evaluation.bench import machine
+from aquaflow.evaluation.bench.meter import require
 from aquaflow.evaluation.bench.render.accuracy import gradient_errors
 from aquaflow.evaluation.bench.render.contenders import (
     BenchmarkedRenderer,
@@ -21,8 +22,9 @@ from aquaflow.evaluation.bench.render.parts import TimedPart, parts_of, time_par
 from aquaflow.evaluation.bench.render.peak import Peak, measure_peak
 from aquaflow.evaluation.bench.render.picture import draw
 from aquaflow.evaluation.bench.render.rows import Row, row_of
-from aquaflow.evaluation.bench.render.scene import SMALL, Size, SplatScene, height_field
 from aquaflow.evaluation.bench.render.timing import Sample, interleaved
+from aquaflow.render.contract import CPU
+from aquaflow.render.example_scene import SMALL, Size, SplatScene, height_field
 from aquaflow.storage.atomic import write_json
 
 JSON_FILE, PICTURE_FILE = "render_bench.json", "render_bench.png"
@@ -32,32 +34,49 @@ FAILURES = (AquaFlowError, MemoryError, RuntimeError, ImportError)
 """Errors that drop one contender's row at a size and no other row; torch and gsplat raise
 RuntimeError when the device is full or a kernel does not compile."""
 
+KERNELS = ("cpu", "gsplat")
+"""Renderers whose gradients are held against the reference's."""
+NO_PEAK = Peak({}, "no measurement")
+"""Of a GPU: what it could do at most is not estimated."""
+
 Progress = Callable[[str, int, int | None], None]
+C = TypeVar("C", bound=BenchmarkedRenderer)
 
 
 def bench_render(
-    sizes: Sequence[Size], repeats: int, out: Path, opensplat: str | None, progress: Progress
+    sizes: Sequence[Size],
+    repeats: int,
+    out: Path,
+    opensplat: str | None,
+    progress: Progress,
+    device: str | None = None,
 ) -> dict[str, Any]:
-    """Time everything that runs here; writes the result and its picture into ``out``.
+    """Time everything that runs here, or what runs on ``device``, cpu or cuda; writes the result
+    and its picture into ``out``.
 
     Raises:
         InputError: ``out`` cannot be written.
+        AquaFlowError: nothing draws on the device asked for.
     """
+    require(device)
     _make_folder(out)
-    contenders, notes = contenders_here(opensplat)
-    peak = measure_peak(thread_counts())
+    contenders, notes = contenders_here(opensplat, device)
+    counts = (1,) if device == "cuda" else thread_counts()
+    peak = NO_PEAK if device == "cuda" else measure_peak(counts)
     described = {
-        **machine.describe(),
+        **machine.describe(device),
         "peak_gflop_per_s": {str(count): rate / 1e9 for count, rate in peak.flop_per_s.items()},
         "peak_method": peak.method,
     }
-    kernels = [c.renderer for c in contenders if isinstance(c, Timed) and c.name == "cpu"]
-    errors = gradient_errors(kernels, height_field(SMALL))
+    kernels = [c for c in contenders if isinstance(c, Timed) and c.name in KERNELS]
+    working = _that_run(kernels, height_field(SMALL), notes)
+    errors = gradient_errors([c.renderer for c in working], height_field(SMALL))
+    drawn_on = kernels[0].renderer.device if device == "cuda" else CPU
     rows = time_sizes(contenders, (SMALL, *sizes), repeats, peak, notes, progress)
     result = {
         "machine": described,
         "rows": rows,
-        "parts": _timed_parts(parts_of(thread_counts()), repeats, progress),
+        "parts": _timed_parts(parts_of(counts, device=drawn_on), repeats, progress),
         "gradient_rel_error": errors,
         "notes": notes,
     }
@@ -99,9 +118,7 @@ def time_sizes(
     return rows
 
 
-def _that_run(
-    contenders: Sequence[BenchmarkedRenderer], scene: SplatScene, notes: list[str]
-) -> list[BenchmarkedRenderer]:
+def _that_run(contenders: Sequence[C], scene: SplatScene, notes: list[str]) -> list[C]:
     """Those that get through the scene once: a run that is not counted."""
     return [c for c in contenders if _attempt(c, scene, notes) is not None]
 
@@ -147,6 +164,6 @@ def _timed_parts(
 def caption(described: dict[str, Any]) -> str:
     """What the picture says about where it comes from."""
     return (
-        f"AquaFlow {described['aquaflow']} on {described['processor']}, {described['cores']} "
-        f"cores, {described['date']}, load {described['load']}; medians on the wall"
+        f"AquaFlow {described['aquaflow']} on {machine.in_words(described)}, "
+        f"{described['date']}, load {described['load']}; medians on the wall"
     )

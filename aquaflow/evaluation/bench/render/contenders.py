@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from aquaflow.errors import AquaFlowError
+from aquaflow.evaluation.bench.meter import Meter
 from aquaflow.evaluation.bench.render.opensplat import NOTE, OpenSplat
-from aquaflow.evaluation.bench.render.scene import SMALL, Size, SplatScene
 from aquaflow.evaluation.bench.render.timing import Clock, Sample, time_renderer, torch_threads
 from aquaflow.render.contract import Renderer
 from aquaflow.render.cpu import CpuRenderer
+from aquaflow.render.example_scene import SMALL, Size, SplatScene
 from aquaflow.render.gsplat import GsplatRenderer
 from aquaflow.render.library import NativeUnavailableError
 from aquaflow.render.native.build import supported_isas
@@ -63,6 +64,7 @@ class Timed:
     most: int | None = None
     """Gaussians times pixels; None: any. What has a limit is slow."""
     clock: Clock | None = None
+    meter: Meter | None = None
 
     @property
     def name(self) -> str:
@@ -90,8 +92,7 @@ class Timed:
         # The kernels have a pool of their own, and idle threads of torch spin on its processors.
         ours = isinstance(self.renderer, CpuRenderer)
         with torch_threads(1 if ours else self.threads):
-            device = "cuda" if self.isa == "cuda" else "cpu"
-            return time_renderer(self.renderer, scene, device, self.clock)
+            return time_renderer(self.renderer, scene, self.clock, self.meter)
 
 
 def thread_counts() -> tuple[int, ...]:
@@ -99,8 +100,28 @@ def thread_counts() -> tuple[int, ...]:
     return tuple(sorted({1, len(os.sched_getaffinity(0))}))
 
 
-def contenders_here(opensplat: str | None = None) -> tuple[list[BenchmarkedRenderer], list[str]]:
-    """The contenders, and one sentence for each that is missing or needs a remark."""
+def contenders_on_gpu() -> list[Timed]:
+    """Those that draw where gsplat does.
+
+    Raises:
+        AquaFlowError: gsplat cannot draw here.
+    """
+    gsplat = GsplatRenderer()
+    return [Timed(gsplat), Timed(ReferenceRenderer(gsplat.device), REFERENCE_MOST)]
+
+
+def contenders_here(
+    opensplat: str | None = None, device: str | None = None
+) -> tuple[list[BenchmarkedRenderer], list[str]]:
+    """The contenders, and one sentence for each that is missing or needs a remark.
+
+    All that run here, or those on ``device``: cpu or cuda.
+
+    Raises:
+        AquaFlowError: nothing draws on the device asked for.
+    """
+    if device == "cuda":
+        return [*contenders_on_gpu()], []
     found: list[BenchmarkedRenderer] = []
     notes: list[str] = []
     for isa in supported_isas():
@@ -108,10 +129,11 @@ def contenders_here(opensplat: str | None = None) -> tuple[list[BenchmarkedRende
             found += [Timed(CpuRenderer(count, isa)) for count in thread_counts()]
         except NativeUnavailableError as error:
             notes.append(str(error))
-    try:
-        found.append(Timed(GsplatRenderer()))
-    except AquaFlowError as error:
-        notes.append(f"gsplat is not timed: {error}")
+    if device is None:
+        try:
+            found.append(Timed(GsplatRenderer()))
+        except AquaFlowError as error:
+            notes.append(f"gsplat is not timed: {error}")
     found += [Timed(TileRenderer(count), TILES_MOST) for count in thread_counts()]
     found.append(Timed(ReferenceRenderer(), REFERENCE_MOST))
     if opensplat is not None:

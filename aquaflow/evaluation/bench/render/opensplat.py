@@ -19,8 +19,8 @@ import tempfile
 from pathlib import Path
 
 from aquaflow.errors import InputError
-from aquaflow.evaluation.bench.render.scene import NAMES, Size, SplatScene
 from aquaflow.evaluation.bench.render.timing import Sample
+from aquaflow.render.example_scene import NAMES, Size, SplatScene
 
 NOTE = (
     "OpenSplat's CPU depth sort, built against current torch as it is, reads a strided depth "

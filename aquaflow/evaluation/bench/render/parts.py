@@ -10,8 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from aquaflow.evaluation.bench.meter import meter_of
 from aquaflow.evaluation.bench.render.timing import Clock, interleaved, spread_of, torch_threads
 from aquaflow.render.adam import SelectiveAdam
+from aquaflow.render.contract import CPU
 from aquaflow.render.photometric import photometric_loss
 
 PICTURES = ((320, 240), (640, 480))
@@ -21,6 +23,8 @@ SEEN_SHARES = (1.0, 0.3)
 """Of the Gaussians: what a view shows of a map."""
 WIDTHS = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "colours": 3}
 """Numbers of one Gaussian that an optimiser steps."""
+FUSED_ON = ("cpu", "cuda")
+"""Devices that torch has its fused Adam for."""
 SSIM_WEIGHT = 0.2
 LEARNING_RATE = 1e-3
 """The weight as the paper has it; any rate, as the time of a step does not depend on it."""
@@ -37,12 +41,16 @@ class TimedPart:
     run: Callable[[], object]
     uses_torch_threads: bool = False
     """False: the work has its own threads, and torch's would only spin in addition."""
+    device: torch.device = CPU
 
     def timed(self, clock: Clock) -> tuple[float, float]:
         """Milliseconds on the wall, and of this thread's CPU time."""
+        meter = meter_of(self.device)
         with torch_threads(self.threads if self.uses_torch_threads else 1):
+            meter.settle()
             begin = clock.wall(), clock.cpu()
             self.run()
+            meter.settle()
             return 1e3 * (clock.wall() - begin[0]), 1e3 * (clock.cpu() - begin[1])
 
 
@@ -50,35 +58,40 @@ def parts_of(
     threads: Iterable[int],
     pictures: Sequence[tuple[int, int]] = PICTURES,
     rows: Sequence[int] = ROWS,
+    device: torch.device = CPU,
 ) -> list[TimedPart]:
     """Loss with gradient on each picture, optimiser step for each number of Gaussians."""
     found: list[TimedPart] = []
     for count in threads:
-        found += [_loss(*picture, count) for picture in pictures]
+        found += [_loss(*picture, count, device) for picture in pictures]
         for n in rows:
-            found += _optimisers(n, count)
+            found += _optimisers(n, count, device)
     return found
 
 
-def _loss(width: int, height: int, threads: int) -> TimedPart:
+def _loss(width: int, height: int, threads: int, device: torch.device) -> TimedPart:
     rng = torch.Generator().manual_seed(0)
-    rendered, target = torch.rand(2, height, width, 3, generator=rng)
-    weight = torch.rand(height, width, generator=rng)
-    mask = torch.rand(height, width, generator=rng) > 0.1
+    rendered, target = torch.rand(2, height, width, 3, generator=rng).to(device)
+    weight = torch.rand(height, width, generator=rng).to(device)
+    mask = (torch.rand(height, width, generator=rng) > 0.1).to(device)
     leaf = rendered.requires_grad_()
 
     def loss_and_gradient() -> object:
         loss = photometric_loss(leaf, target, weight, mask, SSIM_WEIGHT, threads)
         return torch.autograd.grad(loss, leaf)
 
-    return TimedPart("L1 + SSIM", f"{width} x {height}", "fused", threads, loss_and_gradient)
+    variant = "fused" if device == CPU else "torch"
+    work = f"{width} x {height}"
+    return TimedPart("L1 + SSIM", work, variant, threads, loss_and_gradient, device=device)
 
 
-def _optimisers(n: int, threads: int) -> list[TimedPart]:
+def _optimisers(n: int, threads: int, device: torch.device) -> list[TimedPart]:
     rng = torch.Generator().manual_seed(0)
 
     def tensors() -> dict[str, Tensor]:
-        return {name: torch.randn(n, width, generator=rng) for name, width in WIDTHS.items()}
+        return {
+            name: torch.randn(n, width, generator=rng).to(device) for name, width in WIDTHS.items()
+        }
 
     gradients, work = tensors(), f"{n} Gaussians"
     groups = {name: (tensor, LEARNING_RATE) for name, tensor in tensors().items()}
@@ -86,12 +99,15 @@ def _optimisers(n: int, threads: int) -> list[TimedPart]:
     parameters = list(tensors().values())
     for parameter, gradient in zip(parameters, gradients.values(), strict=True):
         parameter.grad = gradient
-    fused = torch.optim.Adam(parameters, lr=LEARNING_RATE, fused=True)
-    found = [TimedPart("Adam", work, "torch, fused", threads, fused.step, True)]
+    is_fused = device.type in FUSED_ON
+    theirs = torch.optim.Adam(parameters, lr=LEARNING_RATE, fused=is_fused)
+    name = "torch, fused" if is_fused else "torch"
+    found = [TimedPart("Adam", work, name, threads, theirs.step, True, device)]
     for share in SEEN_SHARES:
-        seen = torch.rand(n, generator=rng) < share
+        seen = (torch.rand(n, generator=rng) < share).to(device)
         step = partial(ours.step, seen, gradients)
-        found.append(TimedPart("Adam", work, f"selective, {share:.0%} seen", threads, step))
+        name = f"selective, {share:.0%} seen"
+        found.append(TimedPart("Adam", work, name, threads, step, device=device))
     return found
 
 
@@ -117,6 +133,7 @@ def time_parts(
 
 def _row(part: TimedPart, samples: Sequence[tuple[float, float]]) -> dict[str, Any]:
     wall = spread_of([ms for ms, _ in samples])
+    alone = part.threads == 1 and part.device == CPU
     return {
         "part": part.name,
         "work": part.work,
@@ -125,5 +142,5 @@ def _row(part: TimedPart, samples: Sequence[tuple[float, float]]) -> dict[str, A
         "repeats": wall.runs,
         "ms": wall.median,
         "ms_half_range": wall.half_range,
-        "cpu_ms": spread_of([cpu for _, cpu in samples]).median if part.threads == 1 else None,
+        "cpu_ms": spread_of([cpu for _, cpu in samples]).median if alone else None,
     }

@@ -8,8 +8,8 @@ from typing import Any
 from aquaflow.evaluation.bench.render.contenders import BenchmarkedRenderer
 from aquaflow.evaluation.bench.render.interactions import BACKWARD_FLOP, FORWARD_FLOP
 from aquaflow.evaluation.bench.render.peak import Peak
-from aquaflow.evaluation.bench.render.scene import Size
 from aquaflow.evaluation.bench.render.timing import Sample, spread_of
+from aquaflow.render.example_scene import Size
 
 Row = dict[str, Any]
 
@@ -25,7 +25,8 @@ def row_of(
     peak: Peak,
     load: float | None,
 ) -> Row:
-    """Medians in ms; rates by the CPU time where one thread worked, else by the wall's."""
+    """Medians in ms; rates by the GPU's time, else by the CPU time where one thread worked, else
+    by the wall's."""
     row: Row = {
         "renderer": contender.name,
         "isa": contender.isa,
@@ -40,18 +41,25 @@ def row_of(
     busy_s = {}
     for key, _ in PASSES:
         wall = spread_of([getattr(sample, f"{key}_ms") for sample in samples])
-        cpu = [value for s in samples if (value := getattr(s, f"{key}_cpu_ms")) is not None]
-        cpu_ms = spread_of(cpu).median if cpu else None
+        own = {clock: _median(samples, f"{key}_{clock}_ms") for clock in ("cpu", "gpu")}
         row |= {
             f"{key}_ms": wall.median,
             f"{key}_ms_half_range": wall.half_range,
-            f"{key}_cpu_ms": cpu_ms,
+            **{f"{key}_{clock}_ms": ms for clock, ms in own.items()},
         }
-        busy_s[key] = 1e-3 * (wall.median if cpu_ms is None else cpu_ms)
+        known = [ms for ms in (own["gpu"], own["cpu"]) if ms is not None]
+        busy_s[key] = 1e-3 * (known[0] if known else wall.median)
         row[f"{key}_interactions_per_s"] = interactions / busy_s[key] if busy_s[key] else None
+    row["gpu_mb"] = _median(samples, "gpu_mb")
     row["share_of_peak"] = _shares(contender, busy_s, interactions, peak)
     row["stage_ms"] = _stages(samples)
     return row
+
+
+def _median(samples: Sequence[Sample], name: str) -> float | None:
+    """None where it was not measured."""
+    found = [value for sample in samples if (value := getattr(sample, name)) is not None]
+    return spread_of(found).median if found else None
 
 
 def _shares(

@@ -14,6 +14,8 @@ from aquaflow.evaluation.bench.summary import Spread
 
 UNKNOWN = "-"
 """Printed where there is no number."""
+ON_GPU = (("GPU ms fwd", "fwd_gpu_ms"), ("GPU ms bwd", "bwd_gpu_ms"), ("GPU MB", "gpu_mb"))
+"""Columns that are there if something was drawn on a GPU, and their keys."""
 
 
 def print_result(result: dict[str, Any], console: Console) -> None:
@@ -29,9 +31,10 @@ def print_result(result: dict[str, Any], console: Console) -> None:
 def renderer_table(rows: Sequence[Row]) -> Table:
     """One line for each contender and size; columns for stages where a renderer reports them."""
     stages = list(dict.fromkeys(name for row in rows for name in row["stage_ms"] or ()))
+    gpu = [title for title, key in ON_GPU if any(row[key] is not None for row in rows)]
     table = _table(("picture", "Gaussians", "renderer", "threads"))
     for title in (
-        "forward ms", "backward ms", "both ms", "CPU ms", "G/s fwd", "G/s bwd",
+        "forward ms", "backward ms", "both ms", "CPU ms", *gpu, "G/s fwd", "G/s bwd",
         "peak % fwd", "bwd", "both", *stages,
     ):  # fmt: skip
         table.add_column(title, justify="right", no_wrap=True)
@@ -42,11 +45,11 @@ def renderer_table(rows: Sequence[Row]) -> Table:
             table.add_section()
         shown, before = (("", "") if size == before else (size[0], str(size[1]))), size
         name = f"{row['renderer']}, {row['isa']}"
-        table.add_row(*shown, name, str(row["threads"]), *_cells(row, stages))
+        table.add_row(*shown, name, str(row["threads"]), *_cells(row, gpu, stages))
     return table
 
 
-def _cells(row: Row, stages: Sequence[str]) -> list[str]:
+def _cells(row: Row, gpu: Sequence[str], stages: Sequence[str]) -> list[str]:
     cpu = row["fwd_cpu_ms"], row["bwd_cpu_ms"]
     shares, stage_ms = row["share_of_peak"] or {}, row["stage_ms"] or {}
     return [
@@ -54,6 +57,7 @@ def _cells(row: Row, stages: Sequence[str]) -> list[str]:
         _ms(row, "bwd"),
         _number(row["fwd_ms"] + row["bwd_ms"], ".2f"),
         _number(None if None in cpu else sum(cpu), ".2f"),
+        *(_number(row[key], ".2f") for title, key in ON_GPU if title in gpu),
         *(_number(row[f"{key}_interactions_per_s"], ".3f", 1e-9) for key in ("fwd", "bwd")),
         *(_number(shares.get(key), ".1f", 100.0) for key in ("fwd", "bwd", "both")),
         *(_number(stage_ms.get(stage), ".2f") for stage in stages),
@@ -99,13 +103,22 @@ def sentences(result: dict[str, Any]) -> list[str]:
         "CPU ms is the thread's own time, forward and backward, which other programs do not "
         "lengthen.",
         "G/s: 1e9 interactions/s, an interaction being a pixel and a Gaussian that contributes to "
-        "it (alpha above 1/255, transmittance above 1e-4); by CPU time with one thread, else by "
-        f"the wall's. Share of peak: {FORWARD_FLOP:.0f} operations an interaction forward, "
-        f"{BACKWARD_FLOP:.0f} backward; what is computed in vain is not counted as work.",
-        f"Peak: {peaks}, by {machine['peak_method']}.",
+        "it (alpha above 1/255, transmittance above 1e-4); by the GPU's time, by CPU time with one "
+        "thread, else by the wall's.",
         f"Machine: {machine['processor']}, {machine['cores']} cores, load {machine['load']} at "
         f"the start; {machine['date']}.",
     ]
+    if peaks:
+        said.append(
+            f"Share of peak: {FORWARD_FLOP:.0f} operations an interaction forward, "
+            f"{BACKWARD_FLOP:.0f} backward; what is computed in vain is not counted as work. "
+            f"Peak: {peaks}, by {machine['peak_method']}."
+        )
+    if machine["gpu"]:
+        said.append(
+            f"GPU: {machine['gpu']}. GPU ms is between events in its own stream of work, GPU MB "
+            "the most that torch held there. No peak of it was measured, so no share is stated."
+        )
     if errors:
         each = ", ".join(f"{name} {error:.1e}" for name, error in errors.items())
         said.append(f"Relative gradient error against the float64 reference, worst kernel: {each}.")

@@ -11,9 +11,10 @@ from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
 
-from aquaflow.evaluation.bench.render.scene import SplatScene
+from aquaflow.evaluation.bench.meter import Meter, meter_of
 from aquaflow.evaluation.bench.summary import Spread
 from aquaflow.render.contract import Renderer
+from aquaflow.render.example_scene import SplatScene
 
 T = TypeVar("T")
 
@@ -36,6 +37,11 @@ class Sample:
     """None: more than one thread took part, or it was not counted."""
     bwd_cpu_ms: float | None = None
     stage_ms: Mapping[str, float] = field(default_factory=dict)
+    fwd_gpu_ms: float | None = None
+    """By the GPU's own clock; None: it was not drawn on one."""
+    bwd_gpu_ms: float | None = None
+    gpu_mb: float | None = None
+    """Most memory that torch held on the GPU."""
 
 
 @runtime_checkable
@@ -48,35 +54,35 @@ class ReportsStages(Protocol):
 
 
 def time_renderer(
-    renderer: Renderer, scene: SplatScene, device: str = "cpu", clock: Clock | None = None
+    renderer: Renderer, scene: SplatScene, clock: Clock | None = None, meter: Meter | None = None
 ) -> Sample:
     """Draw, then the gradients of all inputs for a given gradient of image and alpha."""
-    clock = clock or Clock()
+    clock, device = clock or Clock(), renderer.device
+    meter = meter or meter_of(device)
     leaves = scene.leaves(device)
     dtype = torch.float64 if renderer.name == "reference" else torch.float32
     incoming = [g.to(device=device, dtype=dtype) for g in (scene.g_image, scene.g_alpha)]
-    _settle(device)
-    begin = clock.wall(), clock.cpu()
+    meter.forget_peak()
+    meter.settle()
+    marks, begin = [meter.mark()], (clock.wall(), clock.cpu())
     drawn = scene.drawn_by(renderer, leaves)
-    _settle(device)
+    marks.append(meter.mark())
+    meter.settle()
     middle = clock.wall(), clock.cpu()
+    marks.append(meter.mark())
     torch.autograd.grad([drawn.image, drawn.alpha], leaves, incoming)
-    _settle(device)
+    marks.append(meter.mark())
+    meter.settle()
     end = clock.wall(), clock.cpu()
     fwd, bwd = (
         [1e3 * (after - before) for before, after in zip(first, second, strict=True)]
         for first, second in ((begin, middle), (middle, end))
     )
-    alone = renderer.threads == 1 and device == "cpu"
+    alone = renderer.threads == 1 and device.type == "cpu"
     fwd_cpu, bwd_cpu = (fwd[1], bwd[1]) if alone else (None, None)
     stages = dict(renderer.stage_ms()) if isinstance(renderer, ReportsStages) else {}
-    return Sample(fwd[0], bwd[0], fwd_cpu, bwd_cpu, stages)
-
-
-def _settle(device: str) -> None:
-    """Wait until the device has done what it was given."""
-    if device == "cuda":
-        torch.cuda.synchronize()
+    gpu = meter.between_ms(*marks[:2]), meter.between_ms(*marks[2:])
+    return Sample(fwd[0], bwd[0], fwd_cpu, bwd_cpu, stages, *gpu, meter.peak_mb())
 
 
 @contextmanager

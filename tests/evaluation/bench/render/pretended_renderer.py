@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from aquaflow.evaluation.bench.render.peak import Peak
-from aquaflow.evaluation.bench.render.scene import Size
 from aquaflow.evaluation.bench.render.timing import Clock
-from aquaflow.render.contract import Rendering
+from aquaflow.render.contract import CPU, Rendering
+from aquaflow.render.example_scene import Size
 
 TINY = Size(200, 52, 39)  # no multiple of a tile
 PEAK = Peak({1: 1e9, 2: 2e9}, "nothing")
@@ -36,6 +36,7 @@ class Pretended:
     threads: int = 1
     name: str = "pretended"
     isa: str = "none"
+    device: torch.device = CPU
     fails_after: int | None = None
     calls: int = 0
     stages: dict[str, float] = field(default_factory=lambda: {"project": 1.0, "blend": 9.0})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -15,12 +16,13 @@ from aquaflow.cli import app
 from aquaflow.errors import InputError
 from aquaflow.evaluation.bench.render import benchmark as bm
 from aquaflow.evaluation.bench.render import peak as peaks
-from aquaflow.evaluation.bench.render import scene as scenes
+from aquaflow.evaluation.bench.render import sizes
 from aquaflow.evaluation.bench.render.contenders import Timed, contenders_here, thread_counts
 from aquaflow.evaluation.bench.render.opensplat import NOTE, OpenSplat
 from aquaflow.evaluation.bench.render.parts import parts_of
-from aquaflow.evaluation.bench.render.scene import NAMES, SIZES, SMALL, Size, height_field
+from aquaflow.evaluation.bench.render.sizes import SIZES
 from aquaflow.evaluation.bench.render.table import print_result
+from aquaflow.render.example_scene import NAMES, SMALL, Size, height_field
 from aquaflow.render.native.build import supported_isas
 from tests.command_line import refused, run_aquaflow
 from tests.evaluation.bench.render.pretended_renderer import PEAK, TINY, Pretended, SlowedClock
@@ -104,8 +106,8 @@ def test_a_peer_that_is_not_there_is_refused(command: str) -> None:
 def small_benchmark(monkeypatch: pytest.MonkeyPatch) -> None:
     """The whole command in seconds."""
     monkeypatch.setattr(peaks, "STEPS", 20_000)
-    monkeypatch.setattr(scenes, "QUICK_SIZES", (TINY, Size(400, 52, 39)))
-    monkeypatch.setattr(bm, "parts_of", lambda threads: parts_of(threads, [(32, 24)], [50]))
+    monkeypatch.setattr(sizes, "QUICK_SIZES", (TINY, Size(400, 52, 39)))
+    monkeypatch.setattr(bm, "parts_of", partial(parts_of, pictures=[(32, 24)], rows=[50]))
 
 
 @pytest.mark.usefixtures("small_benchmark")

@@ -10,9 +10,9 @@ from aquaflow.evaluation.bench.render.contenders import Timed
 from aquaflow.evaluation.bench.render.interactions import count_interactions
 from aquaflow.evaluation.bench.render.parts import parts_of, time_parts
 from aquaflow.evaluation.bench.render.rows import row_of
-from aquaflow.evaluation.bench.render.scene import Size, height_field
 from aquaflow.evaluation.bench.render.timing import Sample, interleaved, time_renderer
 from aquaflow.render.contract import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+from aquaflow.render.example_scene import Size, height_field
 from aquaflow.render.reference import ReferenceRenderer, project
 from tests.evaluation.bench.render.pretended_renderer import PEAK, TINY, Pretended, SlowedClock
 

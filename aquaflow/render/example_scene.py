@@ -1,4 +1,4 @@
-"""What every renderer draws: a textured height field, seeded, in sizes from small to large."""
+"""A scene to try renderers on: a textured height field, seeded, in any size."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from aquaflow.render.contract import Renderer, Rendering
+from aquaflow.render.contract import CPU, Renderer, Rendering
 
 CLOSEST_M, FARTHEST_M = 1.0, 5.0
 """Ranges at which a vehicle maps."""
@@ -45,12 +45,6 @@ class Size:
         return f"{self.width} x {self.height}"
 
 
-COUNTS = (10_000, 30_000, 100_000, 300_000)
-PICTURES = ((320, 240), (640, 480), (1280, 720))
-SIZES = tuple(Size(n, *picture) for picture in PICTURES for n in COUNTS)
-"""Numbers of Gaussians, sizes of pictures, and each with each."""
-QUICK_SIZES = (Size(30_000, 320, 240), Size(100_000, 640, 480))
-"""Those of the renderer's bars."""
 SMALL = Size(400, 96, 72)
 """What the dense float64 reference can hold; gradients are compared here."""
 
@@ -65,7 +59,9 @@ class SplatScene:
     g_image: Tensor  # [H, W, 4]
     g_alpha: Tensor  # [H, W]
 
-    def leaves(self, device: str = "cpu", dtype: torch.dtype = torch.float32) -> list[Tensor]:
+    def leaves(
+        self, device: torch.device = CPU, dtype: torch.dtype = torch.float32
+    ) -> list[Tensor]:
         """The inputs, each asking for its gradient."""
         moved = [tensor.detach().to(device=device, dtype=dtype) for tensor in self.inputs]
         return [tensor.requires_grad_() for tensor in moved]

@@ -1,0 +1,67 @@
+"""Optional packages: which version is installed, what it is for, and what installs it.
+
+Nothing is imported: some of them take seconds, and one prints.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from aquaflow.doctor.machine import Finding, MachineProbes
+
+
+class Package(NamedTuple):
+    """One line of an extra in pyproject.toml."""
+
+    distribution: str
+    module: str
+    extra: str
+    purpose: str
+
+
+PACKAGES = (
+    Package("pymavlink", "pymavlink", "telemetry", "MAVLink: autopilots, tlog and dataflash logs"),
+    Package("websockets", "websockets", "telemetry", "MAVLink by BlueOS's mavlink2rest"),
+    Package("pyserial", "serial", "telemetry", "devices on serial ports"),
+    Package("python-can", "can", "telemetry", "devices on CAN buses, candump logs"),
+    Package("cantools", "cantools", "telemetry", "CAN buses that a DBC file describes"),
+    Package("msgpack", "msgpack", "telemetry", "CAN over UDP multicast"),
+    Package("mcap", "mcap", "recording", "recordings: written and mapped"),
+    Package("mcap-protobuf-support", "mcap_protobuf", "recording", "MCAP files of others"),
+    Package(
+        "foxglove-schemas-protobuf", "foxglove_schemas_protobuf", "recording",
+        "pictures in recordings, for Foxglove and Lichtblick",
+    ),
+    Package("rosbags", "rosbags", "recording", "ROS 1 and 2 bags"),
+    Package("viser", "viser", "viewer", "the map in a browser"),
+    Package("depthai", "depthai", "oak", "Luxonis OAK cameras"),
+    Package("onnxruntime", "onnxruntime", "prior", "learned priors"),
+    Package("kornia", "kornia", "prior-peers", "the priors xfeat and aliked"),
+    Package("gsplat", "gsplat", "gpu", "maps on a GPU with CUDA"),
+    Package("onnx", "onnx", "export", "exporting a trained prior"),
+    Package("onnxscript", "onnxscript", "export", "exporting a trained prior"),
+    Package("pycolmap", "pycolmap", "peers", "COLMAP beside AquaFlow in `aquaflow bench`"),
+)  # fmt: skip
+OTHER_BUILDS = {"onnxruntime": ("onnxruntime-gpu",)}
+"""Distributions that hold the same module."""
+INSTALLED_OTHERWISE = {
+    # What it asks for would replace the build of torch that is installed.
+    "gsplat": "pip install --no-deps gsplat",
+}
+"""Commands for packages that an extra does not install well."""
+
+
+def findings(machine: MachineProbes) -> list[Finding]:
+    """A finding for each optional package."""
+    return [_finding(package, machine) for package in PACKAGES]
+
+
+def _finding(package: Package, machine: MachineProbes) -> Finding:
+    name, extra = package.distribution, package.extra
+    row = f"package {name}"  # what a GPU does with gsplat is another finding
+    if machine.module_present(package.module):
+        names = (name, *OTHER_BUILDS.get(name, ()))
+        version = next(filter(None, map(machine.version, names)), "of unknown version")
+        return Finding(row, version, package.purpose)
+    command = INSTALLED_OTHERWISE.get(name, f"pip install 'aquaflow[{extra}]'")
+    return Finding(row, "not installed", f"{package.purpose}: not here", f"run `{command}`")

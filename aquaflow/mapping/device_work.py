@@ -1,0 +1,123 @@
+"""Work on the maps of a dive, which live on one device until that fails.
+
+Where the device's memory is full, work that may be left out is, and the maps stay where they are.
+Other work, such as a correction, and all work that fails because the device is gone, is done again
+on the CPU, where all maps go on (see host_copies.py).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable
+
+from aquaflow.config import Config
+from aquaflow.errors import first_line, is_device_failure, is_device_full
+from aquaflow.errors.failures import Failures
+from aquaflow.mapping.host_copies import HostCopies
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.render import cpu_renderer
+from aquaflow.render.contract import Renderer
+from aquaflow.render.device_memory import give_back_after
+
+log = logging.getLogger(__name__)
+
+MOST_LEFT_OUT = 10
+"""Times in a row that a full device may cost a kind of work: the map is too large for it then."""
+
+Work = Callable[[Mapper], object]
+
+
+class DeviceWork:
+    """The maps by sub-map, and the device they are on."""
+
+    def __init__(self, config: Config, renderer: Renderer, failures: Failures) -> None:
+        self.renderer = renderer
+        self.mappers: dict[int, Mapper] = {}
+        self.copies = HostCopies()
+        self._config, self._failures = config, failures
+        self._left_out: Counter[str] = Counter()
+        """By stage, how often in a row."""
+
+    def mapper(self, number: int) -> Mapper:
+        """The map of a sub-map, made when first asked for."""
+        if number not in self.mappers:
+            seed = self._config.seed + number
+            self.mappers[number] = Mapper(self._config.mapping, self.renderer, seed, self._failures)
+        return self.mappers[number]
+
+    def do(
+        self,
+        stage: str,
+        number: int,
+        work: Work,
+        frame: int | None = None,
+        may_be_left_out: bool = False,
+    ) -> bool:
+        """Do ``work`` on map ``number``; what it raises is counted, and False returned.
+
+        Work that ``may_be_left_out`` leaves a whole map, whatever it raises.
+        """
+        error = self._tried(stage, number, work, frame)
+        if error is not None and self._is_of_device(error):
+            full = is_device_full(error)
+            if full:
+                give_back_after(error, self.renderer.device)
+            if full and may_be_left_out and self._left_out[stage] < MOST_LEFT_OUT:
+                self._left_out[stage] += 1
+            else:
+                self.leave_device(first_line(error))
+                error = self._tried(stage, number, work, frame)
+        if error is None:
+            self._left_out[stage] = 0
+        elif may_be_left_out:
+            self.mend(number)
+        return error is None
+
+    def change(self, stage: str, number: int, work: Work) -> bool:
+        """A change that is made wholly, and once: a map that a failing device left half changed
+        goes on from its copy, which is of before."""
+        error = self._tried(stage, number, work)
+        if error is not None and self._is_of_device(error):
+            self.leave_device(first_line(error), half_changed=number)
+            error = self._tried(stage, number, work)
+        if error is not None:
+            self.mend(number)
+        return error is None
+
+    def leave_device(self, why: str, half_changed: int | None = None) -> None:
+        """From here on all maps are drawn and optimised on the CPU."""
+        log.warning(
+            "%s failed (%s); the map goes on on the CPU, more slowly", self.renderer.device, why
+        )
+        self.renderer = cpu_renderer(self._config.threads)
+        for number, mapper in self.mappers.items():
+            half = number == half_changed
+            self.mappers[number] = self.copies.on_cpu(number, mapper, self.renderer, half)
+        self.copies = HostCopies()
+
+    def mend(self, number: int) -> None:
+        """After a failure: the map is whole, wherever it is."""
+        try:
+            self.mapper(number).make_whole()
+        except Exception as error:
+            if not self._is_of_device(error):
+                raise
+            self.leave_device(first_line(error))  # where every map is made whole
+
+    def _tried(
+        self, stage: str, number: int, work: Work, frame: int | None = None
+    ) -> Exception | None:
+        """What ``work`` raised, if it was contained or the device's."""
+        try:
+            with self._failures.contain(stage, frame) as run:
+                work(self.mapper(number))
+        except Exception as error:
+            if not self._is_of_device(error):
+                raise
+            self._failures.record(stage, error, frame)
+            return error
+        return run.error
+
+    def _is_of_device(self, error: Exception) -> bool:
+        return self.renderer.device.type != "cpu" and is_device_failure(error)
