@@ -15,6 +15,7 @@ KERNELS := $(wildcard aquaflow/render/native/*.cpp aquaflow/render/native/*.h)
 
 OUT ?= out/dive
 FUZZ_SECONDS ?= 120
+FUZZ_ARGS ?=
 FAULTS ?= 24
 SYNTHETIC := out/synthetic
 
@@ -53,7 +54,7 @@ test: setup ## Run the tests that take seconds.
 	$(TESTS) $(QUICK)
 
 test-ci: setup ## Run the tests that take tens of seconds: compilers, wheels, whole dives.
-	$(TESTS) -m ci
+	$(TESTS) -m 'ci and not slow'
 
 test-injection: setup ## Let FAULTS=24 calls into libraries fail, one in each small dive.
 	$(BIN)/python -m tests.injection --sample $(FAULTS) --seed 16
@@ -66,7 +67,7 @@ test-kernel: setup ## Run the drivers on a real Linux kernel under qemu: V4L2, C
 	$(BIN)/pytest tests/kernel -rs
 
 fuzz: setup ## Feed every command what nothing sane would, for FUZZ_SECONDS=120.
-	$(BIN)/python -m tests.fuzz --seconds $(FUZZ_SECONDS)
+	$(BIN)/python -m tests.fuzz --seconds $(FUZZ_SECONDS) $(FUZZ_ARGS)
 
 coverage: setup ## Run the tests of `make test` and show how much of each file they reach.
 	$(TESTS) $(QUICK) --cov --cov-report=term --cov-report=html:out/coverage

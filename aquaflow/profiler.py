@@ -6,7 +6,7 @@ import threading
 import time
 from array import array
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
@@ -40,10 +40,12 @@ class _Nesting(threading.local):
 class Profiler:
     """Collects durations per stage; stages may nest, each counts its own wall time.
 
-    With ``trace`` every single run of a stage is kept, for :meth:`chrome_trace`.
+    With ``trace`` every single run of a stage is kept, for :meth:`chrome_trace`. A stage ends with
+    a call of ``settle``, which may wait for a GPU: what it still works on is that stage's.
     """
 
-    def __init__(self, trace: bool = False) -> None:
+    def __init__(self, trace: bool = False, settle: Callable[[], None] = lambda: None) -> None:
+        self._settle = settle
         self.top_level_s = 0.0
         """Time inside stages, what nests counted once; of the thread that made the profiler."""
         self._durations: dict[str, array[float]] = defaultdict(lambda: array("d"))
@@ -101,6 +103,7 @@ class Profiler:
         return depth
 
     def _leave(self, name: str, started_s: float, depth: int) -> None:
+        self._settle()
         ended_s = time.perf_counter()
         self._nesting.depth = depth
         took_ms = (ended_s - started_s) * 1e3

@@ -7,16 +7,24 @@ import signal
 from collections.abc import Callable, Iterator
 from threading import Event
 
+ASKED = (signal.SIGINT, signal.SIGTERM)
+
 
 @contextlib.contextmanager
-def stop_on_signals(stopping: Event) -> Iterator[None]:
-    """Either signal sets ``stopping``; the previous handlers are restored at the end."""
-    asked = (signal.SIGINT, signal.SIGTERM)
+def stop_on_signals(stopping: Event, once: bool = False) -> Iterator[None]:
+    """Either signal sets ``stopping``; with ``once``, the next one ends the process as it stands.
+    The previous handlers are restored at the end."""
+
+    def stop(*_: object) -> None:
+        stopping.set()
+        for each in ASKED if once else ():
+            signal.signal(each, signal.SIG_DFL)
+
     before: list[Callable[..., object] | int | None] = []
     with contextlib.suppress(ValueError):  # only the main thread may set handlers
-        before = [signal.signal(each, lambda *_: stopping.set()) for each in asked]
+        before = [signal.signal(each, stop) for each in ASKED]
     try:
         yield
     finally:
-        for each, handler in zip(asked, before, strict=False):
+        for each, handler in zip(ASKED, before, strict=False):
             signal.signal(each, handler)

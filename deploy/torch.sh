@@ -4,6 +4,7 @@
 #           which bring 4.8 GB of CUDA along on x86_64 and on aarch64
 #   cuda    PyPI's wheel, with its CUDA libraries
 #   system  the torch that the system's Python has; on a Jetson, NVIDIA's for JetPack
+#   jetson  that wheel, installed by install.sh (device.sh)
 
 torch_cpu_index=https://download.pytorch.org/whl/cpu
 
@@ -24,7 +25,7 @@ choose_torch() {
     echo "torch: the system's, which reaches the Jetson's GPU" >&2
     echo system
   elif [[ -f $release ]]; then
-    echo "torch: for the processor; $python has no torch that reaches the Jetson's GPU (see deploy/README.md)" >&2
+    echo "torch: for the processor; $python has no torch that reaches the Jetson's GPU; --device jetson fetches one (docs/gpu.md)" >&2
     echo cpu
   elif nvidia-smi --list-gpus 2>/dev/null | grep -q GPU; then
     echo 'torch: with CUDA (4.8 GB), as nvidia-smi names a GPU; --torch cpu avoids it' >&2
@@ -43,6 +44,7 @@ pin_torch() {
     # '+cpu' is in PyTorch's own index only: without that index pip fails instead of taking CUDA.
     cpu) sed -i 's/^torch==\([0-9.]*\).*/torch==\1+cpu/' "$pins" ;;
     cuda) ;;
+    jetson) sed -i "s/^torch==.*/torch==$jetson_torch_version/" "$pins" ;;
     system)
       sed -i '/^torch==/d; /^numpy==/d' "$pins"
       "$python" -c 'import torch; print(f"torch=={torch.__version__}")' >>"$pins" ;;

@@ -16,7 +16,11 @@ import threading
 import traceback
 from typing import TypedDict
 
-IMPORTED = ("torch", "cv2", "scipy.optimize", "scipy.spatial", "matplotlib.pyplot", "aquaflow.cli")
+IMPORTED = (
+    *("torch", "cv2", "scipy.ndimage", "scipy.optimize", "scipy.spatial", "matplotlib.pyplot"),
+    *("aquaflow.cli", "aquaflow.dive.replay", "aquaflow.evaluation.summary"),
+    *("aquaflow.export.report", "aquaflow.service.onboard", "aquaflow.synthetic"),
+)
 """Slow to import; none of them starts a thread when it is imported, so a fork is whole."""
 
 

@@ -4,7 +4,8 @@ CI has no GPU. A ``Pretended`` tensor holds a tensor of the CPU and reports the 
 instead. As on CUDA it does not mix with tensors of the CPU (those of no dimension excepted), has no
 numpy array and no address, and comes back by ``.cpu()``; autograd and optimisers work. Stricter
 than CUDA, it takes no index and no list from the CPU. The device counts what crosses to it and
-back, and it can fail like a real one: out of memory once, or lost for good.
+back and what makes the CPU wait for it; and it can fail like a real one: out of memory once, or
+whenever its memory is full (pretended_allocator.py), or lost for good.
 
 Torch's own name for a device without data, "meta", is borrowed for it: autograd runs such a
 device's gradients in the caller's thread, and needs no driver. Factories and moves with this device
@@ -27,6 +28,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 import aquaflow
+from tests.pretended_allocator import Allocator, asked_through_torch
 
 PRETENDED = torch.device("meta")
 OWN = str(Path(aquaflow.__file__).parent)
@@ -55,6 +57,10 @@ class Device:
     """Those that another of our modules moved: file and function. The others are the test's."""
     read: int = 0
     """Single numbers that Python asked for."""
+    waits: Counter[str] = field(default_factory=Counter)
+    """Places of ours where the CPU waited for the device: for such a number, for tensors that
+    crossed, and for results whose size depends on values, such as indices of True."""
+    memory: Allocator = field(default_factory=Allocator)
     calls: int = 0
     """Operations on the device."""
     fails_at: int | None = None
@@ -62,17 +68,17 @@ class Device:
     lost: bool = False
     """From then on every call fails."""
 
-    def cross(self, moved_in: bool) -> None:
+    def cross(self, moved_in: bool, waits: bool = True) -> None:
         """Count a tensor that moves, and whose doing it was."""
         self.moved_in += moved_in
         self.moved_out += not moved_in
-        frame = sys._getframe()
-        while frame is not None and not frame.f_code.co_filename.startswith(OWN):
-            frame = frame.f_back  # type: ignore[assignment]
-        if frame is not None and frame.f_code.co_filename == TRANSFERS:
+        place = _place()
+        if place.startswith(TRANSFERS):
             self.named += 1
-        elif frame is not None:
-            self.strays[f"{frame.f_code.co_filename}: {frame.f_code.co_name}"] += 1
+        elif place:
+            self.strays[place] += 1
+        if waits:
+            self.waits[place] += 1
 
     def call(self) -> None:
         """Count an operation, which may fail."""
@@ -84,6 +90,14 @@ class Device:
 
 
 DEVICE = Device()
+
+
+def _place() -> str:
+    """File and function of ours that is at work; nothing if it is the test itself."""
+    frame = sys._getframe()
+    while frame is not None and not frame.f_code.co_filename.startswith(OWN):
+        frame = frame.f_back  # type: ignore[assignment]
+    return "" if frame is None else f"{frame.f_code.co_filename}: {frame.f_code.co_name}"
 
 
 class Pretended(torch.Tensor):
@@ -105,7 +119,7 @@ class Pretended(torch.Tensor):
         return made
 
     def __init__(self, inner: torch.Tensor) -> None:
-        self.inner = inner
+        self.inner, self._block = inner, DEVICE.memory.block(inner)
 
     def __repr__(self, **_: Any) -> str:
         return f"Pretended({self.inner!r})"
@@ -145,12 +159,12 @@ def run(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     if target is not None:
         kwargs = {**kwargs, "device": torch.device("cpu")}
     found = func(*args, **kwargs)
-    _count(func, tensors, to_device)
-    if func is aten._local_scalar_dense.default:
-        return found
     if func._schema.is_mutable and func._schema.name.endswith("_"):
-        return tensors[0]
-    return tree_map(_pretended, found) if to_device else found
+        found = tensors[0]
+    elif to_device:
+        found = tree_map(_pretended, found)
+    _count(func, tensors, kwargs, to_device)
+    return found
 
 
 def _pretended(value: Any) -> Any:
@@ -168,12 +182,30 @@ def _check_devices(func: Any, tensors: list[torch.Tensor]) -> None:
         raise RuntimeError(f"{func}: tensors on the pretended device and on the CPU")
 
 
-def _count(func: Any, tensors: list[torch.Tensor], to_device: bool) -> None:
-    if func is aten._local_scalar_dense.default:
-        DEVICE.read += 1
+ANSWERS = {
+    aten._local_scalar_dense.default, aten.equal.default, aten.nonzero.default,
+    aten.masked_select.default, aten.bincount.default, aten.unique_consecutive.default,
+    aten._unique2.default, aten.repeat_interleave.Tensor,
+}  # fmt: skip
+"""For their result, or its size, CUDA waits; what gets its output's size does not."""
+INDEXED = {aten.index.Tensor, aten.index_put_.default, aten.index_put.default}
+
+
+def _is_sized_by_values(of: torch.Tensor, *others: torch.Tensor) -> bool:
+    """True for an index by a mask; one that is filled with one number needs no indices."""
+    masks = [each for each in others if each.dtype in {torch.bool, torch.uint8}]
+    filled = len(others) == 2 and others[1].numel() == 1  # the mask, and what is put there
+    return bool(masks) and not filled
+
+
+def _count(func: Any, tensors: list[torch.Tensor], kwargs: dict[str, Any], to_device: bool) -> None:
+    DEVICE.read += func is aten._local_scalar_dense.default
+    answers = func in ANSWERS and kwargs.get("output_size") is None
+    if answers or (func in INDEXED and _is_sized_by_values(*tensors)):
+        DEVICE.waits[_place()] += 1
     elif func is aten._to_copy.default:
         if isinstance(tensors[0], Pretended) != to_device:
-            DEVICE.cross(to_device)
+            DEVICE.cross(to_device, waits=not kwargs.get("non_blocking", False))
     elif func is aten.copy_.default:
         to, of = (isinstance(x, Pretended) for x in tensors)
         if to != of:
@@ -192,7 +224,7 @@ def pretended_device() -> Iterator[Device]:
 
     threading.Thread.run = run_there  # type: ignore[method-assign]
     try:
-        with PretendedDevice():
+        with PretendedDevice(), asked_through_torch(DEVICE.memory):
             yield DEVICE
     finally:
         threading.Thread.run = plain_run  # type: ignore[method-assign]

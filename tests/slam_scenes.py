@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from aquaflow.clocks.deadline import Deadline
 from aquaflow.config import Config, parse_config
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
@@ -60,5 +61,5 @@ class ToldTracker:
         number = len(self._slam.keyframes) - 1
         return [Tracked(frame, frame_class, sub_map, number, T_wc, pointmap=seen)]
 
-    def finish(self) -> list[Tracked]:
+    def finish(self, until: Deadline | None = None) -> list[Tracked]:
         return []

@@ -12,7 +12,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("aquaflow", "drivers", "sim_drivers")
 FRAMEWORK = {
-    *("forward", "do_GET", "emit"),  # torch, http.server, logging
+    *("forward", "do_GET", "do_POST", "emit"),  # torch, http.server, logging
     *("readable", "seekable"),  # io
     "get_next",  # onnxruntime
 }

@@ -17,12 +17,12 @@ from aquaflow.fusion.metric_file import read_frame_of_map
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.mapping.gaussians.gaussians import radiance
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.state import NO_PIXELS
 from aquaflow.mapping.transfers import map_out, picture_out, water_out
 from aquaflow.mapping.views import View, in_time
 from aquaflow.render import RendererName, select_renderer
+from aquaflow.render.activation import radiance
 from aquaflow.synthetic.water import Medium, Rgb
 
 FloatImage = npt.NDArray[np.float32]

@@ -18,6 +18,7 @@ from aquaflow.cli.bench import register as register_bench
 from aquaflow.cli.calibrate import register as register_calibrate
 from aquaflow.cli.console import PRESETS, Json, progress_bars, unit_in_words
 from aquaflow.cli.devices import register as register_devices
+from aquaflow.cli.dive import register as register_dive
 from aquaflow.cli.export import register as register_export
 from aquaflow.cli.prior import register as register_prior
 from aquaflow.cli.record import register as register_record
@@ -265,7 +266,8 @@ def _print_summary(finished: Finished) -> None:
     quality = (
         "no held-out frames"
         if metrics["psnr"] is None
-        else f"held-out PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.3f}"
+        else f"held-out PSNR {metrics['psnr']:.2f} dB ({metrics['psnr_as_tracked']:.2f} as "
+        f"tracked), SSIM {metrics['ssim']:.3f}"
     )
     typer.echo(
         f"{metrics['tracked']} of {metrics['frames']} frames posed, {metrics['keyframes']} "
@@ -280,6 +282,7 @@ def _print_summary(finished: Finished) -> None:
 register_bench(app)
 register_calibrate(app)
 register_devices(app)
+register_dive(app)
 register_export(app)
 register_prior(app)
 register_record(app)

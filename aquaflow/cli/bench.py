@@ -9,12 +9,16 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from aquaflow.cli.console import Json, progress_bars, table_console
+from aquaflow.cli.console import Json, one_of, progress_bars, table_console
 from aquaflow.errors import InputError
 
 Suite = Annotated[str | None, typer.Option(help="ci (synthetic) | real DATA_DIR")]
 Data = Annotated[Path | None, typer.Argument(help="Of --suite real: a folder for each clip.")]
 Scenes = Annotated[list[Path] | None, typer.Option("--scene", help="Recording; may be repeated.")]
+
+Device = Annotated[
+    str | None, typer.Option(help="cpu | cuda: what is drawn there alone; default: wherever.")
+]
 
 DIVES = "dives"
 """The command that is meant where none is named."""
@@ -51,6 +55,7 @@ def dives(
     ] = None,
     repeats: Annotated[int, typer.Option(min=1, help="Runs of each, interleaved.")] = 1,
     peers: Annotated[bool, typer.Option(help="Run COLMAP and two-view odometry too.")] = True,
+    device: Device = None,
     out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("out/bench"),
     readme: Annotated[
         Path | None, typer.Option(help="Write table and picture into this Markdown file.")
@@ -61,7 +66,7 @@ def dives(
 
     `aquaflow bench` alone does this too; `aquaflow bench render` times the renderer.
     """
-    from aquaflow.config.presets import BY_EFFORT
+    from aquaflow.config.presets import BY_EFFORT, FOR_A_GPU
     from aquaflow.evaluation.bench import benchmark as bm
     from aquaflow.evaluation.bench.readme import around_section
 
@@ -73,10 +78,15 @@ def dives(
 
     if readme is not None:
         around_section(readme)
-    contenders = bm.contenders_of(preset or BY_EFFORT, peers)
+    if device is not None:
+        from aquaflow.evaluation.bench.meter import DEVICES, require
+
+        require(one_of(DEVICES, device, "--device"))
+    presets = (*BY_EFFORT, *FOR_A_GPU) if device == "cuda" else BY_EFFORT
+    contenders = bm.contenders_of(preset or presets, peers)
     with progress_bars(as_json) as progress:
         scenes = bm.scenes_of(suite, data, scene or [], out, progress)
-        result = bm.benchmark(scenes, contenders, repeats, out, progress)
+        result = bm.benchmark(scenes, contenders, repeats, out, progress, device=device)
     if readme is not None:
         from aquaflow.evaluation.bench.readme import write_readme
 
@@ -87,6 +97,8 @@ def dives(
     from aquaflow.evaluation.bench.table import print_table
 
     print_table(result["runs"], table_console())
+    if result["machine"]["gpu"]:
+        typer.echo(f"GPU: {result['machine']['gpu']}.")
     typer.echo(f"Look at {out / bm.PICTURE_FILE}; all numbers are in {out / bm.JSON_FILE}.")
 
 
@@ -96,16 +108,19 @@ def render(
     opensplat: Annotated[
         str | None, typer.Option(help="Times your OpenSplat build; see docs/performance.md.")
     ] = None,
+    device: Device = None,
     out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("out/bench_render"),
     as_json: Json = False,
 ) -> None:
     """Forward and backward ms of every renderer here: table, picture, render_bench.json."""
+    from aquaflow.evaluation.bench.meter import DEVICES
     from aquaflow.evaluation.bench.render import benchmark as bm
-    from aquaflow.evaluation.bench.render.scene import QUICK_SIZES, SIZES
+    from aquaflow.evaluation.bench.render.sizes import QUICK_SIZES, SIZES
 
+    device = None if device is None else one_of(DEVICES, device, "--device")
     sizes = QUICK_SIZES if quick else SIZES
     with progress_bars(as_json) as progress:
-        result = bm.bench_render(sizes, repeats, out, opensplat, progress)
+        result = bm.bench_render(sizes, repeats, out, opensplat, progress, device)
     if as_json:
         typer.echo(json.dumps(result))
         return

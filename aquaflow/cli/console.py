@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from aquaflow.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -26,6 +29,17 @@ def duration(value: float | None) -> float | None:
     """
     if value is not None and not 0.0 <= value <= threading.TIMEOUT_MAX:
         raise typer.BadParameter(f"give seconds from 0 to {threading.TIMEOUT_MAX:.0f}")
+    return value
+
+
+def one_of(choices: Sequence[str], value: str, option: str) -> str:
+    """The value of an option that has to be one of ``choices``.
+
+    Raises:
+        InputError: it is another.
+    """
+    if value not in choices:
+        raise InputError(f"{option} is {value!r}; use one of {', '.join(choices)}")
     return value
 
 
@@ -71,6 +85,21 @@ def unit_in_words(metrics: Mapping[str, Any]) -> list[str]:
     if metrics["telemetry"]:
         return [f"Lengths are map units; metres: {metrics['scale_source']}."]
     return []
+
+
+class _Sentence(logging.Formatter):
+    """The message alone; a traceback is in the dive's log."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return record.getMessage()
+
+
+def devices_on_stderr() -> None:
+    """Print what happens to devices as it happens: a terminal, and the journal of a service."""
+    said = logging.StreamHandler()
+    said.setFormatter(_Sentence())
+    said.addFilter(lambda record: "source" in getattr(record, "fields", {}))
+    logging.getLogger("aquaflow").addHandler(said)
 
 
 def table_console() -> Console:

@@ -1,10 +1,10 @@
-"""The command that looks for hardware: ``devices``. Thin, like all of cli/."""
+"""The command that looks for devices: ``devices``. Thin, like all of cli/."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -19,11 +19,20 @@ def register(app: typer.Typer) -> None:
     app.command()(devices)
 
 
-def devices(as_json: Json = False) -> None:
-    """List cameras and links that are plugged in, with the lines for the config."""
-    from aquaflow.sources.discovery import discover
+def devices(
+    host: Annotated[
+        list[str] | None,
+        typer.Option(help="Ask this computer on the network; may be repeated. Else a BlueROV2's."),
+    ] = None,
+    local: Annotated[
+        bool, typer.Option("--local", help="Look at what is plugged in only, not at the network.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """List cameras, links and streams that are there, with the lines for the config."""
+    from aquaflow.sources.discovery import VEHICLE_HOSTS, discover
 
-    found = discover()
+    found = discover(() if local else tuple(host or VEHICLE_HOSTS))
     if as_json:
         typer.echo(json.dumps(asdict(found)))
     else:
@@ -48,12 +57,14 @@ def _print(found: DiscoveryResult) -> None:
             )
         console.print(table)
     else:
-        typer.echo("No camera, serial port or CAN interface is plugged in.")
+        typer.echo("Nothing was found: no camera, serial port, CAN interface, stream or DVL.")
     for problem in found.problems:
         typer.echo(f"Not looked for: {problem}.")
 
 
-def _as_yaml(config: dict[str, str]) -> str:
+def _as_yaml(config: dict[str, Any]) -> str:
     import yaml
 
+    if not config:
+        return ""
     return str(yaml.safe_dump(config, sort_keys=False)).rstrip()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from aquaflow.cli.console import Json, progress_bars, table_console
+from aquaflow.cli.console import Json, one_of, progress_bars, table_console
 from aquaflow.errors import AquaFlowError, InputError
 
 if TYPE_CHECKING:
@@ -56,8 +56,8 @@ def verify(
 
     settings = None
     if device is not None:
-        where: Any = _one_of(DEVICES, device, "--device")
-        how: Any = _one_of(PRECISIONS, precision, "--precision")
+        where: Any = one_of(DEVICES, device, "--device")
+        how: Any = one_of(PRECISIONS, precision, "--precision")
         settings = RuntimeSettings(where, how)
     if folder is None and device is not None:
         raise InputError(f"nothing to run on {device}; give the folder of a prior")
@@ -79,12 +79,6 @@ def verify(
         )
     if settings is not None:
         check(name, there, settings)
-
-
-def _one_of(choices: tuple[str, ...], value: str, option: str) -> str:
-    if value not in choices:
-        raise InputError(f"{option} is {value!r}; use one of {', '.join(choices)}")
-    return value
 
 
 def _parity_with(checkpoint: Path, folder: Path, card: PriorCard) -> dict[str, float]:

@@ -14,6 +14,7 @@ from aquaflow.cli.console import (
     PRESETS,
     Json,
     Seconds,
+    devices_on_stderr,
     progress_bars,
     table_console,
     unit_in_words,
@@ -78,6 +79,7 @@ def run(
     from aquaflow.service.onboard import map_live  # loads torch
 
     if source is None:
+        devices_on_stderr()
         feed: Feed = devices(vehicle)
     else:
         calibration = None if calib is None else load_camera(calib)

@@ -113,8 +113,9 @@ class ClockMapping:
     later by less than its uncertainty.
     """
 
-    def __init__(self, name: str = "device") -> None:
-        self.name = name
+    def __init__(self, name: str = "device", max_drift: float = MAX_DRIFT) -> None:
+        """``max_drift``: the most by which its clock may run fast or slow, as a share."""
+        self.name, self._max_drift = name, max_drift
         self.resets = 0
         self.outliers = 0
         self._buckets: deque[_Bucket] = deque(maxlen=WINDOW_BUCKETS)
@@ -153,7 +154,9 @@ class ClockMapping:
         try:
             self._earlier = [_Bucket.of(row) for row in earlier]
         except (TypeError, ValueError) as error:
-            log.warning("the clock of %s is learned anew: %s", self.name, error)
+            log.warning(
+                "the clock of %s is learned anew: %s", self.name, error, extra=self._fields()
+            )
 
     def to_monotonic(self, device_ns: int) -> int | None:
         """CLOCK_MONOTONIC of a moment on the device's clock; None before the first message."""
@@ -181,7 +184,7 @@ class ClockMapping:
         since = tuple(self._buckets)
         self._buckets = deque(earlier, maxlen=WINDOW_BUCKETS)
         self._newest_ns = self._buckets[-1].device_ns
-        self._line = _fit(self._buckets)
+        self._line = _fit(self._buckets, self._max_drift)
         for bucket in since:
             self.add(bucket.device_ns, bucket.device_ns + bucket.offset_ns)
 
@@ -198,12 +201,19 @@ class ClockMapping:
     def _begin_anew(self) -> None:
         """Forget the old clock and learn the new one from the messages that revealed it."""
         self.resets += 1
-        log.warning("the clock of %s began anew (%d times so far)", self.name, self.resets)
+        log.warning(
+            "the clock of %s began anew (%d times so far)", self.name, self.resets,
+            extra=self._fields(),
+        )  # fmt: skip
         revealed, self._contradictions = self._contradictions, []
         self._buckets.clear()
         self._line = None
         for device_ns, arrival_ns, round_trip_ns in revealed:
             self.add(device_ns, arrival_ns, round_trip_ns)
+
+    def _fields(self) -> dict[str, dict[str, str]]:
+        """Of a log record."""
+        return {"fields": {"event": "clock", "source": self.name}}
 
     def _learn(self, device_ns: int, arrival_ns: int, round_trip_ns: int | None) -> None:
         first = self._line is None
@@ -218,7 +228,7 @@ class ClockMapping:
         if round_trip_ns is not None and round_trip_ns >= 0:
             changed |= self._bound(self._buckets[-1], device_ns, offset_ns - round_trip_ns)
         if changed:
-            self._line = _fit(self._buckets)
+            self._line = _fit(self._buckets, self._max_drift)
 
     @staticmethod
     def _improve(bucket: _Bucket, device_ns: int, offset_ns: int) -> bool:
@@ -235,14 +245,14 @@ class ClockMapping:
         return True
 
 
-def _fit(buckets: deque[_Bucket]) -> _Line:
+def _fit(buckets: deque[_Bucket], max_drift: float) -> _Line:
     """The line under the fastest messages, lowered by half of what round trips leave open."""
     origin = buckets[0]
     x = np.array([bucket.device_ns - origin.device_ns for bucket in buckets], np.float64)
     y = np.array([bucket.offset_ns - origin.offset_ns for bucket in buckets], np.float64)
     drift = 0.0
     if x[-1] - x[0] >= MIN_DRIFT_SPAN_NS:
-        drift = float(np.clip(_slope_under(x, y), -MAX_DRIFT, MAX_DRIFT))
+        drift = float(np.clip(_slope_under(x, y), -max_drift, max_drift))
     gaps = y - drift * x
     base = float(gaps.min())
     lowest = [

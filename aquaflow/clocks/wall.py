@@ -24,10 +24,12 @@ class WallClockReading:
 
 
 class WallClockWatch:
-    """Offset of the wall clock as a series; jumps are logged and counted, and do nothing else."""
+    """Offset of the wall clock as a series; jumps are counted and logged, and do nothing else."""
 
-    def __init__(self) -> None:
+    def __init__(self, tell: bool = True) -> None:
+        """``tell``: log jumps; of several watches one does."""
         self.jumps = 0
+        self._tell = tell
         self._last_offset_ns: int | None = None
 
     def read(
@@ -42,5 +44,9 @@ class WallClockWatch:
         if abs(change) < JUMP_NS:
             return WallClockReading(monotonic, offset, 0)
         self.jumps += 1
-        log.warning("the wall clock was set by %+.3f s; the dive's clock goes on", change * 1e-9)
+        if self._tell:
+            log.warning(
+                "the wall clock was set by %+.3f s; the dive's clock goes on", change * 1e-9,
+                extra={"fields": {"event": "clock", "source": "computer"}},
+            )  # fmt: skip
         return WallClockReading(monotonic, offset, change)

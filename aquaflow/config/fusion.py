@@ -6,9 +6,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from aquaflow.config.device import MountingConfig
 from aquaflow.config.known_lengths import BoardConfig, LasersConfig
 from aquaflow.config.stage import Stage
-from aquaflow.config.telemetry import MountingConfig
 
 
 class FusionConfig(Stage):

@@ -60,8 +60,9 @@ PRESETS: dict[str, dict[str, Any]] = {
 The width stays the same in all: errors in pictures of different widths cannot be compared.
 """
 BY_EFFORT = ("fast", "balanced", "accurate")
-"""Presets that were measured on a CPU, least effort first; the others are for a GPU, and no figure
-of theirs was measured on one (docs/tuning.md#presets)."""
+"""Presets that were measured on a CPU, least effort first."""
+FOR_A_GPU = ("onboard-gpu", "paper")
+"""The others; no figure of theirs was measured on one (docs/tuning.md#presets)."""
 
 
 def preset(name: str) -> dict[str, Any]:

@@ -6,11 +6,11 @@ import ipaddress
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, IPvAnyNetwork, model_validator
 
+from aquaflow.config.device import MountingConfig
 from aquaflow.config.link import Port
 from aquaflow.config.stage import Stage
-from aquaflow.config.telemetry import MountingConfig
 
 
 def is_loopback(host: str) -> bool:
@@ -32,6 +32,10 @@ class ListenConfig(Stage):
     token_file: Path | None = Field(
         None, description="file that holds the token, readable by the service's user only"
     )
+    trusted: list[IPvAnyNetwork] = Field(
+        [], description="networks whose computers need no token, such as 192.168.2.0/24: everybody "
+        "there may watch and control the dive",
+    )  # fmt: skip
 
     @model_validator(mode="after")
     def _others_need_a_token(self) -> ListenConfig:
@@ -49,7 +53,7 @@ class LiveMappingConfig(Stage):
     )  # fmt: skip
     steps_per_view: int = Field(
         40, ge=0, description="steps of the optimiser for each view in the end, as far as time "
-        "allows: what 1500 steps of refining and 20 a frame are to a clip of 75 views",
+        "allows: as 1500 steps of refining and 20 a frame for a clip of 75 views",
     )  # fmt: skip
     nice: int = Field(
         0,
@@ -62,8 +66,35 @@ class LiveMappingConfig(Stage):
     refine_seconds: float | None = Field(
         20.0,
         ge=0,
-        description="s; refining when the dive ends, within systemd's TimeoutStopSec (None: as "
-        "long as mapping.optimiser says)",
+        description="s; refining when the dive ends, within service.finish_s (None: as long as "
+        "mapping.optimiser says)",
+    )
+
+
+class DiveConfig(Stage):
+    """When dives begin and end. Recordings (``--source``) begin at once, whatever it says."""
+
+    begin: Literal["at_once", "when_armed", "on_command"] = Field(
+        "at_once",
+        description="at_once: the first dive with the service; when_armed: one each time that the "
+        "autopilot is armed; on_command: when the pilot asks. Whatever it says, the pilot may ask, "
+        "and a dive that a crash cut off goes on by itself",
+    )
+    finish: Literal["on_command", "when_disarmed"] = Field(
+        "on_command",
+        description="on_command: when the pilot asks; when_disarmed: also some time after the "
+        "autopilot was disarmed",
+    )
+    disarmed_s: float = Field(
+        60.0,
+        ge=0,
+        description="s; an autopilot that is armed again within this time goes on with its dive "
+        "(judgement: a pilot disarms to change a gripper or to rest on the ground)",
+    )
+    commands: bool = Field(
+        False,
+        description="obey MAV_CMD_USER_1 to 4 (start, stop, finish, new) of any ground station on "
+        "the MAVLink network, which has no token",
     )
 
 
@@ -71,6 +102,12 @@ class CheckpointConfig(Stage):
     """What a kill or a power cut may cost."""
 
     every_s: float = Field(10.0, gt=0, description="s between checkpoints, and so the most lost")
+    deliverables_s: float = Field(
+        60.0,
+        gt=0,
+        description="s between the maps, trajectories and reports that are written while the dive "
+        "goes on; longer where they would take more than 3 % of a core",
+    )
     resume_h: float = Field(
         12.0, ge=0, description="h; an unfinished dive that is older is left as it is (0: always)"
     )
@@ -83,7 +120,9 @@ class LimitsConfig(Stage):
     memory_share: float = Field(
         0.10, ge=0, lt=1, description="of the machine's or the unit's memory that must stay free"
     )
-    gpu_memory_share: float = Field(0.05, ge=0, lt=1, description="of the GPU's, likewise")
+    gpu_memory_share: float = Field(
+        0.05, ge=0, lt=1, description="of the memory of the GPU that the map lives on, likewise"
+    )
     temperature_c: float = Field(
         92.0, gt=0, description="degC of the hottest zone; a Jetson throttles itself at 97 to 99"
     )
@@ -116,7 +155,7 @@ class PoseConfig(Stage):
 class VehicleReportConfig(Stage):
     """Messages to the pilot over MAVLink."""
 
-    status_text: bool = Field(True, description="STATUSTEXT when the state changes")
+    status_text: bool = Field(True, description="STATUSTEXT when something changes")
     values: bool = Field(True, description="NAMED_VALUE_FLOAT once a second: AQ_STATE, AQ_LAG, ...")
 
 
@@ -130,7 +169,15 @@ class ServiceConfig(Stage):
         60.0, gt=0, description="s without a heartbeat of a stage until the process exits; "
         "one fit of the water may take 10 s on two cores",
     )  # fmt: skip
+    finish_s: float | None = Field(
+        100.0,
+        gt=0,
+        description="s; for all that ends a dive: frames that wait, refining, evaluation, files. "
+        "Evaluation and refining are cut short; keep it 30 s below systemd's TimeoutStopSec "
+        "(None: as long as it takes)",
+    )
     health: ListenConfig = ListenConfig(port=8230)
+    dive: DiveConfig = DiveConfig()
     mapping: LiveMappingConfig = LiveMappingConfig()
     checkpoint: CheckpointConfig = CheckpointConfig()
     limits: LimitsConfig = LimitsConfig()

@@ -1,69 +1,24 @@
-"""Settings of telemetry devices: what they speak, on which wire, and where they are mounted."""
+"""Settings of a vehicle's telemetry: its autopilot, and every other device by its kind."""
 
 from __future__ import annotations
 
+from itertools import combinations
 from typing import Annotated, Any, Literal, TypeAlias
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from aquaflow.config.link import ByteLinkConfig, CanConfig
+from aquaflow.config.can_devices import DbcConfig, Nmea2000Config
+from aquaflow.config.device import Assumptions, PositioningConfig
+from aquaflow.config.instruments import (
+    NucleusConfig,
+    Pd0Config,
+    PingConfig,
+    VectorNavConfig,
+    WaterLinkedJsonConfig,
+    WaterLinkedSerialConfig,
+)
+from aquaflow.config.link import EVERY_ADDRESS, ByteLinkConfig, MavlinkLinkConfig, UdpConfig
 from aquaflow.config.stage import Stage, validated
-
-
-class MountingConfig(Stage):
-    """Where a sensor sits in the body frame (forward, right, down)."""
-
-    position_m: tuple[float, float, float] = Field(
-        (0.0, 0.0, 0.0), description="of the sensor, from the body's origin"
-    )
-    roll_deg: float = Field(0.0, description="of the sensor's axes in the body, first roll")
-    pitch_deg: float = Field(0.0, description="then pitch")
-    yaw_deg: float = Field(
-        0.0,
-        description="then yaw; 180: a DVL that points backwards, unless it turns what it sends",
-    )
-
-
-class DeviceConfig(Stage):
-    """What every device has."""
-
-    mounting: MountingConfig = MountingConfig()
-    silence_s: float | None = Field(
-        10.0, gt=0, description="open the link anew after this long without a byte (None: never)"
-    )
-
-
-class PositioningConfig(DeviceConfig):
-    """A device that may send fixes on the earth: GNSS, or an acoustic system of the vehicle."""
-
-    position_lag_s: float = Field(
-        0.0,
-        ge=0,
-        le=60,
-        description="s that a fix is older than its message says. GNSS receivers: 0.1 to 0.25 "
-        "(ArduPilot's GPS1_DELAY_MS ends at 250); acoustic systems more: 0.2 for the sound over "
-        "300 m at 1500 m/s, the wait between two pulses, and their filter",
-    )
-    position_sigma_m: float | None = Field(
-        None,
-        gt=0,
-        description="m, 1 sigma of each horizontal direction of every fix, such as an acoustic "
-        "system's data sheet has it; None: as the device states it, else from HDOP",
-    )
-
-
-class Assumptions(Stage):
-    """What may be assumed where a device measures only part of a quantity.
-
-    A heading without roll and pitch is no attitude. With ``level`` it becomes one: true within the
-    few degrees by which a passively stable ROV leans, wrong for gravity on any other vehicle.
-    """
-
-    level: bool = Field(False, description="roll and pitch are 0 where nothing measures them")
-    no_side_slip: bool = Field(False, description="the vehicle moves only where it points")
-    speed_sigma_m_s: float = Field(
-        0.2, gt=0, description="m/s, 1 sigma of a velocity that only a speed log measures"
-    )
 
 
 class LightsConfig(Stage):
@@ -115,7 +70,7 @@ class MavlinkConfig(PositioningConfig):
     """An autopilot that speaks MAVLink 1 or 2 (ArduSub)."""
 
     kind: Literal["mavlink"] = "mavlink"
-    link: ByteLinkConfig
+    link: MavlinkLinkConfig
     system_id: int = Field(1, ge=1, le=255)
     component_id: int = Field(1, ge=0, le=255)
     also: tuple[MavlinkSenderConfig, ...] = Field(
@@ -155,11 +110,15 @@ class MavlinkConfig(PositioningConfig):
 
     @model_validator(mode="after")
     def _names_each_sender_once(self) -> MavlinkConfig:
-        senders = [(self.system_id, self.component_id)]
-        senders += [(each.system_id or self.system_id, each.component_id) for each in self.also]
-        if len(set(senders)) < len(senders):
+        if len(self.senders) < 1 + len(self.also):
             raise ValueError("'also' names each sender once, and not the autopilot itself")
         return self
+
+    @property
+    def senders(self) -> frozenset[tuple[int, int]]:
+        """System and component of everybody whose messages are used."""
+        also = {(each.system_id or self.system_id, each.component_id) for each in self.also}
+        return frozenset({(self.system_id, self.component_id), *also})
 
 
 class NmeaConfig(PositioningConfig):
@@ -184,94 +143,15 @@ class NmeaConfig(PositioningConfig):
     assume: Assumptions = Assumptions()
 
 
-class WaterLinkedSerialConfig(DeviceConfig):
-    """A Water Linked DVL (A50, A125) on its serial port."""
-
-    kind: Literal["waterlinked_serial"] = "waterlinked_serial"
-    link: ByteLinkConfig
-    attitude: bool = Field(
-        False, description="use its roll, pitch, yaw; yaw counts from power-on, not from north"
-    )
-
-
-class WaterLinkedJsonConfig(DeviceConfig):
-    """A Water Linked DVL on TCP, port 16171."""
-
-    kind: Literal["waterlinked_json"] = "waterlinked_json"
-    link: ByteLinkConfig
-    attitude: bool = Field(
-        False, description="use its roll, pitch, yaw; yaw counts from power-on, not from north"
-    )
-
-
-class Pd0Config(DeviceConfig):
-    """A Teledyne DVL that sends PD0 ensembles, in instrument or ship coordinates."""
-
-    kind: Literal["pd0"] = "pd0"
-    link: ByteLinkConfig
-    velocity_of: Literal["bottom", "vehicle"] = Field(
-        "bottom",
-        description="whose velocity it sends: PD0 has that of the bottom past the instrument; some "
-        "firmware negates it",
-    )
-    sigma_m_s: float = Field(
-        0.01, gt=0, description="m/s, 1 sigma at zero error velocity (data sheets: 0.3-1 cm/s)"
-    )
-
-
-class Nmea2000Config(PositioningConfig):
-    """Instruments on an NMEA 2000 bus."""
-
-    kind: Literal["nmea2000"] = "nmea2000"
-    link: CanConfig
-    assume: Assumptions = Assumptions()
-
-
-class DbcSignal(Stage):
-    """Signals of one CAN message that make a sample."""
-
-    message: str
-    sample: Literal[
-        "depth", "attitude", "euler", "angular_rate", "acceleration", "velocity", "altitude",
-        "lights", "position",
-    ] = Field(
-        description="attitude: quaternion wxyz; euler: roll, pitch, yaw; position: latitude, "
-        "longitude"
-    )  # fmt: skip
-    signals: tuple[str, ...]
-    scale: tuple[float, ...] = Field(
-        (1.0,),
-        description="to metres, radians, seconds and the body's axes, of a position to degrees: "
-        "one, or one each",
-    )
-    sigma_m_s: float = Field(0.1, gt=0, description="m/s, figure of merit of a velocity")
-
-    @model_validator(mode="after")
-    def _has_as_many_signals_as_the_sample_has_values(self) -> DbcSignal:
-        counts = {"depth": 1, "altitude": 1, "lights": 1, "position": 2, "attitude": 4}
-        count = counts.get(self.sample, 3)
-        if len(self.signals) != count:
-            raise ValueError(f"a sample '{self.sample}' is made of {count} signals")
-        if len(self.scale) not in (1, count):
-            raise ValueError(f"scale holds 1 or {count} values")
-        return self
-
-
-class DbcConfig(PositioningConfig):
-    """Any CAN bus that a DBC file describes."""
-
-    kind: Literal["dbc"] = "dbc"
-    link: CanConfig
-    database: str = Field(description="path of the .dbc file")
-    samples: tuple[DbcSignal, ...] = Field(min_length=1)
-
-
 AnyDevice: TypeAlias = Annotated[
     MavlinkConfig
     | NmeaConfig
     | WaterLinkedSerialConfig
     | WaterLinkedJsonConfig
     | Pd0Config
+    | NucleusConfig
+    | PingConfig
+    | VectorNavConfig
     | Nmea2000Config
     | DbcConfig,
     Field(discriminator="kind"),
@@ -285,6 +165,37 @@ class TelemetryConfig(Stage):
     queue_samples: int = Field(
         10_000, ge=1, description="kept until fetched, then the oldest go (a minute at 160/s)"
     )
+
+    @field_validator("devices")
+    @classmethod
+    def _tells_those_of_one_port_apart(cls, devices: dict[str, AnyDevice]) -> dict[str, AnyDevice]:
+        for (name, one), (other_name, other) in combinations(devices.items(), 2):
+            problem = _mixed_up(one, other)
+            if problem is not None:
+                raise ValueError(f"has '{name}' and '{other_name}' on one UDP port: {problem}")
+        return devices
+
+
+def _mixed_up(one: AnyDevice, other: AnyDevice) -> str | None:
+    """Why nobody can say whose a datagram is; None if somebody can."""
+    a, b = one.link, other.link
+    if not (isinstance(a, UdpConfig) and isinstance(b, UdpConfig)) or a.port != b.port:
+        return None
+    if "send" in (a.mode, b.mode) or (a.host != b.host and not EVERY_ADDRESS & {a.host, b.host}):
+        return None
+    if a.host != b.host:
+        return f"give both the same host, not '{a.host}' and '{b.host}'"
+    if a.sender_address != b.sender_address or one.kind != other.kind:
+        return None
+    if isinstance(one, MavlinkConfig) and isinstance(other, MavlinkConfig):
+        common = sorted(one.senders & other.senders)
+        if not common:
+            return None
+        system, component = common[0]
+        what = f"both use system {system}, component {component}"
+    else:
+        what = f"both speak {one.kind}"
+    return f"{what}; state the address that one of them sends from as its link.sender"
 
 
 def parse_telemetry(data: dict[str, Any], origin: str) -> TelemetryConfig:

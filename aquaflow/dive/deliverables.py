@@ -1,14 +1,17 @@
 """The deliverables at the end of a dive; each part is computed and written separately.
 
 A part that fails is counted and made once more; one that fails again is named in the notes and left
-out, and never costs another.
+out, and never costs another. Where it was the maps' device that failed, they go on on the CPU, and
+the part is made there.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
+from aquaflow.clocks.deadline import Deadline
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.found_camera import FoundCamera
 from aquaflow.dive.held_out import HeldOut, examine_held_out, mean_amplification
@@ -26,10 +29,11 @@ from aquaflow.dive.results import (
 from aquaflow.export.georeference import GEOREFERENCE, georeference
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.mapping.mapper import Mapper
 from aquaflow.messages import CameraModel, Dropped
 from aquaflow.slam import Slam
 from aquaflow.tracking.frames import Tracked
+
+T = TypeVar("T")
 
 
 class Deliverables:
@@ -52,12 +56,22 @@ class Deliverables:
         self.outputs = outputs or MetricOutputs()
         self.held_out: list[HeldOut] = []
         """Ranges in the unit of the largest sub-map's metric frame."""
+        self.notes: list[str] = []
+        """What was left out."""
         self.poses: dict[int, Sim3] = self._in_n(tracked_poses(results))
         """T_nc by frame index."""
-        self._attempt = slam.failures.attempt
         self._main = largest_sub_map(results)
         self._waters: dict[int, WaterSummary | None] = {}
         """By sub-map, in map units; a sub-map whose summary failed is missing."""
+
+    def _attempt(self, stage: str, work: Callable[[], T]) -> T | None:
+        failures = self.slam.failures
+        before = failures.of_device
+        made = failures.attempt(stage, work)
+        # A part may have contained the failure itself, and be there without what it cost.
+        if failures.of_device > before and self.slam.maps.leave_device(f"in {stage}"):
+            made = failures.attempt(stage, work)
+        return made
 
     @property
     def metric_frame(self) -> MetricFrame:
@@ -68,23 +82,33 @@ class Deliverables:
         sub_maps = {tracked.frame.index: tracked.sub_map for tracked in self.results}
         return {index: self.outputs.frame(sub_maps[index]).pose(T) for index, T in poses.items()}
 
-    def evaluate(self) -> None:
-        """Poses as the map refined them, held-out views, and the water of each sub-map."""
+    def summarise(self) -> None:
+        """Poses as the map refined them, and the water of each sub-map."""
         attempt = self._attempt
         refined = attempt("refined poses", lambda: refined_poses(self.slam, self.results))
         self.poses = self.poses if refined is None else self._in_n(refined)
-        held_out = attempt("evaluation", lambda: examine_held_out(self.slam, self._main))
-        scale = self.metric_frame.T_nm.scale
-        self.held_out = [held_out_in(example, scale) for example in held_out or ()]
-        for sub_map, mapper in self.slam.mappers.items():
-            attempt("water summary", partial(self._summarise_water, sub_map, mapper))
+        for sub_map in self.slam.mappers:
+            attempt("water summary", partial(self._summarise_water, sub_map))
 
-    def _summarise_water(self, sub_map: int, mapper: Mapper) -> None:
-        self._waters[sub_map] = summarise_water(mapper)
+    def _summarise_water(self, sub_map: int) -> None:
+        self._waters[sub_map] = summarise_water(self.slam.mappers[sub_map])
+
+    def evaluate(self, until: Deadline | None = None) -> None:
+        """Held-out views, as many as there is time for."""
+        main, attempt = self._main, self._attempt
+        found = attempt("evaluation", lambda: examine_held_out(self.slam, main, until)) or []
+        scale = self.metric_frame.T_nm.scale
+        self.held_out = [held_out_in(example, scale) for example in found]
+        there = len(self.slam.held_out.get(main, ()))
+        if until is not None and until.over and len(found) < there:
+            self.notes.append(
+                f"{there - len(found)} of {there} held-out views were not evaluated: the dive's "
+                "end had no more time (service.finish_s)"
+            )
 
     def write(self) -> None:
-        """Everything but the report and metrics.json."""
-        attempt, folder = self._attempt, self.folder
+        """Trajectory, cameras and maps: what does not wait for an evaluation."""
+        attempt = self._attempt
         attempt("writing trajectory.tum", self._write_trajectory)
         attempt("writing trajectory.csv", self._write_path_table)
         attempt("writing metric.json", self._write_metric_file)
@@ -94,7 +118,11 @@ class Deliverables:
             attempt("writing camera.yaml", partial(self._write_cameras, camera))
         for sub_map in self.slam.mappers:
             self._write_map(sub_map)
-        attempt("writing held-out views", partial(folder.write_held_out, self.held_out))
+
+    def write_evaluation(self) -> None:
+        """The held-out views, and the water with what they say of it."""
+        attempt = self._attempt
+        attempt("writing held-out views", partial(self.folder.write_held_out, self.held_out))
         if self._main in self._waters or not self.slam.mappers:
             attempt("writing medium.json", self._write_medium)
 
@@ -142,13 +170,16 @@ class Deliverables:
 
     def _write_map(self, sub_map: int) -> None:
         suffix = "" if sub_map == self._main else f"_{sub_map}"
-        mapper, water = self.slam.mappers[sub_map], self._waters.get(sub_map)
-        frame = self.outputs.frame(sub_map)
-        for file, write in (
-            (f"map{suffix}.aqf", partial(self.folder.write_map, mapper, suffix)),
-            (f"map{suffix}.ply", partial(self.folder.write_splats, mapper, water, frame, suffix)),
-        ):
-            self._attempt(f"writing {file}", write)
+        water, frame = self._waters.get(sub_map), self.outputs.frame(sub_map)
+
+        def write_map() -> None:
+            self.folder.write_map(self.slam.mappers[sub_map], suffix)
+
+        def write_splats() -> None:
+            self.folder.write_splats(self.slam.mappers[sub_map], water, frame, suffix)
+
+        self._attempt(f"writing map{suffix}.aqf", write_map)
+        self._attempt(f"writing map{suffix}.ply", write_splats)
 
     def write_report(
         self, dropped: list[Dropped], numbers: dict[str, Any], notes: list[str]

@@ -6,12 +6,13 @@ import contextlib
 import logging
 import math
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from aquaflow.config import Config
@@ -19,6 +20,7 @@ from aquaflow.dive.frames_csv import FrameRow, header, of_text, to_text
 from aquaflow.dive.held_out import HeldOut
 from aquaflow.dive.log import JsonLog
 from aquaflow.dive.results import WaterSummary, water_of
+from aquaflow.dive.status import NAME as STATUS
 from aquaflow.errors import InputError
 from aquaflow.export.map_file import write_map_file
 from aquaflow.export.ply import PlyGaussians, write_ply
@@ -32,12 +34,13 @@ from aquaflow.fusion.metric_file import write_metric_file
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.mapping.gaussians.gaussians import radiance
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.transfers import map_out, water_in
 from aquaflow.recording.telemetry_lines import NAME as TELEMETRY
+from aquaflow.render.activation import radiance
 from aquaflow.storage.atomic import atomic_write, write_json, write_yaml
 from aquaflow.storage.camera_file import save_camera
+from aquaflow.storage.folder_lock import FolderLock
 
 log = logging.getLogger(__name__)
 
@@ -47,16 +50,19 @@ MARKER = "frames.csv"
 TRACE = "trace.json"
 """Every run of every stage, in Chrome's trace event format; written when asked for."""
 
+CALIBRATION = "calibration.yaml"
+"""The camera that the pictures are undistorted with."""
+
 SUGGESTED = "found_camera.yaml"
 """Calibration that a dive without one found too late to use it."""
 
 RESULTS = (
-    *("trajectory.tum", "camera.yaml", "calibration.yaml", "map*.ply", "map*.aqf", "medium.json"),
-    SUGGESTED,
+    *("trajectory.tum", "camera.yaml", "map*.ply", "map*.aqf", "medium.json"),
+    *(CALIBRATION, SUGGESTED),
     *("metrics.json", "report.html", "heldout/*.png", "heldout/*.npz", TRACE),
     KNOWN_LENGTHS,
     TELEMETRY,
-    *("metric.json", "trajectory.csv", "georeference.json", "restored/*.png"),
+    *("metric.json", "trajectory.csv", "georeference.json", "restored/*.png", STATUS),
 )
 """What a run writes, mostly at its end; of an earlier run in the same folder nothing must
 remain."""
@@ -77,16 +83,34 @@ class DiveFolder:
         config: Config,
         overwrite: bool = False,
         resume: Iterable[FrameRow] | None = None,
+        dive_s: Callable[[], float | None] = lambda: None,
     ) -> None:
-        """Make the folder; or ``resume`` the dive in it, which has these rows so far.
+        """Make the folder; or ``resume`` the dive in it, which has these rows so far. No other
+        process gets it until :meth:`close`. ``dive_s``: seconds since the first frame of a live
+        dive, for its log; None before it.
 
         Raises:
-            InputError: it cannot be made, holds something else, or holds a dive and neither
-                ``overwrite`` nor ``resume`` is set.
+            InputError: it cannot be made, another process writes to it, it holds something else,
+                or it holds a dive and neither ``overwrite`` nor ``resume`` is set.
         """
         self.path = path
         self._recorded = bytearray()
         """The rows so far as lines of frames.csv: a tenth of what they take as objects."""
+        self._lock = self._made()
+        try:
+            self._open(config, overwrite, resume, dive_s)
+        except BaseException:
+            self._lock.release()
+            raise
+
+    def _open(
+        self,
+        config: Config,
+        overwrite: bool,
+        resume: Iterable[FrameRow] | None,
+        dive_s: Callable[[], float | None],
+    ) -> None:
+        path = self.path
         if resume is None:
             self._claim(overwrite)
         else:
@@ -94,17 +118,21 @@ class DiveFolder:
         write_yaml(path / "config.yaml", config.model_dump(mode="json"))
         self._rewrite_frames(self._recorded)
         self._frames = (path / MARKER).open("ab")
-        self._log = JsonLog(path / "log.jsonl", append=resume is not None)
+        self._log = JsonLog(path / "log.jsonl", append=resume is not None, dive_s=dive_s)
         self._log.attach()
+
+    def _made(self) -> FolderLock:
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise _unmade(self.path, error) from error
+        return FolderLock(self.path)
 
     def _claim(self, overwrite: bool) -> None:
         try:
-            self.path.mkdir(parents=True, exist_ok=True)
             occupied = any(self.path.iterdir())
         except OSError as error:
-            raise InputError(
-                f"cannot make the dive folder {self.path}: {error.strerror}; choose another --out"
-            ) from error
+            raise _unmade(self.path, error) from error
         if occupied and not (self.path / MARKER).exists():
             raise InputError(
                 f"{self.path} holds files that are not a dive; choose an empty folder as --out"
@@ -130,6 +158,7 @@ class DiveFolder:
             shutil.rmtree(self.work, ignore_errors=True)
         self._log.close()
         self._close_frames()
+        self._lock.release()
 
     @property
     def rows(self) -> Sequence[FrameRow]:
@@ -173,13 +202,22 @@ class DiveFolder:
     def write_trajectory(self, t_s: list[float], poses: list[Sim3], comment: str = "") -> None:
         """trajectory.tum: every frame that has a pose; ``comment``: what the world is."""
         order = np.argsort(t_s, kind="stable")
-        write_tum(
-            self.path / "trajectory.tum",
+        self.write_poses(
             np.array([t_s[i] for i in order]),
             np.array([poses[i].t for i in order]).reshape(-1, 3),
             np.array([poses[i].quaternion for i in order]).reshape(-1, 4),
-            comment=comment,
+            comment,
         )
+
+    def write_poses(
+        self,
+        t_s: npt.NDArray[np.float64],  # [N] s, increasing
+        positions: npt.NDArray[np.float64],  # [N, 3] n
+        wxyz: npt.NDArray[np.float64],  # [N, 4] n from camera
+        comment: str = "",
+    ) -> None:
+        """trajectory.tum of poses in their order."""
+        write_tum(self.path / "trajectory.tum", t_s, positions, wxyz, comment=comment)
 
     def write_path_table(self, rows: Sequence[PoseRow]) -> None:
         """trajectory.csv."""
@@ -189,6 +227,11 @@ class DiveFolder:
         """metric.json; ``main`` is the largest sub-map."""
         write_metric_file(self.path, frames, main)
 
+    def write_calibration(self, calibration: CameraModel | None) -> None:
+        """calibration.yaml, at the begin of a live dive, which may have no end; None: none."""
+        if calibration is not None:
+            save_camera(calibration, self.path / CALIBRATION)
+
     def write_cameras(
         self, mapped: CameraModel, calibration: CameraModel | None, comment: str = ""
     ) -> None:
@@ -196,7 +239,7 @@ class DiveFolder:
         they were undistorted with, where there is one, with a ``comment`` on where it is from."""
         save_camera(mapped, self.path / "camera.yaml")
         if calibration is not None:
-            save_camera(calibration, self.path / "calibration.yaml", comment)
+            save_camera(calibration, self.path / CALIBRATION, comment)
 
     def write_suggested_camera(self, camera: CameraModel, comment: str) -> None:
         """found_camera.yaml: a calibration for the next dive."""
@@ -257,6 +300,10 @@ class DiveFolder:
     def write_report(self, data: ReportData) -> None:
         """report.html."""
         write_report(self.path / "report.html", data)
+
+
+def _unmade(path: Path, error: OSError) -> InputError:
+    return InputError(f"cannot make the dive folder {path}: {error.strerror}; choose another --out")
 
 
 def _finite(value: Any) -> Any:

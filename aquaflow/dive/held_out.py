@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
+from aquaflow.clocks.deadline import Deadline
 from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.rendering import Shown
 from aquaflow.mapping.restoration import (
     RestoredPicture,
     common_exposure,
@@ -23,6 +26,18 @@ from aquaflow.render.image_metrics import lpips, psnr, ssim
 from aquaflow.slam import Slam
 
 Rgb = list[float]
+
+REGISTERING = 0.85
+"""Of the time for held-out views, for their poses: a dozen drawings each, where comparing takes a
+few (docs/measurements.md#finishing)."""
+
+
+class Fidelity(NamedTuple):
+    """How like the camera's picture a drawing is."""
+
+    psnr: float
+    """dB"""
+    ssim: float
 
 
 @dataclass(frozen=True)
@@ -44,18 +59,19 @@ class HeldOut:
     """[H, W] 0 to 255, the share of ``restored`` that is the picture's (see RestoredPicture)."""
     amplification: npt.NDArray[np.float32] | None = None
     """[2, 3] RGB, as applied and as allowed (see RestoredPicture)."""
+    as_tracked: Fidelity | None = None
+    """Before anything of the view was refined: tracked pose, mean exposure, even light."""
 
 
-def examine_held_out(slam: Slam, sub_map: int) -> list[HeldOut]:
-    """Render every held-out frame of a sub-map from its refined pose and compare."""
+def examine_held_out(slam: Slam, sub_map: int, until: Deadline | None = None) -> list[HeldOut]:
+    """Render every held-out frame of a sub-map from its refined pose and compare; where there is
+    only time for some ``until`` then, those are spread over the dive."""
     mapper = slam.mappers.get(sub_map)
     if mapper is None or len(mapper.gaussians) == 0:
         return []
     views = sorted(slam.held_out.get(sub_map, []), key=lambda view: view.frame_index)
     contain, exposure = slam.failures.contain, 1.0
-    for view in views:
-        with contain("held-out pose", view.frame_index):
-            mapper.register(view)
+    views, as_tracked = _registered(slam, mapper, views, until or Deadline())
     with contain("restored exposure"):
         exposure = common_exposure(
             restored_picture(mapper.scene, view, mapper.show(view)).image for view in views
@@ -63,14 +79,49 @@ def examine_held_out(slam: Slam, sub_map: int) -> list[HeldOut]:
     examined = []
     for view in views:
         with contain("evaluation", view.frame_index):
-            examined.append(_examine(mapper, view, exposure))
+            before = as_tracked.get(view.frame_index)
+            examined.append(replace(_examine(mapper, view, exposure), as_tracked=before))
     return examined
+
+
+def _pictures(view: View, shown: Shown) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """[H, W, 3] of the map and of the camera."""
+    return picture_out(shown.image.clamp(0.0, 1.0)), picture_out(view.target())
+
+
+def _fidelity(view: View, shown: Shown) -> Fidelity:
+    rendered, real = _pictures(view, shown)
+    return Fidelity(psnr(rendered, real), ssim(rendered, real))
+
+
+def _registered(
+    slam: Slam, mapper: Mapper, views: Sequence[View], until: Deadline
+) -> tuple[list[View], dict[int, Fidelity]]:
+    """Refine the poses of the ``views``; those that there was time for, in their order, and how
+    like they were before, by frame index."""
+    registering, done = until.share(REGISTERING), list[int]()
+    as_tracked: dict[int, Fidelity] = {}
+    for place in spread(len(views)):
+        if registering.over:
+            break
+        view = views[place]
+        with slam.failures.contain("held-out pose", view.frame_index):
+            as_tracked[view.frame_index] = _fidelity(view, mapper.show(view))
+            mapper.register(view)
+        done.append(place)
+    return [views[place] for place in sorted(done)], as_tracked
+
+
+def spread(count: int) -> list[int]:
+    """0 to ``count`` - 1 in an order whose every beginning is spread over all of them: that of
+    their binary digits read backwards (van der Corput's sequence)."""
+    digits = max(count - 1, 1).bit_length()
+    return sorted(range(count), key=lambda place: f"{place:0{digits}b}"[::-1])
 
 
 def _examine(mapper: Mapper, view: View, exposure: float) -> HeldOut:
     shown = mapper.show(view)
-    real = picture_out(view.target())
-    rendered = picture_out(shown.image.clamp(0.0, 1.0))
+    rendered, real = _pictures(view, shown)
     restored: RestoredPicture | None = None
     if mapper.medium.active:
         restored = restored_picture(mapper.scene, view, shown)

@@ -37,8 +37,11 @@ def map_recording(
     progress: Progress | None = None,
     trace: bool = False,
     telemetry: TelemetryInput | None = None,
+    settle: Callable[[], None] = lambda: None,
 ) -> Finished:
     """Map a recording into the dive folder ``out``; with ``trace`` it gets a ``trace.json`` too.
+
+    ``settle`` is called at the end of each stage: a benchmark lets it wait for a GPU.
 
     Logs of ``telemetry`` that are on a clock of their own are used from the last frame on, when
     the poses have shown their offset.
@@ -52,7 +55,7 @@ def map_recording(
     folder, failures = DiveFolder(out, config, overwrite), Failures()
     given = telemetry or TelemetryInput()
     try:
-        slam = Slam(config, Profiler(trace), folder.work, failures=failures)
+        slam = Slam(config, Profiler(trace, settle), folder.work, failures=failures)
         calibration = calibration or recording.camera
         run = DiveRun(name, folder, config, slam, calibration, recording.name_of, trace)
         try:

@@ -18,7 +18,7 @@ from aquaflow.export.report import (
     ReportData,
 )
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.messages import Dropped
+from aquaflow.messages import CameraModel, Dropped
 from aquaflow.slam import Slam
 from aquaflow.tracking.frames import FrameClass, Tracked
 
@@ -44,22 +44,27 @@ def report_data(
     path = _path(results, poses, outputs)
     return ReportData(
         name=name,
-        camera=_camera(slam, calibrated),
+        camera=camera_summary(_camera(slam), calibrated),
         metrics=metrics,
         path=path,
         measures=measures(path, frame, water),
         timeline=_timeline(results, dropped),
         examples=_examples(held_out),
-        medium=_curves(water, frame.unit),
+        medium=medium_curves(water, frame.unit),
         stages=metrics["stage_ms"],
         warnings=metrics["warnings"],
         notes=notes,
     )
 
 
-def _camera(slam: Slam, calibrated: bool) -> CameraSummary:
+def _camera(slam: Slam) -> CameraModel:
     camera = slam.tracker.camera
     assert camera is not None
+    return camera
+
+
+def camera_summary(camera: CameraModel, calibrated: bool) -> CameraSummary:
+    """The camera of the mapped pictures."""
     source = "calibrated" if calibrated else "refined"
     return CameraSummary(camera.width, camera.height, camera.fx, source)  # type: ignore[arg-type]
 
@@ -108,7 +113,8 @@ def _examples(held_out: list[HeldOut]) -> list[HeldOutExample]:
     ]
 
 
-def _curves(water: WaterSummary | None, unit: str) -> MediumCurves | None:
+def medium_curves(water: WaterSummary | None, unit: str) -> MediumCurves | None:
+    """The water, in ``unit``, as the report draws it."""
     if water is None:
         return None
     return MediumCurves(

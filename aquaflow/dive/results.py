@@ -30,12 +30,15 @@ PROTOCOL = {
     "resolution": "the width that was mapped, undistorted",
     "ssim": "11x11 Gaussian window, sigma 1.5 px, zero-padded, mean over channels",
     "psnr": "mean over held-out frames of the PSNR of each",
+    "as_tracked": "psnr and ssim before a held-out frame's pose, exposure and light were refined",
     "ate": "see `aquaflow evaluate`, which knows the truth",
 }
 """How the numbers of metrics.json were measured."""
 
 RANGE_PERCENTILES = (5.0, 95.0)
 """Percent; values outside are single pixels at edges of the map."""
+RANGE_VIEWS = 100
+"""Most views that the span of ranges is taken from."""
 
 
 @dataclass(frozen=True)
@@ -86,13 +89,13 @@ def refined_poses(slam: Slam, results: list[Tracked]) -> dict[int, Sim3]:
 
 
 @torch.no_grad()
-def summarise_water(mapper: Mapper) -> WaterSummary | None:
+def summarise_water(mapper: Mapper, most_views: int = RANGE_VIEWS) -> WaterSummary | None:
     """Mean medium over the views and the ranges they span; None while the medium is off."""
     if not mapper.medium.active or not mapper.views or len(mapper.gaussians) == 0:
         return None
     waters = [water for view in mapper.views if (water := mapper.scene.water(view)) is not None]
-    # Every tenth view is enough for the span of ranges.
-    z = torch.cat([_solid_ranges(mapper, view) for view in mapper.views[::10]])
+    looked_at = mapper.views[:: _step(mapper, most_views)]
+    z = torch.cat([_solid_ranges(mapper, view) for view in looked_at])
     if len(z) == 0:
         return None
     low, high = np.percentile(picture_out(z), RANGE_PERCENTILES)
@@ -117,6 +120,11 @@ def summarise_water(mapper: Mapper) -> WaterSummary | None:
     if not np.isfinite(numbers).all():
         raise ArithmeticError("the water's summary is not finite")
     return summary
+
+
+def _step(mapper: Mapper, most: int) -> int:
+    """Every tenth view is enough for the span of ranges."""
+    return max(10, -(-len(mapper.views) // most))
 
 
 def _solid_ranges(mapper: Mapper, view: View) -> torch.Tensor:
@@ -150,7 +158,9 @@ def metrics(
         "common_frames": classes.count(FrameClass.COMMON),
     }
     perceptual = [example.lpips for example in held_out if example.lpips is not None]
+    as_tracked = [example.as_tracked for example in held_out if example.as_tracked is not None]
     return counts | {
+        "complete": True,
         "sub_maps": len({t.sub_map for t in results if t.T_wc is not None}),
         "skipped_by": dict(slam.skipped) | ({"dropped": len(dropped)} if dropped else {}),
         "loops": slam.graph.loops,
@@ -165,6 +175,8 @@ def metrics(
         "peak_rss_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0, 1),
         "psnr": _mean([example.psnr for example in held_out]),
         "ssim": _mean([example.ssim for example in held_out]),
+        "psnr_as_tracked": _mean([before.psnr for before in as_tracked]),
+        "ssim_as_tracked": _mean([before.ssim for before in as_tracked]),
         "lpips": _mean(perceptual),
         "lpips_reason": lpips_reason,
         "heldout_frames": len(held_out),

@@ -33,6 +33,7 @@ from aquaflow.profiler import pace
 from aquaflow.recording.telemetry_lines import NAME as TELEMETRY
 from aquaflow.recording.telemetry_lines import TelemetryLog
 from aquaflow.slam import Slam
+from aquaflow.slam.finish_time import FinishTime
 from aquaflow.sources.preprocessing import Preparation
 from aquaflow.tracking.calibration_check import LensError, lens_error
 from aquaflow.tracking.frames import Tracked
@@ -189,15 +190,21 @@ class DiveRun:
 
     # --- the end ------------------------------------------------------------------------------
 
-    def finish(self, notes: list[str], progress: Progress | None = None) -> Finished:
-        """Refine and write; ``notes`` of the source go to the user with the run's own.
+    def finish(
+        self,
+        notes: list[str],
+        progress: Progress | None = None,
+        limits: FinishTime | None = None,
+    ) -> Finished:
+        """Refine and write; ``notes`` of the source go to the user with the run's own. What is not
+        needed for whole files stays within ``limits``.
 
         Raises:
             NotMappedError: too few frames could be placed; the folder says why.
             InputError: the disk was too full for all files; those with room were written.
         """
-        attempt = self.slam.failures.attempt
-        self.decide(self.slam.finish(progress))
+        limits, attempt = limits or FinishTime(), self.slam.failures.attempt
+        self.decide(self.slam.finish(progress, limits))
         if self.calibration is None and self.found is None:
             self._find_camera()
         with self.profiler.stage("write"):
@@ -207,7 +214,7 @@ class DiveRun:
             attempt("writing frames.csv", partial(self.folder.write_frames, sub_maps))
         if sum(tracked.T_wc is not None for tracked in results) < MIN_VIEWS:
             raise NotMappedError(self._why_not(len(results)))
-        return self._write(results, outputs)
+        return self._write(results, outputs, limits)
 
     def _metric_outputs(self) -> MetricOutputs:
         attempt, telemetry = self.slam.failures.attempt, self.slam.metric.telemetry
@@ -270,14 +277,21 @@ class DiveRun:
             "the camera must move sideways, see frames.csv for each frame"
         )
 
-    def _write(self, results: list[Tracked], outputs: MetricOutputs) -> Finished:
+    def _write(
+        self, results: list[Tracked], outputs: MetricOutputs, limits: FinishTime
+    ) -> Finished:
         made = Deliverables(
             self.name, self.folder, self.slam, results, self.calibration, outputs, self.found
         )
         with self.profiler.stage("evaluate"):
-            made.evaluate()
+            made.summarise()
         with self.profiler.stage("write"):
             made.write()
+        with self.profiler.stage("evaluate"):
+            made.evaluate(limits.evaluating)
+            self.notes += made.notes
+        with self.profiler.stage("write"):
+            made.write_evaluation()
         self._check_calibration()
         with self.profiler.stage("report"):
             self.warnings = self._shortcomings()

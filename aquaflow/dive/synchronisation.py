@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from aquaflow.config.telemetry import MountingConfig
+from aquaflow.config.device import MountingConfig
 from aquaflow.dive.run import DiveRun
 from aquaflow.fusion.start import camera_in_body
 from aquaflow.fusion.time_offset import (

@@ -59,6 +59,14 @@ _DEVICE_FAILED = (
 """How torch words the failure of a GPU, in lower case; after most of them no call works."""
 
 
+_DEVICE_FULL = (
+    "cuda out of memory",
+    "cuda error: out of memory",
+    "cublas_status_alloc_failed",
+)
+"""How torch words that a GPU has no memory left; it works on."""
+
+
 def is_out_of_memory(error: BaseException) -> bool:
     """True for a MemoryError, and for what libraries raise in its place."""
     if isinstance(error, MemoryError):
@@ -68,8 +76,18 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 def is_device_failure(error: BaseException | None) -> bool:
     """True for what torch raises when a GPU has no memory left, or is gone."""
+    return _says(error, _DEVICE_FAILED)
+
+
+def is_device_full(error: BaseException | None) -> bool:
+    """True for what torch raises when a GPU has no memory left for a tensor."""
+    return _says(error, _DEVICE_FULL)
+
+
+def _says(error: BaseException | None, words: Iterable[str]) -> bool:
+    """True if the error, or what caused it, has one of these in its message."""
     while error is not None:
-        if any(each in str(error).lower() for each in _DEVICE_FAILED):
+        if any(each in str(error).lower() for each in words):
             return True
         error = error.__cause__
     return False
@@ -132,8 +150,10 @@ def printable(name: str) -> str:
 
 
 def words_of(message: str) -> str:
-    """pydantic's message on a key, as words that follow the key's name."""
-    return message.removeprefix("Value error, ").lower()
+    """pydantic's message on a key, as words that follow the key's name; those of our own
+    validators may hold names, whose case is kept."""
+    own = message.removeprefix("Value error, ")
+    return message.lower() if own == message else own
 
 
 def path_of_key(parts: Iterable[object]) -> str:

@@ -22,6 +22,8 @@ from aquaflow.errors import (
     ConfigError,
     NotMappedError,
     first_line,
+    is_device_failure,
+    is_device_full,
     is_full_disk,
     is_out_of_memory,
 )
@@ -101,6 +103,10 @@ class Failures:
         self.strict = os.environ.get(STRICT) == "1" if strict is None else strict
         self.disk_was_full = False
         """A file of the dive found no room."""
+        self.of_device = 0
+        """Failures so far that were the GPU's."""
+        self.device_full = 0
+        """Those of them for want of memory."""
         self._kinds: dict[tuple[str, str, str], Kind] = {}
         self._recent: deque[tuple[float, str]] = deque(maxlen=100)
         """When which stage failed."""
@@ -139,6 +145,8 @@ class Failures:
                 kind = Kind(stage, name, place, first_line(error), defect, frame)
                 self._kinds[stage, name, place] = kind
             kind.count += 1
+            self.of_device += is_device_failure(error)
+            self.device_full += is_device_full(error)
             self._recent.append((self._now_s(), stage))
             if frame is not None:
                 self._reasons[frame] = f"{stage} failed: {name} in {place}"

@@ -121,6 +121,9 @@ def _with_picture(
             f"the recording's pictures are {image.shape[1]} x {image.shape[0]} once prepared, the "
             f"dive's {size[1]} x {size[0]}; give the recording that the dive was made from"
         )
-    whole = View(view.frame_index, image, view.camera, view.T_wc, view.keyframe, view.robust)
+    whole = View(
+        view.frame_index, image, view.camera, view.T_wc, view.keyframe, view.robust,
+        device=view.device,
+    )  # fmt: skip
     whole.log_gain, whole.light = view.log_gain, view.light
     return whole

@@ -7,9 +7,12 @@ and mapping on a small machine. The wheel holds a telemetry client, which is swi
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import os
+import sys
 from collections.abc import Iterator, Mapping
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -17,7 +20,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.errors import AquaFlowError, InputError, reason_of
+from aquaflow.errors import AquaFlowError, InputError, first_line, reason_of
 
 log = logging.getLogger(__name__)
 
@@ -73,15 +76,18 @@ class NetworkSession:
         options.inter_op_num_threads = 1
         options.log_severity_level = LOG_ERRORS_ONLY
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        if device != "cpu":
+            _load_gpu_libraries(ort)
         try:
-            self._session = ort.InferenceSession(
-                str(path), options, providers=_providers(device, settings)
-            )
+            with redirect_stdout(sys.stderr):  # it prints there what fails, and --json is for us
+                self._session = ort.InferenceSession(
+                    str(path), options, providers=_providers(device, settings)
+                )
         except Exception as error:  # onnxruntime's errors share no base of their own
             raise InputError(
                 f"{path} cannot be run ({reason_of(error)}); export it again"
             ) from error
-        self.device = _obtained(self._session, device, settings.device, path.name)
+        self.device = _obtained(ort, self._session, device, settings.device, path.name)
         self.inputs = {value.name: tuple(value.shape) for value in self._session.get_inputs()}
         """Shape of each; a name in it is a size that may change."""
         self.outputs = [value.name for value in self._session.get_outputs()]
@@ -166,7 +172,27 @@ def _device(ort: Any, asked: Device) -> str:
     return asked
 
 
-def _obtained(session: Any, wanted: str, asked: Device, what: str) -> str:
+def _load_gpu_libraries(ort: Any) -> None:
+    """Load CUDA and cuDNN from the packages that pip installed, as torch brings them.
+
+    onnxruntime looks for them where the system has libraries, unless torch was imported before.
+    """
+    if hasattr(ort, "preload_dlls"):  # since 1.21
+        with redirect_stdout(sys.stderr):
+            ort.preload_dlls()
+
+
+def _not_loading(ort: Any, device: str) -> str:
+    """Which library of a provider is missing, in brackets; empty if none is."""
+    library = Path(ort.__file__).parent / "capi" / f"libonnxruntime_providers_{device}.so"
+    try:
+        ctypes.CDLL(str(library), mode=os.RTLD_LAZY)
+    except OSError as error:
+        return f" ({first_line(error)})"
+    return ""
+
+
+def _obtained(ort: Any, session: Any, wanted: str, asked: Device, what: str) -> str:
     """The processor that the session runs on; a library that does not load makes it a slower one.
 
     Raises:
@@ -176,12 +202,13 @@ def _obtained(session: Any, wanted: str, asked: Device, what: str) -> str:
     device = next((name for name in FASTEST_FIRST if PROVIDERS[name] == provider), provider)
     if device == wanted:
         return device
+    reason = _not_loading(ort, wanted)
     if asked != "auto":
         raise AquaFlowError(
-            f"{what} was to run on {wanted} but onnxruntime fell back to {provider}; "
+            f"{what} was to run on {wanted} but onnxruntime fell back to {provider}{reason}; "
             "repair its GPU libraries or set device: auto"
         )
-    log.warning("%s runs on %s: onnxruntime cannot use %s here", what, device, wanted)
+    log.warning("%s runs on %s: onnxruntime cannot use %s here%s", what, device, wanted, reason)
     return device
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 from itertools import chain, dropwhile
 from typing import TypeAlias
 
-from aquaflow.config.telemetry import MountingConfig
+from aquaflow.config.device import MountingConfig
 from aquaflow.errors.failures import Failures
 from aquaflow.messages import Dropped, Frame, TelemetrySample
 from aquaflow.sources import CameraSource, TelemetrySource, mounting_of

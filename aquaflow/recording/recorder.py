@@ -14,8 +14,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from aquaflow.config.device import MountingConfig
 from aquaflow.config.recording import RecordingConfig
-from aquaflow.config.telemetry import MountingConfig
 from aquaflow.errors import InputError
 from aquaflow.messages import Dropped, Frame, TelemetrySample
 from aquaflow.recording.disk import free_bytes
@@ -136,7 +136,8 @@ class Recorder:
 
     def _stop(self, reason: str) -> None:
         self.status.stopped = reason
-        log.error("recording stopped: %s", reason)
+        fields = {"event": "stopped", "source": "recorder"}
+        log.error("recording stopped: %s", reason, extra={"fields": fields})
 
     def _full(self) -> str | None:
         free = self._free(self._folder)

@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from aquaflow import __version__
 from aquaflow.clocks.wall import WallClockWatch
+from aquaflow.config.device import MountingConfig
 from aquaflow.config.recording import RecordingConfig
-from aquaflow.config.telemetry import MountingConfig
 from aquaflow.messages import KIND_OF, CameraModel, Dropped, Frame, TelemetrySample
 from aquaflow.recording.dive_file import DiveFile
 from aquaflow.recording.pictures import (
@@ -44,7 +44,7 @@ class DiveWriter:
 
     def __init__(self, folder: Path, settings: RecordingConfig, status: RecorderStatus) -> None:
         self._folder, self._settings, self._status = folder, settings, status
-        self._watch = WallClockWatch()
+        self._watch = WallClockWatch(tell=False)  # the source of UTC tells
         self._finished_bytes = 0
         self._masks: dict[str, npt.NDArray[np.bool_]] = {}
         self._has_video = False

@@ -41,6 +41,10 @@ class Continued:
         """The shift, or 0 where the devices' clock is still the dive's."""
         return self.shift_ns or 0
 
+    def dive_s(self, now_ns: int) -> float | None:
+        """Seconds since the first frame of a moment on this boot's clock; None before it."""
+        return None if self.shift_ns is None else (now_ns + self.shift_ns) * 1e-9
+
     def begun(self, t_ns: int) -> Continued:
         """A dive that was not begun counts from ``t_ns``, its first frame."""
         return self if self.shift_ns is not None else replace(self, shift_ns=-t_ns)

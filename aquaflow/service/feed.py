@@ -26,7 +26,7 @@ from typing import Protocol, runtime_checkable
 
 from aquaflow.clocks.device import Learned
 from aquaflow.config import SourceConfig
-from aquaflow.config.telemetry import MountingConfig
+from aquaflow.config.device import MountingConfig
 from aquaflow.errors.failures import Failures
 from aquaflow.messages import CameraModel, Dropped, Frame, TelemetrySample
 from aquaflow.recording.playback import Event, Playback, arrived
@@ -36,6 +36,7 @@ from aquaflow.service.dive_clock import Continued
 from aquaflow.sources import CameraSource, TelemetrySource, mounting_of
 from aquaflow.sources.newest import Newest
 from aquaflow.sources.outbound import AcceptsMessages, OutboundMessage
+from aquaflow.sources.pilot import HearsPilot
 from aquaflow.sources.reading import read_past_failures
 from aquaflow.sources.wall_clock import WallClock
 
@@ -72,6 +73,10 @@ class LatestSamples:
         if shift_ns is None:
             return []
         return [_later(self._new.popleft(), shift_ns) for _ in range(len(self._new))]
+
+    def forget(self) -> None:
+        """Drop those that wait: no dive wants them."""
+        self._new.clear()
 
     def latest(self) -> list[tuple[TelemetrySample, float]]:
         """The newest of each source and kind, and the seconds since it came."""
@@ -110,9 +115,16 @@ class Feed(Protocol):
     """Errors raised while reading; the dive adds its own."""
     continued: Continued
     """Where frame indices and time of an earlier run go on."""
+    lasting: bool
+    """True if pictures may come for ever: between dives the service waits for the pilot."""
 
     @property
     def calibration(self) -> CameraModel | None: ...
+
+    @property
+    def pilot(self) -> HearsPilot | None:
+        """Tells of the pilot; None where nothing can."""
+        ...
 
     def name_of(self, index: int) -> str:
         """Of a frame, for frames.csv."""
@@ -126,8 +138,20 @@ class Feed(Protocol):
         """Continue frame indices and time of an earlier run; call it before ``start``."""
         ...
 
+    def take(self, timeout_s: float) -> Frame | Dropped | None:
+        """The newest frame, counted as the dive counts; None after ``timeout_s`` without one."""
+        ...
+
+    def forget(self) -> None:
+        """A dive has ended: what failed, was noted, or waits is not the next one's."""
+        ...
+
     def stated_mounting(self) -> MountingConfig | None:
         """Of the mapping camera in the body; see :func:`aquaflow.sources.mounting_of`."""
+        ...
+
+    def dive_s(self) -> float | None:
+        """Seconds since the dive's first frame; None before it, and in a recording."""
         ...
 
     def clocks(self) -> Mapping[str, Learned]:
@@ -139,7 +163,7 @@ class Feed(Protocol):
         ...
 
     def start(self) -> None:
-        """Begin to read the sources, in threads."""
+        """Begin to read the sources, in threads; once, however often it is called."""
         ...
 
     def close(self) -> None: ...
@@ -161,8 +185,27 @@ class _Pumps:
     def continue_from(self, continued: Continued) -> None:
         self.continued = continued
 
+    def dive_s(self) -> float | None:
+        return None
+
+    def take(self, timeout_s: float) -> Frame | Dropped | None:
+        return self.newest.take(timeout_s)
+
+    def forget(self) -> None:
+        self.failures, self.notes = Failures(), []
+        self.latest_samples.forget()
+
     def clocks(self) -> Mapping[str, Learned]:
         return {}
+
+    @property
+    def pilot(self) -> HearsPilot | None:
+        return None
+
+    @property
+    def started(self) -> bool:
+        """True once the sources are being read."""
+        return bool(self._threads)
 
     def pump(self, name: str, work: Callable[[], None], last: bool = False) -> None:
         """Run ``work``; with ``last``, no frame comes after its end."""
@@ -193,6 +236,8 @@ class LiveFeed(_Pumps):
     """Devices. The camera's own queue keeps the newest picture, which is decoded when the loop
     waits for it; with a recorder every picture is decoded, and this queue keeps the newest."""
 
+    lasting = True
+
     def __init__(
         self,
         name: str,
@@ -211,6 +256,10 @@ class LiveFeed(_Pumps):
     def calibration(self) -> CameraModel | None:
         return self._cameras[self.name].camera
 
+    @property
+    def pilot(self) -> HearsPilot | None:
+        return self._telemetry if isinstance(self._telemetry, HearsPilot) else None
+
     def name_of(self, index: int) -> str:
         return f"{self.name}#{index}"
 
@@ -224,15 +273,28 @@ class LiveFeed(_Pumps):
         for name, link in getattr(self._telemetry, "links", {}).items():
             devices[name] = {"kind": "link", **_state_of(link)}
         if self._recorder is not None:
-            status = self._recorder.status
-            devices["recorder"] = {"kind": "recorder", "state": status.stopped or "recording"}
+            stopped = self._recorder.status.stopped
+            state = "recording" if stopped is None else "stopped"
+            devices["recorder"] = {"kind": "recorder", "state": state, "reason": stopped or ""}
         return devices
 
     def continue_from(self, continued: Continued) -> None:
         super().continue_from(continued)
         self.latest_samples.shift_ns = continued.shift_ns
-        if isinstance(self._telemetry, HasDeviceClocks):
+        if continued.clocks and isinstance(self._telemetry, HasDeviceClocks):
             self._telemetry.resume(continued.clocks)
+
+    def dive_s(self) -> float | None:
+        return self.continued.dive_s(time.monotonic_ns())
+
+    def take(self, timeout_s: float) -> Frame | Dropped | None:
+        """A new dive begins with the first frame that is taken."""
+        frame = self.newest.take(timeout_s)
+        if frame is None:
+            return None
+        self.continued = self.continued.begun(frame.t_ns)
+        self.latest_samples.shift_ns = self.continued.shift_ns
+        return self.continued.counted(frame)
 
     def clocks(self) -> Mapping[str, Learned]:
         return self._telemetry.learned() if isinstance(self._telemetry, HasDeviceClocks) else {}
@@ -242,6 +304,8 @@ class LiveFeed(_Pumps):
 
     def start(self) -> None:
         """Open cameras and telemetry, and read them in threads."""
+        if self.started:
+            return
         for name, camera in self._cameras.items():
             mapped = name == self.name
             if mapped or self._recorder is not None:
@@ -269,9 +333,7 @@ class LiveFeed(_Pumps):
             if self._recorder is not None:
                 self._recorder.frame(name, frame)
             if mapped:
-                self.continued = self.continued.begun(frame.t_ns)
-                self.latest_samples.shift_ns = self.continued.shift_ns
-                self.newest.put(self.continued.counted(frame))
+                self.newest.put(frame)
 
     def _when_asked(self, frames: Iterator[Frame | Dropped]) -> Iterator[Frame | Dropped]:
         while not self.closing.is_set():
@@ -291,6 +353,8 @@ class LiveFeed(_Pumps):
 class PlaybackFeed(_Pumps):
     """A recording played back in real time: time differences are kept, arrivals are what they are
     here."""
+
+    lasting = False
 
     def __init__(
         self,
@@ -317,6 +381,8 @@ class PlaybackFeed(_Pumps):
 
     def start(self) -> None:
         """Play the recording back in a thread."""
+        if self.started:
+            return
         self.pump("recording", self._events, last=True)
 
     def close(self) -> None:
@@ -349,9 +415,10 @@ class PlaybackFeed(_Pumps):
 
 
 def _state_of(device: object) -> dict[str, object]:
-    """A driver's state and counters, as far as it reports them."""
+    """A driver's state, counters and flow, as far as it reports them."""
     state = getattr(device, "state", "")
     said: dict[str, object] = {"state": getattr(state, "value", state)}
     said["reason"] = getattr(device, "reason", "")
-    counters = getattr(device, "counters", None)
-    return said | ({} if counters is None else vars(counters))
+    counters, flow = getattr(device, "counters", None), getattr(device, "flow", None)
+    said |= {} if counters is None else vars(counters)
+    return said | ({} if flow is None else flow.to_json())

@@ -1,63 +1,40 @@
-"""One live dive from its folder to its report: constructs, runs and closes all parts."""
+"""One live dive from its folder to its report."""
 
 from __future__ import annotations
 
 import logging
 import shutil
 import sys
-from dataclasses import dataclass
 from functools import partial
 
-from aquaflow.config import Config, parse_config
-from aquaflow.config.service import ServiceConfig
 from aquaflow.config.vehicle import VehicleConfig
-from aquaflow.cores import core_count, usable_threads
+from aquaflow.cores import usable_threads
 from aquaflow.dive.folder import CHECKPOINT, DiveFolder
 from aquaflow.dive.replay import fix_threads
-from aquaflow.dive.run import DiveRun, Finished
-from aquaflow.errors import AquaFlowError, NotMappedError
-from aquaflow.mapping.maps import Maps, Progress
-from aquaflow.messages import Dropped
-from aquaflow.profiler import Profiler
-from aquaflow.recording.telemetry_lines import NAME as TELEMETRY
-from aquaflow.recording.telemetry_lines import TelemetryLog
-from aquaflow.render import select_renderer
-from aquaflow.service.checkpoint.checkpoint import Checkpointer, restore
+from aquaflow.dive.run import Finished
+from aquaflow.dive.status import DiveState
+from aquaflow.errors import NotMappedError
+from aquaflow.mapping.maps import Progress
 from aquaflow.service.checkpoint.resume import Choice
-from aquaflow.service.checkpoint.salvage import Salvaged, lost_with_their_files, salvaged
-from aquaflow.service.checkpoint.telemetry import hear_again
-from aquaflow.service.checkpoint.tracking import refuse_another_size
-from aquaflow.service.dive_clock import Continued
+from aquaflow.service.checkpoint.salvage import salvaged_from
+from aquaflow.service.control import Control
+from aquaflow.service.dive_parts import assembled, plain
 from aquaflow.service.feed import Feed
-from aquaflow.service.health.degradation import Degradation
-from aquaflow.service.health.heartbeats import Heartbeats, Watchdog
-from aquaflow.service.health.pressure import PressureReader
-from aquaflow.service.health.systemd import Notifier
-from aquaflow.service.loop import LiveLoop
-from aquaflow.service.map_thread import MapThread
-from aquaflow.service.mounting import camera_mounting
-from aquaflow.signals import stop_on_signals
-from aquaflow.slam import Slam
+from aquaflow.service.health.state import State
+from aquaflow.service.standby import FINISHING
+from aquaflow.service.vitals import Vitals
+from aquaflow.slam.finish_time import FinishTime
 
 log = logging.getLogger(__name__)
 
 SWITCH_S = 0.0005
 """Longest that one Python thread keeps the others waiting; with the usual 5 ms tracking, which
 gives way at every call of a kernel, would wait for mapping a dozen times a frame."""
-FINISHING_S = 300.0
-"""Time requested from systemd at the end of a dive: refining, evaluating, the report."""
-
-
-@dataclass(frozen=True)
-class Parts:
-    """The parts of a live dive, for the viewer and the report."""
-
-    loop: LiveLoop
-    slam: Slam
-    run: DiveRun
-    maps: MapThread
-    checkpointer: Checkpointer
-    choice: Choice
+STAGE = "finishing"
+"""Name of a dive's end among the heartbeats; it is hung where it takes ``service.hang_s`` longer
+than ``service.finish_s``."""
+FINISH_MARGIN_S = 30.0
+"""Requested from systemd on top of ``service.finish_s``: what cannot be cut short, and closing."""
 
 
 class LiveDive:
@@ -70,125 +47,116 @@ class LiveDive:
         feed: Feed,
         config: VehicleConfig,
         overwrite: bool = False,
+        vitals: Vitals | None = None,
+        control: Control | None = None,
     ) -> None:
-        """Construct all parts.
+        """Construct all parts; ``vitals`` and ``control`` are the service's, where it has several
+        dives.
 
         Raises:
             ConfigError: the checkpoint is of pictures of another size.
             UnusableStateError: the dive cannot be resumed from the checkpoint.
             InputError: the folder cannot be used.
         """
-        service = config.service
         cores = usable_threads(config.threads)
-        fix_threads(max(1, cores // 2))  # tracking's; the renderer's are counted below
+        fix_threads(max(1, cores // 2))  # tracking's; the renderer has its own
         sys.setswitchinterval(SWITCH_S)
-        self._plain = plain(config)
-        self._salvaged = _salvaged(choice, self._plain, feed)
-        rows = None if self._salvaged is None else self._salvaged.rows
-        self.folder = DiveFolder(choice.folder, self._plain, overwrite, rows)
-        self.feed = feed
-        self._heartbeats, self._degradation = Heartbeats(), Degradation(service.limits)
-        self._notifier = Notifier()
-        self.parts = self._assembled(name, choice, service)
-        self._watchdog = Watchdog(self._heartbeats, service.hang_s)
+        salvaged = salvaged_from(choice, plain(config), feed.name_of)
+        rows = None if salvaged is None else salvaged.rows
+        self.folder = DiveFolder(choice.folder, plain(config), overwrite, rows, feed.dive_s)
+        self.feed, self.control = feed, control or Control()
+        self.vitals = vitals or Vitals(config.service)
+        self._own_vitals = vitals is None
+        self._finish_s = config.service.finish_s
         self._finished = False
-
-    def _assembled(self, name: str, choice: Choice, service: ServiceConfig) -> Parts:
-        config, feed, profiler = self._plain, self.feed, Profiler()
-        # A core is left for tracking, where there is more than one.
-        threads = config.threads or max(1, core_count() - 1)
-        renderer = select_renderer(config.mapping.renderer, threads)
-        failures = feed.failures
-        maps = Maps(config, renderer, profiler, self.folder.work, failures)
-        thread = MapThread(maps, service.mapping, self._heartbeats, lambda: self._degradation.level)
-        slam = Slam(config, profiler, self.folder.work, True, thread, failures)
-        with failures.contain("camera mounting"):
-            slam.metric.mounting = camera_mounting(config, service, feed)
-        run = DiveRun(name, self.folder, config, slam, feed.calibration, feed.name_of)
-        continued = Continued()
-        if choice.checkpoint is not None:
-            try:
-                restore(choice.checkpoint, slam, run, maps)
-            except AquaFlowError:
-                slam.close(keep=True)
-                self.folder.close(keep_work=True)
-                raise
-            known, rows = choice.checkpoint, self.folder.rows
-            continued = Continued.after(known.moment, rows, known.clocks)
-            run.notes += lost_with_their_files(known, slam, maps)
-            run.dropped += [
-                Dropped(row.index, round(row.t_s * 1e9), row.reason)
-                for row in rows
-                if row.frame_class == "dropped"
-            ]
-            hear_again(run)
-            log.info("resumed %s with %d keyframes", self.folder.path, len(slam.keyframes))
-        run.notes += [*choice.notes, *(self._salvaged.losses if self._salvaged else ())]
-        for note in run.notes:
-            log.warning("%s", note)
-        feed.continue_from(continued)
-        telemetry_log = partial(TelemetryLog, self.folder.path / TELEMETRY)
-        run.telemetry_log = failures.attempt(f"opening {TELEMETRY}", telemetry_log)
-        loop = LiveLoop(
-            run, feed, thread, service, self._heartbeats, self._degradation,
-            PressureReader(self.folder.path), self._notifier,
-        )  # fmt: skip
-        checkpointer = Checkpointer(
-            self.folder.path, run, slam, thread, service.checkpoint.every_s, feed.clocks,
-            lambda: feed.continued.known_shift_ns,
-        )  # fmt: skip
-        loop.watchers.append(
-            lambda live: checkpointer.take_if_due(live.pressure.disk_is_full(service.limits))
-        )
-        return Parts(loop, slam, run, thread, checkpointer, choice)
+        losses = [] if salvaged is None else salvaged.losses
+        try:
+            self.parts = assembled(
+                name, choice, feed, config, self.folder, self.vitals, self.control, losses
+            )
+        except BaseException:
+            self._close_vitals()
+            self.folder.close(keep_work=True)
+            raise
 
     def run(self, progress: Progress | None = None) -> Finished | None:
-        """Run until the source ends or the dive is stopped; None where nothing could be mapped.
+        """:meth:`map`, and then :meth:`finish`."""
+        self.map()
+        return self.finish(progress)
+
+    def map(self) -> None:
+        """Map until the source ends, or the dive shall.
 
         Raises:
             AquaFlowError: the source or the loop failed; the checkpoint stays.
         """
-        parts = self.parts
-        with stop_on_signals(parts.loop.stopping):
-            parts.loop.run()
-        source_ended = not parts.loop.stopping.is_set()
-        parts.loop.stop("the recording ended" if source_ended else "stop requested")
-        self._notifier.more_time(FINISHING_S)
-        contain = parts.slam.failures.contain
-        if not source_ended:
+        self.parts.loop.run()
+        self.parts.loop.end()
+
+    def finish(self, progress: Progress | None = None) -> Finished | None:
+        """Refine and write, within ``service.finish_s``; None where nothing could be mapped. A dive
+        whose service was told to stop can be gone on with; every other one is finished.
+
+        Raises:
+            InputError: the disk is full.
+        """
+        limits, parts, heartbeats = FinishTime(self._finish_s), self.parts, self.vitals.heartbeats
+        parts.refresher.end()
+        if self._finish_s is not None:
+            heartbeats.beat(STAGE, ahead_s=self._finish_s)
+        stopped, contain = self.control.stopping.is_set(), parts.slam.failures.contain
+        self._tell(stopped)
+        if stopped:
             with contain("checkpoint"):
-                while parts.slam.tracker.past is not None:  # or none would have these poses
-                    parts.loop.take(None)
+                parts.loop.catch_up(limits.settling)  # or none would have these poses
                 parts.checkpointer.take()
-        with contain("closing of the source"):
-            self.feed.close()
+        else:
+            parts.standing.set(DiveState.FINISHING)
+        with contain("device errors"):
+            parts.device_errors.tell()
+        if stopped or self.feed.newest.ended:
+            with contain("closing of the source"):
+                self.feed.close()
         with contain("service counters"):
             parts.run.live = parts.loop.status()
         try:
-            finished = parts.run.finish(self.feed.notes, progress)
+            finished = parts.run.finish(self.feed.notes, progress, limits)
         except NotMappedError as error:
             log.warning("%s", error)
             finished = None
-        self._finished = source_ended
+        self._finished = not stopped
+        parts.standing.set(DiveState.STOPPED if stopped else DiveState.FINISHED)
+        heartbeats.retire(STAGE)
         return finished
+
+    def _tell(self, stopped: bool) -> None:
+        """What happens now: the service ends with this dive, or waits for the next."""
+        if stopped or self.feed.newest.ended:
+            reason = "stop requested" if stopped else "the recording ended"
+            self.vitals.stop(reason, (self._finish_s or 0.0) + FINISH_MARGIN_S)
+        else:
+            self.vitals.health.set(State.FINISHING, FINISHING)
+        self.parts.loop.tell_watchers()  # the pilot hears it while the feed is open
 
     def close(self) -> None:
         """Release everything; an unfinished dive keeps the files for a resumption."""
         keep = not self._finished
         for close in (
-            self._watchdog.close,
-            self.feed.close,
             partial(self.parts.slam.close, keep),
             self._remove_checkpoint,
             self.parts.run.close,
-            self._notifier.close,
+            self._close_vitals,
             partial(self.folder.close, keep),  # last: until then failures go to its log
         ):
             with self.parts.slam.failures.contain("closing"):
                 close()
 
+    def _close_vitals(self) -> None:
+        if self._own_vitals:
+            self.vitals.close()
+
     def _remove_checkpoint(self) -> None:
-        """A dive whose recording ended needs no checkpoint."""
+        """A dive that is finished needs no checkpoint."""
         if self._finished:
             shutil.rmtree(self.folder.path / CHECKPOINT, ignore_errors=True)
 
@@ -197,20 +165,3 @@ class LiveDive:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _salvaged(choice: Choice, config: Config, feed: Feed) -> Salvaged | None:
-    """The salvaged rows and losses if a dive is resumed, else None."""
-    if choice.checkpoint is None:
-        return None
-    refuse_another_size(choice.folder, choice.checkpoint.facts["tracking"], config)
-    return salvaged(choice.checkpoint, choice.folder, feed.name_of)
-
-
-def plain(vehicle: VehicleConfig) -> Config:
-    """The settings of mapping alone, with the service's limit on refining."""
-    settings = vehicle.model_dump(include=set(Config.model_fields))
-    optimiser = settings["mapping"]["optimiser"]
-    if optimiser["refine_seconds"] is None:
-        optimiser["refine_seconds"] = vehicle.service.mapping.refine_seconds
-    return parse_config(settings, "config")

@@ -14,7 +14,6 @@ import numpy.typing as npt
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.mapping.maps import Maps
 from aquaflow.service.loop import LiveLoop
-from aquaflow.service.map_thread import MapThread
 from aquaflow.sources.newest import Newest
 from aquaflow.tracking.frames import Tracked
 from aquaflow.viewer.page import ViewerPage
@@ -31,11 +30,9 @@ LOOK_S = 0.1
 class LiveViewer:
     """Takes new data from the loop and the maps, and shows them from its own thread."""
 
-    def __init__(
-        self, config: ViewerConfig, maps: MapThread, report: Callable[[], dict[str, Any]]
-    ) -> None:
+    def __init__(self, config: ViewerConfig, report: Callable[[], dict[str, Any]]) -> None:
         """Raises what :class:`ViewerPage` raises."""
-        self._config, self._maps, self._report = config, maps, report
+        self._config, self._report = config, report
         self._page = ViewerPage(config, "AquaFlow")
         self.address = self._page.address
         self._poses: Newest[Pose] = Newest()
@@ -52,6 +49,10 @@ class LiveViewer:
         """Gaussians that a browser gets at the moment."""
         return self._page.splats_shown
 
+    def begin(self) -> None:
+        """A dive begins: its path is shown, and no other's."""
+        self._path, self._asked = [], False
+
     def update(self, loop: LiveLoop) -> None:
         """Called after every turn of the loop; queues what is new for the browser, never waits."""
         now, latest, frame = time.monotonic(), loop.latest, loop.picture
@@ -63,7 +64,7 @@ class LiveViewer:
         if now - self._map_s >= self._config.refresh_s and not self._asked:
             self._map_s, self._asked = now, True
             sub_map = latest.sub_map
-            self._maps.inspect("show the map", lambda maps, _: self._copy(maps, sub_map))
+            loop.maps.inspect("show the map", lambda maps, _: self._copy(maps, sub_map))
 
     def close(self) -> None:
         self._closing.set()

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
 from collections.abc import Callable
 from typing import Any
 
+from aquaflow.clocks.deadline import Deadline
 from aquaflow.config.service import ServiceConfig
 from aquaflow.dive.run import DiveRun
 from aquaflow.errors import AquaFlowError
 from aquaflow.messages import Dropped, Frame
+from aquaflow.service import troubles
+from aquaflow.service.control import Control
 from aquaflow.service.feed import Feed
 from aquaflow.service.health.counters import Counters
-from aquaflow.service.health.degradation import Degradation, DegradationLevel
-from aquaflow.service.health.heartbeats import Heartbeats
-from aquaflow.service.health.pressure import Pressure
-from aquaflow.service.health.state import Facts, Health, State, judged
-from aquaflow.service.health.systemd import Notifier
+from aquaflow.service.health.degradation import DegradationLevel
+from aquaflow.service.health.pressure import Need, Pressure, Shortage
+from aquaflow.service.health.state import Facts, Judgement, State, judged
 from aquaflow.service.map_thread import MapThread
+from aquaflow.service.vitals import Vitals
 from aquaflow.tracking.frames import FrameClass, Tracked
 
 log = logging.getLogger(__name__)
@@ -39,10 +40,12 @@ LOST_AFTER = 3
 """Frames in a row without a pose until the state is LOST; one may be a flake of marine snow."""
 MOST_FAILURES = 10
 """Frames in a row that raise before the process exits: then the pictures are not the cause."""
+PAUSED = "the pilot paused the dive: pictures are shown, not mapped"
+"""The reason of the state PAUSED."""
 
 
 class LiveLoop:
-    """Runs until it is stopped, or until a recording ends."""
+    """Runs until the dive shall end, or a recording does; obeys the pilot."""
 
     def __init__(
         self,
@@ -50,17 +53,15 @@ class LiveLoop:
         feed: Feed,
         maps: MapThread,
         config: ServiceConfig,
-        heartbeats: Heartbeats,
-        degradation: Degradation,
+        vitals: Vitals,
+        control: Control,
         pressure: Callable[[], Pressure],
-        notifier: Notifier,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self.run_, self.feed, self.maps, self.config = run, feed, maps, config
-        self.heartbeats, self.degradation, self.notifier = heartbeats, degradation, notifier
-        self.stopping = threading.Event()
-        """Setting it ends the dive cleanly; may be done in a signal handler."""
-        self.health, self.counters = Health(now_s), Counters(run.profiler, now_s)
+        self.vitals, self.control = vitals, control
+        self.health, self.heartbeats = vitals.health, vitals.heartbeats
+        self.degradation, self.counters = vitals.degradation, Counters(run.profiler, now_s)
         self.latest: Tracked | None = None
         """The newest frame that has a pose, without its picture."""
         self.picture: Frame | None = None
@@ -71,10 +72,13 @@ class LiveLoop:
         self._read_pressure, self._now_s = pressure, now_s
         self._frame_s = now_s()
         self._pictured = False
+        self._overtaken_before = feed.newest.overtaken
         self._ever_posed = any(tracked.T_wc is not None for tracked in run.results)
         self._unposed = LOST_AFTER
         """Frames in a row without a pose."""
         self._failed_in_a_row = 0
+        self._gpu_full = 0
+        """How often mapping had found the GPU's memory full at the last turn."""
 
     def run(self) -> None:
         """Run the loop.
@@ -83,8 +87,8 @@ class LiveLoop:
             AquaFlowError: the source failed, or frame after frame did.
         """
         self.feed.start()
-        while not self.stopping.is_set() and not self.feed.newest.ended:
-            self.take(self.feed.newest.take(IDLE_S if self._past is None else BUSY_S))
+        while not self.control.dive_ends and not self.feed.newest.ended:
+            self.take(self.feed.take(IDLE_S if self._past is None else BUSY_S))
         if self.feed.failure is not None:
             raise AquaFlowError(f"{self.feed.failure}; the service ends, to be started anew")
 
@@ -93,6 +97,9 @@ class LiveLoop:
         self.run_.samples(self.feed.latest_samples.taken())
         if frame is not None:
             self._frame_s, self._pictured = self._now_s(), True
+        if self.control.paused:
+            self.picture = frame if isinstance(frame, Frame) else self.picture
+            frame = None
         if isinstance(frame, Dropped):
             self.run_.drop(frame)
         elif frame is not None:
@@ -101,20 +108,21 @@ class LiveLoop:
             self._catch_up(self._past)
         self._tend()
 
-    def stop(self, reason: str) -> None:
-        """Set the state to stopping and notify systemd; telemetry of after the last frame is
-        taken."""
+    def catch_up(self, until: Deadline) -> None:
+        """Poses of the frames that wait for idle moments, as many as there is time for."""
+        while self._past is not None and not until.over:
+            self._catch_up(self._past)
+
+    def end(self) -> None:
+        """After the last turn: telemetry of after the last frame is taken."""
         self.run_.samples(self.feed.latest_samples.taken())
-        self.health.set(State.STOPPING, reason)
-        self.heartbeats.retire(STAGE)  # from here on systemd's timeout of stopping counts
-        self.notifier.stopping()
-        self._notify_systemd()
+        self.heartbeats.retire(STAGE)
 
     def status(self) -> dict[str, Any]:
         """Dropped-work and degradation counters, for health and metrics.json."""
         return {
             **self.counters.to_json(),
-            "overtaken": self.feed.newest.overtaken,
+            "overtaken": self.feed.newest.overtaken - self._overtaken_before,
             "level": self.degradation.level.words,
             "steps_down": self.degradation.steps_down,
             "steps_up": self.degradation.steps_up,
@@ -187,56 +195,47 @@ class LiveLoop:
         self.heartbeats.beat(STAGE)
         contain = self.run_.slam.failures.contain
         with contain("resource check"):
+            self._give_way_to_mapping()
             self.degradation.update(self._need)
             self.counters.update()
         with contain("health state"):
-            self.health.set(*judged(self._facts()))
+            paused = self.control.paused
+            self.health.set(*(Judgement(State.PAUSED, PAUSED) if paused else judged(self._facts())))
+        self.tell_watchers()
+        with contain("notification of systemd"):
+            self.vitals.notify()
+
+    def tell_watchers(self) -> None:
+        """Let those who look on see the service as it is now."""
+        contain = self.run_.slam.failures.contain
         for watch in self.watchers:
             with contain(f"service: {getattr(watch, '__qualname__', type(watch).__name__)}"):
                 watch(self)
-        with contain("notification of systemd"):
-            self._notify_systemd()
 
-    def _need(self) -> str | None:
+    def _give_way_to_mapping(self) -> None:
+        """What found no memory on the GPU was left out; less is asked for from now on."""
+        full = self.run_.slam.failures.device_full
+        if full > self._gpu_full:
+            self.degradation.give_way(Need(Shortage.GPU_MEMORY, "the GPU's memory was full"))
+        self._gpu_full = full
+
+    def _need(self) -> Need | None:
         self.pressure = self._read_pressure()
         return self.pressure.need(self.config.limits)
 
     def _facts(self) -> Facts:
-        devices = self.feed.describe()
-        cameras = [device for device in devices.values() if device["kind"] == "camera"]
+        devices, slam = self.feed.describe(), self.run_.slam
         return Facts(
             self._now_s() - self._frame_s,
             PATIENCE_S,
             self._pictured,
-            str(cameras[0]["reason"]) if cameras else "",
+            troubles.silent_camera(devices),
             self._unposed < LOST_AFTER,
             self._ever_posed,
-            self.run_.slam.tracker.monitor.trouble,
-            self._troubles(devices),
+            troubles.inconsistency(slam.tracker.monitor.trouble),
+            [
+                *troubles.of_the_machine(self.degradation, self.pressure, self.config.limits),
+                *troubles.of_the_stages(self.maps, slam.failures),
+                *troubles.of_the_devices(devices),
+            ],
         )
-
-    def _troubles(self, devices: dict[str, dict[str, object]]) -> list[str]:
-        troubles = []
-        if self.degradation.level is not DegradationLevel.FULL:
-            troubles.append(f"{self.degradation.level.words}: {self.degradation.reason}")
-        if self.pressure.disk_is_full(self.config.limits):
-            troubles.append(f"disk full: {self.pressure.disk_free_mb:.0f} MB left")
-        if self.maps.failing:
-            troubles.append(f"mapping fails: {self.maps.last_failure}")
-        troubles += self.run_.slam.failures.repeated()
-        for name, device in devices.items():
-            if device["kind"] == "link" and device["state"] != "connected":
-                troubles.append(f"link '{name}': {device['state']}")
-            if device["kind"] == "recorder" and device["state"] != "recording":
-                troubles.append(f"not recording: {device['state']}")
-        return troubles
-
-    def _notify_systemd(self) -> None:
-        """Send READY to systemd once a sensor answered or its absence was declared; the watchdog is
-        fed only here, and only while mapping is alive too."""
-        state = self.health.state
-        if state not in (State.STARTING, State.STOPPING):
-            self.notifier.ready()
-        self.notifier.status(f"{state.value}: {self.health.reason}")
-        if self.heartbeats.hung(self.config.hang_s) is None:
-            self.notifier.alive()

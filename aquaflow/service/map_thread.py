@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
+from aquaflow.clocks.deadline import Deadline
 from aquaflow.config.service import LiveMappingConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
@@ -40,6 +41,8 @@ LONGEST_REST_S = 1.0
 """Longest rest; a fit of the water works for longer, but is rare."""
 JOIN_S = 30.0
 """Longest wait for the thread at the end of a dive."""
+BACKLOG_SHARE = 0.5
+"""Of the time until refining must end; frames that still wait for mapping then are left out."""
 MAPPING_AT, KEYFRAME_AT = 3, 8
 """Backlogs after which mapping frames, and then keyframes, are left out."""
 
@@ -76,7 +79,7 @@ class MapThread:
         """Requests that raised an error; each was skipped."""
         self.last_failure = ""
         self.failing = False
-        """The last request raised."""
+        """The last request raised, or found the GPU's memory full."""
         self.late = False
         """Set by tracking that is late: the thread then rests as long as it worked."""
         self.rests = 0
@@ -89,7 +92,11 @@ class MapThread:
         """The sub-map that grew last."""
         self._changed = threading.Condition()
         self._ending = threading.Event()
+        self._until = Deadline()
+        """When frames that wait for mapping are left out, at the end of a dive."""
         self._rest = rest or self._ending.wait
+        self._given_back_at = DegradationLevel.FULL
+        """The level at the last look; memory is given back at each step down."""
         self._thread = threading.Thread(target=self._run, name=STAGE, daemon=True)
         self._thread.start()
 
@@ -128,11 +135,19 @@ class MapThread:
             self._jobs.appendleft((name, lambda maps: job(maps, lacking)))
             self._changed.notify()
 
-    def refine(self, progress: Progress | None = None) -> None:
+    def later(self, name: str, job: Job) -> None:
+        """Run ``job`` on the maps after all waiting requests."""
+        self._post(name, job)
+
+    def refine(self, progress: Progress | None = None, until: Deadline | None = None) -> None:
+        self._until = (until or Deadline()).share(BACKLOG_SHARE)
         self._end()
         if self._level() is DegradationLevel.FULL:  # what fails here must not cost the map as it is
-            self._do("refine", lambda maps: maps.refine(self._beating(progress)))
+            self._do("refine", lambda maps: maps.refine(self._beating(progress), until))
         self._heartbeats.retire(STAGE)
+
+    def leave_device(self, why: str) -> bool:
+        return self._maps.leave_device(why)
 
     def close(self, keep: bool = False) -> None:
         self._end()
@@ -178,6 +193,9 @@ class MapThread:
     def _grow(self, growth: Growth, maps: Maps) -> None:
         with self._changed:
             self._growing -= 1
+        if self._until.over:
+            self.left_out["the dive ended before mapping had caught up"] += 1
+            return
         retired = tuple(each for each in growth.retired if _is_mapped(each, maps))
         maps.grow(replace(growth, retired=retired))
         self._newest = growth.sub_map
@@ -187,12 +205,20 @@ class MapThread:
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self._config.nice)
         while True:
             self._heartbeats.beat(STAGE)
+            self._give_back_memory()
             job = self._next()
             if job is None and self._ending.is_set():
                 return
             began_s = time.monotonic()
             self._do(*job or ("optimise", self._optimise))
             self._rest_if_late(time.monotonic() - began_s)
+
+    def _give_back_memory(self) -> None:
+        level, before = self._level(), self._given_back_at
+        self._given_back_at = level
+        if level > before:
+            with self._maps.failures.contain("giving memory back"):
+                self._maps.give_back_memory()
 
     def _rest_if_late(self, worked_s: float) -> None:
         """Rest while tracking is late. With few cores, mapping competes with tracking for Python's
@@ -212,11 +238,15 @@ class MapThread:
     def _do(self, name: str, job: Job) -> None:
         # A request that fails (a GPU that is gone, a file that cannot be read) is skipped; so is
         # one for which the memory or the disk is full: this thread has no caller to raise to.
+        failures = self._maps.failures
+        full = failures.device_full
         try:
             job(self._maps)
-            self.failing = False
+            self.failing = failures.device_full > full
+            if self.failing:
+                self.last_failure = f"{name}: the GPU's memory was full"
         except Exception as error:
-            self._maps.failures.record(f"map: {name}", error)
+            failures.record(f"map: {name}", error)
             self.last_failure = f"{name}: {error}"
             self.failures, self.failing = self.failures + 1, True
 

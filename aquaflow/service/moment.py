@@ -38,8 +38,9 @@ class Moment:
         return Moment(time.monotonic_ns(), time.time_ns(), boot)
 
     def is_of_the_boot_of(self, now: Moment) -> bool:
-        """True if the monotonic clock has run on until ``now``."""
-        return self.boot == now.boot and now.monotonic_ns >= self.monotonic_ns
+        """True if the monotonic clock has run on until ``now``; False where no boot is known."""
+        known = self.boot != "" and self.boot == now.boot
+        return known and now.monotonic_ns >= self.monotonic_ns
 
     def shift_ns(self, now: Moment) -> int:
         """What to add to ``now``'s monotonic clock so that the dive's clock continues from here.
@@ -51,10 +52,6 @@ class Moment:
             return self.dive_shift_ns
         passed = max(now.wall_ns - self.wall_ns, LEAST_GAP_NS)
         return self.dive_ns + passed - now.monotonic_ns
-
-    def age_h(self, now: Moment) -> float:
-        """Hours until ``now``; 0 where the wall clock was set back."""
-        return max(now.wall_ns - self.wall_ns, 0) / 3.6e12
 
     def to_json(self) -> dict[str, Any]:
         """As plain values."""

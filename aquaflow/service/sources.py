@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 from aquaflow.config.vehicle import VehicleConfig
+from aquaflow.dive.log import EarlyRecords
 from aquaflow.errors import ConfigError
 from aquaflow.errors.failures import Failures
 from aquaflow.messages import CameraModel
@@ -24,6 +25,7 @@ def devices(vehicle: VehicleConfig) -> LiveFeed:
         ConfigError: ``service.camera`` names none of the cameras.
         InputError: a driver or the library that it needs is not installed.
     """
+    EarlyRecords().attach()  # links are opened before the dive has a folder
     name = vehicle.service.camera or next(iter(vehicle.cameras))
     if name not in vehicle.cameras:
         known = ", ".join(vehicle.cameras)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from aquaflow.clocks.deadline import Deadline
 from aquaflow.config import Config
 from aquaflow.errors import ConfigError
 from aquaflow.errors.failures import Failures
@@ -22,6 +23,7 @@ from aquaflow.profiler import Profiler
 from aquaflow.render import select_renderer
 from aquaflow.render.contract import Renderer
 from aquaflow.slam.contributions import Contributions
+from aquaflow.slam.finish_time import FinishTime
 from aquaflow.tracking.adjustment.adjuster import Adjuster
 from aquaflow.tracking.anchored import Anchored, Anchors
 from aquaflow.tracking.frame_table import FrameTable
@@ -157,35 +159,43 @@ class Slam:
         self._latest = newest
         return finished
 
-    def finish_tracking(self) -> list[Tracked]:
+    def finish_tracking(self, until: Deadline | None = None) -> list[Tracked]:
         """After the last frame: the frames that still wait."""
         with self.profiler.stage("track"):
-            tracked = self.tracker.finish()
+            tracked = self.tracker.finish(until)
         return self._link_map_publish(tracked)
 
-    def finish(self, progress: Callable[[int, int], None] | None = None) -> list[Tracked]:
-        """After the last frame: the frames that still wait, the last keyframe, the refinement."""
-        finished = self.finish_tracking()
-        self._settle_graph()
+    def finish(
+        self,
+        progress: Callable[[int, int], None] | None = None,
+        limits: FinishTime | None = None,
+    ) -> list[Tracked]:
+        """After the last frame: the frames that still wait, the last keyframe, the refinement; what
+        is not needed for whole files stays within ``limits``."""
+        limits = limits or FinishTime()
+        finished = self.finish_tracking(limits.settling)
+        self._settle_graph(limits.settling)
         with self.failures.contain("insertion"):
             self._contributions.retire_last()
         with self.failures.contain("refinement"):
-            self.maps.refine(progress)
+            self.maps.refine(progress, limits.refining)
         settled = self.results(len(self.frames) - len(finished))
         return [
             replace(each, T_wc=now.T_wc, sub_map=now.sub_map)
             for each, now in zip(finished, settled, strict=True)
         ]
 
-    def _settle_graph(self) -> None:
+    def _settle_graph(self, until: Deadline) -> None:
         """The last optimisations, of loops and telemetry, and then the frames in metres."""
         self._wait_for_graph()
-        self.graph.adjust_everything()
-        self._wait_for_graph()
+        if not until.over:
+            self.graph.adjust_everything()
+            self._wait_for_graph()
         if self.metric.present:
             for _ in range(SETTLING_ROUNDS):
-                self.graph.straighten()
-                self._wait_for_graph()
+                if not until.over:
+                    self.graph.straighten()
+                    self._wait_for_graph()
             with self.profiler.stage("metric"):
                 self.metric.update(self.graph.snapshot)
 

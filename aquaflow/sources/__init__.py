@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 from aquaflow.config.cameras import CameraConfig
-from aquaflow.config.telemetry import MountingConfig, TelemetryConfig
+from aquaflow.config.device import MountingConfig
+from aquaflow.config.telemetry import TelemetryConfig
 from aquaflow.errors import InputError
 from aquaflow.messages import CameraModel, Dropped, Frame, TelemetrySample
 

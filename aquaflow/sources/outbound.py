@@ -11,12 +11,13 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 
 LONGEST_TEXT, LONGEST_NAME = 50, 10
-"""Characters that MAVLink has room for."""
+"""Characters that a message of MAVLink has room for."""
 
 
 @dataclass(frozen=True)
 class StatusText:
-    """Text for the pilot; cut after ``LONGEST_TEXT`` characters."""
+    """Text for the pilot. Ground stations speak it: up to ``LONGEST_TEXT`` characters are one
+    message, a longer text comes in chunks, which older ones speak one by one."""
 
     severity: Literal["error", "warning", "notice", "info"]
     text: str

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Iterator
 
+from aquaflow.clocks.wall import WallClockWatch
 from aquaflow.messages import UtcTime
 
 SOURCE = "computer/clock"
@@ -23,11 +23,13 @@ class WallClock:
     def __init__(self, every_s: float = EVERY_S) -> None:
         self._every_s = every_s
         self._closed = threading.Event()
+        self._watch = WallClockWatch()
 
     def samples(self) -> Iterator[UtcTime]:
         """The first at once; none while the computer's clock was never set."""
         while not self._closed.is_set():
-            t_ns, utc_ns = time.monotonic_ns(), time.time_ns()
+            now = self._watch.read()
+            t_ns, utc_ns = now.monotonic_ns, now.monotonic_ns + now.offset_ns
             if utc_ns >= OLDEST_NS:
                 yield UtcTime(t_ns, t_ns, SOURCE, utc_ns)
             self._closed.wait(self._every_s)

@@ -113,6 +113,11 @@ class Spill(Generic[T]):
         self._use(number, item)
 
     @property
+    def in_memory(self) -> list[T]:
+        """The items that need not be read from a file."""
+        return list(self._resident.values())
+
+    @property
     def resident_bytes(self) -> int:
         """Size of the arrays in memory."""
         items = self._resident.values()

@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.config.telemetry import MountingConfig
+from aquaflow.config.device import MountingConfig
 from aquaflow.messages import TelemetrySample
 from aquaflow.synthetic.config import SyntheticConfig
 from aquaflow.synthetic.motion import BodyMotion

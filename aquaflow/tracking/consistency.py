@@ -133,10 +133,10 @@ class ConsistencyMonitor:
         self.counts = Counts()
 
     @property
-    def trouble(self) -> str:
-        """The last finding, for some seconds; empty if there is none."""
+    def trouble(self) -> Finding | None:
+        """The last finding, for some seconds."""
         recent = self._frames_since < SHOWN_FRAMES and self.counts.findings
-        return str(self.counts.findings[-1]) if recent else ""
+        return self.counts.findings[-1] if recent else None
 
     def after(
         self, keyframe: Keyframe, frame: int, solved: Matched | None, camera: CameraModel

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable
 from typing import TypeAlias
 
+from aquaflow.clocks.deadline import Deadline
 from aquaflow.config import TrackingConfig
 from aquaflow.errors.failures import Failures
 from aquaflow.geometry.camera import CameraModel
@@ -91,9 +92,11 @@ class Tracker:
         """Finish :attr:`past`, with or without a pose; returns nothing if no frame waits."""
         return self._leaving("back-filling", self.past, self._back_fills.step)
 
-    def finish(self) -> list[Tracked]:
-        """Finish the waiting frames after a last attempt to pose them."""
-        decided = self._leaving("tracking", None, lambda: self._begin() + self._back_fills.all())
+    def finish(self, until: Deadline | None = None) -> list[Tracked]:
+        """Finish the waiting frames after a last attempt to pose them, as far as there is time."""
+        decided = self._leaving(
+            "tracking", None, lambda: self._begin() + self._back_fills.all(until)
+        )
         return decided + self._waiting.give_up(self._as_lost)
 
     @property

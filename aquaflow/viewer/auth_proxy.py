@@ -89,7 +89,7 @@ class AuthProxy:
     def _forward(self, client: socket.socket) -> None:
         request = _head(client)
         target, headers = _parsed(request)
-        if not self._access.allows(target, headers):
+        if not self._access.allows(target, headers, client.getpeername()[0]):
             client.sendall(REFUSED)
             return
         if self._access.by_query(target):  # into a cookie, and out of the address bar

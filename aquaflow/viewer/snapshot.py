@@ -13,10 +13,10 @@ import numpy.typing as npt
 import torch
 
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.mapping.gaussians.gaussians import radiance
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.transfers import map_out
 from aquaflow.messages import CameraModel
+from aquaflow.render.activation import radiance
 from aquaflow.viewer.splats import Splats, heat, splats
 
 OFTEN = 200.0

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+import threading
+from collections.abc import Callable, Sequence
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
+import typer
+from typer.testing import CliRunner
 
 from aquaflow.cli import devices
 from aquaflow.config.cameras import OakConfig, V4l2Config
@@ -83,17 +87,100 @@ def working() -> list[FoundDevice]:
     return [FoundDevice("v4l2", "abc", "Camera [1]", "MJPG", {"kind": "v4l2", "device": "abc"})]
 
 
+def hanging() -> list[FoundDevice]:
+    threading.Event().wait()
+    return []
+
+
+def asked(hosts: Sequence[str]) -> list[FoundDevice]:
+    return [FoundDevice("stream", host, "Camera", "H.264") for host in hosts]
+
+
+def registered(**groups: list[str]) -> Callable[..., list[EntryPoint]]:
+    """Drivers of this module in place of the installed ones."""
+
+    def entries(*, group: str) -> list[EntryPoint]:
+        names = groups.get(group.removeprefix("aquaflow."), [])
+        return [EntryPoint(name, f"{__name__}:{name}", group) for name in names]
+
+    return entries
+
+
 def test_a_driver_that_fails_hides_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    entries = [EntryPoint(n, f"{__name__}:{n}", discovery.DISCOVERY) for n in ("working", "broken")]
-    monkeypatch.setattr(discovery, "entry_points", lambda *, group: entries)
-    assert discover() == DiscoveryResult(working(), ["broken: the bus is on fire"])
+    drivers_here = registered(discovery=["working", "broken", "missing"])
+    monkeypatch.setattr(discovery, "entry_points", drivers_here)
+    found = discover()
+    assert found.devices == working()
+    assert found.problems[0] == "broken: the bus is on fire"
+    assert found.problems[1].startswith("missing: ")
+
+
+def test_a_driver_that_hangs_is_left_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    drivers_here = registered(discovery=["working", "hanging"])
+    monkeypatch.setattr(discovery, "entry_points", drivers_here)
+    assert discover(patience_s=0.2) == DiscoveryResult(working(), ["hanging: it did not end"])
+
+
+def test_hosts_are_asked_by_the_drivers_of_the_network_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    drivers_here = registered(discovery=["working"], network_discovery=["asked"])
+    monkeypatch.setattr(discovery, "entry_points", drivers_here)
+    assert discover(["10.0.0.2"]).devices == [*working(), *asked(["10.0.0.2"])]
+    assert discover([]).devices == working()
+
+
+def test_what_pyproject_registers_is_there() -> None:
+    text = (Path(__file__).parents[2] / "pyproject.toml").read_text()
+    for group in (discovery.DISCOVERY, discovery.NETWORK_DISCOVERY):
+        _, _, block = text.partition(f'[project.entry-points."{group}"]\n')
+        lines = block.partition("\n\n")[0].splitlines()
+        assert len(lines) >= 4
+        for line in lines:
+            name, _, value = line.partition(" = ")
+            assert callable(EntryPoint(name, value.strip('"'), group).load())
+
+
+@pytest.mark.parametrize(
+    ("options", "hosts"),
+    [
+        ((), discovery.VEHICLE_HOSTS),
+        (("--local",), ()),
+        (("--host", "a", "--host", "b"), ("a", "b")),
+    ],
+)
+def test_the_options_say_who_is_asked(
+    options: tuple[str, ...], hosts: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = []
+
+    def look(hosts: Sequence[str]) -> DiscoveryResult:
+        given.append(hosts)
+        return DiscoveryResult([], [])
+
+    monkeypatch.setattr(discovery, "discover", look)
+    app = typer.Typer()
+    devices.register(app)
+    assert CliRunner().invoke(app, [*options, "--json"]).exit_code == 0
+    assert given == [hosts]
+
+
+def test_what_cannot_be_used_now_has_no_lines_to_paste(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    taken = FoundDevice("stream", "udp://0.0.0.0:5600", "UDP port 5600", "another program listens")
+    monkeypatch.setattr(discovery, "discover", lambda hosts: DiscoveryResult([taken], []))
+    devices.devices()
+    printed = capsys.readouterr().out
+    assert "another program listens" in printed
+    assert "{}" not in printed
 
 
 def test_the_table_shows_ids_and_lines_for_the_config(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(
-        discovery, "discover", lambda: DiscoveryResult(working(), ["oak: no library"])
+        discovery, "discover", lambda hosts: DiscoveryResult(working(), ["oak: no library"])
     )
     devices.devices()
     printed = capsys.readouterr().out
@@ -104,13 +191,13 @@ def test_the_table_shows_ids_and_lines_for_the_config(
 def test_nothing_plugged_in_is_a_sentence(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(discovery, "discover", lambda: DiscoveryResult([], []))
+    monkeypatch.setattr(discovery, "discover", lambda hosts: DiscoveryResult([], []))
     devices.devices()
-    assert capsys.readouterr().out == "No camera, serial port or CAN interface is plugged in.\n"
+    assert capsys.readouterr().out.startswith("Nothing was found: ")
 
 
 def test_this_machine_is_looked_at_without_an_error(aquaflow: Cli) -> None:
-    ran = aquaflow("devices", "--json")
+    ran = aquaflow("devices", "--local", "--json")
     assert ran.code == 0
     assert ran.err == ""
     found = json.loads(ran.out)

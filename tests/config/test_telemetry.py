@@ -5,12 +5,8 @@ from __future__ import annotations
 import pytest
 import yaml
 
-from aquaflow.config.telemetry import (
-    MavlinkConfig,
-    TelemetryConfig,
-    WaterLinkedSerialConfig,
-    parse_telemetry,
-)
+from aquaflow.config.instruments import WaterLinkedSerialConfig
+from aquaflow.config.telemetry import MavlinkConfig, TelemetryConfig, parse_telemetry
 from aquaflow.errors import ConfigError
 
 VEHICLE = """

@@ -29,7 +29,12 @@ def load(tmp_path: Path, data: dict[str, Any]) -> VehicleConfig:
 
 
 def test_there_is_an_example_for_each_kind_of_vehicle() -> None:
-    assert [path.stem for path in EXAMPLES] == ["bluerov2_usb", "can_vehicle", "oak_in_housing"]
+    assert [path.stem for path in EXAMPLES] == [
+        "auv_instruments",
+        "bluerov2_usb",
+        "can_vehicle",
+        "oak_in_housing",
+    ]
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
@@ -40,7 +45,8 @@ def test_every_example_is_valid(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "settings"), [("bluerov2_usb", 11), ("oak_in_housing", 2), ("can_vehicle", 0)]
+    ("name", "settings"),
+    [("auv_instruments", 4), ("bluerov2_usb", 15), ("oak_in_housing", 2), ("can_vehicle", 0)],
 )
 def test_settings_that_an_example_leaves_as_comments_are_valid_too(
     name: str, settings: int, tmp_path: Path
@@ -58,7 +64,7 @@ def test_settings_that_an_example_leaves_as_comments_are_valid_too(
     [
         ({**V4L2, "fsp": 3}, "cameras.front.v4l2.fsp' is not a known key"),
         ({**V4L2, "fps": 0}, "cameras.front.v4l2.fps"),
-        ({**V4L2, "pixels": "H264"}, "cameras.front.v4l2.pixels"),
+        ({**V4L2, "pixels": "RGB3"}, "cameras.front.v4l2.pixels"),
         ({"kind": "webcam"}, "cameras.front"),
         ({"device": "abc"}, "cameras.front"),
         ({"kind": "stream"}, "cameras.front.stream.url"),

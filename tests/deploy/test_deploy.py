@@ -5,17 +5,17 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import pytest
-import yaml
 
 from aquaflow.config.vehicle import load_vehicle
-from aquaflow.service.health.http import REGISTRATION
+from aquaflow.drivers.discovery import SERIAL_PORTS
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 MOST_EXPOSED = 2.0
-SCRIPTS = sorted(DEPLOY.glob("*.sh"))
+SCRIPTS = sorted(DEPLOY.rglob("*.sh"))
 
 
 @pytest.fixture
@@ -48,11 +48,59 @@ def test_the_unit_is_hardly_exposed(unit: Path) -> None:
     assert float(found[1]) <= MOST_EXPOSED
 
 
+PROC_DEVICES = {
+    "Raspberry Pi OS": """Character devices:
+  4 ttyS
+ 81 video4linux
+189 usb_device
+204 ttyAMA
+226 drm
+237 media
+""",
+    "arm64 with drivers of many boards": """Character devices:
+  4 ttyS
+166 ttyACM
+188 ttyUSB
+204 ttySC
+204 ttyAMA
+240 ttyTHS
+""",
+}
+"""Of such kernels, the lines that matter here."""
+
+
+def allowed_groups() -> list[str]:
+    """Device groups of the unit, which systemd looks up in /proc/devices by glob."""
+    text = (DEPLOY / "aquaflow.service").read_text()
+    return re.findall(r"^DeviceAllow=char-(\S+) rw$", text, flags=re.MULTILINE)
+
+
+@pytest.mark.parametrize("pattern", SERIAL_PORTS)
+def test_every_serial_port_that_is_listed_may_be_opened_by_the_service(pattern: str) -> None:
+    name = pattern.removesuffix("*")
+    assert any(fnmatchcase(name, group) for group in allowed_groups())
+    rules = (DEPLOY / "99-aquaflow.rules").read_text()
+    kernels = re.findall(r'SUBSYSTEM=="tty", KERNEL=="([^"]+)", GROUP="(\w+)", MODE="0660"', rules)
+    groups = [group for kernel, group in kernels if f"{name}[0-9]*" in kernel.split("|")]
+    assert groups in (["aquaflow"], ["dialout"])
+    assert "dialout" in (DEPLOY / "install.sh").read_text()
+
+
+@pytest.mark.parametrize("listed", PROC_DEVICES.values(), ids=PROC_DEVICES)
+def test_the_units_names_are_those_of_the_kernel(listed: str) -> None:
+    kernel = set(re.findall(r"^ *\d+ (\S+)$", listed, flags=re.MULTILINE))
+    used = {name for name in kernel if name.startswith(("tty", "video", "media", "usb"))}
+    refused = {
+        name for name in used if not any(fnmatchcase(name, each) for each in allowed_groups())
+    }
+    assert refused <= {"ttySC"}  # of another maker's board
+
+
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
 def test_scripts_parse_and_stop_at_the_first_error(script: Path) -> None:
     subprocess.run(["bash", "-n", str(script)], check=True)
-    # torch.sh is read by the others, under their settings.
-    assert script.name == "torch.sh" or "set -euo pipefail" in script.read_text()
+    # These two are read by the others, under their settings.
+    assert script.name in {"torch.sh", "device.sh"} or "set -euo pipefail" in script.read_text()
 
 
 def test_an_interpreter_that_the_sandbox_hides_is_refused(tmp_path: Path) -> None:
@@ -72,20 +120,3 @@ def test_an_interpreter_that_the_sandbox_hides_is_refused(tmp_path: Path) -> Non
 @pytest.mark.parametrize("file", sorted((DEPLOY / "config").glob("*.yaml")), ids=lambda f: f.name)
 def test_example_configs_are_valid(file: Path) -> None:
     assert load_vehicle(file).cameras
-
-
-def test_the_extension_has_the_labels_that_blueos_reads() -> None:
-    import json
-
-    text = (DEPLOY / "blueos" / "Dockerfile").read_text().replace("\\\n", "")
-    labels = dict(re.findall(r"^LABEL (\w+)='(.*)'\s*$", text, flags=re.MULTILINE))
-    assert {"version", "permissions", "authors", "company", "type", "readme", "links"} <= set(
-        labels
-    )
-    permissions = json.loads(labels["permissions"])
-    ((port, _),) = permissions["HostConfig"]["PortBindings"].items()
-    assert port in permissions["ExposedPorts"]
-    assert {"Memory", "CpuQuota"} <= set(permissions["HostConfig"])
-    assert REGISTRATION["api"] == "/health"
-    config = yaml.safe_load((DEPLOY / "blueos" / "aquaflow.yaml").read_text())
-    assert config["service"]["health"]["token_file"]

@@ -113,7 +113,7 @@ def test_config_cameras_log_and_report_can_be_read_again(small_dive: Path) -> No
     assert (camera.width, camera.height) == (WIDTH, HEIGHT)
     assert load_camera(small_dive / "calibration.yaml").fx == pytest.approx(camera.fx)
     for line in (small_dive / "log.jsonl").read_text().splitlines():
-        assert {"t", "level", "message"} <= json.loads(line).keys()
+        assert {"t_s", "utc", "level", "message"} <= json.loads(line).keys()
     report = (small_dive / "report.html").read_text()
     assert report.startswith("<!doctype html>")
     assert "http://" not in report.replace("http://www.w3.org", "")

@@ -58,8 +58,10 @@ def slam(small_recording: Path) -> Slam:
 def written(slam: Slam, path: Path, outputs: MetricOutputs | None) -> Path:
     folder = DiveFolder(path, slam.config)
     made = Deliverables("dive", folder, slam, slam.results(), None, outputs)
-    made.evaluate()
+    made.summarise()
     made.write()
+    made.evaluate()
+    made.write_evaluation()
     made.write_report([], NUMBERS, [])
     folder.close()
     return path

@@ -83,7 +83,7 @@ def test_same_seed_and_clip_give_the_same_bytes(
         assert (again / name).read_bytes() == (small_dive / name).read_bytes(), name
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_another_seed_gives_another_map(
     aquaflow: Cli, small_recording: Path, small_dive: Path, tmp_path: Path
 ) -> None:

@@ -219,8 +219,10 @@ def test_a_file_that_cannot_be_written_leaves_the_others(
     monkeypatch.setattr(slam, "failures", Failures(strict=False))
     monkeypatch.setattr(folder, broken, partial(fail))
     made = Deliverables("planted", folder, slam, slam.results(), None)
-    made.evaluate()
+    made.summarise()
     made.write()
+    made.evaluate()
+    made.write_evaluation()
     made.write_report([], {"stage_ms": {}, "warnings": []}, slam.failures.notes())
     folder.close()
     stage, missing = WRITERS[broken]

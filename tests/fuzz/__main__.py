@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import sys
 import tempfile
 from pathlib import Path
+
+from tests.command_server import IMPORTED
 
 from .child import home_of, temporary_of
 from .commands import all_commands
 from .exemplars import make_exemplars
 from .privileges import own_to_nobody
-from .session import Session
+from .session import BATCH, Session
 from .table import printed
 
 
@@ -24,6 +27,7 @@ def main() -> int:
     parser.add_argument(
         "--interrupt", type=float, default=12.0, help="s until long ones get Ctrl-C"
     )
+    parser.add_argument("--batch", type=int, default=BATCH, help="runs of a command's turn")
     parser.add_argument("--keep", type=Path, help="folder for the folders of finds")
     asked = parser.parse_args()
     _import_all()
@@ -35,7 +39,9 @@ def main() -> int:
             folder.mkdir()
         own_to_nobody(work)
         make_exemplars(exemplars)
-        session = Session(commands, exemplars, work, asked.seed, asked.interrupt, asked.keep)
+        session = Session(
+            commands, exemplars, work, asked.seed, asked.interrupt, asked.keep, asked.batch
+        )
         session.run(asked.seconds)
     print(printed(session))
     return 1 if session.found else 0
@@ -43,10 +49,8 @@ def main() -> int:
 
 def _import_all() -> None:
     """What takes seconds to import, once; nothing here may start a thread."""
-    import cv2  # noqa: F401
-    import matplotlib.pyplot  # noqa: F401
-    import onnxruntime  # noqa: F401
-    import torch  # noqa: F401
+    for module in (*IMPORTED, "onnxruntime"):
+        importlib.import_module(module)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from .privileges import own_to_nobody
 from .values import INTERRUPTED
 
 BATCH = 4
-"""Runs of a command's turn."""
+"""Runs of a command's turn, unless the session is told otherwise."""
 
 LINKS = {"null": "/dev/null", "full": "/dev/full", "zero": "/dev/zero", "loop": "loop"}
 
@@ -66,12 +66,14 @@ class Session:
         seed: int,
         interrupt_s: float = 12.0,
         keep: Path | None = None,
+        batch: int = BATCH,
     ) -> None:
         from aquaflow.cli import main
 
         self.main: Callable[[], None] = main
         self.commands, self.exemplars, self.work = commands, exemplars, work
         self.seed, self.interrupt_s, self.keep = seed, interrupt_s, keep
+        self.batch = batch
         self.names = tuple(sorted(path.name for path in exemplars.iterdir()))
         self.tallies = {command.name: Tally() for command in commands}
         self.found: dict[str, Found] = {}
@@ -95,7 +97,7 @@ class Session:
 
         @hypothesis.seed(key)
         @hypothesis.settings(
-            max_examples=BATCH, phases=[Phase.generate], database=None, deadline=None,
+            max_examples=self.batch, phases=[Phase.generate], database=None, deadline=None,
             suppress_health_check=list(HealthCheck),
         )  # fmt: skip
         @hypothesis.given(invocations(command, self.names))

@@ -82,7 +82,11 @@ QUICK: dict[str, dict[str, str]] = {
 """Given where nothing else was drawn, so that a run that works is over soon."""
 
 INTERRUPTED = frozenset(
-    {*QUICK, "prior train mast3r", "prior verify", "prior export", "export", "doctor"}
+    {
+        *QUICK,
+        *("prior train mast3r", "prior verify", "prior export", "prior compare"),
+        *("export", "doctor"),
+    }
 )
 """Commands that may rightly work for minutes, or until Ctrl-C; they get a Ctrl-C after a while."""
 

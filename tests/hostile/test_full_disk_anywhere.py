@@ -42,7 +42,7 @@ def half_written(folder: Path) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("room_bytes", [64, pytest.param(40_000, marks=pytest.mark.ci)])
+@pytest.mark.parametrize("room_bytes", [64, pytest.param(40_000, marks=pytest.mark.slow)])
 def test_mapping_onto_a_full_disk_is_told_in_one_sentence(
     small_recording: Path, tmp_path: Path, room_bytes: int
 ) -> None:

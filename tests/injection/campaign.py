@@ -94,10 +94,12 @@ def one(task: Task, recordings: Path, before: Before) -> Result:
 def _judged(
     task: Task, met: Moment | None, ended: Ended, folder: Path, before: Before
 ) -> tuple[list[str], str]:
-    problems = verdict.exit_problems(task.strike.kind, met or Moment(), ended)
-    if not problems and ended.code in verdict.ENDED:
+    kind, moment = task.strike.kind, met or Moment()
+    problems = verdict.exit_problems(kind, moment, ended)
+    ended_whole = ended.code in verdict.ENDED and not verdict.stopped_empty(kind, moment, ended)
+    at_start = met is not None and met.phase == "start"
+    if not problems and ended_whole:
         problems = _looked_at(folder, before)
-    ended_whole, at_start = ended.code in verdict.ENDED, met is not None and met.phase == "start"
     if not problems and not ended_whole and not at_start:
         problems = verdict.row_problems(folder / "dive")
     if problems:

@@ -16,9 +16,10 @@ from .watch import Moment
 MOST_MISSING = 6
 """Frames without a pose that one fault may cost: its own, and those that a start of a map waits
 for (``max_waiting`` in dives.py)."""
-ENDED = (0, 3)
-"""Exit codes of a dive that ended; 3: with warnings, as where a busy machine kept a live dive from
-most frames."""
+POOR = 3
+ENDED = (0, POOR)
+"""Exit codes of a dive that ended; POOR: with warnings, as where a busy machine kept a live dive
+from most frames."""
 REFUSALS = (1, 70)
 """Exit codes of a command that says why it does not begin; 70: a library failed."""
 INTERRUPTED, STOPPED = 130, "aquaflow: stopped"
@@ -68,6 +69,11 @@ def exit_problems(kind: Kind, met: Moment, ended: Ended) -> list[str]:
     if kind is Kind.INTERRUPT and ended.code == INTERRUPTED and _says(ended, STOPPED):
         return []
     return [f"exit {ended.code}: {_last_line(ended.err)}"]
+
+
+def stopped_empty(kind: Kind, met: Moment, ended: Ended) -> bool:
+    """True for a live dive that was interrupted before its first frame: it has nothing to write."""
+    return kind is Kind.INTERRUPT and met.phase == "start" and ended.code == POOR
 
 
 def folder_problems(dive: Path, before: Before) -> list[str]:

@@ -65,16 +65,23 @@ class Pretended:
     """An onnxruntime with GPU providers, whose sessions run where ``obtained`` says."""
 
     SessionOptions = Options
+    __file__ = "/nowhere/onnxruntime/__init__.py"
 
     def __init__(self, available: list[str], obtained: str) -> None:
         self.available, self.obtained = available, obtained
         self.bindings: list[Binding] = []
+        self.loaded = 0
+
+    def preload_dlls(self) -> None:
+        print("Failed to load libcufft")
+        self.loaded += 1
 
     def get_available_providers(self) -> list[str]:
         return self.available
 
     def InferenceSession(self, path: str, options: Options, providers: list[Any]) -> Any:
         self.options, self.providers = options, providers
+        print("*** EP Error ***")
         value = SimpleNamespace(name="x", shape=[1, 3, "height", 320])
         return SimpleNamespace(
             get_providers=lambda: [self.obtained],
@@ -127,6 +134,41 @@ def test_a_processor_asked_for_by_name_is_that_or_an_error(
 ) -> None:
     with pytest.raises(AquaFlowError, match="was to run on tensorrt but onnxruntime fell back"):
         session(monkeypatch, Pretended(GPU, PROVIDERS["cuda"]), device="tensorrt")
+
+
+@pytest.mark.parametrize("device", ["cuda", "tensorrt"])
+def test_the_library_that_a_fall_back_is_for_is_named(
+    monkeypatch: pytest.MonkeyPatch, device: str
+) -> None:
+    library = rf"libonnxruntime_providers_{device}\.so: cannot open shared object file"
+    with pytest.raises(AquaFlowError, match=rf"fell back to CPUExecutionProvider \(.*{library}"):
+        session(monkeypatch, Pretended(GPU, PROVIDERS["cpu"]), device=device)
+
+
+def test_a_fall_back_whose_libraries_load_names_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("ctypes.CDLL", lambda path, mode: None)
+    with pytest.raises(AquaFlowError, match="fell back to CPUExecutionProvider; repair"):
+        session(monkeypatch, Pretended(GPU, PROVIDERS["cpu"]), device="cuda")
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda", "tensorrt"])
+def test_libraries_that_pip_installed_are_loaded_for_a_gpu(
+    monkeypatch: pytest.MonkeyPatch, device: str
+) -> None:
+    pretended = Pretended(GPU, PROVIDERS[device])
+    session(monkeypatch, pretended, device=device)
+    assert pretended.loaded == (device != "cpu")
+
+
+def test_what_onnxruntime_prints_is_not_among_our_output(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session(monkeypatch, Pretended(GPU, PROVIDERS["cuda"]))
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err == "Failed to load libcufft\n*** EP Error ***\n"
 
 
 def test_tensorrt_runs_in_half_precision_in_bounded_memory_and_keeps_what_it_built(

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aquaflow.config.device import MountingConfig
 from aquaflow.config.recording import RecordingConfig
-from aquaflow.config.telemetry import MountingConfig
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.port import FlatPort

@@ -23,7 +23,7 @@ from aquaflow.service.checkpoint.generations import STATE, Checkpoint
 from aquaflow.service.checkpoint.resume import newest_usable
 from aquaflow.service.dive_clock import Continued
 from aquaflow.service.live_dive import LiveDive
-from aquaflow.service.onboard import begun
+from aquaflow.service.onboard import Asked, begun
 from aquaflow.sources import open_recording
 from aquaflow.sources.newest import Newest
 from aquaflow.storage.spill import read_item
@@ -74,7 +74,7 @@ def gone_on_with(folder: Path, frames: list[Frame], new: bool = False) -> tuple[
     """Resume, take the frames, and be told to stop, which keeps what it can be resumed from; and
     True if it was the dive of before."""
     feed = ListedFeed(frames)
-    with begun(feed, VEHICLE, folder, new=new, overwrite=False) as dive:
+    with begun(feed, VEHICLE, Asked(folder, new)) as dive:
         feed.listed.at_end = partial(_stop, dive)
         finished = dive.run()
     assert finished is not None
@@ -83,7 +83,7 @@ def gone_on_with(folder: Path, frames: list[Frame], new: bool = False) -> tuple[
 
 def _stop(dive: LiveDive) -> None:
     caught_up(dive)
-    dive.parts.loop.stopping.set()
+    dive.control.stopping.set()
 
 
 def killed_dive(folder: Path) -> list[Frame]:
@@ -93,7 +93,7 @@ def killed_dive(folder: Path) -> list[Frame]:
     frames = frames_of(folder / "recording")
     gone_on_with(folder / "running", frames[:STOPPED])
     feed = ListedFeed([])
-    with begun(feed, VEHICLE, folder / "running", new=False, overwrite=False) as dive:
+    with begun(feed, VEHICLE, Asked(folder / "running")) as dive:
         for count, frame in enumerate(frames[STOPPED:KILLED], start=STOPPED + 1):
             dive.parts.loop.take(frame)
             if count in (FIRST, SECOND):

@@ -10,8 +10,8 @@ import numpy as np
 
 from aquaflow.clocks.device import Learned
 from aquaflow.config import Config, parse_config
+from aquaflow.config.device import MountingConfig
 from aquaflow.config.service import ServiceConfig
-from aquaflow.config.telemetry import MountingConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import DiveRun
@@ -20,18 +20,20 @@ from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.maps import Growth, Insertion, Maps
 from aquaflow.messages import CameraModel, Dropped, Frame
+from aquaflow.service.control import Control
 from aquaflow.service.dive_clock import Continued
 from aquaflow.service.feed import LatestSamples
 from aquaflow.service.health.degradation import Degradation
-from aquaflow.service.health.heartbeats import Heartbeats
 from aquaflow.service.health.pressure import Pressure
-from aquaflow.service.health.systemd import Notifier
+from aquaflow.service.health.state import Health
 from aquaflow.service.live_dive import LiveDive
 from aquaflow.service.loop import LiveLoop
 from aquaflow.service.map_thread import MapThread
+from aquaflow.service.vitals import Vitals
 from aquaflow.slam import Slam
 from aquaflow.sources.newest import Newest
 from aquaflow.sources.outbound import OutboundMessage
+from aquaflow.sources.pilot import HearsPilot
 from aquaflow.tracking.frames import FrameClass, Tracked
 
 WIDTH, HEIGHT = 64, 48
@@ -87,8 +89,18 @@ class ToldFeed:
         self.learned: dict[str, Learned] = {}
         self.mounting: MountingConfig | None = None
 
+    lasting = False
+    pilot: HearsPilot | None = None
+
     def name_of(self, index: int) -> str:
         return f"told#{index}"
+
+    def take(self, timeout_s: float) -> Frame | Dropped | None:
+        return self.newest.take(timeout_s)
+
+    def forget(self) -> None:
+        self.failures, self.notes = Failures(), []
+        self.latest_samples.forget()
 
     def stated_mounting(self) -> MountingConfig | None:
         return self.mounting
@@ -98,6 +110,9 @@ class ToldFeed:
 
     def continue_from(self, continued: Continued) -> None:
         self.continued = continued
+
+    def dive_s(self) -> float | None:
+        return None
 
     def clocks(self) -> dict[str, Learned]:
         return self.learned
@@ -133,20 +148,22 @@ class Told:
     """A live loop of which the test holds every end."""
 
     def __init__(self, folder: Path, config: Config = SETTINGS, **service: object) -> None:
-        self.clock, self.feed, self.heartbeats = Clock(), ToldFeed(), Heartbeats()
+        self.clock, self.feed, self.control = Clock(), ToldFeed(), Control()
         self.pressure = CALM
         self.config = ServiceConfig.model_validate(service)
-        self.degradation = Degradation(self.config.limits, self.clock)
+        self.vitals = Vitals(self.config)
+        self.vitals.health = Health(self.clock)
+        self.vitals.degradation = Degradation(self.config.limits, self.clock)
+        self.degradation, self.heartbeats = self.vitals.degradation, self.vitals.heartbeats
         self.maps = MapThread(
             Maps(config), self.config.mapping, self.heartbeats, lambda: self.degradation.level
         )
         self.dive = DiveFolder(folder, config)
         self.slam = Slam(config, live=True, maps=self.maps)
         self.run = ToldRun("told", self.dive, config, self.slam, None, self.feed.name_of)
-        self.notifier = Notifier({})
         self.loop = LiveLoop(
-            self.run, self.feed, self.maps, self.config, self.heartbeats, self.degradation,
-            lambda: self.pressure, self.notifier, self.clock,
+            self.run, self.feed, self.maps, self.config, self.vitals, self.control,
+            lambda: self.pressure, self.clock,
         )  # fmt: skip
 
     def frames(self, said: str, first: int = 0, every_s: float = 0.1) -> None:
@@ -165,6 +182,7 @@ class Told:
     def close(self) -> None:
         self.slam.close()
         self.dive.close()
+        self.vitals.close()
 
 
 class RecordedMaps(Maps):

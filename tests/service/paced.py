@@ -4,7 +4,7 @@ A live dive takes the newest picture, so that what it maps depends on how fast t
 this one every picture is taken, at the machine's own pace. As a program:
 ``paced.py [--full-disk-at INDEX | --killed-at INDEX] run ...``: at that picture of the recording,
 once a checkpoint that is newer than it was written, files cannot grow any more, or the process is
-killed.
+killed; with ``--killed-with-a-report-at``, once a report was written, too.
 """
 
 from __future__ import annotations
@@ -39,16 +39,20 @@ def kill() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-HAPPENINGS: dict[str, Callable[[], None]] = {"--full-disk-at": fill_the_disk, "--killed-at": kill}
+HAPPENINGS: dict[str, Callable[[], None]] = {
+    "--full-disk-at": fill_the_disk, "--killed-at": kill, "--killed-with-a-report-at": kill,
+}  # fmt: skip
 
 
-def every_picture(at: int | None, happen: Callable[[], None], state: Path) -> None:
-    """From now on pictures wait until they are asked for; at picture ``at``, ``happen``."""
+def every_picture(at: int | None, happen: Callable[[], None], files: list[Path]) -> None:
+    """From now on pictures wait until they are asked for; at picture ``at``, and once the ``files``
+    are newer, ``happen``."""
     put = Newest.put
 
     def put_when_asked(self: Newest[Frame | Dropped], frame: Frame | Dropped) -> None:
         if frame.index == at:
-            wait_for_newer(state, time.time())
+            for file in [*files, *files]:  # what is written at first may be of long before
+                wait_for_newer(file, time.time())
             happen()
         while not self.asked(1.0):
             pass
@@ -73,11 +77,12 @@ def paced_run(
 
 
 if __name__ == "__main__":
-    index, happens = None, kill
+    index, happens, dive = None, kill, Path(sys.argv[sys.argv.index("--out") + 1])
+    awaited = [state_file(dive), *([dive / "report.html"] if "report" in sys.argv[1] else [])]
     if sys.argv[1] in HAPPENINGS:
         happens, index = HAPPENINGS[sys.argv[1]], int(sys.argv[2])
         del sys.argv[1:3]
-    every_picture(index, happens, state_file(Path(sys.argv[sys.argv.index("--out") + 1])))
+    every_picture(index, happens, awaited)
     from aquaflow.cli import main
 
     main()

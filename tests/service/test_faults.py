@@ -7,13 +7,16 @@ noticed what happened before, so that nothing here depends on how fast the machi
 
 from __future__ import annotations
 
+import json
 import random
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -21,10 +24,11 @@ from aquaflow.config import SourceConfig
 from aquaflow.config.cameras import V4l2Config
 from aquaflow.config.telemetry import parse_telemetry
 from aquaflow.dive.frames_csv import read_rows
-from aquaflow.drivers.live import CameraState
+from aquaflow.dive.log import EarlyRecords
+from aquaflow.drivers.camera_state import CameraState
 from aquaflow.drivers.telemetry import LinkTelemetry
 from aquaflow.drivers.v4l2 import V4l2Camera
-from aquaflow.messages import CameraModel, Depth, Frame
+from aquaflow.messages import Depth
 from aquaflow.service.checkpoint.resume import resumed
 from aquaflow.service.feed import LiveFeed
 from aquaflow.service.health.state import State
@@ -35,13 +39,11 @@ from aquaflow.sim_drivers.devices.ardusub import ArduSub
 from aquaflow.sim_drivers.devices.device import SimulatedDevice
 from aquaflow.sim_drivers.devices.wires import PtyWire
 from aquaflow.sim_drivers.v4l2_kernel import V4l2Kernel
-from aquaflow.sources import open_recording
 from tests.service.live_scenes import VEHICLE, Clock
+from tests.service.there_and_back import ThereAndBack
 from tests.small_recording import GIVE_UP_S
 
 FPS = 10.0
-PLACE = 8
-"""Pictures that all see the same place: a machine that takes only some of them stays on course."""
 FOR_EVER_S = 3600.0
 """A device is silent for so long only if it was unplugged."""
 JUMP_S = 1e6
@@ -49,25 +51,6 @@ JUMP_S = 1e6
 PICTURES = 3
 """Shown after something happened, so that it is among the rows."""
 GARBAGE_BYTES = 300_000
-
-
-class ThereAndBack:
-    """The begin of a recording forwards and backwards, for ever: no place changes at once."""
-
-    camera: CameraModel | None = None
-    frame_count: int | None = None
-
-    def __init__(self, recording: Path) -> None:
-        source = open_recording(recording)
-        frames = source.frames(stop=PLACE)
-        self._seen = [frame for frame in frames if isinstance(frame, Frame)]
-        self.notes: list[str] = []
-
-    def frames(self, every: int = 1, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        yield from self._seen
-        yield from self._seen[-2:0:-1]
-
-    def close(self) -> None: ...
 
 
 @dataclass
@@ -115,7 +98,7 @@ class Fate(threading.Thread):
         except AssertionError as error:
             self._told.problem = str(error)
         finally:
-            self._loop.stopping.set()
+            self._loop.control.stopping.set()
 
     def _lose_the_camera(self) -> None:
         self._told.unplugged = self._shown()
@@ -160,6 +143,7 @@ class Fate(threading.Thread):
 @pytest.fixture(scope="module")
 def told(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Told:
     pytest.importorskip("pymavlink", reason="pymavlink is not installed")
+    EarlyRecords().attach()  # as service.sources.devices does
     root = tmp_path_factory.mktemp("at_sea")
     kernel = V4l2Kernel(root, CameraFeed(ThereAndBack(small_recording), FPS), None)
     asked = {"kind": "v4l2", "pixels": "YUYV", "width": 160, "height": 120}
@@ -225,3 +209,47 @@ def test_the_counts_of_all_this_are_kept_with_the_dive(told: Told) -> None:
     assert live["visits"]["waiting for camera"] == 1
     assert live["visits"]["degraded"] == 1
     assert live["failures"] == 0
+
+
+def logged(told: Told, source: str) -> list[dict[str, Any]]:
+    """The entries of the dive's log about one device."""
+    assert told.dive is not None
+    lines = (told.dive.folder.path / "log.jsonl").read_text().splitlines()
+    return [entry for line in lines if (entry := json.loads(line)).get("source") == source]
+
+
+def comings_and_goings(entries: list[dict[str, Any]]) -> list[str]:
+    """Without what depends on how fast the machine is: attempts in between, clocks, summaries."""
+    told = ("format", "connected", "lost", "reconnected")
+    return [entry["event"] for entry in entries if entry["event"] in told]
+
+
+def summed_up(entries: list[dict[str, Any]], counter: str) -> int:
+    """Over the summaries of a dive that may have taken minutes."""
+    return sum(entry["counts"].get(counter, 0) for entry in entries if entry["event"] == "errors")
+
+
+def test_the_log_holds_what_happened_to_each_device_in_its_order(told: Told) -> None:
+    happened = ["connected", "lost", "reconnected"]
+    assert comings_and_goings(logged(told, "autopilot")) == happened
+    camera = logged(told, "front")
+    assert comings_and_goings(camera) == ["format", *happened]
+    assert camera[0]["message"] == "camera 'front' gives 160 x 120 YUYV, 30 pictures/s"
+
+
+def test_the_log_tells_when_by_the_dives_clock_and_in_utc(told: Told) -> None:
+    entries = [*logged(told, "front"), *logged(told, "autopilot")]
+    rows = read_rows(told.dive.folder.path / "frames.csv") if told.dive is not None else []
+    for entry in entries:
+        utc = datetime.fromisoformat(entry["utc"].replace("Z", "+00:00"))
+        assert 0.0 <= time.time() - utc.timestamp() < 2 * GIVE_UP_S
+    before_the_first_frame = {entry["event"] for entry in entries if entry["t_s"] is None}
+    assert before_the_first_frame <= {"waiting", "connected", "format"}
+    (lost,) = [entry["t_s"] for entry in logged(told, "front") if entry["event"] == "lost"]
+    unplugged_s = next(row.t_s for row in rows if row.index >= told.unplugged)
+    assert unplugged_s <= lost < rows[-1].t_s
+
+
+def test_the_log_sums_up_what_could_not_be_read(told: Told) -> None:
+    assert summed_up(logged(told, "autopilot"), "garbage_bytes") > GARBAGE_BYTES // 2
+    assert summed_up(logged(told, "front"), "stamps_repaired") >= 1

@@ -23,6 +23,7 @@ from aquaflow.messages import CameraModel, Depth, Dropped, Frame, TelemetrySampl
 from aquaflow.recording.playback import Playback
 from aquaflow.service.dive_clock import Continued
 from aquaflow.service.feed import LiveFeed, PlaybackFeed
+from aquaflow.service.health.prometheus_devices import device_lines
 from aquaflow.sim_drivers.camera_feed import CameraFaults, CameraFeed
 from aquaflow.sim_drivers.devices.ardusub import ArduSub
 from aquaflow.sim_drivers.devices.device import SimulatedDevice
@@ -74,6 +75,10 @@ def test_an_unplugged_camera_tells_why_and_its_pictures_come_again(tmp_path: Pat
         (device,) = feed.describe().values()
         assert (device["kind"], device["state"]) == ("camera", "streaming")
         assert device["reconnects"] == 1
+        told = "".join(f"{line}\n" for line in device_lines(feed.describe()))
+        assert 'aquaflow_device_up{device="front",kind="camera"} 1\n' in told
+        assert 'aquaflow_device_reconnects_total{device="front"} 1\n' in told
+        assert 'aquaflow_device_age_seconds{device="front"} 0.' in told
     finally:
         feed.close()
 
@@ -100,7 +105,7 @@ def test_a_new_dive_counts_from_its_first_frame_with_the_samples_before_it(tmp_p
     feed.start()
     try:
         frames: list[Frame | Dropped] = []
-        until(lambda: (frame := feed.newest.take(1.0)) is not None and frames.append(frame) is None)
+        until(lambda: (frame := feed.take(1.0)) is not None and frames.append(frame) is None)
         shift_ns = feed.continued.shift_ns
         assert shift_ns is not None
         assert frames[0].t_ns == 0
@@ -116,7 +121,7 @@ def test_only_pictures_that_are_asked_for_are_decoded(tmp_path: Path) -> None:
     feed.start()
     try:
         taken: list[Frame | Dropped] = []
-        until(lambda: (frame := feed.newest.take(1.0)) is None or taken.append(frame) is None)
+        until(lambda: (frame := feed.take(1.0)) is None or taken.append(frame) is None)
         until(lambda: front.counters.received > 20)
         assert front.counters.delivered <= len(taken) + 2
         assert feed.newest.overtaken == 0  # what is left out, the camera's own queue leaves out
@@ -129,7 +134,7 @@ def test_a_resumed_dive_counts_a_devices_pictures_on(tmp_path: Path) -> None:
     feed.continue_from(Continued(first_index=1000, shift_ns=10**15))
     feed.start()
     try:
-        frame = feed.newest.take(GIVE_UP_S)
+        frame = feed.take(GIVE_UP_S)
         assert frame is not None
         assert 1000 <= frame.index < 1100
         assert frame.t_ns > 10**15
@@ -211,6 +216,7 @@ def test_a_flood_of_garbage_costs_its_bytes_and_no_sample() -> None:
         until(lambda: injected["flood"] > 3 and feed.latest_samples.samples > 10)
         (described,) = feed.describe().values()
         assert described["state"] == "connected"
+        assert described["age_s"] is not None
         assert int(str(described["garbage_bytes"])) > 100_000
         assert all(
             abs(s.depth_m - 3.0) < 0.1

@@ -90,7 +90,7 @@ def both(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Bot
     )  # fmt: skip
     dive, feed, events = begun(small_recording, root / "live")
     played(dive, feed, events)
-    dive.parts.loop.stop("the recording ended")
+    dive.parts.loop.end()
     dive.parts.run.finish([])
     dive.close()
     return Both(root / "live", root / "replay")
@@ -162,6 +162,7 @@ def test_a_resumed_dive_has_its_telemetry_and_its_metric_frame_at_once(
     dive.parts.checkpointer.take()
     caught_up(dive)
     before = dive.parts.slam.metric.telemetry  # the process ends here: nothing is closed
+    dive.folder._lock.release()
     with (folder / "telemetry.jsonl").open("ab") as stream:
         stream.write(b'{"kind":"depth","t_ns":12')
 
@@ -177,7 +178,7 @@ def test_a_resumed_dive_has_its_telemetry_and_its_metric_frame_at_once(
     assert any("1 damaged" in note for note in back.parts.run.notes)
     assert len(metric._points) == len(back.parts.slam.keyframes)
     played(back, feed, events)
-    back.parts.loop.stop("the recording ended")
+    back.parts.loop.end()
     finished = back.parts.run.finish([])
     assert finished.metrics["unit"] == "m"
     assert read_metric_file(folder)[0].T_nm.scale == pytest.approx(known.T_nm.scale, rel=0.03)

@@ -121,6 +121,38 @@ def test_heat_and_a_full_gpu_are_pressure_too(
     assert says in told.degradation.reason
 
 
+def test_work_that_found_the_gpu_full_is_asked_for_less_at_once_and_tracking_goes_on(
+    told: Told,
+) -> None:
+    error = RuntimeError("CUDA out of memory. Tried to allocate 2.00 MiB.")
+    for turn, level in enumerate(
+        ("FEWER_STEPS", "SMALLER_IMAGES", "TRACKING_ONLY", "TRACKING_ONLY")
+    ):
+        told.slam.failures.record("optimisation", error)
+        told.frames("p", first=turn, every_s=0.01)
+        assert told.degradation.level is DegradationLevel[level]
+    assert told.degradation.steps_down == 3
+    assert told.loop.health.state is State.DEGRADED
+    assert "the GPU's memory was full" in told.loop.health.reason
+    told.idle(told.config.limits.calm_s)
+    assert told.degradation.level is DegradationLevel.SMALLER_IMAGES
+
+
+def test_a_gpu_that_stays_full_never_ends_tracking(told: Told) -> None:
+    told.pressure = replace(CALM, gpu_free_share=0.01)
+    told.idle(10 * told.config.limits.look_s, turns=10)
+    assert told.degradation.level is DegradationLevel.TRACKING_ONLY
+
+
+def test_after_heat_a_gpu_that_is_full_holds_no_deeper_level_than_it_needs(told: Told) -> None:
+    told.pressure = replace(CALM, temperature_c=99.0)
+    told.idle(10 * told.config.limits.look_s, turns=10)
+    assert told.degradation.level is DegradationLevel.RECORDING_ONLY
+    told.pressure = replace(CALM, gpu_free_share=0.01)
+    told.idle(3 * told.config.limits.calm_s, turns=60)
+    assert told.degradation.level is DegradationLevel.TRACKING_ONLY
+
+
 def test_a_full_disk_degrades_but_costs_no_degradation_level(told: Told) -> None:
     told.frames("pp")
     told.pressure = replace(CALM, disk_free_mb=3.0)
@@ -162,7 +194,8 @@ def test_a_missing_picture_is_a_row_and_no_silence(told: Told) -> None:
 
 def test_after_the_end_there_is_no_other_state(told: Told) -> None:
     told.frames("pp")
-    told.loop.stop("stop requested")
+    told.loop.end()
+    told.vitals.stop("stop requested", 1.0)
     told.loop.take(frame_of(9))
     assert told.loop.health.state is State.STOPPING
 

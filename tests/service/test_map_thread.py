@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from aquaflow.clocks.deadline import Deadline
 from aquaflow.config.service import LiveMappingConfig
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
@@ -157,13 +158,29 @@ def test_mapping_rests_as_long_as_it_worked_while_tracking_is_late(beside: Besid
 def test_a_refinement_that_fails_leaves_the_map_as_it_is(
     beside: Beside, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refine(progress: object = None) -> None:
+    def refine(*_: object) -> None:
         raise RuntimeError("told so")
 
     monkeypatch.setattr(beside.maps, "refine", refine)
     beside.thread.refine()
     assert beside.thread.failures == 1
     assert beside.thread.last_failure == "refine: told so"
+
+
+def test_frames_that_wait_when_a_dives_time_is_up_are_left_out_and_corrections_made(
+    beside: Beside, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(beside.maps, "correct", lambda *_: beside.maps.asked.append("correct"))
+    held = beside.hold()
+    beside.thread.grow(growth(0))
+    beside.thread.correct({3: Sim3.identity()}, {})
+    ending = threading.Thread(target=beside.thread.refine, kwargs={"until": Deadline(0.0)})
+    ending.start()
+    assert beside.thread._ending.wait(20.0)
+    held.set()
+    ending.join()
+    assert beside.maps.asked == ["correct"]
+    assert beside.thread.left_out == {"the dive ended before mapping had caught up": 1}
 
 
 def test_a_look_is_told_the_corrections_that_still_wait(beside: Beside) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from aquaflow.config.telemetry import MountingConfig
+from aquaflow.config.device import MountingConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.service.checkpoint.resume import Choice
 from aquaflow.service.live_dive import LiveDive

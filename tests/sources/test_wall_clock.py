@@ -14,8 +14,8 @@ SECOND = 1_000_000_000
 UTC_NS = 1_795_365_000 * SECOND
 
 
-def test_both_clocks_are_read_again_and_again_until_it_is_closed(
-    monkeypatch: pytest.MonkeyPatch,
+def test_both_clocks_are_read_until_it_is_closed_and_a_jump_is_told(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monotonic, utc = iter([5, 6, 7]), iter([UTC_NS, UTC_NS + 1, UTC_NS - 60 * SECOND])
     monkeypatch.setattr(time, "monotonic_ns", lambda: next(monotonic))
@@ -28,6 +28,9 @@ def test_both_clocks_are_read_again_and_again_until_it_is_closed(
         if len(heard) == 3:
             clock.close()
 
+    (told,) = caplog.records
+    assert told.fields == {"event": "clock", "source": "computer"}  # type: ignore[attr-defined]
+    assert told.getMessage().startswith("the wall clock was set by -60.000 s")
     assert heard == [
         UtcTime(5, 5, "computer/clock", UTC_NS),
         UtcTime(6, 6, "computer/clock", UTC_NS + 1),

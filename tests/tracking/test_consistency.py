@@ -82,7 +82,7 @@ def test_a_sound_dive_raises_no_alarm() -> None:
     counts = tracker.monitor.counts
     assert counts.checks >= len(HOVER) // (2 * MonitorConfig().every)
     assert counts.found == 0
-    assert tracker.monitor.trouble == ""
+    assert tracker.monitor.trouble is None
     assert counts.notes() == []
     assert {t.frame_class for t in tracked} <= PLACED
 
@@ -132,7 +132,7 @@ def test_depths_that_grow_slowly_are_brought_back_again_and_again() -> None:
 def test_a_finding_is_shown_for_some_seconds() -> None:
     tracker, _ = swim(depths)
     last = tracker.monitor.counts.findings[-1]
-    assert (tracker.monitor.trouble == str(last)) is (len(HOVER) - last.frame <= 50)
+    assert (tracker.monitor.trouble == last) is (len(HOVER) - last.frame <= 50)
 
 
 def test_a_keyframe_whose_scale_is_wrong_is_returned_to_no_more() -> None:

@@ -75,6 +75,10 @@ class Checkpointer:
         self._due_s = self._now_s() + self._every_s
         self.take()
 
+    def take_soon(self) -> None:
+        """Take one at the next turn."""
+        self._due_s = self._now_s()
+
     def take(self) -> None:
         """Take a checkpoint now; requests that wait in the mapping thread are not in it, except
         corrections."""

@@ -42,8 +42,7 @@ def deserialise(
     """
     for number, values in facts["maps"].items():
         parts = under(f"map{number}", arrays)
-        mapper = state.deserialise(values, parts, maps.renderer)
-        mapper.failures = maps.failures
+        mapper = state.deserialise(values, parts, maps.renderer, maps.failures)
         mapper.views = maps.views.restore(mapper.views)
         maps.mappers[int(number)] = mapper
     for number, values in facts["held_out"].items():

@@ -9,16 +9,21 @@ import itertools
 import logging
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from aquaflow.clocks.computer import clock_is_set
 from aquaflow.config.service import CheckpointConfig
 from aquaflow.dive.folder import CHECKPOINT, MARKER, WORK
 from aquaflow.dive.frames_csv import header
+from aquaflow.dive.status import NAME as STATUS
+from aquaflow.dive.status import DiveState, read_status
 from aquaflow.errors import InputError
+from aquaflow.service.checkpoint.age import age_of
 from aquaflow.service.checkpoint.generations import Checkpoint, generations, read_state
 from aquaflow.service.moment import Moment
+from aquaflow.storage.folder_lock import is_held
 
 log = logging.getLogger(__name__)
 
@@ -30,20 +35,32 @@ class Choice:
     folder: Path
     checkpoint: Checkpoint | None = None
     notes: tuple[str, ...] = ()
-    """Why it is not the requested folder."""
+    """Why it is not the requested folder, or not the dive before."""
+    left: Path | None = None
+    """A dive that somebody may yet go on with, or finish."""
 
 
-def choose(dives: Path, config: CheckpointConfig, new: bool, now: Moment) -> Choice:
+def choose(
+    dives: Path,
+    config: CheckpointConfig,
+    new: bool,
+    now: Moment,
+    is_set: Callable[[], bool] = clock_is_set,
+) -> Choice:
     """The newest dive in ``dives`` that can be resumed, unless ``new``; else a new folder.
 
-    A dive without a usable checkpoint is left unchanged; a new folder is used.
+    A dive without a usable checkpoint, one that is too old, and one whose age is not known are left
+    unchanged; a new folder is used. ``is_set``: whether the wall clock can be believed.
     """
-    for folder in [] if new else _unfinished(dives):
-        checkpoint = newest_usable(folder)
-        if checkpoint is not None and _is_recent(folder, checkpoint, config, now):
-            return Choice(folder, checkpoint)
-        break  # an older one was left for this one
-    return Choice(_fresh(dives))
+    folder = None if new else next(iter(_unfinished(dives, now.boot)), None)
+    checkpoint = None if folder is None else newest_usable(folder)
+    if folder is None or checkpoint is None:  # an older one was left for this one
+        return Choice(_fresh(dives))
+    why = _why_left(folder, checkpoint, config.resume_h, now, is_set)
+    if why is None:
+        return Choice(folder, checkpoint)
+    note = f"the unfinished dive in {folder} was left as it is: {why}"
+    return Choice(_fresh(dives), notes=(note,), left=folder)
 
 
 def resumed(folder: Path, new: bool) -> Choice:
@@ -87,19 +104,26 @@ def newest_usable(folder: Path) -> Checkpoint | None:
     return None
 
 
-def tidy(dives: Path, keep: Path) -> None:
-    """Remove what finished dives, other than ``keep``, kept for a resumption; not from a dive whose
-    checkpoints are damaged, which is left as it is."""
-    for report in dives.glob("*/report.html"):
-        dive = report.parent
-        if dive != keep and (not generations(dive) or newest_usable(dive) is not None):
+def tidy(dives: Path, keep: Choice) -> None:
+    """Remove what complete dives kept for a resumption. Left as they are: the chosen one, the one
+    that was left for it, and those whose checkpoints are damaged."""
+    for dive in (file.parent for file in dives.glob(f"*/{STATUS}")):
+        spared = dive in (keep.folder, keep.left) or not _is_complete(dive)
+        if not spared and (not generations(dive) or newest_usable(dive) is not None):
             for name in (CHECKPOINT, WORK):
                 shutil.rmtree(dive / name, ignore_errors=True)
 
 
+def _is_complete(dive: Path) -> bool:
+    """True if its deliverables hold everything that came."""
+    status = read_status(dive)
+    return status is not None and status.state.is_complete
+
+
 def _was_cut_off(folder: Path) -> bool:
     """True if the folder holds recorded rows of a dive that was not finished."""
-    ended = (folder / "metrics.json").is_file() and not _kept(folder)
+    replayed = not (folder / STATUS).exists() and (folder / "metrics.json").is_file()
+    ended = (replayed or _is_complete(folder)) and not _kept(folder)
     return holds_rows(folder) and not ended
 
 
@@ -114,21 +138,42 @@ def _numbered(folder: Path) -> Iterator[Path]:
         yield folder.with_name(f"{folder.name}-{count}")
 
 
-def _unfinished(dives: Path) -> list[Path]:
-    """Folders with a checkpoint, the newest first."""
-    newest: dict[Path, float] = {}
+def _unfinished(dives: Path, boot: str) -> list[Path]:
+    """Folders with a checkpoint that no process holds. Those that ran under this ``boot`` come
+    first, whatever the wall clock was when they did; then the newest."""
+    newest: dict[Path, tuple[bool, float]] = {}
     for file in dives.glob(f"*/{CHECKPOINT}/*.npz"):
         dive = file.parent.parent
-        newest[dive] = max(newest.get(dive, 0.0), file.stat().st_mtime)
-    return sorted(newest, key=newest.__getitem__, reverse=True)
+        status = read_status(dive)
+        if status is None or status.state is not DiveState.FINISHED:
+            of_this_boot = status is not None and status.boot == boot
+            _, written = newest.get(dive, (of_this_boot, 0.0))
+            newest[dive] = of_this_boot, max(written, file.stat().st_mtime)
+    return [
+        dive for dive in sorted(newest, key=newest.__getitem__, reverse=True) if not is_held(dive)
+    ]
 
 
-def _is_recent(folder: Path, checkpoint: Checkpoint, config: CheckpointConfig, now: Moment) -> bool:
-    age_h = checkpoint.moment.age_h(now)
-    recent = not config.resume_h or age_h <= config.resume_h
-    if not recent:
-        log.info("the dive in %s is %.0f h old: a new one begins", folder, age_h)
-    return recent
+def _why_left(
+    folder: Path,
+    checkpoint: Checkpoint,
+    resume_h: float,
+    now: Moment,
+    is_set: Callable[[], bool],
+) -> str | None:
+    """Why an unfinished dive is not gone on with, as a clause; None: it is."""
+    status = read_status(folder)
+    if status is not None and status.state is DiveState.FINISHING:
+        return f"it was being finished; `aquaflow dive finish {folder}` does the rest"
+    age = age_of(folder, checkpoint.moment, now, is_set)
+    if not resume_h or (age.hours is not None and age.hours <= resume_h):
+        return None
+    if age.hours is not None:
+        return f"it is {age.hours:.0f} h old"
+    return (
+        f"how old it is cannot be known, because {age.unknown}; "
+        f"`aquaflow run --out {folder}` goes on with it"
+    )
 
 
 def _fresh(dives: Path) -> Path:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from aquaflow.config import Config
 from aquaflow.dive.folder import MARKER, WORK
 from aquaflow.dive.frames_csv import FrameRow, or_lost
 from aquaflow.errors import InputError
@@ -21,12 +22,14 @@ from aquaflow.service.checkpoint.generations import (
     read_state,
     state_file,
 )
+from aquaflow.service.checkpoint.resume import Choice
 from aquaflow.service.checkpoint.salvage_rows import SalvagedRows, salvaged_rows
 from aquaflow.service.checkpoint.set_aside import SetAside
 from aquaflow.service.checkpoint.telemetry import cut_at_checkpoint
-from aquaflow.service.checkpoint.tracking import lost_since
+from aquaflow.service.checkpoint.tracking import lost_since, refuse_another_size
 from aquaflow.service.moment import Moment
 from aquaflow.slam import Slam
+from aquaflow.storage.folder_lock import refuse_held
 from aquaflow.storage.spill import SUFFIX, read_item
 
 MOST_NAMED = 5
@@ -67,6 +70,20 @@ def salvaged(
     cut_at_checkpoint(dive, checkpoint.moment, now or Moment.now(), aside)
     after = [or_lost(row, known) for row in rows.rows]
     return Salvaged(after, losses + _row_losses(rows, dive / MARKER))
+
+
+def salvaged_from(choice: Choice, config: Config, name_of: Callable[[int], str]) -> Salvaged | None:
+    """The dive that goes on in the chosen folder; None for a new one.
+
+    Raises:
+        ConfigError: it is of pictures of another size.
+        InputError: another process writes to it, or a damaged file cannot be set aside.
+    """
+    if choice.checkpoint is None:
+        return None
+    refuse_another_size(choice.folder, choice.checkpoint.facts["tracking"], config)
+    refuse_held(choice.folder)
+    return salvaged(choice.checkpoint, choice.folder, name_of)
 
 
 def lost_with_their_files(checkpoint: Checkpoint, slam: Slam, maps: Maps) -> list[str]:

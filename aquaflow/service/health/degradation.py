@@ -8,6 +8,7 @@ from collections.abc import Callable
 from enum import IntEnum
 
 from aquaflow.config.service import LimitsConfig
+from aquaflow.service.health.pressure import Need, Shortage
 
 log = logging.getLogger(__name__)
 
@@ -31,12 +32,22 @@ class DegradationLevel(IntEnum):
         return self.name.lower().replace("_", " ")
 
 
+DEEPEST = {Shortage.GPU_MEMORY: DegradationLevel.TRACKING_ONLY}
+"""The level below which doing less does not help: once the map, which takes the GPU's memory, no
+longer grows, nothing more does."""
+
+
+def deepest(short: Need) -> DegradationLevel:
+    """The last level that helps against a shortage."""
+    return DEEPEST.get(short.shortage, DegradationLevel.RECORDING_ONLY)
+
+
 class Degradation:
     """The level: one down at each check that finds a shortage, one up after a calm period."""
 
     def __init__(self, config: LimitsConfig, now_s: Callable[[], float] = time.monotonic) -> None:
         self.level = DegradationLevel.FULL
-        self.reason = ""
+        self.need: Need | None = None
         """Why the level is not FULL."""
         self.steps_down = 0
         self.steps_up = 0
@@ -44,23 +55,32 @@ class Degradation:
         self._updated_s = now_s()
         self._needed_s = now_s()
 
-    def update(self, need: Callable[[], str | None]) -> None:
-        """Every ``look_s``: ask ``need`` which resource runs short (a clause), or None."""
+    @property
+    def reason(self) -> str:
+        """Why the level is not FULL, as a clause."""
+        return "" if self.need is None else self.need.reason
+
+    def update(self, need: Callable[[], Need | None]) -> None:
+        """Every ``look_s``: ask ``need`` which resource runs short, if any does."""
         now = self._now_s()
         if now - self._updated_s < self._config.look_s:
             return
         self._updated_s = now
         short = need()
-        if short is not None:
-            self._needed_s, self.reason = now, short
-            if self.level < DegradationLevel.RECORDING_ONLY:
-                self.steps_down += 1
-                self._move(DegradationLevel(self.level + 1), short)
+        if short is not None and self.level <= deepest(short):
+            self.give_way(short)
         elif self.level > DegradationLevel.FULL and now - self._needed_s >= self._config.calm_s:
             self._needed_s = now
             self.steps_up += 1
             self._move(DegradationLevel(self.level - 1), "calm again")
-            self.reason = "" if self.level is DegradationLevel.FULL else self.reason
+            self.need = None if self.level is DegradationLevel.FULL else self.need
+
+    def give_way(self, short: Need) -> None:
+        """A step down at once, unless it would not help."""
+        self._needed_s, self.need = self._now_s(), short
+        if self.level < deepest(short):
+            self.steps_down += 1
+            self._move(DegradationLevel(self.level + 1), short.reason)
 
     def _move(self, level: DegradationLevel, why: str) -> None:
         log.warning("from '%s' to '%s': %s", self.level.words, level.words, why)

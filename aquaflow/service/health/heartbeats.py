@@ -27,9 +27,10 @@ class Heartbeats:
         self._now_s = now_s
         self._last_s: dict[str, float] = {}
 
-    def beat(self, stage: str) -> None:
-        """The stage worked, or is idle; called by the stage itself only."""
-        self._last_s[stage] = self._now_s()
+    def beat(self, stage: str, ahead_s: float = 0.0) -> None:
+        """The stage worked, or is idle; called by the stage itself only. One that may be silent for
+        a known time says so with ``ahead_s``."""
+        self._last_s[stage] = self._now_s() + ahead_s
 
     def retire(self, stage: str) -> None:
         """The stage has ended normally; stop checking it."""

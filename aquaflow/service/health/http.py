@@ -1,20 +1,25 @@
-"""The service's own web server: GET /health, /metrics, /register_service and one small page."""
+"""The service's own web server: its page, what the page asks for, and the pilot's requests."""
 
 from __future__ import annotations
 
 import json
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
+from typing import Any, TypeAlias
+from urllib.parse import parse_qs
 
 from aquaflow import __version__
 from aquaflow.access import Access, path_of
 from aquaflow.config.service import ListenConfig
 from aquaflow.errors import InputError
-from aquaflow.service.health.page import PAGE
-from aquaflow.service.health.prometheus import TYPE, exposition
+from aquaflow.service.control import Control
+from aquaflow.service.health.exposition import TYPE
+from aquaflow.service.health.page import page_file
+from aquaflow.service.health.pilot_requests import MOST_BYTES, answered
+from aquaflow.service.health.policies import policies
+from aquaflow.service.health.prometheus import exposition
 
 log = logging.getLogger(__name__)
 
@@ -23,11 +28,13 @@ PATIENCE_S = 10.0
 MOST_CLIENTS = 16
 """Requests at a time; more are turned away, so that threads stay bounded."""
 
-JSON, HTML = "application/json", "text/html; charset=utf-8"
-"""Content types of the answers."""
+JSON, JPEG = "application/json", "image/jpeg"
+"""Content types of all but the page and the metrics."""
 
 NOT_ALLOWED = {"error": "give the token, or ask on board by the name localhost"}
 """Answer to a request without the token."""
+WRONG_TOKEN = {"error": "this is not the token of this vehicle"}
+"""Answer to a form with another token."""
 
 REGISTRATION = {
     "name": "AquaFlow",
@@ -37,15 +44,33 @@ REGISTRATION = {
     "version": __version__,
     "webpage": "/",
     "api": "/health",
+    "works_in_relative_paths": True,
 }
-"""What BlueOS asks for to list an extension."""
+"""What BlueOS asks for to list an extension. Every address in the page is relative, so that
+BlueOS's own server can hand it on at /extensionv2/aquaflow/."""
+
+Headers: TypeAlias = Sequence[tuple[str, str]]
+Say: TypeAlias = Callable[[], dict[str, Any]]
+"""What is answered as JSON; called in the thread of the request."""
 
 
 class HealthServer:
     """Answers requests in its own threads, with the object that ``report`` returns."""
 
-    def __init__(self, config: ListenConfig, report: Callable[[], dict[str, Any]]) -> None:
+    def __init__(
+        self,
+        config: ListenConfig,
+        report: Say,
+        path: Say | None = None,
+        control: Control | None = None,
+        picture: Callable[[], bytes | None] = lambda: None,
+    ) -> None:
         """Listen at once.
+
+        Args:
+            path: the plan view at /path.json, if there is one.
+            control: gets the pilot's requests.
+            picture: makes the JPEG file at /picture.jpg, if there is a picture.
 
         Raises:
             InputError: the address is taken, or the token file cannot be read.
@@ -53,7 +78,8 @@ class HealthServer:
         """
         access = Access(config)
         try:
-            self._server = _Server((config.host, config.port), _handler(access, report))
+            handler = _handler(access, report, path, control or Control(), picture)
+            self._server = _Server((config.host, config.port), handler)
         except OSError as error:
             raise InputError(
                 f"cannot listen on {config.host}:{config.port}: {error.strerror}; choose another "
@@ -102,37 +128,77 @@ class _Server(ThreadingHTTPServer):
             self._room.release()
 
 
-def _handler(access: Access, report: Callable[[], dict[str, Any]]) -> type[BaseHTTPRequestHandler]:
+def _handler(
+    access: Access,
+    report: Say,
+    plan: Say | None,
+    control: Control,
+    picture: Callable[[], bytes | None],
+) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         timeout = PATIENCE_S
         server_version, sys_version = "AquaFlow", ""
 
         def do_GET(self) -> None:
-            headers = {name.lower(): value for name, value in self.headers.items()}
             path = path_of(self.path)
-            # BlueOS asks without a token, and hears nothing that is not on the package's page.
+            # The page holds no data, and BlueOS asks for both without a token.
             if path is None:
-                self._answer(400, JSON, json.dumps({"error": "this is no address"}))
+                self._say(400, {"error": "this is no address"})
             elif path == "/register_service":
-                self._answer(200, JSON, json.dumps(REGISTRATION))
-            elif not access.allows(self.path, headers):
-                self._answer(403, JSON, json.dumps(NOT_ALLOWED))
+                self._say(200, REGISTRATION)
+            elif (file := page_file(path)) is not None:
+                self._answer(200, file.kind, file.text)
+            elif not access.allows(self.path, self._named_headers(), self.client_address[0]):
+                self._say(403, NOT_ALLOWED)
             elif path == "/health":
-                self._answer(200, JSON, json.dumps(report(), default=str))
+                self._say(200, report())
+            elif path == "/path.json" and plan is not None:
+                self._say(200, plan())
             elif path == "/metrics":
                 self._answer(200, TYPE, exposition(report()))
-            elif path == "/":
-                self._answer(200, HTML, PAGE)
+            elif path == "/picture.jpg" and (jpeg := picture()) is not None:
+                self._answer(200, JPEG, jpeg)
             else:
-                self._answer(404, JSON, json.dumps({"error": "there is nothing here"}))
+                self._say(404, {"error": "there is nothing here"})
 
-        def _answer(self, code: int, kind: str, text: str) -> None:
-            data = text.encode()
+        def do_POST(self) -> None:
+            body = self._body()
+            if body is None:
+                self._say(413, {"error": "a request holds a token at most"})
+            elif path_of(self.path) == "/login":
+                self._log_in(body)
+            else:
+                dive = report().get("dive") or {}
+                peer, headers = self.client_address[0], self._named_headers()
+                self._say(*answered(control, access, self.path, headers, dive.get("name"), peer))
+
+        def _log_in(self, form: str) -> None:
+            tokens = parse_qs(form).get("token", [""])
+            if access.is_token(tokens[-1].strip()):
+                self._say(200, {"ok": True}, [("Set-Cookie", access.cookie())])
+            else:
+                self._say(403, WRONG_TOKEN)
+
+        def _named_headers(self) -> dict[str, str]:
+            return {name.lower(): value for name, value in self.headers.items()}
+
+        def _body(self) -> str | None:
+            """What was posted; None if it is too long, and then not read."""
+            length = self.headers.get("Content-Length", "0")
+            if not length.isdecimal() or int(length) > MOST_BYTES:
+                return None
+            return self.rfile.read(int(length)).decode("ascii", "replace")
+
+        def _say(self, code: int, said: dict[str, Any], headers: Headers = ()) -> None:
+            self._answer(code, JSON, json.dumps(said, default=str), headers)
+
+        def _answer(self, code: int, kind: str, text: str | bytes, headers: Headers = ()) -> None:
+            data = text if isinstance(text, bytes) else text.encode()
+            host = self.headers.get("Host", "")
             self.send_response(code)
-            self.send_header("Content-Type", kind)
+            for name, value in [("Content-Type", kind), *policies(host), *headers]:
+                self.send_header(name, value)
             self.send_header("Content-Length", str(len(data)))
-            self.send_header("Cache-Control", "no-store")
-            self.send_header("X-Content-Type-Options", "nosniff")
             if access.by_query(self.path):
                 self.send_header("Set-Cookie", access.cookie())
             self.end_headers()

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
+from typing import NamedTuple
 
 from aquaflow.config.service import LimitsConfig
 from aquaflow.recording.disk import free_bytes
@@ -16,6 +19,22 @@ HOTTEST_C = 150.0
 """Thermal zones that report more are not connected."""
 
 
+class Shortage(Enum):
+    """What runs short."""
+
+    MEMORY = "memory"
+    GPU_MEMORY = "GPU memory"
+    HEAT = "heat"
+
+
+class Need(NamedTuple):
+    """A reason to do less."""
+
+    shortage: Shortage
+    reason: str
+    """A clause."""
+
+
 @dataclass(frozen=True)
 class Pressure:
     """One reading of the machine's pressure; None where it reports none."""
@@ -24,17 +43,17 @@ class Pressure:
     disk_free_mb: float | None
     temperature_c: float | None
     gpu_free_share: float | None = None
+    """Of the device that the map lives on, what new tensors may have."""
 
-    def need(self, limits: LimitsConfig) -> str | None:
-        """What runs short and is helped by doing less, as a clause. The disk is not: see
-        ``disk_is_full``."""
+    def need(self, limits: LimitsConfig) -> Need | None:
+        """What runs short and is helped by doing less. The disk is not: see ``disk_is_full``."""
         memory, gpu, heat = self.free_memory_share, self.gpu_free_share, self.temperature_c
         if memory is not None and memory < limits.memory_share:
-            return f"{100 * memory:.0f} % of the memory is left"
-        if gpu is not None and gpu < limits.gpu_memory_share:
-            return f"{100 * gpu:.0f} % of the GPU's memory is left"
+            return Need(Shortage.MEMORY, f"{100 * memory:.0f} % of the memory is left")
         if heat is not None and heat > limits.temperature_c:
-            return f"the machine is {heat:.0f} degC hot"
+            return Need(Shortage.HEAT, f"the machine is {heat:.0f} degC hot")
+        if gpu is not None and gpu < limits.gpu_memory_share:
+            return Need(Shortage.GPU_MEMORY, f"{100 * gpu:.0f} % of the GPU's memory is left")
         return None
 
     def disk_is_full(self, limits: LimitsConfig) -> bool:
@@ -43,14 +62,24 @@ class Pressure:
 
 
 class PressureReader:
-    """Reads the pressure from Linux: /proc, /sys, and the unit's own control group."""
+    """Reads the pressure from Linux: /proc, /sys, and the unit's own control group; from torch,
+    that of the maps' device."""
 
-    def __init__(self, disk: Path, root: Path = Path("/")) -> None:
-        self._disk, self._root = disk, root
+    def __init__(
+        self,
+        disk: Path,
+        root: Path = Path("/"),
+        gpu_free: Callable[[], float | None] = lambda: None,
+    ) -> None:
+        """``gpu_free``: of the maps' device, as in :class:`Pressure`."""
+        self._disk, self._root, self._gpu_free = disk, root, gpu_free
 
     def __call__(self) -> Pressure:
         return Pressure(
-            self._free_memory_share(), self._disk_free_mb(), self._temperature_c(), _gpu_free()
+            self._free_memory_share(),
+            self._disk_free_mb(),
+            self._temperature_c(),
+            self._gpu_free(),
         )
 
     def _free_memory_share(self) -> float | None:
@@ -105,12 +134,3 @@ def _inactive_file(stat: str) -> int:
         if name == "inactive_file":
             return int(value)
     return 0
-
-
-def _gpu_free() -> float | None:
-    import torch
-
-    if not torch.cuda.is_available():
-        return None
-    free, total = torch.cuda.mem_get_info()
-    return float(free / total) if total else None

@@ -1,14 +1,13 @@
-"""The report as Prometheus reads it (text format 0.0.4)."""
+"""The report as Prometheus reads it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from aquaflow.service.health.exposition import head, labelled, sample
+from aquaflow.service.health.prometheus_devices import device_lines
 from aquaflow.service.health.state import State
-
-TYPE = "text/plain; version=0.0.4; charset=utf-8"
-"""Content type of Prometheus' text format."""
 
 COUNTERS = {
     "frames": "Frames that were looked at.",
@@ -27,6 +26,8 @@ GAUGES = {
     "gaussians": "Gaussians of all maps.",
 }
 """Metrics that rise and fall: name and help."""
+QUANTILES = {"p50": "0.5", "p95": "0.95"}
+"""Of the lag: the report's keys and Prometheus' labels."""
 
 
 def exposition(report: Mapping[str, Any]) -> str:
@@ -35,56 +36,41 @@ def exposition(report: Mapping[str, Any]) -> str:
 
 
 def _lines(report: Mapping[str, Any]) -> Iterator[str]:
-    yield from _head("state", "gauge", "1 for the state that the service is in.")
-    for state in State:
-        yield f'aquaflow_state{{state="{state.value}"}} {int(report["state"] == state.value)}'
-    yield from _head("ok", "gauge", "1 while nothing is to be done about it.")
-    yield f"aquaflow_ok {int(report['ok'])}"
+    states = {state.value: int(report["state"] == state.value) for state in State}
+    yield from labelled(
+        "state", "state", states, "1 for the state that the service is in.", "gauge"
+    )
+    yield from head("ok", "gauge", "1 while nothing is to be done about it.")
+    yield sample("ok", int(report["ok"]))
     for name, help_text in COUNTERS.items():
-        yield from _head(f"{name}_total", "counter", help_text)
-        yield f"aquaflow_{name}_total {report[name]}"
+        yield from head(f"{name}_total", "counter", help_text)
+        yield sample(f"{name}_total", report[name])
     for name, help_text in GAUGES.items():
-        yield from _head(name, "gauge", help_text)
-        yield f"aquaflow_{name} {report[name]}"
-    yield from _head("lag_seconds", "gauge", "From a frame's arrival to its pose, last minute.")
-    for key, quantile in (("p50", "0.5"), ("p95", "0.95")):
-        lag = report["lag_ms"][key]
-        if lag is not None:
-            yield f'aquaflow_lag_seconds{{quantile="{quantile}"}} {lag / 1e3:g}'
-    yield from _labelled("frames_by_class_total", "class", report["classes"], "Frames by result.")
-    yield from _labelled(
+        yield from head(name, "gauge", help_text)
+        yield sample(name, report[name])
+    lags = {quantile: report["lag_ms"][key] for key, quantile in QUANTILES.items()}
+    lags_s = {quantile: lag_ms / 1e3 for quantile, lag_ms in lags.items() if lag_ms is not None}
+    yield from labelled(
+        "lag_seconds", "quantile", lags_s, "From a frame's arrival to its pose, last minute.",
+        "gauge",
+    )  # fmt: skip
+    yield from labelled("frames_by_class_total", "class", report["classes"], "Frames by result.")
+    yield from labelled(
         "left_out_total", "reason", report["left_out_of_the_map"], "Frames that the map never saw."
     )
-    yield from _labelled("state_visits_total", "state", report["visits"], "Times in each state.")
-    yield from _head("stage_failures_total", "counter", "Failures of a stage, by exception.")
+    yield from labelled("state_visits_total", "state", report["visits"], "Times in each state.")
+    yield from head("stage_failures_total", "counter", "Failures of a stage, by exception.")
     for kind in report["stage_failures"]:
-        labels = f'stage="{_escaped(kind["stage"])}",error="{_escaped(kind["error"])}"'
-        labels += f',place="{_escaped(kind["place"])}"'
-        yield f"aquaflow_stage_failures_total{{{labels}}} {kind['count']}"
+        labels = {key: kind[key] for key in ("stage", "error", "place")}
+        yield sample("stage_failures_total", kind["count"], **labels)
     poses = report["pose_output"]
     if poses is not None:
-        yield from _head("poses_sent_total", "counter", "Poses sent to the autopilot.")
-        yield f"aquaflow_poses_sent_total {poses['sent']}"
-        yield from _labelled(
+        yield from head("poses_sent_total", "counter", "Poses sent to the autopilot.")
+        yield sample("poses_sent_total", poses["sent"])
+        yield from labelled(
             "poses_withheld_total", "reason", poses["withheld"], "Poses not sent to the autopilot."
         )
-    yield from _labelled(
+    yield from labelled(
         "stage_share", "stage", report["stage_shares"], "Seconds per second in a stage.", "gauge"
     )
-
-
-def _labelled(
-    name: str, label: str, values: Mapping[str, float], help_text: str, kind: str = "counter"
-) -> Iterator[str]:
-    yield from _head(name, kind, help_text)
-    for value, number in values.items():
-        yield f'aquaflow_{name}{{{label}="{_escaped(value)}"}} {number}'
-
-
-def _escaped(value: str) -> str:
-    return value.replace("\\", r"\\").replace('"', r"\"").replace("\n", " ")
-
-
-def _head(name: str, kind: str, help_text: str) -> Iterator[str]:
-    yield f"# HELP aquaflow_{name} {help_text}"
-    yield f"# TYPE aquaflow_{name} {kind}"
+    yield from device_lines(report["devices"])

@@ -8,6 +8,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 log = logging.getLogger(__name__)
 
@@ -26,6 +27,9 @@ class State(str, Enum):
     DEGRADED = "degraded"
     STOPPING = "stopping"
     INCONSISTENT = "tracking, inconsistent"
+    IDLE = "idle"
+    PAUSED = "paused"
+    FINISHING = "finishing a dive"
 
     @property
     def number(self) -> int:
@@ -50,16 +54,18 @@ class Health:
     def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
         self.state = State.STARTING
         self.reason = "the service starts"
+        self.sentences: tuple[str, ...] = ()
+        """What the pilot shall hear of the reason; none: the state alone."""
         self.changes: deque[Change] = deque(maxlen=KEPT)
         self.visits: Counter[State] = Counter({State.STARTING: 1})
         self._now_s = now_s
         self.since_s = now_s()
 
-    def set(self, state: State, reason: str) -> bool:
+    def set(self, state: State, reason: str, sentences: tuple[str, ...] = ()) -> bool:
         """Set the state; True if it changed. A new reason alone is no change."""
         if self.state is State.STOPPING:  # nothing comes after the end
             return False
-        before, self.reason = self.state, reason
+        before, self.reason, self.sentences = self.state, reason, sentences
         if state is before:
             return False
         self.since_s = self._now_s()
@@ -69,6 +75,28 @@ class Health:
         fields = {"event": "state", "before": before.value, "after": state.value}
         log.info("%s -> %s: %s", before.value, state.value, reason, extra={"fields": fields})
         return True
+
+    def begin(self) -> None:
+        """A dive begins: visits are counted anew."""
+        self.visits.clear()
+        self.visits[self.state] = 1
+
+
+class Trouble(NamedTuple):
+    """Why something does not work."""
+
+    reason: str
+    """A clause, with what is known."""
+    sentence: str
+    """For the pilot: see :mod:`aquaflow.service.health.sentences`."""
+
+
+class Judgement(NamedTuple):
+    """The arguments of :meth:`Health.set`."""
+
+    state: State
+    reason: str
+    sentences: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -81,30 +109,34 @@ class Facts:
     """Longest time without a frame before the state is WAITING."""
     pictured: bool
     """A frame came since the start."""
-    camera: str
-    """The driver's reason why the camera sends nothing."""
+    camera: Trouble
+    """Why the camera sends nothing, as its driver says."""
     posed: bool
     """The newest frame has a pose."""
     ever_posed: bool
-    inconsistent: str
-    """Why the poses of the last seconds are doubtful, by the monitor of scale; empty: they are
-    not."""
-    troubles: list[str]
+    inconsistent: Trouble | None
+    """Why the poses of the last seconds are doubtful, by the monitor of scale."""
+    troubles: list[Trouble]
     """Why the service works with less than everything."""
 
 
-def judged(facts: Facts) -> tuple[State, str]:
+def judged(facts: Facts) -> Judgement:
     """The state that follows from the facts, and its reason."""
     if facts.frame_age_s > facts.patience_s:
-        said = f": {facts.camera}" if facts.camera else ""
-        return State.WAITING, f"no picture for {facts.frame_age_s:.0f} s{said}"
+        said = f": {facts.camera.reason}" if facts.camera.reason else ""
+        reason = f"no picture for {facts.frame_age_s:.0f} s{said}"
+        return Judgement(State.WAITING, reason, (facts.camera.sentence,))
     if not facts.pictured:
-        return State.STARTING, "no picture yet"
+        return Judgement(State.STARTING, "no picture yet")
     if not facts.ever_posed:
-        return State.INITIALISING, "no pose yet: the camera must move sideways over texture"
+        reason = "no pose yet: the camera must move sideways over texture"
+        return Judgement(State.INITIALISING, reason)
     if not facts.posed:
-        return State.LOST, "the newest frames have no pose; the place is being looked for"
-    if facts.inconsistent or facts.troubles:
-        state = State.INCONSISTENT if facts.inconsistent else State.DEGRADED
-        return state, "; ".join(filter(None, [facts.inconsistent, *facts.troubles]))
-    return State.TRACKING, "every frame has a pose"
+        reason = "the newest frames have no pose; the place is being looked for"
+        return Judgement(State.LOST, reason)
+    troubles = [each for each in (facts.inconsistent, *facts.troubles) if each is not None]
+    if not troubles:
+        return Judgement(State.TRACKING, "every frame has a pose")
+    state = State.DEGRADED if facts.inconsistent is None else State.INCONSISTENT
+    reason = "; ".join(each.reason for each in troubles)
+    return Judgement(state, reason, tuple(each.sentence for each in troubles))

@@ -1,4 +1,4 @@
-"""Messages to the pilot: a sentence at each change of state, values once a second."""
+"""Messages to the pilot: a sentence when something changes, values once a second."""
 
 from __future__ import annotations
 
@@ -7,14 +7,18 @@ from typing import Literal
 
 from aquaflow.config.service import VehicleReportConfig
 from aquaflow.service.feed import Feed
-from aquaflow.service.health.state import State
-from aquaflow.service.loop import LiveLoop
+from aquaflow.service.health.sentences import OF_STATE
+from aquaflow.service.health.state import Health, State
+from aquaflow.service.watched import Watched
 from aquaflow.sources.outbound import NamedValue, StatusText
 
 EVERY_S = 1.0
 """Period of the numbers that the autopilot logs."""
 SPACING_S = 2.0
-"""Between sentences: a state that flaps must not fill the pilot's screen."""
+"""Least time between two sentences: ground stations speak each."""
+REPEAT_S = 15.0
+"""Least time until the same sentence comes again: a state that flaps must not fill the pilot's
+screen."""
 
 SEVERITY: dict[State, Literal["error", "warning", "notice", "info"]] = {
     State.WAITING: "error",
@@ -22,6 +26,7 @@ SEVERITY: dict[State, Literal["error", "warning", "notice", "info"]] = {
     State.DEGRADED: "warning",
     State.INCONSISTENT: "warning",
     State.TRACKING: "notice",
+    State.PAUSED: "notice",
 }
 """How urgent each state is to the pilot."""
 
@@ -31,24 +36,40 @@ class PilotMessages:
 
     def __init__(self, config: VehicleReportConfig, feed: Feed) -> None:
         self._config, self._feed = config, feed
-        self._said: State | None = None
-        self._said_s = self._told_s = -SPACING_S
+        self._standing: set[str] = set()
+        """Sentences that were said and still hold."""
+        self._said_s: dict[str, float] = {}
+        """When each sentence of the last ``REPEAT_S`` was said."""
+        self._told_s = -EVERY_S
 
-    def update(self, loop: LiveLoop, now_s: float | None = None) -> None:
+    def update(self, loop: Watched, now_s: float | None = None) -> None:
         """Called after every turn of the loop; sends what is new or due."""
         now = time.monotonic() if now_s is None else now_s
-        state = loop.health.state
-        if self._config.status_text and state is not self._said and now - self._said_s >= SPACING_S:
-            self._said, self._said_s = state, now
-            severity = SEVERITY.get(state, "info")
-            self._feed.send(StatusText(severity, f"AquaFlow {state.value}: {loop.health.reason}"))
+        if self._config.status_text:
+            self._say(loop.health, now)
         if self._config.values and now - self._told_s >= EVERY_S:
             self._told_s = now
             lag = loop.counters.lag_ms()["p95"] or 0.0
             for name, value in (
-                ("AQ_STATE", float(state.number)),
+                ("AQ_STATE", float(loop.health.state.number)),
                 ("AQ_LEVEL", float(loop.degradation.level)),
                 ("AQ_LAG_MS", lag),
                 ("AQ_FPS", loop.counters.fps),
             ):
                 self._feed.send(NamedValue(time.monotonic_ns(), name, value))
+
+    def _say(self, health: Health, now: float) -> None:
+        """The first sentence that holds now and was not said since it began to."""
+        holding = health.sentences or (OF_STATE[health.state],)
+        self._standing &= set(holding)
+        soon = now - max(self._said_s.values(), default=-SPACING_S) < SPACING_S
+        if soon and health.state is not State.STOPPING:  # which has no later
+            return
+        self._said_s = {each: at for each, at in self._said_s.items() if now - at < REPEAT_S}
+        for sentence in holding:
+            if sentence not in self._standing and sentence not in self._said_s:
+                self._standing.add(sentence)
+                self._said_s[sentence] = now
+                severity = SEVERITY.get(health.state, "info")
+                self._feed.send(StatusText(severity, sentence))
+                return

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from aquaflow.config.telemetry import AnyDevice, DbcConfig, MavlinkConfig
+from aquaflow.config.can_devices import DbcConfig
+from aquaflow.config.telemetry import AnyDevice, MavlinkConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.errors import ConfigError
 

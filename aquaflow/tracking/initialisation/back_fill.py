@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from aquaflow.clocks.deadline import Deadline
 from aquaflow.errors.failures import Failures
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
@@ -90,9 +91,15 @@ class BackFill:
             return None
         return _Placed(frame, encoding, solved, at, solved.estimate.T @ T_ak)
 
-    def all(self, frames: Sequence[Frame]) -> list[Tracked]:
-        """Every one of ``frames``, those that are left; the oldest first."""
-        return [self.step(frame) for frame in reversed(frames)][::-1]
+    def all(self, frames: Sequence[Frame], until: Deadline | None = None) -> list[Tracked]:
+        """Every one of ``frames``, those that are left; the oldest first. Where the time does not
+        last, the newest of them."""
+        done = []
+        for frame in reversed(frames):
+            if until is not None and until.over:
+                break
+            done.append(self.step(frame))
+        return done[::-1]
 
 
 class BackFills:
@@ -140,8 +147,8 @@ class BackFills:
         self._waiting.put([frame], Wait.IN_HAND)
         return [self._left[0].step(frame)]
 
-    def all(self) -> list[Tracked]:
-        """Every frame that waits for idle time."""
+    def all(self, until: Deadline | None = None) -> list[Tracked]:
+        """Every frame that waits for idle time, or those that there is time for."""
         waiting = self._waiting.move(Wait.IN_IDLE_TIME, Wait.IN_HAND)
         fills, self._left = self._left, []
-        return [tracked for fill in fills for tracked in fill.all(fill.left(waiting))]
+        return [tracked for fill in fills for tracked in fill.all(fill.left(waiting), until)]

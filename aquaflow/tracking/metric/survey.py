@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config import FusionConfig
-from aquaflow.config.telemetry import MountingConfig
+from aquaflow.config.device import MountingConfig
 from aquaflow.fusion.camera_path import CameraPath
 from aquaflow.fusion.telemetry import Telemetry
 from aquaflow.geometry.similarity import Sim3

@@ -22,6 +22,7 @@ from tests.prior.textured_pictures import HEIGHT, WIDTH, moved_pair, shift
 
 pytest.importorskip("onnxruntime", reason="pip install 'aquaflow[prior]'")
 pytest.importorskip("onnxscript", reason="pip install 'aquaflow[export]'")
+pytestmark = pytest.mark.slow
 
 FRAME = (64, 64)
 TALL = CameraModel(WIDTH, HEIGHT, 200.0, 200.0, 120.0, 90.0)

@@ -121,7 +121,7 @@ class FallsBack:
     """An onnxruntime that promises CUDA and gives a CPU session."""
 
     def __init__(self, real: Any) -> None:
-        self.real = real
+        self.__file__ = real.__file__
         self.SessionOptions = real.SessionOptions
 
     def get_available_providers(self) -> list[str]:

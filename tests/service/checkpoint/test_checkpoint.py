@@ -15,6 +15,8 @@ import torch
 from aquaflow.config.service import CheckpointConfig
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.dive.frames_csv import read_rows
+from aquaflow.evaluation.trajectory import read_tum
+from aquaflow.export.ply import read_ply
 from aquaflow.messages import Frame
 from aquaflow.service.checkpoint.generations import read_state, state_file
 from aquaflow.service.checkpoint.resume import choose, is_begun, resumed
@@ -56,6 +58,7 @@ def cut(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Iter
     caught_up(dive)
     rows = len(read_rows(folder / "frames.csv"))
     dive.parts.loop.take(frames[CUT])  # after the checkpoint: lost
+    dive.folder._lock.release()  # as the kernel does for a process that was killed
     yield Cut(folder, dive, frames, rows)
     dive.close()
 
@@ -63,6 +66,7 @@ def cut(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Iter
 @pytest.fixture(scope="module")
 def back(cut: Cut) -> Iterator[LiveDive]:
     dive = LiveDive("cut", resumed(cut.folder, new=False), ToldFeed(), VEHICLE)
+    dive.folder._lock.release()  # further tests look at the folder as nobody's
     yield dive
     dive.close()
 
@@ -91,6 +95,12 @@ def test_the_optimisers_and_the_random_state_come_back(cut: Cut, back: LiveDive)
             assert np.array_equal(tensor.numpy(), saved[f"mapping.map0.adam.{kind}.{name}"])
         assert any(bool(tensor.any()) for tensor in moments.values())
     assert torch.equal(new._random.get_state(), torch.from_numpy(saved["mapping.map0.random"]))
+
+
+def test_what_fails_after_a_restart_is_counted_with_the_dives_failures(back: LiveDive) -> None:
+    failures = back.parts.slam.failures
+    mapper = back.parts.maps.mappers[0]
+    assert mapper.failures is mapper.water_fitting.failures is failures
 
 
 def test_idle_moments_give_the_frames_of_the_past_their_poses(cut: Cut) -> None:
@@ -143,7 +153,7 @@ def test_the_newest_unfinished_dive_is_chosen_unless_it_is_old_or_new_is_asked_f
     dives, config, now = cut.folder.parent, CheckpointConfig(), Moment.now()
     assert choose(dives, config, False, now).folder == cut.folder
     assert choose(dives, config, True, now).folder != cut.folder
-    later = replace(now, wall_ns=now.wall_ns + round(13 * 3.6e12))
+    later = replace(now, monotonic_ns=now.monotonic_ns + round(13 * 3.6e12))
     assert choose(dives, config, False, later).folder != cut.folder
     assert choose(dives, CheckpointConfig(resume_h=0.0), False, later).folder == cut.folder
 
@@ -182,6 +192,30 @@ def test_no_checkpoint_names_files_that_the_disk_did_not_take(
     assert checkpointer.taken == taken + 1
     files = list((cut.folder / "work" / "keyframes").glob("*.arrays"))
     assert len(files) == len(cut.dive.parts.slam.keyframes)
+
+
+def test_the_deliverables_of_a_dive_that_goes_on_are_those_of_one_moment(cut: Cut) -> None:
+    parts = cut.dive.parts
+    parts.refresher.write_soon()
+    parts.refresher.write_if_due(disk_is_full=False)
+    while parts.refresher.written == 0:
+        caught_up(cut.dive)
+    posed = {t.frame.t_ns: t.T_wc for t in parts.run.results if t.T_wc is not None}
+    path = read_tum(cut.folder / "trajectory.tum")
+    assert path.t_s == pytest.approx([t_ns * 1e-9 for t_ns in sorted(posed)])
+    for T_wc, position, wxyz in zip(
+        [posed[t_ns] for t_ns in sorted(posed)], path.positions, path.wxyz, strict=True
+    ):
+        np.testing.assert_allclose(position, T_wc.t, atol=2e-9)
+        np.testing.assert_allclose(wxyz, T_wc.quaternion, atol=2e-9)
+    gaussians = sum(len(mapper.gaussians) for mapper in parts.maps.mappers.values())
+    assert len(read_ply(cut.folder / "map.ply").means) == gaussians
+    numbers = json.loads((cut.folder / "metrics.json").read_text())
+    assert (numbers["complete"], numbers["tracked"]) == (False, len(posed))
+    assert numbers["gaussians"] == gaussians
+    told = report(parts, hang_s=1e6)["deliverables"]
+    assert told["written"] == 1
+    assert told["cpu_s"] > 0.0
 
 
 @pytest.mark.parametrize(
@@ -233,7 +267,7 @@ def test_the_live_window_shows_map_path_and_health(cut: Cut) -> None:
     pytest.importorskip("viser", reason="viser is not installed")
     parts = cut.dive.parts
     config = ViewerConfig(port=0, splats=300)
-    window = LiveViewer(config, parts.maps, lambda: report(parts, hang_s=1e6))
+    window = LiveViewer(config, lambda: report(parts, hang_s=1e6))
     try:
         window.update(parts.loop)
         deadline = time.monotonic() + 60.0

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from aquaflow.config.service import CheckpointConfig
+from aquaflow.dive.status import DiveState, DiveStatus
 from aquaflow.errors import InputError
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.service.checkpoint.generations import (
@@ -21,7 +22,7 @@ from aquaflow.service.checkpoint.generations import (
     state_file,
     write_state,
 )
-from aquaflow.service.checkpoint.resume import choose, resumed, tidy
+from aquaflow.service.checkpoint.resume import Choice, choose, resumed, tidy
 from aquaflow.service.live_dive import LiveDive
 from aquaflow.service.moment import Moment
 from aquaflow.service.onboard import map_live
@@ -120,7 +121,7 @@ def test_only_a_dive_that_was_told_to_stop_can_be_resumed(tmp_path: Path, told: 
     for name in ("work", "checkpoint"):
         (tmp_path / "dive" / name).mkdir()
     if told == "stop requested":
-        dive.parts.loop.stopping.set()
+        dive.control.stopping.set()
     feed.newest.end()
     with dive:
         assert dive.run() is None  # not one frame: nothing was mapped
@@ -133,7 +134,8 @@ def test_a_vehicle_whose_checkpoint_fits_nothing_begins_a_new_dive(tmp_path: Pat
     (dives / "old").mkdir(parents=True)
     (dives / "old" / "frames.csv").write_text("index,source,t_s,class,sub_map,keyframe,quality,r\n")
     write_numbered(dives / "old", 0)
-    service = VEHICLE.service.model_copy(update={"dives": dives})
+    whatever_its_age = CheckpointConfig(resume_h=0.0)
+    service = VEHICLE.service.model_copy(update={"dives": dives, "checkpoint": whatever_its_age})
     feed = ToldFeed()
     feed.newest.end()
     assert map_live(feed, VEHICLE.model_copy(update={"service": service})) is None
@@ -141,15 +143,19 @@ def test_a_vehicle_whose_checkpoint_fits_nothing_begins_a_new_dive(tmp_path: Pat
     assert list((dives / "old").glob("set-aside-*/checkpoint/state.npz"))
 
 
-def test_finished_dives_keep_no_files_for_a_resumption(tmp_path: Path) -> None:
-    for name in ("old", "current"):
+def test_complete_dives_keep_no_files_for_a_resumption(tmp_path: Path) -> None:
+    states = {"finished": DiveState.FINISHED, "stopped": DiveState.STOPPED}
+    kept = {
+        **dict.fromkeys(("current", "left", "damaged"), DiveState.STOPPED),
+        "cut off": DiveState.OPEN, "in finishing": DiveState.FINISHING,
+    }  # fmt: skip
+    for name, state in (states | kept).items():
         (tmp_path / name / "work").mkdir(parents=True)
         (tmp_path / name / "checkpoint").mkdir()
-        (tmp_path / name / "report.html").touch()
-    (tmp_path / "damaged" / "checkpoint").mkdir(parents=True)
-    (tmp_path / "damaged" / "report.html").touch()
+        DiveStatus(state, False, None, "boot", None).write(tmp_path / name)
     state_file(tmp_path / "damaged").write_bytes(b"PK damaged")
-    tidy(tmp_path, tmp_path / "current")
-    assert sorted(path.name for path in (tmp_path / "old").iterdir()) == ["report.html"]
-    assert state_file(tmp_path / "damaged").is_file()
-    assert (tmp_path / "current" / "checkpoint").is_dir()
+    tidy(tmp_path, Choice(tmp_path / "current", left=tmp_path / "left"))
+    for name in states:
+        assert [path.name for path in (tmp_path / name).iterdir()] == ["dive.json"]
+    for name in kept:
+        assert (tmp_path / name / "checkpoint").is_dir()

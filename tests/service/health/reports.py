@@ -14,4 +14,19 @@ REPORT: dict[str, Any] = {
     "stage_failures": [
         {"stage": "pose", "error": "cv2.error", "place": 'a "b"', "defect": False, "count": 2}
     ],
+    "devices": {
+        "front": {
+            "kind": "camera", "state": "streaming", "reason": "", "received": 123456789,
+            "delivered": 100, "overtaken": 3, "passed_over": 4, "unusable": 5, "duplicates": 6,
+            "lost": 7, "stamps_repaired": 8, "reconnects": 9, "rate_hz": 14.9, "age_s": 0.05,
+            "lag_ms": 36.0,
+        },
+        'the "dvl"\n': {
+            "kind": "link", "state": "lost", "reason": "no byte for 10 s", "bytes": 10,
+            "messages": 11, "samples": 12, "bad_checksums": 13, "garbage_bytes": 14,
+            "invalid_values": 15, "unheard": 16, "dropped_samples": 17, "reconnects": 18,
+            "rate_hz": None, "age_s": None, "lag_ms": None,
+        },
+        "recorder": {"kind": "recorder", "state": "recording", "reason": ""},
+    },
 }  # fmt: skip

@@ -98,7 +98,7 @@ def test_the_loop_feeds_the_watchdog_only_while_mapping_lives(
     tmp_path: Path, manager: socket.socket
 ) -> None:
     told = Told(tmp_path / "dive")
-    told.loop.notifier = notifier(manager, WATCHDOG_USEC="1000")
+    told.vitals.notifier = notifier(manager, WATCHDOG_USEC="1000")
     told.idle(1.0)
     assert "WATCHDOG=1" in heard(manager)
     told.close()  # the mapping thread has ended, so that nobody beats for it

@@ -21,8 +21,6 @@ from aquaflow.config.service import ListenConfig, ServiceConfig
 from aquaflow.config.stage import validated
 from aquaflow.errors import ConfigError
 from aquaflow.service.health.http import MOST_CLIENTS, HealthServer
-from aquaflow.service.health.prometheus import exposition
-from aquaflow.service.health.state import State
 from tests.command_line import Cli
 from tests.service.health.reports import REPORT
 from tests.small_recording import GIVE_UP_S
@@ -46,9 +44,23 @@ def token_file(tmp_path: Path) -> Path:
     return file
 
 
+@pytest.fixture
+def locked(token_file: Path) -> Iterator[HealthServer]:
+    config = ListenConfig.model_construct(host="127.0.0.1", port=0, token_file=token_file)
+    server = HealthServer(config, lambda: REPORT)
+    yield server
+    server.close()
+
+
 def get(port: int, target: str, **headers: str) -> tuple[int, str, dict[str, str]]:
+    return ask("GET", port, target, **headers)
+
+
+def ask(
+    method: str, port: int, target: str, body: str | None = None, **headers: str
+) -> tuple[int, str, dict[str, str]]:
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
-    connection.request("GET", target, headers=headers)
+    connection.request(method, target, body, headers)
     answer = connection.getresponse()
     body = answer.read().decode()
     connection.close()
@@ -64,17 +76,34 @@ def test_health_is_json_and_metrics_are_prometheus(server: HealthServer) -> None
     assert 'aquaflow_state{state="tracking"} 1' in body
 
 
-def test_every_line_of_the_metrics_is_well_formed() -> None:
-    line = re.compile(r'^(# (HELP|TYPE) \w+ .+|\w+(\{(\w+="([^"\\\n]|\\.)*",?)+\})? -?[\d.e+-]+)$')
-    lines = exposition(REPORT).splitlines()
-    assert [text for text in lines if not line.match(text)] == []
-    assert sum(text.startswith("aquaflow_state{") for text in lines) == len(State)
-
-
 def test_the_page_and_blueos_are_served_and_nothing_else(server: HealthServer) -> None:
     assert "AquaFlow" in get(server.port, "/")[1]
     assert json.loads(get(server.port, "/register_service")[1])["name"] == "AquaFlow"
-    assert get(server.port, "/etc/passwd")[0] == 404
+    for path in ("/etc/passwd", "/page/", "/page/__init__.py", "/page/../http.py", "/index.html"):
+        assert get(server.port, path)[0] == 404, path
+
+
+def test_the_page_s_files_have_their_types_and_load_nothing_from_elsewhere(
+    server: HealthServer,
+) -> None:
+    _, html, headers = get(server.port, "/", Host="localhost:8230")
+    assert "frame-ancestors 'self' http://localhost:*" in headers["Content-Security-Policy"]
+    named = set(re.findall(r'(?:src|href)="(page/[^"]+)"', html))
+    assert {"page/page.js", "page/style.css"} <= named
+    kinds = {"js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
+    for name in named:
+        status, text, headers = get(server.port, f"/{name}")
+        assert status == 200
+        assert headers["Content-Type"].startswith(kinds[name.rpartition(".")[2]])
+        assert not re.search(r"https?://(?!www\.w3\.org/2000/svg)[a-z]", text)
+
+
+def test_the_path_is_told_where_there_is_one(server: HealthServer) -> None:
+    assert get(server.port, "/path.json")[0] == 404
+    config = ListenConfig.model_construct(host="127.0.0.1", port=0, token_file=None)
+    mapping = HealthServer(config, lambda: REPORT, lambda: {"sub_maps": [], "now": None})
+    assert json.loads(get(mapping.port, "/path.json")[1]) == {"sub_maps": [], "now": None}
+    mapping.close()
 
 
 def test_a_page_of_elsewhere_cannot_read_a_socket_of_this_machine(server: HealthServer) -> None:
@@ -82,21 +111,41 @@ def test_a_page_of_elsewhere_cannot_read_a_socket_of_this_machine(server: Health
     assert get(server.port, "/health", Host="[::1]:8230")[0] == 200
 
 
-def test_a_token_is_asked_for_in_header_cookie_or_address(token_file: Path) -> None:
-    config = ListenConfig.model_construct(host="127.0.0.1", port=0, token_file=token_file)
-    server = HealthServer(config, lambda: REPORT)
-    try:
-        assert get(server.port, "/health")[0] == 403
-        assert get(server.port, "/health", Authorization="Bearer wrong")[0] == 403
-        assert get(server.port, "/health", Authorization=f"Bearer {TOKEN}")[0] == 200
-        status, _, headers = get(server.port, f"/health?token={TOKEN}")
-        assert status == 200
-        cookie = headers["Set-Cookie"]
-        assert "HttpOnly" in cookie
-        assert get(server.port, "/health", Cookie=cookie.partition(";")[0])[0] == 200
-        assert get(server.port, "/health", Host="elsewhere", Cookie="aquaflow_token=x")[0] == 403
-    finally:
-        server.close()
+def test_a_token_is_asked_for_in_header_cookie_or_address(locked: HealthServer) -> None:
+    assert get(locked.port, "/health")[0] == 403
+    assert get(locked.port, "/path.json")[0] == 403
+    assert get(locked.port, "/health", Authorization="Bearer wrong")[0] == 403
+    assert get(locked.port, "/health", Authorization=f"Bearer {TOKEN}")[0] == 200
+    status, _, headers = get(locked.port, f"/health?token={TOKEN}")
+    assert status == 200
+    cookie = headers["Set-Cookie"]
+    assert "HttpOnly" in cookie
+    assert get(locked.port, "/health", Cookie=cookie.partition(";")[0])[0] == 200
+    assert get(locked.port, "/health", Host="elsewhere", Cookie="aquaflow_token=x")[0] == 403
+
+
+def test_the_page_comes_without_a_token_and_its_form_gives_the_cookie(
+    locked: HealthServer,
+) -> None:
+    assert get(locked.port, "/")[0] == 200
+    assert get(locked.port, "/page/page.js")[0] == 200
+    for wrong in ("", "token=", "token=wrong", f"token={TOKEN}x", f"token={TOKEN}&token=wrong"):
+        status, said, headers = ask("POST", locked.port, "/login", wrong)
+        assert (status, "Set-Cookie" in headers) == (403, False)
+        assert "not the token" in json.loads(said)["error"]
+    status, _, headers = ask("POST", locked.port, "/login", f"token={TOKEN}%0A")
+    assert status == 200
+    assert {"HttpOnly", "SameSite=Strict"} <= set(headers["Set-Cookie"].split("; "))
+    cookie = headers["Set-Cookie"].partition(";")[0]
+    assert get(locked.port, "/health", Cookie=cookie)[0] == 200
+
+
+def test_a_form_that_is_too_long_is_not_read_and_other_forms_are_nothing(
+    locked: HealthServer,
+) -> None:
+    assert ask("POST", locked.port, "/login", f"token={TOKEN}&x={'x' * 5000}")[0] == 413
+    assert ask("POST", locked.port, "/login", None, **{"Content-Length": "-1"})[0] == 413
+    assert ask("POST", locked.port, "/health", f"token={TOKEN}")[0] == 404
 
 
 def test_clients_that_hang_keep_nobody_else_out(server: HealthServer) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from aquaflow.config.telemetry import MountingConfig
+from aquaflow.config.device import MountingConfig
 from aquaflow.fusion.metric_frame import MetricFrame, North
 from aquaflow.fusion.start import camera_in_body
 from aquaflow.geometry.similarity import Sim3, so3_exp

@@ -14,9 +14,17 @@ import pytest
 from aquaflow.config.telemetry import parse_telemetry
 from aquaflow.drivers.protocol.mavlink import MavlinkDecoder
 from aquaflow.drivers.protocol.mavlink_outbound import ARDUPILOT
+from aquaflow.drivers.protocol.mavlink_text import MOST_CHUNKS
 from aquaflow.geometry.similarity import so3_exp
 from aquaflow.service.vehicle.pilot_messages import PilotMessages
-from aquaflow.sources.outbound import BodyMotion, BodyPose, NamedValue, OutboundMessage, StatusText
+from aquaflow.sources.outbound import (
+    LONGEST_TEXT,
+    BodyMotion,
+    BodyPose,
+    NamedValue,
+    OutboundMessage,
+    StatusText,
+)
 from tests.service.live_scenes import Told
 
 pytest.importorskip("pymavlink", reason="pymavlink is not installed")
@@ -35,7 +43,7 @@ def test_the_pilot_hears_of_changes_and_numbers_come_once_a_second(told: Told) -
     for tenth in range(31):
         report.update(told.loop, tenth / 10)
     sentences = [word for word in told.feed.told if isinstance(word, StatusText)]
-    assert [word.text for word in sentences] == ["AquaFlow tracking: every frame has a pose"]
+    assert [word.text for word in sentences] == ["AquaFlow is tracking."]
     numbers = [word.name for word in told.feed.told if isinstance(word, NamedValue)]
     assert numbers.count("AQ_STATE") == 4
 
@@ -82,9 +90,9 @@ MOTION = BodyMotion(4_900_000_000, 100_000_000, np.array([0, 0, 0.1]), np.array(
 
 def test_every_word_arrives_as_its_message() -> None:
     number = NamedValue(4_900_000_000, "AQ_STATE", 3.0)
-    sentence = StatusText("warning", "é" + "x" * 80)
+    sentence = StatusText("warning", "é" + "x" * 49)
     text, value, pose, delta = heard(sentence, number, body(), MOTION)
-    assert (text.severity, text.text) == (4, "?" + "x" * 49)
+    assert (text.severity, text.text, text.id) == (4, "?" + "x" * 49, 0)
     assert (value.name, value.value) == ("AQ_STATE", 3.0)
     assert (pose.x, pose.z, pose.reset_counter, pose.quality) == (1.5, -2.0, 1, 90)
     assert pose.q == pytest.approx([np.cos(0.15), 0.0, 0.0, np.sin(0.15)], abs=1e-6)
@@ -96,6 +104,28 @@ def test_every_word_arrives_as_its_message() -> None:
     assert [upper[i] for i in range(21) if i not in diagonal] == pytest.approx([0.1] * 15)
     assert twice == pytest.approx([2.0 * each for each in upper])
     assert (delta.time_delta_usec, delta.confidence) == (100_000, 50.0)
+
+
+@pytest.mark.parametrize("length", [51, 99, 100, 101, 150, 249])
+def test_a_long_text_comes_in_chunks_that_make_it_whole(length: int) -> None:
+    words = [StatusText("info", letter * length) for letter in "ab"]
+    chunks = heard(*words)
+    for letter in "ab":
+        of_one = [chunk for chunk in chunks if chunk.text.startswith(letter)]
+        assert "".join(chunk.text for chunk in of_one) == letter * length
+    numbers = list(dict.fromkeys(chunk.id for chunk in chunks))
+    assert len(numbers) == 2
+    assert 0 not in numbers
+    for number in numbers:
+        of_one = [chunk for chunk in chunks if chunk.id == number]
+        assert [chunk.chunk_seq for chunk in of_one] == list(range(len(of_one)))
+        assert all(len(chunk.text) == LONGEST_TEXT for chunk in of_one[:-1])
+        assert len(of_one[-1].text) < LONGEST_TEXT  # a null character ends the text
+
+
+def test_a_text_without_end_is_cut() -> None:
+    chunks = heard(StatusText("info", "x" * 10_000))
+    assert sum(len(chunk.text) for chunk in chunks) == MOST_CHUNKS * LONGEST_TEXT - 1
 
 
 def test_stamps_are_of_the_autopilots_clock() -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 
+from aquaflow.clocks.deadline import Deadline
 from aquaflow.config import TrackingConfig
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.messages import Frame
@@ -65,6 +68,16 @@ def test_the_end_of_a_dive_leaves_nobody_waiting(clip: list[Frame]) -> None:
     decided += tracker.finish()
     assert sorted(tracked.frame.index for tracked in decided) == list(range(newest + 1))
     assert tracker.past is None
+
+
+def test_an_end_without_time_leaves_the_oldest_without_a_pose(clip: list[Frame]) -> None:
+    tracker, looks = live(), itertools.count()
+    decided, newest = until_started(tracker, clip)
+    ended = tracker.finish(Deadline(2.5, lambda: float(next(looks))))
+    posed = {tracked.frame.index for tracked in ended if tracked.T_wc is not None}
+    assert posed == {newest - 1, newest - 2}
+    decided += ended
+    assert sorted(tracked.frame.index for tracked in decided) == list(range(newest + 1))
 
 
 def test_a_run_that_never_has_time_forgets_the_oldest_and_says_so(

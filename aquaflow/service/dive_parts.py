@@ -1,0 +1,159 @@
+"""The parts of a live dive, and how they are put together: for a new one, or one that goes on."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from functools import partial
+
+from aquaflow.config import Config, parse_config
+from aquaflow.config.vehicle import VehicleConfig
+from aquaflow.cores import core_count
+from aquaflow.dive.folder import DiveFolder
+from aquaflow.dive.run import DiveRun
+from aquaflow.dive.status import read_status
+from aquaflow.errors import AquaFlowError
+from aquaflow.mapping.maps import Maps
+from aquaflow.messages import Dropped
+from aquaflow.profiler import Profiler
+from aquaflow.recording.telemetry_lines import NAME as TELEMETRY
+from aquaflow.recording.telemetry_lines import TelemetryLog
+from aquaflow.render import select_renderer
+from aquaflow.render.device_memory import usable_share
+from aquaflow.service.checkpoint.checkpoint import Checkpointer, restore
+from aquaflow.service.checkpoint.generations import Checkpoint
+from aquaflow.service.checkpoint.resume import Choice
+from aquaflow.service.checkpoint.salvage import lost_with_their_files
+from aquaflow.service.checkpoint.telemetry import hear_again
+from aquaflow.service.control import Control
+from aquaflow.service.device_errors import DeviceErrors
+from aquaflow.service.dive_clock import Continued
+from aquaflow.service.feed import Feed
+from aquaflow.service.health.pressure import PressureReader
+from aquaflow.service.loop import LiveLoop
+from aquaflow.service.map_thread import MapThread
+from aquaflow.service.mounting import camera_mounting
+from aquaflow.service.refresh import Refresher
+from aquaflow.service.standing import Standing
+from aquaflow.service.vitals import Vitals
+from aquaflow.slam import Slam
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The parts of a live dive, for the viewer and the report."""
+
+    loop: LiveLoop
+    slam: Slam
+    run: DiveRun
+    maps: MapThread
+    checkpointer: Checkpointer
+    refresher: Refresher
+    choice: Choice
+    standing: Standing
+    device_errors: DeviceErrors
+    frames_before: int
+    """Of an earlier run of the same dive."""
+
+
+def assembled(
+    name: str,
+    choice: Choice,
+    feed: Feed,
+    vehicle: VehicleConfig,
+    folder: DiveFolder,
+    vitals: Vitals,
+    control: Control,
+    losses: list[str],
+) -> Parts:
+    """All parts of a dive; ``losses``: what damaged files cost one that goes on.
+
+    Raises:
+        UnusableStateError: the dive cannot be resumed from the checkpoint.
+        ConfigError: the prior cannot give what the config asks tracking for.
+    """
+    config, service, failures = plain(vehicle), vehicle.service, feed.failures
+    profiler, before = Profiler(), read_status(folder.path)
+    # A core is left for tracking, where there is more than one.
+    threads = config.threads or max(1, core_count() - 1)
+    renderer = select_renderer(config.mapping.renderer, threads)
+    maps = Maps(config, renderer, profiler, folder.work, failures)
+    thread = MapThread(
+        maps, service.mapping, vitals.heartbeats, lambda: vitals.degradation.level
+    )  # fmt: skip
+    slam = Slam(config, profiler, folder.work, True, thread, failures)
+    with failures.contain("camera mounting"):
+        stated = camera_mounting(config, service, feed)
+        slam.metric.mounting = stated or (before.stated_mounting() if before else None)
+    run = DiveRun(name, folder, config, slam, feed.calibration, feed.name_of)
+    continued = Continued()
+    if choice.checkpoint is not None:
+        continued = _restored(choice.checkpoint, slam, run, maps)
+    run.notes += [*choice.notes, *losses]
+    for note in run.notes:
+        log.warning("%s", note)
+    feed.continue_from(continued)
+    failures.attempt(
+        "writing calibration.yaml", partial(folder.write_calibration, feed.calibration)
+    )
+    telemetry_log = partial(TelemetryLog, folder.path / TELEMETRY)
+    run.telemetry_log = failures.attempt(f"opening {TELEMETRY}", telemetry_log)
+    vitals.health.begin()
+    pressure = PressureReader(folder.path, gpu_free=lambda: usable_share(thread.renderer.device))
+    loop = LiveLoop(run, feed, thread, service, vitals, control, pressure)
+    checkpointer = Checkpointer(
+        folder.path, run, slam, thread, service.checkpoint.every_s, feed.clocks,
+        lambda: feed.continued.known_shift_ns,
+    )  # fmt: skip
+    refresher = Refresher(run, thread, service.checkpoint.deliverables_s)
+
+    def write_what_is_due(live: LiveLoop) -> None:
+        disk_is_full = live.pressure.disk_is_full(service.limits)
+        checkpointer.take_if_due(disk_is_full)
+        refresher.write_if_due(disk_is_full)
+
+    def paused() -> None:
+        checkpointer.take_soon()
+        refresher.write_soon()
+
+    standing = Standing(folder.path, failures, slam.metric.mounting, before, paused)
+    errors = DeviceErrors(feed.describe)
+    loop.watchers += [standing.update, write_what_is_due, lambda live: errors.update()]
+    frames_before = len(slam.frames)
+    return Parts(
+        loop, slam, run, thread, checkpointer, refresher, choice, standing, errors, frames_before
+    )  # fmt: skip
+
+
+def _restored(known: Checkpoint, slam: Slam, run: DiveRun, maps: Maps) -> Continued:
+    """The dive as its checkpoint has it; where its frames and its time go on.
+
+    Raises:
+        UnusableStateError: the dive cannot be resumed from it.
+    """
+    try:
+        restore(known, slam, run, maps)
+    except AquaFlowError:
+        slam.close(keep=True)
+        raise
+    rows = run.folder.rows
+    run.notes += lost_with_their_files(known, slam, maps)
+    run.dropped += [
+        Dropped(row.index, round(row.t_s * 1e9), row.reason)
+        for row in rows
+        if row.frame_class == "dropped"
+    ]
+    hear_again(run)
+    log.info("resumed %s with %d keyframes", run.folder.path, len(slam.keyframes))
+    return Continued.after(known.moment, rows, known.clocks)
+
+
+def plain(vehicle: VehicleConfig) -> Config:
+    """The settings of mapping alone, with the service's limit on refining."""
+    settings = vehicle.model_dump(include=set(Config.model_fields))
+    optimiser = settings["mapping"]["optimiser"]
+    if optimiser["refine_seconds"] is None:
+        optimiser["refine_seconds"] = vehicle.service.mapping.refine_seconds
+    return parse_config(settings, "config")

@@ -1,0 +1,139 @@
+"""A headless Chromium, driven through ChromeDriver by W3C WebDriver (JSON over HTTP)."""
+
+from __future__ import annotations
+
+import base64
+import http.client
+import json
+import shutil
+import socket
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.small_recording import GIVE_UP_S
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+DRIVER = shutil.which("chromedriver")
+FLAGS = (
+    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
+    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+    "--hide-scrollbars",
+)
+ELEMENT = "element-6066-11e4-a52e-4f735466cecf"
+"""Key under which WebDriver names an element."""
+
+needs_browser = pytest.mark.skipif(
+    CHROMIUM is None or DRIVER is None,
+    reason="no chromium and chromedriver here: apt-get install chromium chromium-driver",
+)
+
+
+class Browser:
+    """One window with a new, empty profile."""
+
+    def __init__(self, profile: Path) -> None:
+        assert CHROMIUM is not None
+        assert DRIVER is not None
+        with socket.create_server(("127.0.0.1", 0)) as probe:
+            self._port = int(probe.getsockname()[1])
+        self._process = subprocess.Popen(
+            [DRIVER, f"--port={self._port}"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        self.until(self._is_up, "chromedriver")
+        arguments = [*FLAGS, f"--user-data-dir={profile}"]
+        options = {"goog:chromeOptions": {"binary": CHROMIUM, "args": arguments}}
+        said = self._ask("POST", "/session", {"capabilities": {"alwaysMatch": options}})
+        self._session = f"/session/{said['sessionId']}"
+
+    def close(self) -> None:
+        self._ask("DELETE", self._session)
+        self._process.terminate()
+        self._process.wait(GIVE_UP_S)
+
+    def open(self, address: str) -> None:
+        self._ask("POST", f"{self._session}/url", {"url": address})
+
+    def forget(self) -> None:
+        """All cookies, of whatever host and port."""
+        self._command("Network.clearBrowserCookies", {})
+
+    def run(self, script: str, *arguments: object) -> Any:
+        """What ``script``, the body of a function, returns."""
+        body = {"script": script, "args": list(arguments)}
+        return self._ask("POST", f"{self._session}/execute/sync", body)
+
+    def in_frame(self, script: str) -> Any:
+        """The same in the page's only frame."""
+        frame = {ELEMENT: self._find("iframe")}
+        self._ask("POST", f"{self._session}/frame", {"id": frame})
+        try:
+            return self.run(script)
+        finally:
+            self._ask("POST", f"{self._session}/frame", {"id": None})
+
+    def wait(self, condition: str) -> None:
+        """Until the JavaScript expression is true."""
+        self.until(lambda: bool(self.run(f"return Boolean({condition})")), condition)
+
+    def text(self, selector: str) -> str:
+        return str(self.run("return document.querySelector(arguments[0]).innerText", selector))
+
+    def click(self, selector: str) -> None:
+        self._ask("POST", f"{self._session}/element/{self._find(selector)}/click", {})
+
+    def type(self, selector: str, text: str) -> None:
+        self._ask("POST", f"{self._session}/element/{self._find(selector)}/value", {"text": text})
+
+    def press(self, key: str) -> None:
+        """A key, to whatever has the focus."""
+        strokes = [{"type": "keyDown", "value": key}, {"type": "keyUp", "value": key}]
+        actions = [{"type": "key", "id": "keyboard", "actions": strokes}]
+        self._ask("POST", f"{self._session}/actions", {"actions": actions})
+
+    def emulate(self, width: int, height: int, dark: bool = False) -> None:
+        """A screen of this many CSS pixels."""
+        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self._command("Emulation.setDeviceMetricsOverride", metrics)
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self._command("Emulation.setEmulatedMedia", {"features": [scheme]})
+
+    def screenshot(self, file: Path) -> None:
+        """What the screen shows."""
+        file.write_bytes(base64.b64decode(self._ask("GET", f"{self._session}/screenshot")))
+
+    def _command(self, name: str, parameters: dict[str, Any]) -> Any:
+        """Of the Chrome DevTools Protocol."""
+        body = {"cmd": name, "params": parameters}
+        return self._ask("POST", f"{self._session}/goog/cdp/execute", body)
+
+    def _find(self, selector: str) -> str:
+        body = {"using": "css selector", "value": selector}
+        return str(self._ask("POST", f"{self._session}/element", body)[ELEMENT])
+
+    def _is_up(self) -> bool:
+        try:
+            return bool(self._ask("GET", "/status")["ready"])
+        except OSError:
+            return False
+
+    def _ask(self, method: str, path: str, body: dict[str, Any] | None = None) -> Any:
+        connection = http.client.HTTPConnection("127.0.0.1", self._port, timeout=GIVE_UP_S)
+        connection.request(method, path, None if body is None else json.dumps(body))
+        said = json.loads(connection.getresponse().read())["value"]
+        connection.close()
+        if isinstance(said, dict) and "error" in said:
+            raise AssertionError(f"{said['error']}: {said['message']}")
+        return said
+
+    @staticmethod
+    def until(condition: Callable[[], bool], what: str) -> None:
+        """Wait for what the test itself looks at."""
+        end_s = time.monotonic() + GIVE_UP_S
+        while not condition():
+            assert time.monotonic() < end_s, f"waited in vain for {what}"
+            time.sleep(0.05)

@@ -1,0 +1,32 @@
+"""``aquaflow run`` tells of its devices at once, on stderr, and in the dive's log."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import yaml
+
+from tests.command_line import Cli
+
+ABSENT = "http://127.0.0.1:1/video"
+"""Nothing listens on port 1."""
+
+
+def test_a_camera_that_is_not_there_is_told_on_stderr_and_in_the_log(
+    aquaflow: Cli, tmp_path: Path
+) -> None:
+    settings = {
+        "cameras": {"front": {"kind": "stream", "url": ABSENT, "first_retry_s": 0.05}},
+        "service": {"health": {"enabled": False, "port": 8230}},
+    }
+    (tmp_path / "vehicle.yaml").write_text(yaml.safe_dump(settings))
+    dive = tmp_path / "dive"
+    ran = aquaflow("run", "--config", tmp_path / "vehicle.yaml", "--out", dive, "--seconds", 1)
+    told = f"camera 'front' is waited for: no video from {ABSENT}"
+    assert ran.err.splitlines() == [told]
+    lines = [json.loads(line) for line in (dive / "log.jsonl").read_text().splitlines()]
+    about = [line for line in lines if line.get("source") == "front"]
+    assert [(line["event"], line["message"], line["t_s"]) for line in about] == [
+        ("waiting", told, None)
+    ]
