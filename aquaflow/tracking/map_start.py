@@ -74,6 +74,11 @@ class MapStart:
         """True if :meth:`solve` is worth an attempt."""
         return self._initialiser is not None and self._initialiser.ready
 
+    @property
+    def turned_back(self) -> bool:
+        """True if the newest frame is the better reference (:attr:`Initialiser.turned_back`)."""
+        return self._initialiser is not None and self._initialiser.turned_back
+
     def solve(self) -> Started | None:
         """Initialise a map from the waiting frames; None if no geometry is good enough."""
         initialiser, started = self._initialiser, None

@@ -158,11 +158,11 @@ class Tracker:
     def _initialise(self, frame: Frame, encoding: Encoding) -> list[Tracked]:
         matched = self._start.add(frame, encoding)
         started = self._start.begin_learned() if matched else None
-        if started is None and matched and not self._start.ready:
-            return []
-        tracked = self._begin(started)
+        worth_an_attempt = not matched or self._start.ready
+        tracked = self._begin(started) if started or worth_an_attempt else []
         if self._at is None:
-            if not matched:  # so are frames that cannot be: the next reference is another one
+            # So are frames that cannot be matched: the next reference is another one.
+            if not matched or self._start.turned_back:
                 self._start.restart(frame, encoding)
             return []
         return tracked if matched else tracked + self._track(frame)

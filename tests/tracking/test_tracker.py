@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aquaflow.config import TrackingConfig
+from aquaflow.config import InitialisationConfig, TrackingConfig
+from aquaflow.keyframes import KeyframeStore
 from aquaflow.messages import Frame
+from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.tracking.frames import FrameClass
+from aquaflow.tracking.tracker import Tracker
 from tests.tracking.tracked_clips import PLACED, Run, error_share, run
-from tests.tracking.tracking_scenes import CAMERA, SeaFloor, black, filmed, lawn_path
+from tests.tracking.tracking_scenes import CAMERA, SeaFloor, black, filmed, lawn_path, pose
 
 FRAMES = 18
 POSES = lawn_path(FRAMES, step_m=0.12)
@@ -162,6 +165,16 @@ def test_three_frames_without_motion_are_lost_with_a_reason(clip: list[Frame]) -
     assert [t.frame_class for t in result.tracked] == [FrameClass.LOST] * 3
     assert all(t.reason == "no pose found" for t in result.tracked)
     assert len(result.store) == 0
+
+
+def test_a_dive_that_begins_in_the_middle_of_a_swing_starts_from_one_of_its_ends() -> None:
+    """From the middle neither end has the parallax that a start needs; between the ends it is."""
+    right, left = [0.0, 0.3, 0.5, 0.3], [0.0, -0.2, -0.3, -0.2]
+    swing = [pose((0.0, 0.0, 0.0), (x, 0.0, 0.0)) for x in [*right, *left] * 2 + right]
+    config = TrackingConfig(initialisation=InitialisationConfig(parallax_widths=0.025))
+    tracker = Tracker(ClassicalPrior(), KeyframeStore(), config)
+    tracked = [each for frame in filmed(SeaFloor(), swing) for each in tracker.track(frame)]
+    assert sum(each.T_wc is not None for each in tracked) == len(swing)
 
 
 @pytest.mark.filterwarnings("error")

@@ -45,6 +45,9 @@ RETRY_GROWTH = 1.05
 attempt takes seconds, and the next frame alone changes little."""
 
 
+AS_FAR, NEAR = 0.9, 0.5
+"""Of the largest parallax: the camera is as far from the reference again; it was near meanwhile."""
+
 MIN_CONFIDENCE = 0.1
 """Of a match that decides the geometry, where there are enough of them. Next to depth edges, where
 the match follows what is in front, it is below; the first keyframe's depths, bent by such matches,
@@ -68,6 +71,8 @@ class Initialiser:
         self._predicted: npt.NDArray[np.float32] | None = None
         self._tried_px = 0.0
         """Parallax at the last attempt."""
+        self._least_since_px = 0.0
+        """Least parallax since the largest one."""
         self._samples = _grid_samples(reference.interesting, config.points)
 
     def add(self, frame: Frame, encoding: Encoding) -> bool:
@@ -86,6 +91,8 @@ class Initialiser:
             observed = sure
         # What is not a number compares with nothing: one such frame would hold up every start.
         parallax = parallax if np.isfinite(parallax) else 0.0
+        farther = parallax > self.parallax_px
+        self._least_since_px = parallax if farther else min(parallax, self._least_since_px)
         self.waiting.append(MatchedFrame(frame, pixels, observed, parallax, pair))
         self._predicted = pair.matches
         return True
@@ -106,11 +113,27 @@ class Initialiser:
     @property
     def ready(self) -> bool:
         """Enough parallax and, unless the motion is fast, enough views to judge it by."""
+        return len(self.waiting) >= self._config.min_views and self.parallax_px >= self._needed_px
+
+    @property
+    def turned_back(self) -> bool:
+        """The camera came back to the reference, and is as far from it again as it was at most.
+
+        One that swings about a place, or goes up and down it, never has the parallax that is needed
+        to a reference in the middle, but may have it from end to end: twice as much, at most.
+        """
+        largest = self.parallax_px
         return (
-            len(self.waiting) >= self._config.min_views
-            and self.parallax_px >= self._config.parallax_widths * self.reference.camera.width
-            and self.parallax_px >= RETRY_GROWTH * self._tried_px
+            bool(self.waiting)
+            and 2.0 * largest >= self._needed_px
+            and self._least_since_px <= NEAR * largest
+            and self.waiting[-1].parallax_px >= AS_FAR * largest
         )
+
+    @property
+    def _needed_px(self) -> float:
+        needed = self._config.parallax_widths * self.reference.camera.width
+        return max(needed, RETRY_GROWTH * self._tried_px)
 
     def solve(self) -> Initialised | None:
         """The best explanation of all waiting frames; None when none is good enough."""

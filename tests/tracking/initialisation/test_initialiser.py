@@ -201,6 +201,34 @@ def test_nothing_waiting_is_no_solution() -> None:
     assert initialiser.solve() is None
 
 
+def swung(sides_m: list[float], parallax_widths: float = CONFIG.parallax_widths) -> list[bool]:
+    """For each position beside the reference, whether the camera has turned back by then."""
+    prior = prior_of([Sim3.identity(), *(pose((0, 0, 0), (side, 0.0, 0.0)) for side in sides_m)])
+    first, *others = prior.frames(CAMERA)
+    config = CONFIG.model_copy(update={"parallax_widths": parallax_widths})
+    initialiser = Initialiser(first, prior.encode(first.image, CAMERA), prior, config)
+    assert not initialiser.turned_back
+    turned_back = []
+    for frame in others:
+        assert initialiser.add(frame, prior.encode(frame.image, CAMERA))
+        turned_back.append(initialiser.turned_back)
+    return turned_back
+
+
+def test_a_camera_that_swings_about_the_reference_has_turned_back_at_its_ends() -> None:
+    assert swung([0.1, 0.2, 0.1, 0.01, -0.05, -0.1, -0.17]) == [False] * 6 + [True]
+
+
+def test_a_camera_that_goes_on_never_turns_back() -> None:
+    assert not any(swung([0.1, 0.2, 0.18, 0.3, 0.35, 0.4]))
+
+
+def test_a_camera_that_hovers_keeps_its_reference() -> None:
+    sway = [0.1, 0.01, 0.1, 0.01, -0.1]
+    assert any(swung(sway, parallax_widths=0.02))
+    assert not any(swung(sway, parallax_widths=0.03))
+
+
 def test_a_frame_that_does_not_see_the_place_is_turned_away() -> None:
     prior = prior_of(MOVING, blind=(2,))
     frames = prior.frames(CAMERA)
