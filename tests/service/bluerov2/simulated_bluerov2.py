@@ -44,6 +44,7 @@ FPS = 5.0
 STALL_S = 4.0
 
 CONFIG = """
+# The pilot swims to and fro over 24 pictures: wherever a dive begins, it starts within 11 of them.
 threads: 1
 cameras:
   pilot: {{kind: stream, url: "udp://0.0.0.0:{camera}", stall_s: {stall_s}}}
@@ -54,6 +55,8 @@ telemetry:
       link: {{kind: tcp, host: 127.0.0.1, port: {autopilot}}}
       also: [{{component_id: {ping}, messages: [DISTANCE_SENSOR]}}]
     dvl: {{kind: waterlinked_json, link: {{kind: tcp, host: 127.0.0.1, port: {dvl}}}}}
+tracking:
+  initialisation: {{parallax_widths: 0.025}}
 mapping:
   medium: {{enabled: false}}
   optimiser: {{steps_keyframe: 2, steps_mapping: 2, steps_common: 1, refine_steps: 10}}
