@@ -9,14 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from aquaflow.prior import homography as sparse
-from aquaflow.prior.flow import Float, Flow, FlowMatcher, pixel_grid, sample
+from aquaflow.prior.fields import pixel_grid
+from aquaflow.prior.flow import Float, Flow, FlowMatcher
 from aquaflow.prior.flow_pair import FlowEncoding
 
 GOOD_SHARE = 0.5
 """A flow that matches this part of the picture needs no rival."""
-
-REVERSING_ROUNDS = 3
-"""Fixed-point steps; more change less than DIS corrects."""
 
 
 def best_flow(
@@ -31,8 +29,7 @@ def best_flow(
     """
     best: Flow | None = None
     for start in starts:
-        back = None if start is None else reverse(start)
-        flow = matcher(a.grey, b.grey, a.texture, b.texture, start, back)
+        flow = matcher(a.grey, b.grey, a.texture, b.texture, start)
         if best is None or flow.share > best.share:
             best = flow
         if best.share >= GOOD_SHARE:
@@ -56,18 +53,3 @@ def from_homography(a: FlowEncoding, b: FlowEncoding) -> Iterator[Float]:
     if H is not None:
         height, width = a.grey.shape
         yield sparse.flow_of_homography(H, height, width)
-
-
-def reverse(
-    flow: Float,  # [H, W, 2] px, a to b
-) -> Float:
-    """[H, W, 2] approximate flow from b to a: the negated flow, looked up where it arrives.
-
-    Fixed point of r(x) = -flow(x + r(x)); exact enough to start DIS from.
-    """
-    height, width = flow.shape[:2]
-    grid = pixel_grid(height, width)
-    reversed_ = -flow
-    for _ in range(REVERSING_ROUNDS):
-        reversed_ = -sample(flow, grid + reversed_)
-    return reversed_

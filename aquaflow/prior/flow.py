@@ -9,7 +9,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.prior.refinement import refine
+from aquaflow.prior.backward_flow import backward_flow, reverse
+from aquaflow.prior.fields import pixel_grid, sample
+from aquaflow.prior.refinement import is_refinable, refine
 
 Float = npt.NDArray[np.float32]
 Grey = npt.NDArray[np.uint8]
@@ -108,23 +110,6 @@ def texture(
     return smooth if mask is None else np.where(mask, smooth, np.float32(0.0))
 
 
-def pixel_grid(height: int, width: int) -> Float:
-    """[H, W, 2] pixel centres in this package's convention (+0.5)."""
-    u, v = np.meshgrid(np.arange(width), np.arange(height))
-    return (np.stack([u, v], -1) + 0.5).astype(np.float32)
-
-
-def sample(
-    field: Float,  # [H, W] or [H, W, C]
-    pixels: Float,  # [..., 2] px
-) -> Float:
-    """Bilinear values of ``field`` at ``pixels``; the border is repeated outside."""
-    xy = (pixels - 0.5).astype(np.float32)
-    return np.asarray(
-        cv2.remap(field, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    )
-
-
 def confidence(
     flow: Flow,
 ) -> Float:
@@ -141,7 +126,7 @@ def confidence(
 
 
 class FlowMatcher:
-    """Refined DIS flow both ways from a starting flow, with the forward-backward check."""
+    """Refined DIS flow from a starting flow, and the flow back, with the forward-backward check."""
 
     def __init__(self) -> None:
         # Two, because OpenCV keeps a starting flow for later calls that give none; it even reads
@@ -156,10 +141,10 @@ class FlowMatcher:
         texture_a: Float,  # [H, W]
         texture_b: Float,  # [H, W]
         start: Float | None = None,  # [H, W, 2] px, a to b
-        start_backward: Float | None = None,  # [H, W, 2] px, b to a
     ) -> Flow:
-        forward = self._flow(a, b, start)
-        backward = self._flow(b, a, start_backward)
+        # Where a start is NaN, OpenCV reads outside of the picture and ends the process.
+        start = None if start is None or not np.isfinite(start).all() else start
+        forward, backward = self._both_ways(a, b, start)
         height, width = a.shape
         target = pixel_grid(height, width) + forward
         error = np.linalg.norm(forward + sample(backward, target), axis=-1)
@@ -170,14 +155,25 @@ class FlowMatcher:
         valid = inside & (error < FORWARD_BACKWARD_PX) & textured
         return Flow(forward, backward, error.astype(np.float32), valid)
 
+    def _both_ways(
+        self,
+        a: Grey,  # [H, W]
+        b: Grey,  # [H, W]
+        start: Float | None,  # [H, W, 2] px, a to b
+    ) -> tuple[Float, Float]:
+        if is_refinable(a):
+            forward = refine(a, b, self._flow(a, b, start))
+            return forward, backward_flow(a, b, forward)
+        back = None if start is None else reverse(start)
+        return self._flow(a, b, start), self._flow(b, a, back)
+
     def _flow(
         self,
         a: Grey,  # [H, W]
         b: Grey,  # [H, W]
         start: Float | None,  # [H, W, 2] px, a to b
     ) -> Float:
-        # Where a start is NaN, OpenCV reads outside of the picture and ends the process.
-        if start is None or not np.isfinite(start).all():
-            return refine(a, b, self._unseeded.calc(a, b, None))
+        if start is None:
+            return np.asarray(self._unseeded.calc(a, b, None), dtype=np.float32)
         initial = np.ascontiguousarray(start, dtype=np.float32).copy()
-        return refine(a, b, self._seeded.calc(a, b, initial))
+        return np.asarray(self._seeded.calc(a, b, initial), dtype=np.float32)

@@ -14,6 +14,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior import flow as dense
 from aquaflow.prior import homography as sparse
 from aquaflow.prior.contract import Float, Keypoints, Mask, RangeUnit
+from aquaflow.prior.fields import pixel_grid, sample
 
 
 @dataclass
@@ -66,7 +67,7 @@ class FlowPair:
     @cached_property
     def matches(self) -> Float:
         height, width = self._a.grey.shape
-        return dense.pixel_grid(height, width) + self.flow.forward
+        return pixel_grid(height, width) + self.flow.forward
 
     @property
     def valid(self) -> Mask:
@@ -75,11 +76,11 @@ class FlowPair:
     @cached_property
     def matches_back(self) -> Float:
         height, width = self._b.grey.shape
-        return dense.pixel_grid(height, width) + self.flow.backward
+        return pixel_grid(height, width) + self.flow.backward
 
     @cached_property
     def valid_back(self) -> Mask:
-        back = self.flow.backward + dense.sample(self.flow.forward, self.matches_back)
+        back = self.flow.backward + sample(self.flow.forward, self.matches_back)
         height, width = self._a.grey.shape
         inside = ((self.matches_back > 0.0) & (self.matches_back < (width, height))).all(-1)
         close = np.linalg.norm(back, axis=-1) < dense.OCCLUSION_PX

@@ -32,6 +32,13 @@ SINGULAR = 1e-3
 """Relative damping of the 2 x 2 normal equations: along an edge the flow stays what it was."""
 
 
+def is_refinable(
+    grey: Grey,  # [H, W]
+) -> bool:
+    """True if a window is small against the picture."""
+    return bool(min(grey.shape) >= LEAST_WINDOWS * WINDOW_PX)
+
+
 def refine(
     a: Grey,  # [H, W]
     b: Grey,  # [H, W]
@@ -43,8 +50,6 @@ def refine(
     step in one): noise and blur of either picture then shorten no step, and a to b errs like
     b to a. The warp carries the slope and turn of the flow; a window moves only by the remainder.
     """
-    if min(a.shape) < LEAST_WINDOWS * WINDOW_PX:
-        return flow
     # One array for each coordinate, as OpenCV's gradients and remap want them.
     u, v = flow[..., 0].copy(), flow[..., 1].copy()
     here = _contrast_normalised(a.astype(np.float32))

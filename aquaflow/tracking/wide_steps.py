@@ -12,7 +12,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe
 from aquaflow.prior.contract import Encoding, Prior
-from aquaflow.prior.flow import pixel_grid
+from aquaflow.prior.fields import pixel_grid
 from aquaflow.prior.homography import flow_of_homography, homography
 from aquaflow.tracking.loops.keypoint_poses import keypoint_poses
 from aquaflow.tracking.pose.depth_fusion import fuse

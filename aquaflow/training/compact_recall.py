@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from aquaflow.prior import flow as dense
-from aquaflow.prior.candidates import reverse
 from aquaflow.prior.coarse import coarse_flow
 from aquaflow.prior.compact.export import INPUTS
 from aquaflow.prior.compact.matching import coarse_at, descriptors_at, fine_around
 from aquaflow.prior.compact.network import FINE, Compared, Encoded, cell_rays
+from aquaflow.prior.fields import sample
 from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
 from aquaflow.training.compact_range import Compare, range_error
 from aquaflow.training.correspondences import Correspondences, correspondences
@@ -160,8 +160,7 @@ def _flow(
     matcher: dense.FlowMatcher, a: dense.Grey, b: dense.Grey, start: dense.Float | None
 ) -> dense.Float:
     """[H, W, 2] px"""
-    back = None if start is None else reverse(start)
-    return matcher(a, b, dense.texture(a), dense.texture(b), start, back).forward
+    return matcher(a, b, dense.texture(a), dense.texture(b), start).forward
 
 
 def _moved(
@@ -171,9 +170,7 @@ def _moved(
     """[B, N, 2] px"""
     rows = []
     for places, flow in zip(here, flows, strict=True):
-        step = (
-            0.0 if flow is None else torch.from_numpy(dense.sample(flow, places[None].numpy())[0])
-        )
+        step = 0.0 if flow is None else torch.from_numpy(sample(flow, places[None].numpy())[0])
         rows.append(places + step)
     return torch.stack(rows)
 

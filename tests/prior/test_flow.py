@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from aquaflow.prior.fields import pixel_grid, sample
 from aquaflow.prior.flow import (
     BORDER_PX,
     Flow,
     FlowMatcher,
     confidence,
     normalised_grey,
-    pixel_grid,
-    sample,
 )
 from aquaflow.prior.flow import texture as texture_of
 from tests.prior.textured_pictures import (
@@ -32,8 +31,7 @@ from tests.prior.textured_pictures import (
 
 def flow_between(a: Picture, b: Picture, start: np.ndarray | None = None) -> Flow:
     grey_a, grey_b = normalised_grey(a), normalised_grey(b)
-    back = None if start is None else -start
-    return FlowMatcher()(grey_a, grey_b, texture_of(grey_a), texture_of(grey_b), start, back)
+    return FlowMatcher()(grey_a, grey_b, texture_of(grey_a), texture_of(grey_b), start)
 
 
 @pytest.mark.parametrize("move", [(0.0, 0.0), (0.3, -0.45), (6.4, 3.7), (-14.25, 9.5)])
@@ -131,7 +129,7 @@ def test_a_flow_without_a_start_does_not_remember_an_earlier_one() -> None:
     textures = (texture_of(a), texture_of(b))
     far = np.full((HEIGHT, WIDTH, 2), 40.0, np.float32)
     matcher = FlowMatcher()
-    matcher(a, b, *textures, far, -far)
+    matcher(a, b, *textures, far)
     again = matcher(a, b, *textures)
     assert np.array_equal(again.forward, FlowMatcher()(a, b, *textures).forward)
 

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 from aquaflow.evaluation.prior_bench.pair import FoundMatches, Picture
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.contract import Keypoints, Prior
-from aquaflow.prior.flow import pixel_grid
+from aquaflow.prior.fields import pixel_grid
 from aquaflow.prior.hybrid import HybridEncoding
 from aquaflow.prior.keypoint_networks.keypoint_prior import KeypointEncoding
 from aquaflow.prior.keypoint_networks.network import KeypointNetwork, Size, warm_up

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from aquaflow.prior.contract import Float, Mask
-from aquaflow.prior.flow import pixel_grid, sample
+from aquaflow.prior.fields import pixel_grid, sample
 from aquaflow.prior.homography import MIN_INLIERS, RANSAC_PX, flow_of_homography
 
 CELL_PX = 8

@@ -25,7 +25,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.messages import Frame
 from aquaflow.prior.classical import ClassicalPrior
-from aquaflow.prior.flow import pixel_grid
+from aquaflow.prior.fields import pixel_grid
 from aquaflow.prior.keypoint_networks.keypoint_prior import KeypointPrior
 from aquaflow.sources import open_recording
 from aquaflow.training.pair_generator.cameras import WIDE

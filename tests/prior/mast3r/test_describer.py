@@ -12,6 +12,7 @@ from aquaflow.config.prior import PriorConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior import flow as dense
 from aquaflow.prior.factory import make_prior
+from aquaflow.prior.fields import pixel_grid
 from aquaflow.prior.hybrid import HybridPair, HybridPrior
 from aquaflow.prior.mast3r.describer import CELL_PX, Mast3rDescriber
 from aquaflow.prior.mast3r.export import export
@@ -120,6 +121,6 @@ def test_matches_that_were_predicted_are_not_weighed_and_the_network_is_not_aske
     assert isinstance(prior, HybridPrior)
     monkeypatch.setattr(Mast3rDescriber, "features", None)
     a, b = (prior.encode(picture, TALL) for picture in pictures())
-    predicted = dense.pixel_grid(HEIGHT, WIDTH) + np.float32([0.4 * WIDTH, -20.0])
+    predicted = pixel_grid(HEIGHT, WIDTH) + np.float32([0.4 * WIDTH, -20.0])
     pair = prior.decode(a, b, predicted)
     np.testing.assert_array_equal(pair.C, dense.confidence(pair.flow))

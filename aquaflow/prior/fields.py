@@ -1,0 +1,26 @@
+"""Fields over a picture: pixel centres, and values between them."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+Float = npt.NDArray[np.float32]
+
+
+def pixel_grid(height: int, width: int) -> Float:
+    """[H, W, 2] pixel centres in this package's convention (+0.5)."""
+    u, v = np.meshgrid(np.arange(width), np.arange(height))
+    return (np.stack([u, v], -1) + 0.5).astype(np.float32)
+
+
+def sample(
+    field: Float,  # [H, W] or [H, W, C]
+    pixels: Float,  # [..., 2] px
+) -> Float:
+    """Bilinear values of ``field`` at ``pixels``; the border is repeated outside."""
+    xy = (pixels - 0.5).astype(np.float32)
+    return np.asarray(
+        cv2.remap(field, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    )
