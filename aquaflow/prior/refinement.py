@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.render.library import library_or_none
+
 Float = npt.NDArray[np.float32]
 Grey = npt.NDArray[np.uint8]
 
@@ -31,6 +33,12 @@ MAX_STEP_PX = 1.0
 SINGULAR = 1e-3
 """Relative damping of the 2 x 2 normal equations: along an edge the flow stays what it was."""
 
+_CONTRAST_TAPS = np.full(CONTRAST_WINDOW_PX // 2 + 1, 1.0 / CONTRAST_WINDOW_PX, np.float32)
+_WINDOW_TAPS = np.ascontiguousarray(
+    cv2.getGaussianKernel(WINDOW_PX, WINDOW_SIGMA_PX)[WINDOW_PX // 2 :, 0], np.float32
+)
+"""Weights of both windows along one axis, from the middle outwards."""
+
 
 def is_refinable(
     grey: Grey,  # [H, W]
@@ -40,6 +48,31 @@ def is_refinable(
 
 
 def refine(
+    a: Grey,  # [H, W]
+    b: Grey,  # [H, W]
+    flow: Float,  # [H, W, 2] px, a to b
+) -> Float:
+    """[H, W, 2] as :func:`refine_by_opencv`, in compiled code where there is some."""
+    library = library_or_none()
+    if library is None:
+        return refine_by_opencv(a, b, flow)
+    a, b = np.ascontiguousarray(a), np.ascontiguousarray(b)
+    flow = np.ascontiguousarray(flow, dtype=np.float32)
+    if not (a.dtype == b.dtype == np.uint8 and a.shape == b.shape == flow.shape[:2]):
+        raise ValueError("refine takes two grey pictures and a flow, all of one size")
+    refined = np.empty_like(flow)
+    height, width = a.shape
+    library.call(
+        "aq_refine_flow",
+        *(array.ctypes.data for array in (a, b, flow)), width, height,
+        _CONTRAST_TAPS.ctypes.data, len(_CONTRAST_TAPS) - 1,
+        _WINDOW_TAPS.ctypes.data, len(_WINDOW_TAPS) - 1,
+        GREY_NOISE, MAX_STEP_PX, SINGULAR, refined.ctypes.data,
+    )  # fmt: skip
+    return refined
+
+
+def refine_by_opencv(
     a: Grey,  # [H, W]
     b: Grey,  # [H, W]
     flow: Float,  # [H, W, 2] px, a to b

@@ -33,6 +33,10 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "aq_activate_backward": (_INT, [_POINTER] * 5 + [_INT] * 2 + [_POINTER] * 9),
     "aq_decode_view": (_INT, [_POINTER, _INT] + [_POINTER] * 3),
     "aq_decode_view_backward": (_INT, [_POINTER, _INT, _POINTER]),
+    "aq_refine_flow": (
+        _INT,
+        [_POINTER] * 3 + [_INT] * 2 + [_POINTER, _INT] * 2 + [_FLOAT] * 3 + [_POINTER],
+    ),
     "aq_adam_step": (
         _INT,
         [_INT, _POINTER, _INT] + [_POINTER] * 2 + [_DOUBLE] * 2 + [_FLOAT, _POINTER] + [_INT] * 2,

@@ -6,7 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from aquaflow.prior.refinement import MAX_STEP_PX, Float, Grey, is_refinable, refine
+from aquaflow.prior.refinement import (
+    MAX_STEP_PX,
+    Float,
+    Grey,
+    is_refinable,
+    refine,
+    refine_by_opencv,
+)
 from tests.prior.textured_pictures import (
     HEIGHT,
     WIDTH,
@@ -89,3 +96,24 @@ def test_a_picture_of_few_windows_is_not_refined() -> None:
     a, _ = grey_pair(shift(5.3, -2.6))
     assert is_refinable(a)
     assert not is_refinable(cv2.resize(a, (64, 48)))
+
+
+@pytest.mark.parametrize("size", [(WIDTH, HEIGHT), (97, 61), (8, 5), (1, 1)])
+def test_compiled_code_refines_as_opencv_does(size: tuple[int, int]) -> None:
+    a, b = (cv2.resize(grey, size) for grey in grey_pair(ZOOM))
+    flow = cv2.resize(true_flow(ZOOM) + wavy_error(1.5), size)
+    expected = refine_by_opencv(a, b, flow)
+    np.testing.assert_allclose(refine(a, b, flow), expected, atol=2e-3)
+
+
+@pytest.mark.parametrize("wild", [np.nan, np.inf, -np.inf, 1e30])
+def test_a_flow_that_is_no_number_reads_nothing_outside_of_the_pictures(wild: float) -> None:
+    a, b = grey_pair(ZOOM)
+    flow = np.full((HEIGHT, WIDTH, 2), wild, np.float32)
+    assert refine(a, b, flow).shape == flow.shape
+
+
+def test_pictures_of_two_sizes_are_refused() -> None:
+    a, b = grey_pair(ZOOM)
+    with pytest.raises(ValueError, match="one size"):
+        refine(a, b[1:], true_flow(ZOOM))

@@ -19,6 +19,7 @@
 #include "pool.h"
 #include "project.h"
 #include "project_backward.h"
+#include "refine_flow.h"
 #include "tiles.h"
 
 #ifndef AQ_SOURCE_HASH
@@ -195,6 +196,26 @@ AQ_EXPORT int aq_decode_view_backward(const DecoderView* in, int threads,
                                       const DecoderGradients* out) {
   return guarded(
       [&] { decode_view_backward(*in, std::min(std::max(threads, 1), kMaxThreads), *out); });
+}
+
+// See refine_flow.h: the flow [H, W, 2] from a to b, moved to where b fits best.
+AQ_EXPORT int aq_refine_flow(const uint8_t* a, const uint8_t* b, const float* flow, int width,
+                             int height, const float* contrast, int contrast_radius,
+                             const float* window, int window_radius, float grey_noise,
+                             float most_step_px, float singular, float* out) {
+  return guarded([&] {
+    static thread_local FlowRefiner refiner;  // its planes are as large as the pictures
+    refiner.run({a,
+                 b,
+                 flow,
+                 {width, height},
+                 {contrast, contrast_radius},
+                 {window, window_radius},
+                 grey_noise,
+                 most_step_px,
+                 singular},
+                out);
+  });
 }
 
 // See adam.h. Returns the number of visible rows skipped for a non-finite gradient.
