@@ -49,13 +49,16 @@ def backward_flow(
     for _ in range(HALVINGS):
         finer_b, finer_a = pictures[-1]
         pictures.append((_halved(finer_b), _halved(finer_a)))
-    flow = reverse(forward)
+    # What is finer than the coarsest picture is found anew in the finer ones.
+    flow = reverse(_of_size(forward, pictures[-1][0].shape))
     for coarse_b, coarse_a in reversed(pictures):
         flow = refine(coarse_b, coarse_a, _of_size(flow, coarse_b.shape))
     return flow
 
 
-def _halved(grey: Grey) -> Grey:
+def _halved(
+    grey: Grey,  # [H, W]
+) -> Grey:
     return np.asarray(cv2.pyrDown(grey), dtype=np.uint8)
 
 
@@ -65,5 +68,7 @@ def _of_size(
 ) -> Float:
     """The flow of a picture of another size, in that one's pixels."""
     height, width = shape
+    if flow.shape[:2] == shape:
+        return flow
     growth = np.array([width / flow.shape[1], height / flow.shape[0]], np.float32)
     return np.asarray(cv2.resize(flow, (width, height)) * growth, dtype=np.float32)

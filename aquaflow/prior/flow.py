@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.prior.backward_flow import backward_flow, reverse
-from aquaflow.prior.fields import pixel_grid, sample
+from aquaflow.prior.fields import length, pixel_grid, sample
 from aquaflow.prior.refinement import is_refinable, refine
 
 Float = npt.NDArray[np.float32]
@@ -147,13 +147,13 @@ class FlowMatcher:
         forward, backward = self._both_ways(a, b, start)
         height, width = a.shape
         target = pixel_grid(height, width) + forward
-        error = np.linalg.norm(forward + sample(backward, target), axis=-1)
+        error = length(forward + sample(backward, target))
         inside = (target[..., 0] > BORDER_PX) & (target[..., 0] < width - BORDER_PX)
         inside &= (target[..., 1] > BORDER_PX) & (target[..., 1] < height - BORDER_PX)
         # Both ends: onto a black picture DIS flows nowhere, and comes back from there exactly.
         textured = (texture_a > MIN_TEXTURE) & (sample(texture_b, target) > MIN_TEXTURE)
         valid = inside & (error < FORWARD_BACKWARD_PX) & textured
-        return Flow(forward, backward, error.astype(np.float32), valid)
+        return Flow(forward, backward, error, valid)
 
     def _both_ways(
         self,

@@ -14,7 +14,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior import flow as dense
 from aquaflow.prior import homography as sparse
 from aquaflow.prior.contract import Float, Keypoints, Mask, RangeUnit
-from aquaflow.prior.fields import pixel_grid, sample
+from aquaflow.prior.fields import length, pixel_grid, sample
 
 
 @dataclass
@@ -83,7 +83,7 @@ class FlowPair:
         back = self.flow.backward + sample(self.flow.forward, self.matches_back)
         height, width = self._a.grey.shape
         inside = ((self.matches_back > 0.0) & (self.matches_back < (width, height))).all(-1)
-        close = np.linalg.norm(back, axis=-1) < dense.OCCLUSION_PX
+        close = length(back) < dense.OCCLUSION_PX
         return np.asarray(inside & close)
 
     @cached_property

@@ -33,6 +33,7 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "aq_activate_backward": (_INT, [_POINTER] * 5 + [_INT] * 2 + [_POINTER] * 9),
     "aq_decode_view": (_INT, [_POINTER, _INT] + [_POINTER] * 3),
     "aq_decode_view_backward": (_INT, [_POINTER, _INT, _POINTER]),
+    "aq_fuse_depths": (_INT, [_POINTER]),
     "aq_refine_flow": (
         _INT,
         [_POINTER] * 3 + [_INT] * 2 + [_POINTER, _INT] * 2 + [_FLOAT] * 3 + [_POINTER],
@@ -43,6 +44,8 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     ),
 }
 """Result and parameters of each function of the library."""
+_COUNTING = {"aq_adam_step", "aq_fuse_depths"}
+"""Functions whose result is a count; they need no memory of their own."""
 _BUILD_LOCK = threading.Lock()
 """One thread builds; the others wait for its library."""
 
@@ -67,9 +70,9 @@ class Library:
             function.argtypes = arguments
 
     def call(self, name: str, *arguments: object) -> int:
-        """Run a kernel that reports its status; MemoryError when it ran out of memory."""
+        """Run a kernel: the count that it returns, or 0; MemoryError when it ran out of memory."""
         status = int(getattr(self._dll, name)(*arguments))
-        if name != "aq_adam_step" and status != 0:
+        if name not in _COUNTING and status != 0:
             raise MemoryError(f"{name} ran out of memory")
         return status
 

@@ -14,6 +14,7 @@
 #include "context.h"
 #include "decode_view.h"
 #include "decode_view_backward.h"
+#include "fuse_depths.h"
 #include "image_formation.h"
 #include "photometric.h"
 #include "pool.h"
@@ -217,6 +218,9 @@ AQ_EXPORT int aq_refine_flow(const uint8_t* a, const uint8_t* b, const float* fl
                 out);
   });
 }
+
+// See fuse_depths.h. Returns the number of pixels with a usable measurement.
+AQ_EXPORT int aq_fuse_depths(const FuseDepths* in) { return fuse_depths(*in); }
 
 // See adam.h. Returns the number of visible rows skipped for a non-finite gradient.
 AQ_EXPORT int aq_adam_step(int groups, const AdamGroup* group, int rows, const uint8_t* visible,

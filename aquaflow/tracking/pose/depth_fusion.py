@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import ctypes
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.geometry.triangulation import triangulate
+from aquaflow.geometry.triangulation import (
+    MAX_REPROJECTION_PX,
+    MAX_RHO,
+    MIN_CROSS_SQ,
+    MIN_DEPTH,
+    MIN_PARALLAX_RAD,
+    MIN_RHO,
+    triangulate,
+)
 from aquaflow.keyframes import UNKNOWN_VARIANCE, Pointmap
 from aquaflow.prior.contract import PairGeometry
+from aquaflow.render.library import Library, library_or_none
 
 Array = npt.NDArray[np.float64]
 
@@ -41,6 +53,40 @@ FORGETTING_VARIANCE_SIGMAS = 0.5
 measurement."""
 
 
+_CONSTANTS = {
+    "min_rho": MIN_RHO,
+    "max_rho": MAX_RHO,
+    "min_depth": MIN_DEPTH,
+    "max_reprojection_px": MAX_REPROJECTION_PX,
+    "min_cross_sq": MIN_CROSS_SQ,
+    "min_sine": float(np.sin(MIN_PARALLAX_RAD)),
+    "unknown_variance": UNKNOWN_VARIANCE,
+    "least_confidence": LEAST_CONFIDENCE,
+    "measurement_floor": MEASUREMENT_FLOOR,
+    "fused_floor": FUSED_FLOOR,
+    "gate_sigmas": GATE_SIGMAS,
+    "disagreement_inflation": DISAGREEMENT_INFLATION,
+    "forgetting_sigmas": FORGETTING_VARIANCE_SIGMAS,
+}
+"""In the order of ``FuseDepths`` of native/fuse_depths.h."""
+
+
+class _NativeFusion(ctypes.Structure):
+    """``FuseDepths`` of native/fuse_depths.h."""
+
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("matches", "valid", "confidence")),
+        *((name, ctypes.c_void_p) for name in ("rho", "variance")),
+        *((name, ctypes.c_int32) for name in ("width", "height")),
+        *((f"{name}_a", ctypes.c_double) for name in ("fx", "fy", "cx", "cy")),
+        *((f"{name}_b", ctypes.c_double) for name in ("fx", "fy", "cx", "cy")),
+        ("R", ctypes.c_double * 9),
+        ("t", ctypes.c_double * 3),
+        ("sigma_px", ctypes.c_double),
+        *((name, ctypes.c_double) for name in _CONSTANTS),
+    )
+
+
 def fuse(
     pointmap: Pointmap,
     pair: PairGeometry,
@@ -56,9 +102,25 @@ def fuse(
     if pointmap.fused >= MOST_FUSED:
         return 0.0
     pointmap.fused += 1
+    library = library_or_none()
+    if library is None:
+        measured = fuse_by_numpy(pointmap, pair, T_ba, camera_b, sigma_px)
+    else:
+        measured = fuse_compiled(library, pointmap, pair, T_ba, camera_b, sigma_px)
+    return measured / pointmap.camera.width / pointmap.camera.height
+
+
+def fuse_by_numpy(
+    pointmap: Pointmap,
+    pair: PairGeometry,
+    T_ba: Sim3,
+    camera_b: CameraModel,
+    sigma_px: float,
+) -> int:
+    """As :func:`fuse`, readable; returns how many pixels got a usable measurement."""
     rows, columns = np.nonzero(pair.valid)
     if len(rows) == 0:
-        return 0.0
+        return 0
     camera = pointmap.camera
     rays = camera.unproject(np.stack([columns + 0.5, rows + 0.5], -1))
     matched = pair.matches[rows, columns].astype(np.float64)
@@ -86,7 +148,41 @@ def fuse(
     pointmap.rho[rows, columns] = np.where(use, merged, old_rho)
     kept = np.where(distrust, old_variance * DISAGREEMENT_INFLATION, old_variance)
     pointmap.variance[rows, columns] = np.where(use, merged_variance, kept)
-    return float(new.good.sum()) / camera.width / camera.height
+    return int(new.good.sum())
+
+
+def fuse_compiled(
+    library: Library,
+    pointmap: Pointmap,
+    pair: PairGeometry,
+    T_ba: Sim3,
+    camera_b: CameraModel,
+    sigma_px: float,
+) -> int:
+    """As :func:`fuse_by_numpy`, in a tenth of the time (native/fuse_depths.h)."""
+    camera, shape = pointmap.camera, pointmap.rho.shape
+    pointmap.rho = np.ascontiguousarray(pointmap.rho, np.float64)
+    pointmap.variance = np.ascontiguousarray(pointmap.variance, np.float64)
+    in_order: dict[str, npt.NDArray[Any]] = {
+        "matches": np.ascontiguousarray(pair.matches, np.float32),
+        "valid": np.ascontiguousarray(pair.valid, np.bool_),
+        "confidence": np.ascontiguousarray(pair.C, np.float32),
+        "rho": pointmap.rho,
+        "variance": pointmap.variance,
+    }
+    for name, array in in_order.items():
+        if array.shape[:2] != shape:
+            raise ValueError(f"{name} is {array.shape}, and the pointmap {shape}")
+    given = _NativeFusion(**{name: array.ctypes.data for name, array in in_order.items()})
+    given.height, given.width = shape
+    for of, each in (("a", camera), ("b", camera_b)):
+        for name in ("fx", "fy", "cx", "cy"):
+            setattr(given, f"{name}_{of}", getattr(each, name))
+    given.R[:], given.t[:] = T_ba.R.reshape(-1), T_ba.in_source_unit().t
+    given.sigma_px = sigma_px
+    for name, constant in _CONSTANTS.items():
+        setattr(given, name, constant)
+    return library.call("aq_fuse_depths", ctypes.byref(given))
 
 
 def transfer(

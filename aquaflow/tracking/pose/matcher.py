@@ -157,7 +157,9 @@ def matched_share(encoding: Encoding, pair: PairGeometry) -> float:
     """min(valid matches, distinct matched pixels) over the sampled pixels (docs/paper.md)."""
     looked_at = encoding.interesting
     matched = looked_at & pair.valid
-    targets = np.floor(pair.matches[matched]).astype(np.int64)
-    hit = np.zeros_like(looked_at)
-    hit[targets[:, 1], targets[:, 0]] = True
-    return min(int(matched.sum()), int(hit.sum())) / max(int(looked_at.sum()), 1)
+    column, row = np.moveaxis(pair.matches, -1, 0)
+    targets = row[matched].astype(np.int32) * looked_at.shape[1] + column[matched].astype(np.int32)
+    hit = np.zeros(looked_at.size, bool)
+    hit[targets] = True
+    matches, pixels, all_pixels = (int(np.count_nonzero(m)) for m in (matched, hit, looked_at))
+    return min(matches, pixels) / max(all_pixels, 1)

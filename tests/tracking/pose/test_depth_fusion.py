@@ -10,6 +10,8 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.triangulation import triangulate
 from aquaflow.keyframes import UNKNOWN_VARIANCE, KeyframeStore, Pointmap
+from aquaflow.render.library import load_library
+from aquaflow.tracking.pose import depth_fusion
 from aquaflow.tracking.pose.depth_fusion import (
     DISAGREEMENT_INFLATION,
     FUSED_FLOOR,
@@ -18,6 +20,8 @@ from aquaflow.tracking.pose.depth_fusion import (
     MOST_FUSED,
     TRANSFER_INFLATION,
     fuse,
+    fuse_by_numpy,
+    fuse_compiled,
     transfer,
 )
 from tests.tracking.tracking_scenes import KnownPair, KnownView, depth_map, pose
@@ -70,6 +74,39 @@ def first() -> tuple[Array, Array, npt.NDArray[np.bool_]]:
 
 
 Measured = tuple[Array, Array, npt.NDArray[np.bool_]]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_compiled_code_fuses_as_numpy_does(seed: int) -> None:
+    """Over depths of every kind: unknown, distrusted, right, wrong; and matches of every kind."""
+    random, pair = np.random.default_rng(seed), two_views(noise_px=0.3)
+    shape = DEPTH.shape
+    rho = np.where(random.random(shape) < 0.2, 0.0, random.lognormal(0.0, 0.2, shape) / DEPTH)
+    variance = (random.choice([0.003, 0.05, 0.4, 2.0], shape) * rho) ** 2
+    variance = np.where(random.random(shape) < 0.2, UNKNOWN_VARIANCE, variance)
+    pair.matches[random.random(shape) < 0.05] = np.nan
+    pair.matches[random.random(shape) < 0.05] += 40.0
+    by_numpy, compiled = (Pointmap(SMALL, rho.copy(), variance.copy()) for _ in range(2))
+    arguments = (pair, T_BA, SMALL, SIGMA_PX)
+    with np.errstate(invalid="ignore"):
+        expected = fuse_by_numpy(by_numpy, *arguments)
+    assert fuse_compiled(load_library(), compiled, *arguments) == expected
+    np.testing.assert_allclose(compiled.rho, by_numpy.rho, rtol=1e-9)
+    np.testing.assert_allclose(compiled.variance, by_numpy.variance, rtol=1e-9)
+    assert (compiled.rho != rho).mean() > 0.3
+
+
+def test_without_compiled_code_depths_are_fused_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    with_it = fused_with(1.0 / DEPTH, (0.1 / DEPTH) ** 2)
+    monkeypatch.setattr(depth_fusion, "library_or_none", lambda: None)
+    without = fused_with(1.0 / DEPTH, (0.1 / DEPTH) ** 2)
+    np.testing.assert_allclose(without.rho, with_it.rho, rtol=1e-9)
+
+
+def test_matches_of_another_picture_are_refused() -> None:
+    other = Pointmap.unknown(CameraModel(30, 45, 50.0, 50.0, 15.0, 22.5))
+    with pytest.raises(ValueError, match="matches is"):
+        fuse(other, two_views(), T_BA, SMALL, SIGMA_PX)
 
 
 def test_a_first_measurement_is_taken_as_it_is(first: Measured) -> None:
