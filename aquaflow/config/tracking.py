@@ -364,6 +364,15 @@ class TrackingConfig(Stage):
         lt=1,
         description="matched share down to which a keyframe stays in use in a crowded place",
     )
+    crowd_look_s: float = Field(
+        1.0,
+        ge=0,
+        description="s; in a crowded place another keyframe is looked for so often at most; 0: at "
+        "every frame, and the reef swum there and back takes 140 instead of 60 ms a frame there",
+    )
+    crowd_look_loss: float = Field(
+        0.05, gt=0, le=1, description="or when the matched share has fallen by so much"
+    )
     mapping_parallax_widths: float = Field(
         30.0 / 512.0, gt=0, description="tau_mapframe over width; paper: 30 px at 512 px"
     )

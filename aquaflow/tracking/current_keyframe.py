@@ -51,6 +51,9 @@ class CurrentKeyframe:
     """[H, W, 2] px of the last frame: where the next one's are looked for."""
     t_ns: int = 0
     """Moment of the last frame."""
+    kept: tuple[int, float] | None = None
+    """Moment, and matched share, when it last stayed in use in a crowded place, for no other
+    keyframe showed more."""
     mapped_parallax_px: float = 0.0
     """Parallax of the last frame that went into the map."""
 
@@ -265,6 +268,8 @@ class KeyframeTracker:
         graph does not know to be the same, a new keyframe closes the loop.
         """
         config = self._config
+        if self._looked_already(at, solved):
+            return at, solved
         around = self.neighbours.around(at.T_wc, camera, at.keyframe.sub_map, at.keyframe)
         crowded = len(around) >= config.crowd
         best, least = None, solved.share if crowded else config.return_share
@@ -277,7 +282,23 @@ class KeyframeTracker:
         if best is not None:
             self.take_up(best[0])
             return best
-        return (at, solved) if crowded and solved.share >= config.crowd_share else None
+        if not crowded or solved.share < config.crowd_share:
+            return None
+        at.kept = at.t_ns, solved.share
+        return at, solved
+
+    def _looked_already(self, at: CurrentKeyframe, solved: Matched) -> bool:
+        """True if no other keyframe showed more a moment ago: to look costs as much as tracking
+        two or three frames."""
+        if at.kept is None:
+            return False
+        since_ns, share = at.t_ns - at.kept[0], at.kept[1]
+        config = self._config
+        return (
+            since_ns < 1e9 * config.crowd_look_s
+            and solved.share > share - config.crowd_look_loss
+            and solved.share >= config.crowd_share
+        )
 
     def take_up(self, back: CurrentKeyframe) -> None:
         """Hold an earlier keyframe in memory: tracking goes on there."""

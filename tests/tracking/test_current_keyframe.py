@@ -127,6 +127,16 @@ def test_a_place_that_has_keyframes_enough_gets_no_more() -> None:
     assert len([index for index in made[3] if index > 190]) <= 1
 
 
+def test_a_crowded_place_is_not_searched_anew_at_every_frame() -> None:
+    poses, looks = wander(120), {}
+    for look_s in (0.0, 1.0):
+        prior = told(poses)
+        result = run(prior.frames(SMALL), QUICK.model_copy(update={"crowd_look_s": look_s}), prior)
+        assert error_share(result.tracked, poses) < 0.005
+        looks[look_s] = len(prior.predictions) - len(poses)
+    assert looks[1.0] < 0.7 * looks[0.0]
+
+
 def test_keyframes_of_slightly_other_scale_leave_the_frames_their_own(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
