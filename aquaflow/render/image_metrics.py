@@ -49,13 +49,27 @@ def ssim(
     image: Image,  # [H, W, 3] in [0, 1]
     reference: Image,  # [H, W, 3] in [0, 1]
 ) -> float:
-    """Structural similarity as the mapper's loss defines it: 11 x 11 Gaussian, zeros outside."""
-    import torch
+    """Structural similarity as the mapper's loss defines it (Wang et al. 2004): 11 x 11 Gaussian,
+    zeros outside; by OpenCV, which takes a tenth of the time of torch's convolutions."""
+    import cv2
 
-    from aquaflow.render.photometric import ssim as similarity
+    from aquaflow.render.photometric import SSIM_C1, SSIM_C2, SSIM_SIGMA_PX, SSIM_WINDOW
 
-    x, y = (torch.from_numpy(picture.astype(np.float64)) for picture in (image, reference))
-    return float(similarity(x, y))
+    window = cv2.getGaussianKernel(SSIM_WINDOW, SSIM_SIGMA_PX)
+
+    def window_mean(picture: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        filtered = cv2.sepFilter2D(
+            picture, cv2.CV_64F, window, window, borderType=cv2.BORDER_CONSTANT
+        )
+        return np.asarray(filtered, dtype=np.float64)
+
+    a, b = image.astype(np.float64), reference.astype(np.float64)
+    mu_a, mu_b = window_mean(a), window_mean(b)
+    both = mu_a * mu_a + mu_b * mu_b
+    variances = window_mean(a * a + b * b) - both
+    covariance = window_mean(a * b) - mu_a * mu_b
+    luminance = (2.0 * mu_a * mu_b + SSIM_C1) / (both + SSIM_C1)
+    return float((luminance * (2.0 * covariance + SSIM_C2) / (variances + SSIM_C2)).mean())
 
 
 def lpips(
