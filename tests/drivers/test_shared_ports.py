@@ -81,8 +81,10 @@ def test_four_simulated_devices_on_one_port_are_heard_as_if_each_had_its_own():
     devices = {"autopilot": AUTOPILOT, "dvl": {"kind": "pd0"}, "compass": COMPASS, "sonar": SONAR}
     telemetry = LinkTelemetry(parse_telemetry(config(port, **devices), "test"))
     protocols: list[Any] = [ArduSub(), Pd0Dvl(), NmeaTalker()]
+    # UDP loses what finds no room: the kernel's buffer has some 250 datagrams of all four together,
+    # and a busy machine may not read for a second.
     talkers = [
-        SimulatedDevice(each, UdpWire(("127.0.0.1", port)), motion(), 4.0) for each in protocols
+        SimulatedDevice(each, UdpWire(("127.0.0.1", port)), motion(), 1.0) for each in protocols
     ]
     ping = UdpWire(("127.0.0.1", port))
     until(lambda: all(link.is_open for link in telemetry.links.values()))
@@ -92,7 +94,7 @@ def test_four_simulated_devices_on_one_port_are_heard_as_if_each_had_its_own():
     counted = telemetry.counters()
     for k in range(919):
         ping.send(distance(100 + k))
-        until(lambda k=k: counted["sonar"].samples > k - 50)  # the kernel's buffer is small
+        until(lambda k=k: counted["sonar"].samples > k - 10)
     until(lambda: all(talker.finished.is_set() for talker in talkers))
     until(lambda: counted["autopilot"].messages >= talkers[0].sent)
     until(lambda: counted["dvl"].messages >= 20 and counted["sonar"].samples == 919)
