@@ -5,6 +5,7 @@
 //   kernel_driver --out-of-memory SCENE RESULT   every allocation fails once before it succeeds
 #include "aquaflow_native.cpp"
 
+#include <cmath>
 #include <cstddef>
 #include <cstdio>
 #include <cstdlib>
@@ -163,12 +164,70 @@ static void draw(const Scene& s, bool short_of_memory, std::FILE* result) {
     write(*values);
 }
 
+// The kernels of dense matching, on pictures and flows of the scene's size; numbers of every kind.
+static void match(const Scene& s, bool short_of_memory) {
+  const size_t pixels = (size_t)s.width * s.height;
+  const Floats wild{0.3f, -2.5f, 1e30f, NAN, 7.0f, INFINITY, -INFINITY, -0.0f, 1e-40f};
+  std::vector<uint8_t> a(pixels), b(pixels), valid(pixels);
+  Floats flow(2 * pixels), refined(2 * pixels), confidence(pixels);
+  std::vector<double> rho(pixels), variance(pixels);
+  for (size_t i = 0; i < pixels; i++) {
+    a[i] = (uint8_t)(255.0f * s[s.kTarget][3 * i]);
+    b[i] = (uint8_t)(255.0f * s[s.kTarget][3 * i + 1]);
+    valid[i] = i % 5 != 0;
+    confidence[i] = wild[i % wild.size()];
+    rho[i] = wild[(i / 2) % wild.size()];
+    variance[i] = wild[(i / 3) % wild.size()];
+  }
+  for (size_t i = 0; i < flow.size(); i++) flow[i] = wild[i % wild.size()];
+  const Floats contrast(8, 1.0f / 15.0f), window(7, 1.0f / 13.0f);
+  run(short_of_memory, [&] {
+    return aq_refine_flow(a.data(), b.data(), flow.data(), s.width, s.height, contrast.data(), 7,
+                          window.data(), 6, 2.0f, 1.0f, 1e-3f, refined.data());
+  });
+  const FuseDepths in{flow.data(),
+                      valid.data(),
+                      confidence.data(),
+                      rho.data(),
+                      variance.data(),
+                      s.width,
+                      s.height,
+                      50.0,
+                      50.0,
+                      26.0,
+                      20.0,
+                      50.0,
+                      50.0,
+                      26.0,
+                      20.0,
+                      {1, 0, 0, 0, 1, 0, 0, 0, 1},
+                      {0.1, 0.0, 0.02},
+                      0.5,
+                      1e-9,
+                      1e6,
+                      1e-3,
+                      1.5,
+                      1e-12,
+                      2.6e-3,
+                      1e6,
+                      0.005,
+                      0.01,
+                      0.003,
+                      3.0,
+                      1.3,
+                      0.5};
+  const int measured = aq_fuse_depths(&in);
+  if (measured < 0 || (size_t)measured > pixels) std::exit(4);
+}
+
 int main(int count, char** arguments) {
   const bool short_of_memory = count > 1 && std::string(arguments[1]) == "--out-of-memory";
   for (int i = short_of_memory ? 2 : 1; i + 1 < count; i += 2) {
     std::FILE* result = std::fopen(arguments[i + 1], "wb");
     if (!result) return std::perror(arguments[i + 1]), 2;
-    draw(Scene(arguments[i]), short_of_memory, result);
+    const Scene scene(arguments[i]);
+    draw(scene, short_of_memory, result);
+    match(scene, short_of_memory);
     std::fclose(result);
   }
 }
