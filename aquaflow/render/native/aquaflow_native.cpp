@@ -1,7 +1,9 @@
-// AquaFlow's CPU kernels behind a plain C ABI: Gaussian rasteriser, L1 + SSIM, selective Adam.
+// AquaFlow's CPU kernels behind a plain C ABI: Gaussian rasteriser, L1 + SSIM, selective Adam, and
+// the dense parts of tracking.
 //
-// No torch or Python headers: the library serves every version of both. All arrays are contiguous
-// float32 in row-major order. Functions return 0, or 1 when memory ran out.
+// No torch or Python headers: the library serves every version of both. All arrays are contiguous,
+// in row-major order, and float32 where nothing else is said. Functions return 0, or 1 when memory
+// ran out.
 #include <algorithm>
 #include <cstdint>
 #include <new>
