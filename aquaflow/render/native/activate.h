@@ -10,9 +10,9 @@
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
-#include <cstring>
 
 #include "constants.h"
+#include "exponential.h"
 #include "pool.h"
 
 namespace aq {
@@ -24,19 +24,7 @@ constexpr int kActivated = 64;          // numbers in a block
 // exp(x), relative error 2e-7 within the limits above, which x is clamped to.
 inline float exp_of(float x) {
   const float y = kLog2e * std::min(std::max(x, -kMostExponent), kMostExponent);
-  const int n = (int)(y + (y < 0.0f ? -0.5f : 0.5f));
-  const float f = y - (float)n;
-  float p = 1.5403530e-4f;
-  p = p * f + 1.3333558e-3f;
-  p = p * f + 9.6181291e-3f;
-  p = p * f + 5.5504109e-2f;
-  p = p * f + 2.4022651e-1f;
-  p = p * f + 6.9314718e-1f;
-  p = p * f + 1.0f;
-  const int bits = (n + 127) << 23;
-  float power;
-  std::memcpy(&power, &bits, sizeof power);
-  return p * power;
+  return two_to(y, (int)(y + (y < 0.0f ? -0.5f : 0.5f)));
 }
 
 // log(1 + u) for 0 <= u <= 1, relative error 2e-7: the series of 2 atanh(u / (2 + u)).

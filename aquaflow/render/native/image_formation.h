@@ -9,10 +9,10 @@
 
 #include <algorithm>
 #include <cstddef>
-#include <cstring>
 #include <vector>
 
 #include "constants.h"
+#include "exponential.h"
 #include "pool.h"
 
 namespace aq {
@@ -24,23 +24,10 @@ constexpr int kWater = 15, kBlock = 64;
 // Each [3] RGB, in this order.
 enum WaterRow { kBeta, kBInf, kScatter, kBRes, kDecay };
 
-// exp(-x) for 0 <= x <= kMaxOpticalDepth, relative error 2e-7: 2^n by the exponent bits, the rest
-// by the Taylor series of 2^f on [-1/2, 1/2].
+// exp(-x) for 0 <= x <= kMaxOpticalDepth, relative error 2e-7.
 inline float exp_negative(float x) {
   const float y = -kLog2e * x;
-  const int n = (int)(y - 0.5f);
-  const float f = y - (float)n;
-  float p = 1.5403530e-4f;
-  p = p * f + 1.3333558e-3f;
-  p = p * f + 9.6181291e-3f;
-  p = p * f + 5.5504109e-2f;
-  p = p * f + 2.4022651e-1f;
-  p = p * f + 6.9314718e-1f;
-  p = p * f + 1.0f;
-  const int bits = (n + 127) << 23;
-  float power;
-  std::memcpy(&power, &bits, sizeof power);
-  return p * power;
+  return two_to(y, (int)(y - 0.5f));
 }
 
 struct WaterBlock {
