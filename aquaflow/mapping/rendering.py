@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from aquaflow.mapping.views import View
 from aquaflow.mapping.water.image_formation import Water
 from aquaflow.render.activation import activate
-from aquaflow.render.contract import Renderer, Rendering
+from aquaflow.render.contract import Renderer
 from aquaflow.render.water import MIN_SOLID, compose_water
 
 
@@ -70,25 +69,10 @@ def show(
     )
     clean = drawn.image[..., :3]
     if water is None:
-        image, z = clean, drawn.image[..., 3] / drawn.alpha.clamp_min(MIN_SOLID)
+        z = drawn.image[..., 3] / drawn.alpha.clamp_min(MIN_SOLID)
+        image = clean if gain is None else clean * gain[..., None]
     else:
-        image, z = _through(water, uneven, drawn, renderer)
-    if gain is not None:
-        image = image * gain[..., None]
+        image, z = compose_water(
+            drawn.image, drawn.alpha, water.stacked(), renderer.threads, uneven, gain
+        )
     return Shown(image, clean, drawn.alpha, z, drawn.visible, drawn.radius_px, active)
-
-
-def _through(
-    water: Water,
-    uneven: Tensor | None,  # [H, W]
-    drawn: Rendering,
-    renderer: Renderer,
-) -> tuple[Tensor, Tensor]:
-    """Image [H, W, 3] and range [H, W]."""
-    if uneven is None:
-        return compose_water(drawn.image, drawn.alpha, water.stacked(), renderer.threads)
-    # J T + u B = u (J / u T + B)
-    u = uneven[..., None]
-    lit = torch.cat([drawn.image[..., :3] / u, drawn.image[..., 3:]], dim=-1)
-    image, z = compose_water(lit, drawn.alpha, water.stacked(), renderer.threads)
-    return image * u, z

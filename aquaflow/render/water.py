@@ -1,9 +1,10 @@
 """The picture through the water, fused with its gradient (paper, Eq. 12 and 15).
 
-    I = J exp(-beta z) + a (B_inf (1 - exp(-b z)) + B_res exp(-d z)) + (1 - a) B_inf
+    I = s (J exp(-beta z) + u (a (B_inf (1 - exp(-b z)) + B_res exp(-d z)) + (1 - a) B_inf))
 
 J is premultiplied by alpha a. Where the map has no geometry the ray goes on to infinity, and what
-it sees there is B_inf; where a = 1 this is the paper's equation.
+it sees there is B_inf. The paper has no gains: u of the backscatter and s of the camera, at every
+pixel; where all three are one this is the paper's equation.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ def compose_water_torch(
     drawn: Tensor,  # [H, W, 4] premultiplied radiance and accumulated range
     alpha: Tensor,  # [H, W]
     water: Tensor,  # [5, 3] beta, B_inf, b, B_res, d
+    uneven: Tensor | None = None,  # [H, W]
+    gain: Tensor | None = None,  # [H, W]
 ) -> tuple[Tensor, Tensor]:
     """The definition, in the inputs' dtype: oracle and fallback. Image [H, W, 3], range [H, W]."""
     beta, B_inf, b, B_res, d = water
@@ -35,8 +38,9 @@ def compose_water_torch(
     T, far, near = (
         torch.exp(-(rate * path).clamp(0.0, MAX_OPTICAL_DEPTH)) for rate in (beta, b, d)
     )
-    image = drawn[..., :3] * T + B_inf * (1.0 - a * far) + a * B_res * near
-    return image, z
+    veil = B_inf * (1.0 - a * far) + a * B_res * near
+    image = drawn[..., :3] * T + (veil if uneven is None else uneven[..., None] * veil)
+    return (image if gain is None else gain[..., None] * image), z
 
 
 def compose_water(
@@ -44,15 +48,27 @@ def compose_water(
     alpha: Tensor,  # [H, W]
     water: Tensor,  # [5, 3] beta, B_inf, b, B_res, d; rates per unit of range
     threads: int | None = None,
+    uneven: Tensor | None = None,  # [H, W] gain of the backscatter; None: one
+    gain: Tensor | None = None,  # [H, W] gain of the camera; None: one
 ) -> tuple[Tensor, Tensor]:
-    """Image [H, W, 3] through the water and range [H, W]; differentiable in all three inputs."""
+    """Image [H, W, 3] through the water and range [H, W]; differentiable in the first three."""
+    gains = [None if plane is None else plane.detach() for plane in (uneven, gain)]
     library = library_or_none() if drawn.device.type == "cpu" else None
     if library is None:
-        return compose_water_torch(drawn, alpha, water)
+        return compose_water_torch(drawn, alpha, water, *gains)
     threads = threads if threads is not None else torch.get_num_threads()
-    plain = [tensor.to(torch.float32).contiguous() for tensor in (drawn, alpha, water)]
+    plain = [
+        None if tensor is None else tensor.to(torch.float32).contiguous()
+        for tensor in (drawn, alpha, water, *gains)
+    ]
     image, z = _ComposeWater.apply(*plain, threads, library)  # type: ignore[no-untyped-call]
     return image, z
+
+
+def _address(
+    plane: Tensor | None,  # [H, W]
+) -> int | None:
+    return None if plane is None else pointer(plane)
 
 
 class _ComposeWater(torch.autograd.Function):
@@ -62,14 +78,17 @@ class _ComposeWater(torch.autograd.Function):
         drawn: Tensor,  # [H, W, 4] premultiplied colour and range
         alpha: Tensor,  # [H, W]
         water: Tensor,  # [5, 3]
+        uneven: Tensor | None,  # [H, W]
+        gain: Tensor | None,  # [H, W]
         threads: int,
         library: Library,
     ) -> tuple[Tensor, Tensor]:
         height, width = alpha.shape
         image, z = torch.empty(height, width, 3), torch.empty(height, width)
-        inputs = (pointer(drawn), pointer(alpha), pointer(water), height * width, threads)
-        library.call("aq_compose_water", *inputs, pointer(image), pointer(z))
-        ctx.save_for_backward(drawn, alpha, water)
+        inputs = map(_address, (drawn, alpha, water, uneven, gain))
+        outputs = (pointer(image), pointer(z))
+        library.call("aq_compose_water", *inputs, height * width, threads, *outputs)
+        ctx.save_for_backward(drawn, alpha, water, uneven, gain)
         ctx.threads, ctx.library = threads, library
         return image, z
 
@@ -80,10 +99,11 @@ class _ComposeWater(torch.autograd.Function):
         g_image: Tensor,  # [H, W, 3]
         g_z: Tensor,  # [H, W]
     ) -> tuple[Any, ...]:
-        drawn, alpha, water = ctx.saved_tensors
+        drawn, alpha, water, uneven, gain = ctx.saved_tensors
         incoming = (g_image.contiguous(), g_z.contiguous())
         gradients = [torch.empty_like(tensor) for tensor in (drawn, alpha, water)]
-        inputs = (pointer(drawn), pointer(alpha), pointer(water), alpha.numel(), ctx.threads)
+        inputs = map(_address, (drawn, alpha, water, uneven, gain))
         outputs = map(pointer, (*incoming, *gradients))
-        ctx.library.call("aq_compose_water_backward", *inputs, *outputs)
-        return (*gradients, None, None)
+        size = (alpha.numel(), ctx.threads)
+        ctx.library.call("aq_compose_water_backward", *inputs, *size, *outputs)
+        return (*gradients, None, None, None, None)

@@ -28,7 +28,8 @@ from tests.mapping.mapping_scenes import (
 )
 from tests.pretended_device import PRETENDED
 
-FITTED = tuple(f"aquaflow.render.{name}" for name in ("photometric", "water", "adam", "activation"))
+KERNELS = ("photometric", "view_loss", "water", "adam", "activation")
+FITTED = tuple(f"aquaflow.render.{name}" for name in KERNELS)
 DECODE = "aquaflow.mapping.decoder.decode"
 """Modules that take the compiled kernels where there are any."""
 

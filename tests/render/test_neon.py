@@ -89,7 +89,8 @@ def test_neon_water_agrees_with_its_definition(
     got, arrays = on_arm["four channels"], Task(SCENES["four channels"]).arrays
     inputs = (got["image"], got["alpha"], torch.from_numpy(arrays["water"]))
     leaves = [tensor.double().requires_grad_() for tensor in inputs]
-    image, z = compose_water_torch(*leaves)
+    uneven, gain = (torch.from_numpy(arrays[key]).double() for key in ("weight", "g_alpha"))
+    image, z = compose_water_torch(*leaves, uneven, gain)
     g_image, g_z = (torch.from_numpy(arrays[key]).double() for key in ("target", "g_alpha"))
     wanted = torch.autograd.grad((image * g_image).sum() + (z * g_z).sum(), leaves)
     assert torch.allclose(got["rendered"].double(), image, atol=2e-6)

@@ -7,6 +7,15 @@ import torch
 
 from aquaflow.render.water import compose_water, compose_water_torch
 
+GAINS = {"even": (False, False), "uneven": (True, False), "both gains": (True, True)}
+
+
+def random_gains(seed: int, which: str) -> list[torch.Tensor | None]:
+    """Of the backscatter and of the camera, where ``which`` has them."""
+    random = torch.Generator().manual_seed(200 + seed)
+    gains = [0.5 + torch.rand(37, 41, generator=random) for _ in range(2)]
+    return [gain if there else None for gain, there in zip(gains, GAINS[which], strict=True)]
+
 
 def random_scene(seed: int) -> list[torch.Tensor]:
     random = torch.Generator().manual_seed(seed)
@@ -19,24 +28,28 @@ def random_scene(seed: int) -> list[torch.Tensor]:
     return [drawn, alpha, water]
 
 
+@pytest.mark.parametrize("which", GAINS)
 @pytest.mark.parametrize("seed", range(3))
-def test_fused_water_matches_its_definition(seed: int) -> None:
-    inputs = random_scene(seed)
-    image, z = compose_water(*inputs)
-    wanted, wanted_z = compose_water_torch(*(tensor.double() for tensor in inputs))
+def test_fused_water_matches_its_definition(seed: int, which: str) -> None:
+    inputs, (uneven, gain) = random_scene(seed), random_gains(seed, which)
+    image, z = compose_water(*inputs, uneven=uneven, gain=gain)
+    wide = [None if plane is None else plane.double() for plane in (uneven, gain)]
+    wanted, wanted_z = compose_water_torch(*(tensor.double() for tensor in inputs), *wide)
     assert torch.allclose(image.double(), wanted, atol=2e-6)
     assert torch.allclose(z.double(), wanted_z, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("which", GAINS)
 @pytest.mark.parametrize("seed", range(3))
-def test_gradients_of_fused_water_match_autograd(seed: int) -> None:
+def test_gradients_of_fused_water_match_autograd(seed: int, which: str) -> None:
+    uneven, gain = random_gains(seed, which)
     random = torch.Generator().manual_seed(100 + seed)
     g_image = torch.randn(37, 41, 3, generator=random)
     g_z = torch.randn(37, 41, generator=random)
     gradients = []
     for function, dtype in ((compose_water, torch.float32), (compose_water_torch, torch.float64)):
         leaves = [tensor.to(dtype).requires_grad_() for tensor in random_scene(seed)]
-        image, z = function(*leaves)
+        image, z = function(*leaves, uneven=uneven, gain=gain)
         loss = (image * g_image.to(dtype)).sum() + (z * g_z.to(dtype)).sum()
         gradients.append(torch.autograd.grad(loss, leaves))
     for fused, wanted in zip(*gradients, strict=True):

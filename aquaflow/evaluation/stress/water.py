@@ -10,10 +10,10 @@ from torch import Tensor
 from aquaflow.config import MediumConfig
 from aquaflow.evaluation.stress.case import Check, case
 from aquaflow.mapping.gaussians.gaussians import raw_colour
-from aquaflow.mapping.optimisation.losses import depth_loss
 from aquaflow.mapping.water.image_formation import Water
 from aquaflow.mapping.water.medium import Medium
 from aquaflow.render.activation import radiance
+from aquaflow.render.view_loss import depth_loss
 from aquaflow.render.water import compose_water, compose_water_torch
 
 RATES = (0.0, 1e-8, 0.01, 0.5, 5.0, 50.0)
@@ -114,7 +114,7 @@ def picture_through_bare_map(check: Check, seed: int) -> None:
                 torch.tensor([[beta] * 3, [0.3] * 3, [beta] * 3, [0.01] * 3, [1.0] * 3]),
             ]
             leaves = [leaf.clone().requires_grad_() for leaf in leaves]
-            image, z = compose(*leaves)
+            image, z = compose(leaves[0], leaves[1], leaves[2])
             gradients = torch.autograd.grad((image.sum() + z.sum()), leaves)
             check.finite(f"{compose.__name__} at beta {beta}", image, z, *gradients)
             check.below(
@@ -122,7 +122,7 @@ def picture_through_bare_map(check: Check, seed: int) -> None:
             )
 
 
-@case("water", "mapping.optimisation.losses.MIN_RANGE")
+@case("water", "render.view_loss.MIN_RANGE")
 def depth_loss_at_range_0(check: Check, seed: int) -> None:
     """Pixels of range 0, drawn and not drawn, known and not known."""
     z = torch.tensor([[0.0, 0.0, 0.0, 1e-30, 1e9]], requires_grad=True)

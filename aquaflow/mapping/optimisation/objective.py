@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from torch import Tensor
 
 from aquaflow.config import LossConfig
-from aquaflow.mapping.optimisation.losses import depth_loss, outlier_mask, radial_weight, scale_loss
+from aquaflow.mapping.optimisation.losses import radial_weight, scale_loss
 from aquaflow.mapping.rendering import Shown
 from aquaflow.mapping.views import View
 from aquaflow.render.activity import active_pixels
 from aquaflow.render.photometric import photometric_loss
+from aquaflow.render.view_loss import depth_loss, outlier_mask
 
 
 class Objective:
@@ -33,7 +34,8 @@ class Objective:
         if shown.active is not None:
             mask &= active_pixels(shown.active, view.camera.width, view.camera.height)
         if view.robust:
-            mask &= outlier_mask(shown.image, target, self.radial(view), config.tau_e)
+            image, K_rad = shown.image, self.radial(view)
+            mask &= outlier_mask(image, target, K_rad, config.tau_e, self.threads)
         loss = self._pictures(view, shown, target, mask)
         inverse_range = view.inverse_range
         if config.depth > 0.0 and inverse_range is not None:
@@ -41,7 +43,8 @@ class Objective:
             trust = self.radial(view) * mask * view.range_confidence
             # The view's ranges are in its keyframe's unit; the map is in the world's.
             expected = inverse_range / view.T_wc.scale
-            loss = loss + config.depth * depth_loss(shown.z, shown.alpha, expected, trust)
+            ranges = depth_loss(shown.z, shown.alpha, expected, trust, self.threads)
+            loss = loss + config.depth * ranges
         if config.scale > 0.0:
             loss = loss + config.scale * scale_loss(parameters["log_scales"])
         return loss

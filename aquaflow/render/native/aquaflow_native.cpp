@@ -24,6 +24,7 @@
 #include "project_backward.h"
 #include "refine_flow.h"
 #include "tiles.h"
+#include "view_loss.h"
 
 #ifndef AQ_SOURCE_HASH
 #error "build with aquaflow/render/native/build.py, which passes AQ_SOURCE_HASH"
@@ -142,21 +143,41 @@ AQ_EXPORT int aq_photometric(const float* rendered, const float* target, const f
   });
 }
 
+// See view_loss.h: rendered and target [P, 3], weight [P] give mask [P].
+AQ_EXPORT int aq_outlier_mask(const float* rendered, const float* target, const float* weight,
+                              float tau, int pixels, int threads, uint8_t* mask) {
+  return guarded([&] {
+    outlier_mask(rendered, target, weight, tau, pixels, std::min(std::max(threads, 1), kMaxThreads),
+                 mask);
+  });
+}
+
+// See view_loss.h: maps [P] give the loss and its derivative by z [P].
+AQ_EXPORT int aq_range_loss(const float* z, const float* alpha, const float* inverse_range,
+                            const float* weight, float min_range, int pixels, int threads,
+                            float* loss, float* g_z) {
+  return guarded([&] {
+    *loss = range_loss({z, alpha, inverse_range, weight, min_range, pixels},
+                       std::min(std::max(threads, 1), kMaxThreads), g_z);
+  });
+}
+
 // See image_formation.h: drawn [P, 4], alpha [P] and water [15] give image [P, 3] and range [P].
 AQ_EXPORT int aq_compose_water(const float* drawn, const float* alpha, const float* water,
-                               int pixels, int threads, float* image, float* range) {
+                               const float* uneven, const float* gain, int pixels, int threads,
+                               float* image, float* range) {
   return guarded([&] {
-    compose_water({drawn, alpha, water, pixels}, std::min(std::max(threads, 1), kMaxThreads), image,
-                  range);
+    compose_water({drawn, alpha, water, uneven, gain, pixels},
+                  std::min(std::max(threads, 1), kMaxThreads), image, range);
   });
 }
 
 AQ_EXPORT int aq_compose_water_backward(const float* drawn, const float* alpha, const float* water,
-                                        int pixels, int threads, const float* g_image,
-                                        const float* g_range, float* g_drawn, float* g_alpha,
-                                        float* g_water) {
+                                        const float* uneven, const float* gain, int pixels,
+                                        int threads, const float* g_image, const float* g_range,
+                                        float* g_drawn, float* g_alpha, float* g_water) {
   return guarded([&] {
-    compose_water_backward({drawn, alpha, water, pixels},
+    compose_water_backward({drawn, alpha, water, uneven, gain, pixels},
                            std::min(std::max(threads, 1), kMaxThreads), g_image, g_range, g_drawn,
                            g_alpha, g_water);
   });

@@ -1,10 +1,10 @@
 // Underwater image formation (paper, Eq. 12 and 15) and its gradient:
 //
-//   I = J exp(-beta z) + a (B_inf (1 - exp(-b z)) + B_res exp(-d z)) + (1 - a) B_inf
+//   I = s (J exp(-beta z) + u (a (B_inf (1 - exp(-b z)) + B_res exp(-d z)) + (1 - a) B_inf))
 //
-// per pixel and channel, with J premultiplied by alpha a, and z = accumulated range / max(a,
-// kMinSolid). Pixels are taken in blocks and turned into planes, so that every line of the
-// arithmetic is one vector.
+// per pixel and channel, with J premultiplied by alpha a, z = accumulated range / max(a,
+// kMinSolid), u the gain of the backscatter at the pixel and s that of the camera. Pixels are taken
+// in blocks and turned into planes, so that every line of the arithmetic is one vector.
 #pragma once
 
 #include <algorithm>
@@ -30,20 +30,32 @@ inline float exp_negative(float x) {
   return two_to(y, (int)(y - 0.5f));
 }
 
+struct WaterImages {
+  const float* drawn;   // [P, 4] premultiplied radiance and accumulated range
+  const float* alpha;   // [P]
+  const float* water;   // [15]
+  const float* uneven;  // [P] gain of the backscatter, or null for ones
+  const float* gain;    // [P] of the camera, or null for ones
+  int pixels;
+};
+
 struct WaterBlock {
-  float J[3][kBlock], a[kBlock], z[kBlock], solid[kBlock];
+  float J[3][kBlock], a[kBlock], z[kBlock], solid[kBlock], u[kBlock], s[kBlock];
   float T[3][kBlock], far[3][kBlock], near[3][kBlock];
 
-  // drawn [n, 4]: premultiplied radiance and accumulated range.
-  void load(const float* drawn, const float* alpha, int n) {
+  // Pixels [first, first + n).
+  void load(const WaterImages& in, size_t first, int n) {
+    const float *drawn = in.drawn + 4 * first, *alpha = in.alpha + first;
     for (int i = 0; i < n; i++) {
       for (int c = 0; c < 3; c++) J[c][i] = drawn[4 * i + c];
       a[i] = alpha[i];
       solid[i] = std::max(a[i], kMinSolid);
       z[i] = drawn[4 * i + 3] / solid[i];
+      u[i] = in.uneven ? in.uneven[first + i] : 1.0f;
+      s[i] = in.gain ? in.gain[first + i] : 1.0f;
     }
     for (int i = n; i < kBlock; i++)
-      J[0][i] = J[1][i] = J[2][i] = a[i] = z[i] = 0.0f, solid[i] = 1.0f;
+      J[0][i] = J[1][i] = J[2][i] = a[i] = z[i] = 0.0f, solid[i] = u[i] = s[i] = 1.0f;
   }
 
   void attenuate(const float* water) {
@@ -61,27 +73,23 @@ struct WaterBlock {
   }
 };
 
-struct WaterImages {
-  const float *drawn, *alpha, *water;  // [P, 4], [P], [15]
-  int pixels;
-};
-
 inline void compose_water(const WaterImages& in, int threads, float* image, float* z) {
   Pool::run(threads, [&](int part) {
     WaterBlock block;
     const int last = part_begin(in.pixels, kBlock, threads, part + 1);
     for (int first = part_begin(in.pixels, kBlock, threads, part); first < last; first += kBlock) {
       const int n = std::min(kBlock, last - first);
-      block.load(in.drawn + 4 * (size_t)first, in.alpha + first, n);
+      block.load(in, first, n);
       block.attenuate(in.water);
       for (int i = 0; i < n; i++) z[first + i] = block.z[i];
       for (int c = 0; c < 3; c++) {
         const float B_inf = in.water[3 * kBInf + c], B_res = in.water[3 * kBRes + c];
         float* out = image + 3 * (size_t)first + c;
-        for (int i = 0; i < n; i++)
-          out[3 * i] = block.J[c][i] * block.T[c][i] +
-                       B_inf * (1.0f - block.a[i] * block.far[c][i]) +
-                       block.a[i] * B_res * block.near[c][i];
+        for (int i = 0; i < n; i++) {
+          const float a = block.a[i];
+          const float veil = B_inf * (1.0f - a * block.far[c][i]) + a * B_res * block.near[c][i];
+          out[3 * i] = block.s[i] * (block.J[c][i] * block.T[c][i] + block.u[i] * veil);
+        }
       }
     }
   });
@@ -99,16 +107,17 @@ inline void water_block_backward(const WaterBlock& block, const float* water,
 #pragma omp simd reduction(+ : s_beta, s_inf, s_b, s_res, s_d)
     for (int i = 0; i < kBlock; i++) {
       const float a = block.a[i], range = std::max(block.z[i], 0.0f), T = block.T[c][i];
-      const float far = block.far[c][i], near = block.near[c][i], gi = g[c][i];
+      const float far = block.far[c][i], near = block.near[c][i];
+      const float gi = block.s[i] * g[c][i], veil = block.u[i] * gi;
       // Derivatives with respect to the optical depths; zero where these are clamped.
       const float by_T = beta * range < kMaxOpticalDepth ? -gi * block.J[c][i] * T : 0.0f;
-      const float by_far = b * range < kMaxOpticalDepth ? gi * a * B_inf * far : 0.0f;
-      const float by_near = d * range < kMaxOpticalDepth ? -gi * a * B_res * near : 0.0f;
+      const float by_far = b * range < kMaxOpticalDepth ? veil * a * B_inf * far : 0.0f;
+      const float by_near = d * range < kMaxOpticalDepth ? -veil * a * B_res * near : 0.0f;
       g_J[c][i] = gi * T;
-      g_a[i] += gi * (B_res * near - B_inf * far);
+      g_a[i] += veil * (B_res * near - B_inf * far);
       g_z[i] += block.z[i] > 0.0f ? beta * by_T + b * by_far + d * by_near : 0.0f;
       s_beta += range * by_T, s_b += range * by_far, s_d += range * by_near;
-      s_inf += gi * (1.0f - a * far), s_res += gi * a * near;
+      s_inf += veil * (1.0f - a * far), s_res += veil * a * near;
     }
     const float sums[] = {s_beta, s_inf, s_b, s_res, s_d};
     for (int row = 0; row < kWater / 3; row++) g_water[3 * row + c] += sums[row];
@@ -126,7 +135,7 @@ inline void compose_water_backward(const WaterImages& in, int threads, const flo
     const int last = part_begin(in.pixels, kBlock, threads, part + 1);
     for (int first = part_begin(in.pixels, kBlock, threads, part); first < last; first += kBlock) {
       const int n = std::min(kBlock, last - first);
-      block.load(in.drawn + 4 * (size_t)first, in.alpha + first, n);
+      block.load(in, first, n);
       block.attenuate(in.water);
       for (int i = 0; i < kBlock; i++) {
         const size_t p = (size_t)first + i;

@@ -17,10 +17,10 @@ from aquaflow.geometry import camera, similarity, triangulation
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping import views
 from aquaflow.mapping.gaussians import gaussians
-from aquaflow.mapping.optimisation import losses, map_optimiser
+from aquaflow.mapping.optimisation import map_optimiser
 from aquaflow.mapping.water import image_formation, medium
 from aquaflow.prior import flow, homography
-from aquaflow.render import adam, reference, water
+from aquaflow.render import adam, reference, view_loss, water
 from aquaflow.sources import preprocessing
 from aquaflow.tracking import current_keyframe
 from aquaflow.tracking.initialisation import bundle, initialiser
@@ -100,7 +100,7 @@ GUARDS: list[tuple[str, list[tuple[object, str, object]]]] = [
     ("rates_at_0_and_50", [(medium, "MIN_RATE", 0.0)]),
     ("black_and_glowing_radiance", [(gaussians, "MIN_RADIANCE", 0.0)]),
     ("picture_through_bare_map", [(water, "MIN_SOLID", 0.0)]),
-    ("depth_loss_at_range_0", [(losses, "MIN_RANGE", 0.0)]),
+    ("depth_loss_at_range_0", [(view_loss, "MIN_RANGE", 0.0)]),
     ("rank_deficient", [(solver, "_damped_step", unguarded_step)]),
     ("nan_matches_in_bundle", [(bundle, "measured", everything)]),
     ("points_behind_the_camera", [(triangulation, "MIN_DEPTH", -INFINITY)]),

@@ -131,19 +131,30 @@ static void draw(const Scene& s, bool short_of_memory, std::FILE* result) {
   if (s.channels == 4) {
     rendered.resize(3 * pixels);
     run(short_of_memory, [&] {
-      return aq_compose_water(image.data(), alpha.data(), s[s.kWaterRates], (int)pixels, s.threads,
-                              rendered.data(), range.data());
+      return aq_compose_water(image.data(), alpha.data(), s[s.kWaterRates], s[s.kWeight],
+                              s[s.kGAlpha], (int)pixels, s.threads, rendered.data(), range.data());
     });
     run(short_of_memory, [&] {
-      return aq_compose_water_backward(image.data(), alpha.data(), s[s.kWaterRates], (int)pixels,
-                                       s.threads, s[s.kTarget], s[s.kGAlpha], g_drawn.data(),
-                                       g_a.data(), g_water.data());
+      return aq_compose_water_backward(image.data(), alpha.data(), s[s.kWaterRates], s[s.kWeight],
+                                       s[s.kGAlpha], (int)pixels, s.threads, s[s.kTarget],
+                                       s[s.kGAlpha], g_drawn.data(), g_a.data(), g_water.data());
     });
   }
   Floats loss(1), g_rendered(3 * pixels);
   run(short_of_memory, [&] {
     return aq_photometric(rendered.data(), s[s.kTarget], s[s.kWeight], s[s.kMask], s.width,
                           s.height, 0.2f, s.threads, loss.data(), g_rendered.data());
+  });
+
+  Floats range_loss(1), g_range(pixels);
+  run(short_of_memory, [&] {
+    return aq_range_loss(range.data(), alpha.data(), s[s.kWeight], s[s.kMask], 1e-2f, (int)pixels,
+                         s.threads, range_loss.data(), g_range.data());
+  });
+  std::vector<uint8_t> within(pixels);
+  run(short_of_memory, [&] {
+    return aq_outlier_mask(rendered.data(), s[s.kTarget], s[s.kWeight], 0.2f, (int)pixels,
+                           s.threads, within.data());
   });
 
   Floats means(s.arrays[s.kMeans]), first(3 * n), second(3 * n);
