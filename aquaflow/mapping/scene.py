@@ -117,12 +117,20 @@ class Scene:
             parameters = self.seen_from(view, viewmat)
         water, gain, uneven = self.water(view), self.gain(view), self.uneven(view)
         shown = show(parameters, water, gain, self.renderer, view, viewmat, active, uneven)
-        image = shown.image
+        if learn:
+            self._learn_light(view, shown)
+        light = self.sunlight.over(view, self.exposure(view))
+        return shown if light is None else replace(shown, image=shown.image * light)
+
+    def exposure(self, view: View) -> Tensor | None:
+        """The gain [3] of the exposure of ``view``; None where all views have the same."""
+        return gain_of(view) if self.exposes else None
+
+    def _learn_light(self, view: View, shown: Shown) -> None:
+        image = shown.image.detach()
         if self.exposes:
-            if learn:
-                learn_gain(view, image, shown.alpha)
-            image = image * gain_of(view)
-        return replace(shown, image=self.sunlight.shine(view, image, shown.alpha, learn))
+            learn_gain(view, image, shown.alpha)
+        self.sunlight.learn(view, image, shown.alpha, self.exposure(view))
 
     def seen_from(
         self,
@@ -197,9 +205,8 @@ class Scene:
         image, gain = view.target(), self.gain(view)
         if gain is not None:
             image = image / gain[..., None]
-        if self.exposes:
-            image = image / gain_of(view)
-        return self.sunlight.evened(view, image)
+        light = self.sunlight.over(view, self.exposure(view))
+        return image if light is None else image / light
 
     @torch.no_grad()
     def recovered(

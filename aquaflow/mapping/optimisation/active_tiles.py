@@ -16,12 +16,16 @@ from aquaflow.mapping.views import View
 from aquaflow.render.contract import TILE_PX
 
 
+def is_full_look(view: View, config: OptimiserConfig) -> bool:
+    """True if the view's next step draws all of it."""
+    return view.looks % config.full_look_every == 0
+
+
 def tiles_to_draw(view: View, config: OptimiserConfig) -> Tensor | None:
     """[rows, columns] bool of the view's tiles for its next step; None: all of them."""
     if config.noise_floor == 0.0:
         return None
-    full = view.looks % config.full_look_every == 0
-    explained = None if full else view.explained
+    explained = None if is_full_look(view, config) else view.explained
     if view.mask is None:
         return None if explained is None else ~explained
     scene = F.max_pool2d(view.scene_mask()[None].float(), TILE_PX, ceil_mode=True)[0] > 0.0
@@ -36,7 +40,7 @@ def is_nothing_to_draw(
     """True if no tile is active; between two full looks the device is asked only once."""
     if active is None:
         return False
-    if view.looks % config.full_look_every == 0:
+    if is_full_look(view, config):
         return not bool(active.any())
     if view.all_explained is None:
         view.all_explained = not bool(active.any())
@@ -50,7 +54,7 @@ def record_explained(
     config: OptimiserConfig,
 ) -> None:
     """Count the step; after a full drawing record which tiles are explained."""
-    if view.looks % config.full_look_every == 0:
+    if is_full_look(view, config):
         error = (image - view.target()).abs().mean(dim=-1)
         if view.mask is not None:
             error *= view.scene_mask()

@@ -14,6 +14,7 @@ from torch import Tensor
 from aquaflow.config import MappingConfig
 from aquaflow.mapping.decoder.decode import DECODED
 from aquaflow.mapping.optimisation.active_tiles import (
+    is_full_look,
     is_nothing_to_draw,
     record_explained,
     tiles_to_draw,
@@ -86,7 +87,9 @@ class MapOptimiser:
             return
         neural = self.scene.neural
         seen = leaves if neural is None else neural.decode(view, leaves, viewmat)
-        shown = self.scene.draw(view, seen, viewmat, learn=True, active=active)
+        # A view's light hardly changes from step to step: full looks are enough to follow it.
+        learn = is_full_look(view, config)
+        shown = self.scene.draw(view, seen, viewmat, learn, active)
         record_explained(view, shown.image, self.config.optimiser)
         loss = self._objective.total(view, shown, seen)
         if not is_number(loss):

@@ -59,27 +59,25 @@ class Sunlight:
         """Look whether light plays over ``views``; once it does, it always may."""
         self.plays = self.plays or (self.config.enabled and is_light(views))
 
-    def shine(
+    def learn(
         self,
         view: View,
         image: Tensor,  # [H, W, 3] the map from this view, in even light
         alpha: Tensor,  # [H, W]
-        learn: bool,
-    ) -> Tensor:
-        """``image`` in the light of ``view``, which with ``learn`` is set from its picture."""
-        if learn and self.config.enabled:
-            learn_light(view, image.detach(), alpha, self.config.columns)
-        gain = light_over(view) if self.plays else None
-        return image if gain is None else image * gain
+        exposure: Tensor | None,  # [3] gain of the view; None: one
+    ) -> None:
+        """Set the light of ``view`` from its picture."""
+        if self.config.enabled:
+            learn_light(view, image, alpha, self.config.columns, exposure)
 
-    def evened(
+    def over(
         self,
         view: View,
-        image: Tensor,  # [H, W, 3] what the camera saw
-    ) -> Tensor:
-        """``image`` as it would be in even light."""
-        gain = light_over(view) if self.plays else None
-        return image if gain is None else image / gain
+        exposure: Tensor | None,  # [3] gain of the view; None: one
+    ) -> Tensor | None:
+        """[H, W, 3] or [3]: the gains of exposure and sunlight in ``view``; None: all are one."""
+        light = light_over(view, exposure) if self.plays else None
+        return exposure if light is None else light
 
 
 @torch.no_grad()
@@ -88,10 +86,12 @@ def learn_light(
     drawn: Tensor,  # [H, W, 3] the map from this view, in even light
     alpha: Tensor,  # [H, W]
     columns: int,
+    exposure: Tensor | None = None,  # [3] gain of the view
 ) -> None:
-    """Set the light of ``view`` to what makes the map look like its picture."""
+    """Set the light of ``view`` to what makes the map, so exposed, look like its picture."""
     grid = (slice(None, None, EVERY_PX), slice(None, None, EVERY_PX))
     ours, theirs = drawn[grid], view.target()[grid]
+    ours = ours if exposure is None else ours * exposure
     good = ((alpha > SOLID) & view.scene_mask())[grid][..., None] & torch.isfinite(ours)
     layers = torch.cat([torch.where(good, ours, 0.0), theirs * good, good.to(ours.dtype)], dim=-1)
     rows = max(1, round(columns * alpha.shape[0] / alpha.shape[1]))
@@ -103,14 +103,20 @@ def learn_light(
     view.light = torch.where((share > LEAST_SHARE) & torch.isfinite(found), found, before)
 
 
-def light_over(view: View) -> Tensor | None:
-    """The gains [H, W, 3] of a view's pixels; None where none were learned."""
+def light_over(
+    view: View,
+    exposure: Tensor | None = None,  # [3] gain of the view
+) -> Tensor | None:
+    """The gains [H, W, 3] of a view's pixels, between those of the cells; None where none were
+    learned."""
     if view.light is None:
         return None
+    cells = view.light.exp()
+    cells = cells if exposure is None else cells * exposure[:, None, None]
     size = (view.camera.height, view.camera.width)
     # The channels last, as in a picture: the same numbers in two thirds of the time.
-    light = view.light[None].contiguous(memory_format=torch.channels_last)
-    return F.interpolate(light, size, mode="bilinear")[0].permute(1, 2, 0).exp()
+    cells = cells[None].contiguous(memory_format=torch.channels_last)
+    return F.interpolate(cells, size, mode="bilinear")[0].permute(1, 2, 0)
 
 
 def light_at(

@@ -100,9 +100,9 @@ def test_fields_that_follow_each_other_are_light_and_random_or_constant_ones_are
 
 def test_without_the_switch_nothing_is_learned_and_nothing_plays() -> None:
     light, view = Sunlight(SunlightConfig(enabled=False)), sunny_on_the_left()
-    image = light.shine(view, drawn(), SOLID, learn=True)
+    light.learn(view, drawn(), SOLID, exposure=None)
     light.judge(swell(40, period=12.0))
-    assert torch.equal(image, drawn())
+    assert light.over(view, exposure=None) is None
     assert view.light is None
     assert not light.plays
 
@@ -110,9 +110,27 @@ def test_without_the_switch_nothing_is_learned_and_nothing_plays() -> None:
 def test_what_plays_is_drawn_and_taken_out_again() -> None:
     light, view = Sunlight(SunlightConfig()), sunny_on_the_left()
     light.judge(swell(40, period=12.0))
-    shone = light.shine(view, drawn(), SOLID, learn=True)
-    assert float((shone - view.target()).abs().mean()) < 0.02
-    torch.testing.assert_close(light.evened(view, shone), drawn())
+    light.learn(view, drawn(), SOLID, exposure=None)
+    gains = light.over(view, exposure=None)
+    assert gains is not None
+    assert float((drawn() * gains - view.target()).abs().mean()) < 0.02
+
+
+def test_what_the_exposure_explains_is_no_light() -> None:
+    light, view, exposure = Sunlight(SunlightConfig()), sunny_on_the_left(), torch.full((3,), 0.8)
+    light.judge(swell(40, period=12.0))
+    light.learn(view, drawn(), SOLID, exposure=None)
+    alone = light.over(view, exposure=None)
+    light.learn(view, drawn() / exposure, SOLID, exposure)
+    both = light.over(view, exposure)
+    assert alone is not None
+    assert both is not None
+    torch.testing.assert_close(both, 0.8 * alone)
+
+
+def test_without_light_the_exposure_alone_is_over_a_view() -> None:
+    exposure = torch.full((3,), 0.8)
+    assert Sunlight(SunlightConfig()).over(sunny_on_the_left(), exposure) is exposure
 
 
 def test_a_map_in_playing_light_is_that_of_its_mean() -> None:
