@@ -34,6 +34,7 @@ from aquaflow.tracking.loops.relocaliser import Places
 from aquaflow.tracking.metric.learned_scales import learned_scales
 from aquaflow.tracking.metric.metric_frames import MetricFrames
 from aquaflow.tracking.overlay.finder import OverlayFinder
+from aquaflow.tracking.side_work import SideWork
 from aquaflow.tracking.tracker import Tracker
 
 SETTLING_ROUNDS = 2
@@ -55,9 +56,10 @@ class Slam:
     ) -> None:
         """What does not fit into memory waits in the folder ``work``, if there is one.
 
-        A ``live`` run takes over an optimised keyframe graph as soon as it is there; a replay waits
-        for it at the next keyframe, and so repeats bit for bit. ``maps`` may do their work in
-        another thread. What a stage raises is counted in ``failures`` and costs that stage.
+        A ``live`` run takes over an optimised keyframe graph, and what side work has found, as soon
+        as they are there; a replay waits for the one at the next keyframe, has the other done at
+        once, and so repeats bit for bit. ``maps`` may do their work in another thread. What a stage
+        raises is counted in ``failures`` and costs that stage.
 
         Raises:
             ConfigError: the prior cannot give what the config asks tracking for.
@@ -89,10 +91,13 @@ class Slam:
         adjustment = config.tracking.adjustment
         self.adjuster = Adjuster(self.keyframes, adjustment)
         """Joint adjustments of keyframes."""
+        self.side_work = SideWork(self.failures, live)
+        """Searches for loops."""
         self.graph = KeyframeGraph(
             self.keyframes, places, config.tracking, self.failures, self.metric,
             self.adjuster if adjustment.enabled else None,
             learned_scales(self.keyframes, self.prior.unit_sigma, config.tracking.learned),
+            self.side_work,
         )  # fmt: skip
         self.maps: MapWork = maps or Maps(
             config,
@@ -116,6 +121,8 @@ class Slam:
         """One frame's way through the paper; returns the frames that it finished."""
         # Sec. 3.2, Eq. 4: the graph as optimised meanwhile; keyframes move, and the map follows.
         if self._live:
+            with self.profiler.stage("graph"):
+                self.side_work.settle()
             self._follow_graph(wait=False)
 
         # Not in the paper: what a recorder burned into the pictures is masked.
@@ -200,11 +207,14 @@ class Slam:
                 self.metric.update(self.graph.snapshot)
 
     def _wait_for_graph(self) -> None:
+        self.side_work.settle(wait=True)
+        self._follow_graph(wait=True)
         while self.graph.optimising:
             self._follow_graph(wait=True)
 
     def close(self, keep: bool = False) -> None:
         """End the background work; remove the files of the work folder, or ``keep`` them."""
+        self.side_work.close()
         self.graph.close()
         self.keyframes.close(keep)
         self.maps.close(keep)

@@ -69,8 +69,12 @@ class Checkpointer:
         self._writing = False
 
     def take_if_due(self, disk_is_full: bool) -> None:
-        """Take a checkpoint if it is time, the last one is done, and there is room."""
+        """Take a checkpoint if it is time, the last one is done, there is room, and no side work is
+        waited for."""
         if self._now_s() < self._due_s or self._writing or disk_is_full:
+            return
+        self._slam.side_work.settle()
+        if self._slam.side_work.pending:
             return
         self._due_s = self._now_s() + self._every_s
         self.take()
@@ -81,7 +85,9 @@ class Checkpointer:
 
     def take(self) -> None:
         """Take a checkpoint now; requests that wait in the mapping thread are not in it, except
-        corrections."""
+        corrections. Side work is waited for: a dive that goes on does not look for these loops
+        again."""
+        self._slam.side_work.settle(wait=True)
         with self._run.profiler.stage("checkpoint"):
             parts = tracking.serialise(self._slam, self._run)
             if parts is None:

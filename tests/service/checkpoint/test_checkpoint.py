@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
@@ -278,3 +279,21 @@ def test_the_live_window_shows_map_path_and_health(cut: Cut) -> None:
     finally:
         window.close()
     assert "lag" in in_words(report(parts, hang_s=1e6))
+
+
+def test_a_checkpoint_waits_for_side_work_and_a_frame_does_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, taken, go_on = list[bool](), list[bool](), Event()
+    with LiveDive("new", resumed(tmp_path / "new", new=False), ToldFeed(), VEHICLE) as dive:
+        side_work, checkpointer = dive.parts.slam.side_work, dive.parts.checkpointer
+        side_work.do("loop search", 0, lambda: go_on.wait(60.0), found.append)
+        checkpointer.take_soon()
+        with monkeypatch.context() as told:
+            told.setattr(checkpointer, "take", lambda: taken.append(True))
+            checkpointer.take_if_due(disk_is_full=False)
+        assert taken == []
+        go_on.set()
+        checkpointer.take()
+        assert found == [True]
+        assert not side_work.pending
