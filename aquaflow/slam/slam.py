@@ -84,15 +84,15 @@ class Slam:
             self.keyframes, lambda: self.frames, config.fusion, self.failures
         )
         """Telemetry, and the frames in metres that it gives."""
+        self.side_work = SideWork(self.failures, live)
+        """Looks for loops, for keyframes to return to, and for frames of before the map's start."""
         self.tracker = Tracker(
             self.prior, self.keyframes, config.tracking, places, live, self.failures,
-            self.metric.motion,
+            self.metric.motion, self.side_work,
         )  # fmt: skip
         adjustment = config.tracking.adjustment
         self.adjuster = Adjuster(self.keyframes, adjustment)
         """Joint adjustments of keyframes."""
-        self.side_work = SideWork(self.failures, live)
-        """Searches for loops."""
         self.graph = KeyframeGraph(
             self.keyframes, places, config.tracking, self.failures, self.metric,
             self.adjuster if adjustment.enabled else None,
@@ -161,6 +161,7 @@ class Slam:
         """In a live run's idle moments: poses of the past, which waited for a map (Sec. 3.2)."""
         newest = self._latest
         with self.profiler.stage("back-fill"):
+            self.side_work.settle()
             tracked = self.tracker.back_fill()
         finished = self._link_map_publish(tracked)
         self._latest = newest

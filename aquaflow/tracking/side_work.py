@@ -53,10 +53,9 @@ class SideWork:
             with self._failures.contain(done.stage, done.frame):
                 done.then(done.future.result())
 
-    @property
-    def pending(self) -> bool:
-        """True if a result has not been taken yet."""
-        return bool(self._pending)
+    def awaits(self, stage: str) -> bool:
+        """True if a result of ``stage`` has not been taken yet."""
+        return any(each.stage == stage for each in self._pending)
 
     def close(self) -> None:
         """End the thread; what it has not begun is left out, and so are all results."""

@@ -51,14 +51,14 @@ def test_without_a_thread_the_result_is_taken_at_once() -> None:
     side_work = SideWork()
     side_work.do("search", 0, lambda: "found", taken.append)
     assert taken == ["found"]
-    assert not side_work.pending
+    assert not side_work.awaits("search")
 
 
 def test_nothing_is_waited_for_that_still_runs(threaded: Threaded) -> None:
     threaded.ask("first")
     threaded.side_work.settle()
     assert threaded.taken == []
-    assert threaded.side_work.pending
+    assert threaded.side_work.awaits("search")
 
 
 def test_results_are_taken_in_the_order_of_asking(threaded: Threaded) -> None:
@@ -66,7 +66,7 @@ def test_results_are_taken_in_the_order_of_asking(threaded: Threaded) -> None:
     threaded.go_on.set()
     threaded.side_work.settle(wait=True)
     assert threaded.taken == ["first", "second", "third"]
-    assert not threaded.side_work.pending
+    assert not threaded.side_work.awaits("search")
 
 
 @pytest.mark.parametrize("in_thread", [True, False])
@@ -100,4 +100,4 @@ def test_closing_drops_what_was_not_taken() -> None:
     side_work.close()
     side_work.settle(wait=True)
     assert taken == []
-    assert not side_work.pending
+    assert not side_work.awaits("search")

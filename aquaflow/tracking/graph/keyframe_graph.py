@@ -30,6 +30,9 @@ from aquaflow.tracking.graph.table import GraphResult, Snapshot
 from aquaflow.tracking.loops.relocaliser import Places, Relocalised
 from aquaflow.tracking.side_work import SideWork
 
+LOOP_SEARCH = "loop search"
+"""Name of that side work."""
+
 
 @dataclass(frozen=True)
 class Correction:
@@ -290,12 +293,12 @@ class KeyframeGraph:
     def _look_for_loops(self, keyframe: Keyframe) -> None:
         """Search the known places for the new keyframe's, and make it one of them."""
         number, frame, places = keyframe.number, keyframe.frame_index, self._places
-        with self._failures.contain("loop search", frame):
+        with self._failures.contain(LOOP_SEARCH, frame):
             encoding, pointmap = keyframe.encoding, keyframe.pointmap.copy()  # fused meanwhile
             if self._config.enabled:
                 near = self._on_the_path(number)
                 search = partial(places.of_keyframe, encoding, pointmap, near)
-                self._side_work.do("loop search", frame, search, partial(self._close_loops, number))
+                self._side_work.do(LOOP_SEARCH, frame, search, partial(self._close_loops, number))
             index = partial(places.add, number, encoding)
             self._side_work.do("place index", frame, index, lambda _: None)
 
