@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -187,3 +188,23 @@ def test_a_keyframe_needs_a_pose_that_is_finite() -> None:
     with pytest.raises(ArithmeticError):
         store.add(0, 0, PRIOR.encode(picture(0), GUESS), nowhere, pointmap_of(0), 0)
     assert len(store) == 0
+
+
+def test_another_thread_reads_while_keyframes_come_and_go(tmp_path: Path) -> None:
+    store, read = filled(tmp_path), list[int]()
+
+    def look() -> None:
+        for turn in range(60):
+            number = turn % 6
+            known = store[number].pointmap.known(1.0)
+            assert known.shape == (72, 96)
+            read.append(number)
+
+    with ThreadPoolExecutor(1) as threads:
+        looking = threads.submit(look)
+        for number in range(6, 24):
+            add(store, number)
+            store.hold(number // 2)
+            store.save()
+        looking.result()
+    assert len(read) == 60

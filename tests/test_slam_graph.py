@@ -33,8 +33,8 @@ class ToldGraph:
 @pytest.mark.parametrize(
     ("live", "asked"),
     [
-        (False, ["wait", "add 0", "wait", "add 1", "wait", "adjust"]),
-        (True, ["look", "add 0", "look", "look", "add 1", "look", "wait", "adjust"]),
+        (False, ["wait", "add 0", "wait", "add 1", "wait", "adjust", "wait"]),
+        (True, ["look", "add 0", "look", "look", "add 1", "look", "wait", "adjust", "wait"]),
     ],
 )
 def test_only_a_replay_waits_for_the_graph_and_only_at_keyframes(

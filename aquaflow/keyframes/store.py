@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -63,7 +64,8 @@ class KeyframeStore:
     """All keyframes of a dive, in the order of their making.
 
     With a work folder, encodings and pointmaps of all but the last used keyframes wait in its
-    ``keyframes`` folder and come back, bit for bit, when they are looked up.
+    ``keyframes`` folder and come back, bit for bit, when they are looked up. Any thread may look
+    them up, and one changes them; what is held may change while another thread reads it.
     """
 
     def __init__(
@@ -81,6 +83,7 @@ class KeyframeStore:
         """Of encoding and pointmap: before calibration they may differ."""
         folder = None if work is None else work / "keyframes"
         self._contents = Spill(folder, resident, self._pack, self._unpack)
+        self._lock = threading.RLock()
         self._held: int | None = None
         self.lost: set[int] = set()
         """Numbers of the keyframes whose file was lost: they have a pose, and no content."""
@@ -103,7 +106,7 @@ class KeyframeStore:
         keyframe = Keyframe(number, frame_index, t_ns, T_wc.if_finite(), sub_map, self)
         self.keyframes.append(keyframe)
         self._cameras.append((encoding.camera, pointmap.camera))
-        self._contents[number] = _Content(encoding, pointmap)
+        self._set(number, _Content(encoding, pointmap))
         return self.hold(number)
 
     def hold(self, number: int) -> Keyframe:
@@ -115,7 +118,8 @@ class KeyframeStore:
             InputError: it cannot be read back; the one held before still is.
         """
         before = None if self._held is None else self.content(self._held).pointmap
-        self._contents.pin(number)
+        with self._lock:
+            self._contents.pin(number)
         if before is not None:
             _set_writable(before, False)
         self._held = number
@@ -130,13 +134,18 @@ class KeyframeStore:
         """
         if number in self.lost:
             raise InputError(f"what keyframe {number} showed was lost")
-        return self._contents[number]
+        with self._lock:
+            return self._contents[number]
+
+    def _set(self, number: int, content: _Content) -> None:
+        with self._lock:
+            self._contents[number] = content
 
     def replace_pointmap(self, number: int, pointmap: Pointmap) -> None:
         """A better pointmap for a keyframe; it is the store's own from here on."""
         _set_writable(pointmap, number == self._held)
         self._cameras[number] = (self._cameras[number][0], pointmap.camera)
-        self._contents[number] = replace(self.content(number), pointmap=pointmap)
+        self._set(number, replace(self.content(number), pointmap=pointmap))
 
     @property
     def readable(self) -> list[Keyframe]:
@@ -152,11 +161,13 @@ class KeyframeStore:
     @property
     def resident_bytes(self) -> int:
         """Size of the encodings and pointmaps in memory; asks the prior."""
-        return self._contents.resident_bytes
+        with self._lock:
+            return self._contents.resident_bytes
 
     def save(self) -> list[Path]:
         """Write what is only in memory; the files that are new."""
-        return self._contents.save()
+        with self._lock:
+            return self._contents.save()
 
     def restore(
         self,

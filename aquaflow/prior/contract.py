@@ -118,7 +118,7 @@ class PairGeometry(Protocol):
 
 
 class Prior(Protocol):
-    """A two-view prior."""
+    """A two-view prior; a live run calls it from two threads."""
 
     name: str
     ranged: bool

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterable
 from typing import Any
 
@@ -16,6 +17,13 @@ WARM_UP = (240, 320, 3)
 """Shape of a picture to warm up with."""
 
 
+class _OwnMatcher(threading.local):
+    """Each thread's own matcher: OpenCV's flow keeps pictures of a call."""
+
+    def __init__(self) -> None:
+        self.own = FlowMatcher()
+
+
 class FlowPrior:
     """Flow from the likeliest start; without ranges, unless a prior says otherwise."""
 
@@ -24,7 +32,7 @@ class FlowPrior:
     unit_sigma: float = float("inf")
 
     def __init__(self) -> None:
-        self._matcher = FlowMatcher()
+        self._matchers = _OwnMatcher()
 
     def pack(self, encoding: Encoding) -> dict[str, npt.NDArray[Any]]:
         """The arrays of the encoding; keypoints and features only if they were computed."""
@@ -42,4 +50,4 @@ class FlowPrior:
         """From one of ``starts``; from nothing but a prediction that stands ``alone``."""
         if alone and predicted is not None:
             starts = from_prediction(predicted)
-        return best_flow(self._matcher, a, b, starts)
+        return best_flow(self._matchers.own, a, b, starts)

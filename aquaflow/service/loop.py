@@ -30,7 +30,7 @@ STAGE = "tracking"
 IDLE_S = 0.25
 """Longest wait for a frame; then the loop sends its heartbeat as idle."""
 BUSY_S = 0.01
-"""The same while earlier frames wait for their poses: then one of them is processed."""
+"""The same while earlier frames wait for their poses: then one that was placed is taken."""
 LATE_MS = 150.0
 """A frame that took longer from its arrival on is late, and mapping gives way; at 10 frames/s one
 that found tracking idle is ready in 60 to 100 ms."""
@@ -112,6 +112,7 @@ class LiveLoop:
         """Poses of the frames that wait for idle moments, as many as there is time for."""
         while self._past is not None and not until.over:
             self._catch_up(self._past)
+            self.run_.slam.side_work.settle(wait=True)
 
     def end(self) -> None:
         """After the last turn: telemetry of after the last frame is taken."""

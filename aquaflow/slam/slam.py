@@ -34,6 +34,7 @@ from aquaflow.tracking.loops.relocaliser import Places
 from aquaflow.tracking.metric.learned_scales import learned_scales
 from aquaflow.tracking.metric.metric_frames import MetricFrames
 from aquaflow.tracking.overlay.finder import OverlayFinder
+from aquaflow.tracking.side_work import SideWork
 from aquaflow.tracking.tracker import Tracker
 
 SETTLING_ROUNDS = 2
@@ -55,9 +56,10 @@ class Slam:
     ) -> None:
         """What does not fit into memory waits in the folder ``work``, if there is one.
 
-        A ``live`` run takes over an optimised keyframe graph as soon as it is there; a replay waits
-        for it at the next keyframe, and so repeats bit for bit. ``maps`` may do their work in
-        another thread. What a stage raises is counted in ``failures`` and costs that stage.
+        A ``live`` run takes over an optimised keyframe graph, and what side work has found, as soon
+        as they are there; a replay waits for the one at the next keyframe, has the other done at
+        once, and so repeats bit for bit. ``maps`` may do their work in another thread. What a stage
+        raises is counted in ``failures`` and costs that stage.
 
         Raises:
             ConfigError: the prior cannot give what the config asks tracking for.
@@ -82,9 +84,11 @@ class Slam:
             self.keyframes, lambda: self.frames, config.fusion, self.failures
         )
         """Telemetry, and the frames in metres that it gives."""
+        self.side_work = SideWork(self.failures, live)
+        """Looks for loops, for keyframes to return to, and for frames of before the map's start."""
         self.tracker = Tracker(
             self.prior, self.keyframes, config.tracking, places, live, self.failures,
-            self.metric.motion,
+            self.metric.motion, self.side_work,
         )  # fmt: skip
         adjustment = config.tracking.adjustment
         self.adjuster = Adjuster(self.keyframes, adjustment)
@@ -93,6 +97,7 @@ class Slam:
             self.keyframes, places, config.tracking, self.failures, self.metric,
             self.adjuster if adjustment.enabled else None,
             learned_scales(self.keyframes, self.prior.unit_sigma, config.tracking.learned),
+            self.side_work,
         )  # fmt: skip
         self.maps: MapWork = maps or Maps(
             config,
@@ -116,6 +121,8 @@ class Slam:
         """One frame's way through the paper; returns the frames that it finished."""
         # Sec. 3.2, Eq. 4: the graph as optimised meanwhile; keyframes move, and the map follows.
         if self._live:
+            with self.profiler.stage("graph"):
+                self.side_work.settle()
             self._follow_graph(wait=False)
 
         # Not in the paper: what a recorder burned into the pictures is masked.
@@ -154,6 +161,7 @@ class Slam:
         """In a live run's idle moments: poses of the past, which waited for a map (Sec. 3.2)."""
         newest = self._latest
         with self.profiler.stage("back-fill"):
+            self.side_work.settle()
             tracked = self.tracker.back_fill()
         finished = self._link_map_publish(tracked)
         self._latest = newest
@@ -200,11 +208,14 @@ class Slam:
                 self.metric.update(self.graph.snapshot)
 
     def _wait_for_graph(self) -> None:
+        self.side_work.settle(wait=True)
+        self._follow_graph(wait=True)
         while self.graph.optimising:
             self._follow_graph(wait=True)
 
     def close(self, keep: bool = False) -> None:
         """End the background work; remove the files of the work folder, or ``keep`` them."""
+        self.side_work.close()
         self.graph.close()
         self.keyframes.close(keep)
         self.maps.close(keep)

@@ -258,48 +258,6 @@ class KeyframeTracker:
             return CurrentKeyframe(keyframe, T_fk=solved.estimate.T, matches=solved.pair.matches)
         return None
 
-    def instead(
-        self, at: CurrentKeyframe, solved: Matched, encoding: Encoding, camera: CameraModel
-    ) -> tuple[CurrentKeyframe, Matched] | None:
-        """Instead of a new keyframe: an earlier one that shows the last frame well, to be held in
-        memory from now on, or, in a place that has keyframes enough, the one in use.
-
-        Only one that agrees with the keyframe in use about where the frame is: of a place that the
-        graph does not know to be the same, a new keyframe closes the loop.
-        """
-        config = self._config
-        if self._looked_already(at, solved):
-            return at, solved
-        around = self.neighbours.around(at.T_wc, camera, at.keyframe.sub_map, at.keyframe)
-        crowded = len(around) >= config.crowd
-        best, least = None, solved.share if crowded else config.return_share
-        for neighbour in around[: config.return_candidates]:
-            back = self.back_at(neighbour, at, encoding, camera)
-            if back is not None and back[1].share >= least:
-                best, least = back, back[1].share
-            if least >= config.return_share:
-                break
-        if best is not None:
-            self.take_up(best[0])
-            return best
-        if not crowded or solved.share < config.crowd_share:
-            return None
-        at.kept = at.t_ns, solved.share
-        return at, solved
-
-    def _looked_already(self, at: CurrentKeyframe, solved: Matched) -> bool:
-        """True if no other keyframe showed more a moment ago: to look costs as much as tracking
-        two or three frames."""
-        if at.kept is None:
-            return False
-        since_ns, share = at.t_ns - at.kept[0], at.kept[1]
-        config = self._config
-        return (
-            since_ns < 1e9 * config.crowd_look_s
-            and solved.share > share - config.crowd_look_loss
-            and solved.share >= config.crowd_share
-        )
-
     def take_up(self, back: CurrentKeyframe) -> None:
         """Hold an earlier keyframe in memory: tracking goes on there."""
         self._keyframes.hold(back.keyframe.number)

@@ -22,7 +22,9 @@ from aquaflow.tracking.loops.relocaliser import Places
 from aquaflow.tracking.map_start import MapStart, Started
 from aquaflow.tracking.pose.matcher import Matched
 from aquaflow.tracking.repairs import LastFrame, Repairs
+from aquaflow.tracking.returning import Look, Returning, carry
 from aquaflow.tracking.revisits import revisited
+from aquaflow.tracking.side_work import SideWork
 from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
 
 log = logging.getLogger(__name__)
@@ -44,12 +46,15 @@ class Tracker:
         live: bool = False,
         failures: Failures | None = None,
         motion: ExpectedMotion | None = None,
+        side_work: SideWork | None = None,
     ) -> None:
         """Without ``places`` there is no relocalisation: a lost camera starts a new sub-map.
 
         Frames that waited for a keyframe get their poses once it is there; in a ``live`` run
         whenever there is time, by :meth:`back_fill`. What raises is counted in ``failures``.
-        ``motion`` is asked for what gyro and DVL measured since the last frame.
+        ``motion`` is asked for what gyro and DVL measured since the last frame. Where a keyframe is
+        due, an earlier one is looked for as ``side_work``, by default at once; so are the frames
+        of :meth:`back_fill`.
         """
         self.sub_map = 0
         self.camera: CameraModel | None = None
@@ -62,11 +67,17 @@ class Tracker:
         """Number of sub-maps started so far."""
         self._waiting = waiting = WaitingFrames()
         self._start = MapStart(prior, config, waiting, self._failures, live)
-        self._back_fills = BackFills(waiting, prior, self._keyframe_tracker, self._failures, live)
+        side_work = side_work or SideWork(self._failures)
+        self._back_fills = BackFills(
+            waiting, prior, self._keyframe_tracker, self._failures, live, side_work
+        )
         self._at: CurrentKeyframe | None = None
         self._origin = Sim3.identity()
         self.monitor = ConsistencyMonitor(self._keyframe_tracker.neighbours, config)
         self._repair = Repairs(self.monitor, self._keyframe_tracker)
+        self._returning = Returning(
+            self._keyframe_tracker, config, side_work, self._failures, self._return
+        )
         self._solved: Matched | None = None
         """The last frame at the keyframe in use; None if it has become a keyframe itself."""
         self._joined: set[tuple[int, int]] = set()
@@ -85,11 +96,12 @@ class Tracker:
 
     @property
     def past(self) -> Frame | None:
-        """The frame that :meth:`back_fill` will process next."""
+        """The frame that :meth:`back_fill` will finish next."""
         return self._back_fills.next
 
     def back_fill(self) -> list[Tracked]:
-        """Finish :attr:`past`, with or without a pose; returns nothing if no frame waits."""
+        """Finish :attr:`past`, with or without a pose; returns nothing if no frame waits, or while
+        it is looked for."""
         return self._leaving("back-filling", self.past, self._back_fills.step)
 
     def finish(self, until: Deadline | None = None) -> list[Tracked]:
@@ -212,6 +224,20 @@ class Tracker:
                 self._at = repaired.at
                 self.revisits += [] if repaired.revisit is None else [repaired.revisit]
 
+    def _return(self, look: Look, back: CurrentKeyframe, solved_back: Matched) -> None:
+        """Go on at an earlier keyframe that shows the frame of ``look``, unless tracking has left
+        the one that was in use then."""
+        at = look.at
+        if self._at is not at:
+            return
+        self._keyframe_tracker.take_up(back)
+        self._keyframe_tracker.leave(at)
+        self._join(at, look.solved, back, solved_back, look.camera)
+        moved_on = at.T_fk is not look.T_fk
+        if moved_on:
+            carry(back, look)
+        self._at, self._solved = back, None if moved_on else solved_back
+
     def _join(
         self,
         at: CurrentKeyframe,
@@ -306,16 +332,12 @@ class Tracker:
         if keyframe_tracker.hidden(solved):
             frame = keyframe_tracker.without_hidden(frame, at, solved, camera)
         frame_class = keyframe_tracker.classify(at, solved, camera)
-        if frame_class is FrameClass.KEYFRAME:
-            instead = keyframe_tracker.instead(at, solved, encoding, camera)
-            if instead is not None:
-                keyframe_tracker.leave(at)
-                self._join(at, solved, *instead, camera)
-                self._at, solved = instead
-                frame_class = FrameClass.COMMON
         self._solved = solved
+        if frame_class is FrameClass.KEYFRAME:
+            due = not self._returning.does(frame.index, at, solved, encoding, camera)
+            frame_class = FrameClass.KEYFRAME if due else FrameClass.COMMON
         if frame_class is FrameClass.COMMON:
-            return self._at.tracked(frame, frame_class, solved.quality)
+            return self._at.tracked(frame, frame_class, self._solved.quality)
         pointmap, depth = keyframe_tracker.pointmap(at, solved, camera)
         if depth is not None:
             frame, pointmap = keyframe_tracker.without_moving(frame, at, solved, pointmap, depth)

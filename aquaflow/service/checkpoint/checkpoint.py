@@ -33,6 +33,7 @@ from aquaflow.service.map_thread import MapCorrection, MapThread
 from aquaflow.service.moment import Moment
 from aquaflow.slam import Slam
 from aquaflow.storage.arrays import Arrays, prefixed, under
+from aquaflow.tracking.graph.keyframe_graph import LOOP_SEARCH
 
 log = logging.getLogger(__name__)
 
@@ -69,8 +70,12 @@ class Checkpointer:
         self._writing = False
 
     def take_if_due(self, disk_is_full: bool) -> None:
-        """Take a checkpoint if it is time, the last one is done, and there is room."""
+        """Take a checkpoint if it is time, the last one is done, there is room, and no loops are
+        looked for."""
         if self._now_s() < self._due_s or self._writing or disk_is_full:
+            return
+        self._slam.side_work.settle()
+        if self._slam.side_work.awaits(LOOP_SEARCH):
             return
         self._due_s = self._now_s() + self._every_s
         self.take()
@@ -81,7 +86,9 @@ class Checkpointer:
 
     def take(self) -> None:
         """Take a checkpoint now; requests that wait in the mapping thread are not in it, except
-        corrections."""
+        corrections. A search of loops is waited for: a dive that goes on does not make it again."""
+        if self._slam.side_work.awaits(LOOP_SEARCH):
+            self._slam.side_work.settle(wait=True)
         with self._run.profiler.stage("checkpoint"):
             parts = tracking.serialise(self._slam, self._run)
             if parts is None:

@@ -4,13 +4,16 @@ A loop starts an optimisation in another thread, on a snapshot of the graph; its
 applied by ``correction``. A replay waits for it at the next keyframe, so that the same frames
 give the same poses however long it took; a live run asks without waiting. Keyframes and links that
 came meanwhile are moved along, and loops that came meanwhile start the next optimisation.
+
+Loops are looked for as side work: in a live run they may come some frames after their keyframe.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -24,7 +27,11 @@ from aquaflow.tracking.frames import Link, Revisit
 from aquaflow.tracking.graph.improvement import Improvement
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph, edge_information, solve
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
-from aquaflow.tracking.loops.relocaliser import Places
+from aquaflow.tracking.loops.relocaliser import Places, Relocalised
+from aquaflow.tracking.side_work import SideWork
+
+LOOP_SEARCH = "loop search"
+"""Name of that side work."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +93,8 @@ class Adjustments(Protocol):
 class KeyframeGraph:
     """Grows with the keyframes; sets their poses and sub-maps when the graph was optimised.
 
-    To be used from one thread: nothing changes but in ``add`` and ``correction``.
+    To be used from one thread: nothing changes but in ``add``, ``correction`` and where side work
+    is settled.
     """
 
     def __init__(
@@ -98,13 +106,15 @@ class KeyframeGraph:
         telemetry: Measurements | None = None,
         adjustments: Adjustments | None = None,
         scales: Measurements | None = None,
+        side_work: SideWork | None = None,
     ) -> None:
         """``telemetry`` takes part in the optimisations, once there is some, and until then
         ``scales``; ``adjustments`` come before them, and of all keyframes after those that closed
-        loops."""
+        loops. These are looked for as ``side_work``, by default at once."""
         self.graph = PoseGraph(config.graph)
         self._telemetry, self._scales = telemetry, scales
         self._failures = failures or Failures()
+        self._side_work = side_work or SideWork(self._failures)
         self._keyframes, self._places, self._config = keyframes, places, config.graph
         self._adjustment_config = config.adjustment
         self.loops = 0
@@ -136,7 +146,8 @@ class KeyframeGraph:
     def add(self, number: int, link: Link | None) -> None:
         """Add a keyframe and its relative-pose edge to the keyframe it was tracked against.
 
-        If it closes a loop, an optimisation starts in another thread, after one that is running.
+        If it proves to close a loop, an optimisation starts in another thread, after one that is
+        running.
         """
         keyframe = self._keyframes[number]
         if link is not None:  # the earlier one may have been moved since they were linked
@@ -155,11 +166,7 @@ class KeyframeGraph:
             with self._failures.contain("joint adjustment", keyframe.frame_index):
                 self._adjustments.keyframe(keyframe, link, edge)
                 self._to_adjust = number
-        if self._config.enabled:
-            with self._failures.contain("loop search", keyframe.frame_index):
-                self._close_loops(keyframe)
-        with self._failures.contain("place index", keyframe.frame_index):
-            self._places.add(keyframe)
+        self._look_for_loops(keyframe)
         parent = None if link is None else link.keyframe
         for measurements in (self._telemetry, self._scales):
             if measurements is not None:
@@ -203,13 +210,14 @@ class KeyframeGraph:
         self._known = [known for known in self._keyframes.keyframes if known.number in graph]
         for keyframe in self._known:
             if keyframe.number not in self._keyframes.lost:
-                self._places.add(keyframe)
+                self._places.add(keyframe.number, keyframe.encoding)
 
     def correction(self, wait: bool) -> Correction:
         """The optimisation's result, once; empty if there is none, or it is still running.
 
         ``wait``: block until it has ended. An error in its thread counts as a failure here.
         """
+        self._optimise()  # of loops that side work has found since
         if self._optimisation is None or not (wait or self._optimisation.done()):
             return Correction()
         finished, self._optimisation = self._optimisation, None
@@ -282,24 +290,37 @@ class KeyframeGraph:
             return better.alone(snapshot)
         return better.within(optimise(better.of(snapshot)), snapshot)
 
-    def _close_loops(self, keyframe: Keyframe) -> None:
+    def _look_for_loops(self, keyframe: Keyframe) -> None:
+        """Search the known places for the new keyframe's, and make it one of them."""
+        number, frame, places = keyframe.number, keyframe.frame_index, self._places
+        with self._failures.contain(LOOP_SEARCH, frame):
+            encoding, pointmap = keyframe.encoding, keyframe.pointmap.copy()  # fused meanwhile
+            if self._config.enabled:
+                near = self._on_the_path(number)
+                search = partial(places.of_keyframe, encoding, pointmap, near)
+                self._side_work.do(LOOP_SEARCH, frame, search, partial(self._close_loops, number))
+            index = partial(places.add, number, encoding)
+            self._side_work.do("place index", frame, index, lambda _: None)
+
+    def _on_the_path(self, number: int) -> Container[int]:
+        """The keyframes just before ``number``, of whose place the path knows anyway."""
+        component = self.graph.component_of(number)
+        before = range(max(0, number - self._config.loop_gap + 1), number)
+        known = {other for other in before if other in self.graph}
+        return {other for other in known if self.graph.component_of(other) == component}
+
+    def _close_loops(self, number: int, found: list[Relocalised]) -> None:
         """Edges to all earlier keyframes that prove to show the same place."""
-        number, component = keyframe.number, self.graph.component_of(keyframe.number)
-
-        def on_the_path(other: int) -> bool:
-            near = abs(number - other) < self._config.loop_gap
-            return near and self.graph.component_of(other) == component
-
-        for found in self._places.of_keyframe(keyframe, on_the_path):
-            T_fk, covariance = found.estimate.T, found.estimate.covariance
+        for place in found:
+            T_fk, covariance = place.estimate.T, place.estimate.covariance
             sigma = float(np.sqrt(covariance[6, 6]))
             information = edge_information(covariance[:6, :6], sigma, T_fk)
-            edge = Edge(number, found.keyframe.number, T_fk, information, loop=True)
+            edge = Edge(number, place.keyframe.number, T_fk, information, loop=True)
             if self.graph.add_edge(edge):
                 self.loops += 1
                 self._due = self._closed = True
                 if self._adjustments is not None:
-                    self._adjustments.loop(number, found.keyframe.number)
+                    self._adjustments.loop(number, place.keyframe.number)
 
     def _taken_over(self, result: GraphResult) -> Correction:
         """Apply the result to the keyframes."""

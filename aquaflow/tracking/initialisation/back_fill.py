@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from aquaflow.clocks.deadline import Deadline
 from aquaflow.errors.failures import Failures
@@ -15,11 +16,15 @@ from aquaflow.prior.contract import Encoding, Prior
 from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.tracking.pose.matcher import Matched
+from aquaflow.tracking.side_work import SideWork
 from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
+
+STAGE = "back-fill"
+"""Name of this side work."""
 
 
 @dataclass(frozen=True)
-class _Placed:
+class Placed:
     """A frame that got its pose."""
 
     frame: Frame
@@ -60,36 +65,40 @@ class BackFill:
         self._indices = frozenset(frame.index for frame in frames)
         self._at, self._camera = replace(at), camera
         self._prior, self._keyframe_tracker, self._failures = prior, keyframe_tracker, failures
-        self._last: _Placed | None = None
+        self._last: Placed | None = None
 
     def left(self, waiting: Sequence[Frame]) -> list[Frame]:
         """Those of its frames that still wait."""
         return [frame for frame in waiting if frame.index in self._indices]
 
-    def step(self, frame: Frame) -> Tracked:
-        """The newest frame that is left, with its pose if it has one."""
-        at, placed = self._at, None
+    def place(self, frame: Frame) -> Placed | None:
+        """Look for the newest frame that is left; in any thread, one frame at a time."""
         with self._failures.contain("pose", frame.index):
-            placed = self._place(frame)
+            return self._place(frame)
+        return None
+
+    def take(self, frame: Frame, placed: Placed | None) -> Tracked:
+        """The frame, with its pose if it was ``placed``."""
+        at = self._at
         if placed is None:
             return Tracked.lost(frame, at.keyframe.sub_map)
         self._last = placed
         at.T_fk = placed.T_fk
         return at.tracked(frame, FrameClass.COMMON, placed.solved.quality)
 
-    def _place(self, frame: Frame) -> _Placed | None:
+    def _place(self, frame: Frame) -> Placed | None:
         """At the keyframe; where the frame no longer shows that, at the frame placed before."""
         encoding = self._prior.encode(frame.image, self._camera, frame.mask)
         solved = self._keyframe_tracker.place(self._at, encoding, self._camera)
         if solved is not None:
-            return _Placed(frame, encoding, solved, self._at, solved.estimate.T)
+            return Placed(frame, encoding, solved, self._at, solved.estimate.T)
         if self._last is None:
             return None
         at, T_ak = self._last.as_keyframe(self._keyframe_tracker, self._camera)
         solved = self._keyframe_tracker.place(at, encoding, self._camera)
         if solved is None:
             return None
-        return _Placed(frame, encoding, solved, at, solved.estimate.T @ T_ak)
+        return Placed(frame, encoding, solved, at, solved.estimate.T @ T_ak)
 
     def all(self, frames: Sequence[Frame], until: Deadline | None = None) -> list[Tracked]:
         """Every one of ``frames``, those that are left; the oldest first. Where the time does not
@@ -98,7 +107,7 @@ class BackFill:
         for frame in reversed(frames):
             if until is not None and until.over:
                 break
-            done.append(self.step(frame))
+            done.append(self.take(frame, self.place(frame)))
         return done[::-1]
 
 
@@ -112,11 +121,15 @@ class BackFills:
         keyframe_tracker: KeyframeTracker,
         failures: Failures,
         live: bool,
+        side_work: SideWork,
     ) -> None:
+        """A ``live`` run's frames are looked for as ``side_work``."""
         self._waiting, self._prior, self._keyframe_tracker = waiting, prior, keyframe_tracker
-        self._failures, self._live = failures, live
+        self._failures, self._live, self._side_work = failures, live, side_work
         self._left: list[BackFill] = []
         """The frames left for idle time, in processing order."""
+        self._answer: tuple[BackFill, Frame, Placed | None] | None = None
+        """What was found of the last frame that was looked for."""
 
     def start(self, at: CurrentKeyframe, camera: CameraModel) -> list[Tracked]:
         """Against ``at``, all frames that wait for a keyframe; those that are placed at once."""
@@ -133,22 +146,42 @@ class BackFills:
 
     @property
     def next(self) -> Frame | None:
-        """The frame that :meth:`step` will process next."""
+        """The frame that :meth:`step` will finish next."""
         waiting = self._waiting.of(Wait.IN_IDLE_TIME)
         return next((left[-1] for fill in self._left if (left := fill.left(waiting))), None)
 
     def step(self) -> list[Tracked]:
-        """Process :attr:`next`, which gets a pose or none; returns nothing if no frame waits."""
+        """Finish :attr:`next`, which gets a pose or none, once that has been looked for; returns
+        nothing until then, or if no frame waits."""
+        self._look()
+        answer, self._answer = self._answer, None
+        if answer is None:
+            return []
+        fill, frame, placed = answer
+        self._waiting.put([frame], Wait.IN_HAND)
+        tracked = fill.take(frame, placed)
+        self._look()
+        return [tracked]
+
+    def _look(self) -> None:
+        """Look for the next frame, unless one is looked for, or the last answer is not taken."""
+        if self._answer is not None or self._side_work.awaits(STAGE):
+            return
         waiting = self._waiting.of(Wait.IN_IDLE_TIME)
         self._left = [fill for fill in self._left if fill.left(waiting)]
-        if not self._left:
-            return []
-        frame = self._left[0].left(waiting)[-1]
-        self._waiting.put([frame], Wait.IN_HAND)
-        return [self._left[0].step(frame)]
+        if self._left:
+            fill = self._left[0]
+            frame = fill.left(waiting)[-1]
+            found = partial(self._found, fill, frame)
+            self._side_work.do(STAGE, frame.index, partial(fill.place, frame), found)
+
+    def _found(self, fill: BackFill, frame: Frame, placed: Placed | None) -> None:
+        self._answer = fill, frame, placed
 
     def all(self, until: Deadline | None = None) -> list[Tracked]:
         """Every frame that waits for idle time, or those that there is time for."""
+        self._side_work.settle(wait=True)
+        self._answer = None
         waiting = self._waiting.move(Wait.IN_IDLE_TIME, Wait.IN_HAND)
         fills, self._left = self._left, []
         return [tracked for fill in fills for tracked in fill.all(fill.left(waiting), until)]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+from collections.abc import Container
 from dataclasses import dataclass
 
 from aquaflow.config import TrackingConfig
@@ -25,30 +26,39 @@ class Relocalised:
 
 
 class Places:
-    """Retrieval of similar keyframes, then geometric verification of the plausible ones."""
+    """Retrieval of similar keyframes, then geometric verification of the plausible ones; for any
+    thread."""
 
     def __init__(self, keyframes: KeyframeStore, config: TrackingConfig) -> None:
         self._keyframes, self._config = keyframes, config
-        self._retrieval = Retrieval(config.retrieval)
+        self._retrieval, self._lock = Retrieval(config.retrieval), threading.Lock()
 
-    def add(self, keyframe: Keyframe) -> None:
-        """Index ``keyframe``, so that its place can be found again."""
-        self._retrieval.add(keyframe.number, keyframe.encoding)
+    def add(self, number: int, encoding: Encoding) -> None:
+        """Index keyframe ``number``, so that its place can be found again."""
+        with self._lock:
+            self._retrieval.add(number, encoding)
 
     def of_frame(self, encoding: Encoding, camera: CameraModel) -> Relocalised | None:
         """Pose of a lost frame, from the first keyframe, most similar first, that verifies."""
-        for candidate in self._retrieval.candidates(encoding, lambda _: False):
-            found = self._verified(candidate.number, encoding, camera)
+        for number in self._similar(encoding, ()):
+            found = self._verified(number, encoding, camera)
             if found is not None:
                 return found
         return None
 
-    def of_keyframe(self, keyframe: Keyframe, exclude: Callable[[int], bool]) -> list[Relocalised]:
-        """Earlier keyframes that show the same place as ``keyframe``, with relative scale."""
-        encoding, pointmap = keyframe.encoding, keyframe.pointmap
-        numbers = [found.number for found in self._retrieval.candidates(encoding, exclude)]
+    def of_keyframe(
+        self, encoding: Encoding, pointmap: Pointmap, besides: Container[int]
+    ) -> list[Relocalised]:
+        """Keyframes, but for some, that show the same place as the one with this ``encoding`` and
+        ``pointmap``, with relative scale."""
+        numbers = self._similar(encoding, besides)
         found = [self._verified(n, encoding, encoding.camera, pointmap) for n in numbers]
         return [place for place in found if place is not None]
+
+    def _similar(self, encoding: Encoding, besides: Container[int]) -> list[int]:
+        with self._lock:
+            found = self._retrieval.candidates(encoding, besides.__contains__)
+        return [candidate.number for candidate in found]
 
     def _verified(
         self,

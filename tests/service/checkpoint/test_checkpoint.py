@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from aquaflow.service.moment import Moment
 from aquaflow.service.report import report
 from aquaflow.sources import open_recording
 from aquaflow.storage import spill
+from aquaflow.tracking.graph.keyframe_graph import LOOP_SEARCH
 from tests.service.live_scenes import VEHICLE, ToldFeed, caught_up
 
 CLOCKS = {"autopilot": [[12, 12_000_000_000, 345, None, None]]}
@@ -278,3 +280,21 @@ def test_the_live_window_shows_map_path_and_health(cut: Cut) -> None:
     finally:
         window.close()
     assert "lag" in in_words(report(parts, hang_s=1e6))
+
+
+def test_a_checkpoint_waits_for_a_search_of_loops_and_a_frame_does_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, taken, go_on = list[bool](), list[bool](), Event()
+    with LiveDive("new", resumed(tmp_path / "new", new=False), ToldFeed(), VEHICLE) as dive:
+        side_work, checkpointer = dive.parts.slam.side_work, dive.parts.checkpointer
+        side_work.do(LOOP_SEARCH, 0, lambda: go_on.wait(60.0), found.append)
+        checkpointer.take_soon()
+        with monkeypatch.context() as told:
+            told.setattr(checkpointer, "take", lambda: taken.append(True))
+            checkpointer.take_if_due(disk_is_full=False)
+        assert taken == []
+        go_on.set()
+        checkpointer.take()
+        assert found == [True]
+        assert not side_work.awaits(LOOP_SEARCH)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Container, Iterator
 from concurrent import futures
 from dataclasses import dataclass, field
 from threading import Event
@@ -15,7 +15,7 @@ import pytest
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
+from aquaflow.keyframes import KeyframeStore, Pointmap
 from aquaflow.prior.contract import Encoding
 from aquaflow.tracking.frames import Link
 from aquaflow.tracking.graph import keyframe_graph
@@ -23,6 +23,7 @@ from aquaflow.tracking.graph.keyframe_graph import Correction, KeyframeGraph
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
 from aquaflow.tracking.loops.relocaliser import Places, Relocalised
 from aquaflow.tracking.pose.solver import Degeneracy, PoseEstimate
+from aquaflow.tracking.side_work import SideWork
 from tests.tracking.graph.graph_scenes import LOOP_SIGMA, SIGMA, circle
 
 COUNT = 24
@@ -42,12 +43,17 @@ class KnownPlaces:
 
     store: KeyframeStore
     again: dict[int, int]
+    go_on: Event | None = None
+    """Set to let searches end; None: they do at once."""
 
-    def add(self, keyframe: Keyframe) -> None:
+    def add(self, number: int, encoding: Encoding) -> None:
         pass
 
-    def of_keyframe(self, keyframe: Keyframe, exclude: Callable[[int], bool]) -> list[Relocalised]:
-        number = keyframe.number
+    def of_keyframe(
+        self, encoding: Encoding, pointmap: Pointmap, besides: Container[int]
+    ) -> list[Relocalised]:
+        assert self.go_on is None or self.go_on.wait(60.0)
+        number = cast(SimpleNamespace, encoding).number
         if number not in self.again:
             return []
         past = self.again[number]
@@ -62,10 +68,13 @@ class Drifting:
 
     loops: dict[int, int]
     store: KeyframeStore = field(default_factory=KeyframeStore)
+    go_on: Event | None = None
+    """If there is one, loops are looked for in a thread, and found once it is set."""
 
     def __post_init__(self) -> None:
-        places = cast(Places, KnownPlaces(self.store, self.loops))
-        self.graph = KeyframeGraph(self.store, places, TrackingConfig())
+        places = cast(Places, KnownPlaces(self.store, self.loops, self.go_on))
+        self.side_work = SideWork(threaded=self.go_on is not None)
+        self.graph = KeyframeGraph(self.store, places, TrackingConfig(), side_work=self.side_work)
         self.link_T = [
             (between(i, i + 1) @ Sim3.exp(SIGMA * np.array([0, 0, 0, 0, 0, 1, 1]))).inverse()
             for i in range(COUNT - 1)
@@ -77,7 +86,7 @@ class Drifting:
             T_fk = self.link_T[number - 1]
             T_wc = self.store[number - 1].T_wc @ T_fk.inverse()
             link = Link(number - 1, T_fk, np.diag(SIGMA[:6] ** 2))
-        nothing = cast(Encoding, SimpleNamespace(camera=CAMERA))
+        nothing = cast(Encoding, SimpleNamespace(camera=CAMERA, number=number))
         self.store.add(number, number, nothing, T_wc, Pointmap.unknown(CAMERA), 0)
         self.graph.add(number, link)
 
@@ -144,6 +153,23 @@ def test_loops_that_came_meanwhile_start_the_next_optimisation(held: Held) -> No
         dive.graph.correction(wait=True)
     assert held.solved == [21, COUNT]
     assert dive.graph.loops == 3
+
+
+def test_a_loop_that_is_found_some_keyframes_later_closes_all_the_same() -> None:
+    dive = Drifting({20: 0}, go_on=Event())
+    assert dive.go_on is not None
+    for number in range(COUNT):
+        dive.add(number)
+        dive.side_work.settle()
+        assert dive.graph.correction(wait=False) == Correction()
+    assert dive.graph.loops == 0
+    drifted = dive.seam_m(0, 20)
+    dive.go_on.set()
+    dive.side_work.settle(wait=True)
+    assert dive.graph.loops == 1
+    assert dive.graph.correction(wait=True).moves
+    assert dive.seam_m(0, 20) < drifted / 3.0
+    dive.side_work.close()
 
 
 def test_a_correction_is_told_once() -> None:

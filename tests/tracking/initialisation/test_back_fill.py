@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from threading import Event
 
 import pytest
 
@@ -12,6 +13,7 @@ from aquaflow.keyframes import KeyframeStore
 from aquaflow.messages import Frame
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.tracking.frames import Tracked
+from aquaflow.tracking.side_work import SideWork
 from aquaflow.tracking.tracker import Tracker
 from aquaflow.tracking.waiting_frames import BOUNDS, Bound, Wait
 from tests.tracking.tracked_clips import error_share
@@ -60,6 +62,25 @@ def test_the_past_is_placed_frame_by_frame_and_as_well(clip: list[Frame]) -> Non
     assert sorted(tracked.frame.index for tracked in decided) == list(range(len(clip)))
     assert all(tracked.T_wc is not None for tracked in decided)
     assert error_share(decided, POSES) < 0.01
+
+
+def test_a_frame_of_the_past_is_looked_for_beside_tracking(clip: list[Frame]) -> None:
+    side_work, go_on = SideWork(threaded=True), Event()
+    tracker = Tracker(
+        ClassicalPrior(), KeyframeStore(), TrackingConfig(), live=True, side_work=side_work
+    )
+    _, newest = until_started(tracker, clip)
+    side_work.do("hold", 0, lambda: go_on.wait(60.0), lambda _: None)
+    assert tracker.back_fill() == tracker.back_fill() == []
+    assert tracker.past is not None
+    go_on.set()
+    side_work.settle(wait=True)
+    (placed,) = tracker.back_fill()
+    assert placed.frame.index == newest - 1
+    assert placed.T_wc is not None
+    ended = tracker.finish()
+    assert sorted(tracked.frame.index for tracked in ended) == list(range(1, newest - 1))
+    side_work.close()
 
 
 def test_the_end_of_a_dive_leaves_nobody_waiting(clip: list[Frame]) -> None:
