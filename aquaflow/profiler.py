@@ -41,11 +41,18 @@ class Profiler:
     """Collects durations per stage; stages may nest, each counts its own wall time.
 
     With ``trace`` every single run of a stage is kept, for :meth:`chrome_trace`. A stage ends with
-    a call of ``settle``, which may wait for a GPU: what it still works on is that stage's.
+    a call of ``settle``, which may wait for a GPU: what it still works on is that stage's. Another
+    ``clock`` (s), such as that of the thread's CPU time, makes all times its own.
     """
 
-    def __init__(self, trace: bool = False, settle: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self,
+        trace: bool = False,
+        settle: Callable[[], None] = lambda: None,
+        clock: Callable[[], float] | None = None,
+    ) -> None:
         self._settle = settle
+        self._clock_s = clock or time.perf_counter
         self.top_level_s = 0.0
         """Time inside stages, what nests counted once; of the thread that made the profiler."""
         self._durations: dict[str, array[float]] = defaultdict(lambda: array("d"))
@@ -53,7 +60,7 @@ class Profiler:
         self._events: list[_Event] | None = [] if trace else None
         self._nesting = _Nesting()
         self._owner = threading.get_ident()
-        self._origin_s = time.perf_counter()
+        self._origin_s = self._clock_s()
 
     def stage(self, name: str) -> _Stage:
         """Measure the ``with`` block as one run of ``name``."""
@@ -104,7 +111,7 @@ class Profiler:
 
     def _leave(self, name: str, started_s: float, depth: int) -> None:
         self._settle()
-        ended_s = time.perf_counter()
+        ended_s = self._clock_s()
         self._nesting.depth = depth
         took_ms = (ended_s - started_s) * 1e3
         self._durations[name].append(took_ms)
@@ -126,7 +133,7 @@ class _Stage:
 
     def __enter__(self) -> None:
         self._depth = self._profiler._enter()
-        self._started_s = time.perf_counter()
+        self._started_s = self._profiler._clock_s()
 
     def __exit__(self, *_: object) -> None:
         self._profiler._leave(self._name, self._started_s, self._depth)

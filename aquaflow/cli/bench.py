@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from aquaflow.cli.console import Json, one_of, progress_bars, table_console
+from aquaflow.cli.console import PRESETS, Json, one_of, progress_bars, table_console
 from aquaflow.errors import InputError
 
 Suite = Annotated[str | None, typer.Option(help="ci (synthetic) | real DATA_DIR")]
@@ -38,10 +38,12 @@ class _DivesUnlessNamed(TyperGroup):
 def register(app: typer.Typer) -> None:
     """Add the commands to ``app``."""
     bench = typer.Typer(
-        cls=_DivesUnlessNamed, help="Run time against error; `bench render`: of the renderer."
+        cls=_DivesUnlessNamed,
+        help="Run time against error; `bench render`: of the renderer; `bench growth`: long dives.",
     )
     bench.command(DIVES)(dives)
     bench.command()(render)
+    bench.command()(growth)
     app.add_typer(bench, name="bench")
     app.command()(ablate)
 
@@ -64,7 +66,8 @@ def dives(
 ) -> None:
     """Run time against error: scenes x presets as a table, a picture and bench.json.
 
-    `aquaflow bench` alone does this too; `aquaflow bench render` times the renderer.
+    `aquaflow bench` alone does this too; `aquaflow bench render` times the renderer,
+    `aquaflow bench growth` measures dives of several lengths.
     """
     from aquaflow.config.presets import BY_EFFORT, FOR_A_GPU
     from aquaflow.evaluation.bench import benchmark as bm
@@ -127,6 +130,31 @@ def render(
     from aquaflow.evaluation.bench.render.table import print_result
 
     print_result(result, table_console())
+    typer.echo(f"Look at {out / bm.PICTURE_FILE}; all numbers are in {out / bm.JSON_FILE}.")
+
+
+def growth(
+    frames: Annotated[
+        list[int] | None, typer.Option(help="May be repeated; default: 1000, 5000, 20000.")
+    ] = None,
+    width: Annotated[int, typer.Option(min=64, max=1920, help="Of the pictures, pixels.")] = 160,
+    preset: Annotated[str, typer.Option(help=PRESETS)] = "balanced",
+    tracking_only: Annotated[bool, typer.Option(help="Trajectories without maps.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Only 150 and 300 frames.")] = False,
+    out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("out/bench_growth"),
+    as_json: Json = False,
+) -> None:
+    """What a frame costs in long dives: synthetic surveys, CPU time, memory, files, viewer."""
+    from aquaflow.evaluation.bench.growth import benchmark as bm
+
+    counts = frames or (bm.QUICK_FRAMES if quick else bm.FRAMES)
+    jobs = bm.jobs_of(counts, width, preset, tracking_only, out)
+    with progress_bars(as_json) as progress:
+        result = bm.bench_growth(jobs, out, progress)
+    if as_json:
+        typer.echo(json.dumps(result))
+        return
+    typer.echo((out / bm.TABLE_FILE).read_text())
     typer.echo(f"Look at {out / bm.PICTURE_FILE}; all numbers are in {out / bm.JSON_FILE}.")
 
 

@@ -198,6 +198,12 @@ class AdjustmentConfig(Stage):
         ge=0,
         description="keyframes between two adjustments of all keyframes after loops; 0: none",
     )
+    at_loops_share: float = Field(
+        0.25,
+        ge=0,
+        description="as many of them as this share of those adjusted before, where that is more: "
+        "an adjustment takes time by their number (docs/performance.md#growth)",
+    )
     most_at_loops: int = Field(
         300, ge=2, description="keyframes beyond which loops are left to the end; bounds its time"
     )

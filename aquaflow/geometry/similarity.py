@@ -57,9 +57,9 @@ def nearest_rotation(
 
 
 def on_so3(
-    R: Array,  # [3, 3] nearly a rotation
+    R: Array,  # [..., 3, 3] nearly rotations
 ) -> Array:
-    """The rotation [3, 3] next to ``R``: by way of a unit quaternion.
+    """The rotations [..., 3, 3] next to ``R``: by way of unit quaternions.
 
     A copy: SciPy's array is a view of what takes 1.2 kB, and a long dive keeps many poses.
     """

@@ -107,17 +107,23 @@ def row_of(job: Job, load: float | None, result: Row) -> Row:
 
 def in_process(job: Job) -> Row:
     """The worker's answer, or why there is none."""
+    return answer_of(WORKER, job.to_text(), LIMIT_S)
+
+
+def answer_of(worker: str, job: str, limit_s: float | None = None) -> Row:
+    """What the module ``worker`` answers to ``job`` on its standard input: the JSON of its last
+    line, or ``failed`` with the reason. None: it may take as long as it takes."""
     try:
         done = subprocess.run(
-            [sys.executable, "-m", WORKER],
-            input=job.to_text(),
+            [sys.executable, "-m", worker],
+            input=job,
             capture_output=True,
             text=True,
-            timeout=LIMIT_S,
+            timeout=limit_s,
             check=False,
         )
     except subprocess.TimeoutExpired:
-        return {"failed": f"stopped after {LIMIT_S:.0f} s"}
+        return {"failed": f"stopped after {limit_s:.0f} s"}
     if done.returncode != 0:
         said = done.stderr.strip().splitlines()
         return {"failed": f"the run crashed ({done.returncode}): {said[-1] if said else 'silent'}"}

@@ -15,6 +15,7 @@ from typing import Any
 from aquaflow.errors import AquaFlowError, NotMappedError
 from aquaflow.evaluation.bench.job import Job
 from aquaflow.evaluation.bench.measure import measured
+from aquaflow.evaluation.bench.memory import peak_memory_mb
 from aquaflow.evaluation.bench.peers import run_peer
 from aquaflow.geometry.camera import load_camera
 from aquaflow.sources import open_recording
@@ -51,19 +52,6 @@ def perform(job: Job) -> dict[str, Any]:
             raise NotMappedError(f"{scene.name}: {'; '.join(metrics['warnings'])}")
     peak_mb = peak_memory_mb()  # before the evaluation, whose memory is not the run's
     return {**metrics, **measured(scene, out), "peak_rss_mb": peak_mb}
-
-
-def peak_memory_mb() -> float | None:
-    """Of this program alone; None where the system does not report it.
-
-    getrusage's maximum is inherited: it holds the memory of the process that started this one.
-    """
-    try:
-        lines = Path("/proc/self/status").read_text().splitlines()
-    except OSError:
-        return None
-    found = [line.split()[1] for line in lines if line.startswith("VmHWM:")]
-    return round(int(found[0]) / 1024.0, 1) if found else None
 
 
 def main() -> None:

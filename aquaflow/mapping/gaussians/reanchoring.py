@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
 
-from aquaflow.geometry.similarity import Sim3
+from aquaflow.geometry.similarity import Sim3, on_so3
+from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.mapping.gaussians.gaussians import GaussianMap
 from aquaflow.mapping.transfers import moves_in
 from aquaflow.mapping.views import View
@@ -56,12 +58,15 @@ def move_views(views: Iterable[View], moves: Mapping[int, Sim3]) -> None:
     Raises:
         ArithmeticError: where they go is not finite; no view has moved then.
     """
-    moved = [
-        (view, (moves[view.keyframe] @ view.T_wc).if_finite())
-        for view in views
-        if view.keyframe in moves
-    ]
-    for view, T_wc in moved:
+    moving = [view for view in views if view.keyframe in moves]
+    if not moving:
+        return
+    # All at once: one by one, the 2000 views of two joined lines would take half a second.
+    before = Sim3Batch.of([view.T_wc for view in moving])
+    moved = Sim3Batch.of([moves[view.keyframe] for view in moving]) @ before
+    moved = replace(moved, R=on_so3(moved.R))
+    poses = [moved.element(i).if_finite() for i in range(len(moving))]
+    for view, T_wc in zip(moving, poses, strict=True):
         view.T_wc = T_wc
 
 

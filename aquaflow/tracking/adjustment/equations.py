@@ -94,17 +94,12 @@ class AnchorEquations:
 
     H: Array
     """[n, n]"""
-    scores: Array
-    """[P, n] what each point adds to the gradient."""
+    gradient: Array
+    """[n]"""
     gain: Array
     """[P, n] step of a depth by a step of the poses, negative."""
     offset: Array
     """[P] step of a depth while the poses stay, negative."""
-
-    @property
-    def gradient(self) -> Array:
-        """[n]"""
-        return np.asarray(self.scores.sum(axis=0))
 
     def depth_steps(
         self,
@@ -120,6 +115,15 @@ def anchor_equations(
     rho: Array,  # [P]
 ) -> AnchorEquations:
     """Linearise an anchor's matches at ``poses`` and inverse depths."""
+    return equations_and_scores(matches, poses, rho)[0]
+
+
+def equations_and_scores(
+    matches: AnchorMatches,
+    poses: Sim3Batch,
+    rho: Array,  # [P]
+) -> tuple[AnchorEquations, Array]:
+    """The same, and [P, n] what each point adds to the gradient: as large as all the rest."""
     at = projected(matches, poses, rho)
     by_point = _by_point(at)
     by_view = -_moved(by_point, at.Y, rho)
@@ -152,9 +156,9 @@ def anchor_equations(
     n = 7 * (1 + views)
     H_pc, scores = H_pc.reshape(points, n), scores.reshape(points, n)
     gain, offset = H_pc / H_pp[:, None], g_p / H_pp
-    return AnchorEquations(
-        H.reshape(n, n) - H_pc.T @ gain, scores - offset[:, None] * H_pc, gain, offset
-    )
+    scores = scores - offset[:, None] * H_pc
+    H = H.reshape(n, n) - H_pc.T @ gain
+    return AnchorEquations(H, scores.sum(axis=0), gain, offset), scores
 
 
 def _weights(

@@ -7,7 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from aquaflow.geometry.similarity_batch import Sim3Batch
-from aquaflow.tracking.adjustment.equations import AnchorMatches, Array, Index, Mask
+from aquaflow.tracking.adjustment.equations import (
+    AnchorMatches,
+    Array,
+    Index,
+    Mask,
+    equations_and_scores,
+)
 from aquaflow.tracking.adjustment.links import Links
 from aquaflow.tracking.adjustment.solver import State, assembled, linearised, unknowns
 
@@ -53,10 +59,11 @@ def inflation(
     inverse = covariance(matches, links, state, free)
     place = np.where(free, np.cumsum(free) - 1, -1)
     variation, expected = 0.0, 0.0
-    for anchor, part in zip(matches, linearised(matches, state), strict=True):
+    for anchor, rho in zip(matches, state.rho, strict=True):
+        part, scores = equations_and_scores(anchor, state.poses, rho)
         at, inside = unknowns(place[anchor.places])
-        starts = np.arange(0, len(part.scores), CLUSTER)
-        scores = np.add.reduceat(part.scores[:, inside], starts) if len(starts) else part.scores
+        starts = np.arange(0, len(scores), CLUSTER)
+        scores = np.add.reduceat(scores[:, inside], starts) if len(starts) else scores
         own = inverse[np.ix_(at, at)]
         variation += float(((scores @ own) * scores).sum()) if len(starts) else 0.0
         expected += float((part.H[np.ix_(inside, inside)] * own).sum())

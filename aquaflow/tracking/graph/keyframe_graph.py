@@ -235,10 +235,12 @@ class KeyframeGraph:
     def _loops_to_adjust(self) -> bool:
         """True if loops were closed, the graph has taken them in, and it is not too soon."""
         count, config = len(self._known), self._adjustment_config
+        enough = max(config.at_loops, config.at_loops_share * self._adjusted)
         return (
             self._closed
             and not self._due
-            and 0 < config.at_loops <= count - self._adjusted
+            and config.at_loops > 0
+            and enough <= count - self._adjusted
             and count <= config.most_at_loops
         )
 

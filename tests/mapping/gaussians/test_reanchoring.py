@@ -125,3 +125,18 @@ def test_an_absorbed_sub_map_is_optimised_on_with_its_views() -> None:
     assert len(first.views) == 2
     first.optimise(3)
     assert first.steps == 3
+
+
+def test_views_move_as_each_would_alone_to_the_last_bit() -> None:
+    rng = np.random.default_rng(0)
+    poses = [pose(tuple(rng.normal(size=3)), tuple(rng.normal(size=3))) for _ in range(40)]
+    views = [view_of(T_wc) for T_wc in poses]
+    moves = {}
+    for i, view in enumerate(views):
+        view.frame_index, view.keyframe = i, i // 3
+        moves[view.keyframe] = Sim3.exp(0.02 * rng.normal(size=7))
+    alone = [moves[view.keyframe] @ view.T_wc for view in views]
+    move_views(views, moves)
+    for view, expected in zip(views, alone, strict=True):
+        assert (view.T_wc.matrix == expected.matrix).all()
+        assert view.T_wc.scale == expected.scale

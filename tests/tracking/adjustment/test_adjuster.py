@@ -259,3 +259,13 @@ def test_loops_are_left_to_the_end_where_the_config_says_so(
     swim: Callable[..., Swim], monkeypatch: pytest.MonkeyPatch, settings: dict[str, int]
 ) -> None:
     assert looped(swim(**{"at_loops": 2, **settings}), monkeypatch) == []
+
+
+def test_the_more_keyframes_were_adjusted_the_more_must_come_before_the_next_time(
+    swim: Callable[..., Swim], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    often = looped(swim(at_loops=1, at_loops_share=0.0), monkeypatch)
+    assert len(often) > 1
+    monkeypatch.undo()
+    seldom = looped(swim(at_loops=1, at_loops_share=1.0), monkeypatch)
+    assert seldom == often[:1]

@@ -9,7 +9,12 @@ import pytest
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
-from aquaflow.tracking.adjustment.equations import AnchorMatches, anchor_equations, projected
+from aquaflow.tracking.adjustment.equations import (
+    AnchorMatches,
+    anchor_equations,
+    equations_and_scores,
+    projected,
+)
 from aquaflow.tracking.adjustment.links import Links
 from aquaflow.tracking.adjustment.solver import State, assembled, cost_of, linearised
 from tests.tracking.adjustment.adjustment_scenes import Array, no_links, scene, shaken
@@ -70,6 +75,15 @@ def test_residuals_move_as_their_derivatives_say(moved: int) -> None:
     assert float((slope * errors(0.0)).sum()) == pytest.approx(float(own @ d), rel=1e-5)
     curvature = part.H[7 * at : 7 * at + 7, 7 * at : 7 * at + 7]
     assert float((slope**2).sum()) == pytest.approx(float(d @ curvature @ d), rel=1e-5)
+
+
+def test_the_gradient_is_what_the_points_add_to_it() -> None:
+    known = scene(count=4, noise=1e-3)
+    matches, rho = known.matches[1], 1.01 * known.rho[1]
+    part, scores = equations_and_scores(matches, Sim3Batch.of(known.poses), rho)
+    assert scores.shape == (len(rho), 7 * len(matches.places))
+    assert (scores.sum(axis=0) == part.gradient).all()
+    assert np.abs(part.gradient).max() > 0.0
 
 
 def test_links_pull_as_their_cost_says() -> None:

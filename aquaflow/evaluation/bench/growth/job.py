@@ -1,0 +1,43 @@
+"""A survey of one length, which a process of its own maps."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+
+from aquaflow.config import Config
+from aquaflow.config.presets import configured
+
+THREADS = 1
+"""CPU time is the work done then, whatever else the machine does; and what is spent outside of the
+tracking thread is the keyframe graph's."""
+
+
+@dataclass(frozen=True)
+class GrowthJob:
+    """What a process needs to know; all of it goes through its standard input."""
+
+    frames: int
+    width: int
+    out: str
+    """Dive folder."""
+    preset: str
+    tracking_only: bool = False
+
+    def config(self) -> Config:
+        """The preset, on one thread.
+
+        Raises:
+            ConfigError: there is no such preset.
+        """
+        asked = {"threads": THREADS, "mapping": {"enabled": not self.tracking_only}}
+        return configured(None, self.preset, asked, "benchmark of growth")
+
+    def to_text(self) -> str:
+        """As JSON, for the process."""
+        return json.dumps(asdict(self))
+
+    @staticmethod
+    def from_text(text: str) -> GrowthJob:
+        """The job that :meth:`to_text` wrote."""
+        return GrowthJob(**json.loads(text))
