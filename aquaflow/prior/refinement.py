@@ -52,7 +52,11 @@ def refine(
     b: Grey,  # [H, W]
     flow: Float,  # [H, W, 2] px, a to b
 ) -> Float:
-    """[H, W, 2] as :func:`refine_by_opencv`, in compiled code where there is some."""
+    """[H, W, 2] as :func:`refine_by_opencv`, in compiled code where there is some.
+
+    Raises:
+        ValueError: the three are not of one size, or a picture is not of bytes.
+    """
     library = library_or_none()
     if library is None:
         return refine_by_opencv(a, b, flow)

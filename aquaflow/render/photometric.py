@@ -7,9 +7,9 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from aquaflow.errors import AquaFlowError
+from aquaflow.render.known_gradient import KnownGradient
 from aquaflow.render.library import Library, library_or_none, pointer
 
 SSIM_WINDOW = 11
@@ -113,7 +113,7 @@ def _check(
             )
 
 
-class _Photometric(torch.autograd.Function):
+class _Photometric(KnownGradient):
     @staticmethod
     def forward(
         ctx: Any,
@@ -142,12 +142,3 @@ class _Photometric(torch.autograd.Function):
         if gradient is not None:
             ctx.save_for_backward(gradient)
         return loss[0]
-
-    @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
-    def backward(
-        ctx: Any,
-        g_loss: Tensor,  # []
-    ) -> tuple[Any, ...]:
-        (gradient,) = ctx.saved_tensors
-        return (g_loss * gradient, *[None] * 6)

@@ -10,9 +10,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from aquaflow.errors import AquaFlowError
+from aquaflow.render.known_gradient import KnownGradient
 from aquaflow.render.library import Library, library_or_none, pointer
 
 MIN_RANGE = 1e-2
@@ -87,7 +87,7 @@ def depth_loss(
     return loss
 
 
-class _Ranges(torch.autograd.Function):
+class _Ranges(KnownGradient):
     @staticmethod
     def forward(
         ctx: Any,
@@ -104,15 +104,6 @@ class _Ranges(torch.autograd.Function):
         library.call("aq_range_loss", *inputs, MIN_RANGE, z.numel(), threads, *outputs)
         ctx.save_for_backward(gradient)
         return loss[0]
-
-    @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
-    def backward(
-        ctx: Any,
-        g_loss: Tensor,  # []
-    ) -> tuple[Any, ...]:
-        (gradient,) = ctx.saved_tensors
-        return (g_loss * gradient, *[None] * 5)
 
 
 def _check(

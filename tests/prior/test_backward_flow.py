@@ -6,29 +6,20 @@ import cv2
 import numpy as np
 import pytest
 
-from aquaflow.prior.backward_flow import Float, Grey, backward_flow, reverse
+from aquaflow.prior.backward_flow import Float, backward_flow, reverse
 from aquaflow.prior.fields import pixel_grid, sample
 from tests.prior.textured_pictures import (
     HEIGHT,
     WIDTH,
     Array,
+    grey_pair,
     inside,
-    mapped,
-    moved_pair,
     pixel_centres,
     shift,
+    true_flow,
 )
 
 ZOOM = np.array([[1.05, -0.06, 5.0], [0.05, 1.02, -4.0], [0.0, 0.0, 1.0]])
-
-
-def grey_pair(H: Array) -> tuple[Grey, Grey]:
-    a, b = moved_pair(H)
-    return a[..., 0].copy(), b[..., 0].copy()
-
-
-def true_flow(H: Array) -> Float:
-    return np.asarray(mapped(H, pixel_centres()) - pixel_centres(), dtype=np.float32)
 
 
 def way_back_error(forward: Float, backward: Float) -> Float:

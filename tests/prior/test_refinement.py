@@ -18,24 +18,13 @@ from tests.prior.textured_pictures import (
     HEIGHT,
     WIDTH,
     Array,
-    mapped,
-    moved_pair,
-    pixel_centres,
+    grey_pair,
     shift,
+    true_flow,
 )
 
 ZOOM = np.array([[1.06, -0.03, -4.0], [0.03, 1.06, -6.0], [0.0, 0.0, 1.0]])
 INNER = np.s_[15:-15, 20:-20]
-
-
-def grey_pair(H: Array) -> tuple[Grey, Grey]:
-    a, b = moved_pair(H)
-    return a[..., 0].copy(), b[..., 0].copy()
-
-
-def true_flow(H: Array) -> Float:
-    grid = pixel_centres()
-    return np.asarray(mapped(H, grid) - grid, dtype=np.float32)
 
 
 def wavy_error(amplitude_px: float) -> Float:

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.prior.refinement import Float, Grey
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
@@ -56,6 +57,18 @@ def moved_pair(H: Array, seed: int = 0) -> tuple[Picture, Picture]:
     field = texture(seed)
     grid = pixel_centres()
     return rgb(lookup(field, grid)), rgb(lookup(field, mapped(np.linalg.inv(H), grid)))
+
+
+def grey_pair(H: Array) -> tuple[Grey, Grey]:
+    """[H, W] the pair of :func:`moved_pair` without colour."""
+    a, b = moved_pair(H)
+    return a[..., 0].copy(), b[..., 0].copy()
+
+
+def true_flow(H: Array) -> Float:
+    """[H, W, 2] px, of that pair."""
+    grid = pixel_centres()
+    return np.asarray(mapped(H, grid) - grid, dtype=np.float32)
 
 
 def shift(dx: float, dy: float) -> Array:

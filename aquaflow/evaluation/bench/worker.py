@@ -6,13 +6,11 @@ the row as JSON.
 
 from __future__ import annotations
 
-import json
-import logging
-import sys
 from pathlib import Path
 from typing import Any
 
-from aquaflow.errors import AquaFlowError, NotMappedError
+from aquaflow.errors import NotMappedError
+from aquaflow.evaluation.bench.answer import answer
 from aquaflow.evaluation.bench.job import Job
 from aquaflow.evaluation.bench.measure import measured
 from aquaflow.evaluation.bench.memory import peak_memory_mb
@@ -54,16 +52,5 @@ def perform(job: Job) -> dict[str, Any]:
     return {**metrics, **measured(scene, out), "peak_rss_mb": peak_mb}
 
 
-def main() -> None:
-    """Answer one job."""
-    logging.captureWarnings(True)
-    job = Job.from_text(sys.stdin.read())
-    try:
-        row = perform(job)
-    except AquaFlowError as error:
-        row = {"failed": str(error)}
-    print(json.dumps(row))
-
-
 if __name__ == "__main__":
-    main()
+    answer(Job.from_text, perform)

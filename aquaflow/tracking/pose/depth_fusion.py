@@ -98,6 +98,9 @@ def fuse(
 
     Returns the share of the picture that got a usable measurement; 0 for a pointmap that has had
     enough of them.
+
+    Raises:
+        ValueError: the pair is not of the pointmap's size.
     """
     if pointmap.fused >= MOST_FUSED:
         return 0.0

@@ -6,9 +6,6 @@ output is the row as JSON.
 
 from __future__ import annotations
 
-import json
-import logging
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -16,7 +13,7 @@ from typing import Any
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.replay import fix_threads
 from aquaflow.dive.run import DiveRun
-from aquaflow.errors import AquaFlowError
+from aquaflow.evaluation.bench.answer import answer
 from aquaflow.evaluation.bench.growth.job import THREADS, GrowthJob
 from aquaflow.evaluation.bench.growth.stages import TenthsMeter
 from aquaflow.evaluation.bench.growth.stored import checkpoint_bytes, folder_bytes
@@ -80,16 +77,5 @@ def _finished(run: DiveRun) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    """Answer one job."""
-    logging.captureWarnings(True)
-    job = GrowthJob.from_text(sys.stdin.read())
-    try:
-        row = perform(job)
-    except AquaFlowError as error:
-        row = {"failed": str(error)}
-    print(json.dumps(row))
-
-
 if __name__ == "__main__":
-    main()
+    answer(GrowthJob.from_text, perform)
