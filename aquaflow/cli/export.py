@@ -3,19 +3,36 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from aquaflow.cli.console import Json, progress_bars
+from aquaflow.errors import InputError
 
 
 class ExportFormat(str, Enum):
     """What a dive can be written as."""
 
     restored = "restored"
+    laz = "laz"
+
+
+NAMES = {
+    ExportFormat.restored: "restored",
+    ExportFormat.laz: "points.laz",
+}
+"""Of what is written, in the dive's folder."""
+OPTIONS = {
+    ExportFormat.restored: {"--recording"},
+    ExportFormat.laz: {"--water"},
+}
+"""Which options a format knows, besides --out and --json."""
+
+Progress = Callable[[int, int], None]
 
 
 def register(app: typer.Typer) -> None:
@@ -25,23 +42,65 @@ def register(app: typer.Typer) -> None:
 
 def export(
     dive: Annotated[Path, typer.Argument(help="Dive folder.")],
-    format: Annotated[ExportFormat, typer.Option(help="restored: frames without their water.")],
+    format: Annotated[
+        ExportFormat,
+        typer.Option(help="restored: frames without their water. laz: the map as points."),
+    ],
     recording: Annotated[
         Path | None,
         typer.Option(help="What was mapped; without it, the map is drawn, not the pictures."),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder to write; else in the dive's.")] = None,
+    water: Annotated[
+        bool, typer.Option("--water", help="Colours as seen through the water, not without it.")
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option(help="File or folder to write; else in the dive's.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Write the frames of a dive as they would look without water."""
+    """Write a dive in another format: pictures without water, points."""
+    _refuse_others(format, {"--recording": recording is not None, "--water": water})
+    target = out or dive / NAMES[format]
+    with progress_bars(quiet=as_json) as bars:
+
+        def progress(done: int, total: int) -> None:
+            bars(format.value, done, total)
+
+        if format is ExportFormat.restored:
+            said, facts = _restored(dive, target, recording, progress)
+        else:
+            said, facts = _points(dive, target, water, progress)
+    if as_json:
+        typer.echo(json.dumps({"out": str(target), **facts}))
+    else:
+        typer.echo(said)
+
+
+def _refuse_others(format: ExportFormat, given: dict[str, bool]) -> None:
+    unknown = [name for name, is_given in given.items() if is_given and name not in OPTIONS[format]]
+    if unknown:
+        raise InputError(f"--format {format.value} knows no {unknown[0]}; leave it out")
+
+
+def _restored(
+    dive: Path, folder: Path, recording: Path | None, progress: Progress
+) -> tuple[str, dict[str, Any]]:
     from aquaflow.export.restored import export_restored
 
-    folder = out or dive / format.value
-    with progress_bars(quiet=as_json) as progress:
-        count = export_restored(
-            dive, folder, recording, lambda done, total: progress("restore", done, total)
-        )
-    if as_json:
-        typer.echo(json.dumps({"out": str(folder), "frames": count}))
-    else:
-        typer.echo(f"Wrote {count} restored frames to {folder}.")
+    count = export_restored(dive, folder, recording, progress)
+    return f"Wrote {count} restored frames to {folder}.", {"frames": count}
+
+
+def _points(dive: Path, path: Path, water: bool, progress: Progress) -> tuple[str, dict[str, Any]]:
+    from aquaflow.export.laz import write_laz
+    from aquaflow.export.point_cloud import read_point_cloud
+
+    cloud = read_point_cloud(dive, water)
+    write_laz(path, cloud, progress)
+    where = cloud.placement
+    return f"Wrote {len(cloud)} points to {path}: {where.in_words()}.", {
+        "points": len(cloud),
+        "unit": where.unit,
+        "epsg": where.epsg,
+        "axes": where.in_words(),
+    }

@@ -62,7 +62,8 @@ RESULTS = (
     *("metrics.json", "report.html", "heldout/*.png", "heldout/*.npz", TRACE),
     KNOWN_LENGTHS,
     TELEMETRY,
-    *("metric.json", "trajectory.csv", "georeference.json", "restored/*.png", STATUS),
+    *("metric.json", "trajectory.csv", "georeference.json", STATUS),
+    *("restored/*.png", "points.laz"),
 )
 """What a run writes, mostly at its end; of an earlier run in the same folder nothing must
 remain."""

@@ -33,6 +33,8 @@ PACKAGES = (
         "pictures in recordings, for Foxglove and Lichtblick",
     ),
     Package("rosbags", "rosbags", "recording", "ROS 1 and 2 bags"),
+    Package("laspy", "laspy", "survey", "points of a dive as LAZ"),
+    Package("lazrs", "lazrs", "survey", "points of a dive as LAZ"),
     Package("viser", "viser", "viewer", "the map in a browser"),
     Package("depthai", "depthai", "oak", "Luxonis OAK cameras"),
     Package("onnxruntime", "onnxruntime", "prior", "learned priors"),
