@@ -19,16 +19,22 @@ class ExportFormat(str, Enum):
 
     restored = "restored"
     laz = "laz"
+    colmap = "colmap"
+    nerfstudio = "nerfstudio"
 
 
 NAMES = {
     ExportFormat.restored: "restored",
     ExportFormat.laz: "points.laz",
+    ExportFormat.colmap: "colmap",
+    ExportFormat.nerfstudio: "nerfstudio",
 }
 """Of what is written, in the dive's folder."""
 OPTIONS = {
     ExportFormat.restored: {"--recording"},
     ExportFormat.laz: {"--water"},
+    ExportFormat.colmap: {"--recording", "--restored"},
+    ExportFormat.nerfstudio: {"--recording", "--restored"},
 }
 """Which options a format knows, besides --out and --json."""
 
@@ -44,12 +50,18 @@ def export(
     dive: Annotated[Path, typer.Argument(help="Dive folder.")],
     format: Annotated[
         ExportFormat,
-        typer.Option(help="restored: frames without their water. laz: the map as points."),
+        typer.Option(
+            help="restored: frames without their water. laz: the map as points. "
+            "colmap, nerfstudio: pictures, poses and points."
+        ),
     ],
     recording: Annotated[
         Path | None,
-        typer.Option(help="What was mapped; without it, the map is drawn, not the pictures."),
+        typer.Option(help="What was mapped; without it, pictures without water are drawn."),
     ] = None,
+    restored: Annotated[
+        bool, typer.Option("--restored", help="Pictures and points without water.")
+    ] = False,
     water: Annotated[
         bool, typer.Option("--water", help="Colours as seen through the water, not without it.")
     ] = False,
@@ -58,8 +70,9 @@ def export(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Write a dive in another format: pictures without water, points."""
-    _refuse_others(format, {"--recording": recording is not None, "--water": water})
+    """Write a dive for other programs: pictures without water, points, posed pictures."""
+    given = {"--recording": recording is not None, "--restored": restored, "--water": water}
+    _refuse_others(format, given)
     target = out or dive / NAMES[format]
     with progress_bars(quiet=as_json) as bars:
 
@@ -68,8 +81,10 @@ def export(
 
         if format is ExportFormat.restored:
             said, facts = _restored(dive, target, recording, progress)
-        else:
+        elif format is ExportFormat.laz:
             said, facts = _points(dive, target, water, progress)
+        else:
+            said, facts = _posed_pictures(dive, target, format, recording, restored, progress)
     if as_json:
         typer.echo(json.dumps({"out": str(target), **facts}))
     else:
@@ -104,3 +119,20 @@ def _points(dive: Path, path: Path, water: bool, progress: Progress) -> tuple[st
         "epsg": where.epsg,
         "axes": where.in_words(),
     }
+
+
+def _posed_pictures(
+    dive: Path,
+    folder: Path,
+    format: ExportFormat,
+    recording: Path | None,
+    restored: bool,
+    progress: Progress,
+) -> tuple[str, dict[str, Any]]:
+    from aquaflow.export.colmap import write_colmap
+    from aquaflow.export.nerfstudio import write_nerfstudio
+    from aquaflow.export.posed_pictures import export_posed_pictures
+
+    write = write_colmap if format is ExportFormat.colmap else write_nerfstudio
+    count = export_posed_pictures(dive, folder, write, recording, restored, progress)
+    return f"Wrote {count} pictures with their poses to {folder}.", {"frames": count}

@@ -16,6 +16,7 @@ from aquaflow.export.ply import PlyGaussians, write_ply
 from aquaflow.fusion.metric_file import write_metric_file
 from aquaflow.fusion.metric_frame import MetricFrame, Origin
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.mapping.gaussians.gaussians import raw_colour
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import to_bytes
 from aquaflow.render.activation import radiance
@@ -50,12 +51,23 @@ def small_mapper() -> Mapper:
     """The floor in its water, and the views, whose pictures are blank."""
     mapper = Mapper(MappingConfig(), renderer(), seed=0)
     mapper.scene.gaussians = floor(columns=40, rows=30, scale=SPREAD)
+    parameters = mapper.scene.gaussians.parameters
     with torch.no_grad():
-        mapper.scene.gaussians.parameters["log_scales"][:, 2] = math.log(THICKNESS)
+        parameters["log_scales"][:, 2] = math.log(THICKNESS)
+        parameters["raw_colours"].copy_(raw_colour(_waves(parameters["means"])))
     mapper.medium.set_water(*(torch.tensor(values) for values in WATER))
     blank = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
     mapper.views = [view_of(blank, POSES[index], index) for index in FRAMES]
     return mapper
+
+
+def _waves(
+    means: torch.Tensor,  # [N, 3]
+) -> torch.Tensor:
+    """[N, 3] colours that change over half a unit: neighbours blend in a picture."""
+    x, y, _ = means.T
+    phases = (9.0 * x + 2.0 * y, 8.0 * y - 3.0 * x, 6.0 * x + 7.0 * y + 1.0)
+    return 0.5 + 0.35 * torch.sin(torch.stack(phases, dim=1))
 
 
 def write_small_dive(folder: Path, frame: MetricFrame | None = None) -> Mapper:
