@@ -21,6 +21,7 @@ class ExportFormat(str, Enum):
     laz = "laz"
     colmap = "colmap"
     nerfstudio = "nerfstudio"
+    spz = "spz"
 
 
 NAMES = {
@@ -28,6 +29,7 @@ NAMES = {
     ExportFormat.laz: "points.laz",
     ExportFormat.colmap: "colmap",
     ExportFormat.nerfstudio: "nerfstudio",
+    ExportFormat.spz: "map.spz",
 }
 """Of what is written, in the dive's folder."""
 OPTIONS = {
@@ -35,6 +37,7 @@ OPTIONS = {
     ExportFormat.laz: {"--water"},
     ExportFormat.colmap: {"--recording", "--restored"},
     ExportFormat.nerfstudio: {"--recording", "--restored"},
+    ExportFormat.spz: {"--water"},
 }
 """Which options a format knows, besides --out and --json."""
 
@@ -52,7 +55,7 @@ def export(
         ExportFormat,
         typer.Option(
             help="restored: frames without their water. laz: the map as points. "
-            "colmap, nerfstudio: pictures, poses and points."
+            "colmap, nerfstudio: pictures, poses and points. spz: the map, compressed."
         ),
     ],
     recording: Annotated[
@@ -83,6 +86,8 @@ def export(
             said, facts = _restored(dive, target, recording, progress)
         elif format is ExportFormat.laz:
             said, facts = _points(dive, target, water, progress)
+        elif format is ExportFormat.spz:
+            said, facts = _compressed(dive, target, water)
         else:
             said, facts = _posed_pictures(dive, target, format, recording, restored, progress)
     if as_json:
@@ -119,6 +124,14 @@ def _points(dive: Path, path: Path, water: bool, progress: Progress) -> tuple[st
         "epsg": where.epsg,
         "axes": where.in_words(),
     }
+
+
+def _compressed(dive: Path, path: Path, water: bool) -> tuple[str, dict[str, Any]]:
+    from aquaflow.export.spz import export_spz
+
+    count, where = export_spz(dive, path, water)
+    facts = {"gaussians": count, "unit": where.unit}
+    return f"Wrote {count} Gaussians to {path}; lengths are {where.unit}, y is up.", facts
 
 
 def _posed_pictures(
