@@ -19,6 +19,7 @@ class ExportFormat(str, Enum):
 
     restored = "restored"
     laz = "laz"
+    e57 = "e57"
     colmap = "colmap"
     nerfstudio = "nerfstudio"
     spz = "spz"
@@ -27,6 +28,7 @@ class ExportFormat(str, Enum):
 NAMES = {
     ExportFormat.restored: "restored",
     ExportFormat.laz: "points.laz",
+    ExportFormat.e57: "points.e57",
     ExportFormat.colmap: "colmap",
     ExportFormat.nerfstudio: "nerfstudio",
     ExportFormat.spz: "map.spz",
@@ -35,6 +37,7 @@ NAMES = {
 OPTIONS = {
     ExportFormat.restored: {"--recording"},
     ExportFormat.laz: {"--water"},
+    ExportFormat.e57: {"--water"},
     ExportFormat.colmap: {"--recording", "--restored"},
     ExportFormat.nerfstudio: {"--recording", "--restored"},
     ExportFormat.spz: {"--water"},
@@ -54,7 +57,7 @@ def export(
     format: Annotated[
         ExportFormat,
         typer.Option(
-            help="restored: frames without their water. laz: the map as points. "
+            help="restored: frames without their water. laz, e57: the map as points. "
             "colmap, nerfstudio: pictures, poses and points. spz: the map, compressed."
         ),
     ],
@@ -84,8 +87,8 @@ def export(
 
         if format is ExportFormat.restored:
             said, facts = _restored(dive, target, recording, progress)
-        elif format is ExportFormat.laz:
-            said, facts = _points(dive, target, water, progress)
+        elif format in (ExportFormat.laz, ExportFormat.e57):
+            said, facts = _points(dive, target, format, water, progress)
         elif format is ExportFormat.spz:
             said, facts = _compressed(dive, target, water)
         else:
@@ -111,12 +114,16 @@ def _restored(
     return f"Wrote {count} restored frames to {folder}.", {"frames": count}
 
 
-def _points(dive: Path, path: Path, water: bool, progress: Progress) -> tuple[str, dict[str, Any]]:
+def _points(
+    dive: Path, path: Path, format: ExportFormat, water: bool, progress: Progress
+) -> tuple[str, dict[str, Any]]:
+    from aquaflow.export.e57 import write_e57
     from aquaflow.export.laz import write_laz
     from aquaflow.export.point_cloud import read_point_cloud
 
     cloud = read_point_cloud(dive, water)
-    write_laz(path, cloud, progress)
+    write = write_laz if format is ExportFormat.laz else write_e57
+    write(path, cloud, progress)
     where = cloud.placement
     return f"Wrote {len(cloud)} points to {path}: {where.in_words()}.", {
         "points": len(cloud),

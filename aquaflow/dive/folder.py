@@ -63,7 +63,14 @@ RESULTS = (
     KNOWN_LENGTHS,
     TELEMETRY,
     *("metric.json", "trajectory.csv", "georeference.json", STATUS),
-    *("restored/*.png", "points.laz", "map.spz", "colmap/images/*.png", "colmap/sparse/0/*.bin"),
+    *(
+        "restored/*.png",
+        "points.laz",
+        "points.e57",
+        "map.spz",
+        "colmap/images/*.png",
+        "colmap/sparse/0/*.bin",
+    ),
     *("nerfstudio/images/*.png", "nerfstudio/points.ply", "nerfstudio/transforms.json"),
 )
 """What a run writes, mostly at its end; of an earlier run in the same folder nothing must

@@ -35,6 +35,7 @@ PACKAGES = (
     Package("rosbags", "rosbags", "recording", "ROS 1 and 2 bags"),
     Package("laspy", "laspy", "survey", "points of a dive as LAZ"),
     Package("lazrs", "lazrs", "survey", "points of a dive as LAZ"),
+    Package("pye57", "pye57", "survey", "points of a dive as E57"),
     Package("viser", "viser", "viewer", "the map in a browser"),
     Package("depthai", "depthai", "oak", "Luxonis OAK cameras"),
     Package("onnxruntime", "onnxruntime", "prior", "learned priors"),

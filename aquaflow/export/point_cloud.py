@@ -105,11 +105,17 @@ def read_point_cloud(dive: Path, water: bool = False) -> PointCloud:
     """The points of the dive's largest sub-map; ``water``: in the colours that it gives them.
 
     Raises:
-        InputError: the dive has no map, or an empty one.
+        InputError: the dive has no map, or nothing in it is opaque enough.
         ConfigError: the dive's settings cannot be read.
     """
     views, where = read_posed_views(dive, read_mapper(dive))
-    return PointCloud(read_splats(dive, where, water), views, where)
+    cloud = PointCloud(read_splats(dive, where, water), views, where)
+    if not len(cloud):
+        raise InputError(
+            f"no Gaussian in the map of {dive} has an opacity of {LEAST_OPACITY} or more; refine "
+            "the dive for longer (--refine-steps)"
+        )
+    return cloud
 
 
 def read_splats(dive: Path, placement: Placement, water: bool) -> PlyGaussians:

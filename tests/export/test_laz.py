@@ -139,6 +139,12 @@ def test_a_camera_that_does_not_see_a_point_is_taken_only_where_none_does(dive: 
     assert not any(view.shows(view.T_uc.inverse().apply(behind))[0] for view in views)
 
 
+def test_a_map_of_haze_alone_gives_no_points(dive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(point_cloud, "LEAST_OPACITY", 0.95)
+    with pytest.raises(InputError, match=r"has an opacity of 0\.95 or more"):
+        read_point_cloud(dive)
+
+
 def test_a_missing_package_is_named_with_what_installs_it(
     dive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
