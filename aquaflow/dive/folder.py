@@ -62,7 +62,16 @@ RESULTS = (
     *("metrics.json", "report.html", "heldout/*.png", "heldout/*.npz", TRACE),
     KNOWN_LENGTHS,
     TELEMETRY,
-    *("metric.json", "trajectory.csv", "georeference.json", "restored/*.png", STATUS),
+    *("metric.json", "trajectory.csv", "georeference.json", STATUS),
+    *(
+        "restored/*.png",
+        "points.laz",
+        "points.e57",
+        "map.spz",
+        "colmap/images/*.png",
+        "colmap/sparse/0/*.bin",
+    ),
+    *("nerfstudio/images/*.png", "nerfstudio/points.ply", "nerfstudio/transforms.json"),
 )
 """What a run writes, mostly at its end; of an earlier run in the same folder nothing must
 remain."""

@@ -1,0 +1,101 @@
+"""Coordinates of what other programs get: z up, and on the UTM grid where the earth is known.
+
+The upright frame u has the origin and the unit of n (docs/conventions.md#world-n). Where gravity is
+known its axes are right, forward and up of what n's x axis points to: east, north, up where that is
+true north. Where nothing is known they are those of the first keyframe's camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.export.georeference import to_geodetic, utm_epsg
+from aquaflow.fusion.metric_frame import MetricFrame, Origin
+from aquaflow.geometry.similarity import Sim3
+
+Array = npt.NDArray[np.float64]
+
+UPRIGHT_FROM_DOWN = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+"""Right, forward, up from forward, right, down."""
+UPRIGHT_FROM_CAMERA = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""Right, forward, up from right, down, forward."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where the exported points of one sub-map lie."""
+
+    T_un: Sim3
+    """From n to the upright frame: a rotation alone."""
+    unit: str
+    """``m`` or ``map units``."""
+    axes: str
+    """The upright frame in words."""
+    origin: Origin | None = None
+    """Of n, where every point has a latitude and a longitude; else None."""
+    epsg: int | None = None
+    """Of the UTM zone of the origin; None where there is no origin, and near the poles."""
+
+    def on_grid(
+        self,
+        points_u: Array,  # [N, 3] unit, upright frame
+    ) -> Array:
+        """[N, 3] easting, northing and height (m) in the UTM zone; unchanged where there is none.
+
+        The height is that above z = 0 of n. The UTM zone is that of the origin, for all points.
+        """
+        if self.origin is None or self.epsg is None:
+            return points_u
+        from pyproj import Proj
+
+        latitude, longitude = to_geodetic(self.origin, self.T_un.inverse().apply(points_u))
+        easting, northing = Proj(f"EPSG:{self.epsg}")(longitude, latitude)
+        return np.stack([easting, northing, points_u[:, 2]], axis=1)
+
+    def turned_to_grid(
+        self,
+        directions_u: Array,  # [N, 3] upright frame
+    ) -> Array:
+        """[N, 3] the same directions against the grid's north in place of the true one."""
+        if self.origin is None or self.epsg is None:
+            return directions_u
+        from pyproj import Proj
+
+        place = (self.origin.longitude_deg, self.origin.latitude_deg)
+        factors = Proj(f"EPSG:{self.epsg}").get_factors(*place)
+        angle = np.radians(factors.meridian_convergence)
+        c, s = np.cos(angle), np.sin(angle)
+        R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return np.asarray(directions_u @ R.T)
+
+    def wkt(self) -> str | None:
+        """The grid's coordinate reference system in OGC WKT 1, as LAS 1.4 demands; or None."""
+        if self.epsg is None:
+            return None
+        from pyproj import CRS
+
+        return str(CRS.from_epsg(self.epsg).to_wkt("WKT1_GDAL"))
+
+    def in_words(self) -> str:
+        """Axes, unit and grid of exported points, in one line."""
+        if self.epsg is None:
+            return f"{self.axes}; {self.unit}"
+        return f"EPSG:{self.epsg}, x easting, y northing, z up; m"
+
+
+def placement(frame: MetricFrame) -> Placement:
+    """The placement of the sub-map that ``frame`` belongs to."""
+    if frame.north == "first keyframe":
+        R, axes = UPRIGHT_FROM_CAMERA, "x right, y forward, z up of the first keyframe's camera"
+    elif frame.north == "true north":
+        R, axes = UPRIGHT_FROM_DOWN, "x east, y north, z up"
+    else:
+        R, axes = UPRIGHT_FROM_DOWN, f"y {frame.north}, x to the right of it, z up"
+    T_un = Sim3(R, np.zeros(3), 1.0)
+    if not frame.georeferenced or frame.origin is None:
+        return Placement(T_un, frame.unit, axes)
+    epsg = utm_epsg(frame.origin.latitude_deg, frame.origin.longitude_deg)
+    return Placement(T_un, frame.unit, axes, frame.origin, epsg)
