@@ -69,7 +69,13 @@ def _at_the_end(axes: Axes, label: str, rows: Sequence[Row]) -> None:
 
 
 def _label(axes: Axes, label: str) -> None:
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
     axes.set_xscale("log")
+    # Few whole numbers: the default of a short axis writes one over the other.
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_xlabel("frames (log)")
     axes.set_title(label, fontsize=10)
     axes.set_ylim(bottom=0.0)

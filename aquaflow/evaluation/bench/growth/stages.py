@@ -58,6 +58,7 @@ class TenthsMeter:
             return sum(of) / count
 
         elsewhere = (spent.process - before.process) - (spent.thread - before.thread)
+        elsewhere = max(elsewhere, 0.0)  # two clocks are read one after the other
         slam = self._run.slam
         return {
             "frames": self._done,
