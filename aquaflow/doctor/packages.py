@@ -34,6 +34,7 @@ PACKAGES = (
     ),
     Package("rosbags", "rosbags", "recording", "ROS 1 and 2 bags"),
     Package("viser", "viser", "viewer", "the map in a browser"),
+    Package("rasterio", "rasterio", "survey", "orthos and heights as GeoTIFF"),
     Package("depthai", "depthai", "oak", "Luxonis OAK cameras"),
     Package("onnxruntime", "onnxruntime", "prior", "learned priors"),
     Package("kornia", "kornia", "prior-peers", "the priors xfeat and aliked"),
