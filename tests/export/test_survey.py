@@ -223,6 +223,12 @@ def test_too_many_pixels_are_refused(dive: Path, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_a_folder_that_cannot_be_written_to_is_refused(dive: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(InputError, match="give a folder with room"):
+        export_survey(dive, tmp_path / "file" / "out", "dem")
+
+
 def test_without_rasterio_one_sentence_says_what_to_install(
     dive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -6,6 +6,7 @@ what lies behind something else, or stands in the water that the view looks thro
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -60,19 +61,16 @@ class ViewRanges:
         work: Path,
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
-        """Draws every view once; the file is made in the folder ``work``.
+        """Draws every view once; the file is made in the folder ``work``, which is made if needed.
 
         Raises:
-            InputError: the views show nothing.
+            InputError: the views show nothing, or the file cannot be written.
         """
         self._views: list[View] = in_time(mapper.views)
         self._poses: list[Sim3] = [ground.pose(view.T_wc) for view in self._views]
         sizes = [self._size(view) for view in self._views]
         self._starts = np.concatenate([[0], np.cumsum([rows * columns for rows, columns in sizes])])
-        self._file = tempfile.TemporaryFile(dir=work)  # noqa: SIM115 (lives as long as this)
-        self._all: np.memmap[tuple[int], np.dtype[np.float16]] = np.memmap(
-            self._file, np.float16, "w+", shape=(max(1, int(self._starts[-1])),)
-        )
+        self._all = _scratch(work, int(self._starts[-1]))
         for number, view in enumerate(self._views):
             shown = mapper.show(view)
             z = picture_out(shown.z) * ground.T_gm.scale
@@ -159,6 +157,21 @@ class ViewRanges:
         ranges = np.linalg.norm(offset, axis=1)
         same = np.abs(z[rows, columns] - ranges) <= SAME_RANGE * ranges
         return ahead[same], offset[same] / ranges[same][:, None], ranges[same]
+
+
+def _scratch(folder: Path, count: int) -> npt.NDArray[np.float16]:
+    """[count] numbers in a file without a name, whose room is taken at once: a disk that fills up
+    later would end the process."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as stream:
+            os.posix_fallocate(stream.fileno(), 0, max(1, count) * np.dtype(np.float16).itemsize)
+            return np.memmap(stream, np.float16, "r+", shape=(max(1, count),))
+    except OSError as error:
+        raise InputError(
+            f"cannot write to {folder}: {error.strerror or error}; give a folder with room that "
+            "can be written to"
+        ) from error
 
 
 def _height_sigma(

@@ -84,7 +84,6 @@ def export_survey(
     require_rasterio()
     mapper, frame = _read(dive)
     ground = ground_of(frame, mapper.views)
-    out.mkdir(parents=True, exist_ok=True)
     ranges = ViewRanges(mapper, ground, out, progress and partial(progress, "views"))
     side = resolution or rounded(ranges.footprint)
     start = -np.array(ground.origin) / ground.grid_scale
