@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -23,6 +24,8 @@ class ExportFormat(str, Enum):
     colmap = "colmap"
     nerfstudio = "nerfstudio"
     spz = "spz"
+    ortho = "ortho"
+    dem = "dem"
 
 
 NAMES = {
@@ -32,6 +35,8 @@ NAMES = {
     ExportFormat.colmap: "colmap",
     ExportFormat.nerfstudio: "nerfstudio",
     ExportFormat.spz: "map.spz",
+    ExportFormat.ortho: "ortho",
+    ExportFormat.dem: "dem",
 }
 """Of what is written, in the dive's folder."""
 OPTIONS = {
@@ -41,8 +46,13 @@ OPTIONS = {
     ExportFormat.colmap: {"--recording", "--restored"},
     ExportFormat.nerfstudio: {"--recording", "--restored"},
     ExportFormat.spz: {"--water"},
+    ExportFormat.ortho: {"--water", "--resolution"},
+    ExportFormat.dem: {"--resolution"},
 }
 """Which options a format knows, besides --out and --json."""
+
+MAP_FILE = "map.aqf"
+"""What every finished dive with a map has."""
 
 Progress = Callable[[int, int], None]
 
@@ -58,7 +68,8 @@ def export(
         ExportFormat,
         typer.Option(
             help="restored: frames without their water. laz, e57: the map as points. "
-            "colmap, nerfstudio: pictures, poses and points. spz: the map, compressed."
+            "colmap, nerfstudio: pictures, poses and points. spz: the map, compressed. "
+            "ortho: the ground from straight above. dem: its heights."
         ),
     ],
     recording: Annotated[
@@ -71,14 +82,25 @@ def export(
     water: Annotated[
         bool, typer.Option("--water", help="Colours as seen through the water, not without it.")
     ] = False,
+    resolution: Annotated[
+        float | None,
+        typer.Option(help="m a pixel (map units without metres); without it, as in the pictures."),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="File or folder to write; else in the dive's.")
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Write a dive for other programs: pictures without water, points, posed pictures."""
-    given = {"--recording": recording is not None, "--restored": restored, "--water": water}
+    """Write a dive for other programs: pictures without water, points, posed pictures, maps."""
+    given = {
+        "--recording": recording is not None, "--restored": restored, "--water": water,
+        "--resolution": resolution is not None,
+    }  # fmt: skip
     _refuse_others(format, given)
+    if resolution is not None and not (math.isfinite(resolution) and resolution > 0.0):
+        raise InputError(f"--resolution {resolution:g} is no size of a pixel; give a positive one")
+    if not (dive / MAP_FILE).exists():
+        raise InputError(f"{dive} holds no finished dive: {MAP_FILE} is missing")
     target = out or dive / NAMES[format]
     with progress_bars(quiet=as_json) as bars:
 
@@ -91,6 +113,9 @@ def export(
             said, facts = _points(dive, target, format, water, progress)
         elif format is ExportFormat.spz:
             said, facts = _compressed(dive, target, water)
+        elif format in (ExportFormat.ortho, ExportFormat.dem):
+            kind: Literal["ortho", "dem"] = "dem" if format is ExportFormat.dem else "ortho"
+            said, facts = _survey(dive, target, kind, resolution, water, bars)
         else:
             said, facts = _posed_pictures(dive, target, format, recording, restored, progress)
     if as_json:
@@ -156,3 +181,33 @@ def _posed_pictures(
     write = write_colmap if format is ExportFormat.colmap else write_nerfstudio
     count = export_posed_pictures(dive, folder, write, recording, restored, progress)
     return f"Wrote {count} pictures with their poses to {folder}.", {"frames": count}
+
+
+def _survey(
+    dive: Path,
+    folder: Path,
+    kind: Literal["ortho", "dem"],
+    resolution: float | None,
+    water: bool,
+    bars: Callable[[str, int, int], None],
+) -> tuple[str, dict[str, Any]]:
+    from aquaflow.export.ortho.survey import export_survey
+
+    survey = export_survey(dive, folder, kind, resolution, water, bars)
+    ground, names = survey.ground, " and ".join(str(path) for path in survey.files)
+    said = [
+        f"Wrote {names}: {survey.width} x {survey.height} pixels of {survey.resolution:g} "
+        f"{ground.unit}, {survey.covered:.0%} mapped.",
+        f"Coordinates: {ground.axes}. Vertical: {ground.vertical}.",
+    ]
+    if kind == "dem":
+        said.append(f"Heights are above {ground.height_zero}, {ground.unit}.")
+    elif survey.water_range is not None:
+        said.append(f"Seen through {survey.water_range:.3g} {ground.unit} of water.")
+    return "\n".join(said), {
+        "files": [str(path) for path in survey.files],
+        "width": survey.width, "height": survey.height, "resolution": survey.resolution,
+        "covered": survey.covered, "unit": ground.unit, "epsg": ground.epsg,
+        "axes": ground.axes, "vertical": ground.vertical, "height_zero": ground.height_zero,
+        "water_range": survey.water_range,
+    }  # fmt: skip

@@ -37,6 +37,7 @@ PACKAGES = (
     Package("lazrs", "lazrs", "survey", "points of a dive as LAZ"),
     Package("pye57", "pye57", "survey", "points of a dive as E57"),
     Package("viser", "viser", "viewer", "the map in a browser"),
+    Package("rasterio", "rasterio", "survey", "orthos and heights as GeoTIFF"),
     Package("depthai", "depthai", "oak", "Luxonis OAK cameras"),
     Package("onnxruntime", "onnxruntime", "prior", "learned priors"),
     Package("kornia", "kornia", "prior-peers", "the priors xfeat and aliked"),

@@ -1,0 +1,79 @@
+"""What colours an ortho shows: the scene without its water, or through a stated depth of it.
+
+Without water, a pixel is what restoration makes of it at the range from which the nearest view saw
+it (mapping/water/white_balance.py): the map's radiance is put behind the water of that range and
+recovered, so that no channel is amplified beyond what its light there allows, and a channel of
+which the pictures had too little follows the others. Restored frames are bounded by the same rule.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.restoration import common_exposure, to_bytes
+from aquaflow.mapping.transfers import picture_out, water_in
+from aquaflow.mapping.views import in_time
+from aquaflow.mapping.water.image_formation import Water
+
+Array = npt.NDArray[np.float64]
+
+LOOKS = 20
+"""Views, spread over the dive, that the common exposure is judged by; as of restored frames."""
+
+
+class Colours:
+    """Turns a map's radiance into the colours of an ortho."""
+
+    def __init__(self, mapper: Mapper, unit: float, water_range: float | None) -> None:
+        """``unit``: of the ground's lengths for each map unit; ``water_range``: of the water to
+        look through, in the ground's unit, or None for no water."""
+        self._scene, self._unit, self._through = mapper.scene, unit, water_range
+        self._water = _mean_water(mapper)
+        self._exposure = 1.0
+        if water_range is None:
+            views = in_time(mapper.views)[:: max(1, len(mapper.views) // LOOKS)]
+            with torch.no_grad():
+                self._exposure = common_exposure(
+                    mapper.scene.balanced(mapper.show(view).radiance) for view in views
+                )
+
+    @torch.no_grad()
+    def of(
+        self,
+        radiance: Tensor,  # [h, w, 3] J
+        nearest: Array,  # [h, w] range of the nearest view, ground's unit; infinite: none
+    ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32]]:
+        """Colours [h, w, 3], and what share of them was restored from light [h, w] in [0, 1]."""
+        sure = np.ones(nearest.shape, np.float32)
+        if self._water is None:
+            return to_bytes(self._exposure * picture_out(radiance)), sure
+        seen_from = nearest if self._through is None else np.full(nearest.shape, self._through)
+        z = np.where(np.isfinite(seen_from), seen_from, 0.0) / self._unit
+        ranges = water_in(z, radiance.device)
+        water = self._water
+        seen = radiance * water.transmission(ranges) + water.backscatter(ranges)
+        if self._through is not None:
+            return to_bytes(picture_out(seen)), sure
+        if self._scene.balance is None:
+            picture, share = water.restore(seen, ranges)
+        else:
+            recovered = self._scene.balance.recover(seen, ranges, water)
+            picture, share = recovered.picture, recovered.confidence
+        return (
+            to_bytes(self._exposure * picture_out(picture)),
+            picture_out(share).astype(np.float32),
+        )
+
+
+def _mean_water(mapper: Mapper) -> Water | None:
+    """The water of the mean view; None where there is none."""
+    with torch.no_grad():
+        waters = [water for view in mapper.views if (water := mapper.scene.water(view))]
+        if not waters:
+            return None
+        first, beta_a = waters[0], torch.stack([water.beta_a for water in waters]).mean(0)
+    return Water(beta_a, first.B_inf, first.b, first.B_res, first.d)

@@ -1,0 +1,135 @@
+"""The ground that a raster lies on: which way is up, and what its coordinates mean.
+
+Ground axes g are x to the right in the raster, y up in it, z the height above it; lengths are
+metres where the dive's are, else map units. Raster coordinates are those of a UTM zone where the
+dive is georeferenced, else the ground's own x and y.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.errors import InputError
+from aquaflow.export.georeference import to_geodetic, utm_epsg
+from aquaflow.fusion.metric_frame import MetricFrame, Origin
+from aquaflow.geometry.similarity import Sim3, nearest_rotation
+from aquaflow.mapping.views import View
+
+Array = npt.NDArray[np.float64]
+
+BASE_M = 100.0
+"""Length over which north and the scale of the UTM grid are measured. Taken as the same over the
+dive, which 1 km from its middle is wrong by 3 mm in the scale and by less in the turn."""
+LEAST_AGREEMENT = 0.5
+"""Length of the mean of the views' unit axes; at 0.5 they spread over a half-angle of 90 degrees,
+and no direction is below all of them."""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """From a sub-map's world to the ground, and from there to raster coordinates."""
+
+    T_gm: Sim3
+    """Its scale is that of ``MetricFrame.T_nm``."""
+    unit: str
+    """Of lengths in g and of heights: ``m`` or ``map units``."""
+    epsg: int | None
+    """Of the raster's coordinates; None: they are x and y of g."""
+    origin: tuple[float, float]
+    """Raster coordinates of x = y = 0."""
+    grid_scale: float
+    """Lengths in the raster over lengths in g; within 0.1 % of 1 in a UTM zone."""
+    axes: str
+    vertical: str
+    height_zero: str
+    """What axes, direction of z and z = 0 are, in words."""
+
+    def pose(self, T_mc: Sim3) -> Sim3:
+        """T_gc of a camera, rigid."""
+        T = self.T_gm @ T_mc
+        return Sim3(T.R, T.t)
+
+
+def ground_of(frame: MetricFrame, views: Sequence[View]) -> Ground:
+    """The ground of a sub-map.
+
+    Raises:
+        InputError: gravity is unknown, and the views look in all directions.
+    """
+    poses = [frame.pose(view.T_wc) for view in views]
+    middle = np.mean([T_nc.t for T_nc in poses], axis=0)
+    epsg, corner, grid_scale = None, (0.0, 0.0), 1.0
+    if frame.level:
+        north = np.array([0.0, 1.0])
+        if frame.georeferenced and frame.origin is not None:
+            epsg = utm_epsg(frame.origin.latitude_deg, frame.origin.longitude_deg)
+        if epsg is not None and frame.origin is not None:
+            place, step = _on_grid(epsg, frame.origin, middle)
+            grid_scale = float(np.hypot(*step))
+            north = step / grid_scale
+        R_gn = _level(north)
+        if epsg is not None:
+            corner = tuple((place - grid_scale * (R_gn @ middle)[:2]).tolist())
+        vertical = "along gravity"
+    else:
+        R_gn, vertical = _below_views(poses), "against the mean viewing direction of the cameras"
+    return Ground(
+        Sim3(R_gn, np.zeros(3)) @ frame.T_nm, frame.unit, epsg, corner, grid_scale,
+        _axes_in_words(frame, epsg), vertical, _zero_in_words(frame),
+    )  # fmt: skip
+
+
+def _level(
+    north: Array,  # [2] unit: where x of n points to in the raster
+) -> Array:
+    """R_gn [3, 3] of a frame n whose z points down."""
+    x, y = north
+    return np.array([[x, y, 0.0], [y, -x, 0.0], [0.0, 0.0, -1.0]])
+
+
+def _on_grid(
+    epsg: int,
+    origin: Origin,
+    point_n: Array,  # [3] m, n
+) -> tuple[Array, Array]:
+    """Easting and northing [2] of a point of n, and how they change with each metre along its x."""
+    from pyproj import Proj
+
+    half = 0.5 * BASE_M * np.array([1.0, 0.0, 0.0])
+    latitude, longitude = to_geodetic(origin, np.array([point_n, point_n - half, point_n + half]))
+    places = np.column_stack(Proj(f"EPSG:{epsg}")(longitude, latitude))
+    return places[0], (places[2] - places[1]) / BASE_M
+
+
+def _below_views(poses: Sequence[Sim3]) -> Array:
+    """R_gn [3, 3]: up is against the mean viewing direction, y is up in the pictures."""
+    axes = np.mean([T_nc.R for T_nc in poses], axis=0)
+    if np.linalg.norm(axes[:, 2]) < LEAST_AGREEMENT:
+        raise InputError(
+            "nothing says which way is up in this dive, and its cameras look in all directions; "
+            "map it with the vehicle's attitude (--telemetry)"
+        )
+    up = -axes[:, 2] / np.linalg.norm(axes[:, 2])
+    # A survey's lines go there and back, so that only the first picture's top is sure to exist.
+    y = -poses[0].R[:, 1]
+    y = y - up * (up @ y)
+    y /= np.linalg.norm(y)
+    return nearest_rotation(np.array([np.cross(y, up), y, up]))
+
+
+def _axes_in_words(frame: MetricFrame, epsg: int | None) -> str:
+    if epsg is not None:
+        return f"easting and northing of EPSG:{epsg}, m"
+    if frame.level:
+        return f"y towards {frame.north}, x to the right of it, {frame.unit}, from the dive's start"
+    return f"y up in the dive's first picture, x to the right of it, {frame.unit}"
+
+
+def _zero_in_words(frame: MetricFrame) -> str:
+    if frame.level and frame.depth_known:
+        return "the water surface"
+    return "the dive's start"
