@@ -74,6 +74,7 @@ QUICK: dict[str, dict[str, str]] = {
     "synth": {"--frames": "2", "--width": "64", "--height": "48"},
     "bench dives": {"--no-peers": "", "--preset": "fast", "--out": "new"},
     "bench render": {"--repeats": "1", "--out": "new"},
+    "bench growth": {"--frames": "50", "--preset": "fast", "--out": "new"},
     "ablate": {"--out": "new"},
     "prior bench": {"--repeats": "1"},
     "prior train compact": {"--steps": "1", "--scenes": "8", "--batch": "2", "--out": "new"},
