@@ -12,6 +12,7 @@ import torch
 
 from aquaflow.errors import InputError
 from aquaflow.export.map_file import SUFFIX, read_map_file
+from aquaflow.export.map_splats import splats_of
 from aquaflow.export.ply import PlyGaussians
 from aquaflow.fusion.metric_file import read_frame_of_map
 from aquaflow.fusion.metric_frame import MetricFrame
@@ -19,10 +20,9 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.state import NO_PIXELS
-from aquaflow.mapping.transfers import map_out, picture_out, water_out
+from aquaflow.mapping.transfers import picture_out, water_out
 from aquaflow.mapping.views import View, in_time
 from aquaflow.render import RendererName, select_renderer
-from aquaflow.render.activation import radiance
 from aquaflow.synthetic.water import Medium, Rgb
 
 FloatImage = npt.NDArray[np.float32]
@@ -92,15 +92,7 @@ class Map:
 
         With a decoder, each Gaussian as the mapped view nearest to it sees it.
         """
-        with torch.no_grad():
-            plain = self._mapper.scene.baked(self._mapper.views)
-            splats = PlyGaussians(
-                means=map_out(plain["means"]),
-                wxyz=map_out(torch.nn.functional.normalize(plain["quats"], dim=-1)),
-                scales=map_out(torch.exp(plain["log_scales"])),
-                opacities=map_out(torch.sigmoid(plain["opacity_logits"][:, 0])),
-                colours=map_out(radiance(plain["raw_colours"])),
-            )
+        splats = splats_of(self._mapper)
         frame = self.metric_frame
         return splats if frame.is_identity else splats.transformed(frame.T_nm)
 

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.errors import InputError, first_line
-from aquaflow.export.optional_package import survey_package
+from aquaflow.errors.extra import load
 from aquaflow.export.point_cloud import CHUNK, PointCloud, Points
 from aquaflow.storage.atomic import atomic_write
 
@@ -41,8 +41,8 @@ def write_e57(path: Path, cloud: PointCloud, progress: Progress | None = None) -
     Raises:
         InputError: pye57 is not installed, or the file cannot be written.
     """
-    survey_package("pye57", "an E57 file")
-    libe57 = survey_package("pye57.libe57", "an E57 file")
+    load("pye57", "an E57 file", "survey")
+    libe57 = load("pye57.libe57", "an E57 file", "survey")
     with atomic_write(path) as stream:
         try:
             file = libe57.ImageFile(stream.name, "w")  # the library opens files by name alone

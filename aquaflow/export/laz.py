@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from aquaflow.export.optional_package import survey_package
+from aquaflow.errors.extra import load
 from aquaflow.export.point_cloud import PointCloud, Points
 from aquaflow.storage.atomic import atomic_write
 
@@ -43,8 +43,8 @@ def write_laz(path: Path, cloud: PointCloud, progress: Progress | None = None) -
     Raises:
         InputError: laspy or lazrs is not installed, or the file cannot be written.
     """
-    laspy = survey_package("laspy", "a LAZ file")
-    survey_package("lazrs", "a LAZ file")
+    laspy = load("laspy", "a LAZ file", "survey")
+    load("lazrs", "a LAZ file", "survey")
     header, done = _header(laspy, cloud), 0
     with (
         atomic_write(path) as stream,

@@ -16,10 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.cameras import OakConfig
-from aquaflow.drivers.extra import load
 from aquaflow.drivers.oak.calibration import camera_model, imu_rotation
 from aquaflow.drivers.oak.encoding import JPEG_QUALITY, chosen, said
 from aquaflow.drivers.oak.messages import DaiImuReading, DaiPicture, imu_readings, picture_of
+from aquaflow.errors.extra import load
 from aquaflow.messages import CameraModel
 
 SEARCH_MS = 500

@@ -10,8 +10,8 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from aquaflow.config.link import CanConfig
-from aquaflow.drivers.extra import load
 from aquaflow.drivers.link import MAX_READ_BYTES, LinkLostError
+from aquaflow.errors.extra import load
 
 if TYPE_CHECKING:
     from can import BusABC, Message

@@ -18,10 +18,10 @@ from urllib.parse import quote, urlsplit
 
 from aquaflow.config.link import Mavlink2restConfig
 from aquaflow.drivers.events import about
-from aquaflow.drivers.extra import load
 from aquaflow.drivers.link import MAX_READ_BYTES, ByteLink, LinkLostError
 from aquaflow.drivers.mavlink_dialect import dialect
 from aquaflow.drivers.transport.mavlink_json import packet_of, report_of
+from aquaflow.errors.extra import load
 
 log = logging.getLogger(__name__)
 

@@ -101,7 +101,7 @@ def test_a_missing_package_is_named_with_what_installs_it(
     dive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pye57", None)
-    with pytest.raises(InputError, match="an E57 file needs the package pye57"):
+    with pytest.raises(InputError, match="an E57 file needs the library pye57"):
         write_e57(tmp_path / "a.e57", read_point_cloud(dive))
     assert not list(tmp_path.glob("*.e57"))
 

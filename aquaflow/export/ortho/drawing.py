@@ -16,12 +16,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from aquaflow.export.map_splats import splats_of
 from aquaflow.export.ortho.grid import Grid, Tile
 from aquaflow.export.ortho.ground import Ground
-from aquaflow.export.ply import PlyGaussians
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.transfers import checkpoint_in, map_out, picture_out, pose_in
-from aquaflow.render.activation import radiance
+from aquaflow.mapping.transfers import checkpoint_in, picture_out, pose_in
 from aquaflow.render.contract import RADIUS_SIGMAS, Renderer
 
 Array = npt.NDArray[np.float64]
@@ -59,16 +58,7 @@ class Splats:
     def __init__(self, mapper: Mapper, ground: Ground) -> None:
         """With a decoder, each Gaussian is as the view nearest to it sees it."""
         self._renderer: Renderer = mapper.renderer
-        with torch.no_grad():
-            plain = mapper.scene.baked(mapper.views)
-            splats = PlyGaussians(
-                means=map_out(plain["means"]),
-                wxyz=map_out(torch.nn.functional.normalize(plain["quats"], dim=-1)),
-                scales=map_out(torch.exp(plain["log_scales"])),
-                opacities=map_out(torch.sigmoid(plain["opacity_logits"][:, 0])),
-                colours=map_out(radiance(plain["raw_colours"])),
-            )
-        self._splats = splats.transformed(ground.T_gm)
+        self._splats = splats_of(mapper).transformed(ground.T_gm)
         self._reach = RADIUS_SIGMAS * self._splats.scales.max(axis=1, initial=0.0)
 
     def reaching(self, grid: Grid, tile: Tile) -> npt.NDArray[np.intp]:

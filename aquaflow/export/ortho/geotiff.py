@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from aquaflow.errors import InputError, first_line
-from aquaflow.export.optional_package import survey_package
+from aquaflow.errors.extra import load
 from aquaflow.export.ortho.grid import TILE_PX, Grid, Tile
 from aquaflow.export.ortho.ground import Ground
 from aquaflow.export.ortho.layers import NODATA, Layer, TilePixels
@@ -29,7 +29,7 @@ def require_rasterio() -> Any:
     Raises:
         InputError: it is not installed.
     """
-    return survey_package("rasterio", "a GeoTIFF")
+    return load("rasterio", "a GeoTIFF", "survey")
 
 
 class Raster:

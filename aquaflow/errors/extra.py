@@ -1,4 +1,4 @@
-"""Optional libraries: loaded when a driver is opened; an error of one sentence if missing."""
+"""Optional libraries: loaded when they are needed; an error of one sentence if missing."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from aquaflow.errors import InputError
 
 
 def load(module: str, needed_by: str, extra: str = "telemetry") -> Any:
-    """Import ``module``; typed Any, because most device libraries carry no types.
+    """Import ``module``; typed Any, because most such libraries carry no types.
 
     Raises:
         InputError: it is not installed.
