@@ -64,9 +64,14 @@ def exposure_without_water(dive: Path, mapper: Mapper) -> float:
         raise InputError(
             f"{dive} has no water to remove: it was found clear, or mapping.medium.enabled was off"
         )
+    return exposure_of_looks(mapper)
+
+
+@torch.no_grad()
+def exposure_of_looks(mapper: Mapper) -> float:
+    """The one gain at which the map's clean radiance is shown, judged by some of its views."""
     shown = in_time(mapper.views)[:: max(1, len(mapper.views) // LOOKS)]
-    with torch.no_grad():
-        return common_exposure(mapper.scene.balanced(mapper.show(view).radiance) for view in shown)
+    return common_exposure(mapper.scene.balanced(mapper.show(view).radiance) for view in shown)
 
 
 def restored_frames(

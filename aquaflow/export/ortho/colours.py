@@ -13,16 +13,13 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from aquaflow.export.restored import exposure_of_looks
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.restoration import common_exposure, to_bytes
+from aquaflow.mapping.restoration import to_bytes
 from aquaflow.mapping.transfers import picture_out, water_in
-from aquaflow.mapping.views import in_time
 from aquaflow.mapping.water.image_formation import Water
 
 Array = npt.NDArray[np.float64]
-
-LOOKS = 20
-"""Views, spread over the dive, that the common exposure is judged by; as of restored frames."""
 
 
 class Colours:
@@ -33,13 +30,7 @@ class Colours:
         look through, in the ground's unit, or None for no water."""
         self._scene, self._unit, self._through = mapper.scene, unit, water_range
         self._water = _mean_water(mapper)
-        self._exposure = 1.0
-        if water_range is None:
-            views = in_time(mapper.views)[:: max(1, len(mapper.views) // LOOKS)]
-            with torch.no_grad():
-                self._exposure = common_exposure(
-                    mapper.scene.balanced(mapper.show(view).radiance) for view in views
-                )
+        self._exposure = exposure_of_looks(mapper) if water_range is None else 1.0
 
     @torch.no_grad()
     def of(

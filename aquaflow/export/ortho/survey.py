@@ -12,9 +12,8 @@ from typing import Literal
 import numpy as np
 
 from aquaflow import __version__
-from aquaflow.config import load_config
 from aquaflow.errors import InputError
-from aquaflow.export.map_file import SUFFIX, read_map_file
+from aquaflow.export.map_file import SUFFIX
 from aquaflow.export.ortho.colours import Colours
 from aquaflow.export.ortho.drawing import MOST_FINER, Splats
 from aquaflow.export.ortho.geotiff import require_rasterio, writing_raster
@@ -22,11 +21,11 @@ from aquaflow.export.ortho.grid import Grid, Tile, rounded
 from aquaflow.export.ortho.ground import Ground, ground_of
 from aquaflow.export.ortho.layers import DEM, ORTHO, QUALITY, TilePixels
 from aquaflow.export.ortho.sightings import ViewRanges
+from aquaflow.export.posed_views import read_mapper
 from aquaflow.fusion.metric_file import read_frame_of_map
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.water.posed_picture import SOLID
-from aquaflow.render import select_renderer
 
 Kind = Literal["ortho", "dem"]
 Progress = Callable[[str, int, int], None]
@@ -142,12 +141,10 @@ class _Tiles:
 
 def _read(dive: Path) -> tuple[Mapper, MetricFrame]:
     """The largest sub-map and how it lies in the world."""
-    renderer = select_renderer(load_config(dive / "config.yaml").mapping.renderer)
-    path = dive / f"map{SUFFIX}"
-    mapper = read_map_file(path, renderer)
+    mapper = read_mapper(dive)
     if not mapper.views or len(mapper.gaussians) == 0:
         raise InputError(f"the map of {dive} is empty; map a recording that shows more")
-    return mapper, read_frame_of_map(path)
+    return mapper, read_frame_of_map(dive / f"map{SUFFIX}")
 
 
 def _tags(
