@@ -21,6 +21,7 @@ from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.tracking.adjustment.robust import huber_weights
 
 Array = npt.NDArray[np.float64]
+Float = npt.NDArray[np.float32]
 Index = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
 
@@ -44,8 +45,9 @@ class AnchorMatches:
     """[P] inverse depth that the pointmap has."""
     variance: Array
     """[P] of that; infinite where nothing is known."""
-    at: Array
-    """[V, P, 2] normalised plane; NaN where a point is not seen."""
+    at: Array | Float
+    """[V, P, 2] normalised plane; NaN where a point is not seen. In single precision, as matches
+    are kept, it takes half the memory; sums are in double precision with either."""
     used: Mask
     """[V, P]"""
     sigma: Array

@@ -10,11 +10,11 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.tracking.adjustment.block_matrix import BlockPattern
 from aquaflow.tracking.adjustment.equations import (
     AnchorEquations,
     AnchorMatches,
     Array,
-    Index,
     Mask,
     anchor_equations,
     projected,
@@ -29,6 +29,9 @@ STOP_RELATIVE_DECREASE = 1e-4
 """Of the cost, at which the descent ends."""
 DENSE_UNKNOWNS = 700
 """Up to a hundred keyframes a dense factor is quicker than a sparse one."""
+KEPT_BYTES = 64 << 20
+"""What steps of depths are kept from, 0.1 MB for each anchor; making them anew takes as long as the
+equations did."""
 
 
 @dataclass(frozen=True)
@@ -61,11 +64,11 @@ def descend(
 ) -> State:
     """The state of least cost, or the best that ``iterations`` steps find."""
     damping, cost = FIRST_DAMPING, cost_of(matches, links, state)
-    equations = None
+    pattern, system = None, None
     for _ in range(iterations):
-        if equations is None:
-            equations = linearised(matches, state)
-        candidate = _stepped(matches, links, state, equations, free, damping)
+        pattern = pattern or BlockPattern.of(matches, links, free)
+        system = system or linearised(matches, links, state, pattern)
+        candidate = _stepped(matches, state, system, free, damping)
         new_cost = np.inf if candidate is None else cost_of(matches, links, candidate)
         if candidate is None or not new_cost < cost:
             damping *= 10.0
@@ -73,40 +76,61 @@ def descend(
                 break
             continue
         decrease = (cost - new_cost) / max(cost, 1e-12)
-        state, cost, equations = candidate, new_cost, None
+        state, cost, system = candidate, new_cost, None
         damping = max(0.1 * damping, 1e-9)
         if decrease < STOP_RELATIVE_DECREASE:
             break
     return state
 
 
-def linearised(matches: Sequence[AnchorMatches], state: State) -> list[AnchorEquations]:
-    """The equations of every anchor."""
-    return [
-        anchor_equations(anchor, state.poses, rho)
-        for anchor, rho in zip(matches, state.rho, strict=True)
-    ]
+@dataclass(frozen=True)
+class System:
+    """The equations at one state."""
+
+    H: sparse.csc_matrix
+    """[7 F, 7 F] of the free poses, depths eliminated."""
+    gradient: Array
+    """[7 F]"""
+    parts: Sequence[AnchorEquations]
+    """Of the first anchors, as many as KEPT_BYTES hold: those of the others are made anew when
+    their depths step."""
+
+
+def linearised(
+    matches: Sequence[AnchorMatches], links: Links, state: State, pattern: BlockPattern
+) -> System:
+    """The equations of all anchors and links, summed anchor by anchor."""
+    total, kept, room = pattern.zero(), list[AnchorEquations](), KEPT_BYTES
+    for anchor, rho in zip(matches, state.rho, strict=True):
+        part = anchor_equations(anchor, state.poses, rho)
+        total.add(pattern.place[anchor.places], part.H, part.gradient)
+        room -= part.gain.nbytes
+        if room >= 0:
+            kept.append(part)
+    ends = pattern.place[np.stack([links.a, links.b], axis=1)]
+    for places, H, gradient in zip(ends, *links.blocks(state.poses), strict=True):
+        total.add(places, H, gradient)
+    return System(total.matrix(), total.gradient, kept)
 
 
 def _stepped(
     matches: Sequence[AnchorMatches],
-    links: Links,
     state: State,
-    equations: Sequence[AnchorEquations],
+    system: System,
     free: Mask,  # [K]
     damping: float,
 ) -> State | None:
     """The state after a damped step; None if the equations have no solution."""
     step = np.zeros((len(state.poses), 7))
-    system = assembled(matches, equations, links, state.poses, free)
-    step[free] = solved(*system, damping)
+    step[free] = solved(system.H, system.gradient, damping)
     poses = (state.poses @ Sim3Batch.exp(step)).on_group()
     if not (np.isfinite(step).all() and np.isfinite(poses.t).all() and (poses.scale > 0).all()):
         return None
-    rho = [
-        rho + part.depth_steps(step[anchor.places].ravel())
-        for anchor, rho, part in zip(matches, state.rho, equations, strict=True)
-    ]
+    rho = []
+    for i, (anchor, depths) in enumerate(zip(matches, state.rho, strict=True)):
+        kept = i < len(system.parts)
+        part = system.parts[i] if kept else anchor_equations(anchor, state.poses, depths)
+        rho.append(depths + part.depth_steps(step[anchor.places].ravel()))
     return State(poses, rho)
 
 
@@ -129,42 +153,3 @@ def solved(
     except RuntimeError:
         return np.full((len(gradient) // 7, 7), np.nan)
     return np.asarray(-factor.solve(gradient)).reshape(-1, 7)
-
-
-def assembled(
-    matches: Sequence[AnchorMatches],
-    equations: Sequence[AnchorEquations],
-    links: Links,
-    poses: Sim3Batch,
-    free: Mask,  # [K]
-) -> tuple[sparse.csc_matrix, Array]:
-    """The reduced normal equations of the free poses: [7 F, 7 F] and the gradient [7 F]."""
-    place = np.full(len(free), -1, dtype=np.intp)
-    place[free] = np.arange(int(free.sum()))
-    parts = [
-        (place[anchor.places], part.H, part.gradient)
-        for anchor, part in zip(matches, equations, strict=True)
-    ]
-    ends = place[np.stack([links.a, links.b], axis=1)]
-    parts += list(zip(ends, *links.blocks(poses), strict=True))
-    size = 7 * int(free.sum())
-    total, values, rows, columns = np.zeros(size), [], [], []
-    for places, H, gradient in parts:
-        at, inside = unknowns(places)
-        np.add.at(total, at, gradient[inside])
-        values.append(H[np.ix_(inside, inside)].ravel())
-        rows.append(np.repeat(at, len(at)))
-        columns.append(np.tile(at, len(at)))
-    if not values:
-        return sparse.csc_matrix((size, size)), total
-    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    return sparse.csc_matrix(entries, shape=(size, size)), total
-
-
-def unknowns(
-    places: Index,  # [1 + V] among the free poses; -1 for those that are held
-) -> tuple[Index, Index]:
-    """Unknowns [u] of the free ones among ``places``, and where they stand in their block [u]."""
-    columns = (7 * places[:, None] + np.arange(7)).ravel()
-    inside = np.flatnonzero(np.repeat(places >= 0, 7))
-    return columns[inside], inside

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.tracking.adjustment.block_matrix import SIDE, BlockPattern
 from aquaflow.tracking.adjustment.equations import (
     AnchorMatches,
     Array,
@@ -15,7 +16,7 @@ from aquaflow.tracking.adjustment.equations import (
     equations_and_scores,
 )
 from aquaflow.tracking.adjustment.links import Links
-from aquaflow.tracking.adjustment.solver import State, assembled, linearised, unknowns
+from aquaflow.tracking.adjustment.solver import State, linearised
 
 CLUSTER = 4
 """Consecutive points of an anchor, row by row, whose errors count as one draw: neighbouring matches
@@ -37,8 +38,8 @@ def covariance(
     Raises:
         numpy.linalg.LinAlgError: a pose is not determined at all.
     """
-    H, _ = assembled(matches, linearised(matches, state), links, state.poses, free)
-    return np.asarray(np.linalg.inv(H.toarray()))
+    pattern = BlockPattern.of(matches, links, free)
+    return np.asarray(np.linalg.inv(linearised(matches, links, state, pattern).H.toarray()))
 
 
 def inflation(
@@ -84,3 +85,12 @@ def of_edge(
         if place[pose] >= 0:
             J[:, 7 * place[pose] : 7 * place[pose] + 7] = by_pose
     return np.asarray(J @ inverse @ J.T)
+
+
+def unknowns(
+    places: Index,  # [1 + V] among the free poses; -1 for those that are held
+) -> tuple[Index, Index]:
+    """Unknowns [u] of the free ones among ``places``, and where they stand in their block [u]."""
+    columns = (SIDE * places[:, None] + np.arange(SIDE)).ravel()
+    inside = np.flatnonzero(np.repeat(places >= 0, SIDE))
+    return columns[inside], inside

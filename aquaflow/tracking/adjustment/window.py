@@ -62,7 +62,7 @@ def problem_of(
 
 def _matches_of(points: AnchoredPoints, place: Mapping[int, int]) -> AnchorMatches:
     views = [number for number in sorted(points.seen) if number in place]
-    at = np.zeros((len(views), len(points.rho), 2))
+    at = np.zeros((len(views), len(points.rho), 2), np.float32)
     for i, number in enumerate(views):
         at[i] = points.seen[number]
     rho, variance = points.rho.astype(np.float64), points.variance.astype(np.float64)

@@ -9,6 +9,7 @@ import pytest
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.tracking.adjustment.block_matrix import BlockPattern
 from aquaflow.tracking.adjustment.equations import (
     AnchorMatches,
     anchor_equations,
@@ -16,7 +17,7 @@ from aquaflow.tracking.adjustment.equations import (
     projected,
 )
 from aquaflow.tracking.adjustment.links import Links
-from aquaflow.tracking.adjustment.solver import State, assembled, cost_of, linearised
+from aquaflow.tracking.adjustment.solver import State, cost_of, linearised
 from tests.tracking.adjustment.adjustment_scenes import Array, no_links, scene, shaken
 
 STEP = 1e-6
@@ -32,7 +33,10 @@ def test_the_gradient_is_that_of_the_cost_along_poses_and_depths() -> None:
     poses = shaken(known.poses, 0.01)
     matches = [stretched(each) for each in known.problem(poses).matches]
     state = State(Sim3Batch.of(poses), [1.02 * each.rho for each in matches])
-    equations = linearised(matches, state)
+    equations = [
+        anchor_equations(each, state.poses, rho)
+        for each, rho in zip(matches, state.rho, strict=True)
+    ]
     rng = np.random.default_rng(5)
     step = rng.normal(0.0, 1.0, (4, 7))
     # The eliminated gradient is the slope along steps that take the best depths with them.
@@ -97,7 +101,8 @@ def test_links_pull_as_their_cost_says() -> None:
         root @ root.transpose(0, 2, 1),
     )
     free = np.ones(3, dtype=bool)
-    H, gradient = assembled([], [], links, poses, free)
+    system = linearised([], links, State(poses, []), BlockPattern.of([], links, free))
+    H, gradient = system.H, system.gradient
     step = rng.normal(size=(3, 7))
 
     def cost_at(size: float) -> float:
@@ -114,8 +119,26 @@ def test_poses_that_are_held_are_no_unknowns() -> None:
     problem = known.problem(known.poses)
     state = State(problem.poses, known.rho)
     free = np.array([False, True, False, True])
-    H, gradient = assembled(
-        problem.matches, linearised(problem.matches, state), no_links(), state.poses, free
-    )
-    assert H.shape == (14, 14)
-    assert gradient.shape == (14,)
+    pattern = BlockPattern.of(problem.matches, no_links(), free)
+    system = linearised(problem.matches, no_links(), state, pattern)
+    assert system.H.shape == (14, 14)
+    assert system.gradient.shape == (14,)
+
+
+def test_sums_of_blocks_are_those_of_a_dense_matrix() -> None:
+    known = scene(count=6, reach=1)
+    problem = known.problem(shaken(known.poses, 0.01))
+    state, free = State(problem.poses, known.rho), np.ones(6, dtype=bool)
+    free[[0, 3]] = False
+    H, gradient = np.zeros((42, 42)), np.zeros(42)
+    for each, rho in zip(problem.matches, state.rho, strict=True):
+        part = anchor_equations(each, state.poses, rho)
+        at = (7 * each.places[:, None] + np.arange(7)).ravel()
+        H[np.ix_(at, at)] += part.H
+        gradient[at] += part.gradient
+    pattern = BlockPattern.of(problem.matches, no_links(), free)
+    system = linearised(problem.matches, no_links(), state, pattern)
+    own = np.flatnonzero(np.repeat(free, 7))
+    assert np.allclose(system.H.toarray(), H[np.ix_(own, own)], rtol=1e-12, atol=1e-9)
+    assert np.allclose(system.gradient, gradient[own], rtol=1e-12, atol=1e-9)
+    assert len(pattern.keys) < 16  # no point is seen by keyframes 1 and 5

@@ -9,10 +9,16 @@ import pytest
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.tracking.adjustment import solver
+from aquaflow.tracking.adjustment.equations import (
+    AnchorEquations,
+    AnchorMatches,
+    anchor_equations,
+)
 from aquaflow.tracking.adjustment.held_out import triangulated, verdict
 from aquaflow.tracking.adjustment.joint import adjust
 from aquaflow.tracking.adjustment.uncertainty import covariance
-from tests.tracking.adjustment.adjustment_scenes import NOISE, apart, scene, shaken
+from tests.tracking.adjustment.adjustment_scenes import NOISE, Array, apart, scene, shaken
 
 
 def test_poses_and_units_come_back_from_exact_matches() -> None:
@@ -43,6 +49,35 @@ def test_outliers_are_left_out() -> None:
     given = sum(int(each.used[:, np.arange(120) % 5 != 4].sum()) for each in known.matches)
     assert 0.7 * given < used < 0.9 * given
     assert apart(adjusted.state.poses, known.poses).max() < 0.01
+
+
+def test_a_dive_too_long_to_keep_its_equations_is_adjusted_to_the_same_bits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    known = scene(count=8)
+    problem = known.problem(shaken(known.poses, 0.005))
+    made: list[int] = []
+
+    def counted(matches: AnchorMatches, poses: Sim3Batch, rho: Array) -> AnchorEquations:
+        made.append(matches.anchor)
+        return anchor_equations(matches, poses, rho)
+
+    monkeypatch.setattr(solver, "anchor_equations", counted)
+    kept, first = adjust(problem, 10).state, len(made)
+    monkeypatch.setattr(solver, "KEPT_BYTES", 0)
+    anew, second = adjust(problem, 10).state, len(made) - first
+    assert second > first
+    assert (kept.poses.t == anew.poses.t).all()
+    assert all((a == b).all() for a, b in zip(kept.rho, anew.rho, strict=True))
+
+
+def test_matches_in_single_precision_are_summed_in_double() -> None:
+    known = scene(count=4)
+    problem = known.problem(shaken(known.poses, 0.005))
+    single = [replace(each, at=each.at.astype(np.float32)) for each in problem.matches]
+    double = [replace(each, at=each.at.astype(np.float64)) for each in single]
+    found = [adjust(replace(problem, matches=each), 10).state for each in (single, double)]
+    assert (found[0].poses.t == found[1].poses.t).all()
 
 
 def test_poses_that_are_right_already_are_kept_as_they_are() -> None:
