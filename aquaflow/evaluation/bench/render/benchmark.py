@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -11,6 +12,7 @@ from aquaflow.errors import AquaFlowError, InputError
 from aquaflow.evaluation.bench import machine
 from aquaflow.evaluation.bench.meter import require
 from aquaflow.evaluation.bench.render.accuracy import gradient_errors
+from aquaflow.evaluation.bench.render.blend_limit import measure_blend_limit
 from aquaflow.evaluation.bench.render.contenders import (
     BenchmarkedRenderer,
     Timed,
@@ -62,11 +64,12 @@ def bench_render(
     _make_folder(out)
     contenders, notes = contenders_here(opensplat, device)
     counts = (1,) if device == "cuda" else thread_counts()
-    peak = NO_PEAK if device == "cuda" else measure_peak(counts)
+    peak = NO_PEAK if device == "cuda" else _limits(measure_peak(counts), contenders)
     described = {
         **machine.describe(device),
         "peak_gflop_per_s": {str(count): rate / 1e9 for count, rate in peak.flop_per_s.items()},
         "peak_method": peak.method,
+        "blend_limit": {isa: asdict(limit) for isa, limit in peak.blending.items()},
     }
     kernels = [c for c in contenders if isinstance(c, Timed) and c.name in KERNELS]
     working = _that_run(kernels, height_field(SMALL), notes)
@@ -83,6 +86,12 @@ def bench_render(
     write_json(out / JSON_FILE, result)
     draw(rows, out / PICTURE_FILE, caption(described))
     return result
+
+
+def _limits(peak: Peak, contenders: Sequence[BenchmarkedRenderer]) -> Peak:
+    """The peak, with what the blending loops of each instruction set do at most."""
+    isas = sorted({contender.isa for contender in contenders if contender.name == "cpu"})
+    return replace(peak, blending={isa: measure_blend_limit(isa) for isa in isas})
 
 
 def _make_folder(out: Path) -> None:

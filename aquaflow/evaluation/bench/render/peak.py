@@ -9,13 +9,14 @@ import ctypes
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 
+from aquaflow.evaluation.bench.render.blend_limit import BlendLimit
 from aquaflow.render.native import build
 
 VECTOR_BYTES = {"avx512": 64, "avx2": 32, "sse4": 16, "neon": 16}
@@ -52,6 +53,9 @@ class Peak:
 
     flop_per_s: dict[int, float]
     method: str
+    blending: Mapping[str, BlendLimit] = field(default_factory=dict)
+    """By instruction set, what one thread of the kernels blends at most; those that were
+    measured."""
 
 
 def measure_peak(threads: tuple[int, ...]) -> Peak:

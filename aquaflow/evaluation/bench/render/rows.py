@@ -52,6 +52,7 @@ def row_of(
         row[f"{key}_interactions_per_s"] = interactions / busy_s[key] if busy_s[key] else None
     row["gpu_mb"] = _median(samples, "gpu_mb")
     row["share_of_peak"] = _shares(contender, busy_s, interactions, peak)
+    row["share_of_blend_limit"] = _blend_shares(contender, busy_s, interactions, peak)
     row["stage_ms"] = _stages(samples)
     return row
 
@@ -72,6 +73,18 @@ def _shares(
     flop = {key: each * interactions for key, each in PASSES}
     shares = {key: flop[key] / busy_s[key] / most for key, _ in PASSES}
     return {**shares, "both": sum(flop.values()) / sum(busy_s.values()) / most}
+
+
+def _blend_shares(
+    contender: BenchmarkedRenderer, busy_s: dict[str, float], interactions: int, peak: Peak
+) -> dict[str, float] | None:
+    """Of the rate at which the kernels blend where nothing is in vain and nothing else is done."""
+    limit = peak.blending.get(contender.isa)
+    if contender.name != "cpu" or limit is None or not all(busy_s.values()):
+        return None
+    least = {key: s / contender.threads for key, s in limit.seconds(interactions).items()}
+    shares = {key: least[key] / busy_s[key] for key, _ in PASSES}
+    return {**shares, "both": sum(least.values()) / sum(busy_s.values())}
 
 
 def _stages(samples: Sequence[Sample]) -> dict[str, float] | None:

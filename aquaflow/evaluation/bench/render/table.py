@@ -35,7 +35,7 @@ def renderer_table(rows: Sequence[Row]) -> Table:
     table = _table(("picture", "Gaussians", "renderer", "threads"))
     for title in (
         "forward ms", "backward ms", "both ms", "CPU ms", *gpu, "G/s fwd", "G/s bwd",
-        "peak % fwd", "bwd", "both", *stages,
+        "peak % fwd", "bwd", "both", "limit % both", *stages,
     ):  # fmt: skip
         table.add_column(title, justify="right", no_wrap=True)
     before: tuple[str, int] | None = None
@@ -60,6 +60,7 @@ def _cells(row: Row, gpu: Sequence[str], stages: Sequence[str]) -> list[str]:
         *(_number(row[key], ".2f") for title, key in ON_GPU if title in gpu),
         *(_number(row[f"{key}_interactions_per_s"], ".3f", 1e-9) for key in ("fwd", "bwd")),
         *(_number(shares.get(key), ".1f", 100.0) for key in ("fwd", "bwd", "both")),
+        _number((row["share_of_blend_limit"] or {}).get("both"), ".1f", 100.0),
         *(_number(stage_ms.get(stage), ".2f") for stage in stages),
     ]
 
@@ -113,6 +114,16 @@ def sentences(result: dict[str, Any]) -> list[str]:
             f"Share of peak: {FORWARD_FLOP:.0f} operations an interaction forward, "
             f"{BACKWARD_FLOP:.0f} backward; what is computed in vain is not counted as work. "
             f"Peak: {peaks}, by {machine['peak_method']}."
+        )
+    if machine["blend_limit"]:
+        limits = "; ".join(
+            f"{isa} {1e-9 * limit['fwd']:.2f} and {1e-9 * limit['bwd']:.2f}"
+            for isa, limit in machine["blend_limit"].items()
+        )
+        said.append(
+            "Share of the limit: of the 1e9 interactions/s that one thread blends forward and "
+            f"backward where Gaussians reach every pixel of a picture in the caches: {limits}. "
+            "Projecting, sorting and lanes in vain count against it."
         )
     if machine["gpu"]:
         said.append(

@@ -123,6 +123,8 @@ def test_the_benchmark_writes_rows_gradients_and_a_picture(tmp_path: Path) -> No
     fastest = [row for row in written["rows"] if row["isa"] == supported_isas()[0]]
     assert len(fastest) == 3 * len(thread_counts())  # and the small scene
     assert all(row["share_of_peak"]["both"] > 0.0 for row in fastest)
+    assert all(row["share_of_blend_limit"]["both"] > 0.0 for row in fastest)
+    assert set(written["machine"]["blend_limit"]) == set(supported_isas())
     assert set(written["gradient_rel_error"]) == set(NAMES)
     assert 0.0 < max(written["gradient_rel_error"].values()) <= 5e-5
     assert {"processor", "load", "peak_gflop_per_s", "peak_method"} <= set(written["machine"])

@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import pytest
 import torch
 
 from aquaflow.evaluation.bench.render import peak as peaks
+from aquaflow.evaluation.bench.render.blend_limit import (
+    COVERING,
+    BlendLimit,
+    covering_scene,
+    measure_blend_limit,
+)
 from aquaflow.evaluation.bench.render.contenders import Timed
 from aquaflow.evaluation.bench.render.interactions import count_interactions
 from aquaflow.evaluation.bench.render.parts import parts_of, time_parts
@@ -13,6 +22,7 @@ from aquaflow.evaluation.bench.render.rows import row_of
 from aquaflow.evaluation.bench.render.timing import Sample, interleaved, time_renderer
 from aquaflow.render.contract import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from aquaflow.render.example_scene import Size, height_field
+from aquaflow.render.native.build import supported_isas
 from aquaflow.render.reference import ReferenceRenderer, project
 from tests.evaluation.bench.render.pretended_renderer import PEAK, TINY, Pretended, SlowedClock
 
@@ -99,6 +109,28 @@ def test_a_row_has_medians_rates_and_shares_of_the_peak() -> None:
     assert row["fwd_interactions_per_s"] == pytest.approx(10e6)  # of the wall's
     assert row["share_of_peak"]["fwd"] == pytest.approx(0.15)
     assert row["stage_ms"] is None
+
+
+def test_a_row_of_the_kernels_has_its_share_of_what_blending_does_at_most() -> None:
+    limited = replace(PEAK, blending={"avx2": BlendLimit(40e6, 20e6)})
+    samples = [Sample(9.0, 40.0, 5.0, 20.0)]
+    for name, threads, shares in (
+        ("cpu", 1, {"fwd": 0.5, "bwd": 0.25, "both": 0.3}),
+        ("cpu", 2, {"fwd": 0.25, "bwd": 0.125, "both": 0.15}),
+        ("tiles", 1, None),
+    ):
+        kernel = SimpleNamespace(name=name, isa="avx2", threads=threads)
+        row = row_of(kernel, TINY, samples, 100_000, limited, None)  # type: ignore[arg-type]
+        share = row["share_of_blend_limit"]
+        assert share == (None if shares is None else pytest.approx(shares))
+
+
+def test_gaussians_of_the_limits_scene_reach_every_pixel_and_saturate_none() -> None:
+    scene = covering_scene()
+    assert count_interactions(scene) == COVERING.n * COVERING.pixels
+    found = measure_blend_limit(supported_isas()[0])
+    assert found.seconds(round(found.fwd))["fwd"] == pytest.approx(1.0)
+    assert min(found.fwd, found.bwd) > 0.0
 
 
 def test_the_peak_is_measured_with_and_without_a_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
