@@ -14,7 +14,8 @@ from typing import Any, TypeVar
 from aquaflow.clocks.deadline import Deadline
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.found_camera import FoundCamera
-from aquaflow.dive.held_out import HeldOut, examine_held_out, mean_amplification
+from aquaflow.dive.from_maps import held_out_examples, water_in_numbers
+from aquaflow.dive.held_out_example import HeldOut, mean_amplification
 from aquaflow.dive.medium_json import medium_json
 from aquaflow.dive.metric_outputs import MetricOutputs, held_out_in, water_in, worlds_in_words
 from aquaflow.dive.path_rows import path_rows
@@ -23,7 +24,6 @@ from aquaflow.dive.results import (
     WaterSummary,
     largest_sub_map,
     refined_poses,
-    summarise_water,
     tracked_poses,
 )
 from aquaflow.export.georeference import GEOREFERENCE, georeference
@@ -91,12 +91,12 @@ class Deliverables:
             attempt("water summary", partial(self._summarise_water, sub_map))
 
     def _summarise_water(self, sub_map: int) -> None:
-        self._waters[sub_map] = summarise_water(self.slam.mappers[sub_map])
+        self._waters[sub_map] = water_in_numbers(self.slam.mappers[sub_map])
 
     def evaluate(self, until: Deadline | None = None) -> None:
         """Held-out views, as many as there is time for."""
         main, attempt = self._main, self._attempt
-        found = attempt("evaluation", lambda: examine_held_out(self.slam, main, until)) or []
+        found = attempt("evaluation", lambda: held_out_examples(self.slam, main, until)) or []
         scale = self.metric_frame.T_nm.scale
         self.held_out = [held_out_in(example, scale) for example in found]
         there = len(self.slam.held_out.get(main, ()))

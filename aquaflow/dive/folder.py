@@ -9,21 +9,19 @@ import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from aquaflow.config import Config
+from aquaflow.dive import from_maps
 from aquaflow.dive.frames_csv import FrameRow, header, of_text, to_text
-from aquaflow.dive.held_out import HeldOut
+from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.dive.log import JsonLog
-from aquaflow.dive.results import WaterSummary, water_of
+from aquaflow.dive.results import WaterSummary
 from aquaflow.dive.status import NAME as STATUS
 from aquaflow.errors import InputError
-from aquaflow.export.map_file import write_map_file
-from aquaflow.export.ply import PlyGaussians, write_ply
 from aquaflow.export.png import write_png
 from aquaflow.export.report import ReportData, write_report
 from aquaflow.export.trajectory_csv import NAME as PATH_TABLE
@@ -34,13 +32,13 @@ from aquaflow.fusion.metric_file import write_metric_file
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.transfers import map_out, water_in
 from aquaflow.recording.telemetry_lines import NAME as TELEMETRY
-from aquaflow.render.activation import radiance
 from aquaflow.storage.atomic import atomic_write, write_json, write_yaml
 from aquaflow.storage.camera_file import save_camera
 from aquaflow.storage.folder_lock import FolderLock
+
+if TYPE_CHECKING:
+    from aquaflow.mapping.mapper import Mapper
 
 log = logging.getLogger(__name__)
 
@@ -256,7 +254,7 @@ class DiveFolder:
 
     def write_map(self, mapper: Mapper, suffix: str = "") -> None:
         """map.aqf: the exact map."""
-        write_map_file(self.path / f"map{suffix}.aqf", mapper)
+        from_maps.write_exact(self.path, mapper, suffix)
 
     def write_splats(
         self, mapper: Mapper, water: WaterSummary | None, frame: MetricFrame, suffix: str = ""
@@ -266,20 +264,7 @@ class DiveFolder:
 
         ``water``: in map units.
         """
-        with torch.no_grad():
-            plain = mapper.scene.baked(mapper.views)
-            clear = radiance(plain["raw_colours"])
-            seen = clear
-            if water is not None:
-                medium = water_of(water, clear.device)
-                z = torch.full((len(clear),), water.range_median, device=clear.device)
-                seen = clear * medium.transmission(z) + medium.backscatter(z)
-                clear = clear * water_in(water.white_gain, clear.device)
-            for name, colours in (("map", seen), ("map_clear", clear)):
-                splats = _splats(plain, colours)
-                if not frame.is_identity:
-                    splats = splats.transformed(frame.T_nm)
-                write_ply(self.path / f"{name}{suffix}.ply", splats)
+        from_maps.write_splats(self.path, mapper, water, frame, suffix)
 
     def write_medium(self, content: dict[str, Any]) -> None:
         """medium.json: the water, see :func:`aquaflow.dive.medium_json.medium_json`."""
@@ -322,16 +307,3 @@ def _finite(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _finite(each) for key, each in value.items()}
     return [_finite(each) for each in value] if isinstance(value, (list, tuple)) else value
-
-
-def _splats(
-    parameters: Mapping[str, torch.Tensor],  # of a GaussianMap
-    colours: torch.Tensor,  # [N, 3]
-) -> PlyGaussians:
-    return PlyGaussians(
-        map_out(parameters["means"]),
-        map_out(torch.nn.functional.normalize(parameters["quats"], dim=-1)),
-        map_out(torch.exp(parameters["log_scales"])),
-        map_out(torch.sigmoid(parameters["opacity_logits"][:, 0])),
-        map_out(colours),
-    )

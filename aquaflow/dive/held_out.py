@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from aquaflow.clocks.deadline import Deadline
+from aquaflow.dive.held_out_example import Fidelity, HeldOut
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.rendering import Shown
 from aquaflow.mapping.restoration import (
@@ -25,42 +25,9 @@ from aquaflow.mapping.water.posed_picture import SOLID
 from aquaflow.render.image_metrics import lpips, psnr, ssim
 from aquaflow.slam import Slam
 
-Rgb = list[float]
-
 REGISTERING = 0.85
 """Of the time for held-out views, for their poses: a dozen drawings each, where comparing takes a
 few (docs/measurements.md#finishing)."""
-
-
-class Fidelity(NamedTuple):
-    """How like the camera's picture a drawing is."""
-
-    psnr: float
-    """dB"""
-    ssim: float
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """One held-out frame after its pose was refined."""
-
-    frame_index: int
-    real: npt.NDArray[np.uint8]
-    rendered: npt.NDArray[np.uint8]
-    restored: npt.NDArray[np.uint8] | None
-    """[H, W, 3], or [H, W, 4] with alpha where open water was removed."""
-    psnr: float
-    ssim: float
-    lpips: float | None
-    z: npt.NDArray[np.float32] | None = None
-    """[H, W] rendered range, 0 where the map is not solid; map units unless something else is
-    said."""
-    confidence: npt.NDArray[np.uint8] | None = None
-    """[H, W] 0 to 255, the share of ``restored`` that is the picture's (see RestoredPicture)."""
-    amplification: npt.NDArray[np.float32] | None = None
-    """[2, 3] RGB, as applied and as allowed (see RestoredPicture)."""
-    as_tracked: Fidelity | None = None
-    """Before anything of the view was refined: tracked pose, mean exposure, even light."""
 
 
 def examine_held_out(slam: Slam, sub_map: int, until: Deadline | None = None) -> list[HeldOut]:
@@ -139,12 +106,3 @@ def _examine(mapper: Mapper, view: View, exposure: float) -> HeldOut:
         None if restored is None else restored.confidence_bytes(),
         None if amplification is None else picture_out(amplification),
     )
-
-
-def mean_amplification(examples: Sequence[HeldOut]) -> tuple[Rgb, Rgb] | None:
-    """Red, green, blue as applied and as allowed, mean over the views; None where none has any."""
-    known = [each.amplification for each in examples if each.amplification is not None]
-    if not known:
-        return None
-    mean = np.stack(known).astype(np.float64).mean(axis=0)
-    return mean[0].tolist(), mean[1].tolist()

@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow import __version__
+from aquaflow.dive.from_maps import water_in_numbers
 from aquaflow.dive.measures import measures
 from aquaflow.dive.metric_outputs import (
     MetricOutputs,
@@ -24,17 +25,19 @@ from aquaflow.dive.metric_outputs import (
     worlds_in_words,
 )
 from aquaflow.dive.report_data import camera_summary, medium_curves
-from aquaflow.dive.results import WaterSummary, summarise_water
+from aquaflow.dive.results import WaterSummary
 from aquaflow.dive.run import DiveRun
 from aquaflow.export.report import PathPlot, ReportData
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3, quaternion_from_rotation
 from aquaflow.geometry.similarity_batch import Sim3Batch
-from aquaflow.mapping.mapper import Mapper
 from aquaflow.messages import CameraModel
 from aquaflow.storage.arrays import Array
 from aquaflow.tracking.frame_table import CLASSES, NONE
 from aquaflow.tracking.frames import FrameClass
+
+if TYPE_CHECKING:
+    from aquaflow.mapping.mapper import Mapper
 
 WATER_VIEWS = 8
 """Views that the water's ranges are taken from: 0.1 s at 480 px, where the end takes ten times as
@@ -82,7 +85,7 @@ class Interim:
         main = self._main
         for number, mapper in mappers.items():
             if len(mapper.gaussians):
-                self._waters[number] = summarise_water(mapper, WATER_VIEWS)
+                self._waters[number] = water_in_numbers(mapper, WATER_VIEWS)
                 suffix = "" if number == main else f"_{number}"
                 frame, water = self._outputs.frame(number), self._waters[number]
                 self._run.folder.write_splats(mapper, water, frame, suffix)

@@ -20,7 +20,8 @@ def medium_json(
         water: with rates and ranges in the unit of ``frame``; None while the medium is off.
         frame: of the same sub-map.
         evidence: log odds of water against clear water or none, before the prior's 5 are added.
-        amplification: of held-out views, see :func:`aquaflow.dive.held_out.mean_amplification`.
+        amplification: of held-out views, see
+            :func:`aquaflow.dive.held_out_example.mean_amplification`.
     """
     data: dict[str, Any] = {"active": water is not None, "scale_source": frame.scale_source}
     if frame.metric:

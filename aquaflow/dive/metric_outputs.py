@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from aquaflow.dive.held_out import HeldOut
+from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.dive.results import WaterSummary
 from aquaflow.fusion.interpolation import Interpolation
 from aquaflow.fusion.metric_frame import MetricFrame

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import torch
-
 from aquaflow.config import Config, SourceConfig
 from aquaflow.cores import usable_threads
 from aquaflow.dive.calibration_pass import found_in
@@ -25,6 +23,10 @@ from aquaflow.sources.telemetry_input import TelemetryInput
 
 Progress = Callable[[str, int, int | None], None]
 """Called with the stage, the steps done and, where known, the steps there are."""
+
+
+TORCH_PRIORS = ("xfeat", "aliked")
+"""Kinds of prior that run in torch; a dive without them and without a map does not load it."""
 
 
 def map_recording(
@@ -51,7 +53,7 @@ def map_recording(
         ConfigError: crop or calibration do not fit the pictures.
         NotMappedError: the frames were read but gave no map; the folder says why.
     """
-    fix_threads(usable_threads(config.threads))
+    fix_threads(usable_threads(config.threads), config)
     folder, failures = DiveFolder(out, config, overwrite), Failures()
     given = telemetry or TelemetryInput()
     try:
@@ -132,7 +134,7 @@ def _events(run: DiveRun, playback: Playback, source: SourceConfig) -> Iterator[
     return read_past_failures(read, source.start, source, count, failures, give_up)
 
 
-def fix_threads(threads: int) -> None:
+def fix_threads(threads: int, config: Config) -> None:
     """Results repeat bit for bit at a given number of threads, so it is set once and everywhere.
 
     torch and BLAS get one: their barriers cost whole scheduler quanta on a busy machine
@@ -141,7 +143,10 @@ def fix_threads(threads: int) -> None:
     import cv2
     from threadpoolctl import threadpool_limits
 
-    torch.set_num_threads(1)
+    if config.mapping.enabled or config.prior.kind in TORCH_PRIORS:
+        import torch
+
+        torch.set_num_threads(1)
     threadpool_limits(1, user_api="blas")  # small matrices: threads only wait for each other
     cv2.setNumThreads(threads)
     cv2.setRNGSeed(0)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from aquaflow.dive.held_out import HeldOut
+from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.dive.measures import measures
 from aquaflow.dive.metric_outputs import MetricOutputs
 from aquaflow.dive.results import WaterSummary, largest_sub_map

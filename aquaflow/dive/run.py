@@ -27,7 +27,7 @@ from aquaflow.dive.metric_outputs import (
 from aquaflow.dive.results import metrics
 from aquaflow.dive.shortcomings import shortcomings
 from aquaflow.errors import InputError, NotMappedError
-from aquaflow.mapping.maps import MIN_VIEWS, Progress
+from aquaflow.mapping.work import MIN_VIEWS, Progress
 from aquaflow.messages import CameraModel, Dropped, Frame, TelemetrySample
 from aquaflow.profiler import pace
 from aquaflow.recording.telemetry_lines import NAME as TELEMETRY

@@ -2,103 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 from aquaflow.clocks.deadline import Deadline
 from aquaflow.config import Config
 from aquaflow.errors.failures import Failures
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes import Pointmap
 from aquaflow.mapping.device_work import DeviceWork
 from aquaflow.mapping.gaussians.reanchoring import move_views
 from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.maps_state import restored, serialised
 from aquaflow.mapping.view_budget import drop_surplus, same_group
 from aquaflow.mapping.views import View, ViewStore
+from aquaflow.mapping.work import MIN_VIEWS, Growth, Insertion, Progress
 from aquaflow.profiler import Profiler
 from aquaflow.render import select_renderer
 from aquaflow.render.contract import Renderer
-from aquaflow.render.device_memory import give_back_idle
-
-MIN_VIEWS = 3
-"""Fewer posed frames are not a map, and not worth refining."""
-
-Progress = Callable[[int, int], None]
-
-
-@dataclass(frozen=True)
-class Insertion:
-    """A view and the depths of its pixels."""
-
-    view: View
-    sub_map: int
-    pointmap: Pointmap
-
-
-@dataclass(frozen=True)
-class Growth:
-    """The contribution of one posed frame to the map of its sub-map."""
-
-    view: View
-    sub_map: int
-    steps: int
-    """Of the optimiser, afterwards."""
-    pointmap: Pointmap | None = None
-    """Depths of the view's own pixels, if new Gaussians may come from it."""
-    retired: tuple[Insertion, ...] = ()
-    """Keyframes that this one relieves, with their pointmaps as fused over their whole life."""
-    metres_per_unit: float | None = None
-    """Of the sub-map; None while it is unknown."""
-
-
-class MapWork(Protocol):
-    """Tracking's requests to the maps; done at once, or in a thread."""
-
-    @property
-    def mappers(self) -> dict[int, Mapper]:
-        """By sub-map. Owned by the mapping thread while it runs."""
-        ...
-
-    @property
-    def renderer(self) -> Renderer:
-        """What the maps are drawn with at the moment, and where."""
-        ...
-
-    @property
-    def held_out(self) -> dict[int, list[View]]:
-        """Per sub-map, the views that were tracked but never mapped."""
-        ...
-
-    def grow(self, growth: Growth) -> None:
-        """Add a view, insert Gaussians, optimise."""
-        ...
-
-    def hold_out(self, view: View, sub_map: int) -> None:
-        """Keep a view for evaluation; the map is never optimised on it."""
-        ...
-
-    def insert(self, insertion: Insertion) -> None:
-        """Gaussians from a keyframe whose view the map has."""
-        ...
-
-    def correct(self, moves: Mapping[int, Sim3], merged: Mapping[int, int]) -> None:
-        """Move Gaussians and views with their keyframes; merge the maps of merged sub-maps."""
-        ...
-
-    def refine(self, progress: Progress | None = None, until: Deadline | None = None) -> None:
-        """After the last frame, as far as there is time; the caller owns the maps from here on."""
-        ...
-
-    def leave_device(self, why: str) -> bool:
-        """After ``refine``: the maps go on on the CPU, if they are not there; True if they were
-        elsewhere. They are as their device has them, or, if it is gone, as they were refined."""
-        ...
-
-    def close(self, keep: bool = False) -> None:
-        """Remove the files of the work folder; or, to ``keep`` them, write the missing ones."""
-        ...
+from aquaflow.render.device_memory import give_back_idle, usable_share
+from aquaflow.storage.arrays import Arrays
 
 
 class Maps:
@@ -243,6 +166,34 @@ class Maps:
         """Free what the maps' device can do without: copies of pictures, and idle blocks."""
         self.views.drop_copies()
         give_back_idle(self.renderer.device)
+
+    def usable_memory(self) -> float | None:
+        return usable_share(self.renderer.device)
+
+    def holds(self, view: View) -> bool:
+        return self.views.holds(view)
+
+    def save_pictures(self) -> list[Path]:
+        return self.views.save()
+
+    @property
+    def lost_pictures(self) -> set[int]:
+        return self.views.lost
+
+    def serialise(self) -> tuple[dict[str, Any], Arrays]:
+        return serialised(self.mappers, self.held_out)
+
+    def restore(
+        self,
+        facts: dict[str, Any],
+        arrays: Arrays,  # as from serialise
+    ) -> None:
+        mappers, held_out = restored(facts, arrays, self.renderer, self.failures)
+        for number, mapper in mappers.items():
+            mapper.views = self.views.restore(mapper.views)
+            self.mappers[number] = mapper
+        for number, views in held_out.items():
+            self.held_out[number] = self.views.restore(views)
 
     def close(self, keep: bool = False) -> None:
         self.views.close(keep)

@@ -11,8 +11,6 @@ Reading one number, as ``float(loss)`` does, is a decision and not counted here.
 
 from __future__ import annotations
 
-import threading
-from collections import Counter
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
@@ -21,32 +19,10 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from aquaflow.mapping.transfer_counts import COUNTS
+
 Array = npt.NDArray[Any]
 Module = TypeVar("Module", bound=nn.Module)
-
-
-class _Counts:
-    """Counters that several threads may use."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._counts: Counter[str] = Counter()
-
-    def add(self, name: str, tensors: int = 1) -> None:
-        with self._lock:
-            self._counts[name] += tensors
-
-    def taken(self) -> dict[str, int]:
-        with self._lock:
-            return dict(self._counts)
-
-
-_COUNTS = _Counts()
-
-
-def transfers() -> dict[str, int]:
-    """Tensors moved so far in this process, by the name of the function that moved them."""
-    return _COUNTS.taken()
 
 
 # --- in -------------------------------------------------------------------------------------------
@@ -122,7 +98,7 @@ def weights_in(module: Module, device: torch.device) -> Module:
     """A network as it is made, with all its parameters and buffers."""
     moved = module.to(device)
     if device.type != "cpu":
-        _COUNTS.add("weights in", sum(1 for _ in (*module.parameters(), *module.buffers())))
+        COUNTS.add("weights in", sum(1 for _ in (*module.parameters(), *module.buffers())))
     return moved
 
 
@@ -198,7 +174,7 @@ def _into(
         return host
     # Without waiting for the device; memory that is not pinned is read before this returns.
     moved = host.to(device, non_blocking=True)
-    _COUNTS.add(name)
+    COUNTS.add(name)
     return moved
 
 
@@ -209,5 +185,5 @@ def _out(
     tensor = tensor.detach()
     if tensor.device.type != "cpu":
         tensor = tensor.cpu()
-        _COUNTS.add(name)
+        COUNTS.add(name)
     return tensor.numpy()

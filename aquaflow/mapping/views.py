@@ -93,6 +93,17 @@ class View:
         self.all_explained: bool | None = None
         """Whether those are all that show the scene; None while nobody has asked."""
 
+    def with_pixels(
+        self,
+        image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
+        camera: CameraModel,
+        mask: npt.NDArray[np.bool_] | None,  # [H, W]
+    ) -> View:
+        """The same frame, of which nothing was learned yet, in another picture of it."""
+        return View(
+            self.frame_index, image, camera, self.T_wc, self.keyframe, self.robust, mask
+        )  # fmt: skip
+
     def move_pixels(self, store: Spill[Pixels]) -> None:
         """Move the pixels into ``store``, under the frame's index."""
         store[self.frame_index] = self._pixels

@@ -13,7 +13,8 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from aquaflow.render.library import Library, library_or_none, pointer
+from aquaflow.render.library import Library, library_or_none
+from aquaflow.render.tensor_address import pointer
 
 COLOUR_SHARPNESS = 10.0
 """Of the softplus, which is the identity above about 0.3; kSharpness of native/activate.h."""

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from aquaflow.errors import AquaFlowError
 from aquaflow.render.adam_rows import Moved, fused_kernel, step_rows, step_rows_fused
-from aquaflow.render.library import Library, library_or_none, pointer
+from aquaflow.render.library import Library, library_or_none
+from aquaflow.render.tensor_address import pointer
 
 LARGEST_GRADIENT = 1e18
 """Larger gradients count as not finite: their square overflows float32."""

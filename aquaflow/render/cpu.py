@@ -11,7 +11,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from aquaflow.render.contract import CPU, Rendering, check_devices, check_inputs
-from aquaflow.render.library import STAGES, Library, load_library, pointer
+from aquaflow.render.library import STAGES, Library, load_library
+from aquaflow.render.tensor_address import pointer
 
 
 class _ContextPool:

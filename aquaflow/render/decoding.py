@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from aquaflow.render.library import Library, pointer
+from aquaflow.render.library import Library
+from aquaflow.render.tensor_address import pointer
 
 MAX_WIDTH = 64
 """Widest decoder that the kernel takes; its width is a multiple of UNITS."""

@@ -1,4 +1,7 @@
-"""Find, build if need be, and load the shared library with the C++ kernels."""
+"""Find, build if need be, and load the shared library with the C++ kernels.
+
+Tracking calls some of them with numpy arrays: this module loads no torch.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,6 @@ import threading
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
-
-import torch
-from torch import Tensor
 
 from aquaflow.errors import AquaFlowError
 from aquaflow.render.native import build as native
@@ -100,34 +100,6 @@ class Library:
         out = (ctypes.c_double * 10)()
         self._dll.aq_constants(out)
         return list(out)
-
-
-def pointer(
-    tensor: Tensor,  # [...] contiguous, on the CPU
-    dtype: torch.dtype = torch.float32,
-) -> int:
-    """Address of a tensor; the caller keeps it alive during the call.
-
-    Raises AquaFlowError for any other tensor than a contiguous one of ``dtype`` on the CPU: a
-    kernel that reads a foreign address ends the process.
-    """
-    if tensor.device.type != "cpu":
-        raise AquaFlowError(
-            f"A CPU kernel was given a tensor on {tensor.device}; pass tensors on the CPU, or use "
-            "the renderer of that device."
-        )
-    if tensor.dtype != dtype or tensor.layout != torch.strided or not tensor.is_contiguous():
-        raise AquaFlowError(
-            f"A CPU kernel was given a tensor of {tensor.dtype} with shape {tuple(tensor.shape)} "
-            f"and strides {_strides(tensor)}; pass a contiguous one of {dtype}."
-        )
-    return tensor.data_ptr()
-
-
-def _strides(
-    tensor: Tensor,  # [...]
-) -> tuple[int, ...] | str:
-    return tuple(tensor.stride()) if tensor.layout == torch.strided else str(tensor.layout)
 
 
 @lru_cache(maxsize=8)

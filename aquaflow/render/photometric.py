@@ -10,7 +10,8 @@ from torch import Tensor
 
 from aquaflow.errors import AquaFlowError
 from aquaflow.render.known_gradient import KnownGradient
-from aquaflow.render.library import Library, library_or_none, pointer
+from aquaflow.render.library import Library, library_or_none
+from aquaflow.render.tensor_address import pointer
 
 SSIM_WINDOW = 11
 SSIM_SIGMA_PX = 1.5

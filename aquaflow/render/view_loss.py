@@ -13,7 +13,8 @@ from torch import Tensor
 
 from aquaflow.errors import AquaFlowError
 from aquaflow.render.known_gradient import KnownGradient
-from aquaflow.render.library import Library, library_or_none, pointer
+from aquaflow.render.library import Library, library_or_none
+from aquaflow.render.tensor_address import pointer
 
 MIN_RANGE = 1e-2
 """Map units; guards 1 / range."""

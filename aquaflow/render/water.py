@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from aquaflow.render.library import Library, library_or_none, pointer
+from aquaflow.render.library import Library, library_or_none
+from aquaflow.render.tensor_address import pointer
 
 MAX_OPTICAL_DEPTH = 8.0
 """exp(-8) = 3e-4 is below a tenth of a grey level in 256: beyond it nothing changes any more."""

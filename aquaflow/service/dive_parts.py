@@ -13,13 +13,11 @@ from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import DiveRun
 from aquaflow.dive.status import read_status
 from aquaflow.errors import AquaFlowError
-from aquaflow.mapping.maps import Maps
+from aquaflow.mapping.work import OwnedMaps
 from aquaflow.messages import Dropped
 from aquaflow.profiler import Profiler
 from aquaflow.recording.telemetry_lines import NAME as TELEMETRY
 from aquaflow.recording.telemetry_lines import TelemetryLog
-from aquaflow.render import select_renderer
-from aquaflow.render.device_memory import usable_share
 from aquaflow.service.checkpoint.checkpoint import Checkpointer, restore
 from aquaflow.service.checkpoint.generations import Checkpoint
 from aquaflow.service.checkpoint.resume import Choice
@@ -37,6 +35,7 @@ from aquaflow.service.refresh import Refresher
 from aquaflow.service.standing import Standing
 from aquaflow.service.vitals import Vitals
 from aquaflow.slam import Slam
+from aquaflow.slam.map_parts import make_maps
 
 log = logging.getLogger(__name__)
 
@@ -78,8 +77,9 @@ def assembled(
     profiler, before = Profiler(), read_status(folder.path)
     # A core is left for tracking, where there is more than one.
     threads = config.threads or max(1, core_count() - 1)
-    renderer = select_renderer(config.mapping.renderer, threads)
-    maps = Maps(config, renderer, profiler, folder.work, failures)
+    # A dive whose map was made before mapping was switched off keeps it.
+    mapped = config.mapping.enabled or _has_maps(choice.checkpoint)
+    maps = make_maps(config, profiler, folder.work, failures, mapped, threads)
     thread = MapThread(
         maps, service.mapping, vitals.heartbeats, lambda: vitals.degradation.level
     )  # fmt: skip
@@ -101,7 +101,7 @@ def assembled(
     telemetry_log = partial(TelemetryLog, folder.path / TELEMETRY)
     run.telemetry_log = failures.attempt(f"opening {TELEMETRY}", telemetry_log)
     vitals.health.begin()
-    pressure = PressureReader(folder.path, gpu_free=lambda: usable_share(thread.renderer.device))
+    pressure = PressureReader(folder.path, gpu_free=thread.usable_memory)
     loop = LiveLoop(run, feed, thread, service, vitals, control, pressure)
     checkpointer = Checkpointer(
         folder.path, run, slam, thread, service.checkpoint.every_s, feed.clocks,
@@ -127,7 +127,11 @@ def assembled(
     )  # fmt: skip
 
 
-def _restored(known: Checkpoint, slam: Slam, run: DiveRun, maps: Maps) -> Continued:
+def _has_maps(known: Checkpoint | None) -> bool:
+    return known is not None and bool(known.facts["mapping"]["maps"])
+
+
+def _restored(known: Checkpoint, slam: Slam, run: DiveRun, maps: OwnedMaps) -> Continued:
     """The dive as its checkpoint has it; where its frames and its time go on.
 
     Raises:

@@ -17,7 +17,7 @@ from aquaflow.dive.status import DiveState, read_status
 from aquaflow.errors import InputError
 from aquaflow.errors.failures import Failures
 from aquaflow.geometry.camera import CameraModel, load_camera
-from aquaflow.mapping.maps import Progress
+from aquaflow.mapping.work import Progress
 from aquaflow.messages import Dropped, Frame
 from aquaflow.service.checkpoint.generations import generations
 from aquaflow.service.checkpoint.resume import Choice, newest_usable

@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.keyframes import Pointmap
-from aquaflow.mapping.maps import Growth
-from aquaflow.mapping.views import View
+from aquaflow.mapping.work import Growth
+
+if TYPE_CHECKING:
+    from aquaflow.mapping.views import View
 
 
 def halved(growth: Growth) -> Growth:
     """The same growth at half the picture width."""
     view = growth.view
     width, height = view.camera.width // 2, view.camera.height // 2
-    small = View(
-        view.frame_index,
+    small = view.with_pixels(
         _picture(view, width, height),
         view.camera.scaled(width, height),
-        view.T_wc,
-        view.keyframe,
-        view.robust,
         None if view.mask is None else view.mask[1 : 2 * height : 2, 1 : 2 * width : 2].copy(),
     )
     pointmap = growth.pointmap

@@ -14,7 +14,7 @@ from aquaflow.dive.replay import fix_threads
 from aquaflow.dive.run import Finished
 from aquaflow.dive.status import DiveState
 from aquaflow.errors import NotMappedError
-from aquaflow.mapping.maps import Progress
+from aquaflow.mapping.work import Progress
 from aquaflow.service.checkpoint.resume import Choice
 from aquaflow.service.checkpoint.salvage import salvaged_from
 from aquaflow.service.control import Control
@@ -59,7 +59,7 @@ class LiveDive:
             InputError: the folder cannot be used.
         """
         cores = usable_threads(config.threads)
-        fix_threads(max(1, cores // 2))  # tracking's; the renderer has its own
+        fix_threads(max(1, cores // 2), plain(config))  # tracking's; the renderer has its own
         sys.setswitchinterval(SWITCH_S)
         salvaged = salvaged_from(choice, plain(config), feed.name_of)
         rows = None if salvaged is None else salvaged.rows

@@ -12,12 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.viewer import ViewerConfig
-from aquaflow.mapping.maps import Maps
+from aquaflow.mapping.work import OwnedMaps
 from aquaflow.service.loop import LiveLoop
 from aquaflow.sources.newest import Newest
 from aquaflow.tracking.frames import Tracked
+from aquaflow.viewer.copies import MapCopy, Pose, shown
 from aquaflow.viewer.page import ViewerPage
-from aquaflow.viewer.snapshot import MapCopy, Pose, copied, shown
 
 log = logging.getLogger(__name__)
 
@@ -86,11 +86,13 @@ class LiveViewer:
         path = np.array(self._path, np.float32)
         self._poses.put(Pose(latest.T_wc, latest.frame.camera, small, path))
 
-    def _copy(self, maps: Maps, sub_map: int) -> None:
+    def _copy(self, maps: OwnedMaps, sub_map: int) -> None:
         """In the mapping thread."""
         self._asked = False
         mapper = maps.mappers.get(sub_map)
         if mapper is not None and mapper.views and len(mapper.gaussians):
+            from aquaflow.viewer.snapshot import copied  # torch, which has made the map
+
             self._copies.put(copied(mapper))
 
     def _run(self) -> None:

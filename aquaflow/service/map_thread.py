@@ -15,17 +15,20 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 from aquaflow.clocks.deadline import Deadline
 from aquaflow.config.service import LiveMappingConfig
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.maps import Growth, Insertion, Maps, Progress
-from aquaflow.mapping.views import View
-from aquaflow.render.contract import Renderer
+from aquaflow.mapping.work import Growth, Insertion, OwnedMaps, Progress
 from aquaflow.service.half_size import halved
 from aquaflow.service.health.degradation import DegradationLevel
 from aquaflow.service.health.heartbeats import Heartbeats
+
+if TYPE_CHECKING:
+    from aquaflow.mapping.mapper import Mapper
+    from aquaflow.mapping.views import View
+    from aquaflow.render.contract import Renderer
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +49,7 @@ BACKLOG_SHARE = 0.5
 MAPPING_AT, KEYFRAME_AT = 3, 8
 """Backlogs after which mapping frames, and then keyframes, are left out."""
 
-Job = Callable[[Maps], None]
+Job = Callable[[OwnedMaps], None]
 
 
 @dataclass(frozen=True)
@@ -56,16 +59,16 @@ class MapCorrection:
     moves: Mapping[int, Sim3]
     merged: Mapping[int, int]
 
-    def __call__(self, maps: Maps) -> None:
+    def __call__(self, maps: OwnedMaps) -> None:
         maps.correct(self.moves, self.merged)
 
 
 class MapThread:
-    """The :class:`aquaflow.mapping.maps.MapWork` of a live run."""
+    """The :class:`aquaflow.mapping.work.MapWork` of a live run."""
 
     def __init__(
         self,
-        maps: Maps,
+        maps: OwnedMaps,
         config: LiveMappingConfig,
         heartbeats: Heartbeats,
         level: Callable[[], DegradationLevel] = lambda: DegradationLevel.FULL,
@@ -127,7 +130,7 @@ class MapThread:
     def correct(self, moves: Mapping[int, Sim3], merged: Mapping[int, int]) -> None:
         self._post("correct", MapCorrection(moves, merged))
 
-    def inspect(self, name: str, job: Callable[[Maps, list[MapCorrection]], None]) -> None:
+    def inspect(self, name: str, job: Callable[[OwnedMaps, list[MapCorrection]], None]) -> None:
         """Run ``job`` on the maps before all waiting requests; its second argument is the
         corrections that tracking has made and the maps do not contain yet."""
         with self._changed:
@@ -159,12 +162,16 @@ class MapThread:
         return self._maps.mappers
 
     @property
-    def renderer(self) -> Renderer:
+    def renderer(self) -> Renderer | None:
         return self._maps.renderer
 
     @property
     def held_out(self) -> dict[int, list[View]]:
         return self._maps.held_out
+
+    def usable_memory(self) -> float | None:
+        """Of the maps' device, as :meth:`aquaflow.mapping.work.OwnedMaps.usable_memory`."""
+        return self._maps.usable_memory()
 
     @property
     def waiting(self) -> int:
@@ -190,7 +197,7 @@ class MapThread:
             self._jobs.append((name, job))
             self._changed.notify()
 
-    def _grow(self, growth: Growth, maps: Maps) -> None:
+    def _grow(self, growth: Growth, maps: OwnedMaps) -> None:
         with self._changed:
             self._growing -= 1
         if self._until.over:
@@ -260,7 +267,7 @@ class MapThread:
         wanted = self._config.steps_per_view * len(mapper.views)
         return mapper if sum(view.looks for view in mapper.views) < wanted else None
 
-    def _optimise(self, maps: Maps) -> None:
+    def _optimise(self, maps: OwnedMaps) -> None:
         if self._newest is not None and self._wanting() is not None:
             with maps.profiler.stage("optimise"):
                 maps.optimise(self._newest, STEPS_AT_ONCE)
@@ -288,11 +295,11 @@ def _owned(insertion: Insertion) -> Insertion:
     return replace(insertion, pointmap=insertion.pointmap.copy())
 
 
-def _is_mapped(insertion: Insertion, maps: Maps) -> bool:
+def _is_mapped(insertion: Insertion, maps: OwnedMaps) -> bool:
     """True if the map has the view, at its full size."""
-    return maps.views.holds(insertion.view)
+    return maps.holds(insertion.view)
 
 
-def _insert(insertion: Insertion, maps: Maps) -> None:
+def _insert(insertion: Insertion, maps: OwnedMaps) -> None:
     if _is_mapped(insertion, maps):
         maps.insert(insertion)

@@ -13,7 +13,7 @@ from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.run import Finished
 from aquaflow.dive.status import DiveState, read_status
 from aquaflow.errors import AquaFlowError
-from aquaflow.mapping.maps import Progress
+from aquaflow.mapping.work import Progress
 from aquaflow.service.checkpoint.checkpoint import UnusableStateError
 from aquaflow.service.checkpoint.resume import Choice, choose, is_begun, resumed, tidy
 from aquaflow.service.checkpoint.set_aside import SetAside

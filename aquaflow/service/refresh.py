@@ -15,7 +15,7 @@ from aquaflow.dive.interim import Interim
 from aquaflow.dive.run import DiveRun
 from aquaflow.errors import InputError
 from aquaflow.errors.failures import Failures
-from aquaflow.mapping.maps import MIN_VIEWS, Maps
+from aquaflow.mapping.work import MIN_VIEWS, OwnedMaps
 from aquaflow.service.map_thread import Job, MapThread
 
 log = logging.getLogger(__name__)
@@ -78,7 +78,7 @@ class Refresher:
         """The first of the parts, behind what waits for mapping; then the next."""
         (name, write), *rest = parts
 
-        def work(maps: Maps) -> None:
+        def work(maps: OwnedMaps) -> None:
             if self._ended:
                 return
             before_s, failures = self._cpu_s(), maps.failures

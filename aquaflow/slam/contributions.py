@@ -8,8 +8,8 @@ from aquaflow.config import MappingConfig
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.keyframes import KeyframeStore
-from aquaflow.mapping.maps import Growth, Insertion, MapWork
 from aquaflow.mapping.views import View
+from aquaflow.mapping.work import Growth, Insertion, MapWork
 from aquaflow.tracking.frames import FrameClass, Tracked
 
 
@@ -26,22 +26,19 @@ class Contributions:
         """``frame_of`` a sub-map, as last estimated."""
         self._maps, self._keyframes, self._config = maps, keyframes, config
         self._frame_of = frame_of
-        self.used = 0
-        """Frames that passed the gate so far."""
         self._to_hold_out: set[int] = set()
         """Indices of the frames in tracking that the map shall not see."""
         self._views: dict[int, View] = {}
         """Of the keyframe in use, by its number."""
 
-    def expect(self, index: int) -> None:
+    def expect(self, index: int, i: int) -> None:
         """Frame ``index`` goes into tracking; it is decided here whether it is held out.
 
-        i % n == 0 and i != 0, i counts used frames (docs/paper.md#deviations-evaluation).
+        i % n == 0 and i != 0, ``i`` counts used frames (docs/paper.md#deviations-evaluation).
         """
-        every, i = self._config.hold_out_every, self.used
+        every = self._config.hold_out_every
         if every > 0 and i != 0 and i % every == 0:
             self._to_hold_out.add(index)
-        self.used += 1
 
     def add(self, tracked: Tracked, camera: CameraModel) -> None:
         """Hold a posed frame out, or let its map grow by it."""

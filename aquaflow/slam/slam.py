@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from aquaflow.clocks.deadline import Deadline
 from aquaflow.config import Config
@@ -14,16 +14,12 @@ from aquaflow.errors import ConfigError
 from aquaflow.errors.failures import Failures
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.keyframes import KeyframeStore
-from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.maps import Maps, MapWork
-from aquaflow.mapping.views import View
+from aquaflow.mapping.work import MapWork
 from aquaflow.messages import Frame
 from aquaflow.prior.factory import make_prior
 from aquaflow.profiler import Profiler
-from aquaflow.render import select_renderer
-from aquaflow.render.contract import Renderer
-from aquaflow.slam.contributions import Contributions
 from aquaflow.slam.finish_time import FinishTime
+from aquaflow.slam.map_parts import make_contributions, make_maps
 from aquaflow.tracking.adjustment.adjuster import Adjuster
 from aquaflow.tracking.anchored import Anchored, Anchors
 from aquaflow.tracking.frame_table import FrameTable
@@ -36,6 +32,11 @@ from aquaflow.tracking.metric.metric_frames import MetricFrames
 from aquaflow.tracking.overlay.finder import OverlayFinder
 from aquaflow.tracking.side_work import SideWork
 from aquaflow.tracking.tracker import Tracker
+
+if TYPE_CHECKING:
+    from aquaflow.mapping.mapper import Mapper
+    from aquaflow.mapping.views import View
+    from aquaflow.render.contract import Renderer
 
 SETTLING_ROUNDS = 2
 """Optimisations with telemetry at the end: the second starts from a path that the first pulled
@@ -99,21 +100,20 @@ class Slam:
             learned_scales(self.keyframes, self.prior.unit_sigma, config.tracking.learned),
             self.side_work,
         )  # fmt: skip
-        self.maps: MapWork = maps or Maps(
-            config,
-            select_renderer(config.mapping.renderer, config.threads or os.cpu_count()),
-            self.profiler,
-            work,
-            self.failures,
+        self.maps: MapWork = maps or make_maps(
+            config, self.profiler, work, self.failures, config.mapping.enabled
         )
         self.skipped: Counter[str] = Counter()
         """Frames that the gate kept from tracking, by its reason's kind."""
         self._live = live
         self.frames = FrameTable()
         """Finished frames, in completion order."""
-        self._contributions = Contributions(
-            self.maps, self.keyframes, config.mapping, self.metric_frame
+        self.used = 0
+        """Frames that passed the gate so far."""
+        self._contributions = make_contributions(
+            config, self.maps, self.keyframes, self.metric_frame
         )
+        """None with mapping off."""
         self._latest: int | None = None
         """The row of the frame linked last, if it has a pose."""
 
@@ -183,8 +183,9 @@ class Slam:
         limits = limits or FinishTime()
         finished = self.finish_tracking(limits.settling)
         self._settle_graph(limits.settling)
-        with self.failures.contain("insertion"):
-            self._contributions.retire_last()
+        if self._contributions is not None:
+            with self.failures.contain("insertion"):
+                self._contributions.retire_last()
         with self.failures.contain("refinement"):
             self.maps.refine(progress, limits.refining)
         settled = self.results(len(self.frames) - len(finished))
@@ -221,13 +222,8 @@ class Slam:
         self.maps.close(keep)
 
     @property
-    def used(self) -> int:
-        """Frames that passed the gate so far."""
-        return self._contributions.used
-
-    @property
-    def renderer(self) -> Renderer:
-        """What the maps are drawn with; another one after a device failed."""
+    def renderer(self) -> Renderer | None:
+        """What the maps are drawn with, None without any; another one after a device failed."""
         return self.maps.renderer
 
     @property
@@ -252,7 +248,7 @@ class Slam:
 
     def resume(self, frames: FrameTable, used: int) -> None:
         """Take over the frames of an earlier run; ``used`` of them passed the gate."""
-        self.frames, self._contributions.used = frames, used
+        self.frames, self.used = frames, used
 
     # --- the steps of a frame -----------------------------------------------------------------
 
@@ -271,7 +267,9 @@ class Slam:
         with self.profiler.stage("gate"), self.failures.contain("frame gate", frame.index):
             verdict = self.gate.judge(frame.image, frame.mask)
         if verdict.passed:
-            self._contributions.expect(frame.index)
+            if self._contributions is not None:
+                self._contributions.expect(frame.index, self.used)
+            self.used += 1
         else:
             self.skipped[verdict.kind.value] += 1
         return verdict
@@ -323,14 +321,15 @@ class Slam:
 
     def _map(self, tracked: Tracked) -> None:
         """Hold the frame out, or let the map grow by it."""
-        if not self.config.mapping.enabled or tracked.T_wc is None:
+        if self._contributions is None or tracked.T_wc is None:
             return
         with self.failures.contain("mapping", tracked.frame.index):
             self._contributions.add(tracked, self.tracker.camera or tracked.frame.camera)
 
     def _publish(self, anchored: Anchored) -> Tracked:
         """The frame is finished: its row goes into the table."""
-        self._contributions.forget(anchored.tracked.frame.index)
+        if self._contributions is not None:
+            self._contributions.forget(anchored.tracked.frame.index)
         self.frames.add(anchored.tracked, anchored.T_kf)
         return anchored.tracked
 

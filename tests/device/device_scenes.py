@@ -12,7 +12,7 @@ from torch import Tensor
 from aquaflow.config import MappingConfig
 from aquaflow.mapping import state
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.transfers import transfers
+from aquaflow.mapping.transfer_counts import transfers
 from aquaflow.render.contract import CPU, Rendering
 from aquaflow.render.reference import ReferenceRenderer
 from tests.mapping.mapping_scenes import (

@@ -8,8 +8,9 @@ import torch
 from aquaflow.config import Config
 from aquaflow.errors.failures import Failures
 from aquaflow.mapping.decoder.regrouping import is_whole
-from aquaflow.mapping.maps import Growth, Maps
+from aquaflow.mapping.maps import Maps
 from aquaflow.mapping.state import serialise
+from aquaflow.mapping.work import Growth
 from aquaflow.render.contract import CPU
 from tests.device.device_scenes import SMALL, SinglePrecision, again, everything
 from tests.mapping.mapping_scenes import flat_pointmap, floor, path, picture, pose, view_of

@@ -24,7 +24,7 @@ from aquaflow.evaluation.bench.ci_suite import ci_scenes
 from aquaflow.evaluation.bench.job import Job
 from aquaflow.evaluation.bench.scene import BenchmarkScene
 from aquaflow.evaluation.bench.worker import perform
-from aquaflow.mapping.transfers import transfers
+from aquaflow.mapping.transfer_counts import transfers
 from aquaflow.render.contract import CPU
 from tests.device.device_scenes import without_kernels
 from tests.device.gsplats_place import machine_with

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from aquaflow.mapping.host_copies import COPY_EVERY
-from aquaflow.mapping.maps import Growth
+from aquaflow.mapping.work import Growth
 from aquaflow.render.contract import CPU
 from tests.device.failing_dives import (
     SHIFT,

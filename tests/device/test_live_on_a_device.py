@@ -9,12 +9,14 @@ import pytest
 from aquaflow.config import Config
 from aquaflow.config.service import LiveMappingConfig
 from aquaflow.errors.failures import Failures
-from aquaflow.mapping.maps import Growth, Maps
+from aquaflow.mapping.maps import Maps
+from aquaflow.mapping.work import Growth
 from aquaflow.render.contract import CPU
 from aquaflow.service.health.degradation import DegradationLevel
 from aquaflow.service.health.heartbeats import Heartbeats
 from aquaflow.service.map_thread import MapThread
-from aquaflow.viewer.snapshot import MapCopy, copied
+from aquaflow.viewer.copies import MapCopy
+from aquaflow.viewer.snapshot import copied
 from tests.device.device_scenes import SMALL, SinglePrecision, everything
 from tests.mapping.mapping_scenes import flat_pointmap, floor, path, picture, view_of
 from tests.pretended_allocator import DEFAULT_BYTES

@@ -14,7 +14,8 @@ from aquaflow.mapping import state
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.contract import CPU
 from aquaflow.render.cpu import CpuRenderer
-from aquaflow.viewer.snapshot import copied, shown
+from aquaflow.viewer.copies import shown
+from aquaflow.viewer.snapshot import copied
 from tests.device.device_scenes import (
     SMALL,
     WHERE,

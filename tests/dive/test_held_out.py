@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from aquaflow.config import Config
-from aquaflow.dive.held_out import HeldOut, examine_held_out, mean_amplification
+from aquaflow.dive.held_out import examine_held_out
+from aquaflow.dive.held_out_example import HeldOut, mean_amplification
 from aquaflow.slam import Slam
 
 PICTURE = np.zeros((48, 64, 3), np.uint8)

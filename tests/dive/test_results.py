@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from aquaflow.config import Config
-from aquaflow.dive.held_out import HeldOut
+from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.dive.results import (
     WaterSummary,
     largest_sub_map,
     metrics,
     refined_poses,
-    water_of,
 )
+from aquaflow.dive.water_summary import water_of
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.messages import Dropped, Frame

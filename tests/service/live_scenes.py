@@ -18,7 +18,8 @@ from aquaflow.dive.run import DiveRun
 from aquaflow.errors.failures import Failures
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.mapping.maps import Growth, Insertion, Maps
+from aquaflow.mapping.maps import Maps
+from aquaflow.mapping.work import Growth, Insertion
 from aquaflow.messages import CameraModel, Dropped, Frame
 from aquaflow.service.control import Control
 from aquaflow.service.dive_clock import Continued

@@ -13,8 +13,8 @@ from aquaflow.config.service import LiveMappingConfig
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
-from aquaflow.mapping.maps import Growth, Insertion
 from aquaflow.mapping.views import View
+from aquaflow.mapping.work import Growth, Insertion
 from aquaflow.service.health.degradation import DegradationLevel
 from aquaflow.service.health.heartbeats import Heartbeats
 from aquaflow.service.map_thread import LONGEST_REST_S, STAGE, MapThread

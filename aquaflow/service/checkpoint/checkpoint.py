@@ -18,10 +18,10 @@ from aquaflow import __version__
 from aquaflow.clocks.device import Learned
 from aquaflow.dive.run import DiveRun
 from aquaflow.errors import InputError
-from aquaflow.mapping.maps import Maps
+from aquaflow.mapping.work import OwnedMaps
 from aquaflow.recording.telemetry_lines import NAME as TELEMETRY
-from aquaflow.service.checkpoint import maps as map_state
 from aquaflow.service.checkpoint import tracking
+from aquaflow.service.checkpoint.corrections import catch_up, serialise_corrections
 from aquaflow.service.checkpoint.generations import (
     FORMAT,
     Checkpoint,
@@ -104,7 +104,7 @@ class Checkpointer:
         head |= {"tracking": facts, "clocks": self._clocks()}
         arrays = prefixed("tracking", arrays)
 
-        def write(maps: Maps, lacking: list[MapCorrection]) -> None:
+        def write(maps: OwnedMaps, lacking: list[MapCorrection]) -> None:
             self._write(maps, lacking, head, arrays, files)
 
         self._writing = True
@@ -112,7 +112,7 @@ class Checkpointer:
 
     def _write(
         self,
-        maps: Maps,
+        maps: OwnedMaps,
         lacking: list[MapCorrection],
         head: dict[str, Any],
         arrays: Arrays,  # of the tracking
@@ -121,10 +121,10 @@ class Checkpointer:
         """In the mapping thread."""
         began = time.monotonic()
         try:
-            facts, own = map_state.serialise(maps)
-            facts["lacking"], more = map_state.serialise_corrections(lacking)
+            facts, own = maps.serialise()
+            facts["lacking"], more = serialise_corrections(lacking)
             own |= more
-            bring_to_disk([*files, self._dive / TELEMETRY, *maps.views.save()])
+            bring_to_disk([*files, self._dive / TELEMETRY, *maps.save_pictures()])
             write_state(self._dive, head | {"mapping": facts}, arrays | prefixed("mapping", own))
             self.taken += 1
             self.size_bytes = state_file(self._dive).stat().st_size
@@ -140,7 +140,7 @@ class Checkpointer:
         log.warning("no checkpoint: %s", error)
 
 
-def restore(checkpoint: Checkpoint, slam: Slam, run: DiveRun, maps: Maps) -> None:
+def restore(checkpoint: Checkpoint, slam: Slam, run: DiveRun, maps: OwnedMaps) -> None:
     """Restore new ``slam``, ``run`` and ``maps`` from ``checkpoint``.
 
     Raises:
@@ -150,7 +150,7 @@ def restore(checkpoint: Checkpoint, slam: Slam, run: DiveRun, maps: Maps) -> Non
     facts, arrays = checkpoint.facts, checkpoint.arrays
     try:
         tracking.deserialise(slam, run, facts["tracking"], under("tracking", arrays))
-        map_state.deserialise(maps, facts["mapping"], under("mapping", arrays))
-        map_state.catch_up(maps, facts["mapping"]["lacking"], under("mapping", arrays))
+        maps.restore(facts["mapping"], under("mapping", arrays))
+        catch_up(maps, facts["mapping"]["lacking"], under("mapping", arrays))
     except (KeyError, ValueError, TypeError, IndexError, RuntimeError, InputError) as error:
         raise UnusableStateError(f"{checkpoint.file} cannot be used: {error}") from error

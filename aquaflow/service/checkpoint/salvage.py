@@ -14,7 +14,7 @@ from aquaflow.config import Config
 from aquaflow.dive.folder import MARKER, WORK
 from aquaflow.dive.frames_csv import FrameRow, or_lost
 from aquaflow.errors import InputError
-from aquaflow.mapping.maps import Maps
+from aquaflow.mapping.work import OwnedMaps
 from aquaflow.service.checkpoint.generations import (
     Checkpoint,
     OtherFormatError,
@@ -86,7 +86,7 @@ def salvaged_from(choice: Choice, config: Config, name_of: Callable[[int], str])
     return salvaged(choice.checkpoint, choice.folder, name_of)
 
 
-def lost_with_their_files(checkpoint: Checkpoint, slam: Slam, maps: Maps) -> list[str]:
+def lost_with_their_files(checkpoint: Checkpoint, slam: Slam, maps: OwnedMaps) -> list[str]:
     """A sentence for keyframes, and one for views, whose files were missing when ``slam`` and
     ``maps`` were restored."""
     said = []
@@ -97,9 +97,10 @@ def lost_with_their_files(checkpoint: Checkpoint, slam: Slam, maps: Maps) -> lis
             f"the files of {_named('keyframe', keyframes)} were damaged or gone: their {hang} "
             "frames keep their poses, but these places are no longer recognised"
         )
-    if maps.views.lost:
+    lost = maps.lost_pictures
+    if lost:
         said.append(
-            f"the pictures of {_named('mapped frame', maps.views.lost)} were damaged or gone: the "
+            f"the pictures of {_named('mapped frame', lost)} were damaged or gone: the "
             "map goes on without them"
         )
     return said

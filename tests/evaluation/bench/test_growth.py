@@ -17,7 +17,7 @@ from aquaflow.evaluation.bench.growth import worker
 from aquaflow.evaluation.bench.growth.job import GrowthJob
 from aquaflow.evaluation.bench.growth.stored import checkpoint_bytes, folder_bytes
 from aquaflow.evaluation.bench.growth.table import COLUMNS, markdown
-from aquaflow.service.checkpoint import maps as map_state
+from aquaflow.mapping.maps import Maps
 from aquaflow.service.checkpoint import tracking
 from aquaflow.slam import Slam
 from aquaflow.storage.arrays import prefixed
@@ -109,7 +109,8 @@ def test_a_survey_is_mapped_and_looked_at(tmp_path: Path, monkeypatch: pytest.Mo
         stands_for = SimpleNamespace(first_pose_s=None, notes=[])
         told = tracking.serialise(slam, stands_for)  # type: ignore[arg-type]
         assert told is not None
-        facts, arrays = map_state.serialise(slam.maps)  # type: ignore[arg-type]
+        assert isinstance(slam.maps, Maps)
+        facts, arrays = slam.maps.serialise()
         whole = prefixed("tracking", told[1]) | prefixed("mapping", arrays)
         write_facts_file(tmp_path / "true.npz", {"tracking": told[0], "mapping": facts}, whole)
         sizes.append(

@@ -30,8 +30,8 @@ def perform(job: GrowthJob) -> dict[str, Any]:
     Raises:
         AquaFlowError: the run failed; the sentence says why.
     """
-    fix_threads(THREADS)
     config, survey = job.config(), Survey(job.width)
+    fix_threads(THREADS, config)
     start_mb = resident_mb()
     folder = DiveFolder(Path(job.out), config, overwrite=True)
     try:

@@ -1,0 +1,51 @@
+"""What a dive takes from its maps: the one door of this folder to code that loads torch.
+
+A function loads what it needs when it is called, with a map in its hands, so that a dive without a
+map never does.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from aquaflow.clocks.deadline import Deadline
+from aquaflow.dive.held_out_example import HeldOut
+from aquaflow.dive.results import WaterSummary
+from aquaflow.fusion.metric_frame import MetricFrame
+
+if TYPE_CHECKING:
+    from aquaflow.mapping.mapper import Mapper
+    from aquaflow.slam import Slam
+
+
+def water_in_numbers(mapper: Mapper, most_views: int | None = None) -> WaterSummary | None:
+    """See :func:`aquaflow.dive.water_summary.summarise_water`; None: as many views as there."""
+    from aquaflow.dive import water_summary
+
+    return water_summary.summarise_water(mapper, most_views or water_summary.RANGE_VIEWS)
+
+
+def held_out_examples(slam: Slam, sub_map: int, until: Deadline | None = None) -> list[HeldOut]:
+    """See :func:`aquaflow.dive.held_out.examine_held_out`; a sub-map without a map has none."""
+    if sub_map not in slam.mappers:
+        return []
+    from aquaflow.dive.held_out import examine_held_out
+
+    return examine_held_out(slam, sub_map, until)
+
+
+def write_exact(folder: Path, mapper: Mapper, suffix: str = "") -> None:
+    """See :func:`aquaflow.dive.map_files.write_exact`."""
+    from aquaflow.dive import map_files
+
+    map_files.write_exact(folder, mapper, suffix)
+
+
+def write_splats(
+    folder: Path, mapper: Mapper, water: WaterSummary | None, frame: MetricFrame, suffix: str = ""
+) -> None:
+    """See :func:`aquaflow.dive.map_files.write_splats`."""
+    from aquaflow.dive import map_files
+
+    map_files.write_splats(folder, mapper, water, frame, suffix)

@@ -1,0 +1,149 @@
+"""What tracking asks of the maps, and what the maps are to those who own them; without torch.
+
+Everything else in ``mapping`` loads torch, 100 MB that a dive without a map does not need.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from aquaflow.clocks.deadline import Deadline
+from aquaflow.errors.failures import Failures
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes import Pointmap
+from aquaflow.profiler import Profiler
+from aquaflow.storage.arrays import Arrays
+
+if TYPE_CHECKING:
+    from aquaflow.mapping.mapper import Mapper
+    from aquaflow.mapping.views import View
+    from aquaflow.render.contract import Renderer
+
+MIN_VIEWS = 3
+"""Fewer posed frames are not a map, and not worth refining."""
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Insertion:
+    """A view and the depths of its pixels."""
+
+    view: View
+    sub_map: int
+    pointmap: Pointmap
+
+
+@dataclass(frozen=True)
+class Growth:
+    """The contribution of one posed frame to the map of its sub-map."""
+
+    view: View
+    sub_map: int
+    steps: int
+    """Of the optimiser, afterwards."""
+    pointmap: Pointmap | None = None
+    """Depths of the view's own pixels, if new Gaussians may come from it."""
+    retired: tuple[Insertion, ...] = ()
+    """Keyframes that this one relieves, with their pointmaps as fused over their whole life."""
+    metres_per_unit: float | None = None
+    """Of the sub-map; None while it is unknown."""
+
+
+class MapWork(Protocol):
+    """Tracking's requests to the maps; done at once, or in a thread."""
+
+    @property
+    def mappers(self) -> dict[int, Mapper]:
+        """By sub-map. Owned by the mapping thread while it runs."""
+        ...
+
+    @property
+    def renderer(self) -> Renderer | None:
+        """What the maps are drawn with at the moment, and where; None without maps."""
+        ...
+
+    @property
+    def held_out(self) -> dict[int, list[View]]:
+        """Per sub-map, the views that were tracked but never mapped."""
+        ...
+
+    def grow(self, growth: Growth) -> None:
+        """Add a view, insert Gaussians, optimise."""
+        ...
+
+    def hold_out(self, view: View, sub_map: int) -> None:
+        """Keep a view for evaluation; the map is never optimised on it."""
+        ...
+
+    def insert(self, insertion: Insertion) -> None:
+        """Gaussians from a keyframe whose view the map has."""
+        ...
+
+    def correct(self, moves: Mapping[int, Sim3], merged: Mapping[int, int]) -> None:
+        """Move Gaussians and views with their keyframes; merge the maps of merged sub-maps."""
+        ...
+
+    def refine(self, progress: Progress | None = None, until: Deadline | None = None) -> None:
+        """After the last frame, as far as there is time; the caller owns the maps from here on."""
+        ...
+
+    def leave_device(self, why: str) -> bool:
+        """After ``refine``: the maps go on on the CPU, if they are not there; True if they were
+        elsewhere. They are as their device has them, or, if it is gone, as they were refined."""
+        ...
+
+    def close(self, keep: bool = False) -> None:
+        """Remove the files of the work folder; or, to ``keep`` them, write the missing ones."""
+        ...
+
+
+class OwnedMaps(MapWork, Protocol):
+    """The maps as the thread that owns them uses them."""
+
+    profiler: Profiler
+    failures: Failures
+
+    def optimise(self, sub_map: int, steps: int) -> None:
+        """Steps of the optimiser on a sub-map's map."""
+        ...
+
+    def holds(self, view: View) -> bool:
+        """True if a map has the view, at its full size."""
+        ...
+
+    def give_back_memory(self) -> None:
+        """Free what the maps' device can do without."""
+        ...
+
+    def usable_memory(self) -> float | None:
+        """Of the device's own memory, what new tensors may have, in [0, 1]; None on the CPU."""
+        ...
+
+    def save_pictures(self) -> list[Path]:
+        """Write what pictures are only in memory; the files that are new."""
+        ...
+
+    @property
+    def lost_pictures(self) -> set[int]:
+        """Frame indices of the views that :meth:`restore` found no file of."""
+        ...
+
+    def serialise(self) -> tuple[dict[str, Any], Arrays]:
+        """All maps for a checkpoint: facts for JSON, and arrays, which are copies."""
+        ...
+
+    def restore(
+        self,
+        facts: dict[str, Any],
+        arrays: Arrays,  # as from serialise
+    ) -> None:
+        """Become, while new, as the serialised maps were; a view whose file was lost is left out.
+
+        Raises:
+            KeyError, ValueError, TypeError, RuntimeError: this is no such checkpoint.
+        """
+        ...
