@@ -36,6 +36,7 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "aq_decode_view": (_INT, [_POINTER, _INT] + [_POINTER] * 3),
     "aq_decode_view_backward": (_INT, [_POINTER, _INT, _POINTER]),
     "aq_fuse_depths": (_INT, [_POINTER]),
+    "aq_pose_equations": (_INT, [_POINTER] * 3),
     "aq_refine_flow": (
         _INT,
         [_POINTER] * 3 + [_INT] * 2 + [_POINTER, _INT] * 2 + [_FLOAT] * 3 + [_POINTER],

@@ -20,6 +20,7 @@
 #include "image_formation.h"
 #include "photometric.h"
 #include "pool.h"
+#include "pose_equations.h"
 #include "project.h"
 #include "project_backward.h"
 #include "refine_flow.h"
@@ -244,6 +245,12 @@ AQ_EXPORT int aq_refine_flow(const uint8_t* a, const uint8_t* b, const float* fl
 
 // See fuse_depths.h. Returns the number of pixels with a usable measurement.
 AQ_EXPORT int aq_fuse_depths(const FuseDepths* in) { return fuse_depths(*in); }
+
+// See pose_equations.h: cost and normal equations, and, unless ``left`` is null, what is left.
+AQ_EXPORT int aq_pose_equations(const PoseEquations* in, PoseResult* out, const PoseLeft* left) {
+  pose_equations(*in, *out, left);
+  return 0;
+}
 
 // See adam.h. Returns the number of visible rows skipped for a non-finite gradient.
 AQ_EXPORT int aq_adam_step(int groups, const AdamGroup* group, int rows, const uint8_t* visible,

@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <cstring>
 #include <vector>
 
 #include "plane.h"
@@ -56,11 +57,16 @@ class FlowRefiner {
       c = ((kA + 2.0f) * g - (kA + 3.0f)) * g * g + 1.0f;
       d = 1.0f - a - b - c;
     }
-    float of(const float* from) const {
-      return a * from[0] + b * from[1] + c * from[2] + d * from[3];
-    }
     float a, b, c, d;
   };
+
+  // Four neighbours of a row at once: eight of these are faster than sixteen gathered values.
+  typedef float Four __attribute__((vector_size(16)));
+  static Four four_at(const float* from) {
+    Four out;
+    std::memcpy(&out, from, sizeof out);
+    return out;
+  }
 
   // there_: b where the flow leads; its border is repeated outside.
   void warp(const RefineFlow& in) {
@@ -70,25 +76,42 @@ class FlowRefiner {
     for (int y = -kPad; y < height + kPad; y++) {
       const uint8_t* row = in.b + (size_t)std::clamp(y, 0, height - 1) * width;
       float* to = padded_.data() + (size_t)(y + kPad) * stride + kPad;
-      for (int x = -kPad; x < width + kPad; x++) to[x] = (float)row[std::clamp(x, 0, width - 1)];
+      for (int x = -kPad; x < 0; x++) to[x] = (float)row[0];
+      for (int x = 0; x < width; x++) to[x] = (float)row[x];
+      for (int x = width; x < width + kPad; x++) to[x] = (float)row[width - 1];
     }
-    const float most_x = (float)width + 1.0f, most_y = (float)height + 1.0f;
-    const float* corner = padded_.data() + (kPad - 1) * (stride + 1);
-    for (int y = 0; y < height; y++) {
-      const float *u = u_.data() + (size_t)y * width, *v = v_.data() + (size_t)y * width;
-      float* out = there_.data() + (size_t)y * width;
+    corner_.resize(width);
+    for (auto& weights : weights_) weights.resize(width);
+    for (int y = 0; y < height; y++) warp_row(in, y, stride, kPad);
+  }
+
+  void warp_row(const RefineFlow& in, int y, int stride, int pad) {
+    const int width = in.size.width;
+    const float most_x = (float)width + 1.0f, most_y = (float)in.size.height + 1.0f;
+    const float *u = u_.data() + (size_t)y * width, *v = v_.data() + (size_t)y * width;
+    float *xa = weights_[0].data(), *xb = weights_[1].data(), *xc = weights_[2].data(),
+          *xd = weights_[3].data(), *ya = weights_[4].data(), *yb = weights_[5].data(),
+          *yc = weights_[6].data(), *yd = weights_[7].data();
+    int* corner = corner_.data();
 #pragma omp simd
-      for (int x = 0; x < width; x++) {
-        // In this order a flow that is no number leads to the rim, and not out of the picture.
-        const float at_x = std::min(most_x, std::max(-2.0f, (float)x + u[x]));
-        const float at_y = std::min(most_y, std::max(-2.0f, (float)y + v[x]));
-        // Both are -2 or more: rounding towards zero after adding 2 is rounding down.
-        const int left = (int)(at_x + 2.0f) - 2, top = (int)(at_y + 2.0f) - 2;
-        const Cubic across(at_x - (float)left), down(at_y - (float)top);
-        const float* from = corner + top * stride + left;
-        out[x] = down.a * across.of(from) + down.b * across.of(from + stride) +
-                 down.c * across.of(from + 2 * stride) + down.d * across.of(from + 3 * stride);
-      }
+    for (int x = 0; x < width; x++) {
+      // In this order a flow that is no number leads to the rim, and not out of the picture.
+      const float at_x = std::min(most_x, std::max(-2.0f, (float)x + u[x]));
+      const float at_y = std::min(most_y, std::max(-2.0f, (float)y + v[x]));
+      // Both are -2 or more: rounding towards zero after adding 2 is rounding down.
+      const int left = (int)(at_x + 2.0f) - 2, top = (int)(at_y + 2.0f) - 2;
+      const Cubic across(at_x - (float)left), down(at_y - (float)top);
+      xa[x] = across.a, xb[x] = across.b, xc[x] = across.c, xd[x] = across.d;
+      ya[x] = down.a, yb[x] = down.b, yc[x] = down.c, yd[x] = down.d;
+      corner[x] = top * stride + left;
+    }
+    const float* first = padded_.data() + (pad - 1) * (stride + 1);
+    float* out = there_.data() + (size_t)y * width;
+    for (int x = 0; x < width; x++) {
+      const float* from = first + corner[x];
+      const Four column = ya[x] * four_at(from) + yb[x] * four_at(from + stride) +
+                          yc[x] * four_at(from + 2 * stride) + yd[x] * four_at(from + 3 * stride);
+      out[x] = (xa[x] * column[0] + xb[x] * column[1]) + (xc[x] * column[2] + xd[x] * column[3]);
     }
   }
 
@@ -121,25 +144,47 @@ class FlowRefiner {
     }
   }
 
-  void solve(const RefineFlow& in, float* out) const {
-    const size_t count = in.size.count();
-    for (size_t i = 0; i < count; i++) {
-      const float xy = products_[2][i], xe = products_[3][i], ye = products_[4][i];
-      const float damping = in.singular * (products_[0][i] + products_[1][i]) + 1e-6f;
-      const float xx = products_[0][i] + damping, yy = products_[1][i] + damping;
-      const float inverse = 1.0f / (xx * yy - xy * xy);
-      const float x = (yy * xe - xy * ye) * inverse, y = (xx * ye - xy * xe) * inverse;
-      // The step is in a; through the warp, 1 + d flow / d pixel, it becomes one in b.
-      const float step_x = x + slope_[0][i] * x + slope_[1][i] * y;
-      const float step_y = y + slope_[2][i] * x + slope_[3][i] * y;
-      const float length = std::sqrt(step_x * step_x + step_y * step_y);
-      const float shorten = in.most_step_px / std::max(length, in.most_step_px);
-      out[2 * i] = u_[i] + step_x * shorten;
-      out[2 * i + 1] = v_[i] + step_y * shorten;
+  void solve(const RefineFlow& in, float* out) {
+    const int width = in.size.width;
+    for (int y = 0; y < in.size.height; y++) {
+      const size_t first = (size_t)y * width;
+      solve_row(in, first);
+      const float *u = gx_.data() + first, *v = gy_.data() + first;
+      for (int x = 0; x < width; x++) {
+        out[2 * (first + x)] = u[x];
+        out[2 * (first + x) + 1] = v[x];
+      }
     }
   }
 
-  Plane u_, v_, here_, there_, gx_, gy_, products_[5], slope_[4], padded_;
+  // gx_ and gy_ become the new flow: into rows of their own, the loop is made of vectors.
+  void solve_row(const RefineFlow& in, size_t first) {
+    const float *xx_ = products_[0].data() + first, *yy_ = products_[1].data() + first,
+                *xy_ = products_[2].data() + first, *xe_ = products_[3].data() + first,
+                *ye_ = products_[4].data() + first, *ux = slope_[0].data() + first,
+                *uy = slope_[1].data() + first, *vx = slope_[2].data() + first,
+                *vy = slope_[3].data() + first, *u = u_.data() + first, *v = v_.data() + first;
+    float *new_u = gx_.data() + first, *new_v = gy_.data() + first;
+    const float singular = in.singular, most = in.most_step_px;
+#pragma omp simd
+    for (int i = 0; i < in.size.width; i++) {
+      const float xy = xy_[i], xe = xe_[i], ye = ye_[i];
+      const float damping = singular * (xx_[i] + yy_[i]) + 1e-6f;
+      const float xx = xx_[i] + damping, yy = yy_[i] + damping;
+      const float inverse = 1.0f / (xx * yy - xy * xy);
+      const float x = (yy * xe - xy * ye) * inverse, y = (xx * ye - xy * xe) * inverse;
+      // The step is in a; through the warp, 1 + d flow / d pixel, it becomes one in b.
+      const float step_x = x + ux[i] * x + uy[i] * y;
+      const float step_y = y + vx[i] * x + vy[i] * y;
+      const float length = std::sqrt(step_x * step_x + step_y * step_y);
+      const float shorten = most / std::max(length, most);
+      new_u[i] = u[i] + step_x * shorten;
+      new_v[i] = v[i] + step_y * shorten;
+    }
+  }
+
+  Plane u_, v_, here_, there_, gx_, gy_, products_[5], slope_[4], padded_, weights_[8];
+  std::vector<int> corner_;
   Filter filter_;
 };
 

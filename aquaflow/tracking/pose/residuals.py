@@ -70,30 +70,32 @@ class Matches:
     def __init__(self, problem: PoseProblem, residual: PoseResidual, free_scale: bool) -> None:
         if residual == "point" and problem.frame_points is None:
             raise ValueError("the point residual needs the frame's own points")
-        own, own_variance = _own(problem)
         around = problem.around_rho
         nearer = np.zeros(len(problem.points)) if around is None else around * problem.points[:, 2]
         columns = np.vstack(
             [problem.points.T, problem.rho_variance, problem.pixels.T, problem.weights, nearer]
         )
-        usable = np.isfinite(columns).all(0)
-        known = np.isfinite(own).all(0) & np.isfinite(own_variance) & (own[2] > 0.0)
-        if residual == "point":
-            usable &= known
+        own = _Own.of(problem)
+        usable = np.asarray(np.isfinite(columns).all(0))
+        if residual == "point" and own is not None:
+            usable &= own.known
         if not usable.all():
-            columns, known = columns[:, usable], known[usable]
-            own, own_variance = own[:, usable], own_variance[usable]
+            columns, own = columns[:, usable], None if own is None else own.at(usable)
         self.camera, self.sigma_px, self.size = problem.camera, problem.sigma_px, 6 + free_scale
         self.X, self.variance = columns[:3], columns[3]
         self.u, self.v, self.weights = columns[4], columns[5], columns[6]
+        self.median_depth = float(np.median(self.X[2])) if self.X.size else 1.0
+        """In the keyframe."""
         self.nearer = None if around is None else columns[7]
         """[M] inverse depth around a point over its own."""
-        self.own, self.has_own = np.where(known, own, 1.0), bool(known.any())
-        self.own_range = np.sqrt((self.own**2).sum(0))
         # Relative variance of the range; of the keyframe's points and of the frame's own.
         self.range_variance = self.variance * self.X[2] ** 2
-        own_relative = own_variance * self.own[2] ** 2
-        self.own_range_variance = np.where(known, np.maximum(own_relative, MIN_SIGMA**2), np.inf)
+        self.has_own = own is not None and bool(own.known.any())
+        if own is not None:
+            self.own = np.where(own.known, own.points, 1.0)
+            self.own_range = np.sqrt((self.own**2).sum(0))
+            relative = np.maximum(own.variance * self.own[2] ** 2, MIN_SIGMA**2)
+            self.own_range_variance = np.where(own.known, relative, np.inf)
 
     def __len__(self) -> int:
         return int(self.X.shape[1])
@@ -103,13 +105,32 @@ class Matches:
         return Rows(np.zeros((count, len(self))), np.zeros((self.size, count, len(self))))
 
 
-def _own(problem: PoseProblem) -> tuple[Array, Array]:
-    """The frame's own points [3, M] and the variance of their inverse depths [M]; NaN if none."""
-    count = len(problem.points)
-    if problem.frame_points is None:
-        return np.full((3, count), np.nan), np.full(count, np.nan)
-    variance = problem.frame_rho_variance
-    return problem.frame_points.T, np.zeros(count) if variance is None else variance
+@dataclass(frozen=True)
+class _Own:
+    """The points as the frame alone knows them; NaN where it does not."""
+
+    points: Array
+    """[3, M]"""
+    variance: Array
+    """[M] of their inverse depths."""
+
+    @staticmethod
+    def of(problem: PoseProblem) -> _Own | None:
+        points, variance = problem.frame_points, problem.frame_rho_variance
+        if points is None:
+            return None
+        return _Own(points.T, np.zeros(len(points)) if variance is None else variance)
+
+    @property
+    def known(self) -> npt.NDArray[np.bool_]:
+        finite = np.isfinite(self.points).all(0) & np.isfinite(self.variance)
+        return np.asarray(finite & (self.points[2] > 0.0))
+
+    def at(
+        self,
+        which: npt.NDArray[np.bool_],  # [M]
+    ) -> _Own:
+        return _Own(self.points[:, which], self.variance[which])
 
 
 def point_rows(matches: Matches, T: Sim3) -> Rows:
@@ -182,7 +203,7 @@ def pixel_rows(matches: Matches, T: Sim3) -> Rows:
     camera, z, variance = matches.camera, matches.X[2], matches.variance
     moved = T.scale * (T.R @ matches.X)
     Y = moved + T.t[:, None]
-    nearest = MIN_DEPTH_SHARE * max(T.scale * float(np.median(z)), 1e-12)
+    nearest = nearest_depth(matches, T)
     behind = Y[2] < nearest
     iz = 1.0 / np.where(behind, 1.0, Y[2])
     x, y = Y[0] * iz, Y[1] * iz
@@ -224,6 +245,11 @@ def pixel_rows(matches: Matches, T: Sim3) -> Rows:
     if behind.any():
         rows.residual[:, behind], rows.J[:, :, behind] = BEHIND, 0.0
     return rows
+
+
+def nearest_depth(matches: Matches, T: Sim3) -> float:
+    """Depth in the frame below which a point counts as behind the camera."""
+    return MIN_DEPTH_SHARE * max(T.scale * matches.median_depth, 1e-12)
 
 
 def _depth_change(

@@ -13,7 +13,9 @@ import numpy.typing as npt
 
 from aquaflow.config.tracking import PoseResidual
 from aquaflow.geometry.similarity import Sim3, so3_exp
+from aquaflow.render.library import library_or_none
 from aquaflow.tracking.pose.covariance import Degeneracy, cell_sums, pose_covariance
+from aquaflow.tracking.pose.pixel_equations import PixelEquations
 from aquaflow.tracking.pose.residuals import ROWS, Matches, PoseProblem, Rows
 
 __all__ = ["PoseEstimate", "PoseProblem", "solve_pose"]
@@ -77,29 +79,52 @@ def solve_pose(
     matches = Matches(problem, residual, free_scale)
     if len(matches) == 0 or not initial.is_finite():
         return None
-    linearise = ROWS[residual]
+    equations = _equations(matches, residual)
     T, damping = initial if free_scale else initial.in_source_unit(), FIRST_DAMPING
-    rows = linearise(matches, T)
-    cost = _cost(rows.residual, matches.weights)
+    H, g, cost = equations.at(T)
     for _ in range(MAX_ITERATIONS):
-        H, g = _normal_equations(rows, matches.weights)
         step = _damped_step(H, g, damping)
         if step is None:
             return None
         candidate = _moved(T, step)
-        new_rows = linearise(matches, candidate)
-        new_cost = _cost(new_rows.residual, matches.weights)
+        new_H, new_g, new_cost = equations.at(candidate)
         still = stop_converged and float(step @ H @ step) < STOP_SIGMAS**2
         if not np.isfinite(new_cost) or new_cost > cost * (1.0 + SLACK):
             damping *= 10.0
             if still or damping > MAX_DAMPING:
                 break
             continue
-        T, rows, cost = candidate, new_rows, new_cost
+        T, H, g, cost = candidate, new_H, new_g, new_cost
         damping = max(damping * 0.1, 1e-9)
         if still:
             break
-    return _summary(problem, matches, T, rows)
+    return _summary(problem, matches, T, H, *equations.left(T))
+
+
+class RowEquations:
+    """The equations of some matches from their rows: readable, for every kind of residual."""
+
+    def __init__(self, matches: Matches, residual: PoseResidual) -> None:
+        self._matches, self._linearise = matches, ROWS[residual]
+
+    def at(self, T: Sim3) -> tuple[Array, Array, float]:
+        """H [n, n], g [n] and cost of the weighted Huber loss at ``T``."""
+        rows, weights = self._linearise(self._matches, T), self._matches.weights
+        return *_normal_equations(rows, weights), _cost(rows.residual, weights)
+
+    def left(self, T: Sim3) -> tuple[Array, Array]:
+        """Residuals [K, M] at ``T``, and what each match pulls by [n, M]: weighted J' residual."""
+        rows = self._linearise(self._matches, T)
+        pull = _huber_weights(rows.residual) * rows.residual * self._matches.weights
+        return rows.residual, np.asarray((rows.J * pull).sum(1))
+
+
+def _equations(matches: Matches, residual: PoseResidual) -> RowEquations | PixelEquations:
+    """Compiled, where that can be had: a third of the time, for pixels without own ranges."""
+    library = library_or_none()
+    if library is None or residual != "pixel" or matches.size != 6 or matches.has_own:
+        return RowEquations(matches, residual)
+    return PixelEquations(library, matches, HUBER)
 
 
 def _moved(
@@ -155,19 +180,24 @@ def _damped_step(
     return None
 
 
-def _summary(problem: PoseProblem, matches: Matches, T: Sim3, rows: Rows) -> PoseEstimate | None:
-    H, _ = _normal_equations(rows, matches.weights)
+def _summary(
+    problem: PoseProblem,
+    matches: Matches,
+    T: Sim3,
+    H: Array,  # [n, n]
+    residual: Array,  # [K, M]
+    pull: Array,  # [n, M]
+) -> PoseEstimate | None:
     if not (np.isfinite(H).all() and T.is_finite()):
         return None
     Y = T.scale * (T.R @ matches.X) + T.t[:, None]
     in_front = Y[2] > 0.0
     depth = float(np.median(Y[2][in_front])) if in_front.any() else 1.0
-    pull = _huber_weights(rows.residual) * rows.residual * matches.weights
-    scores, camera = (rows.J * pull).sum(1), matches.camera
-    cells = cell_sums(scores, matches.u, matches.v, camera.width, camera.height)
+    camera = matches.camera
+    cells = cell_sums(pull, matches.u, matches.v, camera.width, camera.height)
     covariance, degeneracy = pose_covariance(H, cells, T, depth)
 
-    inlier = in_front & (np.abs(rows.residual) < INLIER).all(0)
+    inlier = in_front & (np.abs(residual) < INLIER).all(0)
     residual_px = float("inf")
     if inlier.any():
         seen = camera.project(Y[:, inlier].T)

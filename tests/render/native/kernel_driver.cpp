@@ -229,6 +229,38 @@ static void match(const Scene& s, bool short_of_memory) {
                       0.5};
   const int measured = aq_fuse_depths(&in);
   if (measured < 0 || (size_t)measured > pixels) std::exit(4);
+
+  // Wild depths and matches; more of them than a block holds.
+  const int count = (int)pixels;
+  const double* wild_values = rho.data();
+  std::vector<double> left(2 * pixels), pull(6 * pixels);
+  PoseEquations pose{wild_values,
+                     variance.data(),
+                     wild_values,
+                     variance.data(),
+                     wild_values,
+                     variance.data(),
+                     wild_values,
+                     wild_values,
+                     count,
+                     50.0,
+                     50.0,
+                     26.0,
+                     20.0,
+                     0.5,
+                     {1, 0, 0, 0, 1, 0, 0, 0, 1},
+                     {0.1, 0.0, 0.02},
+                     1.0,
+                     1e-3,
+                     1.345,
+                     10.0,
+                     0.5,
+                     3.0};
+  const PoseLeft out{left.data(), pull.data()};
+  PoseResult result;
+  if (aq_pose_equations(&pose, &result, &out) != 0) std::exit(4);
+  pose.nearer = nullptr;
+  if (aq_pose_equations(&pose, &result, nullptr) != 0) std::exit(4);
 }
 
 int main(int count, char** arguments) {

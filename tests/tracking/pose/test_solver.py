@@ -11,7 +11,7 @@ import pytest
 from aquaflow.geometry.similarity import Sim3, so3_exp, so3_log
 from aquaflow.tracking.pose import solver
 from aquaflow.tracking.pose.covariance import UNKNOWN_SIGMA, pose_covariance
-from aquaflow.tracking.pose.residuals import Matches, Rows
+from aquaflow.tracking.pose.pixel_equations import PixelEquations
 from aquaflow.tracking.pose.solver import PoseProblem, solve_pose
 from tests.tracking.tracking_scenes import CAMERA, cloud, pose, problem_of
 
@@ -310,13 +310,13 @@ def test_random_matches_raise_nothing() -> None:
 def counted(monkeypatch: pytest.MonkeyPatch) -> list[Sim3]:
     """The poses at which the solver linearises from now on."""
     taken: list[Sim3] = []
-    linearise = solver.ROWS["pixel"]
+    linearise = solver.PixelEquations.at
 
-    def count(matches: Matches, T: Sim3) -> Rows:
+    def count(equations: PixelEquations, T: Sim3) -> tuple[Array, Array, float]:
         taken.append(T)
-        return linearise(matches, T)
+        return linearise(equations, T)
 
-    monkeypatch.setitem(solver.ROWS, "pixel", count)
+    monkeypatch.setattr(solver.PixelEquations, "at", count)
     return taken
 
 
