@@ -100,6 +100,21 @@ def read_notes(dive: Path, frame: MetricFrame) -> list[Note]:
         raise InputError(f"{path} does not hold notes ({what}); correct or remove it") from error
 
 
+def new_note(
+    notes: Sequence[Note],
+    text: str,
+    shape: Shape,
+    places: Array,  # [N, 3] in n
+    properties: dict[str, Any],
+) -> Note:
+    """A note beside ``notes``, with the least number as its key that none of them has."""
+    keys = {note.key for note in notes}
+    number = 1
+    while str(number) in keys:
+        number += 1
+    return Note(str(number), text, shape, places, properties)
+
+
 def scaled(
     notes: Sequence[Note],
     times: float,
