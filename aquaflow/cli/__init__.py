@@ -20,6 +20,7 @@ from aquaflow.cli.console import PRESETS, Json, progress_bars, unit_in_words
 from aquaflow.cli.devices import register as register_devices
 from aquaflow.cli.dive import register as register_dive
 from aquaflow.cli.export import register as register_export
+from aquaflow.cli.measure import register as register_measure
 from aquaflow.cli.prior import register as register_prior
 from aquaflow.cli.record import register as register_record
 from aquaflow.cli.scale import register as register_scale
@@ -287,5 +288,6 @@ register_export(app)
 register_prior(app)
 register_record(app)
 register_scale(app)
+register_measure(app)
 register_service(app)
 register_stress(app)

@@ -19,6 +19,7 @@ from aquaflow.dive.held_out_example import HeldOut, mean_amplification
 from aquaflow.dive.medium_json import medium_json
 from aquaflow.dive.metric_outputs import MetricOutputs, held_out_in, water_in, worlds_in_words
 from aquaflow.dive.path_rows import path_rows
+from aquaflow.dive.reef import numbers_at_the_end
 from aquaflow.dive.report_data import report_data
 from aquaflow.dive.results import (
     WaterSummary,
@@ -29,6 +30,8 @@ from aquaflow.dive.results import (
 from aquaflow.export.georeference import GEOREFERENCE, georeference
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.measure.reef_files import write_reef_numbers
+from aquaflow.measure.reef_numbers import ReefNumbers
 from aquaflow.messages import CameraModel, Dropped
 from aquaflow.slam import Slam
 from aquaflow.tracking.frames import Tracked
@@ -56,6 +59,8 @@ class Deliverables:
         self.outputs = outputs or MetricOutputs()
         self.held_out: list[HeldOut] = []
         """Ranges in the unit of the largest sub-map's metric frame."""
+        self.reef: ReefNumbers | None = None
+        """None before they are measured, and where that failed."""
         self.notes: list[str] = []
         """What was left out."""
         self.poses: dict[int, Sim3] = self._in_n(tracked_poses(results))
@@ -105,6 +110,23 @@ class Deliverables:
                 f"{there - len(found)} of {there} held-out views were not evaluated: the dive's "
                 "end had no more time (service.finish_s)"
             )
+
+    def measure(self, until: Deadline | None = None) -> None:
+        """The reef numbers; those of the ground, for which every view is drawn, within the time."""
+        self.reef = self._attempt("reef numbers", partial(self._numbers, until))
+        if self.reef is not None:
+            self._attempt("writing reef_numbers", self._write_reef_numbers)
+
+    def _numbers(self, until: Deadline | None) -> ReefNumbers:
+        sub_maps = {tracked.frame.index: tracked.sub_map for tracked in self.results}
+        poses = [self.poses[i] for i in sorted(self.poses) if sub_maps[i] == self._main]
+        mapper = self.slam.mappers.get(self._main)
+        water, work = self._water(), self.folder.path
+        return numbers_at_the_end(mapper, self.metric_frame, poses, water, work, until)
+
+    def _write_reef_numbers(self) -> None:
+        if self.reef is not None:
+            write_reef_numbers(self.folder.path, self.reef)
 
     def write(self) -> None:
         """Trajectory, cameras and maps: what does not wait for an evaluation."""
@@ -190,7 +212,7 @@ class Deliverables:
             self.folder.write_report(
                 report_data(
                     self.name, self.slam, self.results, dropped, self.poses, self.held_out,
-                    self._water(), self.outputs, numbers, notes,
+                    self._water(), self.outputs, numbers, notes, self.reef,
                     calibrated=self.calibration is not None,
                 )
             )  # fmt: skip

@@ -6,8 +6,9 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.dive.results import WaterSummary
-from aquaflow.export.report import Measures, PathPlot
+from aquaflow.export.report import Measures, PathPlot, ReefRow
 from aquaflow.fusion.metric_frame import MetricFrame
+from aquaflow.measure.reef_numbers import ReefNumbers
 
 
 def measures(path: PathPlot, frame: MetricFrame, water: WaterSummary | None) -> Measures:
@@ -24,6 +25,18 @@ def measures(path: PathPlot, frame: MetricFrame, water: WaterSummary | None) -> 
         seen = f"{water.range_p5:.3g} to {water.range_p95:.3g} {frame.unit}"
         rows.append(("distances seen", f"{seen} (5 % and 95 %)"))
     return Measures(rows, frame.sources)
+
+
+def reef_rows(found: ReefNumbers | None) -> list[ReefRow]:
+    """The reef numbers in words; empty where there are none."""
+    if found is None:
+        return []
+    rows = []
+    for each in found.numbers:
+        q = each.quantity
+        interval = f"{q.low:.4g} to {q.high:.4g}"
+        rows.append(ReefRow(each.label, q.in_words(), interval, each.meaning))
+    return rows + [ReefRow(what, "unknown", "", why) for what, why in found.missing.items()]
 
 
 def _unit(frame: MetricFrame) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from aquaflow.dive.held_out_example import HeldOut
-from aquaflow.dive.measures import measures
+from aquaflow.dive.measures import measures, reef_rows
 from aquaflow.dive.metric_outputs import MetricOutputs
 from aquaflow.dive.results import WaterSummary, largest_sub_map
 from aquaflow.export.report import (
@@ -18,6 +18,7 @@ from aquaflow.export.report import (
     ReportData,
 )
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.measure.reef_numbers import ReefNumbers
 from aquaflow.messages import CameraModel, Dropped
 from aquaflow.slam import Slam
 from aquaflow.tracking.frames import FrameClass, Tracked
@@ -37,6 +38,7 @@ def report_data(
     outputs: MetricOutputs,
     metrics: dict[str, Any],
     notes: list[str],
+    reef: ReefNumbers | None,
     calibrated: bool,
 ) -> ReportData:
     """Everything the report shows; ``poses`` are T_nc, held-out ranges and water in n's unit."""
@@ -48,6 +50,7 @@ def report_data(
         metrics=metrics,
         path=path,
         measures=measures(path, frame, water),
+        reef=reef_rows(reef),
         timeline=_timeline(results, dropped),
         examples=_examples(held_out),
         medium=medium_curves(water, frame.unit),

@@ -27,6 +27,7 @@ from aquaflow.fusion.known_lengths.known_length import KnownLength, LengthScale
 from aquaflow.fusion.metric_file import read_main, read_metric_file, write_metric_file
 from aquaflow.fusion.metric_frame import LARGEST_SCALE_SIGMA, MetricFrame, SourceReport
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.measure.notes import read_notes, scaled, write_notes
 from aquaflow.storage.atomic import atomic_write, write_json
 
 Array = npt.NDArray[np.float64]
@@ -69,8 +70,9 @@ def rescale(dive: Path, sub_map: int, lengths: Sequence[KnownLength], scale: Len
     inside = {round(1e9 * row.t_s) for row in rows if row.sub_map == sub_map}
     chosen = np.array([round(1e9 * t) in inside for t in poses[:, 0]], bool)
     poses[chosen, 1:4] *= times
-    texts = {}
+    texts, notes = {}, []
     if sub_map == main:
+        notes = scaled(read_notes(dive, before), times)
         texts["metrics.json"] = _json(dive / "metrics.json") | frame_numbers(frames[main])
         if (dive / "medium.json").is_file():
             texts["medium.json"] = _medium(_json(dive / "medium.json"), frames[main], times)
@@ -85,6 +87,8 @@ def rescale(dive: Path, sub_map: int, lengths: Sequence[KnownLength], scale: Len
         write_json(dive / name, content)
     if sub_map == main:
         _scale_ranges(dive / "heldout", times)
+        if notes:
+            write_notes(dive, notes, frames[main])
     write_metric_file(dive, frames, main)
 
 

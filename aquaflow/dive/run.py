@@ -289,6 +289,8 @@ class DiveRun:
             made.write()
         with self.profiler.stage("evaluate"):
             made.evaluate(limits.evaluating)
+        with self.profiler.stage("measure"):
+            made.measure(limits.evaluating)
             self.notes += made.notes
         with self.profiler.stage("write"):
             made.write_evaluation()

@@ -7,11 +7,9 @@ point of a picture is where its ray meets the map as the renderer draws it.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from aquaflow.config import load_config
 from aquaflow.dive.frames_csv import read_rows
@@ -20,38 +18,15 @@ from aquaflow.export.map_file import SUFFIX, read_map_file
 from aquaflow.fusion.known_lengths.known_length import KnownLength
 from aquaflow.fusion.metric_file import read_frame_of_map
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.transfers import picture_out
 from aquaflow.mapping.views import View
+from aquaflow.measure.picked import CLICK_SIGMA_PX, RANGE_SIGMA, refuse_outside, seen, view_of_frame
 from aquaflow.render import select_renderer
 
-Array = npt.NDArray[np.float64]
-
-RANGE_SIGMA = 0.02
-"""Relative 1 sigma of a rendered range: 1.1 to 2.8 % on held-out views (docs/benchmarks.md)."""
-CLICK_SIGMA_PX = 1.0
-"""1 sigma of a point that a person marked, and of the refined poses."""
 POINT_SIGMA = 0.01
 """Of a point marked in the viewer, as a share of the marked length (judgement: a splat has a
 size)."""
-LEAST_ALPHA = 0.5
-"""Of the map at a point; less is mostly not there."""
-WINDOW_PX = 2
-"""Half the window that a range is the median of."""
 LEAST_LENGTH_PX = 10.0
 """Between two points of a picture; nearer ones are the same, but for the click."""
-
-
-@dataclass(frozen=True)
-class _Point:
-    """A point of a picture in the map."""
-
-    place: Array
-    """[3] in the world."""
-    ray: Array
-    """[3] unit, from the camera."""
-    range: float
-    sigma: float
-    """Of the range: of the map anywhere, and by how much it differs around the point."""
 
 
 def between_pixels(
@@ -70,19 +45,12 @@ def between_pixels(
     """
     mapper, view, sub_map = _mapped(dive, frame)
     points = np.array([start, end], np.float64)
-    size = np.array([view.camera.width, view.camera.height])
-    for point in points:
-        if not bool(np.all((point >= 0.0) & (point < size))):
-            raise InputError(
-                f"the point {point[0]:g},{point[1]:g} is outside of the mapped picture of "
-                f"{size[0]} x {size[1]} pixels; give pixels of the pictures that `aquaflow export "
-                "--format restored` writes"
-            )
+    refuse_outside(view, points)
     if np.linalg.norm(points[1] - points[0]) < LEAST_LENGTH_PX:
         raise InputError(
             f"the two points are less than {LEAST_LENGTH_PX:.0f} pixels apart; mark a longer length"
         )
-    a, b = _seen(mapper, view, points)
+    a, b = seen(mapper, view, points)
     length = float(np.linalg.norm(b.place - a.place))
     along = (b.place - a.place) / length
     click = CLICK_SIGMA_PX / view.camera.fx * float(np.hypot(a.range, b.range))
@@ -124,12 +92,7 @@ def _mapped(dive: Path, frame: int) -> tuple[Mapper, View, int]:
     renderer = select_renderer(load_config(dive / "config.yaml").mapping.renderer)
     name = "map" if number == largest else f"map_{number}"
     mapper = read_map_file(dive / f"{name}{SUFFIX}", renderer)
-    views = {view.frame_index: view for view in mapper.views}
-    if frame not in views:
-        nearest = min(views, key=lambda index: abs(index - frame), default=None)
-        other = "" if nearest is None else f"; the nearest mapped one is {nearest}"
-        raise InputError(f"frame {frame} of {dive} was not mapped{other}")
-    return mapper, views[frame], number
+    return mapper, view_of_frame(mapper, frame, dive), number
 
 
 def _sub_maps(dive: Path) -> dict[int, int]:
@@ -141,27 +104,3 @@ def _sub_maps(dive: Path) -> dict[int, int]:
 def _largest(sub_maps: dict[int, int]) -> int:
     counts = Counter(sub_maps.values())
     return max(counts, key=lambda number: (counts[number], -number), default=0)
-
-
-def _seen(
-    mapper: Mapper,
-    view: View,
-    pixels: Array,  # [2, 2]
-) -> list[_Point]:
-    shown = mapper.show(view)
-    ranges, alpha = picture_out(shown.z), picture_out(shown.alpha)
-    points = []
-    for u, v in pixels:
-        column, row = int(u), int(v)
-        rows = slice(max(0, row - WINDOW_PX), row + WINDOW_PX + 1)
-        columns = slice(max(0, column - WINDOW_PX), column + WINDOW_PX + 1)
-        solid = alpha[rows, columns] >= LEAST_ALPHA
-        if alpha[row, column] < LEAST_ALPHA or not solid.any():
-            raise InputError(f"the map shows nothing at {u:g},{v:g}; choose another point")
-        around = ranges[rows, columns][solid]
-        distance = float(np.median(around))
-        sigma = float(np.hypot(RANGE_SIGMA * distance, np.std(around)))
-        ray = view.T_wc.R @ view.camera.unproject(np.array([u, v]))
-        ray /= np.linalg.norm(ray)
-        points.append(_Point(view.T_wc.t + distance * ray, ray, distance, sigma))
-    return points

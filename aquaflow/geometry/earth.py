@@ -34,6 +34,26 @@ def latitude_longitude(
     return np.asarray(latitude), np.asarray(longitude)
 
 
+def from_geodetic(
+    latitude_deg: Array,  # [N]
+    longitude_deg: Array,  # [N]
+    height: Array,  # [N] m above the ellipsoid
+    origin: tuple[float, float],
+) -> Array:
+    """[N, 3] m north, east and down of ``origin`` (latitude, longitude, deg)."""
+    east, north, up = _plane(origin).transform(longitude_deg, latitude_deg, height)
+    return np.stack([north, east, -up], axis=1)
+
+
+def geodetic(
+    points_n: Array,  # [N, 3] m: north, east, down
+    origin: tuple[float, float],
+) -> Array:
+    """[N, 3] longitude, latitude (deg) and height above the ellipsoid (m), in GeoJSON's order."""
+    north, east, down = np.asarray(points_n, np.float64).T
+    return np.stack(_plane(origin).transform(east, north, -down, direction="INVERSE"), axis=1)
+
+
 def _plane(origin: tuple[float, float]) -> Transformer:
     """From longitude, latitude (deg) and height (m) to east, north and up (m)."""
     from pyproj import Transformer

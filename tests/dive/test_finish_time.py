@@ -21,7 +21,7 @@ from aquaflow.slam import Slam
 from aquaflow.slam.finish_time import EVALUATED, REFINED, SETTLED, FinishTime
 from aquaflow.sources import open_recording
 
-SECONDS = 28.0
+SECONDS = 30.0
 FRAMES = 14
 
 
@@ -84,6 +84,12 @@ def test_only_some_held_out_views_are_evaluated_and_the_notes_say_so(ended: Ende
     left = ended.held_out - numbers["heldout_frames"]
     said = [note for note in ended.finished.notes if "service.finish_s" in note]
     assert said[0].startswith(f"{left} of {ended.held_out} held-out views were not evaluated")
+
+
+def test_the_ground_is_not_measured_without_time_and_the_file_says_so(ended: Ended) -> None:
+    numbers = json.loads((ended.finished.dive / "reef_numbers.json").read_text())
+    assert "no more time" in numbers["missing"]["ground"]
+    assert numbers["numbers"]["path_length"]["value"] > 0.0
 
 
 def test_every_deliverable_is_there(ended: Ended) -> None:

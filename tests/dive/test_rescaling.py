@@ -14,6 +14,7 @@ from aquaflow.export.ply import read_ply
 from aquaflow.export.trajectory_csv import read_trajectory_csv
 from aquaflow.fusion.metric_file import read_metric_file, write_metric_file
 from aquaflow.fusion.metric_frame import MetricFrame
+from aquaflow.measure.notes import Note, read_notes, write_notes
 from tests.command_line import Cli, refused
 from tests.metric_scenes import metric_frame
 
@@ -82,6 +83,14 @@ def test_a_length_that_is_marked_anew_replaces_the_scale(dive: Path, command: Cl
     assert said["rescaled"]
     assert_scaled(dive, before, said["all_metres_per_unit"])
     assert said["all_metres_per_unit"] == pytest.approx(3.1, abs=0.05)
+
+
+def test_notes_stay_where_they_are_in_the_map(dive: Path, command: Cli) -> None:
+    place = np.array([[0.5, -0.25, 2.0]])
+    write_notes(dive, [Note("a", "crack", "Point", place)], MetricFrame.unknown())
+    assert command("scale", dive, *LENGTH).code == 0
+    [note] = read_notes(dive, read_metric_file(dive)[0])
+    np.testing.assert_allclose(note.places, 3.0 * place)
 
 
 def test_a_dive_that_is_metric_already_keeps_its_metres(dive: Path, command: Cli) -> None:

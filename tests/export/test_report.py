@@ -18,6 +18,7 @@ from aquaflow.export.report import (
     Measures,
     MediumCurves,
     PathPlot,
+    ReefRow,
     ReportData,
     render_report,
     write_report,
@@ -219,3 +220,12 @@ def test_a_transparent_restored_picture_and_its_confidence_are_shown():
 def test_date_is_shown_only_when_given(page):
     assert "on 2 May 2026" in render_report(ReportData("d", CAMERA, {}, written="2 May 2026"))
     assert not re.search(r"\b20\d\d-\d\d-\d\d", page)
+
+
+def test_the_grounds_numbers_stand_with_their_intervals() -> None:
+    row = ReefRow("rugosity", "1.25 \u00b1 0.01", "1.23 to 1.27", "on cells of <0.1> m")
+    page = render_report(report(reef=[row]))
+    assert "The ground in numbers" in page
+    assert "1.23 to 1.27" in page
+    assert "on cells of &lt;0.1&gt; m" in page
+    assert "The ground in numbers" not in render_report(report())

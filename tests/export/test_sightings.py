@@ -75,6 +75,27 @@ def test_what_stands_between_hides_the_ground(mapper: Mapper, tmp_path: Path) ->
     assert before.count[0] - after.count[0] == 1
 
 
+def test_a_place_that_was_filmed_and_not_mapped_is_held(mapper: Mapper, tmp_path: Path) -> None:
+    ranges = ViewRanges(mapper, ground(mapper), tmp_path)
+    mapped, beyond = ground_point(1.9, 1.7), ground_point(1.9, -0.3)
+    assert ranges.hold(mapped).tolist() == ranges.see(mapped).count.tolist()
+    assert ranges.see(beyond).count.tolist() == [0]
+    rows = sum(abs(x - 1.9) < 0.5 * CAMERA.height / CAMERA.fx * ALTITUDE_M for x in STOPS)
+    assert ranges.hold(beyond).tolist() == [rows]  # by the views of the westernmost stop
+    outside, behind = ground_point(1.9, -2.5), ground_point(1.9, 1.7, above=-0.4)
+    assert ranges.hold(outside).tolist() == [0]
+    assert ranges.hold(behind).tolist() == [0]
+
+
+def test_pictures_that_end_earlier_hold_less(mapper: Mapper, tmp_path: Path) -> None:
+    ranges = ViewRanges(mapper, ground(mapper), tmp_path)
+    steps = np.linspace(0.2, 3.4, 40)
+    east, north = (each.ravel() for each in np.meshgrid(steps, steps))
+    points = np.column_stack([east, north, height(north, east) - DEPTH_M])
+    narrow, plain, wide = (int(ranges.hold(points, px).sum()) for px in (4.0, 0.0, -4.0))
+    assert narrow < plain < wide
+
+
 def test_the_height_is_known_as_well_as_the_rays_cross(mapper: Mapper, tmp_path: Path) -> None:
     """Two views h above a point and b apart leave its height open by r / (f sqrt(2) sin a)."""
     mapper.views = [mapper.views[5], mapper.views[9]]

@@ -61,6 +61,11 @@ class Splats:
         self._splats = splats_of(mapper).transformed(ground.T_gm)
         self._reach = RADIUS_SIGMAS * self._splats.scales.max(axis=1, initial=0.0)
 
+    @property
+    def places(self) -> Array:
+        """[N, 2] x and y of the Gaussians on the ground."""
+        return np.asarray(self._splats.means[:, :2], np.float64)
+
     def reaching(self, grid: Grid, tile: Tile) -> npt.NDArray[np.intp]:
         """[M] numbers of the Gaussians that touch a tile."""
         low, high = grid.bounds(tile)

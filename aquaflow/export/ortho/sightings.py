@@ -139,24 +139,65 @@ class ViewRanges:
             information[seen] += across / (sigma**2)[:, None, None]
         return Sightings(count, _height_sigma(information, count), nearest)
 
+    def hold(
+        self,
+        points: Array,  # [M, 3] on the ground
+        margin_px: float = 0.0,
+    ) -> npt.NDArray[np.int32]:
+        """[M] how many views show the place of each point, ``margin_px`` inside their edges.
+
+        Unlike :meth:`see` this asks nothing of the map at the point, only that it has nothing
+        before it, and that the view shows something as far away: a place that was filmed and not
+        mapped is held.
+        """
+        count = np.zeros(len(points), np.int32)
+        low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+        size = self._high - self._low
+        around = ((self._low - size <= high) & (self._high + size >= low)).all(axis=1)
+        for number in np.flatnonzero(around).tolist():
+            z = self._of(number)
+            inside, rows, columns, ranges = self._projected(number, points, margin_px)
+            shown = z[rows, columns]
+            hidden = (shown > 0.0) & (ranges > (1.0 + SAME_RANGE) * shown)
+            farthest = min(float(z.max()), FAR * self.median_range)
+            count[inside[~hidden & (ranges <= farthest)]] += 1
+        return count
+
+    def _projected(
+        self,
+        number: int,
+        points: Array,  # [M, 3] on the ground
+        margin_px: float = 0.0,
+    ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], npt.NDArray[np.intp], Array]:
+        """Numbers [K] of the points within a view's picture, rows and columns [K] of their kept
+        ranges, and how far they are [K]."""
+        view, T_gc = self._views[number], self._poses[number]
+        camera = view.camera
+        local = (points - T_gc.t) @ T_gc.R
+        ahead = np.flatnonzero(local[:, 2] > 0.0)
+        u, v = camera.project(local[ahead]).T
+        # The outermost column stands for what a negative margin adds.
+        inside = (u >= margin_px) & (u < camera.width - margin_px)
+        inside &= (v >= margin_px) & (v < camera.height - margin_px)
+        most = self._size(view)
+        rows, columns = (
+            np.clip(np.floor(each[inside] / STRIDE_PX), 0, side - 1).astype(np.intp)
+            for each, side in zip((v, u), most, strict=True)
+        )
+        ahead = ahead[inside]
+        return ahead, rows, columns, np.linalg.norm(points[ahead] - T_gc.t, axis=1)
+
     def _seen_by(
         self,
         number: int,
         points: Array,  # [M, 3] on the ground
     ) -> tuple[npt.NDArray[np.intp], Array, Array]:
         """Numbers [K] of the points that a view sees, unit vectors [K, 3] to them, ranges [K]."""
-        view, T_gc, z = self._views[number], self._poses[number], self._of(number)
-        camera = view.camera
-        local = (points - T_gc.t) @ T_gc.R
-        ahead = np.flatnonzero(local[:, 2] > 0.0)
-        u, v = camera.project(local[ahead]).T
-        inside = (u >= 0.0) & (u < camera.width) & (v >= 0.0) & (v < camera.height)
-        ahead = ahead[inside]
-        rows, columns = (np.floor(each[inside] / STRIDE_PX).astype(int) for each in (v, u))
-        offset = points[ahead] - T_gc.t
-        ranges = np.linalg.norm(offset, axis=1)
+        inside, rows, columns, ranges = self._projected(number, points)
+        offset = points[inside] - self._poses[number].t
+        z = self._of(number)
         same = np.abs(z[rows, columns] - ranges) <= SAME_RANGE * ranges
-        return ahead[same], offset[same] / ranges[same][:, None], ranges[same]
+        return inside[same], offset[same] / ranges[same][:, None], ranges[same]
 
 
 def _scratch(folder: Path, count: int) -> npt.NDArray[np.float16]:

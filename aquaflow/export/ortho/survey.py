@@ -81,7 +81,7 @@ def export_survey(
         ConfigError: the dive's settings cannot be read.
     """
     require_rasterio()
-    mapper, frame = _read(dive)
+    mapper, frame = read_map(dive)
     ground = ground_of(frame, mapper.views)
     ranges = ViewRanges(mapper, ground, out, progress and partial(progress, "views"))
     side = resolution or rounded(ranges.footprint)
@@ -139,8 +139,13 @@ class _Tiles:
         return TilePixels(solid & (views >= LEAST_VIEWS), drawn.height, sigma, views, picture)
 
 
-def _read(dive: Path) -> tuple[Mapper, MetricFrame]:
-    """The largest sub-map and how it lies in the world."""
+def read_map(dive: Path) -> tuple[Mapper, MetricFrame]:
+    """The largest sub-map of a dive and how it lies in the world.
+
+    Raises:
+        InputError: the dive has no map, or an empty one.
+        ConfigError: the dive's settings cannot be read.
+    """
     mapper = read_mapper(dive)
     if not mapper.views or len(mapper.gaussians) == 0:
         raise InputError(f"the map of {dive} is empty; map a recording that shows more")

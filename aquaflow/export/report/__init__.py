@@ -6,6 +6,7 @@ from aquaflow.export.report.data import (
     Measures,
     MediumCurves,
     PathPlot,
+    ReefRow,
     ReportData,
 )
 from aquaflow.export.report.page import render_report, write_report
@@ -16,6 +17,7 @@ __all__ = [
     "Measures",
     "MediumCurves",
     "PathPlot",
+    "ReefRow",
     "ReportData",
     "render_report",
     "write_report",

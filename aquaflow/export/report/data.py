@@ -61,6 +61,18 @@ class Measures:
 
 
 @dataclass(frozen=True)
+class ReefRow:
+    """A number of the ground, the path or the water, in words."""
+
+    label: str
+    value: str
+    """With 1 sigma."""
+    interval: str
+    """That holds the truth with 95 %."""
+    meaning: str
+
+
+@dataclass(frozen=True)
 class HeldOutExample:
     """A frame that the mapper never saw, and what the map shows from there."""
 
@@ -104,6 +116,7 @@ class ReportData:
     """``metrics.json``."""
     path: PathPlot | None = None
     measures: Measures | None = None
+    reef: list[ReefRow] = field(default_factory=list)
     timeline: list[str] = field(default_factory=list)
     """Class of every frame in order, also ``skipped``, ``lost`` and ``dropped``."""
     examples: list[HeldOutExample] = field(default_factory=list)

@@ -1,11 +1,11 @@
-"""The report's sections on metres, gravity and north, and on the telemetry behind them."""
+"""The report's sections on the ground, on metres, gravity and north, and on telemetry."""
 
 from __future__ import annotations
 
 import html
 from collections.abc import Sequence
 
-from aquaflow.export.report.data import Measures
+from aquaflow.export.report.data import Measures, ReefRow
 from aquaflow.fusion.metric_frame import SourceReport
 
 
@@ -21,6 +21,23 @@ def measures(data: Measures | None) -> str:
     return (
         f"<section><h2>Metres, gravity and north</h2><p>{said}</p><table>{rows}</table>"
         f"{_sources(data.sources)}</section>"
+    )
+
+
+def reef(rows: Sequence[ReefRow]) -> str:
+    """What a survey is made for: the ground in numbers."""
+    if not rows:
+        return ""
+    cells = "".join(
+        f"<tr><td>{html.escape(row.label)}</td><td>{html.escape(row.value)}</td>"
+        f"<td>{html.escape(row.interval)}</td><td>{html.escape(row.meaning)}</td></tr>"
+        for row in rows
+    )
+    return (
+        "<section><h2>The ground in numbers</h2><p>Each with 1 sigma, and the interval that holds "
+        "the truth with 95 %. They are of the largest sub-map; reef_numbers.csv has them too.</p>"
+        "<table><tr><th>what</th><th>value</th><th>95 %</th><th>meaning</th></tr>"
+        f"{cells}</table></section>"
     )
 
 

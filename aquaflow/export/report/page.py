@@ -28,6 +28,7 @@ def render_report(data: ReportData) -> str:
         sections.warnings(data),
         sections.tiles(data.metrics),
         sections.path(data),
+        measures.reef(data.reef),
         measures.measures(data.measures),
         sections.examples(data),
         sections.medium(data),

@@ -1,0 +1,139 @@
+"""The command that measures in a finished dive: ``measure``. Thin, like all of cli/."""
+
+from __future__ import annotations
+
+import json
+import math
+import tempfile
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from aquaflow.cli.console import Json, progress_bars
+from aquaflow.errors import InputError
+
+if TYPE_CHECKING:
+    from aquaflow.measure.answers import Answer
+    from aquaflow.measure.reef_numbers import ReefNumbers
+
+
+class Shape(str, Enum):
+    """What points are taken as."""
+
+    line = "line"
+    area = "area"
+    profile = "profile"
+
+
+MAP_FILE = "map.aqf"
+"""What every finished dive with a map has."""
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to ``app``."""
+    app.command("measure")(measure)
+
+
+def measure(
+    dive: Annotated[Path, typer.Argument(help="Dive folder.")],
+    point: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="x,y,z of the map, FRAME:u,v of a picture, or 63.4305N,10.3951E; once for each."
+        ),
+    ] = None,
+    shape: Annotated[
+        Shape | None,
+        typer.Option("--as", help="Two points are a line, more an area, unless this says else."),
+    ] = None,
+    cell: Annotated[
+        float | None,
+        typer.Option(help="m (map units without metres), cells of the ground; else found."),
+    ] = None,
+    note: Annotated[
+        str | None, typer.Option(help="Pin the measurement to the map with this text.")
+    ] = None,
+    csv: Annotated[Path | None, typer.Option(help="File for the numbers as a table.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Measure in a finished dive: the ground in numbers, or between points."""
+    if cell is not None and not (math.isfinite(cell) and cell > 0.0):
+        raise InputError(f"--cell {cell:g} is no size of a cell; give a positive one")
+    if not point and (shape is not None or note is not None):
+        raise InputError("--as and --note need points; give --point for each")
+    if not (dive / MAP_FILE).exists():
+        raise InputError(f"{dive} holds no finished dive: {MAP_FILE} is missing")
+    from aquaflow.measure.reef_files import numbers_of_dive, write_csv
+
+    with progress_bars(quiet=as_json) as bars, tempfile.TemporaryDirectory() as work:
+        found: Answer | ReefNumbers
+        if point:
+            found = _between(dive, point, shape, cell, Path(work), bars)
+        else:
+            found = numbers_of_dive(dive, Path(work), cell, bars)
+    if note is not None:
+        _pin(dive, note, found)
+    if csv is not None:
+        write_csv(csv, found.rows())
+    typer.echo(json.dumps(found.to_json()) if as_json else _in_words(found))
+
+
+def _between(
+    dive: Path,
+    texts: list[str],
+    shape: Shape | None,
+    cell: float | None,
+    work: Path,
+    progress: Any,
+) -> Answer:
+    from aquaflow.measure.asked import parse_point
+
+    asked = [parse_point(text) for text in texts]
+    from aquaflow.measure.answers import answer  # loads torch
+
+    return answer(dive, asked, None if shape is None else shape.value, work, cell, progress)
+
+
+def _pin(dive: Path, text: str, found: Any) -> None:
+    from aquaflow.export.map_file import SUFFIX
+    from aquaflow.fusion.metric_file import read_frame_of_map
+    from aquaflow.measure.notes import new_note, read_notes, write_notes
+
+    frame = read_frame_of_map(dive / f"map{SUFFIX}")
+    notes = read_notes(dive, frame)
+    measured = found.to_json()["measured"]
+    shape: Literal["Polygon", "LineString"] = "Polygon" if found.shape == "area" else "LineString"
+    note = new_note(notes, text, shape, found.places, {"measured": measured})
+    write_notes(dive, [*notes, note], frame)
+
+
+def _in_words(found: Any) -> str:
+    """Lines for people; of an answer or of reef numbers."""
+    if hasattr(found, "quantities"):
+        named = [(name.replace("_", " "), q) for name, q in found.quantities.items()]
+        said = list(found.notes)
+        if found.profile is not None:
+            ends = f"{found.profile.height.min():.3f} to {found.profile.height.max():.3f}"
+            said.append(
+                f"{len(found.profile.along)} heights from {ends} {found.profile.unit}; --csv or "
+                "--json gives them all."
+            )
+    else:
+        named = [(each.label, each.quantity) for each in found.numbers]
+        said = [f"{what}: unknown, {why}." for what, why in found.missing.items()]
+        if found.cell is not None:
+            said.append(
+                f"On cells of {found.cell:g} {found.unit}; vertical is {found.vertical}. Other "
+                "cells have other numbers: compare dives on the same --cell."
+            )
+        if found.unit != "m":
+            said.append(
+                "The dive has no metres: lengths are in map units; aquaflow scale gives it some."
+            )
+    width = max((len(name) for name, _ in named), default=0)
+    lines = [
+        f"{name:<{width}}  {q.in_words()}  (95 %: {q.low:.4g} to {q.high:.4g})" for name, q in named
+    ]
+    return "\n".join([*lines, *said])

@@ -1,0 +1,55 @@
+"""The reef numbers at the end of a dive, from the map that is still in memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from aquaflow.clocks.deadline import Deadline
+from aquaflow.dive.results import WaterSummary
+from aquaflow.errors import InputError
+from aquaflow.export.ortho.ground import Ground, ground_of
+from aquaflow.fusion.metric_frame import MetricFrame
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.measure.drawn_heights import draw_heights
+from aquaflow.measure.height_field import HeightField
+from aquaflow.measure.reef_numbers import ReefNumbers, Water, reef_numbers
+from aquaflow.measure.scale import scale_of
+
+
+def numbers_at_the_end(
+    mapper: Mapper | None,
+    frame: MetricFrame,
+    poses: list[Sim3],
+    water: WaterSummary | None,
+    work: Path,
+    until: Deadline | None = None,
+) -> ReefNumbers:
+    """Of the largest sub-map.
+
+    Args:
+        mapper: None: nothing was mapped.
+        poses: T_nc of its frames in order of time.
+        water: in the unit of ``frame``.
+        work: folder of a file that ends with the call.
+        until: when the ground is left out; None: never.
+    """
+
+    def in_time(stage: str, done: int, total: int) -> None:
+        if until is not None and until.over:
+            raise InputError(
+                f"the dive's end had no more time after {done} of {total} {stage} "
+                "(service.finish_s); aquaflow measure does it"
+            )
+
+    def draw() -> tuple[HeightField, Ground]:
+        if mapper is None or not mapper.views or len(mapper.gaussians) == 0:
+            raise InputError("the map is empty; map a recording that shows more")
+        ground = ground_of(frame, mapper.views)
+        return draw_heights(mapper, ground, work, progress=in_time), ground
+
+    places = np.array([T_nc.t for T_nc in poses]).reshape(-1, 3)
+    known = None if water is None else Water(water.beta_a, water.beta_a_sigma)
+    return reef_numbers(draw, places, known, scale_of(frame))

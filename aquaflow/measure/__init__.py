@@ -1,0 +1,1 @@
+"""What is measured in a finished dive: between marked points, and of the ground as a whole."""
