@@ -67,11 +67,12 @@ class PixelEquations:
             )
         ]  # fmt: skip
         addresses = [None if each is None else each.ctypes.data for each in self._columns]
-        self._given = given = _Equations(**dict(zip(_COLUMNS, addresses, strict=True)))
+        limits = {"behind": BEHIND, "most_change": MAX_DEPTH_CHANGE, "inlier": INLIER}
+        columns = dict(zip(_COLUMNS, addresses, strict=True))
+        self._given = given = _Equations(**columns, **limits)
         camera = matches.camera
         given.fx, given.fy, given.cx, given.cy = camera.fx, camera.fy, camera.cx, camera.cy
         given.count, given.sigma_px, given.huber = len(matches), matches.sigma_px, huber
-        given.behind, given.most_change, given.inlier = BEHIND, MAX_DEPTH_CHANGE, INLIER
 
     def at(self, T: Sim3) -> tuple[Array, Array, float]:
         """H [6, 6], g [6] and cost of the weighted Huber loss at ``T``."""
