@@ -61,6 +61,8 @@ def measure(
     """Measure in a finished dive: the ground in numbers, or between points."""
     if cell is not None and not (math.isfinite(cell) and cell > 0.0):
         raise InputError(f"--cell {cell:g} is no size of a cell; give a positive one")
+    if csv is not None and csv.suffix.lower() != ".csv":
+        raise InputError(f"{csv} does not end in .csv; give the table a file of its own")
     if not point and (shape is not None or note is not None):
         raise InputError("--as and --note need points; give --point for each")
     if not (dive / MAP_FILE).exists():

@@ -11,7 +11,7 @@ from typing import Any
 
 import typer
 
-OUTPUTS = frozenset({"out", "readme"})
+OUTPUTS = frozenset({"out", "readme", "csv"})
 """Parameters whose file or folder a command may write."""
 
 

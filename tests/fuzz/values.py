@@ -16,6 +16,7 @@ FITTING: dict[str, tuple[str, ...]] = {
     "pictures": ("pictures", "recording"),
     "dive": DIVES,
     "out": ("dive", "killed", "recording", "recorded", "README.md"),
+    "csv": ("positions.csv", "README.md"),
     "truth": ("recording", "poses.tum", "positions.csv", "dive"),
     "clean": RECORDINGS,
     "calib": ("camera.yaml", "fisheye.yaml"),

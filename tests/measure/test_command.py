@@ -168,6 +168,7 @@ ENDS = ("--point", "1,1,9.9", "--point", "2,2,9.9")
         (("--point", "10.0N,10.0E", "--point", "63.0N,10.0E"), "no ground at"),
         ((*ENDS, "--point", "1,2,9.9", "--as", "profile"), "between 2 points"),
         ((*ENDS, "--cell", "nan"), "--cell nan is no size"),
+        ((*ENDS, "--csv", "clip.mp4"), "does not end in .csv"),
         (("--as", "line"), "need points"),
         (("--note", "text"), "need points"),
     ],
