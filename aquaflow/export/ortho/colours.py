@@ -32,6 +32,11 @@ class Colours:
         self._water = _mean_water(mapper)
         self._exposure = exposure_of_looks(mapper) if water_range is None else 1.0
 
+    @property
+    def device(self) -> torch.device:
+        """Of the map, and of the radiance that is handed in."""
+        return self._scene.device
+
     @torch.no_grad()
     def of(
         self,
