@@ -38,10 +38,15 @@ class Seen:
     """[M] 1 sigma of the place in the direction that is known least, where rays meet that are each
     known to PICTURE_SIGMA_PX, in the mesh's unit; infinite of what fewer than two views see."""
 
+    footprint: Array
+    """[M] smallest width of a picture's pixel there, in the mesh's unit; infinite of what none
+    sees."""
+
     @property
-    def relative_sigma(self) -> Array:
-        """[M] sigma over the range of the nearest view; infinite where sigma is."""
-        return np.where(np.isfinite(self.sigma), self.sigma / self.nearest, np.inf)
+    def sigma_px(self) -> Array:
+        """[M] sigma in widths of a pixel; infinite where sigma is."""
+        known = np.isfinite(self.sigma)
+        return np.where(known, self.sigma / np.where(known, self.footprint, 1.0), np.inf)
 
 
 def look_at(
@@ -52,7 +57,8 @@ def look_at(
     """How the views see ``places`` of the surface."""
     count = len(places)
     total, weights = np.zeros((count, 3)), np.zeros(count)
-    nearest, information = np.full(count, np.inf), np.zeros((count, 3, 3))
+    nearest, footprint = np.full(count, np.inf), np.full(count, np.inf)
+    information = np.zeros((count, 3, 3))
     for number in surfaces.around(places.min(axis=0), places.max(axis=0)):
         view, layers = surfaces.views[number], surfaces.surface(number)
         offset = places - view.T_uc.t
@@ -72,12 +78,13 @@ def look_at(
         nearest[ahead] = np.minimum(nearest[ahead], ranges)
         rays = offset[ahead] / ranges[:, None]
         across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-        sigma = PICTURE_SIGMA_PX / view.camera.fx * ranges
-        information[ahead] += across / (sigma**2)[:, None, None]
+        width = ranges / view.camera.fx
+        footprint[ahead] = np.minimum(footprint[ahead], width)
+        information[ahead] += across / ((PICTURE_SIGMA_PX * width) ** 2)[:, None, None]
     least = np.linalg.eigvalsh(information)[:, 0]
     with np.errstate(divide="ignore"):
         sigma = np.where(least > 0.0, 1.0 / np.sqrt(np.maximum(least, 0.0)), np.inf)
-    return Seen(total / np.maximum(weights, 1e-30)[:, None], nearest, sigma)
+    return Seen(total / np.maximum(weights, 1e-30)[:, None], nearest, sigma, footprint)
 
 
 def batches(count: int) -> Iterator[slice]:

@@ -40,10 +40,10 @@ VOXEL_PX = 2.0
 """Side of a voxel, in pixels of the mapped pictures at the median range."""
 LEAST_VIEWS = 2
 """That show a place, or it is a hole: one view alone has no parallax. As in the ortho."""
-MOST_SIGMA = 0.03
-"""Sigma of a vertex, from where rays meet, over the range of the nearest view, beyond which it is a
-hole: rendered ranges err by 1 to 3 % (docs/benchmarks.md), and what no two views see from apart is
-smears along their rays. On the reef, which is filmed forwards, that is the far ground."""
+MOST_SIGMA_PX = 8.0
+"""Sigma of a vertex, from where rays meet, beyond which it is a hole, in widths of a pixel there:
+two rays that cross at 10 degrees leave as much along them. What is seen from less apart is smears;
+on the reef, which is filmed forwards, 11 and 18 leave some of the far ground."""
 LEAST_PIECE_VOXELS = 30.0
 """Side of the square whose area a piece of the surface has at least; what is smaller is haze or a
 fish."""
@@ -153,7 +153,7 @@ def _surface(views: ViewSurfaces, voxel: float, report: Progress) -> _Surface:
         builder.add(chunk, fused(views, chunk, voxel, LEAST_VIEWS))
         report("fusion", done + 1, blocks.chunk_count())
     mesh = builder.mesh()
-    known = _sigmas(views, mesh, voxel, relative=True) <= MOST_SIGMA
+    known = _sigmas(views, mesh, voxel, in_pixels=True) <= MOST_SIGMA_PX
     mesh = mesh.with_faces(np.asarray(known[mesh.faces].all(axis=1)))
     mesh = mesh.without_small_pieces((LEAST_PIECE_VOXELS * voxel) ** 2)
     if not len(mesh.faces):
@@ -164,12 +164,14 @@ def _surface(views: ViewSurfaces, voxel: float, report: Progress) -> _Surface:
     return _Surface(mesh, _sigmas(views, mesh, voxel), views, voxel)
 
 
-def _sigmas(views: ViewSurfaces, mesh: TriangleMesh, voxel: float, relative: bool = False) -> Array:
-    """[N] of the vertices, in the mesh's unit, or over the range of the nearest view."""
+def _sigmas(
+    views: ViewSurfaces, mesh: TriangleMesh, voxel: float, in_pixels: bool = False
+) -> Array:
+    """[N] of the vertices, in the mesh's unit, or in widths of a pixel there."""
     found = [np.empty(0)]
     for part in batches(len(mesh.vertices)):
         seen = look_at(views, mesh.vertices[part], voxel)
-        found.append(seen.relative_sigma if relative else seen.sigma)
+        found.append(seen.sigma_px if in_pixels else seen.sigma)
     return np.concatenate(found)
 
 
