@@ -34,8 +34,9 @@ from aquaflow.fusion.metric_file import write_metric_file
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.mapping.clear_colours import restored_gaussians
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.transfers import map_out, water_in
+from aquaflow.mapping.transfers import map_out
 from aquaflow.recording.telemetry_lines import NAME as TELEMETRY
 from aquaflow.render.activation import radiance
 from aquaflow.storage.atomic import atomic_write, write_json, write_yaml
@@ -274,7 +275,7 @@ class DiveFolder:
                 medium = water_of(water, clear.device)
                 z = torch.full((len(clear),), water.range_median, device=clear.device)
                 seen = clear * medium.transmission(z) + medium.backscatter(z)
-                clear = clear * water_in(water.white_gain, clear.device)
+                clear = restored_gaussians(mapper.scene, clear, mapper.views)
             for name, colours in (("map", seen), ("map_clear", clear)):
                 splats = _splats(plain, colours)
                 if not frame.is_identity:
