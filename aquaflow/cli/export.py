@@ -24,6 +24,9 @@ class ExportFormat(str, Enum):
     colmap = "colmap"
     nerfstudio = "nerfstudio"
     spz = "spz"
+    ply = "ply"
+    obj = "obj"
+    glb = "glb"
     ortho = "ortho"
     dem = "dem"
 
@@ -35,6 +38,9 @@ NAMES = {
     ExportFormat.colmap: "colmap",
     ExportFormat.nerfstudio: "nerfstudio",
     ExportFormat.spz: "map.spz",
+    ExportFormat.ply: "mesh.ply",
+    ExportFormat.obj: "mesh.obj",
+    ExportFormat.glb: "mesh.glb",
     ExportFormat.ortho: "ortho",
     ExportFormat.dem: "dem",
 }
@@ -46,10 +52,19 @@ OPTIONS = {
     ExportFormat.colmap: {"--recording", "--restored"},
     ExportFormat.nerfstudio: {"--recording", "--restored"},
     ExportFormat.spz: {"--water"},
+    ExportFormat.ply: {"--water", "--resolution"},
+    ExportFormat.obj: {"--water", "--resolution"},
+    ExportFormat.glb: {"--water", "--resolution"},
     ExportFormat.ortho: {"--water", "--resolution"},
     ExportFormat.dem: {"--resolution"},
 }
 """Which options a format knows, besides --out and --json."""
+MESHES: dict[ExportFormat, Literal["ply", "obj", "glb"]] = {
+    ExportFormat.ply: "ply",
+    ExportFormat.obj: "obj",
+    ExportFormat.glb: "glb",
+}
+"""Formats that are triangles."""
 
 MAP_FILE = "map.aqf"
 """What every finished dive with a map has."""
@@ -69,6 +84,7 @@ def export(
         typer.Option(
             help="restored: frames without their water. laz, e57: the map as points. "
             "colmap, nerfstudio: pictures, poses and points. spz: the map, compressed. "
+            "ply, obj, glb: the surface as triangles. "
             "ortho: the ground from straight above. dem: its heights."
         ),
     ],
@@ -84,7 +100,9 @@ def export(
     ] = False,
     resolution: Annotated[
         float | None,
-        typer.Option(help="m a pixel (map units without metres); without it, as in the pictures."),
+        typer.Option(
+            help="m a pixel or voxel (map units without metres); without it, as in the pictures."
+        ),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="File or folder to write; else in the dive's.")
@@ -116,6 +134,8 @@ def export(
         elif format in (ExportFormat.ortho, ExportFormat.dem):
             kind: Literal["ortho", "dem"] = "dem" if format is ExportFormat.dem else "ortho"
             said, facts = _survey(dive, target, kind, resolution, water, bars)
+        elif format in MESHES:
+            said, facts = _mesh(dive, target, MESHES[format], resolution, water, bars)
         else:
             said, facts = _posed_pictures(dive, target, format, recording, restored, progress)
     if as_json:
@@ -164,6 +184,32 @@ def _compressed(dive: Path, path: Path, water: bool) -> tuple[str, dict[str, Any
     count, where = export_spz(dive, path, water)
     facts = {"gaussians": count, "unit": where.unit}
     return f"Wrote {count} Gaussians to {path}; lengths are {where.unit}, y is up.", facts
+
+
+def _mesh(
+    dive: Path,
+    path: Path,
+    kind: Literal["ply", "obj", "glb"],
+    resolution: float | None,
+    water: bool,
+    bars: Callable[[str, int, int], None],
+) -> tuple[str, dict[str, Any]]:
+    from aquaflow.export.mesh.export_mesh import export_mesh
+
+    mesh = export_mesh(dive, path, kind, resolution, water, bars)
+    unit, names = mesh.where.unit, " and ".join(str(file) for file in mesh.files)
+    said = [
+        f"Wrote {names}: {mesh.triangles} triangles of {mesh.voxel:g} {unit}, {mesh.seen}.",
+        f"Coordinates: {mesh.where.in_words()}"
+        + (f", less {mesh.origin[0]:g}, {mesh.origin[1]:g}." if mesh.where.epsg else "."),
+    ]
+    return "\n".join(said), {
+        "files": [str(file) for file in mesh.files],
+        "vertices": mesh.vertices, "triangles": mesh.triangles, "area": mesh.area,
+        "resolution": mesh.voxel, "sigma": mesh.sigma, "texture": mesh.texture,
+        "unit": unit, "epsg": mesh.where.epsg, "axes": mesh.where.in_words(),
+        "origin": mesh.origin, "colours": mesh.seen,
+    }  # fmt: skip
 
 
 def _posed_pictures(

@@ -12,8 +12,9 @@ from aquaflow.dive.water_summary import water_of
 from aquaflow.export.map_file import write_map_file
 from aquaflow.export.ply import PlyGaussians, write_ply
 from aquaflow.fusion.metric_frame import MetricFrame
+from aquaflow.mapping.clear_colours import restored_gaussians
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.transfers import map_out, water_in
+from aquaflow.mapping.transfers import map_out
 from aquaflow.render.activation import radiance
 
 
@@ -34,7 +35,7 @@ def write_splats(
             medium = water_of(water, clear.device)
             z = torch.full((len(clear),), water.range_median, device=clear.device)
             seen = clear * medium.transmission(z) + medium.backscatter(z)
-            clear = clear * water_in(water.white_gain, clear.device)
+            clear = restored_gaussians(mapper.scene, clear, mapper.views)
         for name, colours in (("map", seen), ("map_clear", clear)):
             splats = _splats(plain, colours)
             if not frame.is_identity:

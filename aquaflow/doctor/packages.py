@@ -38,6 +38,8 @@ PACKAGES = (
     Package("pye57", "pye57", "survey", "points of a dive as E57"),
     Package("viser", "viser", "viewer", "the map in a browser"),
     Package("rasterio", "rasterio", "survey", "orthos and heights as GeoTIFF"),
+    Package("scikit-image", "skimage", "survey", "the surface of a dive as triangles"),
+    Package("xatlas", "xatlas", "survey", "textured meshes: OBJ and GLB"),
     Package("depthai", "depthai", "oak", "Luxonis OAK cameras"),
     Package("onnxruntime", "onnxruntime", "prior", "learned priors"),
     Package("kornia", "kornia", "prior-peers", "the priors xfeat and aliked"),

@@ -71,7 +71,10 @@ def exposure_without_water(dive: Path, mapper: Mapper) -> float:
 def exposure_of_looks(mapper: Mapper) -> float:
     """The one gain at which the map's clean radiance is shown, judged by some of its views."""
     shown = in_time(mapper.views)[:: max(1, len(mapper.views) // LOOKS)]
-    return common_exposure(mapper.scene.balanced(mapper.show(view).radiance) for view in shown)
+    scene = mapper.scene
+    return common_exposure(
+        drawn_without_water(scene, view, mapper.show(view)).image for view in shown
+    )
 
 
 def restored_frames(
@@ -86,7 +89,7 @@ def restored_frames(
     views = in_time(mapper.views)
     if recording is None:
         for view in views:
-            yield view.frame_index, drawn_without_water(mapper.scene, mapper.show(view))
+            yield view.frame_index, drawn_without_water(mapper.scene, view, mapper.show(view))
         return
     for view, image in recorded_pictures(dive, recording, views):
         picture = restored_picture(mapper.scene, _with_picture(view, image), mapper.show(view))

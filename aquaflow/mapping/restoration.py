@@ -11,11 +11,13 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from aquaflow.mapping.clear_colours import restored_radiance
 from aquaflow.mapping.rendering import Shown
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.transfers import picture_out, water_in
 from aquaflow.mapping.views import View
 from aquaflow.mapping.water.posed_picture import SOLID
+from aquaflow.render.water import MIN_SOLID
 
 EDGE_PX = 3.0
 """Deviation of the Gaussian over which open water begins."""
@@ -55,15 +57,16 @@ def restored_picture(scene: Scene, view: View, shown: Shown) -> RestoredPicture:
     """The picture without water, at the ranges that the map ``shown`` from the view has, in the
     white balance that the camera had for what was nearest (see water/white_balance.py).
 
-    Where the vehicle is in the picture, the map's own radiance. J-hat keeps the detail that the map
-    has lost: on synthetic dives it is 5 dB closer to the clean scene than the map's radiance
-    everywhere. What was not mapped stays as the camera saw it. Open water is black, as what was
-    removed ends nowhere; or as the camera saw it; or black with alpha 0 (``medium.open_water``).
+    Where the vehicle is in the picture, the map's own radiance, bounded alike. J-hat keeps the
+    detail that the map has lost: on synthetic dives it is 5 dB closer to the clean scene than the
+    map's radiance everywhere. What was not mapped stays as the camera saw it. Open water is black,
+    as what was removed ends nowhere; or as the camera saw it; or black with alpha 0
+    (``medium.open_water``).
     """
     camera, solid = scene.evenly_lit(view), shown.alpha > SOLID
     recovered, open_water = scene.recovered(view, camera, shown.z), scene.open_water(view, camera)
     usable = solid & view.scene_mask()
-    image = torch.where(usable[..., None], recovered.picture, scene.balanced(shown.radiance))
+    image = torch.where(usable[..., None], recovered.picture, _own_colours(scene, view, shown))
     image = image + ((1.0 - shown.alpha) * ~usable)[..., None] * camera
     usable = usable & ~open_water
     amplification = None
@@ -89,13 +92,24 @@ def _with_soft_edge(
 
 
 @torch.no_grad()
-def drawn_without_water(scene: Scene, shown: Shown) -> RestoredPicture:
-    """The map's own radiance in place of a picture; nothing of it was restored from one."""
-    solid, image = shown.alpha > SOLID, scene.balanced(shown.radiance)
+def drawn_without_water(scene: Scene, view: View, shown: Shown) -> RestoredPicture:
+    """The map's own radiance from the view in place of a picture, as bounded as one; nothing of it
+    was restored from one."""
+    solid, image = shown.alpha > SOLID, _own_colours(scene, view, shown)
     opaque = None
     if scene.config.open_water == "removed":
         image, opaque = image * solid[..., None], solid
     return RestoredPicture(image, torch.zeros_like(shown.alpha), opaque, None)
+
+
+def _own_colours(scene: Scene, view: View, shown: Shown) -> Tensor:
+    """[H, W, 3] the map's radiance without the view's water, premultiplied by alpha."""
+    water = scene.water(view)
+    if water is None:
+        return shown.radiance
+    alpha = shown.alpha.clamp_min(MIN_SOLID)[..., None]
+    own = restored_radiance(scene, shown.radiance / alpha, shown.z, water).picture
+    return own * alpha
 
 
 def common_exposure(

@@ -117,9 +117,9 @@ def test_open_water_is_transparent_where_it_is_to_be_removed() -> None:
 
 
 def test_without_a_picture_what_the_map_has_not_is_transparent() -> None:
-    scene, _, shown = with_open_water("removed")
+    scene, view, shown = with_open_water("removed")
     shown.alpha[:10] = 0.2
-    picture = drawn_without_water(scene, shown).picture_bytes(1.0)
+    picture = drawn_without_water(scene, view, shown).picture_bytes(1.0)
     np.testing.assert_array_equal(picture[..., 3] == 255, (shown.alpha > 0.5).numpy())
     assert not picture[:10].any()
 
@@ -166,8 +166,8 @@ def test_a_picture_of_nothing_but_open_water_has_no_amplification() -> None:
 def test_the_map_s_own_radiance_is_restored_from_no_picture() -> None:
     scene, view = submerged()
     shown = scene.show(view)
-    drawn = drawn_without_water(scene, shown)
-    assert torch.equal(drawn.image, shown.radiance)
+    drawn = drawn_without_water(scene, view, shown)
+    torch.testing.assert_close(drawn.image, shown.radiance)
     assert not drawn.confidence.any()
     assert drawn.opaque is None
 

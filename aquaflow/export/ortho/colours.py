@@ -1,9 +1,8 @@
 """What colours an ortho shows: the scene without its water, or through a stated depth of it.
 
 Without water, a pixel is what restoration makes of it at the range from which the nearest view saw
-it (mapping/water/white_balance.py): the map's radiance is put behind the water of that range and
-recovered, so that no channel is amplified beyond what its light there allows, and a channel of
-which the pictures had too little follows the others. Restored frames are bounded by the same rule.
+it (mapping/clear_colours.py): no channel is amplified beyond what its light there allows, and a
+channel of which the pictures had too little follows the others.
 """
 
 from __future__ import annotations
@@ -14,10 +13,10 @@ import torch
 from torch import Tensor
 
 from aquaflow.export.restored import exposure_of_looks
+from aquaflow.mapping.clear_colours import mean_water, restored_radiance
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import to_bytes
 from aquaflow.mapping.transfers import picture_out, water_in
-from aquaflow.mapping.water.image_formation import Water
 
 Array = npt.NDArray[np.float64]
 
@@ -29,8 +28,13 @@ class Colours:
         """``unit``: of the ground's lengths for each map unit; ``water_range``: of the water to
         look through, in the ground's unit, or None for no water."""
         self._scene, self._unit, self._through = mapper.scene, unit, water_range
-        self._water = _mean_water(mapper)
+        self._water = mean_water(mapper.scene, mapper.views)
         self._exposure = exposure_of_looks(mapper) if water_range is None else 1.0
+
+    @property
+    def device(self) -> torch.device:
+        """Of the map, and of the radiance that is handed in."""
+        return self._scene.device
 
     @torch.no_grad()
     def of(
@@ -45,26 +49,12 @@ class Colours:
         seen_from = nearest if self._through is None else np.full(nearest.shape, self._through)
         z = np.where(np.isfinite(seen_from), seen_from, 0.0) / self._unit
         ranges = water_in(z, radiance.device)
-        water = self._water
-        seen = radiance * water.transmission(ranges) + water.backscatter(ranges)
         if self._through is not None:
+            water = self._water
+            seen = radiance * water.transmission(ranges) + water.backscatter(ranges)
             return to_bytes(picture_out(seen)), sure
-        if self._scene.balance is None:
-            picture, share = water.restore(seen, ranges)
-        else:
-            recovered = self._scene.balance.recover(seen, ranges, water)
-            picture, share = recovered.picture, recovered.confidence
+        recovered = restored_radiance(self._scene, radiance, ranges, self._water)
         return (
-            to_bytes(self._exposure * picture_out(picture)),
-            picture_out(share).astype(np.float32),
+            to_bytes(self._exposure * picture_out(recovered.picture)),
+            picture_out(recovered.confidence).astype(np.float32),
         )
-
-
-def _mean_water(mapper: Mapper) -> Water | None:
-    """The water of the mean view; None where there is none."""
-    with torch.no_grad():
-        waters = [water for view in mapper.views if (water := mapper.scene.water(view))]
-        if not waters:
-            return None
-        first, beta_a = waters[0], torch.stack([water.beta_a for water in waters]).mean(0)
-    return Water(beta_a, first.B_inf, first.b, first.B_res, first.d)

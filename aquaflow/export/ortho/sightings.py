@@ -6,8 +6,6 @@ what lies behind something else, or stands in the water that the view looks thro
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +20,7 @@ from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.transfers import picture_out
 from aquaflow.mapping.views import View, in_time
 from aquaflow.mapping.water.posed_picture import SOLID
+from aquaflow.storage.scratch import scratch_array
 
 Array = npt.NDArray[np.float64]
 
@@ -70,7 +69,7 @@ class ViewRanges:
         self._poses: list[Sim3] = [ground.pose(view.T_wc) for view in self._views]
         sizes = [self._size(view) for view in self._views]
         self._starts = np.concatenate([[0], np.cumsum([rows * columns for rows, columns in sizes])])
-        self._all = _scratch(work, int(self._starts[-1]))
+        self._all = scratch_array(work, (int(self._starts[-1]),), np.float16)
         for number, view in enumerate(self._views):
             shown = mapper.show(view)
             z = picture_out(shown.z) * ground.T_gm.scale
@@ -198,21 +197,6 @@ class ViewRanges:
         z = self._of(number)
         same = np.abs(z[rows, columns] - ranges) <= SAME_RANGE * ranges
         return inside[same], offset[same] / ranges[same][:, None], ranges[same]
-
-
-def _scratch(folder: Path, count: int) -> npt.NDArray[np.float16]:
-    """[count] numbers in a file without a name, whose room is taken at once: a disk that fills up
-    later would end the process."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder) as stream:
-            os.posix_fallocate(stream.fileno(), 0, max(1, count) * np.dtype(np.float16).itemsize)
-            return np.memmap(stream, np.float16, "r+", shape=(max(1, count),))
-    except OSError as error:
-        raise InputError(
-            f"cannot write to {folder}: {error.strerror or error}; give a folder with room that "
-            "can be written to"
-        ) from error
 
 
 def _height_sigma(

@@ -1,0 +1,1 @@
+"""A dive's surface as triangles: ranges drawn from the Gaussians, fused, coloured and written."""
