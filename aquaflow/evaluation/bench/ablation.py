@@ -100,6 +100,8 @@ PARTS = (
     AblatedPart("without pose refinement", {"mapping": {"optimiser": {"poses": 0.0}}}),
     AblatedPart("without depth loss", {"mapping": {"loss": {"depth": 0.0}}}),
     AblatedPart("without loop closure", _tracking(graph={"enabled": False})),
+    AblatedPart("without the monitor of scale", _tracking(monitor={"enabled": False})),
+    AblatedPart("without adjustment at the end", _tracking(adjustment={"at_end": False})),
     AblatedPart("without masking of overlays", _tracking(mask_overlays=False)),
     AblatedPart("without joint adjustment", _tracking(adjustment={"enabled": False})),
     AblatedPart("with neural Gaussians (LGPD)", _decoder()),
@@ -127,6 +129,11 @@ PARTS = (
     AblatedPart("skip off: encoder features reused", _tracking(reuse_encodings=False)),
     AblatedPart("skip off: matching seeded by motion", _tracking(seed_matching=False)),
     AblatedPart("skip off: solver stops when converged", _tracking(stop_converged=False)),
+    AblatedPart("skip off: crowded places searched once a second", _tracking(crowd_look_s=0.0)),
+    AblatedPart(
+        "skip off: keyframes adjusted again when a quarter are new",
+        _tracking(adjustment={"at_loops_share": 0.0}),
+    ),
     AblatedPart("skip off: retrieval only at keyframes", built=False),
     AblatedPart("without exposure of each view", _medium(exposure=False)),
     AblatedPart("without sunlight on each view", {"mapping": {"sunlight": {"enabled": False}}}),
@@ -139,6 +146,10 @@ PARTS = (
     AblatedPart(
         "skip off: views already explained",
         {"mapping": {"optimiser": {"skip_explained": False}}},
+    ),
+    AblatedPart(
+        "skip off: light, and all tiles, at one look in four",
+        {"mapping": {"optimiser": {"full_look_every": 1}}},
     ),
     AblatedPart(
         "skip off: tiles at the noise floor",

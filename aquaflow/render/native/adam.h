@@ -29,8 +29,9 @@ struct AdamGroup {
 
 // Its square is still finite; NaN fails the comparison too.
 constexpr float kLargestGradient = 1e18f;
-constexpr int kAdamRows = 8192;  // of a chunk: long runs of each array; its gradients stay cached
-constexpr int kAdamBlock = 64;   // rows stepped or passed over together
+constexpr int kAdamRows = 16384;  // of a chunk: long runs of each array; its gradients stay cached
+constexpr int kAdamBlock = 64;   // rows that are passed over together
+constexpr int kAdamRun = 1024;   // rows stepped together if their counts are equal
 constexpr int kAdamRowsPerThread = 4096;  // fewer are done before another thread is awake
 
 struct AdamStep {
@@ -71,12 +72,19 @@ AQ_INLINE void step_element(const AdamCoefficients& k, float bias1, float bias2,
   param -= stepped ? change : 0.0f;
 }
 
-// Calls visit(first row, rows) for the blocks of [begin, begin + rows) with a visible row.
+// Calls visit(first row, rows) for runs of neighbouring blocks of [begin, begin + rows) that have a
+// visible row each.
 template <class Visit>
-AQ_INLINE void each_visible_block(const AdamStep& s, int begin, int rows, const Visit& visit) {
-  for (int row = begin; row < begin + rows; row += kAdamBlock) {
-    const int size = std::min(kAdamBlock, begin + rows - row);
-    if (std::memchr(s.visible + row, 1, size)) visit(row, size);
+AQ_INLINE void each_visible_run(const AdamStep& s, int begin, int rows, const Visit& visit) {
+  const int end = begin + rows;
+  int first = begin;  // of the run that is being collected
+  for (int row = begin; row < end; row += kAdamBlock) {
+    const int size = std::min(kAdamBlock, end - row);
+    const bool seen = std::memchr(s.visible + row, 1, size) != nullptr;
+    const int last = seen ? row + size : row;
+    if (last > first && (!seen || last == end || last - first == kAdamRun))
+      visit(first, last - first), first = last;
+    if (!seen) first = row + size;
   }
 }
 
@@ -98,10 +106,20 @@ AQ_INLINE bool sound_row(const AdamStep& s, int row) {
 static bool sound_rows(const AdamStep& s, int begin, int rows) {
   bool all = true;
   for (int g = 0; g < s.groups; g++)
-    each_visible_block(s, begin, rows, [&](int row, int size) {
+    each_visible_run(s, begin, rows, [&](int row, int size) {
       all &= sound(s.group[g].gradient + (size_t)row * s.group[g].dim, size * s.group[g].dim);
     });
   return all;
+}
+
+// Whether all rows are visible and have the same count of steps.
+AQ_INLINE bool in_step(const uint8_t* visible, const int32_t* steps, int rows) {
+  if (std::memchr(visible, 0, rows)) return false;
+  const int32_t first = steps[0];
+  int other = 0;
+#pragma omp simd reduction(| : other)
+  for (int j = 0; j < rows; j++) other |= steps[j] ^ first;
+  return !other;
 }
 
 // Counts the steps of the rows and returns how many are visible but not sound.
@@ -109,6 +127,14 @@ static int start_rows(const AdamStep& s, int begin, int rows, bool all_sound, fl
                       float* bias2) {
   const uint8_t* visible = s.visible + begin;
   int32_t* steps = s.steps + begin;
+  if (all_sound && in_step(visible, steps, rows)) {
+    const int32_t count = steps[0];
+    const float* at = s.bias + 2 * (size_t)std::min(count, s.bias_rows - 1);
+    std::fill(bias1, bias1 + rows, at[0]);
+    std::fill(bias2, bias2 + rows, at[1]);
+    std::fill(steps, steps + rows, count + 1);
+    return 0;
+  }
   int skipped = 0;
   for (int j = 0; j < rows; j++) {
     const bool stepped = visible[j] & (all_sound || sound_row(s, begin + j));
@@ -119,6 +145,15 @@ static int start_rows(const AdamStep& s, int begin, int rows, bool all_sound, fl
     skipped += visible[j] - stepped;
   }
   return skipped;
+}
+
+// Whether all rows are stepped, and at the same count.
+AQ_INLINE bool uniform(const float* bias1, int rows) {
+  const float first = bias1[0];
+  int other = first == 0;
+#pragma omp simd reduction(| : other)
+  for (int j = 0; j < rows; j++) other |= bias1[j] != first;
+  return !other;
 }
 
 // Each row's value once for each of its elements: the existing array, or `buffer`.
@@ -161,9 +196,19 @@ static void step_long_rows(const AdamCoefficients& k, const AdamGroup& g, int be
   }
 }
 
-static void step_rows(const AdamStep& s, const AdamGroup& g, int begin, int rows,
+// Rows that all have the same bias, of any length, as one array.
+static void step_uniform_rows(const AdamCoefficients& k, const AdamGroup& g, int begin, int rows,
+                              float bias1, float bias2) {
+  const size_t at = (size_t)begin * g.dim;
+  float *param = g.param + at, *m = g.first_moment + at, *v = g.second_moment + at;
+  const float* gradient = g.gradient + at;
+#pragma omp simd
+  for (int i = 0; i < g.dim * rows; i++)
+    step_element(k, bias1, bias2, gradient[i], param[i], m[i], v[i]);
+}
+
+static void step_rows(const AdamCoefficients& k, const AdamGroup& g, int begin, int rows,
                       const float* bias1, const float* bias2) {
-  const AdamCoefficients k(s, g);
   switch (g.dim) {
     case 1: return step_short_rows<1>(k, g, begin, rows, bias1, bias2);
     case 2: return step_short_rows<2>(k, g, begin, rows, bias1, bias2);
@@ -173,17 +218,25 @@ static void step_rows(const AdamStep& s, const AdamGroup& g, int begin, int rows
   }
 }
 
+static void step_run(const AdamStep& s, const AdamGroup& g, int begin, int rows,
+                     const float* bias1, const float* bias2) {
+  const AdamCoefficients k(s, g);
+  if (uniform(bias1, rows)) return step_uniform_rows(k, g, begin, rows, bias1[0], bias2[0]);
+  for (int row = 0; row < rows; row += kAdamBlock)
+    step_rows(k, g, begin + row, std::min(kAdamBlock, rows - row), bias1 + row, bias2 + row);
+}
+
 static int step_chunk(const AdamStep& s, int begin, int rows) {
   ChunkBias bias;
   const bool all_sound = sound_rows(s, begin, rows);
   int skipped = 0;
-  each_visible_block(s, begin, rows, [&](int row, int size) {
+  each_visible_run(s, begin, rows, [&](int row, int size) {
     const int at = row - begin;
     skipped += start_rows(s, row, size, all_sound, bias.first + at, bias.second + at);
   });
   for (int g = 0; g < s.groups; g++)
-    each_visible_block(s, begin, rows, [&](int row, int size) {
-      step_rows(s, s.group[g], row, size, bias.first + row - begin, bias.second + row - begin);
+    each_visible_run(s, begin, rows, [&](int row, int size) {
+      step_run(s, s.group[g], row, size, bias.first + row - begin, bias.second + row - begin);
     });
   return skipped;
 }
