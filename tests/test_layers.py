@@ -16,7 +16,7 @@ FLOORS = (
     {"evaluation", "service", "doctor"},
     {"dive", "viewer", "training"},
     {"slam", "export", "sim_drivers"},
-    {"tracking", "mapping", "recording", "drivers", "calibration"},
+    {"tracking", "mapping", "coverage", "recording", "drivers", "calibration"},
     {"keyframes", "sources", "synthetic", "fusion"},
     {"prior", "messages", "storage", "access"},
     {"config", "geometry", "render"},
