@@ -43,6 +43,20 @@ class PageView:
         """Of a class, in the square of ``unit``."""
         return self.plan.area(seen) * self.scale**2
 
+    def rescaled(self, times: float, unit: str) -> PageView:
+        """The same in another unit, of which one of before is ``times``."""
+        state = self.state
+        lines = [
+            replace(each, start=times * each.start, end=times * each.end) for each in state.lines
+        ]
+        line = state.suggestion
+        line = line and replace(line, start=times * line.start, end=times * line.end)
+        return replace(
+            self, to_page=times * self.to_page, scale=times * self.scale, unit=unit,
+            path=times * self.path,
+            state=LineState(lines, times * state.swath, state.overlap, line),
+        )  # fmt: skip
+
     def classes_at(
         self,
         places: Array,  # [..., 2] on the page

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from aquaflow.coverage import DiveCoverage, PageView, Seen, mapping_range
 from aquaflow.coverage.coverage_file import NAME, write_coverage_file
 from aquaflow.coverage.picture import coverage_png
-from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.metric_outputs import MetricOutputs
 from aquaflow.dive.results import WaterSummary
 from aquaflow.slam import Slam
-from aquaflow.storage.atomic import atomic_write
+from aquaflow.storage.atomic import atomic_write, write_json
 
 NUMBERS, PICTURE = "coverage.json", "coverage.png"
 """In the dive's folder, beside NAME."""
@@ -45,18 +45,19 @@ def current_views(
     return coverage.views(slam.keyframes, outputs.frame, limits)
 
 
-def write_coverage(folder: DiveFolder, views: Mapping[int, PageView], main: int) -> None:
-    """coverage.npz, coverage.json and, of the ``main`` sub-map, coverage.png; without views none.
+def write_coverage(dive: Path, views: Mapping[int, PageView], main: int) -> None:
+    """coverage.npz, coverage.json and, of the ``main`` sub-map, coverage.png, into the folder of a
+    dive; without views none.
 
     Raises:
         InputError: a file cannot be written.
     """
     if not views:
         return
-    write_coverage_file(folder.path / NAME, views)
-    folder.write_json(NUMBERS, {str(number): numbers(view) for number, view in views.items()})
+    write_coverage_file(dive / NAME, views)
+    write_json(dive / NUMBERS, {str(number): numbers(view) for number, view in views.items()})
     if main in views:
-        with atomic_write(folder.path / PICTURE) as stream:
+        with atomic_write(dive / PICTURE) as stream:
             stream.write(coverage_png(views[main]))
 
 

@@ -29,6 +29,8 @@ from aquaflow.dive.results import (
     tracked_poses,
 )
 from aquaflow.export.georeference import GEOREFERENCE, georeference
+from aquaflow.export.ortho.overview import NAME as OVERVIEW
+from aquaflow.export.ortho.overview import overview_png
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.messages import CameraModel, Dropped
@@ -57,6 +59,7 @@ class Deliverables:
         self.name, self.folder, self.slam = name, folder, slam
         self.results, self.calibration, self._found = results, calibration, found
         self._coverage, self._views = coverage, dict[int, PageView]()
+        self._overview: bytes | None = None
         self.outputs = outputs or MetricOutputs()
         self.held_out: list[HeldOut] = []
         """Ranges in the unit of the largest sub-map's metric frame."""
@@ -123,11 +126,19 @@ class Deliverables:
         for sub_map in self.slam.mappers:
             self._write_map(sub_map)
         attempt("writing the coverage", self._write_coverage)
+        attempt("drawing the overview", self._draw_overview)
+
+    def _draw_overview(self) -> None:
+        """The map from above, for the report."""
+        mapper = self.slam.mappers.get(self._main)
+        if mapper is not None and mapper.views and len(mapper.gaussians):
+            self._overview = overview_png(mapper, self.metric_frame)
+            self.folder.write_bytes(OVERVIEW, self._overview)
 
     def _write_coverage(self) -> None:
         if self._coverage is not None:
             self._views = final_views(self._coverage, self.slam, self.outputs, self._waters)
-            write_coverage(self.folder, self._views, self._main)
+            write_coverage(self.folder.path, self._views, self._main)
 
     def write_evaluation(self) -> None:
         """The held-out views, and the water with what they say of it."""
@@ -199,9 +210,10 @@ class Deliverables:
         def write() -> None:
             self.folder.write_report(
                 report_data(
-                    self.name, self.slam, self.results, dropped, self.poses, self.held_out,
-                    self._water(), self.outputs, numbers, notes,
+                    self.name, self.slam, self.results, dropped, self.folder.rows, self.poses,
+                    self.held_out, self._water(), self.outputs, numbers, notes,
                     calibrated=self.calibration is not None,
+                    coverage=self._views.get(self._main), overview=self._overview,
                 )
             )  # fmt: skip
 

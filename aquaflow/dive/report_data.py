@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from aquaflow.coverage import PageView
+from aquaflow.dive.frames_csv import FrameRow
 from aquaflow.dive.held_out import HeldOut
 from aquaflow.dive.measures import measures
 from aquaflow.dive.metric_outputs import MetricOutputs
+from aquaflow.dive.path_rows import path_rows
 from aquaflow.dive.results import WaterSummary, largest_sub_map
+from aquaflow.dive.survey_data import left_out, profile
 from aquaflow.export.report import (
     CameraSummary,
     HeldOutExample,
@@ -31,6 +36,7 @@ def report_data(
     slam: Slam,
     results: list[Tracked],
     dropped: list[Dropped],
+    frames: Sequence[FrameRow],
     poses: dict[int, Sim3],
     held_out: list[HeldOut],
     water: WaterSummary | None,
@@ -38,10 +44,13 @@ def report_data(
     metrics: dict[str, Any],
     notes: list[str],
     calibrated: bool,
+    coverage: PageView | None = None,
+    overview: bytes | None = None,
 ) -> ReportData:
     """Everything the report shows; ``poses`` are T_nc, held-out ranges and water in n's unit."""
     frame = outputs.frame(largest_sub_map(results))
     path = _path(results, poses, outputs)
+    rows = path_rows(outputs, results, poses)
     return ReportData(
         name=name,
         camera=camera_summary(_camera(slam), calibrated),
@@ -51,6 +60,10 @@ def report_data(
         timeline=_timeline(results, dropped),
         examples=_examples(held_out),
         medium=medium_curves(water, frame.unit),
+        coverage=coverage,
+        overview=overview,
+        profile=profile(rows, frame),
+        left_out=left_out(frames),
         stages=metrics["stage_ms"],
         warnings=metrics["warnings"],
         notes=notes,

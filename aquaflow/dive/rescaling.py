@@ -16,6 +16,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.coverage.coverage_file import NAME as COVERAGE
+from aquaflow.coverage.coverage_file import read_coverage_file
+from aquaflow.dive.coverage_files import write_coverage
 from aquaflow.dive.metric_outputs import frame_numbers, worlds_in_words
 from aquaflow.dive.path_rows import position_sigma, speeds_of
 from aquaflow.errors import InputError, reason_of
@@ -69,6 +72,7 @@ def rescale(dive: Path, sub_map: int, lengths: Sequence[KnownLength], scale: Len
     inside = {round(1e9 * row.t_s) for row in rows if row.sub_map == sub_map}
     chosen = np.array([round(1e9 * t) in inside for t in poses[:, 0]], bool)
     poses[chosen, 1:4] *= times
+    seen = read_coverage_file(dive / COVERAGE) if (dive / COVERAGE).is_file() else {}
     texts = {}
     if sub_map == main:
         texts["metrics.json"] = _json(dive / "metrics.json") | frame_numbers(frames[main])
@@ -85,6 +89,9 @@ def rescale(dive: Path, sub_map: int, lengths: Sequence[KnownLength], scale: Len
         write_json(dive / name, content)
     if sub_map == main:
         _scale_ranges(dive / "heldout", times)
+    if sub_map in seen:
+        seen[sub_map] = seen[sub_map].rescaled(times, frames[sub_map].unit)
+        write_coverage(dive, seen, main)
     write_metric_file(dive, frames, main)
 
 

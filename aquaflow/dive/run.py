@@ -310,6 +310,7 @@ class DiveRun:
             notes = self.notes + self.slam.failures.notes()
             made.write_report(self.dropped, numbers, notes)
         numbers = self._numbers(results, made)  # the report's own time included
+        numbers["notes"] = self.notes + self.slam.failures.notes()
         attempt, write = self.slam.failures.attempt, self.folder.write_json
         attempt("writing metrics.json", partial(write, "metrics.json", numbers))
         if self._trace:

@@ -3,9 +3,11 @@
 from aquaflow.export.report.data import (
     CameraSummary,
     HeldOutExample,
+    LeftOut,
     Measures,
     MediumCurves,
     PathPlot,
+    Profile,
     ReportData,
 )
 from aquaflow.export.report.page import render_report, write_report
@@ -13,9 +15,11 @@ from aquaflow.export.report.page import render_report, write_report
 __all__ = [
     "CameraSummary",
     "HeldOutExample",
+    "LeftOut",
     "Measures",
     "MediumCurves",
     "PathPlot",
+    "Profile",
     "ReportData",
     "render_report",
     "write_report",
