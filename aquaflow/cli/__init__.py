@@ -23,6 +23,7 @@ from aquaflow.cli.export import register as register_export
 from aquaflow.cli.measure import register as register_measure
 from aquaflow.cli.prior import register as register_prior
 from aquaflow.cli.record import register as register_record
+from aquaflow.cli.report import register as register_report
 from aquaflow.cli.scale import register as register_scale
 from aquaflow.cli.service import exit_code, map_realtime, print_finished
 from aquaflow.cli.service import register as register_service
@@ -287,6 +288,7 @@ register_dive(app)
 register_export(app)
 register_prior(app)
 register_record(app)
+register_report(app)
 register_scale(app)
 register_measure(app)
 register_service(app)

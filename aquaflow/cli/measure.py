@@ -67,7 +67,8 @@ def measure(
         raise InputError("--as and --note need points; give --point for each")
     if not (dive / MAP_FILE).exists():
         raise InputError(f"{dive} holds no finished dive: {MAP_FILE} is missing")
-    from aquaflow.measure.reef_files import numbers_of_dive, write_csv
+    from aquaflow.measure.finished_dive import numbers_of_dive
+    from aquaflow.measure.reef_files import write_csv
 
     with progress_bars(quiet=as_json) as bars, tempfile.TemporaryDirectory() as work:
         found: Answer | ReefNumbers

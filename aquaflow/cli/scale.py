@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 RESCALED = (
     "The dive is in metres now: trajectory.tum, trajectory.csv, map.ply, map_clear.ply, "
-    "medium.json, metrics.json, metric.json, the notes and the ranges of heldout/. report.html "
-    "still shows map units."
+    "medium.json, metrics.json, metric.json, coverage.*, the notes and the ranges of heldout/. "
+    "report.html still shows map units; `aquaflow report` does not."
 )
 RULER_SIGMA_M = 0.001
 """1 sigma of a length measured with a ruler."""

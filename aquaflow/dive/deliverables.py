@@ -12,9 +12,16 @@ from functools import partial
 from typing import Any, TypeVar
 
 from aquaflow.clocks.deadline import Deadline
+from aquaflow.coverage import DiveCoverage, PageView
+from aquaflow.dive.coverage_files import final_views, write_coverage
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.found_camera import FoundCamera
-from aquaflow.dive.from_maps import held_out_examples, water_in_numbers
+from aquaflow.dive.from_maps import (
+    OVERVIEW,
+    held_out_examples,
+    overview,
+    water_in_numbers,
+)
 from aquaflow.dive.held_out_example import HeldOut, mean_amplification
 from aquaflow.dive.medium_json import medium_json
 from aquaflow.dive.metric_outputs import MetricOutputs, held_out_in, water_in, worlds_in_words
@@ -51,11 +58,14 @@ class Deliverables:
         calibration: CameraModel | None,
         outputs: MetricOutputs | None = None,
         found: FoundCamera | None = None,
+        coverage: DiveCoverage | None = None,
     ) -> None:
         """``results``: all frames with their final poses; ``calibration``: as given, if any, else
         ``found`` may be there; ``outputs``: None where nothing but the map is known."""
         self.name, self.folder, self.slam = name, folder, slam
         self.results, self.calibration, self._found = results, calibration, found
+        self._coverage, self._views = coverage, dict[int, PageView]()
+        self._overview: bytes | None = None
         self.outputs = outputs or MetricOutputs()
         self.held_out: list[HeldOut] = []
         """Ranges in the unit of the largest sub-map's metric frame."""
@@ -140,6 +150,20 @@ class Deliverables:
             attempt("writing camera.yaml", partial(self._write_cameras, camera))
         for sub_map in self.slam.mappers:
             self._write_map(sub_map)
+        attempt("writing the coverage", self._write_coverage)
+        attempt("drawing the overview", self._draw_overview)
+
+    def _draw_overview(self) -> None:
+        """The map from above, for the report."""
+        mapper = self.slam.mappers.get(self._main)
+        if mapper is not None and mapper.views and len(mapper.gaussians):
+            self._overview = overview(mapper, self.metric_frame)
+            self.folder.write_bytes(OVERVIEW, self._overview)
+
+    def _write_coverage(self) -> None:
+        if self._coverage is not None:
+            self._views = final_views(self._coverage, self.slam, self.outputs, self._waters)
+            write_coverage(self.folder.path, self._views, self._main)
 
     def write_evaluation(self) -> None:
         """The held-out views, and the water with what they say of it."""
@@ -211,9 +235,10 @@ class Deliverables:
         def write() -> None:
             self.folder.write_report(
                 report_data(
-                    self.name, self.slam, self.results, dropped, self.poses, self.held_out,
-                    self._water(), self.outputs, numbers, notes, self.reef,
+                    self.name, self.slam, self.results, dropped, self.folder.rows, self.poses,
+                    self.held_out, self._water(), self.outputs, numbers, notes, self.reef,
                     calibrated=self.calibration is not None,
+                    coverage=self._views.get(self._main), overview=self._overview,
                 )
             )  # fmt: skip
 

@@ -60,6 +60,7 @@ RESULTS = (
     *("metrics.json", "report.html", "heldout/*.png", "heldout/*.npz", TRACE),
     KNOWN_LENGTHS,
     TELEMETRY,
+    *("coverage.npz", "coverage.json", "coverage.png", "overview.png", "report.pdf"),
     *("metric.json", "trajectory.csv", "georeference.json", STATUS),
     *(
         "restored/*.png",
@@ -286,6 +287,15 @@ class DiveFolder:
                 pictures["confidence"] = example.confidence
             for name, picture in pictures.items():
                 write_png(folder / f"{example.frame_index:06d}_{name}.png", picture)
+
+    def write_bytes(self, name: str, content: bytes) -> None:
+        """A file whose content is made already.
+
+        Raises:
+            InputError: it cannot be written.
+        """
+        with atomic_write(self.path / name) as stream:
+            stream.write(content)
 
     def write_json(self, name: str, data: dict[str, Any]) -> None:
         """A JSON file of the dive; a number that is not finite is unknown, null."""

@@ -16,6 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow import __version__
+from aquaflow.coverage import PageView
+from aquaflow.dive.coverage_files import current_views
 from aquaflow.dive.from_maps import water_in_numbers
 from aquaflow.dive.measures import measures
 from aquaflow.dive.metric_outputs import (
@@ -152,7 +154,9 @@ class Interim:
         run, poses = self._run, self._posed()
         frame, water = self._outputs.frame(self._main), self._waters.get(self._main)
         known = None if water is None else water_in(water, frame.T_nm.scale)
-        path = _plot(poses, frame, self._outputs)
+        path, seen = _plot(poses, frame, self._outputs), dict[int, PageView]()
+        if run.coverage is not None:
+            seen = current_views(run.coverage, run.slam, self._outputs, self._waters)
         return ReportData(
             name=run.name,
             camera=camera_summary(camera, run.calibration is not None),
@@ -160,6 +164,7 @@ class Interim:
             path=path,
             measures=measures(path, frame, known),
             medium=medium_curves(known, frame.unit),
+            coverage=seen.get(self._main),
             notes=[NOTE, *self._notes, *run.slam.failures.notes()],
         )
 

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from aquaflow.clocks.deadline import Deadline
+from aquaflow.dive.from_maps import drawn_ground
 from aquaflow.dive.results import WaterSummary
 from aquaflow.errors import InputError
-from aquaflow.export.ortho.ground import Ground, ground_of
+from aquaflow.export.ortho.ground import Ground
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.mapping.mapper import Mapper
-from aquaflow.measure.drawn_heights import draw_heights
 from aquaflow.measure.height_field import HeightField
 from aquaflow.measure.reef_numbers import ReefNumbers, Water, reef_numbers
 from aquaflow.measure.scale import scale_of
+
+if TYPE_CHECKING:
+    from aquaflow.mapping.mapper import Mapper
 
 
 def numbers_at_the_end(
@@ -47,8 +50,7 @@ def numbers_at_the_end(
     def draw() -> tuple[HeightField, Ground]:
         if mapper is None or not mapper.views or len(mapper.gaussians) == 0:
             raise InputError("the map is empty; map a recording that shows more")
-        ground = ground_of(frame, mapper.views)
-        return draw_heights(mapper, ground, work, progress=in_time), ground
+        return drawn_ground(mapper, frame, work, in_time)
 
     places = np.array([T_nc.t for T_nc in poses]).reshape(-1, 3)
     known = None if water is None else Water(water.beta_a, water.beta_a_sigma)

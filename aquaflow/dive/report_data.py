@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from aquaflow.coverage import PageView
+from aquaflow.dive.frames_csv import FrameRow
 from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.dive.measures import measures, reef_rows
 from aquaflow.dive.metric_outputs import MetricOutputs
+from aquaflow.dive.path_rows import path_rows
 from aquaflow.dive.results import WaterSummary, largest_sub_map
+from aquaflow.dive.survey_data import left_out, profile
 from aquaflow.export.report import (
     CameraSummary,
     HeldOutExample,
@@ -32,6 +37,7 @@ def report_data(
     slam: Slam,
     results: list[Tracked],
     dropped: list[Dropped],
+    frames: Sequence[FrameRow],
     poses: dict[int, Sim3],
     held_out: list[HeldOut],
     water: WaterSummary | None,
@@ -40,10 +46,13 @@ def report_data(
     notes: list[str],
     reef: ReefNumbers | None,
     calibrated: bool,
+    coverage: PageView | None = None,
+    overview: bytes | None = None,
 ) -> ReportData:
     """Everything the report shows; ``poses`` are T_nc, held-out ranges and water in n's unit."""
     frame = outputs.frame(largest_sub_map(results))
     path = _path(results, poses, outputs)
+    rows = path_rows(outputs, results, poses)
     return ReportData(
         name=name,
         camera=camera_summary(_camera(slam), calibrated),
@@ -54,6 +63,10 @@ def report_data(
         timeline=_timeline(results, dropped),
         examples=_examples(held_out),
         medium=medium_curves(water, frame.unit),
+        coverage=coverage,
+        overview=overview,
+        profile=profile(rows, frame),
+        left_out=left_out(frames),
         stages=metrics["stage_ms"],
         warnings=metrics["warnings"],
         notes=notes,

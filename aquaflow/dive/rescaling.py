@@ -16,6 +16,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.coverage.coverage_file import NAME as COVERAGE
+from aquaflow.coverage.coverage_file import read_coverage_file
+from aquaflow.dive.coverage_files import write_coverage
 from aquaflow.dive.metric_outputs import frame_numbers, worlds_in_words
 from aquaflow.dive.path_rows import position_sigma, speeds_of
 from aquaflow.errors import InputError, reason_of
@@ -70,6 +73,7 @@ def rescale(dive: Path, sub_map: int, lengths: Sequence[KnownLength], scale: Len
     inside = {round(1e9 * row.t_s) for row in rows if row.sub_map == sub_map}
     chosen = np.array([round(1e9 * t) in inside for t in poses[:, 0]], bool)
     poses[chosen, 1:4] *= times
+    seen = read_coverage_file(dive / COVERAGE) if (dive / COVERAGE).is_file() else {}
     texts, notes = {}, []
     if sub_map == main:
         notes = scaled(read_notes(dive, before), times)
@@ -89,6 +93,9 @@ def rescale(dive: Path, sub_map: int, lengths: Sequence[KnownLength], scale: Len
         _scale_ranges(dive / "heldout", times)
         if notes:
             write_notes(dive, notes, frames[main])
+    if sub_map in seen:
+        seen[sub_map] = seen[sub_map].rescaled(times, frames[sub_map].unit)
+        write_coverage(dive, seen, main)
     write_metric_file(dive, frames, main)
 
 

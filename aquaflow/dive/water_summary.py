@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 
@@ -51,6 +53,16 @@ def summarise_water(mapper: Mapper, most_views: int = RANGE_VIEWS) -> WaterSumma
     if not np.isfinite(numbers).all():
         raise ArithmeticError("the water's summary is not finite")
     return summary
+
+
+def attenuations(mappers: Mapping[int, Mapper]) -> dict[int, list[float]]:
+    """Per map unit, of each channel, by sub-map; without water none. In the maps' thread."""
+    found = {}
+    for number, mapper in mappers.items():
+        water = mapper.scene.water(mapper.views[-1]) if mapper.views else None
+        if water is not None:
+            found[number] = water_out(water.beta_a).ravel().tolist()
+    return found
 
 
 def _step(mapper: Mapper, most: int) -> int:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from aquaflow.export.ortho.survey import LEAST_VIEWS
+from aquaflow.export.ortho.ground import LEAST_VIEWS
 from aquaflow.measure.height_field import Counts, HeightField
 from aquaflow.measure.quantity import NORMAL_95, Quantity
 from aquaflow.measure.scale import Scale

@@ -14,9 +14,8 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 from aquaflow.errors import InputError
 from aquaflow.export.ortho.drawing import MOST_FINER, Splats
 from aquaflow.export.ortho.grid import Grid, Tile
-from aquaflow.export.ortho.ground import Ground
+from aquaflow.export.ortho.ground import LEAST_VIEWS, Ground
 from aquaflow.export.ortho.sightings import PICTURE_SIGMA_PX, ViewRanges
-from aquaflow.export.ortho.survey import LEAST_VIEWS
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.water.posed_picture import SOLID
 from aquaflow.measure.height_field import Array, Counts, HeightField, Held

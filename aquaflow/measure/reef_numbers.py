@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.errors import InputError
-from aquaflow.export.ortho.ground import Ground
-from aquaflow.export.ortho.survey import LEAST_VIEWS
+from aquaflow.export.ortho.ground import LEAST_VIEWS, Ground
 from aquaflow.measure.areas import WELL_SEEN, areas
 from aquaflow.measure.height_field import HeightField
 from aquaflow.measure.path import way

@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from aquaflow.coverage.water_range import VISIBLE_CONTRAST
 from aquaflow.measure.quantity import NORMAL_95, Quantity
 from aquaflow.measure.scale import Scale
 
-VISIBLE_CONTRAST = 0.05
-"""Share of its contrast with which a thing is still seen: the threshold of the meteorological
-optical range (WMO-No. 8, Guide to Instruments and Methods of Observation, chapter 9)."""
 DEFINITION = (
     "range at which contrasts of the scene fall to 5 %: ln(20) / attenuation (Koschmieder's law), "
     "in the colour that reaches farthest; for the light there was and this camera's colours"

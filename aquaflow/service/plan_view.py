@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.coverage.page_axes import names_of, page_axes
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.service.dive_parts import Parts
+from aquaflow.service.live_coverage import LiveCoverage
 
 Array = npt.NDArray[np.float64]
 
@@ -27,21 +29,18 @@ LEAST_LOOK = 0.1
 """Share of the viewing direction that must lie in the plane; a camera that looks straight down
 looks to no side."""
 
-LEVEL = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
-"""Rows: what points right and up on the page, in n, which is north-east-down."""
-FORWARD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-FACING = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""The same in a map that is not level, whose axes are the first picture's: right, down, ahead."""
-
 
 class PlanView:
     """The path at the moment; asked from the threads of the health server."""
 
     def __init__(
-        self, parts: Callable[[], Parts | None], now_s: Callable[[], float] = time.monotonic
+        self,
+        parts: Callable[[], Parts | None],
+        now_s: Callable[[], float] = time.monotonic,
+        coverage: LiveCoverage | None = None,
     ) -> None:
         """``parts``: of the dive that runs; None: there is none."""
-        self._parts, self._now_s = parts, now_s
+        self._parts, self._now_s, self._coverage = parts, now_s, coverage
         self._lock = threading.Lock()
         self._computed_s = -KEPT_S
         self._said: dict[str, Any] = {}
@@ -50,7 +49,7 @@ class PlanView:
         """``sub_maps``: of each its ``number``, ``unit``, from where it is ``seen``, what ``right``
         and ``up`` are on the page, and ``points`` [N, 2] through its keyframes. ``now``: the newest
         pose, its ``sub_map``, ``at`` [2], and ``ahead`` [2], a unit vector along the view's axis or
-        null.
+        null. With coverage, each sub-map has it as ``coverage``, and ``hints`` are those that hold.
         """
         with self._lock:
             if self._now_s() - self._computed_s >= KEPT_S:
@@ -74,7 +73,11 @@ class PlanView:
         if latest is not None and latest.T_wc is not None and latest.sub_map in plans:
             now = {"sub_map": latest.sub_map, **plans[latest.sub_map].pose(latest.T_wc)}
         sub_maps = [{"number": number, **plan.to_json()} for number, plan in plans.items()]
-        return {"sub_maps": sub_maps, "now": now}
+        if self._coverage is None:
+            return {"sub_maps": sub_maps, "now": now}
+        seen = self._coverage.to_json()
+        sub_maps = [each | {"coverage": seen.get(each["number"])} for each in sub_maps]
+        return {"sub_maps": sub_maps, "now": now, "hints": self._coverage.in_words()}
 
 
 class _Plan:
@@ -87,14 +90,10 @@ class _Plan:
     ) -> None:
         self._frame = frame
         self._path = frame.T_nm.apply(centres)
-        if frame.level:
-            self._axes = LEVEL
-        else:
-            spread = np.ptp(self._path, axis=0)
-            self._axes = FORWARD if spread[2] >= spread[1] else FACING
+        self._axes = page_axes(frame, self._path)
 
     def to_json(self) -> dict[str, Any]:
-        seen, right, up = self._names()
+        seen, right, up = names_of(self._frame, self._axes)
         points = np.round(self._path @ self._axes.T, DIGITS).tolist()
         return {
             "unit": self._frame.unit, "seen": seen, "right": right, "up": up, "points": points,
@@ -110,15 +109,6 @@ class _Plan:
             "at": np.round(self._axes @ T_nc.t, DIGITS).tolist(),
             "ahead": np.round(ahead / length, DIGITS).tolist() if known else None,
         }
-
-    def _names(self) -> tuple[str, str, str]:
-        """From where the plane is seen, and what its axes point to."""
-        north = self._frame.north
-        if self._axes is FACING:
-            return "as in the first picture", "right", "up"
-        if self._axes is FORWARD:
-            return "from above the first picture", "right of it", "ahead of it"
-        return "from above", "east" if north.endswith("north") else f"right of the {north}", north
 
 
 def _thinned(

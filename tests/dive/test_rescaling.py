@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from aquaflow.coverage.coverage_file import read_coverage_file
 from aquaflow.export.ply import read_ply
 from aquaflow.export.trajectory_csv import read_trajectory_csv
 from aquaflow.fusion.metric_file import read_metric_file, write_metric_file
@@ -34,6 +35,8 @@ def numbers(dive: Path) -> dict[str, Any]:
     """Everything in the dive that has a length in it."""
     water = json.loads((dive / "medium.json").read_text())
     clear = read_ply(dive / "map_clear.ply")
+    seen = read_coverage_file(dive / "coverage.npz")[0]
+    coverage = {"scale": seen.scale, "swath": seen.state.swath}
     ranges = sorted((dive / "heldout").glob("*_range.npz"))
     return {
         "tum": np.loadtxt(dive / "trajectory.tum")[:, 1:4],
@@ -42,6 +45,7 @@ def numbers(dive: Path) -> dict[str, Any]:
         "scales": clear.scales,
         "held out": np.concatenate([np.load(path)["z"].ravel() for path in ranges]),
         "ranges": np.array([water["range_p5"], water["map_ply_reference_range"]]),
+        "coverage": np.array([coverage["scale"], coverage["swath"]]),
         "path per rate": 1.0 / np.array(water["attenuation_per_unit"]),
         "path per b": 1.0 / np.array(water["backscatter"]["b"]),
     }

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -17,13 +18,18 @@ from aquaflow.errors import InputError
 from aquaflow.export.georeference import to_geodetic, utm_epsg
 from aquaflow.fusion.metric_frame import MetricFrame, Origin
 from aquaflow.geometry.similarity import Sim3, nearest_rotation
-from aquaflow.mapping.views import View
+
+if TYPE_CHECKING:
+    from aquaflow.mapping.views import View
 
 Array = npt.NDArray[np.float64]
 
 BASE_M = 100.0
 """Length over which north and the scale of the UTM grid are measured. Taken as the same over the
 dive, which 1 km from its middle is wrong by 3 mm in the scale and by less in the turn."""
+LEAST_VIEWS = 2
+"""That see a pixel, or it is a hole: what one view alone sees has no parallax. On the surveys 1 and
+7 it is smears along the rim, whose heights are guesses."""
 LEAST_AGREEMENT = 0.5
 """Length of the mean of the views' unit axes; at 0.5 they spread over a half-angle of 90 degrees,
 and no direction is below all of them."""

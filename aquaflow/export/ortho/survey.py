@@ -18,7 +18,7 @@ from aquaflow.export.ortho.colours import Colours
 from aquaflow.export.ortho.drawing import MOST_FINER, Splats
 from aquaflow.export.ortho.geotiff import require_rasterio, writing_raster
 from aquaflow.export.ortho.grid import Grid, Tile, rounded
-from aquaflow.export.ortho.ground import Ground, ground_of
+from aquaflow.export.ortho.ground import LEAST_VIEWS, Ground, ground_of
 from aquaflow.export.ortho.layers import DEM, ORTHO, QUALITY, TilePixels
 from aquaflow.export.ortho.sightings import ViewRanges
 from aquaflow.export.posed_views import read_mapper
@@ -33,9 +33,6 @@ Progress = Callable[[str, int, int], None]
 
 LAYERS = {"ortho": (ORTHO, QUALITY), "dem": (DEM,)}
 """Files of each kind."""
-LEAST_VIEWS = 2
-"""That see a pixel, or it is a hole: what one view alone sees has no parallax. On the surveys 1 and
-7 it is smears along the rim, whose heights are guesses."""
 SIGMA_IS = (
     "of where the rays of the views that see the pixel meet, each known to 1 pixel of its picture, "
     "and the spread of the map's heights within the pixel; poses are taken as exact"

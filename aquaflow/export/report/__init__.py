@@ -3,9 +3,11 @@
 from aquaflow.export.report.data import (
     CameraSummary,
     HeldOutExample,
+    LeftOut,
     Measures,
     MediumCurves,
     PathPlot,
+    Profile,
     ReefRow,
     ReportData,
 )
@@ -14,9 +16,11 @@ from aquaflow.export.report.page import render_report, write_report
 __all__ = [
     "CameraSummary",
     "HeldOutExample",
+    "LeftOut",
     "Measures",
     "MediumCurves",
     "PathPlot",
+    "Profile",
     "ReefRow",
     "ReportData",
     "render_report",

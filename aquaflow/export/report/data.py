@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.coverage import PageView
 from aquaflow.fusion.metric_frame import SourceReport
 
 FocalSource = Literal["calibrated", "guessed", "refined"]
@@ -107,6 +108,32 @@ class MediumCurves:
 
 
 @dataclass(frozen=True)
+class Profile:
+    """Depth and altitude over time; NaN where unknown."""
+
+    t_s: npt.NDArray[np.floating]
+    """[N] seconds of the recording."""
+    depth: npt.NDArray[np.floating]
+    """[N]"""
+    altitude: npt.NDArray[np.floating]
+    """[N] above the bottom."""
+    depth_is: str
+    """What ``depth`` is, in words."""
+    unit: str = "m"
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Frames that are not in the map for one reason."""
+
+    kind: str
+    """``skipped``, ``lost`` or ``dropped``."""
+    reason: str
+    """With N for its numbers."""
+    count: int
+
+
+@dataclass(frozen=True)
 class ReportData:
     """Everything that the report shows; empty parts are left out of it."""
 
@@ -122,6 +149,12 @@ class ReportData:
     examples: list[HeldOutExample] = field(default_factory=list)
     medium: MediumCurves | None = None
     """None if the medium is off."""
+    coverage: PageView | None = None
+    """Of the largest sub-map."""
+    overview: bytes | None = None
+    """PNG file of the map from above."""
+    profile: Profile | None = None
+    left_out: Sequence[LeftOut] = ()
     stages: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Stage -> ``count``, ``total``, ``p50``, ``p95``; times in ms."""
     warnings: list[str] = field(default_factory=list)

@@ -53,16 +53,17 @@ CURVE_SAMPLES = 128
 def path_svg(path: PathPlot) -> str:
     """The path seen from two sides: from above and from the side where gravity is known, else along
     the direction of least motion and across it."""
-    figure = _figure(9.0, 3.6, level_axes if path.up else path_axes, path)
-    return _svg(figure, "path")
+    figure = drawn(9.0, 3.6, level_axes if path.up else path_axes, path)
+    return svg_of(figure, "path")
 
 
 def medium_svg(medium: MediumCurves) -> str:
     """Transmission and backscatter over range."""
-    return _svg(_figure(9.0, 3.1, medium_axes, medium), "medium")
+    return svg_of(drawn(9.0, 3.1, medium_axes, medium), "medium")
 
 
-def _figure(width_in: float, height_in: float, draw: Any, data: Any) -> Figure:
+def drawn(width_in: float, height_in: float, draw: Any, data: Any) -> Figure:
+    """A figure in the report's style, into which ``draw`` has drawn ``data``."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
@@ -172,7 +173,7 @@ def medium_axes(figure: Figure, medium: MediumCurves) -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=3)
 
 
-def _svg(figure: Figure, salt: str) -> str:
+def svg_of(figure: Figure, salt: str) -> str:
     """Inline SVG: no header, no date, ids unique to the figure, colours those of the page."""
     import matplotlib as mpl
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 from pathlib import Path
 
-from aquaflow.export.report import measures, sections
+from aquaflow.export.report import measures, sections, survey_sections
 from aquaflow.export.report.data import ReportData
 from aquaflow.export.report.style import STYLE_SHEET
 from aquaflow.storage.atomic import atomic_write
@@ -28,11 +28,15 @@ def render_report(data: ReportData) -> str:
         sections.warnings(data),
         sections.tiles(data.metrics),
         sections.path(data),
+        survey_sections.coverage(data),
+        survey_sections.profile(data.profile),
         measures.reef(data.reef),
         measures.measures(data.measures),
         sections.examples(data),
         sections.medium(data),
+        survey_sections.water(data.medium),
         sections.timeline(data),
+        survey_sections.left_out(data.left_out),
         sections.notes(data),
         sections.camera(data.camera),
         sections.stages(data),

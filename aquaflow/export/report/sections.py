@@ -28,6 +28,19 @@ JPEG_QUALITY = 88
 MINIMUM_PATH = 2
 """Poses below which there is no path to draw."""
 
+TILES = (
+    ("tracked", "{:,.0f}", "frames with a pose"),
+    ("keyframes", "{:,.0f}", "keyframes"),
+    ("gaussians", "{:,.0f}", "Gaussians in the map"),
+    ("fps", "{:.2f}", "frames per second"),
+    ("psnr", "{:.2f}", "dB PSNR, held-out frames"),
+    ("psnr_as_tracked", "{:.2f}", "dB PSNR, pose and light as tracked"),
+    ("ssim", "{:.3f}", "SSIM, held-out frames"),
+    ("lpips", "{:.3f}", "LPIPS, held-out frames"),
+    ("ate_rmse_m_sim3", "{:.3g}", "path error (ATE, Sim(3))"),
+)
+"""Key of metrics.json, how it is written, and what it is."""
+
 FRAME_CLASSES = {
     "keyframe": "keyframe: a new anchor of the map",
     "mapping": "mapping: added detail",
@@ -56,20 +69,9 @@ def warnings(data: ReportData) -> str:
 
 def tiles(metrics: Mapping[str, Any]) -> str:
     """The numbers that a pilot asks for first; what was not measured is left out."""
-    wanted = (
-        ("tracked", "{:,.0f}", "frames with a pose"),
-        ("keyframes", "{:,.0f}", "keyframes"),
-        ("gaussians", "{:,.0f}", "Gaussians in the map"),
-        ("fps", "{:.2f}", "frames per second"),
-        ("psnr", "{:.2f}", "dB PSNR, held-out frames"),
-        ("psnr_as_tracked", "{:.2f}", "dB PSNR, pose and light as tracked"),
-        ("ssim", "{:.3f}", "SSIM, held-out frames"),
-        ("lpips", "{:.3f}", "LPIPS, held-out frames"),
-        ("ate_rmse_m_sim3", "{:.3g}", "path error (ATE, Sim(3))"),
-    )
     cells = [
         f'<div class="tile"><b>{form.format(metrics[key])}</b><span>{label}</span></div>'
-        for key, form, label in wanted
+        for key, form, label in TILES
         if isinstance(metrics.get(key), int | float)
     ]
     return f'<div class="tiles">{"".join(cells)}</div>' if cells else ""
@@ -236,11 +238,11 @@ def notes(data: ReportData) -> str:
 
 
 def numbers(metrics: Mapping[str, Any]) -> str:
-    """Every number of ``metrics.json`` but the stages, which have their own section."""
+    """Every number of ``metrics.json``, but stages and notes, which have their own sections."""
     rows = [
         (key, "not measured" if value is None else _plain(value))
         for key, value in metrics.items()
-        if key != "stage_ms"
+        if key not in {"stage_ms", "notes"}
     ]
     if not rows:
         return ""

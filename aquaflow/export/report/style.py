@@ -48,6 +48,7 @@ svg { width: 100%; height: auto; display: block; font-family: inherit; }
 figure { margin: 0; }
 figcaption { font-size: .84rem; color: var(--soft); margin-top: .25rem; }
 .views img { width: 100%; border-radius: 8px; display: block; }
+.overview img { display: block; max-width: 100%; max-height: 30rem; margin: 0 auto; }
 .shot { margin: 1.1rem 0 .5rem; font-weight: 600; }
 .shot small { font-weight: 400; color: var(--soft); margin-left: .5em; }
 table { border-collapse: collapse; width: 100%; font-size: .92rem; }

@@ -1,0 +1,36 @@
+"""The command that writes the report of a finished dive as a PDF: ``report``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from aquaflow.cli.console import Json
+
+NAME = "report.pdf"
+"""In the dive's folder, where no other place is given."""
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to ``app``."""
+    app.command("report")(report)
+
+
+def report(
+    dive: Annotated[Path, typer.Argument(help="Dive folder.")],
+    pdf: Annotated[Path | None, typer.Option(help="File; else report.pdf in the dive.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Write the report of a finished dive as one PDF, to print or to send."""
+    from aquaflow.dive.report_of_folder import report_of_folder
+    from aquaflow.export.report.pdf import write_pdf
+
+    out = pdf or dive / NAME
+    pages = write_pdf(out, report_of_folder(dive))
+    if as_json:
+        typer.echo(json.dumps({"pdf": str(out), "pages": pages}))
+        return
+    typer.echo(f"Wrote {pages} pages to {out}.")
