@@ -17,7 +17,7 @@ FLOORS = (
     {"dive", "viewer", "training"},
     {"measure"},
     {"slam", "export", "sim_drivers"},
-    {"tracking", "mapping", "recording", "drivers", "calibration"},
+    {"tracking", "mapping", "coverage", "recording", "drivers", "calibration"},
     {"keyframes", "sources", "synthetic", "fusion"},
     {"prior", "messages", "storage", "access"},
     {"config", "geometry", "render"},

@@ -11,6 +11,7 @@ from typing import Any
 
 from pydantic import Field
 
+from aquaflow.config.coverage import CoverageConfig
 from aquaflow.config.fusion import FusionConfig
 from aquaflow.config.mapping import (
     DecoderConfig,
@@ -39,6 +40,7 @@ from aquaflow.errors.plain_yaml import read_mapping
 
 __all__ = [
     "Config",
+    "CoverageConfig",
     "DecoderConfig",
     "FusionConfig",
     "GateConfig",
@@ -74,6 +76,7 @@ class Config(Stage):
     tracking: TrackingConfig = TrackingConfig()
     mapping: MappingConfig = MappingConfig()
     fusion: FusionConfig = FusionConfig()
+    coverage: CoverageConfig = CoverageConfig()
 
 
 def parse_config(data: dict[str, Any], origin: str) -> Config:

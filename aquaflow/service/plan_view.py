@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.coverage.page_axes import names_of, page_axes
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.service.dive_parts import Parts
@@ -26,12 +27,6 @@ DIGITS = 3
 LEAST_LOOK = 0.1
 """Share of the viewing direction that must lie in the plane; a camera that looks straight down
 looks to no side."""
-
-LEVEL = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
-"""Rows: what points right and up on the page, in n, which is north-east-down."""
-FORWARD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-FACING = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""The same in a map that is not level, whose axes are the first picture's: right, down, ahead."""
 
 
 class PlanView:
@@ -87,14 +82,10 @@ class _Plan:
     ) -> None:
         self._frame = frame
         self._path = frame.T_nm.apply(centres)
-        if frame.level:
-            self._axes = LEVEL
-        else:
-            spread = np.ptp(self._path, axis=0)
-            self._axes = FORWARD if spread[2] >= spread[1] else FACING
+        self._axes = page_axes(frame, self._path)
 
     def to_json(self) -> dict[str, Any]:
-        seen, right, up = self._names()
+        seen, right, up = names_of(self._frame, self._axes)
         points = np.round(self._path @ self._axes.T, DIGITS).tolist()
         return {
             "unit": self._frame.unit, "seen": seen, "right": right, "up": up, "points": points,
@@ -110,15 +101,6 @@ class _Plan:
             "at": np.round(self._axes @ T_nc.t, DIGITS).tolist(),
             "ahead": np.round(ahead / length, DIGITS).tolist() if known else None,
         }
-
-    def _names(self) -> tuple[str, str, str]:
-        """From where the plane is seen, and what its axes point to."""
-        north = self._frame.north
-        if self._axes is FACING:
-            return "as in the first picture", "right", "up"
-        if self._axes is FORWARD:
-            return "from above the first picture", "right of it", "ahead of it"
-        return "from above", "east" if north.endswith("north") else f"right of the {north}", north
 
 
 def _thinned(
