@@ -10,6 +10,7 @@ from aquaflow.config.stage import Stage
 class CoverageConfig(Stage):
     """What the camera has seen from above, and the lines that it was seen along."""
 
+    enabled: bool = Field(True, description="False: neither shown nor written nor hinted at")
     cells: int = Field(
         16, ge=4, le=64, description="cells of the plan along the shorter side of what a picture "
         "shows, median: 6 % of it, and 0.1 m at 2 m altitude",
@@ -19,8 +20,8 @@ class CoverageConfig(Stage):
         "give a point, a third one contradicts a wrong match",
     )  # fmt: skip
     least_directions: int = Field(
-        2, ge=1, le=9, description="different directions among them (from above, or from one of "
-        "eight sides): without parallax there is no range",
+        2, ge=1, le=17, description="different directions among its views (from above, or from one "
+        "of four sides in steps of 15 degrees): without parallax there is no range",
     )  # fmt: skip
     least_contrast: float = Field(
         0.1, gt=0, lt=0.5, description="apparent contrast of the ground's texture below which it "
@@ -30,4 +31,8 @@ class CoverageConfig(Stage):
     overlap: float = Field(
         0.6, ge=0, le=0.95, description="wanted of neighbouring survey lines, share of the swath: "
         "photogrammetry asks for 60 % (judgement: currents and altitude need the margin)",
+    )  # fmt: skip
+    forward_overlap: float = Field(
+        0.6, ge=0, le=0.95, description="wanted of one tracked picture with the next, share of "
+        "what a picture shows along the path",
     )  # fmt: skip

@@ -156,6 +156,10 @@ class VehicleReportConfig(Stage):
     """Messages to the pilot over MAVLink."""
 
     status_text: bool = Field(True, description="STATUSTEXT when something changes")
+    hints: bool = Field(
+        False, description="STATUSTEXT also where the pilot swims too fast or too high for the "
+        "coverage, or too far from the last line (see coverage); needs status_text",
+    )  # fmt: skip
     values: bool = Field(True, description="NAMED_VALUE_FLOAT once a second: AQ_STATE, AQ_LAG, ...")
 
 

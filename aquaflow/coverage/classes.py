@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from aquaflow.config.coverage import CoverageConfig
 from aquaflow.coverage.raster import RANGE_BINS, GridFrame
-from aquaflow.coverage.tiles import Counts
+from aquaflow.coverage.tiles import Counts, Sides
 
 Classes = npt.NDArray[np.uint8]
 
@@ -25,6 +25,12 @@ class Seen(IntEnum):
     WELL = 3
 
 
+COLOURS = {
+    Seen.TOO_FAR: (191, 75, 52),
+    Seen.SPARSE: (233, 189, 62),
+    Seen.WELL: (22, 148, 125),
+}
+"""RGB of each class that is drawn; brick, yellow and teal differ for the colour-blind, too."""
 WORDS = {
     Seen.NOT: "not seen",
     Seen.TOO_FAR: "too far for this water",
@@ -47,7 +53,7 @@ def near_bins(frame: GridFrame, limit: float | None) -> int:
 
 def classified(
     by_range: Counts,  # [..., 12] as in a tile
-    by_direction: Counts,  # [..., 9] likewise
+    by_direction: Sides,  # [..., 17] likewise
     near: int,
     config: CoverageConfig,
 ) -> Classes:

@@ -16,6 +16,8 @@ SAMPLES_ALONG, SAMPLES_ACROSS = 40, 9
 """Places at which a strip is looked at."""
 LEAST_GAIN = 0.1
 """Share of a strip that a next line must still find uncovered, or it is not worth swimming."""
+FURTHEST = 2.0
+"""Swaths up to which two lines are neighbours; one that is further away is of another survey."""
 SAME_GAIN = 0.05
 """Difference of two shares below which the side of the survey so far decides."""
 
@@ -59,17 +61,18 @@ def line_state(
     if not lines or swath <= 0.0:
         return LineState(lines, swath, None, None)
     newest = lines[-1]
-    before = _neighbour(newest, lines[:-1])
+    before = _neighbour(newest, lines[:-1], swath)
     aside = None if before is None else newest.aside(0.5 * (before.start + before.end))
     found = None if aside is None else 1.0 - abs(aside) / swath
     suggestion = _suggested(newest, before, aside, swath, overlap, covered)
     return LineState(lines, swath, found, suggestion)
 
 
-def _neighbour(line: Line, earlier: list[Line]) -> Line | None:
+def _neighbour(line: Line, earlier: list[Line], swath: float) -> Line | None:
     """The last parallel line beside it."""
     for other in reversed(earlier):
-        if line.is_parallel(other) and line.beside(other):
+        aside = abs(line.aside(0.5 * (other.start + other.end)))
+        if line.is_parallel(other) and line.beside(other) and aside <= FURTHEST * swath:
             return other
     return None
 

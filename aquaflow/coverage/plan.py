@@ -40,7 +40,7 @@ class CoveragePlan:
     views: npt.NDArray[np.uint16]
     """[H, W] keyframes that see the cell, from any range."""
     directions: npt.NDArray[np.uint8]
-    """[H, W] different directions among them, at most 9."""
+    """[H, W] different directions among them, at most 17."""
     nearest: npt.NDArray[np.float32]
     """[H, W] map units; range of the nearest view, to 19 %; infinite where there is none."""
     limit: float | None

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.coverage.footprint import Footprint
+from aquaflow.geometry.camera import MIN_DEPTH
 from aquaflow.geometry.similarity import Sim3
 
 Array = npt.NDArray[np.float64]
@@ -23,12 +24,13 @@ BIN_RATIO = 2.0**0.25
 """Of a bin's end to its start, 19 %: the attenuation of real water is known to about that."""
 FIRST_BIN = 2.0**-1.25
 """End of the first bin, over the grid's reference range; the last begins at 2.4 times it."""
-SIDES = 8
-DIRECTION_BINS = 1 + SIDES
-"""From above, and from eight sides."""
-ABOVE = float(np.tan(np.radians(10.0)))
-"""Tangent of the angle from the vertical up to which a view is from above: at 60 % overlap along a
-path, neighbouring views of a place differ by about this much (judgement)."""
+RINGS = np.tan(np.radians([10.0, 25.0, 40.0, 60.0]))
+"""Tangents of the angles from the vertical between which directions of view differ: at 60 % overlap
+along a path, neighbouring views of a place differ by about 10 degrees (judgement)."""
+SIDES = 4
+"""Of every ring; those of one ring begin in the middle of those of the next."""
+DIRECTION_BINS = 1 + SIDES * len(RINGS)
+"""Within the first angle it is from above, whatever the side."""
 SAMPLE_SPACING = 0.7
 """Largest distance of two samples of a patch, in cells: below 1 / sqrt(2) each cell has one."""
 FINENESS = (2, 4, 8)
@@ -123,7 +125,9 @@ def _range_bins(
 def _direction_bins(
     offset: Array,  # [M, 3] from the place to the camera, g
 ) -> Numbers:
-    """[M] 0: from above; then from the right, and on against the clock."""
+    """[M] 0: from above; then ring by ring, the sides of each against the clock."""
     x, y, z = offset.T
-    side = 1 + np.round(np.arctan2(y, x) * (0.5 * SIDES / np.pi)).astype(np.int64) % SIDES
-    return np.where(np.hypot(x, y) <= ABOVE * np.abs(z), 0, side)
+    ring = np.searchsorted(RINGS, np.hypot(x, y) / np.maximum(np.abs(z), MIN_DEPTH))
+    turn = np.arctan2(y, x) * (SIDES / (2.0 * np.pi)) + 0.5 * (1 + ring % 2)
+    side = np.floor(turn).astype(np.int64) % SIDES
+    return np.where(ring == 0, 0, 1 + SIDES * (ring - 1) + side)

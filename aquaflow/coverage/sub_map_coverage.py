@@ -27,7 +27,7 @@ Array = npt.NDArray[np.float64]
 REDRAWN = 32
 """Keyframes that are drawn anew in a turn: 20 to 60 ms of CPU time."""
 MOST_TILES = 8192
-"""Of a grid: 88 MB, at 0.1 m a cell 20,000 m^2. Then its cells become twice as large."""
+"""Of a grid: 86 MB, at 0.1 m a cell 20,000 m^2. Then its cells become twice as large."""
 UNMOVED = 0.25
 """Cells by which a keyframe's view may have moved until it is drawn anew: no cell's share that is
 seen changes by more."""

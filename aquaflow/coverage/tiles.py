@@ -11,11 +11,12 @@ import numpy.typing as npt
 from aquaflow.coverage.raster import DIRECTION_BINS, RANGE_BINS, Cells
 
 Counts = npt.NDArray[np.uint16]
+Sides = npt.NDArray[np.uint8]
 
 TILE = 16
 """Cells along a side: what a picture shows."""
-TILE_BYTES = TILE * TILE * (RANGE_BINS + DIRECTION_BINS) * 2
-"""11 kB."""
+TILE_BYTES = TILE * TILE * (2 * RANGE_BINS + DIRECTION_BINS)
+"""10 kB."""
 
 
 @dataclass
@@ -24,8 +25,9 @@ class Tile:
 
     by_range: Counts
     """[16, 16, 12] by the bin of the smallest range; first axis x, second axis y."""
-    by_direction: Counts
-    """[16, 16, 9] by the direction from which it was seen."""
+    by_direction: Sides
+    """[16, 16, 17] by the direction from which it was seen, modulo 256: whether a direction occurs
+    is asked for, and 256 views of one direction are as good as none once in a dive of years."""
     keyframes: int = 0
     """That see any cell of it."""
 
@@ -34,7 +36,7 @@ class Tile:
         """One that nothing sees."""
         shape = (TILE, TILE)
         return Tile(
-            np.zeros((*shape, RANGE_BINS), np.uint16), np.zeros((*shape, DIRECTION_BINS), np.uint16)
+            np.zeros((*shape, RANGE_BINS), np.uint16), np.zeros((*shape, DIRECTION_BINS), np.uint8)
         )
 
 
@@ -70,9 +72,8 @@ class Tiles:
     ) -> None:
         x, y = (cells.ij[inside] % TILE).T
         # No cell is there twice, so that nothing is lost where a place is indexed.
-        step = np.uint16(by % (1 << 16))
-        tile.by_range[x, y, cells.range_bin[inside]] += step
-        tile.by_direction[x, y, cells.direction_bin[inside]] += step
+        tile.by_range[x, y, cells.range_bin[inside]] += np.uint16(by % (1 << 16))
+        tile.by_direction[x, y, cells.direction_bin[inside]] += np.uint8(by % (1 << 8))
 
     def __len__(self) -> int:
         return len(self.tiles)

@@ -12,6 +12,8 @@ from functools import partial
 from typing import Any, TypeVar
 
 from aquaflow.clocks.deadline import Deadline
+from aquaflow.coverage import DiveCoverage, PageView
+from aquaflow.dive.coverage_files import final_views, write_coverage
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.found_camera import FoundCamera
 from aquaflow.dive.held_out import HeldOut, examine_held_out, mean_amplification
@@ -48,11 +50,13 @@ class Deliverables:
         calibration: CameraModel | None,
         outputs: MetricOutputs | None = None,
         found: FoundCamera | None = None,
+        coverage: DiveCoverage | None = None,
     ) -> None:
         """``results``: all frames with their final poses; ``calibration``: as given, if any, else
         ``found`` may be there; ``outputs``: None where nothing but the map is known."""
         self.name, self.folder, self.slam = name, folder, slam
         self.results, self.calibration, self._found = results, calibration, found
+        self._coverage, self._views = coverage, dict[int, PageView]()
         self.outputs = outputs or MetricOutputs()
         self.held_out: list[HeldOut] = []
         """Ranges in the unit of the largest sub-map's metric frame."""
@@ -118,6 +122,12 @@ class Deliverables:
             attempt("writing camera.yaml", partial(self._write_cameras, camera))
         for sub_map in self.slam.mappers:
             self._write_map(sub_map)
+        attempt("writing the coverage", self._write_coverage)
+
+    def _write_coverage(self) -> None:
+        if self._coverage is not None:
+            self._views = final_views(self._coverage, self.slam, self.outputs, self._waters)
+            write_coverage(self.folder, self._views, self._main)
 
     def write_evaluation(self) -> None:
         """The held-out views, and the water with what they say of it."""

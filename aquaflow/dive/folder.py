@@ -62,6 +62,7 @@ RESULTS = (
     *("metrics.json", "report.html", "heldout/*.png", "heldout/*.npz", TRACE),
     KNOWN_LENGTHS,
     TELEMETRY,
+    *("coverage.npz", "coverage.json", "coverage.png"),
     *("metric.json", "trajectory.csv", "georeference.json", STATUS),
     *(
         "restored/*.png",

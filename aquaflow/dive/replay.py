@@ -22,6 +22,7 @@ from aquaflow.slam import Slam
 from aquaflow.sources import RecordedCamera, mounting_of
 from aquaflow.sources.reading import read_past_failures
 from aquaflow.sources.telemetry_input import TelemetryInput
+from aquaflow.tracking.frames import FrameClass
 
 Progress = Callable[[str, int, int | None], None]
 """Called with the stage, the steps done and, where known, the steps there are."""
@@ -101,7 +102,9 @@ def _replay(
         if isinstance(event, Dropped):
             run.drop(event)
         else:
-            run.frame(event)
+            decided = run.frame(event)
+            if any(tracked.frame_class is FrameClass.KEYFRAME for tracked in decided):
+                run.cover()
         with run.profiler.stage("progress"), contain("progress"):
             progress("map", done, total)
     if done == 0:

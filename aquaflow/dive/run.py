@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from aquaflow.config import Config
+from aquaflow.coverage import DiveCoverage
 from aquaflow.dive import calibration_findings
 from aquaflow.dive.deliverables import Deliverables
 from aquaflow.dive.folder import SUGGESTED, TRACE, DiveFolder
@@ -82,6 +83,8 @@ class DiveRun:
         """Counters of a live run for metrics.json."""
         self.telemetry_log: TelemetryLog | None = None
         """Of a live run: a replay's telemetry is in files already."""
+        self.coverage = DiveCoverage(config.coverage) if config.coverage.enabled else None
+        """What the camera has seen; brought up to date by whoever runs the dive."""
         self.started = time.monotonic()
         self.frame_ms = array("d")
         """Of every frame that was read: preparing, tracking and mapping it."""
@@ -145,6 +148,13 @@ class DiveRun:
         decided = self.slam.catch_up()
         self.decide(decided)
         return decided
+
+    def cover(self) -> None:
+        """Bring the coverage up to date; it never costs a frame."""
+        if self.coverage is not None:
+            with self.profiler.stage("coverage"), self.slam.failures.contain("coverage"):
+                self.coverage.look(self.slam.keyframes, self.slam.metric_frame)
+                self.coverage.update()
 
     def _time_frame(self, begun: float, decided: list[Tracked]) -> None:
         now = time.monotonic()
@@ -281,8 +291,9 @@ class DiveRun:
         self, results: list[Tracked], outputs: MetricOutputs, limits: FinishTime
     ) -> Finished:
         made = Deliverables(
-            self.name, self.folder, self.slam, results, self.calibration, outputs, self.found
-        )
+            self.name, self.folder, self.slam, results, self.calibration, outputs, self.found,
+            self.coverage,
+        )  # fmt: skip
         with self.profiler.stage("evaluate"):
             made.summarise()
         with self.profiler.stage("write"):

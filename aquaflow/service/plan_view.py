@@ -14,6 +14,7 @@ from aquaflow.coverage.page_axes import names_of, page_axes
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.service.dive_parts import Parts
+from aquaflow.service.live_coverage import LiveCoverage
 
 Array = npt.NDArray[np.float64]
 
@@ -33,10 +34,13 @@ class PlanView:
     """The path at the moment; asked from the threads of the health server."""
 
     def __init__(
-        self, parts: Callable[[], Parts | None], now_s: Callable[[], float] = time.monotonic
+        self,
+        parts: Callable[[], Parts | None],
+        now_s: Callable[[], float] = time.monotonic,
+        coverage: LiveCoverage | None = None,
     ) -> None:
         """``parts``: of the dive that runs; None: there is none."""
-        self._parts, self._now_s = parts, now_s
+        self._parts, self._now_s, self._coverage = parts, now_s, coverage
         self._lock = threading.Lock()
         self._computed_s = -KEPT_S
         self._said: dict[str, Any] = {}
@@ -45,7 +49,7 @@ class PlanView:
         """``sub_maps``: of each its ``number``, ``unit``, from where it is ``seen``, what ``right``
         and ``up`` are on the page, and ``points`` [N, 2] through its keyframes. ``now``: the newest
         pose, its ``sub_map``, ``at`` [2], and ``ahead`` [2], a unit vector along the view's axis or
-        null.
+        null. With coverage, each sub-map has it as ``coverage``, and ``hints`` are those that hold.
         """
         with self._lock:
             if self._now_s() - self._computed_s >= KEPT_S:
@@ -69,7 +73,11 @@ class PlanView:
         if latest is not None and latest.T_wc is not None and latest.sub_map in plans:
             now = {"sub_map": latest.sub_map, **plans[latest.sub_map].pose(latest.T_wc)}
         sub_maps = [{"number": number, **plan.to_json()} for number, plan in plans.items()]
-        return {"sub_maps": sub_maps, "now": now}
+        if self._coverage is None:
+            return {"sub_maps": sub_maps, "now": now}
+        seen = self._coverage.to_json()
+        sub_maps = [each | {"coverage": seen.get(each["number"])} for each in sub_maps]
+        return {"sub_maps": sub_maps, "now": now, "hints": self._coverage.in_words()}
 
 
 class _Plan:

@@ -7,10 +7,12 @@ from collections.abc import Callable
 from typing import Any
 
 from aquaflow.config.vehicle import VehicleConfig
+from aquaflow.coverage.hints import Hint
 from aquaflow.service.control import Control
 from aquaflow.service.dive_parts import Parts
 from aquaflow.service.feed import Feed
 from aquaflow.service.health.http import HealthServer
+from aquaflow.service.live_coverage import LiveCoverage
 from aquaflow.service.live_dive import LiveDive
 from aquaflow.service.live_viewer import LiveViewer
 from aquaflow.service.picture import NewestPicture
@@ -42,7 +44,8 @@ class Station:
         self._shown: tuple[Parts, PoseOutput | None] | None = None
         self._closing = contextlib.ExitStack()
         self.picture = NewestPicture()
-        messages = PilotMessages(service.report, feed)
+        self._coverage = LiveCoverage(feed.failures) if vehicle.coverage.enabled else None
+        messages = PilotMessages(service.report, feed, self._hints)
         self._watchers: list[Callable[[Watched], None]] = [self.picture.update, messages.update]
         if feed.pilot is not None:
             self._watchers.append(Arming(service.dive, control, feed.pilot).update)
@@ -50,11 +53,14 @@ class Station:
         self._viewer: LiveViewer | None = None
         self._viewer_config = vehicle.viewer
         with contextlib.ExitStack() as opened:
+            if self._coverage is not None:
+                opened.callback(self._contained, self._coverage.close)
             if service.health.enabled:
-                plan = PlanView(lambda: None if self._shown is None else self._shown[0])
+                plan = PlanView(self._dive_shown, coverage=self._coverage)
                 server = HealthServer(
-                    service.health, self._page, plan.to_json, control, self.picture.jpeg
-                )
+                    service.health, self._page, plan.to_json, control, self.picture.jpeg,
+                    self._coverage,
+                )  # fmt: skip
                 opened.callback(self._contained, server.close)
             if vehicle.viewer.enabled:
                 self._viewer = LiveViewer(vehicle.viewer, self.report)
@@ -84,11 +90,22 @@ class Station:
         if self._viewer is not None:
             self._viewer.begin()
             parts.loop.watchers.append(self._viewer.update)
+        if self._coverage is not None:
+            self._coverage.show(parts)
+            parts.loop.watchers.append(self._coverage.update)
         self._shown = parts, poses
 
     def hide(self) -> None:
         """From here on, no dive: what it holds may be let go."""
         self._shown = None
+        if self._coverage is not None:
+            self._coverage.hide()
+
+    def _dive_shown(self) -> Parts | None:
+        return None if self._shown is None else self._shown[0]
+
+    def _hints(self) -> tuple[Hint, ...]:
+        return () if self._coverage is None else self._coverage.hints
 
     def close(self) -> None:
         """Stop listening."""

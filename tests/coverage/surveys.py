@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.config.coverage import CoverageConfig
+from aquaflow.coverage import PageView, page_view
 from aquaflow.coverage.footprint import BLOCKS, Footprint
 from aquaflow.coverage.sub_map_coverage import SubMapCoverage
 from aquaflow.fusion.metric_frame import MetricFrame
@@ -70,13 +74,15 @@ def sides_at(
     path: Array,  # [N, 2]
 ) -> Array:
     """[...] different directions among the views of each place: within 10 degrees of the vertical,
-    or one of eight sides."""
+    or one of four quarters in rings up to 25, 40 and 60 degrees, every other ring turned by 45."""
     offset = path - places[..., None, :]
     seen = (np.abs(offset) <= 0.5 * np.array([WIDTH, HEIGHT])).all(axis=-1)
-    above = np.hypot(*np.moveaxis(offset, -1, 0)) <= ALTITUDE * np.tan(np.radians(10.0))
-    turn = np.degrees(np.arctan2(offset[..., 1], offset[..., 0])) + 22.5
-    side = np.where(above, 8, np.floor(turn % 360.0 / 45.0))
-    return np.asarray(sum(((side == each) & seen).any(axis=-1) for each in range(9)))
+    angle = np.degrees(np.arctan2(np.hypot(*np.moveaxis(offset, -1, 0)), ALTITUDE))
+    ring = np.digitize(angle, [10.0, 25.0, 40.0, 60.0], right=True)
+    turn = np.degrees(np.arctan2(offset[..., 1], offset[..., 0])) + np.where(ring % 2, 0.0, 45.0)
+    side = np.where(ring == 0, 0, 10 * ring + np.floor(turn % 360.0 / 90.0))
+    kinds = np.unique(side)
+    return np.asarray(sum(((side == each) & seen).any(axis=-1) for each in kinds))
 
 
 def metric(scale: float = 1.0, heading: float = 0.0) -> MetricFrame:
@@ -87,3 +93,12 @@ def metric(scale: float = 1.0, heading: float = 0.0) -> MetricFrame:
         Sim3(turn @ to_ned, np.array([5.0, -3.0, 1.0]), scale), 1e-4 * np.eye(7), metric=True,
         level=True, north="true north",
     )  # fmt: skip
+
+
+def survey_of(path: Array, limit: float | None = 2.4) -> PageView:  # path: [N, 2] east, north
+    """What is shown of a survey 2 m above the ground, in metres, after its last keyframe."""
+    frame = replace(metric(), T_nm=Sim3(metric().T_nm.R, np.zeros(3)))
+    centres = np.column_stack([path, np.full(len(path), ALTITUDE)])
+    view = page_view(0, surveyed(path), centres, frame, limit, CoverageConfig())
+    assert view is not None
+    return view

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from aquaflow.config.coverage import CoverageConfig
-from aquaflow.coverage import DiveCoverage
+from aquaflow.coverage import DiveCoverage, dive_coverage
 from aquaflow.coverage.footprint import BLOCKS, Footprint
 from aquaflow.errors import InputError
 from aquaflow.geometry.similarity import Sim3
@@ -43,8 +43,8 @@ def store(count: int) -> Any:
     return SimpleNamespace(keyframes=[Told(number) for number in range(count)])
 
 
-def look(coverage: DiveCoverage, keyframes: Any, most: int = 100) -> None:
-    coverage.look(keyframes, lambda _: metric(), most)
+def look(coverage: DiveCoverage, keyframes: Any, everything: bool = False) -> None:
+    coverage.look(keyframes, lambda _: metric(), everything)
     while coverage.update():
         pass
 
@@ -74,14 +74,30 @@ def test_a_pointmap_is_read_when_new_and_once_more_when_it_is_final() -> None:
     look(coverage, keyframes)
     look(coverage, keyframes)
     assert [each.read for each in keyframes.keyframes] == [1, 1, 4, 2]
+    look(coverage, keyframes, everything=True)
+    look(coverage, keyframes, everything=True)
+    assert [each.read for each in keyframes.keyframes] == [1, 1, 4, 3]
+
+
+def test_every_keyframe_that_moves_is_found_after_some_turns(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(dive_coverage, "FOLLOWED", 3)
+    coverage, keyframes = DiveCoverage(CONFIG), store(12)
+    look(coverage, keyframes, everything=True)
+    for each in keyframes.keyframes:
+        each.T_wc = Sim3(np.eye(3), np.array([4.0, 0.0, 0.0])) @ each.T_wc
+    for _ in range(3):
+        look(coverage, keyframes)
+    assert {T.t[0] for _, T in coverage.sub_maps[0].seen.values()} == {4.0}
 
 
 def test_after_a_restart_the_newest_are_read_first_a_few_at_a_time() -> None:
     coverage, keyframes = DiveCoverage(CONFIG), store(10)
-    look(coverage, keyframes, 4)
+    look(coverage, keyframes)
     assert sorted(coverage.sub_maps[0].seen) == [6, 7, 8, 9]
     for _ in range(3):
-        look(coverage, keyframes, 4)
+        look(coverage, keyframes)
     assert sorted(coverage.sub_maps[0].seen) == list(range(10))
 
 

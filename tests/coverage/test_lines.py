@@ -85,6 +85,12 @@ def test_one_line_or_a_crossing_one_overlaps_nothing() -> None:
     assert state(cross).overlap is None
 
 
+def test_a_line_of_another_survey_is_no_neighbour() -> None:
+    found = state(lawnmower(2, 10.0, 6.0, 0.25))
+    assert len(found.lines) >= 2
+    assert found.overlap is None
+
+
 def test_the_next_line_goes_on_at_the_wanted_spacing_from_where_the_vehicle_is() -> None:
     found = state(lawnmower(3, 10.0, 1.0, 0.25), overlap=0.5).suggestion
     assert found is not None

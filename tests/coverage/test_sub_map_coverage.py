@@ -160,7 +160,7 @@ def test_another_unit_of_the_whole_map_changes_shares_by_no_more_than_the_cells_
     larger = Sim3(np.eye(3), np.zeros(3), scale)
     coverage.move({number: larger @ T for number, (_, T) in coverage.seen.items()})
     coverage.settle()
-    assert shown(coverage).area(Seen.WELL) == pytest.approx(scale**2 * before, rel=0.05)
+    assert shown(coverage).area(Seen.WELL) == pytest.approx(scale**2 * before, rel=0.1)
 
 
 def test_what_moves_by_less_than_a_fraction_of_a_cell_waits_for_the_end() -> None:
@@ -206,9 +206,9 @@ def test_while_the_grid_is_made_anew_the_one_of_before_is_shown_and_grows() -> N
         pass
     assert coverage.settled
     assert coverage.layer is not before
-    assert shown(coverage).area(Seen.WELL) == pytest.approx(
-        shown(surveyed(path)).area(Seen.WELL), rel=0.03
-    )
+    plan, alone = shown(coverage), shown(surveyed(path))
+    area, before = (sum(each.area(seen) for seen in Seen) for each in (plan, alone))
+    assert area == pytest.approx(before + WIDTH * HEIGHT, rel=0.02)
 
 
 def test_a_long_dive_takes_larger_cells_and_bounded_memory(

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import threading
 from collections.abc import Callable, Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias
 from urllib.parse import parse_qs
 
 from aquaflow import __version__
@@ -28,7 +29,7 @@ PATIENCE_S = 10.0
 MOST_CLIENTS = 16
 """Requests at a time; more are turned away, so that threads stay bounded."""
 
-JSON, JPEG = "application/json", "image/jpeg"
+JSON, JPEG, PNG = "application/json", "image/jpeg", "image/png"
 """Content types of all but the page and the metrics."""
 
 NOT_ALLOWED = {"error": "give the token, or ask on board by the name localhost"}
@@ -50,6 +51,22 @@ REGISTRATION = {
 BlueOS's own server can hand it on at /extensionv2/aquaflow/."""
 
 Headers: TypeAlias = Sequence[tuple[str, str]]
+CELLS = re.compile(r"/coverage/([0-9]{1,6})\.png")
+"""Address of the cells of a sub-map."""
+
+
+class CoveragePictures(Protocol):
+    """PNG files of the coverage, made in the thread of a request."""
+
+    def png(self) -> bytes | None:
+        """The finished picture, for whoever looks on; None: there is none."""
+        ...
+
+    def cells(self, sub_map: int) -> bytes | None:
+        """A pixel for each cell, for the page; None: there is none."""
+        ...
+
+
 Say: TypeAlias = Callable[[], dict[str, Any]]
 """What is answered as JSON; called in the thread of the request."""
 
@@ -64,6 +81,7 @@ class HealthServer:
         path: Say | None = None,
         control: Control | None = None,
         picture: Callable[[], bytes | None] = lambda: None,
+        coverage: CoveragePictures | None = None,
     ) -> None:
         """Listen at once.
 
@@ -71,6 +89,7 @@ class HealthServer:
             path: the plan view at /path.json, if there is one.
             control: gets the pilot's requests.
             picture: makes the JPEG file at /picture.jpg, if there is a picture.
+            coverage: makes /coverage.png and /coverage/0.png, where there is a coverage.
 
         Raises:
             InputError: the address is taken, or the token file cannot be read.
@@ -78,7 +97,7 @@ class HealthServer:
         """
         access = Access(config)
         try:
-            handler = _handler(access, report, path, control or Control(), picture)
+            handler = _handler(access, report, path, control or Control(), picture, coverage)
             self._server = _Server((config.host, config.port), handler)
         except OSError as error:
             raise InputError(
@@ -128,12 +147,23 @@ class _Server(ThreadingHTTPServer):
             self._room.release()
 
 
+def _coverage_picture(path: str, coverage: CoveragePictures | None) -> bytes | None:
+    """What is at ``path``; None if that is no picture of the coverage, or there is none yet."""
+    if coverage is None:
+        return None
+    if path == "/coverage.png":
+        return coverage.png()
+    of_cells = CELLS.fullmatch(path)
+    return None if of_cells is None else coverage.cells(int(of_cells[1]))
+
+
 def _handler(
     access: Access,
     report: Say,
     plan: Say | None,
     control: Control,
     picture: Callable[[], bytes | None],
+    coverage: CoveragePictures | None,
 ) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         timeout = PATIENCE_S
@@ -158,6 +188,8 @@ def _handler(
                 self._answer(200, TYPE, exposition(report()))
             elif path == "/picture.jpg" and (jpeg := picture()) is not None:
                 self._answer(200, JPEG, jpeg)
+            elif (png := _coverage_picture(path, coverage)) is not None:
+                self._answer(200, PNG, png)
             else:
                 self._say(404, {"error": "there is nothing here"})
 

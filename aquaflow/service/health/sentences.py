@@ -6,6 +6,7 @@ numbers, paths or errors; those are in the reason on the service's page.
 
 from __future__ import annotations
 
+from aquaflow.coverage.hints import Hint
 from aquaflow.service.health.degradation import DegradationLevel
 from aquaflow.service.health.pressure import Shortage
 from aquaflow.service.health.state import State
@@ -45,6 +46,12 @@ OF_LEVEL = {
     DegradationLevel.RECORDING_ONLY: "it only records",
 }
 """What the service still does."""
+OF_HINT = {
+    Hint.TOO_HIGH: "AquaFlow: too high for this water.",
+    Hint.TOO_FAST: "AquaFlow: too fast for the wanted overlap.",
+    Hint.TOO_FAR_ASIDE: "AquaFlow: too far from the last line.",
+}
+"""What a pilot could do better."""
 DISK_FULL = "AquaFlow: the disk is full, nothing is kept."
 MAPPING_FAILS = "AquaFlow: the map cannot grow, tracking goes on."
 STAGE_FAILS = "AquaFlow: a stage fails again and again."

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 from aquaflow.config.service import VehicleReportConfig
+from aquaflow.coverage.hints import Hint
 from aquaflow.service.feed import Feed
-from aquaflow.service.health.sentences import OF_STATE
+from aquaflow.service.health.sentences import OF_HINT, OF_STATE
 from aquaflow.service.health.state import Health, State
 from aquaflow.service.watched import Watched
 from aquaflow.sources.outbound import NamedValue, StatusText
@@ -19,6 +21,9 @@ SPACING_S = 2.0
 REPEAT_S = 15.0
 """Least time until the same sentence comes again: a state that flaps must not fill the pilot's
 screen."""
+
+HINTED_IN = (State.TRACKING, State.DEGRADED)
+"""States in which a pilot has time for what could be better."""
 
 SEVERITY: dict[State, Literal["error", "warning", "notice", "info"]] = {
     State.WAITING: "error",
@@ -34,8 +39,14 @@ SEVERITY: dict[State, Literal["error", "warning", "notice", "info"]] = {
 class PilotMessages:
     """A watcher of the loop."""
 
-    def __init__(self, config: VehicleReportConfig, feed: Feed) -> None:
-        self._config, self._feed = config, feed
+    def __init__(
+        self,
+        config: VehicleReportConfig,
+        feed: Feed,
+        hints: Callable[[], Sequence[Hint]] = tuple,
+    ) -> None:
+        """``hints``: those of the coverage that hold now."""
+        self._config, self._feed, self._hints = config, feed, hints
         self._standing: set[str] = set()
         """Sentences that were said and still hold."""
         self._said_s: dict[str, float] = {}
@@ -60,7 +71,9 @@ class PilotMessages:
 
     def _say(self, health: Health, now: float) -> None:
         """The first sentence that holds now and was not said since it began to."""
-        holding = health.sentences or (OF_STATE[health.state],)
+        hints = self._hints() if self._config.hints and health.state in HINTED_IN else ()
+        own = health.sentences or (OF_STATE[health.state],)
+        holding = (*own, *(OF_HINT[hint] for hint in hints))
         self._standing &= set(holding)
         soon = now - max(self._said_s.values(), default=-SPACING_S) < SPACING_S
         if soon and health.state is not State.STOPPING:  # which has no later
@@ -70,6 +83,6 @@ class PilotMessages:
             if sentence not in self._standing and sentence not in self._said_s:
                 self._standing.add(sentence)
                 self._said_s[sentence] = now
-                severity = SEVERITY.get(health.state, "info")
+                severity = SEVERITY.get(health.state, "info") if sentence in own else "notice"
                 self._feed.send(StatusText(severity, sentence))
                 return

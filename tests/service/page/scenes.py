@@ -11,6 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from aquaflow.coverage import PageView
+from aquaflow.coverage.picture import cells_png, coverage_png
+from aquaflow.service.live_coverage import described
+from tests.coverage.surveys import survey_of
 from tests.service.health.reports import REPORT
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -31,6 +35,8 @@ class SimulatedDive:
         """Actions in the order of the clicks."""
         self.refusal = ""
         """Why nothing that is asked for can be done."""
+        self.coverage: PageView | None = None
+        """What the camera has seen; None: a server without coverage."""
         self.controlled = True
         """False: a server without the requests that control a dive."""
 
@@ -84,7 +90,9 @@ class SimulatedDive:
             "up": "magnetic north", "points": points,
         }  # fmt: skip
         now = {"sub_map": 0, "at": points[-1], "ahead": [1.0, 0.1]}
-        return {"sub_maps": [plan], "now": now}
+        seen = {} if self.coverage is None else {"coverage": described(self.coverage)}
+        hints = [] if self.coverage is None else ["too fast for the wanted overlap: 41 %"]
+        return {"sub_maps": [plan | seen], "now": now, "hints": hints}
 
     def act(self, action: str) -> tuple[int, dict[str, Any]]:
         """As `POST /dive/...` answers."""
@@ -94,6 +102,17 @@ class SimulatedDive:
             return 409, {"error": self.refusal or f"the dive is {self.state}"}
         self.state = after
         return 202, {"state": self.state, "dive": "dive-20261104-0912"}
+
+    def cover(self) -> None:
+        """See what the path's keyframes see from 2 m above the ground."""
+        points = np.array(self.path()["sub_maps"][0]["points"])
+        self.coverage = survey_of(points)
+
+    def png(self) -> bytes | None:
+        return None if self.coverage is None else coverage_png(self.coverage)
+
+    def cells(self, sub_map: int) -> bytes | None:
+        return None if self.coverage is None or sub_map else cells_png(self.coverage)
 
     def picture(self) -> bytes:
         """A JPEG: the first panel of the README's picture, which is a synthetic dive."""

@@ -52,7 +52,7 @@ def address(dive: SimulatedDive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         lambda access, *says: with_buttons(real(access, *says), dive, access.allows),
     )
     config = ListenConfig.model_construct(host="127.0.0.1", port=0, token_file=token)
-    server = http.HealthServer(config, dive.report, dive.path)
+    server = http.HealthServer(config, dive.report, dive.path, coverage=dive)
     yield f"http://127.0.0.1:{server.port}/"
     server.close()
 
@@ -213,3 +213,27 @@ def test_only_pages_of_the_same_machine_may_frame_it(browser: Browser, address: 
     assert not framed(browser, address, f"http://localhost:{port}/")
     blueos.shutdown()
     blueos.server_close()
+
+
+def test_the_plan_shows_what_was_seen_and_the_next_line(
+    browser: Browser, address: str, dive: SimulatedDive
+) -> None:
+    dive.cover()
+    browser.emulate(*DESKTOP)
+    log_in(browser, address)
+    browser.wait("document.querySelector('#plan-frame image')")
+    assert "seen well:" in browser.text("#coverage-key")
+    assert "overlap to the last line" in browser.text("#coverage-note").lower()
+    assert browser.text("#hints") == "Too fast for the wanted overlap: 41 %"
+    inside = """
+        const frame = document.querySelector('#plan-frame').getBoundingClientRect();
+        return [...document.querySelectorAll('#plan-frame :is(image, .path, .next)')].map(each => {
+            const box = each.getBoundingClientRect();
+            return box.left >= frame.left - 1 && box.right <= frame.right + 1
+                && box.top >= frame.top - 1 && box.bottom <= frame.bottom + 1;
+        });
+    """
+    assert browser.run(inside) == [True, True, True]
+    keep(browser, "coverage")
+    browser.emulate(*PHONE, dark=True)
+    keep(browser, "coverage_phone_dark")

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from aquaflow.coverage.hints import Hint
 from aquaflow.service.health import sentences
 from aquaflow.service.health.degradation import DegradationLevel, deepest
 from aquaflow.service.health.pressure import Shortage
@@ -32,6 +33,7 @@ LEVELS = [level for level in DegradationLevel if level is not DegradationLevel.F
 EVERY_SENTENCE = {
     *sentences.OF_STATE.values(),
     *sentences.OF_CAUSE.values(),
+    *sentences.OF_HINT.values(),
     *(sentences.doing_less(level, short) for level in LEVELS for short in Shortage),
     *(sentences.no_picture(name) for name in NAMES),
     *(sentences.silent_link(name, heard) for name in NAMES for heard in (False, True)),
@@ -51,6 +53,7 @@ def told(tmp_path: Path) -> Iterator[Told]:
 def test_every_state_and_every_cause_has_its_sentence() -> None:
     assert set(sentences.OF_STATE) == set(State)
     assert set(sentences.OF_CAUSE) == set(Cause)
+    assert set(sentences.OF_HINT) == set(Hint)
     assert set(sentences.OF_LEVEL) == set(LEVELS)
     assert set(sentences.OF_SHORTAGE) == set(Shortage)
 

@@ -2,7 +2,7 @@
 // Every address is relative: BlueOS serves the page under a path of its own.
 
 import { drawPlan } from "./plan.js";
-import { ago, capital, colourOf, colourOfDevice, factsNow, factsOfScale, flat } from "./words.js";
+import { ago, capital, colourOf, colourOfDevice, coverageKey, coverageNote, factsNow, factsOfScale, flat } from "./words.js";
 
 const LOOK_MS = 1000, PATIENCE_MS = 5000, PATH_EVERY = 2;
 const POSSIBLE = { idle: ["start", "new"], mapping: ["stop", "finish", "new"], paused: ["start", "finish", "new"], finishing: [] };
@@ -114,6 +114,18 @@ function showPicture(frames) {
   picture.src = `picture.jpg?frame=${frames}`;
 }
 
+function showCoverage(coverage, unit) {
+  $("coverage").hidden = !coverage;
+  $("hints").textContent = capital((plans?.hints ?? []).join("; "));
+  if (!coverage) return;
+  $("coverage-key").replaceChildren(...coverageKey(coverage, unit).map(([name, words]) => {
+    const row = make("li", "");
+    row.append(make("span", "", `swatch ${name}`), make("span", words));
+    return row;
+  }));
+  $("coverage-note").textContent = coverageNote(coverage, unit);
+}
+
 function showPlan() {
   const parts = plans?.sub_maps ?? [];
   const choice = $("plan-choice");
@@ -122,10 +134,12 @@ function showPlan() {
   $("plan").hidden = plans === null;
   if (!plan) {
     $("plan-frame").replaceChildren(make("p", "No path yet"));
+    showCoverage(null);
     return;
   }
   const now = plans.now?.sub_map === plan.number ? plans.now : null;
-  drawPlan($("plan-frame"), plan, now);
+  drawPlan($("plan-frame"), plan, now, shownFrames);
+  showCoverage(plan.coverage, plan.unit);
   $("plan-note").textContent = `seen ${plan.seen}; up: ${plan.up}`;
   const names = ["now", ...parts.map(part => String(part.number))];
   if (choice.options.length !== names.length) {

@@ -1,4 +1,5 @@
-// The path seen from above, drawn in pixels of its frame: grid, path, start, vehicle, scale bar.
+// The path seen from above, drawn in pixels of its frame: what was seen, grid, path, next line,
+// start, vehicle, scale bar.
 
 const SVG = "http://www.w3.org/2000/svg";
 const MARGIN_PX = 30, BAR_PX = 16; // the scale bar's own, below the path
@@ -62,20 +63,49 @@ function scaleBar(step, unit, scale, height) {
   ];
 }
 
-// Draws `plan` (an entry of sub_maps in /path.json) and `now`, if it is of that sub-map.
-export function drawPlan(frame, plan, now) {
+// The cells as one picture; `to_page` is from its pixels to units of the map.
+function cells(number, coverage, view, version) {
+  const [[a, c, e], [b, d, f]] = coverage.to_page, k = view.scale, [x, y] = view.place([0, 0]);
+  const matrix = [k * a, -k * b, k * c, -k * d, x + k * e, y - k * f];
+  const [width, height] = coverage.size;
+  return element("image", {
+    class: "cells", width, height, href: `coverage/${number}.png?frame=${version}`,
+    preserveAspectRatio: "none", transform: `matrix(${matrix.join(" ")})`,
+  });
+}
+
+// Corners of the cells' picture, in units of the map.
+function corners({ to_page: [[a, c, e], [b, d, f]], size: [width, height] }) {
+  return [[0, 0], [width, 0], [0, height], [width, height]].map(([u, v]) => [a * u + c * v + e, b * u + d * v + f]);
+}
+
+function nextLine([start, end]) {
+  const [x, y] = start;
+  return [
+    element("line", { class: "next", x1: x, y1: y, x2: end[0], y2: end[1] }),
+    element("circle", { class: "next-start", cx: x, cy: y, r: 4.5 }),
+  ];
+}
+
+// Draws `plan` (an entry of sub_maps in /path.json) and `now`, if it is of that sub-map; `version`
+// changes when what was seen may have.
+export function drawPlan(frame, plan, now, version) {
   const [width, height] = [frame.clientWidth, frame.clientHeight];
   if (!width || !plan.points.length) return;
-  const view = fitted(now ? [...plan.points, now.at] : plan.points, width, height);
+  const coverage = plan.coverage, next = coverage?.next_line?.places ?? [];
+  const around = [...(now ? [now.at] : []), ...(coverage ? corners(coverage) : []), ...next];
+  const view = fitted([...plan.points, ...around], width, height);
   const step = roundStep(GRID_PX / view.scale);
   const path = plan.points.map(view.place);
   const drawn = element("svg", {
     viewBox: `0 0 ${width} ${height}`, role: "img",
     "aria-label": `Path of ${plan.points.length} points; up is ${plan.up}`,
   });
+  if (coverage) drawn.append(cells(plan.number, coverage, view, version));
   drawn.append(
     ...grid(view, step, width, height),
     element("polyline", { class: "path", points: path.join(" ") }),
+    ...(next.length ? nextLine(next.map(view.place)) : []),
     element("circle", { class: "start", cx: path[0][0], cy: path[0][1], r: 4.5 }),
     ...scaleBar(step, plan.unit, view.scale, height),
   );

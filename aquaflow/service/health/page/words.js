@@ -67,6 +67,23 @@ export function factsOfScale(report) {
   return [["Lengths", length(frame)], ["Vertical", tilt], ["Axes", `x to ${frame.north}`], ...unused];
 }
 
+const CLASSES = [["well", "seen well"], ["sparse", "seen sparsely"], ["too_far", "too far for this water"]];
+
+// Name of the class, its words and its area.
+export function coverageKey({ areas }, unit) {
+  const square = unit === "m" ? " m²" : "";
+  return CLASSES.map(([name, words]) => [name, `${words}: ${Number((areas[name] ?? 0).toPrecision(3))}${square}`]);
+}
+
+export function coverageNote({ overlap, swath, next_line: next, range_limit: limit }, unit) {
+  const said = [];
+  if (overlap !== null && overlap >= 0) said.push(`overlap to the last line ${Math.round(100 * overlap)} %`);
+  if (overlap !== null && overlap < 0) said.push(`gap to the last line ${number(-overlap * swath, 1)} ${unit}`);
+  if (next) said.push(`next line (dashed): ${Math.round(100 * next.new_share)} % new`);
+  if (limit !== null) said.push(`this water allows ${number(limit, 1)} ${unit}`);
+  return capital(said.join("; "));
+}
+
 // Every number of the report as rows of a table.
 export function flat(value, name = "") {
   if (value === null || typeof value !== "object") return [[name, String(value)]];
