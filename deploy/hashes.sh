@@ -10,7 +10,7 @@ set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 checkout=$(dirname "$here")
 wheelhouse=${1:?give a folder for the wheels}
-extras=${2-prior,telemetry,recording,viewer}
+extras=${2-prior,telemetry,recording}
 python=${PYTHON:-python3}
 # shellcheck source=deploy/torch.sh
 source "$here/torch.sh"

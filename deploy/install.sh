@@ -5,7 +5,7 @@
 #     --config FILE      the vehicle's YAML (default: keep /etc/aquaflow/aquaflow.yaml, or the example)
 #     --python PROGRAM   interpreter of the environment (default: python3)
 #     --wheelhouse DIR   install from these wheels only, without a network
-#     --extras LIST      optional parts (default: prior,telemetry,recording,viewer)
+#     --extras LIST      optional parts (default: prior,telemetry,recording)
 #     --device DEVICE    cpu, cuda or jetson: where maps are drawn and learned priors run (default:
 #                        auto, cuda where a GPU answers, jetson where torch reaches a Jetson's, or cpu)
 #     --torch BUILD      cpu, cuda, or system for the torch that --python has (default: the device's)
@@ -16,7 +16,7 @@ set -euo pipefail
 
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 checkout=$(dirname "$here")
-config='' python=python3 wheelhouse='' extras=prior,telemetry,recording,viewer
+config='' python=python3 wheelhouse='' extras=prior,telemetry,recording
 torch=auto device=auto start=yes root='' dry=''
 
 # shellcheck source=deploy/torch.sh

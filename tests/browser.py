@@ -24,6 +24,8 @@ FLAGS = (
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
     "--hide-scrollbars",
 )
+WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+"""In place of --disable-gpu, where a page draws by WebGL: on the processor."""
 ELEMENT = "element-6066-11e4-a52e-4f735466cecf"
 """Key under which WebDriver names an element."""
 
@@ -36,7 +38,7 @@ needs_browser = pytest.mark.skipif(
 class Browser:
     """One window with a new, empty profile."""
 
-    def __init__(self, profile: Path) -> None:
+    def __init__(self, profile: Path, webgl: bool = False) -> None:
         assert CHROMIUM is not None
         assert DRIVER is not None
         with socket.create_server(("127.0.0.1", 0)) as probe:
@@ -45,7 +47,8 @@ class Browser:
             [DRIVER, f"--port={self._port}"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
         self.until(self._is_up, "chromedriver")
-        arguments = [*FLAGS, f"--user-data-dir={profile}"]
+        flags = [flag for flag in FLAGS if not webgl or flag != "--disable-gpu"]
+        arguments = [*flags, *(WEBGL if webgl else ()), f"--user-data-dir={profile}"]
         options = {"goog:chromeOptions": {"binary": CHROMIUM, "args": arguments}}
         said = self._ask("POST", "/session", {"capabilities": {"alwaysMatch": options}})
         self._session = f"/session/{said['sessionId']}"
@@ -94,6 +97,18 @@ class Browser:
         strokes = [{"type": "keyDown", "value": key}, {"type": "keyUp", "value": key}]
         actions = [{"type": "key", "id": "keyboard", "actions": strokes}]
         self._ask("POST", f"{self._session}/actions", {"actions": actions})
+
+    def tap(self, x: float, y: float) -> None:
+        """A click at CSS pixels of the window."""
+        for kind in ("mousePressed", "mouseReleased"):
+            at = {"type": kind, "x": x, "y": y, "button": "left", "clickCount": 1}
+            self._command("Input.dispatchMouseEvent", at)
+
+    def swipe(self, start: tuple[float, float], end: tuple[float, float]) -> None:
+        """A finger put down, moved and lifted, as on a tablet."""
+        for kind, at in (("touchStart", start), ("touchMove", end), ("touchEnd", None)):
+            points = [] if at is None else [{"x": at[0], "y": at[1]}]
+            self._command("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
 
     def emulate(self, width: int, height: int, dark: bool = False) -> None:
         """A screen of this many CSS pixels."""

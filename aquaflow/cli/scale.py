@@ -41,27 +41,13 @@ def scale(
     for name, value in (("length", length), ("sigma", sigma)):
         if not (math.isfinite(value) and value > 0.0):
             raise typer.BadParameter(f"--{name} must be a positive number of metres")
-    from aquaflow.dive.rescaling import rescale, why_not
-    from aquaflow.fusion.known_lengths.known_length import scale_of
-    from aquaflow.fusion.known_lengths.known_lengths_file import (
-        FILE,
-        read_known_lengths,
-        with_length,
-        write_known_lengths,
-    )
-    from aquaflow.fusion.metric_file import read_metric_file
+    from aquaflow.dive.marked_length import keep_length
+    from aquaflow.fusion.known_lengths.known_lengths_file import FILE, read_known_lengths
 
-    earlier = read_known_lengths(dive)
+    read_known_lengths(dive)  # a damaged file is found before the map is drawn
     known = _measured(dive, frame, _numbers("--from", start), _numbers("--to", end), length, sigma)
-    lengths = with_length(earlier, known)
-    write_known_lengths(dive, lengths)
-    together = scale_of([each for each in lengths if each.sub_map == known.sub_map])
-    assert together is not None
-    of_map = read_metric_file(dive).get(known.sub_map)
-    unchanged = why_not(of_map, together)
-    if unchanged is None:
-        members = [each for each in lengths if each.sub_map == known.sub_map]
-        rescale(dive, known.sub_map, members, together)
+    marked = keep_length(dive, known)
+    together, unchanged = marked.together, marked.unchanged
     if as_json:
         said = {
             "metres_per_unit": known.metres_per_unit, "relative_sigma": known.relative_sigma,
@@ -72,13 +58,7 @@ def scale(
         }  # fmt: skip
         typer.echo(json.dumps(said))
         return
-    typer.echo(f"1 map unit is {_plus_minus(known.metres_per_unit, known.relative_sigma)}.")
-    if together.used + len(together.rejected) > 1:
-        contradicting = f", {len(together.rejected)} contradicting" if together.rejected else ""
-        typer.echo(
-            f"With all known lengths ({together.used} used{contradicting}): "
-            f"{_plus_minus(together.metres_per_unit, together.relative_sigma)}."
-        )
+    typer.echo(marked.in_words())
     typer.echo(f"Written to {dive / FILE}.")
     typer.echo(unchanged or RESCALED)
 
@@ -116,7 +96,3 @@ def _numbers(option: str, text: str) -> tuple[float, ...]:
     if len(numbers) not in (2, 3) or not all(map(math.isfinite, numbers)):
         raise typer.BadParameter(f"{option} {text!r} is neither x,y nor x,y,z; give numbers")
     return numbers
-
-
-def _plus_minus(metres: float, relative_sigma: float) -> str:
-    return f"{metres:.4g} m +- {metres * relative_sigma:.2g} m (1 sigma)"

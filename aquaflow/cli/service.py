@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import threading
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -30,6 +31,10 @@ if TYPE_CHECKING:
 POOR_RESULT = 3
 """Exit code of a dive that was written but has warnings: hardly any poses, an empty map, or a
 calibration that does not fit."""
+
+MOST_SPLATS = 500_000
+"""Gaussians of a finished dive that a browser gets: 7.6 MB, 6 s at 10 Mbit/s, of which the first
+0.3 MB are a picture (docs/viewer.md)."""
 
 
 def register(app: typer.Typer) -> None:
@@ -115,21 +120,34 @@ def view(
     token_file: Annotated[
         Path | None, typer.Option(help="File that holds the token; needed beyond this machine.")
     ] = None,
-    splats: Annotated[int | None, typer.Option(help="Gaussians to show at most.")] = None,
+    splats: Annotated[int, typer.Option(help="Gaussians to show at most.")] = MOST_SPLATS,
 ) -> None:
-    """Show a finished dive in a browser: splats, path, camera; until Ctrl-C."""
+    """Show a finished dive in a browser, to look around and to measure; until Ctrl-C."""
     from aquaflow.config.stage import validated
     from aquaflow.config.viewer import ViewerConfig
-    from aquaflow.viewer.finished import read_dive, show_dive
+    from aquaflow.viewer.finished import open_dive
 
     asked = {"enabled": True, "host": host, "port": port, "token_file": token_file}
-    asked |= {} if splats is None else {"splats": splats}
-    config = validated(ViewerConfig, asked, "command line")
-    window = show_dive(read_dive(dive, config.splats), config)
+    config = validated(ViewerConfig, asked | {"splats": splats}, "command line")
+    window = open_dive(dive, config, partial(_mark, dive))
     typer.echo(f"Open {window.address} in a browser; Ctrl-C ends it.")
     with contextlib.suppress(KeyboardInterrupt):
         threading.Event().wait()
     window.close()
+
+
+def _mark(
+    dive: Path,
+    ends: tuple[tuple[float, float, float], tuple[float, float, float]],
+    length_m: float,
+    sigma_m: float,
+) -> tuple[str, bool]:
+    """Keep a length that was marked in the viewer; what came of it, and whether files changed."""
+    from aquaflow.dive.marked_length import keep_length
+    from aquaflow.dive.scale_bar import between_points  # loads torch
+
+    marked = keep_length(dive, between_points(dive, *ends, length_m, sigma_m))
+    return f"{marked.in_words()}\n{marked.unchanged or ''}".rstrip(), marked.unchanged is None
 
 
 def _print_status(report: dict[str, Any]) -> None:

@@ -89,7 +89,7 @@ def cells_seen(footprint: Footprint, T_mc: Sim3, frame: GridFrame) -> Cells:
     first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
     enough = np.add.reduceat(ordered, first) >= LEAST_SHARE * frame.cell**2
     chosen = order[first[enough]]  # the nearest sample of each cell
-    return Cells(ij[chosen], _range_bins(ranges[chosen], frame), _direction_bins(offset[chosen]))
+    return Cells(ij[chosen], _range_bins(ranges[chosen], frame), direction_bins(offset[chosen]))
 
 
 def _samples(
@@ -122,10 +122,11 @@ def _range_bins(
     return np.searchsorted(frame.bin_ends()[:-1], ranges).astype(np.int64)
 
 
-def _direction_bins(
+def direction_bins(
     offset: Array,  # [M, 3] from the place to the camera, g
 ) -> Numbers:
-    """[M] 0: from above; then ring by ring, the sides of each against the clock."""
+    """[M] below ``DIRECTION_BINS``. 0: from above; then ring by ring, the sides of each against the
+    clock."""
     x, y, z = offset.T
     ring = np.searchsorted(RINGS, np.hypot(x, y) / np.maximum(np.abs(z), MIN_DEPTH))
     turn = np.arctan2(y, x) * (SIDES / (2.0 * np.pi)) + 0.5 * (1 + ring % 2)

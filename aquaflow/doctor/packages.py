@@ -36,7 +36,6 @@ PACKAGES = (
     Package("laspy", "laspy", "survey", "points of a dive as LAZ"),
     Package("lazrs", "lazrs", "survey", "points of a dive as LAZ"),
     Package("pye57", "pye57", "survey", "points of a dive as E57"),
-    Package("viser", "viser", "viewer", "the map in a browser"),
     Package("rasterio", "rasterio", "survey", "orthos and heights as GeoTIFF"),
     Package("scikit-image", "skimage", "survey", "the surface of a dive as triangles"),
     Package("xatlas", "xatlas", "survey", "textured meshes: OBJ and GLB"),

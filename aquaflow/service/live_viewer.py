@@ -12,11 +12,14 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.viewer import ViewerConfig
+from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.mapping.work import OwnedMaps
+from aquaflow.measure.scale import Scale
 from aquaflow.service.loop import LiveLoop
 from aquaflow.sources.newest import Newest
 from aquaflow.tracking.frames import Tracked
 from aquaflow.viewer.copies import MapCopy, Pose, shown
+from aquaflow.viewer.measuring import Frame
 from aquaflow.viewer.page import ViewerPage
 
 log = logging.getLogger(__name__)
@@ -37,7 +40,7 @@ class LiveViewer:
         self.address = self._page.address
         self._poses: Newest[Pose] = Newest()
         self._copies: Newest[MapCopy] = Newest()
-        self._path: list[tuple[float, float, float, float]] = []
+        self._path: list[tuple[float, ...]] = []
         self._pose_s = self._map_s = 0.0
         self._asked = False
         self._closing = threading.Event()
@@ -77,8 +80,8 @@ class LiveViewer:
         image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
     ) -> None:
         assert latest.T_wc is not None
-        x, y, z = (float(v) for v in latest.T_wc.t)
-        self._path.append((x, y, z, latest.quality.inlier_share))
+        T = latest.T_wc
+        self._path.append((*T.t.tolist(), *T.quaternion.tolist(), latest.quality.inlier_share))
         if len(self._path) > LONGEST_PATH:
             self._path = self._path[::2]
         step = max(1, image.shape[1] // self._config.picture_width)
@@ -105,20 +108,32 @@ class LiveViewer:
 
     def _show(self) -> None:
         pose = self._poses.take(LOOK_S)
+        report = self._report()
+        frame = frame_of(report)
+        self._page.set_frame(frame)
         if pose is not None:
             self._page.show_camera(pose.T_wc, pose.camera, pose.picture)
-            self._page.show_path(pose.path[:, :3], pose.path[:, 3])
+            self._page.show_path(pose.path)
         copy = self._copies.take(0.0)
         if copy is not None:
-            self._page.show_splats(shown(copy, self._config.splats))
-        self._page.show_health(in_words(self._report()))
+            self._page.show_splats(*shown(copy, self._config.splats, frame, self._page.watched))
+        self._page.show_health(in_words(report))
+
+
+def frame_of(report: dict[str, Any]) -> Frame:
+    """How lengths are said: the map is in its own units, and metres may be known by now."""
+    known = report.get("metric_frame") or {}
+    metres = known.get("metres_per_map_unit")
+    if metres is None:
+        return Frame.of(MetricFrame.unknown())
+    return Frame(Scale("m", known.get("scale_sigma") or 0.0, 0.0), metres)
 
 
 def in_words(report: dict[str, Any]) -> str:
     """The health panel."""
     lag = report["lag_ms"]
     lines = [
-        f"**{report['state']}**: {report['reason']}",
+        f"{report['state']}: {report['reason']}",
         f"{report['fps']:.1f} frames/s, lag {lag['p50'] or 0:.0f} ms (95 %: {lag['p95'] or 0:.0f})",
         f"slowest stage: {report['slowest_stage'] or '-'}; {report['level']}",
         f"{report['keyframes']} keyframes, {report['gaussians']} Gaussians",

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import csv
-from collections.abc import Callable
+import json
+import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,15 +14,28 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.viewer import ViewerConfig
-from aquaflow.errors import InputError, reason_of
+from aquaflow.errors import DamagedError, InputError, reason_of
 from aquaflow.export.ply import read_ply
 from aquaflow.fusion.metric_file import read_frame_of_map
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.geometry.similarity import Sim3, rotation_from_quaternion
+from aquaflow.viewer.dive_coverage import coverage_of_dive
+from aquaflow.viewer.exhibit import POSE_NUMBERS
+from aquaflow.viewer.levels import RANGE, Palette, range_level
+from aquaflow.viewer.measuring import Asked, Frame
 from aquaflow.viewer.page import ViewerPage
+from aquaflow.viewer.pinned_notes import PinnedNotes
+from aquaflow.viewer.scale_tool import Mark, marked
+from aquaflow.viewer.seen_classes import CLASSES, COVERAGE
+from aquaflow.viewer.seen_water import SeenWater, water_of
 from aquaflow.viewer.splats import Splats, splats
+from aquaflow.viewer.tools import SCALE, Tools
 
+log = logging.getLogger(__name__)
+
+KEYFRAME = "keyframe"
+"""Class of a keyframe in frames.csv."""
 TUM_COLUMNS = 8
 """t_s tx ty tz qx qy qz qw"""
 
@@ -30,6 +45,8 @@ class FinishedDive:
     """What the viewer shows of a dive folder."""
 
     splats: Splats
+    water: SeenWater | None
+    palettes: dict[str, Palette]
     poses: list[Sim3]
     quality: npt.NDArray[np.float64]
     """[N] inlier share of each pose."""
@@ -37,8 +54,7 @@ class FinishedDive:
     """What the camera saw at each pose, where the dive keeps it."""
     camera: CameraModel
     summary: str
-    level: bool = False
-    """True if z points down, else y does, in the first camera."""
+    frame: MetricFrame
 
 
 def _frame_in_words(frame: MetricFrame) -> str:
@@ -58,57 +74,98 @@ def read_dive(folder: Path, budget: int) -> FinishedDive:
         if not (folder / name).is_file():
             raise InputError(f"{folder} holds no finished dive: {name} is missing")
     poses, times = _poses(folder / "trajectory.tum")
-    quality, pictures = _of_frames(folder, times)
-    shown = _splats(folder, budget)
-    frame = read_frame_of_map(folder / "map.aqf")
-    summary = (
-        f"**{folder.name}**\n\n{len(poses)} poses, {len(shown)} of the map's Gaussians\n\n"
-        f"{_frame_in_words(frame)}"
-    )
+    quality, pictures, keyframes = _of_frames(folder, times)
+    frame, camera = read_frame_of_map(folder / "map.aqf"), load_camera(folder / "camera.yaml")
+    water = _water(folder / "medium.json")
+    clear = folder / "map_clear.ply"
+    if water is None or not clear.is_file():  # colours with the water in them are all there is
+        water, clear = None, folder / "map.ply"
+    gaussians = read_ply(clear)
+    cameras = np.array([pose.t for pose in poses]).reshape(-1, 3)
+    levels, palettes = _levels(gaussians.means, cameras, frame.unit)
+    views = [pose for pose, counts in zip(poses, keyframes, strict=True) if counts]
+    classes = coverage_of_dive(folder, gaussians.means, views, camera, frame, water)
+    if classes is not None:
+        levels[COVERAGE], palettes[COVERAGE] = classes, CLASSES
+    shown = splats(
+        np.asarray(gaussians.means, np.float32), np.asarray(gaussians.wxyz, np.float32),
+        np.asarray(gaussians.scales, np.float32), np.asarray(gaussians.opacities, np.float32),
+        np.asarray(gaussians.colours, np.float32), budget, levels,
+    )  # fmt: skip
+    of_all = f"{len(shown)} of {len(gaussians.means)} Gaussians"
+    summary = f"{folder.name}: {len(poses)} poses, {of_all}\n\n{_frame_in_words(frame)}"
     return FinishedDive(
-        shown, poses, quality, pictures, load_camera(folder / "camera.yaml"), summary, frame.level
-    )
+        shown, water, palettes, poses, quality, pictures, camera, summary, frame
+    )  # fmt: skip
 
 
-def show_dive(dive: FinishedDive, config: ViewerConfig) -> ViewerPage:
-    """The viewer's page of ``dive``, with a slider along its path."""
-    page = ViewerPage(config, "AquaFlow", up="-z" if dive.level else "-y")
-    page.show_health(dive.summary)
-    page.show_splats(dive.splats)
-    page.show_path(np.array([pose.t for pose in dive.poses]).reshape(-1, 3), dive.quality)
-    move = _mover(dive, page)
-    if dive.poses:
-        with_picture = [i for i, picture in enumerate(dive.pictures) if picture is not None]
-        first = with_picture[len(with_picture) // 2] if with_picture else 0
-        move(first)
-        page.add_slider("Along the path", len(dive.poses), first, move)
+def show_dive(dive: FinishedDive, config: ViewerConfig, tools: Tools | None = None) -> ViewerPage:
+    """The viewer's page of ``dive``."""
+    page = ViewerPage(config, "AquaFlow", live=False, tools=tools)
+    fill(page, dive)
     return page
 
 
-def _mover(dive: FinishedDive, page: ViewerPage) -> Callable[[int], None]:
-    def move(number: int) -> None:
-        picture = dive.pictures[number]
-        image = None if picture is None else _picture(picture)
-        page.show_camera(dive.poses[number], dive.camera, image)
+def fill(page: ViewerPage, dive: FinishedDive) -> None:
+    """Show ``dive`` on ``page``, in place of what was there."""
+    page.set_frame(Frame.of(dive.frame), up="-z" if dive.frame.level else "-y")
+    page.show_health(dive.summary)
+    page.show_splats(dive.splats, dive.water, dive.palettes)
+    page.show_path(rows_of(dive.poses, dive.quality))
+    page.show_pictures(dive.pictures)
+    if dive.poses:
+        page.show_camera(dive.poses[0], dive.camera, None)
 
-    return move
+
+def open_dive(folder: Path, config: ViewerConfig, mark: Mark | None = None) -> ViewerPage:
+    """The page of the finished dive in ``folder``, with its notes and, by ``mark``, its scale bar.
+
+    Raises:
+        InputError: there is no finished dive, or the address is taken.
+        ConfigError: the token will not do.
+    """
+    tools = Tools(others=PinnedNotes(folder).tools())
+    page: list[ViewerPage] = []
+
+    def scale(given: Asked) -> Asked:
+        said = marked(given, mark) if mark is not None else {}
+        if said.get("rescaled"):
+            fill(page[0], read_dive(folder, config.splats))
+        return said
+
+    if mark is not None:
+        tools.others[SCALE] = scale
+    page.append(show_dive(read_dive(folder, config.splats), config, tools))
+    return page[0]
 
 
-def _splats(folder: Path, budget: int) -> Splats:
-    water = read_ply(folder / "map.ply")
-    colours = {"water": np.asarray(water.colours, np.float32)}
-    if (folder / "map_clear.ply").is_file():
-        clear = read_ply(folder / "map_clear.ply")
-        if len(clear.means) == len(water.means):
-            colours["clear"] = np.asarray(clear.colours, np.float32)
-    return splats(
-        np.asarray(water.means, np.float32),
-        np.asarray(water.wxyz, np.float32),
-        np.asarray(water.scales, np.float32),
-        np.asarray(water.opacities, np.float32),
-        colours,
-        budget,
-    )
+def rows_of(
+    poses: Sequence[Sim3],
+    quality: npt.NDArray[np.float64],  # [N]
+) -> npt.NDArray[np.float32]:
+    """[N, 8] as :meth:`ViewerPage.show_path` takes them."""
+    rows = [[*T.t, *T.quaternion, q] for T, q in zip(poses, quality, strict=True)]
+    return np.array(rows, np.float32).reshape(-1, POSE_NUMBERS)
+
+
+def _levels(
+    means: npt.NDArray[np.floating],  # [N, 3]
+    cameras: npt.NDArray[np.float64],  # [M, 3]
+    unit: str,
+) -> tuple[dict[str, npt.NDArray[np.uint8]], dict[str, Palette]]:
+    if not len(cameras) or not len(means):
+        return {}, {}
+    values, palette = range_level(means, cameras, unit)
+    return {RANGE: values}, {RANGE: palette}
+
+
+def _water(path: Path) -> SeenWater | None:
+    """None for a dive without water, and for a file that does not say it."""
+    try:
+        return water_of(json.loads(path.read_text("utf-8")))
+    except (OSError, ValueError, AttributeError, DamagedError) as error:
+        log.warning("the viewer shows no water: %s: %s", path, reason_of(error))
+        return None
 
 
 def _poses(path: Path) -> tuple[list[Sim3], npt.NDArray[np.float64]]:
@@ -125,26 +182,29 @@ def _poses(path: Path) -> tuple[list[Sim3], npt.NDArray[np.float64]]:
 def _of_frames(
     folder: Path,
     times: npt.NDArray[np.float64],  # [N] s
-) -> tuple[npt.NDArray[np.float64], list[Path | None]]:
-    """Quality and picture of the frame at each time."""
+) -> tuple[npt.NDArray[np.float64], list[Path | None], npt.NDArray[np.bool_]]:
+    """Quality and picture of the frame at each time, and whether it is a keyframe."""
     shown = _shown_by_microsecond(folder / "frames.csv")
-    quality, pictures = [], []
+    quality, pictures, keyframes = [], [], []
     for t_s in times:
-        inliers, index = shown.get(_microsecond(t_s), (1.0, 0))
+        inliers, index, is_keyframe = shown.get(_microsecond(t_s), (1.0, 0, False))
         quality.append(inliers)
+        keyframes.append(is_keyframe)
         picture = folder / "heldout" / f"{index:06d}_real.png"
         pictures.append(picture if picture.is_file() else None)
-    return np.array(quality), pictures
+    return np.array(quality), pictures, np.array(keyframes, bool)
 
 
-def _shown_by_microsecond(path: Path) -> dict[int, tuple[float, int]]:
-    """Quality and index of the frame at each time; a damaged line is skipped."""
-    shown: dict[int, tuple[float, int]] = {}
+def _shown_by_microsecond(path: Path) -> dict[int, tuple[float, int, bool]]:
+    """Quality and index of the frame at each time, and whether it is a keyframe; a damaged line is
+    skipped."""
+    shown: dict[int, tuple[float, int, bool]] = {}
     try:
         with path.open(newline="", encoding="utf-8", errors="replace") as stream:
             for row in csv.DictReader(stream):
                 with contextlib.suppress(KeyError, TypeError, ValueError, OverflowError):
-                    found = float(row["quality"] or 1.0), int(row["index"])
+                    is_keyframe = row["class"] == KEYFRAME
+                    found = float(row["quality"] or 1.0), int(row["index"]), is_keyframe
                     shown[_microsecond(float(row["t_s"]))] = found
     except (OSError, csv.Error) as error:
         raise InputError(f"cannot read {path}; map the dive again") from error
@@ -153,10 +213,3 @@ def _shown_by_microsecond(path: Path) -> dict[int, tuple[float, int]]:
 
 def _microsecond(t_s: float) -> int:
     return round(float(t_s) * 1e6)
-
-
-def _picture(path: Path) -> npt.NDArray[np.uint8] | None:
-    import cv2
-
-    image = cv2.imread(str(path))
-    return None if image is None else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)

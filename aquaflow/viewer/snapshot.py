@@ -1,4 +1,4 @@
-"""Copies of a map for the live viewer, made in the thread that owns the map."""
+"""The copy of a map that the live viewer shows; it loads torch, as the map does."""
 
 from __future__ import annotations
 
@@ -13,16 +13,15 @@ from aquaflow.viewer.copies import MapCopy
 
 @torch.no_grad()
 def copied(mapper: Mapper) -> MapCopy:
-    """In the mapping thread: a copy, and two colours; a tenth of a second for 150,000."""
+    """In the mapping thread: a copy; a tenth of a second for 150,000."""
     tensors = mapper.gaussians.parameters
     plain = {name: map_out(tensor) for name, tensor in tensors.items()}
-    clear = radiance(mapper.gaussians.parameters["raw_colours"])
-    seen = clear
+    clear = restored_gaussians(mapper.scene, radiance(tensors["raw_colours"]), mapper.views)
     view = mapper.views[-1]
     water = mapper.scene.water(view)
+    rows = None
     if water is not None:
-        z = torch.linalg.vector_norm(mapper.gaussians.means - view.centre(), dim=-1)
-        seen = clear * water.transmission(z) + water.backscatter(z)
+        rows = map_out(torch.cat([water.stacked(), mapper.scene.white_gain()[None]]))
     steps = map_out(mapper.optimiser.adam.steps)
-    clear = restored_gaussians(mapper.scene, clear, mapper.views)
-    return MapCopy(plain, steps, map_out(seen), map_out(clear))
+    poses = [each.T_wc for each in mapper.views]
+    return MapCopy(plain, steps, map_out(clear), rows, poses, view.camera)

@@ -1,30 +1,49 @@
-"""Gaussians as a browser gets them: those that matter most, as covariances and colours."""
+"""Gaussians as a browser gets them: those that matter most, those that cover most first."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
 Float = npt.NDArray[np.float32]
+Levels = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class Splats:
-    """N Gaussians, in the world."""
+    """N Gaussians in the world; those whose opacity and area are largest come first."""
 
     centres: Float
     """[N, 3]"""
-    covariances: Float
-    """[N, 3, 3]"""
+    wxyz: Float
+    """[N, 4] unit rotations."""
+    scales: Float
+    """[N, 3] standard deviations along their axes."""
     opacities: Float
     """[N]"""
-    colours: dict[str, Float]
-    """[N, 3] in [0, 1] by what they show: water, clear, coverage."""
+    colours: Float
+    """[N, 3] without the water, at least 0."""
+    levels: dict[str, Levels] = field(default_factory=dict)
+    """[N] further values of each, by name: 0 to 255, as a palette has colours for them."""
 
     def __len__(self) -> int:
         return len(self.centres)
+
+    def among(
+        self,
+        chosen: npt.NDArray[np.bool_],  # [N]
+    ) -> Splats:
+        """Only those."""
+        return Splats(
+            self.centres[chosen], self.wxyz[chosen], self.scales[chosen], self.opacities[chosen],
+            self.colours[chosen], {name: values[chosen] for name, values in self.levels.items()},
+        )  # fmt: skip
+
+    def weights(self) -> Float:
+        """[N] opacity times area of the two largest axes: what each covers."""
+        return weights(self.opacities, self.scales)
 
 
 def splats(
@@ -32,8 +51,9 @@ def splats(
     quats: Float,  # [N, 4] wxyz, of any length
     scales: Float,  # [N, 3]
     opacities: Float,  # [N]
-    colours: dict[str, Float],  # [N, 3] each
+    colours: Float,  # [N, 3]
     budget: int,
+    levels: dict[str, Levels] | None = None,  # [N] each
 ) -> Splats:
     """At most ``budget`` of them: those that cover most, by opacity and area. The others' share of
     the surface goes to them, so that no holes open.
@@ -41,25 +61,29 @@ def splats(
     What is not finite is left out.
     """
     sound = np.isfinite(means).all(1) & np.isfinite(scales).all(1) & np.isfinite(quats).all(1)
-    sound &= np.isfinite(opacities)
-    for values in colours.values():
-        sound &= np.isfinite(values).all(1)
-    largest = np.sort(np.where(sound[:, None], scales, 0.0), axis=1)[:, 1:]
-    weight = np.where(sound, opacities * largest.prod(axis=1), 0.0)
-    chosen = np.flatnonzero(sound)
-    grown = 1.0
-    if len(chosen) > budget:
-        order = np.argpartition(-weight, budget)[:budget]
-        chosen = np.sort(order)
-        # Areas grow by the root of what was left out: twice the gaps, no mud.
-        share = float(weight[chosen].sum() / max(float(weight.sum()), 1e-12))
-        grown = min(max(share, 0.25), 1.0) ** -0.25
+    sound &= np.isfinite(opacities) & np.isfinite(colours).all(1)
+    weight = weights(np.where(sound, opacities, 0.0), np.where(sound[:, None], scales, 0.0))
+    order = np.argsort(-weight, kind="stable")
+    chosen = order[sound[order]][:budget]
+    share = float(weight[chosen].sum() / max(float(weight.sum()), 1e-12))
+    # Areas grow by the root of what was left out: twice the gaps, no mud.
+    grown = 1.0 if len(chosen) == sound.sum() else min(max(share, 0.25), 1.0) ** -0.25
     return Splats(
         means[chosen].astype(np.float32),
-        covariances(quats[chosen], grown * scales[chosen]),
+        _unit(quats[chosen]),
+        (grown * scales[chosen]).astype(np.float32),
         np.clip(opacities[chosen], 0.0, 1.0).astype(np.float32),
-        {name: np.clip(c[chosen], 0.0, 1.0).astype(np.float32) for name, c in colours.items()},
+        np.maximum(colours[chosen], 0.0).astype(np.float32),
+        {name: values[chosen] for name, values in (levels or {}).items()},
     )
+
+
+def weights(
+    opacities: Float,  # [N]
+    scales: Float,  # [N, 3]
+) -> Float:
+    """[N] opacity times area of the two largest axes."""
+    return np.asarray(opacities * np.sort(scales, axis=1)[:, 1:].prod(axis=1), np.float32)
 
 
 def covariances(
@@ -67,8 +91,7 @@ def covariances(
     scales: Float,  # [N, 3]
 ) -> Float:
     """[N, 3, 3] R S S^T R^T."""
-    length = np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
-    w, x, y, z = (quats / length).T
+    w, x, y, z = _unit(quats).T
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
@@ -79,11 +102,8 @@ def covariances(
     return np.asarray(M @ M.transpose(0, 2, 1), dtype=np.float32)
 
 
-def heat(
-    values: npt.NDArray[np.floating],  # [N] in [0, 1]
+def _unit(
+    quats: Float,  # [N, 4]
 ) -> Float:
-    """[N, 3] from violet (0) over green to yellow (1): viridis by three of its colours."""
-    stops = np.array([[0.27, 0.00, 0.33], [0.13, 0.57, 0.55], [0.99, 0.91, 0.14]])
-    at = np.clip(np.nan_to_num(values), 0.0, 1.0)
-    channels = [np.interp(at, (0.0, 0.5, 1.0), stops[:, c]) for c in range(3)]
-    return np.stack(channels, axis=1).astype(np.float32)
+    length = np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
+    return np.asarray(quats / length, np.float32)

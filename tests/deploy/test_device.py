@@ -95,13 +95,13 @@ PINS = "--constraint ROOT/opt/aquaflow/share/constraints.txt"
 def test_without_a_gpu_nothing_but_the_wheels_for_processors_is_taken(machine: Machine) -> None:
     machine.nvcc = False
     assert plan(machine) == [
-        "install.sh: device cpu, torch cpu, extras prior,telemetry,recording,viewer",
+        "install.sh: device cpu, torch cpu, extras prior,telemetry,recording",
         "+ install -d -m 0755 ROOT/opt/aquaflow ROOT/opt/aquaflow/share",
         "+ ROOT/bin/python3 -m venv ROOT/opt/aquaflow/venv",
         "+ install -m 0644 CHECKOUT/constraints.txt ROOT/opt/aquaflow/share/constraints.txt",
         "+ pin_torch cpu ROOT/bin/python3 ROOT/opt/aquaflow/share/constraints.txt",
         f"{PIP} --extra-index-url https://download.pytorch.org/whl/cpu {PINS} --upgrade "
-        "CHECKOUT[prior,telemetry,recording,viewer]",
+        "CHECKOUT[prior,telemetry,recording]",
         "+ install -m 0644 CHECKOUT/deploy/README.md ROOT/opt/aquaflow/share/README.md",
     ]
 
@@ -109,11 +109,9 @@ def test_without_a_gpu_nothing_but_the_wheels_for_processors_is_taken(machine: M
 def test_a_gpu_gets_onnxruntimes_build_for_it_and_gsplat_compiled_for_it(machine: Machine) -> None:
     machine.gpu = "8.6"
     said, *steps = plan(machine)
-    assert said == (
-        "install.sh: device cuda, torch cuda, extras prior-gpu,telemetry,recording,viewer"
-    )
+    assert said == ("install.sh: device cuda, torch cuda, extras prior-gpu,telemetry,recording")
     aquaflow, builders, gsplat = (step for step in steps if "pip" in step)
-    assert aquaflow == f"{PIP} {PINS} --upgrade CHECKOUT[prior-gpu,telemetry,recording,viewer]"
+    assert aquaflow == f"{PIP} {PINS} --upgrade CHECKOUT[prior-gpu,telemetry,recording]"
     assert builders == f"{PIP} {PINS} setuptools ninja"
     assert re.fullmatch(
         r"\+ env PATH=ROOT/opt/aquaflow/venv/bin:ROOT/bin:\S+ TORCH_CUDA_ARCH_LIST=8\.6 "
@@ -129,7 +127,7 @@ def test_a_jetson_gets_the_wheels_that_pypi_does_not_have(tmp_path: Path) -> Non
     aquaflow, _, gsplat = (step for step in steps if "pip" in step)
     assert JETSON_TORCH in aquaflow
     assert JETSON_NETWORKS in aquaflow
-    assert "CHECKOUT[prior-gpu,telemetry,recording,viewer]" in aquaflow
+    assert "CHECKOUT[prior-gpu,telemetry,recording]" in aquaflow
     hashes = re.findall(r"\.whl#sha256=([0-9a-f]+)", aquaflow)
     assert [len(each) for each in hashes] == [64, 64]
     assert "TORCH_CUDA_ARCH_LIST=8.7 " in gsplat
@@ -173,7 +171,7 @@ def test_an_old_python_keeps_its_networks_on_the_processor(machine: Machine) -> 
     [
         ("prior", "prior-gpu"),
         ("telemetry,prior", "telemetry,prior-gpu"),
-        ("prior-peers,viewer", "prior-peers,viewer"),
+        ("prior-peers,survey", "prior-peers,survey"),
         ("", "none"),
     ],
 )

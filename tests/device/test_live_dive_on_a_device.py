@@ -29,7 +29,6 @@ from tests.pretended_device import PRETENDED, Device
 from tests.service.live_scenes import ToldFeed, caught_up
 from tests.small_recording import GIVE_UP_S
 
-pytest.importorskip("viser", reason="viser is not installed")
 pytestmark = [pytest.mark.usefixtures("nothing_strays", "repaired"), pytest.mark.ci]
 
 CUT = 7

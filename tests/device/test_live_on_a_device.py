@@ -89,7 +89,7 @@ def test_a_live_map_grows_on_the_device_and_is_shown_from_there(device: Device) 
     thread.close()
     assert thread.renderer.device == PRETENDED
     assert thread.failures == 0
-    assert len(copy.seen) == len(thread.mappers[0].gaussians) > 0
+    assert len(copy.clear) == len(thread.mappers[0].gaussians) > 0
 
 
 def test_a_live_map_goes_on_when_its_device_is_lost(device: Device) -> None:
@@ -106,7 +106,7 @@ def test_a_live_map_goes_on_when_its_device_is_lost(device: Device) -> None:
     assert thread.renderer.device == CPU
     assert not thread.failing
     assert len(thread.mappers[0].views) == 4
-    assert len(after.seen) == len(before.seen) > 0
+    assert len(after.clear) == len(before.clear) > 0
 
 
 def test_a_full_device_costs_a_live_map_what_it_was_asked_for_meanwhile(device: Device) -> None:
@@ -124,7 +124,7 @@ def test_a_full_device_costs_a_live_map_what_it_was_asked_for_meanwhile(device: 
     thread.close()
     assert thread.renderer.device == PRETENDED
     assert [view.frame_index for view in thread.mappers[0].views] == [0, 1, 2, 3]
-    assert len(after.seen) == len(before.seen) > 0
+    assert len(after.clear) == len(before.clear) > 0
 
 
 def test_at_each_step_down_memory_is_given_back(device: Device) -> None:

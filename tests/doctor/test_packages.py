@@ -21,7 +21,7 @@ else:
 
 PROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
 FOR_DEVELOPERS = {"dev", "docs"}
-HEAVY = ("depthai", "onnxruntime", "gsplat", "viser", "pymavlink.mavutil", "torch")
+HEAVY = ("depthai", "onnxruntime", "gsplat", "pymavlink.mavutil", "torch")
 
 
 def names(requirements: list[str]) -> set[str]:
@@ -57,7 +57,7 @@ def test_a_package_that_is_there_is_named_with_its_version() -> None:
     assert found["pymavlink"].ok
     assert "autopilots" in found["pymavlink"].used_for
     assert found["onnxruntime"].found == "1.31.1"  # the other build of the same module
-    assert found["viser"].found == "of unknown version"
+    assert found["rosbags"].found == "of unknown version"
 
 
 def test_a_package_that_is_missing_says_what_installs_it(project: dict[str, Any]) -> None:
@@ -76,7 +76,7 @@ def test_a_package_that_is_missing_says_what_installs_it(project: dict[str, Any]
 
 def test_what_is_installed_here_is_found_by_its_module() -> None:
     found = {finding.name: finding.found for finding in findings(MachineProbes())}
-    for name in ("pymavlink", "pyserial", "python-can", "mcap-protobuf-support", "viser"):
+    for name in ("pymavlink", "pyserial", "python-can", "mcap-protobuf-support"):
         assert found[f"package {name}"] == version(name)
 
 

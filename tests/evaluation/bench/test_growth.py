@@ -101,7 +101,6 @@ def test_a_line_has_first_and_last_tenth_memory_and_bytes_per_1000_frames(tmp_pa
 
 
 def test_a_survey_is_mapped_and_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("viser", reason="viser is not installed")
     sizes: list[tuple[int, int]] = []
 
     def compared(slam: Slam, scratch: Path) -> int:

@@ -266,7 +266,6 @@ def test_the_report_of_a_real_dive_is_json_and_prometheus(cut: Cut) -> None:
 
 
 def test_the_live_window_shows_map_path_and_health(cut: Cut) -> None:
-    pytest.importorskip("viser", reason="viser is not installed")
     parts = cut.dive.parts
     config = ViewerConfig(port=0, splats=300)
     window = LiveViewer(config, lambda: report(parts, hang_s=1e6))

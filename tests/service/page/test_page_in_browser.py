@@ -13,7 +13,7 @@ import pytest
 from aquaflow.config.service import ListenConfig
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.service.health import http
-from aquaflow.viewer.auth_proxy import AuthProxy
+from aquaflow.viewer.page import ViewerPage
 from tests.browser import Browser, needs_browser
 from tests.service.page.scenes import SimulatedDive, with_buttons
 
@@ -171,20 +171,15 @@ def test_who_has_opened_the_page_may_open_the_viewer(
     browser: Browser, address: str, tmp_path: Path
 ) -> None:
     """Cookies know no ports."""
-    viser = ThreadingHTTPServer(("127.0.0.1", 0), OtherPage)
-    threading.Thread(target=viser.serve_forever, args=(0.05,), daemon=True).start()
-    config = ViewerConfig(port=0, token_file=tmp_path / "token")
-    proxy = AuthProxy(config, viser.server_address[1])
-    viewer = f"http://127.0.0.1:{proxy.port}/"
+    page = ViewerPage(ViewerConfig(port=0, token_file=tmp_path / "token"), "the viewer")
+    viewer = page.address
     browser.forget()
     browser.open(viewer)
     assert "Give the token" in browser.text("body")
     log_in(browser, address)
     browser.open(viewer)
-    assert browser.text("body") == ""
-    proxy.close()
-    viser.shutdown()
-    viser.server_close()
+    browser.wait("document.title === 'the viewer'")
+    page.close()
 
 
 def framed(browser: Browser, address: str, by: str) -> bool:

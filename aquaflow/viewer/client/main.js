@@ -1,0 +1,122 @@
+// The page: asks for the dive, shows it, and joins the parts.
+
+import { add, Eye } from "./camera.js";
+import { Drawing } from "./draw.js";
+import { hands } from "./hands.js";
+import { asked, chunk, loadMap } from "./load.js";
+import { Looks } from "./looks.js";
+import { Marks } from "./marks.js";
+import { TimeLine } from "./timeline.js";
+import { ToolBox } from "./tools.js";
+import { divider } from "./wipe.js";
+
+const ASK_MS = 500; // between two questions for what is new in a live dive
+const find = id => document.getElementById(id);
+const say = text => { find("said").textContent = text; };
+
+let scene = null, drawing = null, looking = false, pathShown = -1, loading = false, wrong = "";
+
+const changed = () => { if (drawing) drawing.wanted = true; };
+// In ms since the address was opened: the script runs, a first chunk is there, a first picture is on
+// the screen, the whole map is drawn.
+const times = window.aquaflowTimes = { script: performance.now(), get first() { return drawing?.shownAt; }, get cost_us() { return drawing?.cost_us; } };
+const drawn = () => {
+  marks.camera = line.camera;
+  marks.draw(eye);
+  times.whole = drawing.count === scene.map.count ? times.whole ?? performance.now() : undefined;
+};
+const eye = new Eye([0, -1, 0]), marks = new Marks(find("marks"));
+const tools = new ToolBox(marks, changed);
+const line = new TimeLine(eye, changed);
+const looks = new Looks(changed);
+
+hands(find("marks"), eye, {
+  changed: () => { drawing.moving = true; line.leave(); changed(); },
+  rested: () => { if (drawing) drawing.moving = false; changed(); },
+  pointed: (x, y) => {
+    const optics = eye.optics(marks.canvas.clientWidth, marks.canvas.clientHeight);
+    tools.point({ origin: eye.place, direction: eye.ray(x, y, optics), pixel_rad: 1 / optics.fx });
+  },
+});
+new ResizeObserver(changed).observe(find("view"));
+
+// Behind the path and above it, with the map before the eye.
+function home() {
+  const { middle, half } = scene.map, size = half[0], path = marks.path;
+  const mean = path.reduce((sum, pose) => add(sum, pose.place, 1 / path.length), [0, 0, 0]);
+  const back = path.length ? add(mean, middle, -1) : eye.up;
+  const length = Math.hypot(...back) || 1;
+  const place = add(add(middle, back, 1.8 * size / length), eye.up, 0.7 * size);
+  line.leave();
+  eye.look(place, [...middle]);
+  changed();
+}
+find("home").addEventListener("click", home);
+
+find("fold").addEventListener("click", () => {
+  const open = find("panel").toggleAttribute("data-folded");
+  find("fold").setAttribute("aria-expanded", String(!open));
+});
+
+// One map after the other: the next one is asked for when this one is whole.
+async function showMap(about, coming) {
+  loading = true;
+  try {
+    drawing.begin(about);
+    marks.size = about.half[0];
+    await loadMap(about, coming, (part, first, end) => { times.data ??= performance.now(); drawing.put(part, first, end); });
+  } finally { loading = false; }
+}
+
+async function showPath(path) {
+  if (path.number === pathShown) return;
+  pathShown = path.number;
+  const rows = new Float32Array(await (await asked(`/path/${path.number}`)).arrayBuffer());
+  marks.setPath(rows);
+  line.setPath(rows, scene);
+}
+
+async function update() {
+  scene = await (await asked("/scene.json")).json();
+  find("health").replaceChildren(...scene.health.split("\n\n").map(text => {
+    const part = document.createElement("p");
+    part.textContent = text;
+    return part;
+  }));
+  document.title = scene.title;
+  eye.up = scene.up;
+  const due = scene.map && !loading && drawing?.about?.version !== scene.map.version;
+  const coming = due && chunk(scene.map, 0); // on its way while all else is made ready
+  await showPath(scene.path);
+  line.setScene(scene);
+  if (!scene.map) { say("There is no map yet."); return; }
+  if (!drawing) begin();
+  looks.offer(scene.map, scene.unit, scene.metres);
+  if (!looking) { looking = true; home(); }
+  const done = due && showMap(scene.map, coming).catch(error => say(error.message));
+  if (!scene.live) await done;
+  say("");
+}
+
+function begin() {
+  drawing = new Drawing(find("map"), drawn);
+  looks.begin(drawing, divider(find("divider"), find("view"), share => { drawing.look.wipe = looks.wiping ? share : null; changed(); }));
+  tools.offer(scene.can);
+  const turn = () => { drawing.turn(eye); requestAnimationFrame(turn); };
+  requestAnimationFrame(turn);
+}
+
+async function run() {
+  for (;;) {
+    try {
+      await update();
+      if (wrong) { wrong = ""; say(""); }
+    } catch (error) {
+      wrong = error.message;
+      say(`The viewer does not answer: ${wrong}`);
+    }
+    if (scene && !scene.live && !wrong) return;
+    await new Promise(later => setTimeout(later, ASK_MS));
+  }
+}
+run();

@@ -1,0 +1,78 @@
+// Gaussians as ellipses on the screen (M. Zwicker et al., EWA Splatting, 2002; B. Kerbl et al., 3D
+// Gaussian Splatting, 2023), each through the water before it (paper, Eq. 12 and 15).
+
+export const VERTEX = `#version 300 es
+precision highp float; precision highp int; precision highp usampler2D;
+uniform usampler2D data; uniform sampler2D palette;
+uniform mat3 axes; uniform vec3 place; uniform vec2 focal, centre, size;
+uniform vec3 middle, extent; uniform vec2 logScales; uniform float brightest, grown, nearest;
+uniform vec3 beta, Binf, b, Bres, d, gain; uniform float water, through;
+uniform int level, rangeLevel; uniform float within;
+in vec2 corner; in uint index;
+out vec4 colour; out vec2 at;
+
+vec4 bytes(uint word) { return vec4(uvec4(word, word >> 8, word >> 16, word >> 24) & 255u); }
+
+vec3 position(uvec2 words) {
+  vec3 u = vec3(uvec3(words.x & 65535u, words.x >> 16, words.y & 65535u)) * (4.0 / 65535.0) - 2.0;
+  vec3 far = min(abs(u), 1.9999);
+  return middle + extent * mix(u, sign(u) / (2.0 - far), step(1.0, far));
+}
+
+mat3 rotation(vec4 q) {
+  float w = q.x, x = q.y, y = q.z, z = q.w;
+  return mat3(
+    1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y),
+    2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x),
+    2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
+}
+
+vec3 throughWater(vec3 clear, float range) {
+  float z = min(range, through) * water;
+  vec3 veil = Binf * (1.0 - exp(-b * z)) + water * Bres * exp(-d * z);
+  return clear * pow(gain, vec3(-water)) * exp(-beta * z) + veil;
+}
+
+void main() {
+  gl_Position = vec4(0.0, 0.0, 2.0, 1.0);
+  ivec2 texel = ivec2(int(index & 1023u) * 2, int(index >> 10));
+  uvec4 one = texelFetch(data, texel, 0), two = texelFetch(data, texel + ivec2(1, 0), 0);
+  vec4 levels = vec4(bytes(one.w).yzw, 0.0);
+  if (rangeLevel >= 0 && levels[rangeLevel] > within) return;
+  vec3 t = transpose(axes) * (position(one.xy) - place);
+  if (t.z < nearest) return;
+  vec2 limit = 1.3 * size / (2.0 * focal);
+  vec2 slope = clamp(t.xy / t.z, -limit, limit);
+  vec4 first = bytes(one.y), second = bytes(one.z);
+  vec3 scale = exp(logScales.x + vec3(first.zw, second.x) / 255.0 * (logScales.y - logScales.x)) * grown;
+  vec4 q = (vec4(ivec4(int(two.x) << 24, int(two.x) << 16, int(two.x) << 8, int(two.x)) >> 24)) / 127.0;
+  mat3 M = transpose(axes) * rotation(normalize(q));
+  M = mat3(M[0] * scale.x, M[1] * scale.y, M[2] * scale.z);
+  vec3 jx = vec3(focal.x, 0.0, -focal.x * slope.x) / t.z, jy = vec3(0.0, focal.y, -focal.y * slope.y) / t.z;
+  vec3 mx = jx * M, my = jy * M;
+  float xx = dot(mx, mx) + 0.3, xy = dot(mx, my), yy = dot(my, my) + 0.3;
+  float mean = 0.5 * (xx + yy), apart = length(vec2(0.5 * (xx - yy), xy));
+  float major = mean + apart, minor = max(mean - apart, 0.1);
+  float alpha = second.y / 255.0;
+  float reach = sqrt(2.0 * log(max(255.0 * alpha, 1.0)));
+  if (reach <= 0.0) return;
+  vec2 along = abs(xy) < 1e-6 ? (xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0)) : normalize(vec2(xy, major - xx));
+  at = corner * reach;
+  vec2 px = min(sqrt(major), 1024.0) * at.x * along + min(sqrt(minor), 1024.0) * at.y * vec2(-along.y, along.x);
+  vec2 pixel = centre + focal * t.xy / t.z + px;
+  gl_Position = vec4(2.0 * pixel.x / size.x - 1.0, 1.0 - 2.0 * pixel.y / size.y, 0.0, 1.0);
+  vec3 clear = vec3(second.zw, bytes(one.w).x) / 255.0 * brightest;
+  vec3 shown = level < 0 ? throughWater(clear, length(t))
+    : texture(palette, vec2((levels[level] + 0.5) / 256.0, 0.5)).rgb * (0.75 + 0.25 * min(dot(clear, vec3(0.6)), 1.0));
+  colour = vec4(clamp(shown, 0.0, 1.0), alpha);
+}`;
+
+export const FRAGMENT = `#version 300 es
+precision highp float;
+in vec4 colour; in vec2 at;
+out vec4 drawn;
+void main() {
+  float alpha = min(colour.a * exp(-0.5 * dot(at, at)), 0.99);
+  if (alpha < 1.0 / 255.0) discard;
+  drawn = vec4(colour.rgb * alpha, alpha);
+}`;

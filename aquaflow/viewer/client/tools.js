@@ -1,0 +1,143 @@
+// Measuring, notes and the scale bar: points on the map, which the server finds and measures.
+
+import { tell } from "./load.js";
+
+const HINTS = {
+  distance: "Point at both ends; more points make a line.",
+  area: "Point at three or more corners, in their order.",
+  profile: "Point at both ends of the profile.",
+  note: "Point at where the note belongs.",
+  scale: "Point at both ends of a known length.",
+};
+const MOST = { profile: 2, note: 1, scale: 2 };
+const LEAST = { distance: 2, area: 3, profile: 2 };
+const find = id => document.getElementById(id);
+
+export class ToolBox {
+  constructor(marks, changed) {
+    Object.assign(this, { marks, changed, tool: null, points: [], quantities: {}, turn: 0, can: [] });
+    for (const button of document.querySelectorAll("[data-tool]")) {
+      button.addEventListener("click", () => this.choose(this.tool === button.dataset.tool ? null : button.dataset.tool));
+    }
+    find("again").addEventListener("click", () => this.choose(this.tool));
+    find("note-form").addEventListener("submit", event => { event.preventDefault(); this.guarded(() => this.keepNote()); });
+    find("scale-form").addEventListener("submit", event => { event.preventDefault(); this.guarded(() => this.setScale()); });
+  }
+
+  offer(can) {
+    this.can = can;
+    for (const name of ["note", "scale"]) document.querySelector(`[data-tool=${name}]`).hidden = !can.includes(name);
+    if (can.includes("note")) this.guarded(() => this.showNotes());
+  }
+
+  choose(tool) {
+    this.tool = tool;
+    this.turn++;
+    this.points = [];
+    this.quantities = {};
+    for (const button of document.querySelectorAll("[data-tool]")) button.setAttribute("aria-pressed", String(button.dataset.tool === tool));
+    find("hint").textContent = HINTS[tool] || "";
+    this.result("");
+    for (const id of ["note-form", "scale-form", "again"]) find(id).hidden = true;
+    this.marks.canvas.classList.toggle("pointing", tool !== null);
+    this.show();
+  }
+
+  show() {
+    find("tools").dataset.points = String(this.points.length);
+    Object.assign(this.marks, { points: this.points, closed: this.tool === "area" });
+    this.changed();
+  }
+
+  result(text, chart = null) {
+    find("result").textContent = text;
+    find("chart").toggleAttribute("hidden", chart === null); // an SVG has no property of that name
+    if (chart) drawChart(find("chart"), chart);
+    if (text) (chart ? find("chart") : find("result")).scrollIntoView({ block: "nearest" });
+  }
+
+  // What fails costs this request; a later click begins another.
+  async guarded(work) {
+    const turn = this.turn;
+    try { await work(); } catch (error) { if (turn === this.turn) this.result(error.message); }
+  }
+
+  point(ray) {
+    if (this.tool) this.guarded(() => this.add(ray));
+  }
+
+  async add(ray) {
+    const turn = this.turn, tool = this.tool;
+    const found = await tell("pick", ray);
+    if (turn !== this.turn) return;
+    if (this.points.length >= (MOST[tool] ?? Infinity)) this.points = [];
+    this.points.push({ ...found, ray });
+    find("again").hidden = false;
+    this.result("");
+    this.show();
+    find("note-form").hidden = !(tool === "note" && this.can.includes("note"));
+    find("scale-form").hidden = !(tool === "scale" && this.points.length === 2);
+    if (tool === "note") find("note-text").focus();
+    if (this.points.length >= (LEAST[tool] ?? Infinity)) await this.measure(turn);
+  }
+
+  async measure(turn) {
+    const points = this.points.map(({ place, sigma, range, ray }) => ({ place, sigma, range, ...ray }));
+    const said = await tell("measure", { what: this.tool, points });
+    if (turn !== this.turn || points.length !== this.points.length) return;
+    this.quantities = said.quantities;
+    find("note-form").hidden = !this.can.includes("note");
+    this.result(said.words, said.profile ?? null);
+  }
+
+  async keepNote() {
+    const shape = { note: "Point", area: "Polygon" }[this.tool] ?? "LineString";
+    await tell("notes/add", { text: find("note-text").value, shape, places: this.points.map(point => point.place), measured: this.quantities });
+    find("note-text").value = "";
+    this.choose(this.tool);
+    await this.showNotes();
+  }
+
+  async setScale() {
+    const number = id => Number(find(id).value.replace(",", "."));
+    const said = await tell("scale", { places: this.points.map(point => point.place), length_m: number("length"), sigma_m: number("sigma") });
+    this.result(said.words);
+    find("scale-form").hidden = true;
+    if (said.rescaled) setTimeout(() => location.reload(), 2500);
+  }
+
+  async showNotes() {
+    const { notes } = await tell("notes/list", {});
+    this.marks.notes = notes;
+    find("notes").replaceChildren(...notes.map(note => {
+      const row = document.createElement("li"), text = document.createElement("span"), remove = document.createElement("button");
+      text.textContent = note.text || "(no text)";
+      remove.textContent = "Remove";
+      remove.addEventListener("click", () => this.guarded(async () => { await tell("notes/remove", { key: note.key }); await this.showNotes(); }));
+      row.append(text, remove);
+      return row;
+    }));
+    this.changed();
+  }
+}
+
+// Heights over the distance along a line, with their 95 % interval.
+function drawChart(svg, { along, height, low, high, unit }) {
+  const [width, tall, left, below] = [264, 130, 44, 18];
+  const [least, most] = [Math.min(...low), Math.max(...high)], length = along.at(-1) || 1;
+  const x = v => left + (width - left - 4) * v / length, y = v => 6 + (tall - below - 12) * (most - v) / ((most - least) || 1);
+  const make = (name, attributes, text) => {
+    const made = document.createElementNS("http://www.w3.org/2000/svg", name);
+    for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+    if (text !== undefined) made.textContent = text;
+    return made;
+  };
+  svg.setAttribute("viewBox", `0 0 ${width} ${tall}`);
+  const at = values => values.map((v, i) => `${x(along[i])},${y(v)}`);
+  svg.replaceChildren(
+    make("polygon", { points: [...at(high), ...at(low).reverse()].join(" ") }),
+    make("path", { d: `M${at(height).join("L")}` }),
+    make("text", { x: 0, y: 14 }, most.toPrecision(3)), make("text", { x: 0, y: tall - below }, least.toPrecision(3)),
+    make("text", { x: left, y: tall - 3 }, "0"), make("text", { x: width, y: tall - 3, "text-anchor": "end" }, `${length.toPrecision(3)} ${unit}`),
+  );
+}

@@ -1,0 +1,142 @@
+"""What is shown at the moment, for the threads of the server; everything is packed when asked for.
+
+The thread that shows replaces whole objects and never waits; a browser gets what is there when it
+asks. Where no browser asks, nothing is packed.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.messages import CameraModel
+from aquaflow.viewer.levels import Palette
+from aquaflow.viewer.packing import Packed
+from aquaflow.viewer.seen_water import SeenWater
+from aquaflow.viewer.splats import Splats
+
+Float = npt.NDArray[np.floating[Any]]
+
+JPEG_QUALITY = 80
+POSE_NUMBERS = 8
+"""Of each pose: place, rotation wxyz, quality."""
+
+
+@dataclass(frozen=True)
+class ShownMap:
+    """Gaussians with what is needed to see them."""
+
+    splats: Splats
+    packed: Packed
+    water: SeenWater | None
+    palettes: dict[str, Palette]
+
+
+@dataclass(frozen=True)
+class ShownCamera:
+    """A camera with what it sees."""
+
+    T_wc: Sim3
+    camera: CameraModel
+    picture: npt.NDArray[np.uint8] | None
+    """[H, W, 3] RGB"""
+    number: int
+    """Counts the cameras shown."""
+
+
+@dataclass
+class Exhibit:
+    """Attributes are replaced as a whole; they are not changed in place."""
+
+    title: str
+    up: tuple[float, float, float]
+    live: bool = True
+    health: str = ""
+    unit: str = "map units"
+    metres: float = 1.0
+    """Of ``unit``, in a unit of the coordinates."""
+    map: ShownMap | None = None
+    path: npt.NDArray[np.float32] = field(
+        default_factory=lambda: np.zeros((0, POSE_NUMBERS), np.float32)
+    )
+    """[N, 8]"""
+    path_number: int = 0
+    camera: ShownCamera | None = None
+    pictures: Sequence[Path | None] = ()
+    """By pose."""
+    can: tuple[str, ...] = ()
+    """Tools that this dive offers beyond measuring: ``notes``, ``scale``."""
+    asked_s: float = -math.inf
+    """When a browser last asked for the scene, s of the monotonic clock."""
+    _jpeg: tuple[int, bytes] = (-1, b"")
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def scene(self) -> dict[str, Any]:
+        """What the page asks for first, and again and again while the dive goes on."""
+        shown, camera = self.map, self.camera
+        self.asked_s = time.monotonic()
+        said: dict[str, Any] = {
+            "title": self.title, "up": self.up, "live": self.live, "health": self.health,
+            "unit": self.unit, "metres": self.metres, "can": self.can, "map": None, "camera": None,
+            "path": {"number": self.path_number, "count": len(self.path)},
+            "pictures": [i for i, each in enumerate(self.pictures) if each is not None],
+        }  # fmt: skip
+        if shown is not None and len(shown.splats):
+            water = None if shown.water is None else shown.water.to_json()
+            palettes = {name: each.to_json() for name, each in shown.palettes.items()}
+            said["map"] = shown.packed.description() | {"water": water, "palettes": palettes}
+        if camera is not None:
+            model = camera.camera
+            said["camera"] = {
+                "number": camera.number, "place": camera.T_wc.t.tolist(),
+                "wxyz": camera.T_wc.quaternion.tolist(), "width": model.width,
+                "height": model.height, "fx": model.fx, "fy": model.fy,
+                "cx": model.cx, "cy": model.cy, "picture": camera.picture is not None,
+            }  # fmt: skip
+        return said
+
+    def chunk(self, version: str, number: int) -> bytes | None:
+        """Gzipped, of the map of that version; None if another one is shown by now."""
+        shown = self.map
+        if shown is None or shown.packed.version != version:
+            return None
+        return shown.packed.chunk(number)
+
+    def picture(self, number: int) -> bytes | None:
+        """JPEG of what the camera saw at a pose of a finished dive; None where nothing is kept."""
+        path = self.pictures[number] if 0 <= number < len(self.pictures) else None
+        if path is None:
+            return None
+        import cv2
+
+        return _jpeg(cv2.imread(str(path)))
+
+    def newest_picture(self) -> bytes | None:
+        """JPEG of what the camera sees; encoded once for all browsers."""
+        camera = self.camera
+        if camera is None or camera.picture is None:
+            return None
+        with self._lock:
+            if self._jpeg[0] != camera.number:
+                self._jpeg = camera.number, _jpeg(camera.picture[..., ::-1]) or b""
+            return self._jpeg[1]
+
+
+def _jpeg(
+    image: npt.NDArray[Any] | None,  # [H, W, 3] BGR
+) -> bytes | None:
+    if image is None:
+        return None
+    import cv2
+
+    done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return data.tobytes() if done else None
