@@ -32,7 +32,7 @@ PACKAGES = (
         "foxglove-schemas-protobuf", "foxglove_schemas_protobuf", "recording",
         "pictures in recordings, for Foxglove and Lichtblick",
     ),
-    Package("rosbags", "rosbags", "recording", "ROS 1 and 2 bags"),
+    Package("rosbags", "rosbags", "recording", "ROS 1 and 2 bags; a dive as ROS 2 messages"),
     Package("laspy", "laspy", "survey", "points of a dive as LAZ"),
     Package("lazrs", "lazrs", "survey", "points of a dive as LAZ"),
     Package("pye57", "pye57", "survey", "points of a dive as E57"),
