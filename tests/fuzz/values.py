@@ -79,6 +79,7 @@ QUICK: dict[str, dict[str, str]] = {
     "prior bench": {"--repeats": "1"},
     "prior train compact": {"--steps": "1", "--scenes": "8", "--batch": "2", "--out": "new"},
     "stress": {"--family": "solvers"},
+    "video": {"--out": "new.mp4"},
 }
 """Given where nothing else was drawn, so that a run that works is over soon."""
 
