@@ -65,7 +65,7 @@ class Poses:
             return None
         share = (t_ns - before) / (then - before)
         first, second = self._poses[after - 1], self._poses[after]
-        turns = Slerp([0.0, 1.0], Rotation.from_matrix([first.R, second.R]))
+        turns = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([first.R, second.R])))
         R = np.asarray(turns(share).as_matrix())
         return Sim3(R, (1.0 - share) * first.t + share * second.t)
 

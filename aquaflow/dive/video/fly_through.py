@@ -94,10 +94,14 @@ class Clear:
         ranges = picture_out(mapper.scene.nearest_cameras(mapper.views)[1]).astype(np.float64)
         radiance = checkpoint_in(np.ascontiguousarray(splats.colours[:, None]), device)
         bounded, _ = Colours(mapper, 1.0, None).of(radiance, ranges[:, None])
-        values = (
-            splats.means, splats.wxyz, splats.scales, splats.opacities, bounded[:, 0] / 255.0,
-        )  # fmt: skip
-        self._sent = [checkpoint_in(np.ascontiguousarray(v, np.float32), device) for v in values]
+
+        def sent(values: npt.NDArray[np.floating]) -> torch.Tensor:  # [N, ...]
+            return checkpoint_in(np.ascontiguousarray(values, np.float32), device)
+
+        self._means, self._wxyz, self._scales = map(
+            sent, (splats.means, splats.wxyz, splats.scales)
+        )
+        self._opacities, self._colours = sent(splats.opacities), sent(bounded[:, 0] / 255.0)
 
     @torch.no_grad()
     def __call__(self, T_wc: Sim3) -> Picture:
@@ -105,6 +109,7 @@ class Clear:
         camera, blank = self._camera, np.zeros((1, 1, 3), np.uint8)
         view = View(-1, blank, camera, T_wc, 0, False, device=self._mapper.device)
         drawn = self._mapper.renderer(
-            *self._sent, view.viewmat(), view.K(), camera.width, camera.height
-        )
+            self._means, self._wxyz, self._scales, self._opacities, self._colours,
+            view.viewmat(), view.K(), camera.width, camera.height,
+        )  # fmt: skip
         return to_bytes(picture_out(drawn.image))
