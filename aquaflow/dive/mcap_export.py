@@ -154,7 +154,7 @@ def _water_status(medium: dict[str, Any]) -> Any:
     rates = {"attenuation": medium["attenuation_per_unit"], **medium["backscatter"]}
     for key, numbers in rates.items():
         per = "" if key.startswith("B_") else f", {unit}"
-        for channel, value in zip(("red", "green", "blue"), numbers, strict=True):
+        for channel, value in zip(messages.CHANNELS, numbers, strict=True):
             values[f"{key} {channel}{per}"] = f"{value:.6g}"
     return messages.status(messages.OK, name, "parameters of the image formation", values)
 

@@ -33,6 +33,7 @@ PACKAGES = (
         "pictures in recordings, for Foxglove and Lichtblick",
     ),
     Package("rosbags", "rosbags", "recording", "ROS 1 and 2 bags; a dive as ROS 2 messages"),
+    Package("foxglove-sdk", "foxglove", "foxglove", "a running dive in Foxglove"),
     Package("laspy", "laspy", "survey", "points of a dive as LAZ"),
     Package("lazrs", "lazrs", "survey", "points of a dive as LAZ"),
     Package("pye57", "pye57", "survey", "points of a dive as E57"),

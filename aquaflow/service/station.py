@@ -10,6 +10,7 @@ from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.service.control import Control
 from aquaflow.service.dive_parts import Parts
 from aquaflow.service.feed import Feed
+from aquaflow.service.foxglove.live import LiveFoxglove
 from aquaflow.service.health.http import HealthServer
 from aquaflow.service.live_dive import LiveDive
 from aquaflow.service.live_viewer import LiveViewer
@@ -48,6 +49,7 @@ class Station:
             self._watchers.append(Arming(service.dive, control, feed.pilot).update)
         self.standby.watchers += self._watchers
         self._viewer: LiveViewer | None = None
+        self._foxglove: LiveFoxglove | None = None
         self._viewer_config = vehicle.viewer
         with contextlib.ExitStack() as opened:
             if service.health.enabled:
@@ -59,6 +61,9 @@ class Station:
             if vehicle.viewer.enabled:
                 self._viewer = LiveViewer(vehicle.viewer, self.report)
                 opened.callback(self._contained, self._viewer.close)
+            if service.foxglove.enabled:
+                self._foxglove = LiveFoxglove(service.foxglove, self.report)
+                opened.callback(self._contained, self._foxglove.close)
             self._closing = opened.pop_all()
 
     def report(self) -> dict[str, Any]:
@@ -84,6 +89,9 @@ class Station:
         if self._viewer is not None:
             self._viewer.begin()
             parts.loop.watchers.append(self._viewer.update)
+        if self._foxglove is not None:
+            self._foxglove.begin()
+            parts.loop.watchers.append(self._foxglove.update)
         self._shown = parts, poses
 
     def hide(self) -> None:

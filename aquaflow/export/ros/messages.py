@@ -26,8 +26,9 @@ POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4"), ("si
 as a float, as PCL, RViz and Foxglove expect it."""
 HALF_PIXEL = 0.5
 """ROS's first pixel has its centre at (0, 0), AquaFlow's at (0.5, 0.5)."""
-OK, WARN, ERROR = 0, 1, 2
+OK, WARN = 0, 1
 """Levels of DiagnosticStatus."""
+CHANNELS = ("red", "green", "blue")
 
 
 def header(t_ns: int, frame_id: str) -> Any:

@@ -33,3 +33,6 @@ TYPES = {
 
 LASTING = frozenset({TF_STATIC, PATH, POINTS})
 """Whose newest message stays true: who comes later gets it too (transient local)."""
+
+OF_FINISHED_DIVES = frozenset({SPEED, FIX})
+"""What a live connection does not have: trajectory.csv has it."""
