@@ -39,6 +39,17 @@ class FoxgloveServer:
         import foxglove
 
         self._context = context = foxglove.Context()  # gone with it, channels would be silent
+        # Before there can be a client: one that subscribes while channels are made is not heard.
+        self._channels = {
+            topic: foxglove.Channel(
+                topic,
+                schema=foxglove.Schema(name=kind, encoding=SCHEMA_ENCODING, data=definition(kind)),
+                message_encoding=MESSAGE_ENCODING,
+                context=context,
+            )
+            for topic, kind in TYPES.items()
+            if topic not in OF_FINISHED_DIVES
+        }
         try:
             self._server: Any = foxglove.start_server(
                 name=name, host=config.host, port=config.port, context=context,
@@ -50,16 +61,6 @@ class FoxgloveServer:
                 "service.foxglove.port, or stop what listens there"
             ) from error
         self.port = int(self._server.port)
-        self._channels = {
-            topic: foxglove.Channel(
-                topic,
-                schema=foxglove.Schema(name=kind, encoding=SCHEMA_ENCODING, data=definition(kind)),
-                message_encoding=MESSAGE_ENCODING,
-                context=context,
-            )
-            for topic, kind in TYPES.items()
-            if topic not in OF_FINISHED_DIVES
-        }
 
     def wanted(self, topic: str) -> bool:
         """True while a client has subscribed to it."""
