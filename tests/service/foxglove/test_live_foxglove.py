@@ -31,11 +31,14 @@ from aquaflow.export.ros import messages, topics
 from aquaflow.export.ros.definitions import encoded
 from aquaflow.messages import Frame
 from aquaflow.service.checkpoint.resume import resumed
+from aquaflow.service.control import Control
 from aquaflow.service.foxglove.live import LiveFoxglove
 from aquaflow.service.foxglove.map_moment import cloud_of, taken
 from aquaflow.service.foxglove.server import BACKLOG, FoxgloveServer
 from aquaflow.service.live_dive import LiveDive
 from aquaflow.service.report import report
+from aquaflow.service.station import Station
+from aquaflow.service.vitals import Vitals
 from aquaflow.sources import open_recording
 from tests.export.ros.published import HASHES, hash_of
 from tests.service.live_scenes import VEHICLE, ToldFeed
@@ -283,6 +286,31 @@ def test_a_missing_package_is_named(module: str, monkeypatch: pytest.MonkeyPatch
         monkeypatch.setattr(f"{place}.find_spec", missing)
     with pytest.raises(InputError, match=module):
         FoxgloveServer(LOOPBACK, "test")
+
+
+def test_a_service_shows_its_dives_where_it_is_asked_to_and_stops_listening(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made: list[FoxgloveServer] = []
+    begin = FoxgloveServer.__init__
+
+    def noted(self: FoxgloveServer, *arguments: Any) -> None:
+        begin(self, *arguments)
+        made.append(self)
+
+    monkeypatch.setattr(FoxgloveServer, "__init__", noted)
+    changed = VEHICLE.service.model_copy(update={"foxglove": LOOPBACK})
+    dive: Any = SimpleNamespace(parts=SimpleNamespace(loop=SimpleNamespace(watchers=[])))
+    for service, count in ((VEHICLE.service, 0), (changed, 1)):
+        vehicle = VEHICLE.model_copy(update={"service": service})
+        with Vitals(service) as vitals, Station(ToldFeed(), vehicle, Control(), vitals) as station:
+            station.show(dive)
+            station.hide()
+        assert len(made) == count
+    owners = [getattr(watch, "__self__", None) for watch in dive.parts.loop.watchers]
+    assert sum(isinstance(owner, LiveFoxglove) for owner in owners) == 1
+    with pytest.raises(OSError, match="refused"):
+        connect(f"ws://127.0.0.1:{made[0].port}")
 
 
 # --- the node of examples/ros2 --------------------------------------------------------------------
