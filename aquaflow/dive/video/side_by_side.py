@@ -79,4 +79,4 @@ def _composed(
 ) -> npt.NDArray[np.uint8]:
     """[H + h, 2 W, 3] both pictures over a band of words."""
     pictures = np.hstack([picture, clear])
-    return np.vstack([pictures, band(pictures.shape[1], [[left, "without water"], words])])
+    return np.vstack([pictures, band(pictures.shape[1], [left, "without water"], words)])

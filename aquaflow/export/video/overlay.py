@@ -16,6 +16,8 @@ Picture = npt.NDArray[np.uint8]
 
 LETTER_SHARE, LEAST_PX, MOST_PX = 1 / 36, 9, 40
 """Height of the letters over the picture's width, and its limits: the words of a line fit."""
+SMALLEST_PX = 5
+"""Letters below are no letters."""
 LINE = 1.5
 """Height of a line over that of its letters."""
 INK, GROUND, MARK = (235, 240, 245), (16, 20, 24), (255, 176, 32)
@@ -31,23 +33,28 @@ def _letters(width: int) -> int:
     return round(min(max(width * LETTER_SHARE, LEAST_PX), MOST_PX))
 
 
-def band(width: int, lines: Sequence[Sequence[str]]) -> Picture:
-    """[h, width, 3] lines of words; the words of a line stand at equal distances."""
+def band(width: int, heads: Sequence[str], words: Sequence[str]) -> Picture:
+    """[h, width, 3] two lines: ``heads``, each over the part of the width that it names, and
+    ``words`` with equal gaps, in smaller letters where they would not fit."""
     px = _letters(width)
     height = round(px * LINE)
-    image = Image.new("RGB", (width, height * len(lines)), GROUND)
+    image = Image.new("RGB", (width, 2 * height), GROUND)
     draw = ImageDraw.Draw(image)
-    for number, words in enumerate(lines):
-        for place, word in enumerate(words):
-            at = (place * width // max(len(words), 1) + px // 2, number * height + px // 6)
-            draw.text(at, word, INK, _fitting(word, px, width // max(len(words), 1)))
+    for number, head in enumerate(heads):
+        draw.text((number * width // len(heads) + px // 2, px // 6), head, INK, _font(px))
+    small = _fitting(words, px, width)
+    lengths = [_font(small).getlength(word) for word in words]
+    gap = (width - sum(lengths)) / max(len(words), 1)
+    for number, word in enumerate(words):
+        x = min(px // 2, gap / 2) + sum(lengths[:number]) + number * gap
+        draw.text((x, height + px // 6), word, INK, _font(small))
     return np.asarray(image)
 
 
-def _fitting(word: str, px: int, room: int) -> Any:
-    """A font in which ``word`` is no wider than ``room``."""
-    wide = _font(px).getlength(word) + px
-    return _font(px if wide <= room else max(int(px * room / wide), 5))
+def _fitting(words: Sequence[str], px: int, room: int) -> int:
+    """The height of letters, at most ``px``, at which the words fit with a letter in between."""
+    wide = sum(_font(px).getlength(word) + px for word in words)
+    return px if wide <= room else max(int(px * room / wide), SMALLEST_PX)
 
 
 def marked(

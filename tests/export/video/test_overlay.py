@@ -28,14 +28,18 @@ def test_only_what_the_dive_knows_is_said_with_its_unit() -> None:
 @pytest.mark.parametrize("width", [320, 1920])
 def test_a_band_is_as_wide_as_the_picture_and_its_words_do_not_touch(width: int) -> None:
     words = words_of(83.456, ROW, "true north")
-    drawn = band(width, [["camera", "without water"], words])
+    drawn = band(width, ["camera", "without water"], words)
     assert drawn.shape[1] == width
     is_ink = (drawn != GROUND).any(axis=2)
-    line = is_ink[drawn.shape[0] // 2 :]
-    for place in range(1, len(words)):
-        edge = place * width // len(words)
-        assert not line[:, edge - 1 : edge + 1].any()
-        assert line[:, edge : edge + width // len(words)].any()
+    above, below = is_ink[: drawn.shape[0] // 2], is_ink[drawn.shape[0] // 2 :]
+    assert above[:, width // 2 : width // 2 + width // 8].any()
+    empty = ~below.any(axis=0)
+    edges = np.flatnonzero(np.diff(empty.astype(int)))
+    gaps = np.sort(np.diff(edges)[1::2])  # between two stretches of ink
+    between = len(words) - 1
+    assert gaps[-between] > 1.3 * gaps[-between - 1]  # the next are those within the words
+    assert empty[-1]
+    assert empty[0]
     assert np.abs(drawn.astype(int) - INK).sum(axis=2).min() < 60
 
 
