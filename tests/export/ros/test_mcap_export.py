@@ -17,6 +17,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from PIL import Image
+from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from aquaflow.api.dive import read_dive
@@ -257,6 +258,19 @@ def test_the_whole_path_is_there_from_the_beginning(messages: Messages) -> None:
     for stamped, posed in zip(path.ros_msg.poses, poses, strict=True):
         assert stamp_ns(stamped.header) == stamp_ns(posed.header)
         assert stamped.pose.position.x == posed.pose.pose.position.x
+
+
+def test_a_second_reader_has_the_same_messages(exported: Path, messages: Messages) -> None:
+    found: dict[str, int] = defaultdict(int)
+    with AnyReader([exported]) as reader:
+        for connection, t_ns, data in reader.messages():
+            theirs = reader.deserialize(data, connection.msgtype)
+            if connection.topic == "/aquaflow/pose":
+                ours = messages[connection.topic][found[connection.topic]]
+                assert t_ns == ours.log_time_ns
+                assert theirs.pose.pose.position.x == ours.ros_msg.pose.pose.position.x
+            found[connection.topic] += 1
+    assert found == {topic: len(reads) for topic, reads in messages.items()}
 
 
 def test_the_layout_shows_only_topics_that_are_in_the_file(
