@@ -29,6 +29,7 @@ class ExportFormat(str, Enum):
     glb = "glb"
     ortho = "ortho"
     dem = "dem"
+    mcap = "mcap"
 
 
 NAMES = {
@@ -43,6 +44,7 @@ NAMES = {
     ExportFormat.glb: "mesh.glb",
     ExportFormat.ortho: "ortho",
     ExportFormat.dem: "dem",
+    ExportFormat.mcap: "dive.mcap",
 }
 """Of what is written, in the dive's folder."""
 OPTIONS = {
@@ -57,6 +59,7 @@ OPTIONS = {
     ExportFormat.glb: {"--water", "--resolution"},
     ExportFormat.ortho: {"--water", "--resolution"},
     ExportFormat.dem: {"--resolution"},
+    ExportFormat.mcap: {"--recording"},
 }
 """Which options a format knows, besides --out and --json."""
 MESHES: dict[ExportFormat, Literal["ply", "obj", "glb"]] = {
@@ -85,7 +88,8 @@ def export(
             help="restored: frames without their water. laz, e57: the map as points. "
             "colmap, nerfstudio: pictures, poses and points. spz: the map, compressed. "
             "ply, obj, glb: the surface as triangles. "
-            "ortho: the ground from straight above. dem: its heights."
+            "ortho: the ground from straight above. dem: its heights. "
+            "mcap: all of it for Foxglove and ROS 2."
         ),
     ],
     recording: Annotated[
@@ -136,6 +140,8 @@ def export(
             said, facts = _survey(dive, target, kind, resolution, water, bars)
         elif format in MESHES:
             said, facts = _mesh(dive, target, MESHES[format], resolution, water, bars)
+        elif format is ExportFormat.mcap:
+            said, facts = _messages(dive, target, recording, progress)
         else:
             said, facts = _posed_pictures(dive, target, format, recording, restored, progress)
     if as_json:
@@ -227,6 +233,24 @@ def _posed_pictures(
     write = write_colmap if format is ExportFormat.colmap else write_nerfstudio
     count = export_posed_pictures(dive, folder, write, recording, restored, progress)
     return f"Wrote {count} pictures with their poses to {folder}.", {"frames": count}
+
+
+def _messages(
+    dive: Path, path: Path, recording: Path | None, progress: Progress
+) -> tuple[str, dict[str, Any]]:
+    from aquaflow.dive.mcap_export import export_mcap
+
+    wrote = export_mcap(dive, path, recording, progress)
+    where = wrote.where
+    said = (
+        f"Wrote {wrote.messages} messages to {path}, {wrote.poses} poses and {wrote.pictures} "
+        f"pictures among them; a layout for Foxglove to {wrote.layout}.\n"
+        f"Frame map: {where.axes}; {where.unit}. Times: {wrote.times}."
+    )
+    return said, {
+        "layout": str(wrote.layout), "messages": wrote.messages, "poses": wrote.poses,
+        "pictures": wrote.pictures, "unit": where.unit, "axes": where.axes, "times": wrote.times,
+    }  # fmt: skip
 
 
 def _survey(

@@ -6,7 +6,7 @@ import ipaddress
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field, IPvAnyNetwork, model_validator
+from pydantic import Field, IPvAnyNetwork, field_validator, model_validator
 
 from aquaflow.config.device import MountingConfig
 from aquaflow.config.link import Port
@@ -42,6 +42,33 @@ class ListenConfig(Stage):
         if self.enabled and not is_loopback(self.host) and self.token_file is None:
             raise ValueError(f"{self.host} can be reached from outside: set token_file as well")
         return self
+
+
+class FoxgloveConfig(Stage):
+    """A running dive as ROS 2 messages over Foxglove's websocket; off unless asked for."""
+
+    enabled: bool = False
+    host: str = Field(
+        "127.0.0.1",
+        description="loopback only: the protocol has no token; from another computer, "
+        "ssh -L 8765:127.0.0.1:8765",
+    )
+    port: int = Field(8765, ge=0, le=65535, description="Foxglove's default; 0: any that is free")
+    pose_hz: float = Field(10.0, gt=0, le=60, description="tf, pose, camera picture, diagnostics")
+    refresh_s: float = Field(
+        3.0, gt=0, description="s between points and rendered pictures of the map, as the viewer's"
+    )
+    points: int = Field(60_000, ge=100, description="of the map at most; 20 bytes each")
+
+    @field_validator("host")
+    @classmethod
+    def _is_loopback(cls, host: str) -> str:
+        if not is_loopback(host):
+            raise ValueError(
+                f"{host} can be reached from outside, and Foxglove's protocol has no token: leave "
+                "it at 127.0.0.1 and use ssh -L"
+            )
+        return host
 
 
 class LiveMappingConfig(Stage):
@@ -181,6 +208,7 @@ class ServiceConfig(Stage):
         "(None: as long as it takes)",
     )
     health: ListenConfig = ListenConfig(port=8230)
+    foxglove: FoxgloveConfig = FoxgloveConfig()
     dive: DiveConfig = DiveConfig()
     mapping: LiveMappingConfig = LiveMappingConfig()
     checkpoint: CheckpointConfig = CheckpointConfig()

@@ -55,7 +55,7 @@ def _rows(
     ):
         t_ns = tracked.frame.t_ns
         x, y, z = (float(value) for value in T_nc.t)
-        heading, roll, pitch = _attitude(frame, T_nc)
+        heading, roll, pitch = attitude_of(frame, T_nc)
         rows.append(
             PoseRow(
                 tracked.frame.index, t_ns * 1e-9, navigation.utc_of(t_ns), sub_map,
@@ -79,7 +79,7 @@ def _places(
     return [(float(a), float(b)) for a, b in zip(latitudes, longitudes, strict=True)]
 
 
-def _attitude(
+def attitude_of(
     frame: MetricFrame, T_nc: Sim3
 ) -> tuple[float, float, float] | tuple[None, None, None]:
     """Heading, roll and pitch, degrees, of the body, or of the camera if the mounting is unknown;

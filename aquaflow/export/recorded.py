@@ -28,11 +28,7 @@ def recorded_pictures(
         InputError: the recording has not all of the frames, or has them in another size.
         ConfigError: the dive's settings or its calibration cannot be read.
     """
-    calibration = dive / "calibration.yaml"
-    prepare = Preparation(
-        load_config(dive / "config.yaml").source,
-        load_camera(calibration) if calibration.is_file() else None,
-    )
+    prepare = preparation_of(dive)
     missing = {view.frame_index: view for view in views}
     indices = list(missing)
     every = math.gcd(*(index - indices[0] for index in indices)) or 1
@@ -51,6 +47,20 @@ def recorded_pictures(
             f"{recording} has no readable frame {min(missing)}, which {dive} mapped; give the "
             "recording that the dive was made from"
         )
+
+
+def preparation_of(dive: Path, width: int | None = None) -> Preparation:
+    """How the pictures of ``dive`` were prepared: cropped, undistorted and resized, to ``width``
+    pixels in place of what was mapped.
+
+    Raises:
+        InputError, ConfigError: the dive's settings or its calibration cannot be read.
+    """
+    calibration = dive / "calibration.yaml"
+    source = load_config(dive / "config.yaml").source
+    if width is not None:
+        source = source.model_copy(update={"width": width})
+    return Preparation(source, load_camera(calibration) if calibration.is_file() else None)
 
 
 def _check_size(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from aquaflow.export.png import write_png
 from aquaflow.export.posed_views import read_mapper
 from aquaflow.export.recorded import recorded_pictures
 from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.rendering import Shown
 from aquaflow.mapping.restoration import (
     RestoredPicture,
     common_exposure,
@@ -77,6 +79,39 @@ def exposure_of_looks(mapper: Mapper) -> float:
     )
 
 
+@dataclass(frozen=True)
+class SeenFrame:
+    """A mapped frame: as the camera saw it, and as the map shows it from there."""
+
+    view: View
+    """With its picture, if there is one."""
+    picture: npt.NDArray[np.uint8] | None
+    """[H, W, 3] RGB of the recording; None without one."""
+    shown: Shown
+
+
+def seen_frames(dive: Path, mapper: Mapper, recording: Path | None) -> Iterator[SeenFrame]:
+    """Each mapped frame of ``dive``, whose map is ``mapper``, in the order of the recording.
+
+    Raises:
+        InputError: the recording is another than that of the dive.
+    """
+    views = in_time(mapper.views)
+    if recording is None:
+        for view in views:
+            yield SeenFrame(view, None, mapper.show(view))
+        return
+    for view, picture in recorded_pictures(dive, recording, views):
+        yield SeenFrame(_with_picture(view, picture), picture, mapper.show(view))
+
+
+def without_water(mapper: Mapper, seen: SeenFrame) -> RestoredPicture:
+    """The frame's picture restored; without a picture, the map as it would look."""
+    if seen.picture is None:
+        return drawn_without_water(mapper.scene, seen.view, seen.shown)
+    return restored_picture(mapper.scene, seen.view, seen.shown)
+
+
 def restored_frames(
     dive: Path, mapper: Mapper, recording: Path | None
 ) -> Iterator[tuple[int, RestoredPicture]]:
@@ -86,14 +121,8 @@ def restored_frames(
     Raises:
         InputError: the recording is another than that of the dive.
     """
-    views = in_time(mapper.views)
-    if recording is None:
-        for view in views:
-            yield view.frame_index, drawn_without_water(mapper.scene, view, mapper.show(view))
-        return
-    for view, image in recorded_pictures(dive, recording, views):
-        picture = restored_picture(mapper.scene, _with_picture(view, image), mapper.show(view))
-        yield view.frame_index, picture
+    for seen in seen_frames(dive, mapper, recording):
+        yield seen.view.frame_index, without_water(mapper, seen)
 
 
 def _with_picture(

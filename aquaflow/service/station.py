@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.coverage.hints import Hint
@@ -24,6 +24,9 @@ from aquaflow.service.vehicle.pilot_messages import PilotMessages
 from aquaflow.service.vehicle.pose_output import PoseOutput
 from aquaflow.service.vitals import Vitals
 from aquaflow.service.watched import Watched
+
+if TYPE_CHECKING:
+    from aquaflow.service.foxglove.live import LiveFoxglove
 
 
 class Station:
@@ -51,6 +54,7 @@ class Station:
             self._watchers.append(Arming(service.dive, control, feed.pilot).update)
         self.standby.watchers += self._watchers
         self._viewer: LiveViewer | None = None
+        self._foxglove: LiveFoxglove | None = None
         self._viewer_config = vehicle.viewer
         with contextlib.ExitStack() as opened:
             if self._coverage is not None:
@@ -65,6 +69,11 @@ class Station:
             if vehicle.viewer.enabled:
                 self._viewer = LiveViewer(vehicle.viewer, self.report)
                 opened.callback(self._contained, self._viewer.close)
+            if service.foxglove.enabled:
+                from aquaflow.service.foxglove.live import LiveFoxglove  # it loads torch
+
+                self._foxglove = LiveFoxglove(service.foxglove, self.report)
+                opened.callback(self._contained, self._foxglove.close)
             self._closing = opened.pop_all()
 
     def report(self) -> dict[str, Any]:
@@ -93,6 +102,9 @@ class Station:
         if self._coverage is not None:
             self._coverage.show(parts)
             parts.loop.watchers.append(self._coverage.update)
+        if self._foxglove is not None:
+            self._foxglove.begin()
+            parts.loop.watchers.append(self._foxglove.update)
         self._shown = parts, poses
 
     def hide(self) -> None:

@@ -35,6 +35,11 @@ class Preparation:
         self._size = (0, 0)
 
     @property
+    def calibration(self) -> CameraModel | None:
+        """What pictures are undistorted with; None if there is none."""
+        return self._calibration
+
+    @property
     def camera(self) -> CameraModel | None:
         """The camera of the prepared frames, once the first has been seen."""
         return None if self._rectifier is None else self._rectifier.camera

@@ -81,6 +81,7 @@ QUICK: dict[str, dict[str, str]] = {
     "prior train compact": {"--steps": "1", "--scenes": "8", "--batch": "2", "--out": "new"},
     "stress": {"--family": "solvers"},
     "report": {"--pdf": "new"},
+    "video": {"--out": "new.mp4"},
 }
 """Given where nothing else was drawn, so that a run that works is over soon."""
 

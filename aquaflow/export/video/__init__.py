@@ -1,0 +1,1 @@
+"""Videos of a dive: the file, its clock, words over pictures, a camera's smooth path."""
