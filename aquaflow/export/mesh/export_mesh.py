@@ -43,7 +43,7 @@ LEAST_VIEWS = 2
 MOST_SIGMA_PX = 8.0
 """Sigma of a vertex, from where rays meet, beyond which it is a hole, in widths of a pixel there:
 two rays that cross at 10 degrees leave as much along them. What is seen from less apart is smears;
-on the reef, which is filmed forwards, 11 and 18 leave some of the far ground."""
+on the reef, which is filmed forwards, 11 and 18 leave much of the far ground."""
 LEAST_PIECE_VOXELS = 30.0
 """Side of the square whose area a piece of the surface has at least; what is smaller is haze or a
 fish."""
