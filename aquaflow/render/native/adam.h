@@ -30,8 +30,8 @@ struct AdamGroup {
 // Its square is still finite; NaN fails the comparison too.
 constexpr float kLargestGradient = 1e18f;
 constexpr int kAdamRows = 16384;  // of a chunk: long runs of each array; its gradients stay cached
-constexpr int kAdamBlock = 64;   // rows that are passed over together
-constexpr int kAdamRun = 1024;   // rows stepped together if their counts are equal
+constexpr int kAdamBlock = 64;    // rows that are passed over together
+constexpr int kAdamRun = 1024;    // rows stepped together if their counts are equal
 constexpr int kAdamRowsPerThread = 4096;  // fewer are done before another thread is awake
 
 struct AdamStep {
@@ -218,8 +218,8 @@ static void step_rows(const AdamCoefficients& k, const AdamGroup& g, int begin, 
   }
 }
 
-static void step_run(const AdamStep& s, const AdamGroup& g, int begin, int rows,
-                     const float* bias1, const float* bias2) {
+static void step_run(const AdamStep& s, const AdamGroup& g, int begin, int rows, const float* bias1,
+                     const float* bias2) {
   const AdamCoefficients k(s, g);
   if (uniform(bias1, rows)) return step_uniform_rows(k, g, begin, rows, bias1[0], bias2[0]);
   for (int row = 0; row < rows; row += kAdamBlock)
