@@ -10,7 +10,7 @@ import torch
 
 from aquaflow.config import Config, MappingConfig
 from aquaflow.dive.folder import DiveFolder
-from aquaflow.dive.results import summarise_water
+from aquaflow.dive.water_summary import summarise_water
 from aquaflow.export.ply import read_ply
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.mapping.clear_colours import mean_water, restored_gaussians, restored_radiance

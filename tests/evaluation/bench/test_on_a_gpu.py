@@ -138,7 +138,8 @@ def test_the_renderers_table_comes_out_on_a_device(
 def test_a_table_without_a_gpu_has_no_columns_for_one(tmp_path: Path) -> None:
     row = row_of(Timed(Pretended(SlowedClock())), TINY, [timing.Sample(1.0, 2.0)], 100, PEAK, None)
     page = io.StringIO()
-    described = {**machine.describe(), "peak_gflop_per_s": {"1": 1.0}, "peak_method": "nothing"}
+    peak = {"peak_gflop_per_s": {"1": 1.0}, "peak_method": "nothing", "blend_limit": {}}
+    described = {**machine.describe(), **peak}
     result = {
         "machine": described,
         "rows": [row],
