@@ -50,7 +50,7 @@ MIN_TEXTURE = 30.0
 """Smoothed squared Sobel gradient of the normalised grey image below which flow only guesses."""
 
 QUARTER_SCALE = 2
-"""DIS stops at this halving where a flow is known to start from; its matches are then fitted at
+"""DIS stops at this halving where the last matches are known; its matches are then fitted at
 half and at all of the size. To half the size DIS costs three times as much, and trajectories are no
 more accurate (docs/measurements.md#seeded)."""
 
@@ -198,10 +198,12 @@ class FlowMatcher:
         texture_a: Float,  # [H, W]
         texture_b: Float,  # [H, W]
         start: Float | None = None,  # [H, W, 2] px, a to b
+        quick: bool = False,
     ) -> Flow:
+        """``quick``: in half the time, for a start that is seldom far off."""
         # Where a start is NaN, OpenCV reads outside of the picture and ends the process.
         start = None if start is None or not np.isfinite(start).all() else start
-        forward, backward = self._both_ways(a, b, start)
+        forward, backward = self._both_ways(a, b, start, quick)
         return Flow(forward, backward, *check(forward, backward, texture_a, texture_b))
 
     def _both_ways(
@@ -209,10 +211,11 @@ class FlowMatcher:
         a: Grey,  # [H, W]
         b: Grey,  # [H, W]
         start: Float | None,  # [H, W, 2] px, a to b
+        quick: bool,
     ) -> tuple[Float, Float]:
         if is_refinable(a):
-            known = start is not None and is_refinable(a[::2, ::2])
-            flow = self._from_coarse(a, b, start) if known else self._flow(a, b, start)
+            coarse = quick and start is not None and is_refinable(a[::2, ::2])
+            flow = self._from_coarse(a, b, start) if coarse else self._flow(a, b, start)
             forward = refine(a, b, flow)
             return forward, backward_flow(a, b, forward)
         back = None if start is None else reverse(start)
