@@ -7,11 +7,10 @@ confirmed by it: what is reversed there fits nothing, or something else
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.prior.fields import pixel_grid, sample
+from aquaflow.prior.fields import halved, of_size, pixel_grid, sample
 from aquaflow.prior.refinement import refine
 
 Float = npt.NDArray[np.float32]
@@ -48,27 +47,9 @@ def backward_flow(
     pictures = [(b, a)]
     for _ in range(HALVINGS):
         finer_b, finer_a = pictures[-1]
-        pictures.append((_halved(finer_b), _halved(finer_a)))
+        pictures.append((halved(finer_b), halved(finer_a)))
     # What is finer than the coarsest picture is found anew in the finer ones.
-    flow = reverse(_of_size(forward, pictures[-1][0].shape))
+    flow = reverse(of_size(forward, pictures[-1][0].shape))
     for coarse_b, coarse_a in reversed(pictures):
-        flow = refine(coarse_b, coarse_a, _of_size(flow, coarse_b.shape))
+        flow = refine(coarse_b, coarse_a, of_size(flow, coarse_b.shape))
     return flow
-
-
-def _halved(
-    grey: Grey,  # [H, W]
-) -> Grey:
-    return np.asarray(cv2.pyrDown(grey), dtype=np.uint8)
-
-
-def _of_size(
-    flow: Float,  # [H, W, 2] px
-    shape: tuple[int, ...],
-) -> Float:
-    """The flow of a picture of another size, in that one's pixels."""
-    height, width = shape
-    if flow.shape[:2] == shape:
-        return flow
-    growth = np.array([width / flow.shape[1], height / flow.shape[0]], np.float32)
-    return np.asarray(cv2.resize(flow, (width, height)) * growth, dtype=np.float32)

@@ -22,11 +22,17 @@ def best_flow(
     a: FlowEncoding,
     b: FlowEncoding,
     starts: Iterable[Float | None],  # [H, W, 2] px each, a to b; None: from nothing
+    near: Float | None = None,  # [H, W, 2] px, a to b
 ) -> Flow:
     """The flow of the first start that explains the pair, or the one that matches most.
 
-    ``starts`` is asked for the next one only when those before were not good enough.
+    From ``near``, where it is known well, a quicker flow comes first. ``starts`` is asked for the
+    next one only when those before were not good enough.
     """
+    if near is not None:
+        flow = matcher(a.grey, b.grey, a.texture, b.texture, near, quick=True)
+        if flow.share >= GOOD_SHARE:
+            return flow
     best: Flow | None = None
     for start in starts:
         flow = matcher(a.grey, b.grey, a.texture, b.texture, start)

@@ -36,3 +36,22 @@ def sample(
     return np.asarray(
         cv2.remap(field, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     )
+
+
+def halved(
+    grey: npt.NDArray[np.uint8],  # [H, W]
+) -> npt.NDArray[np.uint8]:
+    """[H / 2, W / 2] the picture, smoothed and of half the size, rounded up."""
+    return np.asarray(cv2.pyrDown(grey), dtype=np.uint8)
+
+
+def of_size(
+    flow: Float,  # [H, W, 2] px
+    shape: tuple[int, ...],
+) -> Float:
+    """[h, w, 2] the flow of a picture of another size ``shape``, (h, w), in that one's pixels."""
+    height, width = shape
+    if flow.shape[:2] == shape:
+        return flow
+    growth = np.array([width / flow.shape[1], height / flow.shape[0]], np.float32)
+    return np.asarray(cv2.resize(flow, (width, height)) * growth, dtype=np.float32)

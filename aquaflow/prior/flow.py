@@ -10,8 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.prior.backward_flow import backward_flow, reverse
-from aquaflow.prior.fields import length, pixel_grid, sample
+from aquaflow.prior.fields import halved, length, of_size, pixel_grid, sample
 from aquaflow.prior.refinement import is_refinable, refine
+from aquaflow.render.library import library_or_none
 
 Float = npt.NDArray[np.float32]
 Grey = npt.NDArray[np.uint8]
@@ -47,6 +48,14 @@ keyframes (synthetic reef, 25 degrees down; 42 degrees down: -2.2 against -0.1 %
 
 MIN_TEXTURE = 30.0
 """Smoothed squared Sobel gradient of the normalised grey image below which flow only guesses."""
+
+QUARTER_SCALE = 2
+"""DIS stops at this halving where the last matches are known; its matches are then fitted at
+half and at all of the size. To half the size DIS costs three times as much, and trajectories are no
+more accurate (docs/measurements.md#seeded)."""
+
+HALF_SIZE_FITS = 2
+"""Times that such a flow is fitted at half the size: once, trajectories err by a quarter more."""
 
 BORDER_PX = 2.0
 """Matches this near to the rim of the picture are rejected."""
@@ -125,14 +134,62 @@ def confidence(
     return np.where(flow.valid, certain, 0.0).astype(np.float32)
 
 
+def check(
+    forward: Float,  # [H, W, 2] px, a to b
+    backward: Float,  # [H, W, 2] px, b to a
+    texture_a: Float,  # [H, W]
+    texture_b: Float,  # [H, W]
+) -> tuple[Float, Mask]:
+    """As :func:`check_by_numpy`, in compiled code where there is some.
+
+    Raises:
+        ValueError: the four are not of one size.
+    """
+    library = library_or_none()
+    if library is None:
+        return check_by_numpy(forward, backward, texture_a, texture_b)
+    given = [
+        np.ascontiguousarray(each, np.float32) for each in (forward, backward, texture_a, texture_b)
+    ]
+    height, width = forward.shape[:2]
+    if any(each.shape[:2] != (height, width) for each in given):
+        raise ValueError("check takes two flows and two textures, all of one size")
+    error, valid = np.empty((height, width), np.float32), np.empty((height, width), np.bool_)
+    library.call(
+        "aq_check_flow",
+        *(each.ctypes.data for each in given), width, height,
+        BORDER_PX, FORWARD_BACKWARD_PX, MIN_TEXTURE, error.ctypes.data, valid.ctypes.data,
+    )  # fmt: skip
+    return error, valid
+
+
+def check_by_numpy(
+    forward: Float,  # [H, W, 2] px, a to b
+    backward: Float,  # [H, W, 2] px, b to a
+    texture_a: Float,  # [H, W]
+    texture_b: Float,  # [H, W]
+) -> tuple[Float, Mask]:
+    """[H, W] px by which a match does not come back, and [H, W] True where it counts."""
+    height, width = texture_a.shape
+    target = pixel_grid(height, width) + forward
+    error = length(forward + sample(backward, target))
+    inside = (target[..., 0] > BORDER_PX) & (target[..., 0] < width - BORDER_PX)
+    inside &= (target[..., 1] > BORDER_PX) & (target[..., 1] < height - BORDER_PX)
+    # Both ends: onto a black picture DIS flows nowhere, and comes back from there exactly.
+    textured = (texture_a > MIN_TEXTURE) & (sample(texture_b, target) > MIN_TEXTURE)
+    return error, np.asarray(inside & (error < FORWARD_BACKWARD_PX) & textured)
+
+
 class FlowMatcher:
     """Refined DIS flow from a starting flow, and the flow back, with the forward-backward check."""
 
     def __init__(self) -> None:
-        # Two, because OpenCV keeps a starting flow for later calls that give none; it even reads
-        # beyond it when those pictures are larger. Any: its stubs do not know of None.
+        # Several, because OpenCV keeps a starting flow for later calls that give none; it even
+        # reads beyond it when those pictures are larger. Any: its stubs do not know of None.
         self._unseeded: Any = cv2.DISOpticalFlow.create(cv2.DISOpticalFlow_PRESET_MEDIUM)
         self._seeded: Any = cv2.DISOpticalFlow.create(cv2.DISOpticalFlow_PRESET_MEDIUM)
+        self._coarse: Any = cv2.DISOpticalFlow.create(cv2.DISOpticalFlow_PRESET_MEDIUM)
+        self._coarse.setFinestScale(QUARTER_SCALE)
 
     def __call__(
         self,
@@ -141,31 +198,43 @@ class FlowMatcher:
         texture_a: Float,  # [H, W]
         texture_b: Float,  # [H, W]
         start: Float | None = None,  # [H, W, 2] px, a to b
+        quick: bool = False,
     ) -> Flow:
+        """``quick``: in half the time, for a start that is seldom far off."""
         # Where a start is NaN, OpenCV reads outside of the picture and ends the process.
         start = None if start is None or not np.isfinite(start).all() else start
-        forward, backward = self._both_ways(a, b, start)
-        height, width = a.shape
-        target = pixel_grid(height, width) + forward
-        error = length(forward + sample(backward, target))
-        inside = (target[..., 0] > BORDER_PX) & (target[..., 0] < width - BORDER_PX)
-        inside &= (target[..., 1] > BORDER_PX) & (target[..., 1] < height - BORDER_PX)
-        # Both ends: onto a black picture DIS flows nowhere, and comes back from there exactly.
-        textured = (texture_a > MIN_TEXTURE) & (sample(texture_b, target) > MIN_TEXTURE)
-        valid = inside & (error < FORWARD_BACKWARD_PX) & textured
-        return Flow(forward, backward, error, valid)
+        forward, backward = self._both_ways(a, b, start, quick)
+        return Flow(forward, backward, *check(forward, backward, texture_a, texture_b))
 
     def _both_ways(
         self,
         a: Grey,  # [H, W]
         b: Grey,  # [H, W]
         start: Float | None,  # [H, W, 2] px, a to b
+        quick: bool,
     ) -> tuple[Float, Float]:
         if is_refinable(a):
-            forward = refine(a, b, self._flow(a, b, start))
+            coarse = quick and start is not None and is_refinable(a[::2, ::2])
+            flow = self._from_coarse(a, b, start) if coarse else self._flow(a, b, start)
+            forward = refine(a, b, flow)
             return forward, backward_flow(a, b, forward)
         back = None if start is None else reverse(start)
         return self._flow(a, b, start), self._flow(b, a, back)
+
+    def _from_coarse(
+        self,
+        a: Grey,  # [H, W]
+        b: Grey,  # [H, W]
+        start: Float | None,  # [H, W, 2] px, a to b
+    ) -> Float:
+        """DIS down to a quarter of the size, fitted at half of it."""
+        initial = np.array(start, dtype=np.float32, order="C")
+        half_a, half_b = halved(a), halved(b)
+        flow = np.asarray(self._coarse.calc(a, b, initial), dtype=np.float32)
+        flow = of_size(flow, half_a.shape)
+        for _ in range(HALF_SIZE_FITS):
+            flow = refine(half_a, half_b, flow)
+        return of_size(flow, a.shape)
 
     def _flow(
         self,

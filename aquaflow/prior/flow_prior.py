@@ -50,4 +50,5 @@ class FlowPrior:
         """From one of ``starts``; from nothing but a prediction that stands ``alone``."""
         if alone and predicted is not None:
             starts = from_prediction(predicted)
-        return best_flow(self._matchers.own, a, b, starts)
+        near = next(from_prediction(predicted), None)
+        return best_flow(self._matchers.own, a, b, starts, near)

@@ -12,6 +12,7 @@
 #include "activate.h"
 #include "adam.h"
 #include "blend.h"
+#include "check_flow.h"
 #include "constants.h"
 #include "context.h"
 #include "decode_view.h"
@@ -241,6 +242,16 @@ AQ_EXPORT int aq_refine_flow(const uint8_t* a, const uint8_t* b, const float* fl
                  singular},
                 out);
   });
+}
+
+// See check_flow.h: error [H, W] and valid [H, W] of a flow there and back.
+AQ_EXPORT int aq_check_flow(const float* forward, const float* backward, const float* texture_a,
+                            const float* texture_b, int width, int height, float border_px,
+                            float most_error_px, float least_texture, float* error,
+                            uint8_t* valid) {
+  check_flow({forward, backward, texture_a, texture_b, border_px, most_error_px, least_texture},
+             {width, height}, error, valid);
+  return 0;
 }
 
 // See fuse_depths.h. Returns the number of pixels with a usable measurement.

@@ -29,10 +29,20 @@ class Filter {
  public:
   // out may be in.
   void run(const float* in, Size size, Taps f, float* out) {
+    // Of a radius that is known, a sum stays in a register until it is complete.
+    if (f.radius == 7) return run<7>(in, size, f, out);
+    if (f.radius == 6) return run<6>(in, size, f, out);
+    run<0>(in, size, f, out);
+  }
+
+ private:
+  template <int Radius>
+  void run(const float* in, Size size, Taps f, float* out) {
     const int pad = f.radius, width = size.width;
     row_.resize((size_t)width + 2 * pad);
     columns_.resize(size.count());
-    for (int y = 0; y < size.height; y++) down(in, size, f, y, columns_.data() + (size_t)y * width);
+    for (int y = 0; y < size.height; y++)
+      down<Radius>(in, size, f, y, columns_.data() + (size_t)y * width);
     for (int y = 0; y < size.height; y++) {
       const float* column = columns_.data() + (size_t)y * width;
       std::copy_n(column, width, row_.data() + pad);
@@ -40,30 +50,56 @@ class Filter {
         row_[pad - x] = column[mirrored(-x, width)];
         row_[pad + width - 1 + x] = column[mirrored(width - 1 + x, width)];
       }
-      across(row_.data() + pad, width, f, out + (size_t)y * width);
+      across<Radius>(row_.data() + pad, width, f, out + (size_t)y * width);
     }
   }
 
- private:
+  template <int Radius>
   static void down(const float* in, Size size, Taps f, int y, float* out) {
     const int width = size.width;
     const float* here = in + (size_t)y * width;
-    for (int x = 0; x < width; x++) out[x] = f.taps[0] * here[x];
-    for (int k = 1; k <= f.radius; k++) {
-      const float* above = in + (size_t)mirrored(y - k, size.height) * width;
-      const float* below = in + (size_t)mirrored(y + k, size.height) * width;
-      const float tap = f.taps[k];
+    const auto row = [&](int at) { return in + (size_t)mirrored(at, size.height) * width; };
+    if constexpr (Radius > 0) {
+      const float *above[Radius], *below[Radius];
+      float taps[Radius + 1];
+      std::copy_n(f.taps, Radius + 1, taps);
+      for (int k = 0; k < Radius; k++) above[k] = row(y - k - 1), below[k] = row(y + k + 1);
 #pragma omp simd
-      for (int x = 0; x < width; x++) out[x] += tap * (above[x] + below[x]);
+      for (int x = 0; x < width; x++) {
+        float sum = taps[0] * here[x];
+#pragma GCC unroll 8
+        for (int k = 0; k < Radius; k++) sum += taps[k + 1] * (above[k][x] + below[k][x]);
+        out[x] = sum;
+      }
+    } else {
+      for (int x = 0; x < width; x++) out[x] = f.taps[0] * here[x];
+      for (int k = 1; k <= f.radius; k++) {
+        const float *above = row(y - k), *below = row(y + k), tap = f.taps[k];
+#pragma omp simd
+        for (int x = 0; x < width; x++) out[x] += tap * (above[x] + below[x]);
+      }
     }
   }
 
+  template <int Radius>
   static void across(const float* row, int width, Taps f, float* out) {
-    for (int x = 0; x < width; x++) out[x] = f.taps[0] * row[x];
-    for (int k = 1; k <= f.radius; k++) {
-      const float tap = f.taps[k];
+    if constexpr (Radius > 0) {
+      float taps[Radius + 1];
+      std::copy_n(f.taps, Radius + 1, taps);
 #pragma omp simd
-      for (int x = 0; x < width; x++) out[x] += tap * (row[x - k] + row[x + k]);
+      for (int x = 0; x < width; x++) {
+        float sum = taps[0] * row[x];
+#pragma GCC unroll 8
+        for (int k = 1; k <= Radius; k++) sum += taps[k] * (row[x - k] + row[x + k]);
+        out[x] = sum;
+      }
+    } else {
+      for (int x = 0; x < width; x++) out[x] = f.taps[0] * row[x];
+      for (int k = 1; k <= f.radius; k++) {
+        const float tap = f.taps[k];
+#pragma omp simd
+        for (int x = 0; x < width; x++) out[x] += tap * (row[x - k] + row[x + k]);
+      }
     }
   }
 

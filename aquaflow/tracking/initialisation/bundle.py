@@ -20,8 +20,9 @@ HUBER_PX = 1.0
 """Reprojection error where the loss turns linear."""
 MAX_ITERATIONS = 25
 """Limit of Levenberg-Marquardt."""
-STOP_RELATIVE_DECREASE = 1e-5
-"""Relative fall of the cost at which the adjustment has converged."""
+STOP_RELATIVE_DECREASE = 1e-4
+"""Relative fall of the cost at which the adjustment has converged. With a tenth of it, 24 views of
+Curasao took 20 steps instead of 13 to the same residual; trajectories were no more accurate."""
 MIN_RHO = 1e-3
 """Points further than 1000 scene units are held there: infinity has no parallax to solve for."""
 

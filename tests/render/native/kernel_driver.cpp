@@ -196,6 +196,10 @@ static void match(const Scene& s, bool short_of_memory) {
     return aq_refine_flow(a.data(), b.data(), flow.data(), s.width, s.height, contrast.data(), 7,
                           window.data(), 6, 2.0f, 1.0f, 1e-3f, refined.data());
   });
+  std::vector<float> error(pixels);
+  if (aq_check_flow(flow.data(), refined.data(), confidence.data(), confidence.data(), s.width,
+                    s.height, 2.0f, 1.0f, 30.0f, error.data(), valid.data()) != 0)
+    std::exit(4);
   const FuseDepths in{flow.data(),
                       valid.data(),
                       confidence.data(),
