@@ -18,12 +18,14 @@ from aquaflow.dive.measures import measures
 from aquaflow.dive.report_data import MAX_EXAMPLES, camera_summary
 from aquaflow.dive.survey_data import left_out, profile
 from aquaflow.errors import InputError, reason_of
-from aquaflow.export.report import HeldOutExample, MediumCurves, PathPlot, ReportData
+from aquaflow.export.report import HeldOutExample, MediumCurves, PathPlot, ReefRow, ReportData
 from aquaflow.export.trajectory_csv import NAME as PATH_TABLE
 from aquaflow.export.trajectory_csv import PoseRow, read_trajectory_csv
 from aquaflow.fusion.metric_file import read_main, read_metric_file
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.camera import load_camera
+from aquaflow.measure.quantity import Quantity
+from aquaflow.measure.reef_files import JSON as REEF
 
 FOUND = "found from the dive"
 """In the first line of a calibration that nobody gave."""
@@ -47,6 +49,7 @@ def report_of_folder(dive: Path) -> ReportData:
         metrics=metrics,
         path=path,
         measures=measures(path, frame, None),
+        reef=_reef(dive / REEF, frame),
         timeline=[row.frame_class for row in rows],
         examples=_examples(dive),
         medium=medium,
@@ -107,6 +110,30 @@ def _medium(dive: Path, frame: MetricFrame) -> MediumCurves | None:
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{dive / 'medium.json'} is damaged; map the dive again") from error
     return MediumCurves(beta, b, B_inf, B_res, d, *span, unit=frame.unit)
+
+
+def _reef(path: Path, frame: MetricFrame) -> list[ReefRow]:
+    """Empty where they were measured in map units, before ``aquaflow scale`` knew metres."""
+    if not path.is_file():
+        return []
+    content = _json(path)
+    try:
+        if content["unit"] != frame.unit:
+            return []
+        numbers = [_reef_row(each) for each in content["numbers"].values()]
+        missing = content["missing"].items()
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path} is damaged; map the dive again") from error
+    return numbers + [ReefRow(what, "unknown", "", why) for what, why in missing]
+
+
+def _reef_row(number: dict[str, Any]) -> ReefRow:
+    """Raises KeyError, TypeError or ValueError for what is none."""
+    value, sigma, low, high = (
+        float(number[key]) for key in ("value", "sigma", "low_95", "high_95")
+    )
+    words = Quantity(value, sigma, low, high, str(number["unit"])).in_words()
+    return ReefRow(number["label"], words, f"{low:.4g} to {high:.4g}", number["meaning"])
 
 
 def _coverage(dive: Path, main: int) -> PageView | None:

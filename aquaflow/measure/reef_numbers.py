@@ -64,7 +64,7 @@ class ReefNumbers:
         return {
             "unit": self.unit, "cell": self.cell, "vertical": self.vertical,
             "numbers": {
-                each.key: each.quantity.to_json() | {"meaning": each.meaning}
+                each.key: each.quantity.to_json() | {"label": each.label, "meaning": each.meaning}
                 for each in self.numbers
             },
             "missing": self.missing,

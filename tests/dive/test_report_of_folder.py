@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import shutil
 from pathlib import Path
@@ -43,6 +44,25 @@ def test_the_folder_gives_back_what_the_report_showed(small_dive: Path) -> None:
     assert all(note.split("&")[0] in page for note in data.notes if "'" not in note)
 
 
+def test_the_ground_in_numbers_is_that_of_the_page_until_its_unit_changes(dive: Path) -> None:
+    page, rows = (dive / "report.html").read_text(), report_of_folder(dive).reef
+    assert len(rows) > 5
+    for row in rows:
+        assert html.escape(row.label) in page
+        assert html.escape(row.value) in page
+        assert html.escape(row.interval) in page
+    numbers = dive / "reef_numbers.json"
+    content = json.loads(numbers.read_text())
+    numbers.write_text(json.dumps(content | {"unit": "furlongs"}))
+    assert report_of_folder(dive).reef == []
+
+
+def test_a_report_is_never_written_over_what_is_no_pdf(dive: Path, command: Cli) -> None:
+    before = (dive / "camera.yaml").read_bytes()
+    refused(command("report", dive, "--pdf", dive / "camera.yaml"), "does not end in .pdf")
+    assert (dive / "camera.yaml").read_bytes() == before
+
+
 def test_report_writes_a_pdf_where_it_is_told_to(dive: Path, command: Cli, tmp_path: Path) -> None:
     ran = command("report", dive, "--pdf", tmp_path / "reef.pdf", "--json")
     assert ran.code == 0, ran.err
@@ -54,7 +74,9 @@ def test_report_writes_a_pdf_where_it_is_told_to(dive: Path, command: Cli, tmp_p
     assert (dive / "report.pdf").stat().st_size > 20_000
 
 
-@pytest.mark.parametrize("name", ["metrics.json", "trajectory.csv", "medium.json", "coverage.npz"])
+@pytest.mark.parametrize(
+    "name", ["metrics.json", "trajectory.csv", "medium.json", "coverage.npz", "reef_numbers.json"]
+)
 def test_a_damaged_file_is_named_in_a_sentence(dive: Path, command: Cli, name: str) -> None:
     (dive / name).write_bytes(b"{\x00 damaged")
     refused(command("report", dive), name)

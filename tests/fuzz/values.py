@@ -80,7 +80,7 @@ QUICK: dict[str, dict[str, str]] = {
     "prior bench": {"--repeats": "1"},
     "prior train compact": {"--steps": "1", "--scenes": "8", "--batch": "2", "--out": "new"},
     "stress": {"--family": "solvers"},
-    "report": {"--pdf": "new"},
+    "report": {"--pdf": "new.pdf"},
     "video": {"--out": "new.mp4"},
 }
 """Given where nothing else was drawn, so that a run that works is over soon."""

@@ -81,6 +81,12 @@ def _survey(pages: Pages, data: ReportData) -> None:
     if data.profile is not None:
         pages.heading("Depth and altitude", PROFILE_IN)
         pages.drawing(PROFILE_IN, profile_axes, data.profile)
+    if data.reef:
+        pages.heading("The ground in numbers, each with 1 sigma and its 95 % interval")
+        pages.table([
+            (row.label, row.value, f"({row.interval})" if row.interval else row.meaning)
+            for row in data.reef
+        ])  # fmt: skip
 
 
 def _water(pages: Pages, data: ReportData) -> None:

@@ -202,7 +202,7 @@ def test_a_dive_on_a_device_is_the_row_that_one_on_the_cpu_is(
     rows = {}
     for where in (CPU, PRETENDED):
         renderer = SinglePrecision(where)
-        monkeypatch.setattr("aquaflow.slam.slam.select_renderer", lambda *_, r=renderer: r)
+        monkeypatch.setattr("aquaflow.render.select_renderer", lambda *_, r=renderer: r)
         on = Job(scene, "fast", job.out, overrides=FEW, device="cuda" if where != CPU else None)
         with pretended_device():
             rows[where] = worker.perform(on)
