@@ -22,11 +22,22 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
         InputError: the file cannot be written.
     """
     part = path.with_name(f".{path.name}.part")
+    with becoming(path, part), part.open("wb") as stream:
+        yield stream
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+@contextlib.contextmanager
+def becoming(path: Path, part: Path) -> Iterator[None]:
+    """``part``, which the block writes to the disk, becomes ``path`` when it ends without an
+    exception; else it is removed, and what was at ``path`` stays.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
     try:
-        with part.open("wb") as stream:
-            yield stream
-            stream.flush()
-            os.fsync(stream.fileno())
+        yield
         part.replace(path)
     except OSError as error:
         raise InputError(
@@ -34,7 +45,8 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
             "written to"
         ) from error
     finally:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
 
 
 def write_json(path: Path, data: dict[str, Any]) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.errors import InputError
+from aquaflow.storage.atomic import becoming
 
 SUFFIX, CODEC = ".mp4", "vp09"
 """Of the files; the codec by its FourCC."""
@@ -107,11 +108,10 @@ def video_file(path: Path, fps: float) -> Iterator[VideoFile]:
         InputError: the name has another ending, or the file cannot be written.
     """
     check_name(path)
-    part = path.with_name(
-        f".{path.stem}.part{SUFFIX}"
-    )  # FFmpeg takes the container from the ending
+    # FFmpeg takes the container from the ending.
+    part = path.with_name(f".{path.stem}.part{SUFFIX}")
     file = VideoFile(part, min(fps, MOST_FPS))
-    try:
+    with becoming(path, part):
         with part.open("wb"):  # what cannot be written is known before pictures are made
             pass
         try:
@@ -122,12 +122,3 @@ def video_file(path: Path, fps: float) -> Iterator[VideoFile]:
             raise
         with part.open("rb") as stream:
             os.fsync(stream.fileno())
-        part.replace(path)
-    except OSError as error:
-        raise InputError(
-            f"cannot write {path}: {error.strerror or error}; give a folder with room that can be "
-            "written to"
-        ) from error
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
