@@ -19,14 +19,14 @@ FLOORS = (
     {"slam", "export", "sim_drivers"},
     {"tracking", "mapping", "coverage", "recording", "drivers", "calibration"},
     {"keyframes", "sources", "synthetic", "fusion"},
-    {"prior", "messages", "storage", "access"},
+    {"prior", "messages", "storage", "access", "bounded_server"},
     {"config", "geometry", "render"},
     {"errors", "clocks", "profiler", "signals", "cores"},
 )
 """Top floor first."""
 
 LOOSE_MODULES = {
-    *("access", "cores", "messages"),
+    *("access", "bounded_server", "cores", "messages"),
     *("profiler", "signals"),
 }
 """Modules right under ``aquaflow``; everything else lies in a folder."""

@@ -9,11 +9,11 @@ import json
 import logging
 import threading
 from collections.abc import Callable, Sequence
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from socket import AF_INET6
+from http.server import BaseHTTPRequestHandler
 from typing import Any, TypeAlias
 
 from aquaflow.access import Access, path_of
+from aquaflow.bounded_server import BoundedServer
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.errors import InputError
 from aquaflow.viewer.client import ClientFile, client_file
@@ -59,9 +59,9 @@ class ViewerServer:
             ConfigError: the token will not do.
         """
         access = Access(config)
-        server = _Server6 if ":" in config.host else _Server
+        handler = _handler(access, exhibit, ask)
         try:
-            self._server = server((config.host, config.port), _handler(access, exhibit, ask))
+            self._server = BoundedServer((config.host, config.port), handler, MOST_CONNECTIONS)
         except OSError as error:
             raise InputError(
                 f"cannot listen on {config.host}:{config.port}: {error.strerror}; choose another "
@@ -78,39 +78,6 @@ class ViewerServer:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join(PATIENCE_S)
-
-
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    block_on_close = False
-
-    def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
-        self._room = threading.BoundedSemaphore(MOST_CONNECTIONS)
-        super().__init__(address, handler)
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """A browser that disconnects during an answer is no error of the viewer."""
-        log.debug("a viewer's connection ended", exc_info=True)
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        if not self._room.acquire(blocking=False):
-            self.shutdown_request(request)
-            return
-        try:
-            super().process_request(request, client_address)
-        except BaseException:  # no thread was started that would give the room back
-            self._room.release()
-            raise
-
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            self._room.release()
-
-
-class _Server6(_Server):
-    address_family = AF_INET6
 
 
 def _handler(access: Access, exhibit: Exhibit, ask: Answer) -> type[BaseHTTPRequestHandler]:

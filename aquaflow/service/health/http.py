@@ -7,12 +7,13 @@ import logging
 import re
 import threading
 from collections.abc import Callable, Sequence
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from typing import Any, Protocol, TypeAlias
 from urllib.parse import parse_qs
 
 from aquaflow import __version__
 from aquaflow.access import Access, path_of
+from aquaflow.bounded_server import BoundedServer
 from aquaflow.config.service import ListenConfig
 from aquaflow.errors import InputError
 from aquaflow.service.control import Control
@@ -98,7 +99,7 @@ class HealthServer:
         access = Access(config)
         try:
             handler = _handler(access, report, path, control or Control(), picture, coverage)
-            self._server = _Server((config.host, config.port), handler)
+            self._server = BoundedServer((config.host, config.port), handler, MOST_CLIENTS)
         except OSError as error:
             raise InputError(
                 f"cannot listen on {config.host}:{config.port}: {error.strerror}; choose another "
@@ -114,37 +115,6 @@ class HealthServer:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
-
-
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    block_on_close = False
-
-    def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
-        self._room = threading.BoundedSemaphore(MOST_CLIENTS)
-        super().__init__(address, handler)
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """A client that disconnects during an answer is no error of the service."""
-        log.debug("a request failed", exc_info=True)
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        if not self._room.acquire(blocking=False):
-            self.shutdown_request(request)
-            return
-        try:
-            super().process_request(request, client_address)
-        except BaseException:  # no thread was started that would give the room back
-            self._room.release()
-            raise
-
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        try:
-            super().process_request_thread(request, client_address)
-        except Exception as error:  # a thread's own traceback would go to the terminal
-            log.warning("a request was not answered: %s", error)
-        finally:
-            self._room.release()
 
 
 def _coverage_picture(path: str, coverage: CoveragePictures | None) -> bytes | None:
