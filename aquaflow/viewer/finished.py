@@ -8,6 +8,7 @@ import json
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -20,22 +21,22 @@ from aquaflow.fusion.metric_file import read_frame_of_map
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.geometry.similarity import Sim3, rotation_from_quaternion
-from aquaflow.viewer.dive_coverage import coverage_of_dive
+from aquaflow.viewer.dive_coverage import CLASSES, COVERAGE, coverage_of_dive
+from aquaflow.viewer.dive_moments import moments_of_dive, pictures_of_dive
 from aquaflow.viewer.exhibit import POSE_NUMBERS
 from aquaflow.viewer.levels import RANGE, Palette, range_level
 from aquaflow.viewer.measuring import Asked, Frame
 from aquaflow.viewer.page import ViewerPage
 from aquaflow.viewer.pinned_notes import PinnedNotes
 from aquaflow.viewer.scale_tool import Mark, marked
-from aquaflow.viewer.seen_classes import CLASSES, COVERAGE
 from aquaflow.viewer.seen_water import SeenWater, water_of
 from aquaflow.viewer.splats import Splats, splats
 from aquaflow.viewer.tools import SCALE, Tools
 
 log = logging.getLogger(__name__)
 
-KEYFRAME = "keyframe"
-"""Class of a keyframe in frames.csv."""
+LONGEST_PATH = 5000
+"""Most poses that a page gets, as of a live dive: 52 bytes each, on their way before the map."""
 TUM_COLUMNS = 8
 """t_s tx ty tz qx qy qz qw"""
 
@@ -50,8 +51,12 @@ class FinishedDive:
     poses: list[Sim3]
     quality: npt.NDArray[np.float64]
     """[N] inlier share of each pose."""
-    pictures: list[Path | None]
-    """What the camera saw at each pose, where the dive keeps it."""
+    moments: npt.NDArray[np.float32]
+    """[N, 5] of each pose, as :mod:`aquaflow.viewer.moments` has them."""
+    began: datetime | None
+    """UTC of the first pose, if it is known."""
+    pictures: dict[int, Path]
+    """What the camera saw, by the frame's index, where the dive keeps it."""
     camera: CameraModel
     summary: str
     frame: MetricFrame
@@ -74,7 +79,9 @@ def read_dive(folder: Path, budget: int) -> FinishedDive:
         if not (folder / name).is_file():
             raise InputError(f"{folder} holds no finished dive: {name} is missing")
     poses, times = _poses(folder / "trajectory.tum")
-    quality, pictures, keyframes = _of_frames(folder, times)
+    quality, indices = _of_frames(folder, times)
+    pictures = pictures_of_dive(folder)
+    moments, began = moments_of_dive(folder, times, indices, pictures)
     frame, camera = read_frame_of_map(folder / "map.aqf"), load_camera(folder / "camera.yaml")
     water = _water(folder / "medium.json")
     clear = folder / "map_clear.ply"
@@ -83,8 +90,7 @@ def read_dive(folder: Path, budget: int) -> FinishedDive:
     gaussians = read_ply(clear)
     cameras = np.array([pose.t for pose in poses]).reshape(-1, 3)
     levels, palettes = _levels(gaussians.means, cameras, frame.unit)
-    views = [pose for pose, counts in zip(poses, keyframes, strict=True) if counts]
-    classes = coverage_of_dive(folder, gaussians.means, views, camera, frame, water)
+    classes = coverage_of_dive(folder, gaussians.means, frame)
     if classes is not None:
         levels[COVERAGE], palettes[COVERAGE] = classes, CLASSES
     shown = splats(
@@ -95,7 +101,7 @@ def read_dive(folder: Path, budget: int) -> FinishedDive:
     of_all = f"{len(shown)} of {len(gaussians.means)} Gaussians"
     summary = f"{folder.name}: {len(poses)} poses, {of_all}\n\n{_frame_in_words(frame)}"
     return FinishedDive(
-        shown, water, palettes, poses, quality, pictures, camera, summary, frame
+        shown, water, palettes, poses, quality, moments, began, pictures, camera, summary, frame
     )  # fmt: skip
 
 
@@ -108,10 +114,13 @@ def show_dive(dive: FinishedDive, config: ViewerConfig, tools: Tools | None = No
 
 def fill(page: ViewerPage, dive: FinishedDive) -> None:
     """Show ``dive`` on ``page``, in place of what was there."""
-    page.set_frame(Frame.of(dive.frame), up="-z" if dive.frame.level else "-y")
+    page.set_frame(
+        Frame.of(dive.frame), up="-z" if dive.frame.level else "-y", north=dive.frame.north
+    )
     page.show_health(dive.summary)
     page.show_splats(dive.splats, dive.water, dive.palettes)
-    page.show_path(rows_of(dive.poses, dive.quality))
+    shown = thinned(dive.moments)
+    page.show_path(rows_of(dive.poses, dive.quality)[shown], dive.moments[shown], dive.began)
     page.show_pictures(dive.pictures)
     if dive.poses:
         page.show_camera(dive.poses[0], dive.camera, None)
@@ -137,6 +146,14 @@ def open_dive(folder: Path, config: ViewerConfig, mark: Mark | None = None) -> V
         tools.others[SCALE] = scale
     page.append(show_dive(read_dive(folder, config.splats), config, tools))
     return page[0]
+
+
+def thinned(
+    moments: npt.NDArray[np.float32],  # [N, 5]
+) -> npt.NDArray[np.intp]:
+    """Numbers [M] of the poses that the page gets: at most ``LONGEST_PATH``."""
+    step = max(1, -(-len(moments) // LONGEST_PATH))
+    return np.arange(0, len(moments), step)
 
 
 def rows_of(
@@ -182,29 +199,25 @@ def _poses(path: Path) -> tuple[list[Sim3], npt.NDArray[np.float64]]:
 def _of_frames(
     folder: Path,
     times: npt.NDArray[np.float64],  # [N] s
-) -> tuple[npt.NDArray[np.float64], list[Path | None], npt.NDArray[np.bool_]]:
-    """Quality and picture of the frame at each time, and whether it is a keyframe."""
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+    """Quality and index of the frame at each time; -1 where there is none."""
     shown = _shown_by_microsecond(folder / "frames.csv")
-    quality, pictures, keyframes = [], [], []
+    quality, indices = [], []
     for t_s in times:
-        inliers, index, is_keyframe = shown.get(_microsecond(t_s), (1.0, 0, False))
+        inliers, index = shown.get(_microsecond(t_s), (1.0, -1))
         quality.append(inliers)
-        keyframes.append(is_keyframe)
-        picture = folder / "heldout" / f"{index:06d}_real.png"
-        pictures.append(picture if picture.is_file() else None)
-    return np.array(quality), pictures, np.array(keyframes, bool)
+        indices.append(index)
+    return np.array(quality), np.array(indices, np.int64)
 
 
-def _shown_by_microsecond(path: Path) -> dict[int, tuple[float, int, bool]]:
-    """Quality and index of the frame at each time, and whether it is a keyframe; a damaged line is
-    skipped."""
-    shown: dict[int, tuple[float, int, bool]] = {}
+def _shown_by_microsecond(path: Path) -> dict[int, tuple[float, int]]:
+    """Quality and index of the frame at each time; a damaged line is skipped."""
+    shown: dict[int, tuple[float, int]] = {}
     try:
         with path.open(newline="", encoding="utf-8", errors="replace") as stream:
             for row in csv.DictReader(stream):
                 with contextlib.suppress(KeyError, TypeError, ValueError, OverflowError):
-                    is_keyframe = row["class"] == KEYFRAME
-                    found = float(row["quality"] or 1.0), int(row["index"]), is_keyframe
+                    found = float(row["quality"] or 1.0), int(row["index"])
                     shown[_microsecond(float(row["t_s"]))] = found
     except (OSError, csv.Error) as error:
         raise InputError(f"cannot read {path}; map the dive again") from error

@@ -13,10 +13,10 @@ import pytest
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.viewer.dive_coverage import CLASSES, COVERAGE
 from aquaflow.viewer.finished import open_dive
 from aquaflow.viewer.levels import RANGE, range_level
 from aquaflow.viewer.page import ViewerPage
-from aquaflow.viewer.seen_classes import CLASSES, COVERAGE
 from aquaflow.viewer.seen_water import seen_water
 from tests.browser import Browser, needs_browser
 from tests.viewer.planes import floor
