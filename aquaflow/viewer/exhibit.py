@@ -10,7 +10,7 @@ import contextlib
 import math
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -23,6 +23,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.messages import CameraModel
 from aquaflow.viewer.levels import Palette
 from aquaflow.viewer.moments import MOMENT_NUMBERS
+from aquaflow.viewer.packed_file import PackedFile
 from aquaflow.viewer.packing import Packed
 from aquaflow.viewer.seen_water import SeenWater
 from aquaflow.viewer.splats import Splats
@@ -40,8 +41,9 @@ PATH_NUMBERS = POSE_NUMBERS + MOMENT_NUMBERS
 class ShownMap:
     """Gaussians with what is needed to see them."""
 
-    splats: Splats
-    packed: Packed
+    splats: Callable[[], Splats]
+    """For who points at them; may take seconds when it is first called."""
+    packed: Packed | PackedFile
     water: SeenWater | None
     palettes: dict[str, Palette]
 
@@ -99,7 +101,7 @@ class Exhibit:
             "path": {"number": self.path_number, "count": len(self.path)},
             "began": None if self.began is None else self.began.isoformat(), "north": self.north,
         }  # fmt: skip
-        if shown is not None and len(shown.splats):
+        if shown is not None and shown.packed.count:
             water = None if shown.water is None else shown.water.to_json()
             palettes = {name: each.to_json() for name, each in shown.palettes.items()}
             said["map"] = shown.packed.description() | {"water": water, "palettes": palettes}

@@ -6,31 +6,34 @@ import contextlib
 import csv
 import json
 import logging
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.errors import DamagedError, InputError, reason_of
-from aquaflow.export.ply import read_ply
 from aquaflow.fusion.metric_file import read_frame_of_map
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.geometry.similarity import Sim3, rotation_from_quaternion
-from aquaflow.viewer.dive_coverage import CLASSES, COVERAGE, coverage_of_dive
+from aquaflow.viewer.dive_map import DiveMap, read_map
 from aquaflow.viewer.dive_moments import moments_of_dive, pictures_of_dive
 from aquaflow.viewer.exhibit import POSE_NUMBERS
-from aquaflow.viewer.levels import RANGE, Palette, range_level
+from aquaflow.viewer.levels import Palette
 from aquaflow.viewer.measuring import Asked, Frame
+from aquaflow.viewer.packed_file import PackedFile, key_of, read_packed, write_packed
 from aquaflow.viewer.page import ViewerPage
 from aquaflow.viewer.pinned_notes import PinnedNotes
 from aquaflow.viewer.scale_tool import Mark, marked
 from aquaflow.viewer.seen_water import SeenWater, water_of
-from aquaflow.viewer.splats import Splats, splats
+from aquaflow.viewer.splats import Splats
 from aquaflow.viewer.tools import SCALE, Tools
 
 log = logging.getLogger(__name__)
@@ -45,9 +48,14 @@ TUM_COLUMNS = 8
 class FinishedDive:
     """What the viewer shows of a dive folder."""
 
-    splats: Splats
+    name: str
+    map: Callable[[], DiveMap]
+    """Reads the Gaussians when it is first called."""
+    packed: PackedFile | None
+    """Of an earlier look: then a browser needs no :attr:`map` to see them."""
+    key: dict[str, Any]
+    """Of a packed map of this dive as it is now."""
     water: SeenWater | None
-    palettes: dict[str, Palette]
     poses: list[Sim3]
     quality: npt.NDArray[np.float64]
     """[N] inlier share of each pose."""
@@ -58,8 +66,27 @@ class FinishedDive:
     pictures: dict[int, Path]
     """What the camera saw, by the frame's index, where the dive keeps it."""
     camera: CameraModel
-    summary: str
     frame: MetricFrame
+
+    @property
+    def splats(self) -> Splats:
+        """The Gaussians that are shown."""
+        return self.map().splats
+
+    @property
+    def palettes(self) -> dict[str, Palette]:
+        """Of the splats' levels."""
+        return self.map().palettes if self.packed is None else self.packed.palettes
+
+    @property
+    def summary(self) -> str:
+        """For the panel: paragraphs."""
+        if self.packed is None:
+            count, total = len(self.map().splats), self.map().total
+        else:
+            count, total = self.packed.count, self.packed.total
+        of_all = f"{len(self.poses)} poses, {count} of {total} Gaussians"
+        return f"{self.name}: {of_all}\n\n{_frame_in_words(self.frame)}"
 
 
 def _frame_in_words(frame: MetricFrame) -> str:
@@ -70,7 +97,7 @@ def _frame_in_words(frame: MetricFrame) -> str:
 
 
 def read_dive(folder: Path, budget: int) -> FinishedDive:
-    """The finished dive in ``folder``.
+    """The finished dive in ``folder``; its Gaussians are read when they are asked for.
 
     Raises:
         InputError: there is none.
@@ -87,21 +114,12 @@ def read_dive(folder: Path, budget: int) -> FinishedDive:
     clear = folder / "map_clear.ply"
     if water is None or not clear.is_file():  # colours with the water in them are all there is
         water, clear = None, folder / "map.ply"
-    gaussians = read_ply(clear)
     cameras = np.array([pose.t for pose in poses]).reshape(-1, 3)
-    levels, palettes = _levels(gaussians.means, cameras, frame.unit)
-    classes = coverage_of_dive(folder, gaussians.means, frame)
-    if classes is not None:
-        levels[COVERAGE], palettes[COVERAGE] = classes, CLASSES
-    shown = splats(
-        np.asarray(gaussians.means, np.float32), np.asarray(gaussians.wxyz, np.float32),
-        np.asarray(gaussians.scales, np.float32), np.asarray(gaussians.opacities, np.float32),
-        np.asarray(gaussians.colours, np.float32), budget, levels,
-    )  # fmt: skip
-    of_all = f"{len(shown)} of {len(gaussians.means)} Gaussians"
-    summary = f"{folder.name}: {len(poses)} poses, {of_all}\n\n{_frame_in_words(frame)}"
+    key = key_of(folder, budget)
     return FinishedDive(
-        shown, water, palettes, poses, quality, moments, began, pictures, camera, summary, frame
+        folder.name, cache(partial(read_map, folder, clear, cameras, frame, budget)),
+        read_packed(folder, key), key, water, poses, quality, moments, began, pictures, camera,
+        frame,
     )  # fmt: skip
 
 
@@ -118,7 +136,10 @@ def fill(page: ViewerPage, dive: FinishedDive) -> None:
         Frame.of(dive.frame), up="-z" if dive.frame.level else "-y", north=dive.frame.north
     )
     page.show_health(dive.summary)
-    page.show_splats(dive.splats, dive.water, dive.palettes)
+    if dive.packed is not None:
+        page.show_packed(dive.packed, lambda: dive.splats, dive.water, dive.palettes)
+    else:
+        page.show_splats(dive.splats, dive.water, dive.palettes)
     shown = thinned(dive.moments)
     page.show_path(rows_of(dive.poses, dive.quality)[shown], dive.moments[shown], dive.began)
     page.show_pictures(dive.pictures)
@@ -144,8 +165,28 @@ def open_dive(folder: Path, config: ViewerConfig, mark: Mark | None = None) -> V
 
     if mark is not None:
         tools.others[SCALE] = scale
-    page.append(show_dive(read_dive(folder, config.splats), config, tools))
+    dive = read_dive(folder, config.splats)
+    page.append(show_dive(dive, config, tools))
+    prepare(folder, dive, page[0])
     return page[0]
+
+
+def prepare(folder: Path, dive: FinishedDive, page: ViewerPage) -> threading.Thread:
+    """Behind the page: the Gaussians are read, for who points at them, or their packing is kept."""
+
+    def work() -> None:
+        try:
+            packed = page.packed
+            if dive.packed is not None:
+                dive.map()
+            elif packed is not None:
+                write_packed(folder, dive.key, packed, dive.palettes, dive.map().total)
+        except InputError as error:  # who points is told so
+            log.warning("%s", error)
+
+    thread = threading.Thread(target=work, name="viewer's map", daemon=True)
+    thread.start()
+    return thread
 
 
 def thinned(
@@ -163,17 +204,6 @@ def rows_of(
     """[N, 8] as :meth:`ViewerPage.show_path` takes them."""
     rows = [[*T.t, *T.quaternion, q] for T, q in zip(poses, quality, strict=True)]
     return np.array(rows, np.float32).reshape(-1, POSE_NUMBERS)
-
-
-def _levels(
-    means: npt.NDArray[np.floating],  # [N, 3]
-    cameras: npt.NDArray[np.float64],  # [M, 3]
-    unit: str,
-) -> tuple[dict[str, npt.NDArray[np.uint8]], dict[str, Palette]]:
-    if not len(cameras) or not len(means):
-        return {}, {}
-    values, palette = range_level(means, cameras, unit)
-    return {RANGE: values}, {RANGE: palette}
 
 
 def _water(path: Path) -> SeenWater | None:

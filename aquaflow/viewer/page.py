@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -18,6 +18,7 @@ from aquaflow.viewer.exhibit import POSE_NUMBERS, Exhibit, ShownCamera, ShownMap
 from aquaflow.viewer.levels import Palette
 from aquaflow.viewer.measuring import Frame
 from aquaflow.viewer.moments import unknown
+from aquaflow.viewer.packed_file import PackedFile
 from aquaflow.viewer.packing import Packed
 from aquaflow.viewer.seen_water import SeenWater
 from aquaflow.viewer.server import ViewerServer
@@ -70,7 +71,14 @@ class ViewerPage:
     @property
     def splats_shown(self) -> int:
         """Number of Gaussians on the page."""
-        return 0 if self._exhibit.map is None else len(self._exhibit.map.splats)
+        shown = self._exhibit.map
+        return 0 if shown is None else shown.packed.count
+
+    @property
+    def packed(self) -> Packed | None:
+        """The map as it was packed here; None of one that came packed."""
+        shown = self._exhibit.map
+        return shown.packed if shown is not None and isinstance(shown.packed, Packed) else None
 
     def show_splats(
         self,
@@ -79,7 +87,17 @@ class ViewerPage:
         palettes: dict[str, Palette] | None = None,
     ) -> None:
         """The map, the water before it, and the palette of each of the splats' levels."""
-        self._exhibit.map = ShownMap(splats, Packed(splats), water, palettes or {})
+        self._exhibit.map = ShownMap(lambda: splats, Packed(splats), water, palettes or {})
+
+    def show_packed(
+        self,
+        packed: PackedFile,
+        splats: Callable[[], Splats],
+        water: SeenWater | None,
+        palettes: dict[str, Palette],
+    ) -> None:
+        """A map that was packed before; ``splats`` are its Gaussians for who points at them."""
+        self._exhibit.map = ShownMap(splats, packed, water, palettes)
 
     def show_path(
         self,

@@ -26,6 +26,12 @@ def frame(index: int, size: tuple[int, int] = (640, 480)) -> Frame:
     return Frame(index, t_ns, t_ns, image, guess_camera(width, height))
 
 
+def read(path: Path) -> np.ndarray:
+    picture = cv2.imread(str(path))
+    assert picture is not None
+    return picture
+
+
 def test_one_picture_a_second_is_kept_small(tmp_path: Path) -> None:
     pictures = KeptPictures(tmp_path, 1e9)
     for index in range(3 * RATE):
@@ -33,7 +39,7 @@ def test_one_picture_a_second_is_kept_small(tmp_path: Path) -> None:
     kept = kept_pictures(tmp_path)
     assert list(kept) == [0, 4, 8]
     assert pictures.paths == kept
-    assert cv2.imread(str(kept[4])).shape == (360, 480, 3)
+    assert read(kept[4]).shape == (360, 480, 3)
 
 
 @pytest.mark.parametrize(("size", "kept"), [((200, 100), (100, 200)), ((300, 960), (480, 150))])
@@ -41,7 +47,7 @@ def test_a_small_picture_stays_and_a_tall_one_is_fitted(
     tmp_path: Path, size: tuple[int, int], kept: tuple[int, int]
 ) -> None:
     KeptPictures(tmp_path, 1e9).offer(frame(0, size))
-    assert cv2.imread(str(kept_pictures(tmp_path)[0])).shape[:2] == kept
+    assert read(kept_pictures(tmp_path)[0]).shape[:2] == kept
 
 
 def test_a_long_dive_keeps_fewer_pictures_that_span_it_all(tmp_path: Path) -> None:
