@@ -101,7 +101,8 @@ class LiveViewer:
         report = self._report()
         self._path.hear(report.get("telemetry") or {})
         frame = frame_of(report)
-        self._page.set_frame(frame)
+        known = report.get("metric_frame") or {}
+        self._page.set_frame(frame, north=known.get("north") or "")
         if pose is not None:
             self._page.show_camera(pose.T_wc, pose.camera, pose.picture)
             path, pictures = self._path, self._pictures

@@ -15,7 +15,7 @@ export function clock(seconds) {
 
 export class TimeLine {
   constructor(eye, changed) {
-    Object.assign(this, { eye, changed, rows: new Float32Array(0), scene: null, beside: false, number: -1, shown: "", newest: true });
+    Object.assign(this, { eye, changed, rows: new Float32Array(0), scene: null, beside: false, number: -1, shown: null, newest: true });
     find("pose").addEventListener("input", () => this.go(Number(find("pose").value)));
     find("beside").addEventListener("click", () => this.besides(!this.beside));
   }
@@ -94,7 +94,7 @@ export class TimeLine {
   // Of a compass, or of what x points to where no compass was heard.
   heading(degrees) {
     const { north } = this.scene;
-    return north.endsWith("north") ? `heading ${degrees}\u00b0` : `${degrees}\u00b0 from the ${north}`;
+    return north.endsWith("north") ? `heading ${degrees}\u00b0` : north ? `${degrees}\u00b0 from the ${north}` : `turned ${degrees}\u00b0`;
   }
 
   // The picture of that pose, else the nearest one that is kept.
