@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from socket import AF_INET, AF_INET6
 from typing import Any
@@ -18,7 +19,7 @@ class BoundedServer(ThreadingHTTPServer):
     block_on_close = False
 
     def __init__(
-        self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler], most: int
+        self, address: tuple[str, int], handler: Callable[..., BaseHTTPRequestHandler], most: int
     ) -> None:
         """Raises OSError where nobody can listen at ``address``."""
         self.address_family = AF_INET6 if ":" in address[0] else AF_INET

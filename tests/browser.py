@@ -11,11 +11,13 @@ import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import pytest
 
 from tests.small_recording import GIVE_UP_S
+
+Place: TypeAlias = tuple[float, float]
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 DRIVER = shutil.which("chromedriver")
@@ -104,11 +106,30 @@ class Browser:
             at = {"type": kind, "x": x, "y": y, "button": "left", "clickCount": 1}
             self._command("Input.dispatchMouseEvent", at)
 
+    def touch(self, x: float, y: float) -> None:
+        """A finger put down and lifted."""
+        for kind, points in (("touchStart", [{"x": x, "y": y}]), ("touchEnd", [])):
+            self._command("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
     def swipe(self, start: tuple[float, float], end: tuple[float, float]) -> None:
         """A finger put down, moved and lifted, as on a tablet."""
         for kind, at in (("touchStart", start), ("touchMove", end), ("touchEnd", None)):
             points = [] if at is None else [{"x": at[0], "y": at[1]}]
             self._command("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    def two_fingers(
+        self, start: tuple[Place, Place], end: tuple[Place, Place], steps: int = 8
+    ) -> None:
+        """Put two fingers down, move both, and lift them."""
+        for kind, share in [("touchStart", 0.0)] + [
+            ("touchMove", step / steps) for step in range(1, steps + 1)
+        ]:
+            points = [
+                {"x": a[0] + share * (b[0] - a[0]), "y": a[1] + share * (b[1] - a[1]), "id": number}
+                for number, (a, b) in enumerate(zip(start, end, strict=True))
+            ]
+            self._command("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+        self._command("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
 
     def emulate(self, width: int, height: int, dark: bool = False) -> None:
         """A screen of this many CSS pixels."""

@@ -56,17 +56,28 @@ def measure(
         str | None, typer.Option(help="Pin the measurement to the map with this text.")
     ] = None,
     csv: Annotated[Path | None, typer.Option(help="File for the numbers as a table.")] = None,
+    notes: Annotated[
+        bool, typer.Option("--notes", help="List the notes pinned to the map; measure nothing.")
+    ] = False,
+    delete: Annotated[
+        list[str] | None,
+        typer.Option(help="Key of a note to remove, as --notes lists it; once for each."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Measure in a finished dive: the ground in numbers, or between points."""
+    """Measure in a finished dive: the ground in numbers, or between points; or tend its notes."""
+    if notes or delete:
+        if point or any(each is not None for each in (shape, cell, note, csv)):
+            raise InputError("--notes and --delete measure nothing; give no other options")
+        _tend_notes(_with_map(dive), delete or [], as_json)
+        return
     if cell is not None and not (math.isfinite(cell) and cell > 0.0):
         raise InputError(f"--cell {cell:g} is no size of a cell; give a positive one")
     if csv is not None and csv.suffix.lower() != ".csv":
         raise InputError(f"{csv} does not end in .csv; give the table a file of its own")
     if not point and (shape is not None or note is not None):
         raise InputError("--as and --note need points; give --point for each")
-    if not (dive / MAP_FILE).exists():
-        raise InputError(f"{dive} holds no finished dive: {MAP_FILE} is missing")
+    _with_map(dive)
     from aquaflow.measure.finished_dive import numbers_of_dive
     from aquaflow.measure.reef_files import write_csv
 
@@ -81,6 +92,28 @@ def measure(
     if csv is not None:
         write_csv(csv, found.rows())
     typer.echo(json.dumps(found.to_json()) if as_json else _in_words(found))
+
+
+def _with_map(dive: Path) -> Path:
+    if not (dive / MAP_FILE).exists():
+        raise InputError(f"{dive} holds no finished dive: {MAP_FILE} is missing")
+    return dive
+
+
+def _tend_notes(dive: Path, delete: list[str], as_json: bool) -> None:
+    """Remove the notes with these keys, and list what is left."""
+    from aquaflow.fusion.metric_file import read_frame_of_map
+    from aquaflow.measure.notes import listed, read_notes, without, write_notes
+
+    frame = read_frame_of_map(dive / MAP_FILE)
+    notes = read_notes(dive, frame)
+    if delete:
+        notes = without(notes, delete)
+        write_notes(dive, notes, frame)
+    if as_json:
+        typer.echo(json.dumps({"unit": frame.unit, "notes": [note.to_json() for note in notes]}))
+        return
+    typer.echo("\n".join(listed(notes)) or "The dive has no notes.")
 
 
 def _between(

@@ -24,6 +24,7 @@ from aquaflow.config.mapping import (
     VoxelConfig,
     WaterPriorsConfig,
 )
+from aquaflow.config.pictures import PicturesConfig
 from aquaflow.config.prior import PriorConfig
 from aquaflow.config.source import SourceConfig
 from aquaflow.config.stage import Stage, validated
@@ -52,6 +53,7 @@ __all__ = [
     "MediumConfig",
     "MonitorConfig",
     "OptimiserConfig",
+    "PicturesConfig",
     "PriorConfig",
     "RetrievalConfig",
     "SourceConfig",
@@ -77,6 +79,7 @@ class Config(Stage):
     mapping: MappingConfig = MappingConfig()
     fusion: FusionConfig = FusionConfig()
     coverage: CoverageConfig = CoverageConfig()
+    pictures: PicturesConfig = PicturesConfig()
 
 
 def parse_config(data: dict[str, Any], origin: str) -> Config:

@@ -99,7 +99,8 @@ def _lines(
     to_page: Array,  # [2, 3] directions of the page in the sub-map's world
     config: CoverageConfig,
 ) -> LineState:
-    """Lines by the width of what is seen across the newest one."""
+    """Lines by the width of what is seen across the newest one; the only stretch of a path is one
+    where its ends are further apart than a picture's shorter side."""
 
     def covered(
         places: Array,  # [..., 2] on the page
@@ -107,9 +108,9 @@ def _lines(
         return np.asarray(view.classes_at(places) == Seen.WELL)
 
     newest = [coverage.seen[number] for number in sorted(coverage.seen)[-MOST_SIGHTS:]]
-    swath = view.scale * coverage.side
-    lines = survey_lines(view.path, swath)
+    side = swath = view.scale * coverage.side
+    lines = survey_lines(view.path, swath, alone=side)
     if lines:  # now it is known which way is across
         swath = view.scale * extent(newest, lines[-1].right @ to_page) or swath
-        lines = survey_lines(view.path, swath)
+        lines = survey_lines(view.path, swath, alone=side)
     return line_state(lines, swath, config.overlap, covered)

@@ -60,6 +60,7 @@ RESULTS = (
     *("metrics.json", "report.html", "heldout/*.png", "heldout/*.npz", TRACE),
     KNOWN_LENGTHS,
     TELEMETRY,
+    *("pictures/*.jpg", "view.zip"),
     *("coverage.npz", "coverage.json", "coverage.png", "overview.png", "report.pdf"),
     *("metric.json", "trajectory.csv", "georeference.json", STATUS),
     *(

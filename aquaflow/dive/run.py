@@ -31,6 +31,7 @@ from aquaflow.errors import InputError, NotMappedError
 from aquaflow.mapping.work import MIN_VIEWS, Progress
 from aquaflow.messages import CameraModel, Dropped, Frame, TelemetrySample
 from aquaflow.profiler import pace
+from aquaflow.recording.kept_pictures import KeptPictures, PictureThread
 from aquaflow.recording.telemetry_lines import NAME as TELEMETRY
 from aquaflow.recording.telemetry_lines import TelemetryLog
 from aquaflow.slam import Slam
@@ -85,6 +86,11 @@ class DiveRun:
         """Of a live run: a replay's telemetry is in files already."""
         self.coverage = DiveCoverage(config.coverage) if config.coverage.enabled else None
         """What the camera has seen; brought up to date by whoever runs the dive."""
+        self.pictures: KeptPictures | None = None
+        if config.pictures.enabled:
+            self.pictures = KeptPictures(folder.path, 1e6 * config.pictures.most_mb)
+        self.picture_thread: PictureThread | None = None
+        """Of a live run, which waits for no disk."""
         self.started = time.monotonic()
         self.frame_ms = array("d")
         """Of every frame that was read: preparing, tracking and mapping it."""
@@ -112,6 +118,7 @@ class DiveRun:
         prepared = self._prepared(frame)
         if prepared is None:
             return []
+        self._keep(prepared)
         decided = self.slam.process(prepared)
         self.decide(decided)
         self._time_frame(begun, decided)
@@ -142,6 +149,13 @@ class DiveRun:
                 reason = str(error)
         self.drop(Dropped(frame.index, frame.t_ns, reason))
         return None
+
+    def _keep(self, frame: Frame) -> None:
+        if self.picture_thread is not None:
+            self.picture_thread.offer(frame)
+        elif self.pictures is not None:
+            with self.profiler.stage("keep"), self.slam.failures.contain("keeping of a picture"):
+                self.pictures.offer(frame)
 
     def catch_up(self) -> list[Tracked]:
         """Compute the pose of an earlier frame that waits; called while no new frame is there."""
@@ -195,6 +209,8 @@ class DiveRun:
 
     def close(self) -> None:
         """Close what the run itself has open; may be called again."""
+        if self.picture_thread is not None:
+            self.picture_thread.close()
         if self.telemetry_log is not None:
             self.telemetry_log.close()
 

@@ -48,6 +48,13 @@ class Note:
     properties: dict[str, Any] = field(default_factory=dict)
     """What else goes into the file, such as a measured length; JSON values alone."""
 
+    def to_json(self) -> dict[str, Any]:
+        """For machines: places [N, 3] in n and the dive's unit."""
+        return {
+            "key": self.key, "text": self.text, "shape": self.shape,
+            "places": np.asarray(self.places).tolist(), "properties": self.properties,
+        }  # fmt: skip
+
 
 def write_notes(dive: Path, notes: Sequence[Note], frame: MetricFrame) -> None:
     """Write all notes of a dive, whose largest sub-map lies in ``frame``; replaces the file.
@@ -113,6 +120,26 @@ def new_note(
     while str(number) in keys:
         number += 1
     return Note(str(number), text, shape, places, properties)
+
+
+def without(notes: Sequence[Note], keys: Sequence[str]) -> list[Note]:
+    """The notes that have none of the ``keys``.
+
+    Raises:
+        InputError: no note has one of the keys; then none is removed.
+    """
+    known = {note.key for note in notes}
+    missing = [key for key in keys if key not in known]
+    if missing:
+        raise InputError(f"the dive has no note {missing[0]!r}; --notes lists their keys")
+    return [note for note in notes if note.key not in keys]
+
+
+def listed(notes: Sequence[Note]) -> list[str]:
+    """A line for each: its key, what it marks, and its text."""
+    width = max((len(note.key) for note in notes), default=0)
+    words = {"Point": "point", "LineString": "line", "Polygon": "area"}
+    return [f"{note.key:<{width}}  {words[note.shape]:<5}  {note.text}" for note in notes]
 
 
 def scaled(

@@ -16,6 +16,7 @@ from aquaflow.errors import AquaFlowError
 from aquaflow.mapping.work import OwnedMaps
 from aquaflow.messages import Dropped
 from aquaflow.profiler import Profiler
+from aquaflow.recording.kept_pictures import PictureThread
 from aquaflow.recording.telemetry_lines import NAME as TELEMETRY
 from aquaflow.recording.telemetry_lines import TelemetryLog
 from aquaflow.service.checkpoint.checkpoint import Checkpointer, restore
@@ -103,6 +104,10 @@ def assembled(
     vitals.health.begin()
     pressure = PressureReader(folder.path, gpu_free=thread.usable_memory)
     loop = LiveLoop(run, feed, thread, service, vitals, control, pressure)
+    if run.pictures is not None:
+        run.picture_thread = PictureThread(
+            run.pictures, failures, lambda: not loop.pressure.disk_is_full(service.limits)
+        )
     checkpointer = Checkpointer(
         folder.path, run, slam, thread, service.checkpoint.every_s, feed.clocks,
         lambda: feed.continued.known_shift_ns,

@@ -19,6 +19,7 @@ import numpy as np
 from aquaflow.coverage import DiveCoverage, PageView, mapping_range
 from aquaflow.coverage.hints import Hint, Hints, Measured, Place, forward_steps
 from aquaflow.coverage.picture import cells_affine, cells_png, coverage_png
+from aquaflow.coverage.plan import CoveragePlan
 from aquaflow.coverage.swath import MOST_SIGHTS, extent
 from aquaflow.dive.from_maps import attenuations
 from aquaflow.errors.failures import Failures
@@ -125,6 +126,11 @@ class LiveCoverage:
         """The picture of a sub-map's cells alone; None where there is none."""
         view = self._views.get(sub_map)
         return None if view is None else cells_png(view)
+
+    def plan(self, sub_map: int) -> CoveragePlan | None:
+        """The cells of a sub-map as they are known by now; None where there are none."""
+        view = self._views.get(sub_map)
+        return None if view is None else view.plan
 
     # --- the thread -----------------------------------------------------------------------------
 

@@ -2,50 +2,50 @@
 
 from __future__ import annotations
 
-import logging
-import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.viewer import ViewerConfig
+from aquaflow.coverage.plan import CoveragePlan
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.mapping.work import OwnedMaps
 from aquaflow.measure.scale import Scale
+from aquaflow.service.live_path import LivePath
 from aquaflow.service.loop import LiveLoop
+from aquaflow.service.showing import LOOK_S, Showing
 from aquaflow.sources.newest import Newest
 from aquaflow.tracking.frames import Tracked
 from aquaflow.viewer.copies import MapCopy, Pose, shown
 from aquaflow.viewer.measuring import Frame
 from aquaflow.viewer.page import ViewerPage
 
-log = logging.getLogger(__name__)
-
-LONGEST_PATH = 5000
-"""Most poses of the trajectory that are shown; a longer one is thinned."""
-LOOK_S = 0.1
-"""Longest wait for a new pose; then the thread checks whether it shall end."""
-
 
 class LiveViewer:
     """Takes new data from the loop and the maps, and shows them from its own thread."""
 
-    def __init__(self, config: ViewerConfig, report: Callable[[], dict[str, Any]]) -> None:
-        """Raises what :class:`ViewerPage` raises."""
-        self._config, self._report = config, report
+    def __init__(
+        self,
+        config: ViewerConfig,
+        report: Callable[[], dict[str, Any]],
+        plan: Callable[[int], CoveragePlan | None] = lambda sub_map: None,
+    ) -> None:
+        """Raises what :class:`ViewerPage` raises. ``plan``: the coverage of a sub-map."""
+        self._config, self._report, self._plan = config, report, plan
         self._page = ViewerPage(config, "AquaFlow")
         self.address = self._page.address
         self._poses: Newest[Pose] = Newest()
-        self._copies: Newest[MapCopy] = Newest()
-        self._path: list[tuple[float, ...]] = []
+        self._copies: Newest[tuple[int, MapCopy]] = Newest()
+        """With their sub-maps."""
+        self._path = LivePath()
+        self._pictures: Mapping[int, Path] = {}
         self._pose_s = self._map_s = 0.0
         self._asked = False
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
-        self._thread.start()
+        self._showing = Showing("viewer", self._show, config.refresh_s)
 
     @property
     def splats_shown(self) -> int:
@@ -54,7 +54,7 @@ class LiveViewer:
 
     def begin(self) -> None:
         """A dive begins: its path is shown, and no other's."""
-        self._path, self._asked = [], False
+        self._path, self._asked = LivePath(), False
 
     def update(self, loop: LiveLoop) -> None:
         """Called after every turn of the loop; queues what is new for the browser, never waits."""
@@ -63,31 +63,29 @@ class LiveViewer:
             return
         if now - self._pose_s >= 1.0 / self._config.pose_hz:
             self._pose_s = now
-            self._hand_over(latest, frame.image)
+            self._hand_over(loop, latest, frame.image)
         if now - self._map_s >= self._config.refresh_s and not self._asked:
             self._map_s, self._asked = now, True
             sub_map = latest.sub_map
             loop.maps.inspect("show the map", lambda maps, _: self._copy(maps, sub_map))
 
     def close(self) -> None:
-        self._closing.set()
-        self._thread.join(5.0)
+        self._showing.close()
         self._page.close()
 
     def _hand_over(
         self,
+        loop: LiveLoop,
         latest: Tracked,
         image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
     ) -> None:
         assert latest.T_wc is not None
-        T = latest.T_wc
-        self._path.append((*T.t.tolist(), *T.quaternion.tolist(), latest.quality.inlier_share))
-        if len(self._path) > LONGEST_PATH:
-            self._path = self._path[::2]
+        self._path.add(latest, loop.run_.slam.metric_frame(latest.sub_map))
+        kept = loop.run_.pictures
+        self._pictures = {} if kept is None else kept.paths
         step = max(1, image.shape[1] // self._config.picture_width)
         small = np.ascontiguousarray(image[::step, ::step])
-        path = np.array(self._path, np.float32)
-        self._poses.put(Pose(latest.T_wc, latest.frame.camera, small, path))
+        self._poses.put(Pose(latest.T_wc, latest.frame.camera, small))
 
     def _copy(self, maps: OwnedMaps, sub_map: int) -> None:
         """In the mapping thread."""
@@ -96,27 +94,25 @@ class LiveViewer:
         if mapper is not None and mapper.views and len(mapper.gaussians):
             from aquaflow.viewer.snapshot import copied  # torch, which has made the map
 
-            self._copies.put(copied(mapper))
-
-    def _run(self) -> None:
-        while not self._closing.is_set():
-            try:
-                self._show()
-            except Exception:  # whatever a browser did to the server, the dive goes on
-                log.exception("the viewer failed to show the dive")
-                self._closing.wait(self._config.refresh_s)
+            self._copies.put((sub_map, copied(mapper)))
 
     def _show(self) -> None:
         pose = self._poses.take(LOOK_S)
         report = self._report()
+        self._path.hear(report.get("telemetry") or {})
         frame = frame_of(report)
-        self._page.set_frame(frame)
+        known = report.get("metric_frame") or {}
+        self._page.set_frame(frame, north=known.get("north") or "")
         if pose is not None:
             self._page.show_camera(pose.T_wc, pose.camera, pose.picture)
-            self._page.show_path(pose.path)
-        copy = self._copies.take(0.0)
-        if copy is not None:
-            self._page.show_splats(*shown(copy, self._config.splats, frame, self._page.watched))
+            path, pictures = self._path, self._pictures
+            self._page.show_pictures(pictures)
+            self._page.show_path(*path.rows(pictures), path.began)
+        taken = self._copies.take(0.0)
+        if taken is not None:
+            sub_map, copy = taken
+            plan = self._plan(sub_map) if self._page.watched else None
+            self._page.show_splats(*shown(copy, self._config.splats, frame, plan))
         self._page.show_health(in_words(report))
 
 

@@ -67,7 +67,8 @@ class Station:
                 )  # fmt: skip
                 opened.callback(self._contained, server.close)
             if vehicle.viewer.enabled:
-                self._viewer = LiveViewer(vehicle.viewer, self.report)
+                plan_of = (lambda number: None) if self._coverage is None else self._coverage.plan
+                self._viewer = LiveViewer(vehicle.viewer, self.report, plan_of)
                 opened.callback(self._contained, self._viewer.close)
             if service.foxglove.enabled:
                 from aquaflow.service.foxglove.live import LiveFoxglove  # it loads torch

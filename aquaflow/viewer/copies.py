@@ -11,22 +11,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.config.coverage import CoverageConfig
-from aquaflow.coverage.water_range import mapping_range
+from aquaflow.coverage.plan import CoveragePlan
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.messages import CameraModel
+from aquaflow.viewer.dive_coverage import CLASSES, COVERAGE
 from aquaflow.viewer.levels import RANGE, Palette, range_level, steps_level
 from aquaflow.viewer.measuring import Frame
-from aquaflow.viewer.seen_classes import CLASSES, COVERAGE, coverage_level
 from aquaflow.viewer.seen_water import SeenWater, seen_water
 from aquaflow.viewer.splats import Splats, splats
 
-UP = np.array([0.0, -1.0, 0.0])
-"""Of a live map: the first camera's, whose y points down."""
-LIVE_PLACES = 4096
-"""Places of a live map that are classed: 0.19 s of CPU time for 1000 views, once a refresh and only
-while a browser looks."""
 SEEN = "seen"
 """Name of the level that says how often a Gaussian was seen."""
 OFTEN = 200.0
@@ -41,8 +35,6 @@ class Pose:
     camera: CameraModel
     picture: npt.NDArray[np.uint8]
     """[H, W, 3] RGB"""
-    path: npt.NDArray[np.float32]
-    """[N, 8] poses of the cameras so far: place, rotation wxyz, how well each is known."""
 
 
 @dataclass(frozen=True)
@@ -58,15 +50,14 @@ class MapCopy:
     """[6, 3] beta, B_inf, b, B_res, d as the last camera sees it, and the gain of ``clear``."""
     views: list[Sim3]
     """T_wc of the mapped views; the last one is the newest."""
-    camera: CameraModel
 
 
 def shown(
-    copy: MapCopy, budget: int, frame: Frame | None = None, classes: bool = True
+    copy: MapCopy, budget: int, frame: Frame | None = None, plan: CoveragePlan | None = None
 ) -> tuple[Splats, SeenWater | None, dict[str, Palette]]:
     """In the viewer's thread: what a browser gets, the water before it, and the palettes of what
-    each Gaussian is coloured by: how often it was seen, from how far away, and, with ``classes``,
-    how well."""
+    each Gaussian is coloured by: how often it was seen, from how far away, and, by the ``plan`` of
+    its sub-map's coverage, how well."""
     plain, water, unit = copy.parameters, _water(copy), frame or Frame.of(MetricFrame.unknown())
     with np.errstate(over="ignore"):
         opacities = (1.0 / (1.0 + np.exp(-plain["opacity_logits"][:, 0]))).astype(np.float32)
@@ -78,18 +69,10 @@ def shown(
     cameras = np.array([T_wc.t for T_wc in copy.views])
     ranges, range_palette = range_level(chosen.centres, cameras, unit.scale.unit, unit.metres)
     levels, palettes = chosen.levels | {RANGE: ranges}, {SEEN: palette, RANGE: range_palette}
-    if classes:
-        levels[COVERAGE], palettes[COVERAGE] = _classes(copy, chosen, water), CLASSES
+    if plan is not None:
+        levels[COVERAGE] = plan.classes_of(chosen.centres.astype(np.float64))
+        palettes[COVERAGE] = CLASSES
     return replace(chosen, levels=levels), water, palettes
-
-
-def _classes(copy: MapCopy, chosen: Splats, water: SeenWater | None) -> npt.NDArray[np.uint8]:
-    """[N]"""
-    config = CoverageConfig()
-    limit = None if water is None else mapping_range(water.beta, config.least_contrast)
-    return coverage_level(
-        chosen.centres, copy.views, copy.camera, UP, limit, config, LIVE_PLACES
-    )  # fmt: skip
 
 
 def _water(copy: MapCopy) -> SeenWater | None:

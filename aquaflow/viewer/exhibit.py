@@ -6,11 +6,13 @@ asks. Where no browser asks, nothing is packed.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,8 @@ import numpy.typing as npt
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.messages import CameraModel
 from aquaflow.viewer.levels import Palette
+from aquaflow.viewer.moments import MOMENT_NUMBERS
+from aquaflow.viewer.packed_file import PackedFile
 from aquaflow.viewer.packing import Packed
 from aquaflow.viewer.seen_water import SeenWater
 from aquaflow.viewer.splats import Splats
@@ -29,14 +33,17 @@ Float = npt.NDArray[np.floating[Any]]
 JPEG_QUALITY = 80
 POSE_NUMBERS = 8
 """Of each pose: place, rotation wxyz, quality."""
+PATH_NUMBERS = POSE_NUMBERS + MOMENT_NUMBERS
+"""Of each row of the path."""
 
 
 @dataclass(frozen=True)
 class ShownMap:
     """Gaussians with what is needed to see them."""
 
-    splats: Splats
-    packed: Packed
+    splats: Callable[[], Splats]
+    """For who points at them; may take seconds when it is first called."""
+    packed: Packed | PackedFile
     water: SeenWater | None
     palettes: dict[str, Palette]
 
@@ -66,13 +73,17 @@ class Exhibit:
     """Of ``unit``, in a unit of the coordinates."""
     map: ShownMap | None = None
     path: npt.NDArray[np.float32] = field(
-        default_factory=lambda: np.zeros((0, POSE_NUMBERS), np.float32)
+        default_factory=lambda: np.zeros((0, PATH_NUMBERS), np.float32)
     )
-    """[N, 8]"""
+    """[N, 13] of each pose, place, rotation and quality, and its moment."""
     path_number: int = 0
     camera: ShownCamera | None = None
-    pictures: Sequence[Path | None] = ()
-    """By pose."""
+    pictures: Mapping[int, Path] = field(default_factory=dict)
+    """What the camera saw, by the frame's index."""
+    began: datetime | None = None
+    """UTC of the first pose; None where nothing stated it."""
+    north: str = ""
+    """What headings are counted from."""
     can: tuple[str, ...] = ()
     """Tools that this dive offers beyond measuring: ``notes``, ``scale``."""
     asked_s: float = -math.inf
@@ -88,9 +99,9 @@ class Exhibit:
             "title": self.title, "up": self.up, "live": self.live, "health": self.health,
             "unit": self.unit, "metres": self.metres, "can": self.can, "map": None, "camera": None,
             "path": {"number": self.path_number, "count": len(self.path)},
-            "pictures": [i for i, each in enumerate(self.pictures) if each is not None],
+            "began": None if self.began is None else self.began.isoformat(), "north": self.north,
         }  # fmt: skip
-        if shown is not None and len(shown.splats):
+        if shown is not None and shown.packed.count:
             water = None if shown.water is None else shown.water.to_json()
             palettes = {name: each.to_json() for name, each in shown.palettes.items()}
             said["map"] = shown.packed.description() | {"water": water, "palettes": palettes}
@@ -111,10 +122,14 @@ class Exhibit:
             return None
         return shown.packed.chunk(number)
 
-    def picture(self, number: int) -> bytes | None:
-        """JPEG of what the camera saw at a pose of a finished dive; None where nothing is kept."""
-        path = self.pictures[number] if 0 <= number < len(self.pictures) else None
+    def picture(self, index: int) -> bytes | None:
+        """JPEG of what the camera saw at a frame; None where nothing is kept."""
+        path = self.pictures.get(index)
         if path is None:
+            return None
+        if path.suffix == ".jpg":
+            with contextlib.suppress(OSError):  # thinned meanwhile
+                return path.read_bytes()
             return None
         import cv2
 

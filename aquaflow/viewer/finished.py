@@ -6,36 +6,40 @@ import contextlib
 import csv
 import json
 import logging
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import datetime
+from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.errors import DamagedError, InputError, reason_of
-from aquaflow.export.ply import read_ply
 from aquaflow.fusion.metric_file import read_frame_of_map
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.geometry.similarity import Sim3, rotation_from_quaternion
-from aquaflow.viewer.dive_coverage import coverage_of_dive
+from aquaflow.viewer.dive_map import DiveMap, read_map
+from aquaflow.viewer.dive_moments import moments_of_dive, pictures_of_dive
 from aquaflow.viewer.exhibit import POSE_NUMBERS
-from aquaflow.viewer.levels import RANGE, Palette, range_level
+from aquaflow.viewer.levels import Palette
 from aquaflow.viewer.measuring import Asked, Frame
+from aquaflow.viewer.packed_file import PackedFile, key_of, read_packed, write_packed
 from aquaflow.viewer.page import ViewerPage
 from aquaflow.viewer.pinned_notes import PinnedNotes
 from aquaflow.viewer.scale_tool import Mark, marked
-from aquaflow.viewer.seen_classes import CLASSES, COVERAGE
 from aquaflow.viewer.seen_water import SeenWater, water_of
-from aquaflow.viewer.splats import Splats, splats
+from aquaflow.viewer.splats import Splats
 from aquaflow.viewer.tools import SCALE, Tools
 
 log = logging.getLogger(__name__)
 
-KEYFRAME = "keyframe"
-"""Class of a keyframe in frames.csv."""
+LONGEST_PATH = 5000
+"""Most poses that a page gets, as of a live dive: 52 bytes each, on their way before the map."""
 TUM_COLUMNS = 8
 """t_s tx ty tz qx qy qz qw"""
 
@@ -44,17 +48,45 @@ TUM_COLUMNS = 8
 class FinishedDive:
     """What the viewer shows of a dive folder."""
 
-    splats: Splats
+    name: str
+    map: Callable[[], DiveMap]
+    """Reads the Gaussians when it is first called."""
+    packed: PackedFile | None
+    """Of an earlier look: then a browser needs no :attr:`map` to see them."""
+    key: dict[str, Any]
+    """Of a packed map of this dive as it is now."""
     water: SeenWater | None
-    palettes: dict[str, Palette]
     poses: list[Sim3]
     quality: npt.NDArray[np.float64]
     """[N] inlier share of each pose."""
-    pictures: list[Path | None]
-    """What the camera saw at each pose, where the dive keeps it."""
+    moments: npt.NDArray[np.float32]
+    """[N, 5] of each pose, as :mod:`aquaflow.viewer.moments` has them."""
+    began: datetime | None
+    """UTC of the first pose, if it is known."""
+    pictures: dict[int, Path]
+    """What the camera saw, by the frame's index, where the dive keeps it."""
     camera: CameraModel
-    summary: str
     frame: MetricFrame
+
+    @property
+    def splats(self) -> Splats:
+        """The Gaussians that are shown."""
+        return self.map().splats
+
+    @property
+    def palettes(self) -> dict[str, Palette]:
+        """Of the splats' levels."""
+        return self.map().palettes if self.packed is None else self.packed.palettes
+
+    @property
+    def summary(self) -> str:
+        """For the panel: paragraphs."""
+        if self.packed is None:
+            count, total = len(self.map().splats), self.map().total
+        else:
+            count, total = self.packed.count, self.packed.total
+        of_all = f"{len(self.poses)} poses, {count} of {total} Gaussians"
+        return f"{self.name}: {of_all}\n\n{_frame_in_words(self.frame)}"
 
 
 def _frame_in_words(frame: MetricFrame) -> str:
@@ -65,7 +97,7 @@ def _frame_in_words(frame: MetricFrame) -> str:
 
 
 def read_dive(folder: Path, budget: int) -> FinishedDive:
-    """The finished dive in ``folder``.
+    """The finished dive in ``folder``; its Gaussians are read when they are asked for.
 
     Raises:
         InputError: there is none.
@@ -74,28 +106,20 @@ def read_dive(folder: Path, budget: int) -> FinishedDive:
         if not (folder / name).is_file():
             raise InputError(f"{folder} holds no finished dive: {name} is missing")
     poses, times = _poses(folder / "trajectory.tum")
-    quality, pictures, keyframes = _of_frames(folder, times)
+    quality, indices = _of_frames(folder, times)
+    pictures = pictures_of_dive(folder)
+    moments, began = moments_of_dive(folder, times, indices, pictures)
     frame, camera = read_frame_of_map(folder / "map.aqf"), load_camera(folder / "camera.yaml")
     water = _water(folder / "medium.json")
     clear = folder / "map_clear.ply"
     if water is None or not clear.is_file():  # colours with the water in them are all there is
         water, clear = None, folder / "map.ply"
-    gaussians = read_ply(clear)
     cameras = np.array([pose.t for pose in poses]).reshape(-1, 3)
-    levels, palettes = _levels(gaussians.means, cameras, frame.unit)
-    views = [pose for pose, counts in zip(poses, keyframes, strict=True) if counts]
-    classes = coverage_of_dive(folder, gaussians.means, views, camera, frame, water)
-    if classes is not None:
-        levels[COVERAGE], palettes[COVERAGE] = classes, CLASSES
-    shown = splats(
-        np.asarray(gaussians.means, np.float32), np.asarray(gaussians.wxyz, np.float32),
-        np.asarray(gaussians.scales, np.float32), np.asarray(gaussians.opacities, np.float32),
-        np.asarray(gaussians.colours, np.float32), budget, levels,
-    )  # fmt: skip
-    of_all = f"{len(shown)} of {len(gaussians.means)} Gaussians"
-    summary = f"{folder.name}: {len(poses)} poses, {of_all}\n\n{_frame_in_words(frame)}"
+    key = key_of(folder, budget)
     return FinishedDive(
-        shown, water, palettes, poses, quality, pictures, camera, summary, frame
+        folder.name, cache(partial(read_map, folder, clear, cameras, frame, budget)),
+        read_packed(folder, key), key, water, poses, quality, moments, began, pictures, camera,
+        frame,
     )  # fmt: skip
 
 
@@ -108,10 +132,16 @@ def show_dive(dive: FinishedDive, config: ViewerConfig, tools: Tools | None = No
 
 def fill(page: ViewerPage, dive: FinishedDive) -> None:
     """Show ``dive`` on ``page``, in place of what was there."""
-    page.set_frame(Frame.of(dive.frame), up="-z" if dive.frame.level else "-y")
+    page.set_frame(
+        Frame.of(dive.frame), up="-z" if dive.frame.level else "-y", north=dive.frame.north
+    )
     page.show_health(dive.summary)
-    page.show_splats(dive.splats, dive.water, dive.palettes)
-    page.show_path(rows_of(dive.poses, dive.quality))
+    if dive.packed is not None:
+        page.show_packed(dive.packed, lambda: dive.splats, dive.water, dive.palettes)
+    else:
+        page.show_splats(dive.splats, dive.water, dive.palettes)
+    shown = thinned(dive.moments)
+    page.show_path(rows_of(dive.poses, dive.quality)[shown], dive.moments[shown], dive.began)
     page.show_pictures(dive.pictures)
     if dive.poses:
         page.show_camera(dive.poses[0], dive.camera, None)
@@ -135,8 +165,36 @@ def open_dive(folder: Path, config: ViewerConfig, mark: Mark | None = None) -> V
 
     if mark is not None:
         tools.others[SCALE] = scale
-    page.append(show_dive(read_dive(folder, config.splats), config, tools))
+    dive = read_dive(folder, config.splats)
+    page.append(show_dive(dive, config, tools))
+    prepare(folder, dive, page[0])
     return page[0]
+
+
+def prepare(folder: Path, dive: FinishedDive, page: ViewerPage) -> threading.Thread:
+    """Behind the page: the Gaussians are read, for who points at them, or their packing is kept."""
+
+    def work() -> None:
+        try:
+            packed = page.packed
+            if dive.packed is not None:
+                dive.map()
+            elif packed is not None:
+                write_packed(folder, dive.key, packed, dive.palettes, dive.map().total)
+        except InputError as error:  # who points is told so
+            log.warning("%s", error)
+
+    thread = threading.Thread(target=work, name="viewer's map", daemon=True)
+    thread.start()
+    return thread
+
+
+def thinned(
+    moments: npt.NDArray[np.float32],  # [N, 5]
+) -> npt.NDArray[np.intp]:
+    """Numbers [M] of the poses that the page gets: at most ``LONGEST_PATH``."""
+    step = max(1, -(-len(moments) // LONGEST_PATH))
+    return np.arange(0, len(moments), step)
 
 
 def rows_of(
@@ -146,17 +204,6 @@ def rows_of(
     """[N, 8] as :meth:`ViewerPage.show_path` takes them."""
     rows = [[*T.t, *T.quaternion, q] for T, q in zip(poses, quality, strict=True)]
     return np.array(rows, np.float32).reshape(-1, POSE_NUMBERS)
-
-
-def _levels(
-    means: npt.NDArray[np.floating],  # [N, 3]
-    cameras: npt.NDArray[np.float64],  # [M, 3]
-    unit: str,
-) -> tuple[dict[str, npt.NDArray[np.uint8]], dict[str, Palette]]:
-    if not len(cameras) or not len(means):
-        return {}, {}
-    values, palette = range_level(means, cameras, unit)
-    return {RANGE: values}, {RANGE: palette}
 
 
 def _water(path: Path) -> SeenWater | None:
@@ -182,29 +229,25 @@ def _poses(path: Path) -> tuple[list[Sim3], npt.NDArray[np.float64]]:
 def _of_frames(
     folder: Path,
     times: npt.NDArray[np.float64],  # [N] s
-) -> tuple[npt.NDArray[np.float64], list[Path | None], npt.NDArray[np.bool_]]:
-    """Quality and picture of the frame at each time, and whether it is a keyframe."""
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+    """Quality and index of the frame at each time; -1 where there is none."""
     shown = _shown_by_microsecond(folder / "frames.csv")
-    quality, pictures, keyframes = [], [], []
+    quality, indices = [], []
     for t_s in times:
-        inliers, index, is_keyframe = shown.get(_microsecond(t_s), (1.0, 0, False))
+        inliers, index = shown.get(_microsecond(t_s), (1.0, -1))
         quality.append(inliers)
-        keyframes.append(is_keyframe)
-        picture = folder / "heldout" / f"{index:06d}_real.png"
-        pictures.append(picture if picture.is_file() else None)
-    return np.array(quality), pictures, np.array(keyframes, bool)
+        indices.append(index)
+    return np.array(quality), np.array(indices, np.int64)
 
 
-def _shown_by_microsecond(path: Path) -> dict[int, tuple[float, int, bool]]:
-    """Quality and index of the frame at each time, and whether it is a keyframe; a damaged line is
-    skipped."""
-    shown: dict[int, tuple[float, int, bool]] = {}
+def _shown_by_microsecond(path: Path) -> dict[int, tuple[float, int]]:
+    """Quality and index of the frame at each time; a damaged line is skipped."""
+    shown: dict[int, tuple[float, int]] = {}
     try:
         with path.open(newline="", encoding="utf-8", errors="replace") as stream:
             for row in csv.DictReader(stream):
                 with contextlib.suppress(KeyError, TypeError, ValueError, OverflowError):
-                    is_keyframe = row["class"] == KEYFRAME
-                    found = float(row["quality"] or 1.0), int(row["index"]), is_keyframe
+                    found = float(row["quality"] or 1.0), int(row["index"])
                     shown[_microsecond(float(row["t_s"]))] = found
     except (OSError, csv.Error) as error:
         raise InputError(f"cannot read {path}; map the dive again") from error

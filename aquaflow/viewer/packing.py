@@ -63,6 +63,11 @@ class Packed:
         self._chunks: dict[int, bytes] = {}
         self._lock = threading.Lock()
 
+    @property
+    def count(self) -> int:
+        """Gaussians."""
+        return len(self._splats)
+
     @cached_property
     def version(self) -> str:
         """The same for the same content: a browser keeps the chunks that it has seen before."""

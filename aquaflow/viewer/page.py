@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,6 +17,8 @@ from aquaflow.messages import CameraModel
 from aquaflow.viewer.exhibit import POSE_NUMBERS, Exhibit, ShownCamera, ShownMap
 from aquaflow.viewer.levels import Palette
 from aquaflow.viewer.measuring import Frame
+from aquaflow.viewer.moments import unknown
+from aquaflow.viewer.packed_file import PackedFile
 from aquaflow.viewer.packing import Packed
 from aquaflow.viewer.seen_water import SeenWater
 from aquaflow.viewer.server import ViewerServer
@@ -68,7 +71,14 @@ class ViewerPage:
     @property
     def splats_shown(self) -> int:
         """Number of Gaussians on the page."""
-        return 0 if self._exhibit.map is None else len(self._exhibit.map.splats)
+        shown = self._exhibit.map
+        return 0 if shown is None else shown.packed.count
+
+    @property
+    def packed(self) -> Packed | None:
+        """The map as it was packed here; None of one that came packed."""
+        shown = self._exhibit.map
+        return shown.packed if shown is not None and isinstance(shown.packed, Packed) else None
 
     def show_splats(
         self,
@@ -77,14 +87,30 @@ class ViewerPage:
         palettes: dict[str, Palette] | None = None,
     ) -> None:
         """The map, the water before it, and the palette of each of the splats' levels."""
-        self._exhibit.map = ShownMap(splats, Packed(splats), water, palettes or {})
+        self._exhibit.map = ShownMap(lambda: splats, Packed(splats), water, palettes or {})
+
+    def show_packed(
+        self,
+        packed: PackedFile,
+        splats: Callable[[], Splats],
+        water: SeenWater | None,
+        palettes: dict[str, Palette],
+    ) -> None:
+        """A map that was packed before; ``splats`` are its Gaussians for who points at them."""
+        self._exhibit.map = ShownMap(splats, packed, water, palettes)
 
     def show_path(
         self,
         poses: Float,  # [N, 8] place, rotation wxyz from the camera, quality in [0, 1]
+        moments: Float | None = None,  # [N, 5] as aquaflow/viewer/moments.py has them
+        began: datetime | None = None,
     ) -> None:
-        """The trajectory, with how well each pose is known."""
-        self._exhibit.path = np.asarray(poses, np.float32).reshape(-1, POSE_NUMBERS)
+        """The trajectory, with how well each pose is known, and what else is known of its moments;
+        ``began``: UTC of the first one."""
+        rows = np.asarray(poses, np.float32).reshape(-1, POSE_NUMBERS)
+        said = unknown(len(rows)) if moments is None else np.asarray(moments, np.float32)
+        self._exhibit.path = np.concatenate([rows, said], axis=1)
+        self._exhibit.began = began
         self._exhibit.path_number += 1
 
     def show_camera(
@@ -98,17 +124,18 @@ class ViewerPage:
         number = 0 if before is None else before.number + 1
         self._exhibit.camera = ShownCamera(T_wc, camera, picture, number)
 
-    def show_pictures(self, pictures: Sequence[Path | None]) -> None:
-        """What the camera saw at each pose of the path, where that is kept."""
+    def show_pictures(self, pictures: Mapping[int, Path]) -> None:
+        """What the camera saw, by the frame's index, where that is kept."""
         self._exhibit.pictures = pictures
 
     def show_health(self, text: str) -> None:
         """The panel's text: paragraphs."""
         self._exhibit.health = text
 
-    def set_frame(self, frame: Frame, up: Literal["-y", "-z"] = "-y") -> None:
+    def set_frame(self, frame: Frame, up: Literal["-y", "-z"] = "-y", north: str = "") -> None:
         """The unit of lengths, how well it is known, and which axis of the world points up: by
-        default the first camera's, whose y points down."""
+        default the first camera's, whose y points down. ``north``: what headings begin at."""
+        self._exhibit.north = north
         self._tools.frame = frame
         self._exhibit.unit, self._exhibit.metres = frame.scale.unit, frame.metres
         self._exhibit.up = UP[up]

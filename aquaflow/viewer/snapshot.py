@@ -24,4 +24,4 @@ def copied(mapper: Mapper) -> MapCopy:
         rows = map_out(torch.cat([water.stacked(), mapper.scene.white_gain()[None]]))
     steps = map_out(mapper.optimiser.adam.steps)
     poses = [each.T_wc for each in mapper.views]
-    return MapCopy(plain, steps, map_out(clear), rows, poses, view.camera)
+    return MapCopy(plain, steps, map_out(clear), rows, poses)

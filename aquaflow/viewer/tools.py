@@ -52,7 +52,7 @@ class Tools:
             self._turn.release()
 
     def _pick(self, given: Asked) -> Asked:
-        found = pick(self._map().splats, *ray_of(given))
+        found = pick(self._map().splats(), *ray_of(given))
         return {"place": found.place.tolist(), "range": found.range, "sigma": found.sigma}
 
     def _measure(self, given: Asked) -> Asked:
@@ -66,7 +66,7 @@ class Tools:
         camera = exhibit.camera
         width = 1.0 if camera is None else camera.camera.width / camera.camera.fx
         cameras = exhibit.path[:, :3].astype(np.float64)
-        scene = Scene(shown.splats, cameras, width, np.array(exhibit.up), self.frame)
+        scene = Scene(shown.splats(), cameras, width, np.array(exhibit.up), self.frame)
         return measured(str(given.get("what")), asked, scene)
 
     def _map(self) -> ShownMap:

@@ -143,3 +143,14 @@ def test_without_gravity_the_page_is_in_map_units() -> None:
     view = viewed(lawnmower(2, 6.0, 1.0, 0.45), unknown)
     assert view.unit == "map units"
     assert view.state.swath > 0.0
+
+
+def test_a_path_without_a_turn_is_a_line_before_one_between_turns_would_be() -> None:
+    """Eight stills of an AUV are 1.2 to 1.5 swaths long, and a whole line."""
+    ahead = np.column_stack([np.zeros(14), np.linspace(0.0, 1.25 * SWATH, 14)])
+    assert survey_lines(ahead, SWATH) == []
+    (line,) = survey_lines(ahead, SWATH, alone=0.75 * SWATH)
+    assert line.length == pytest.approx(1.25 * SWATH, rel=0.1)
+    assert survey_lines(ahead, SWATH, alone=1.3 * SWATH) == []
+    aside = np.column_stack([np.linspace(0.0, 1.25 * SWATH, 14), np.full(14, ahead[-1, 1])])
+    assert survey_lines(np.concatenate([ahead, aside]), SWATH, alone=0.75 * SWATH) == []

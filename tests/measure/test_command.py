@@ -16,7 +16,7 @@ from aquaflow.errors import InputError
 from aquaflow.export.georeference import to_geodetic
 from aquaflow.fusion.metric_file import read_frame_of_map
 from aquaflow.measure.asked import MapPoint, Pixel, Place, parse_point
-from aquaflow.measure.notes import read_notes
+from aquaflow.measure.notes import Note, read_notes, write_notes
 from tests.command_line import Cli
 from tests.export.survey_scenes import DEPTH_M, height, surveyed, write_survey
 from tests.metric_scenes import TRONDHEIM, metric_frame
@@ -191,3 +191,48 @@ def test_a_dive_that_has_no_place_on_the_earth_says_so(tmp_path: Path, command: 
 
 def test_a_folder_without_a_map_is_no_dive(tmp_path: Path, command: Cli) -> None:
     assert "holds no finished dive: map.aqf is missing" in command("measure", tmp_path).err
+
+
+@pytest.fixture
+def noted(dive: Path, tmp_path: Path) -> Path:
+    """A dive with three notes."""
+    copy = shutil.copytree(dive, tmp_path / "noted")
+    frame = read_frame_of_map(copy / "map.aqf")
+    ground = ground_n(CORNERS)
+    notes = [
+        Note("1", "wall", "LineString", ground[:2]),
+        Note("7f2a", "sponge", "Point", ground[:1]),
+        Note("3", "bed", "Polygon", ground),
+    ]
+    write_notes(copy, notes, frame)
+    return copy
+
+
+def test_notes_are_listed_with_their_keys(noted: Path, command: Cli) -> None:
+    lines = command("measure", noted, "--notes").out.splitlines()
+    assert [line.split() for line in lines] == [
+        ["1", "line", "wall"], ["7f2a", "point", "sponge"], ["3", "area", "bed"],
+    ]  # fmt: skip
+    said = asked(command, noted, "--notes")
+    assert said["unit"] == "m"
+    assert [note["key"] for note in said["notes"]] == ["1", "7f2a", "3"]
+    assert np.allclose(said["notes"][2]["places"], ground_n(CORNERS), atol=1e-3)
+
+
+def test_notes_are_deleted_by_their_keys_and_the_others_stay(noted: Path, command: Cli) -> None:
+    ran = command("measure", noted, "--delete", "7f2a", "--delete", "3")
+    assert (ran.code, ran.out.split()) == (0, ["1", "line", "wall"])
+    assert command("measure", noted, "--delete", "1").out.strip() == "The dive has no notes."
+
+
+def test_a_key_that_no_note_has_deletes_none(noted: Path, command: Cli) -> None:
+    ran = command("measure", noted, "--delete", "1", "--delete", "9")
+    assert ran.code != 0
+    assert "no note '9'" in ran.err
+    assert len(read_notes(noted, read_frame_of_map(noted / "map.aqf"))) == 3
+
+
+def test_tending_notes_measures_nothing(noted: Path, command: Cli) -> None:
+    ran = command("measure", noted, "--notes", "--point", "0,0,0")
+    assert ran.code != 0
+    assert "measure nothing" in ran.err

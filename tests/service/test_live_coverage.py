@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from aquaflow.config.service import ListenConfig
+from aquaflow.coverage.classes import Seen
 from aquaflow.coverage.hints import Hint
 from aquaflow.coverage.picture import HEIGHT, WIDTH
 from aquaflow.service.health.http import HealthServer
@@ -41,6 +42,10 @@ def test_a_survey_is_shown_with_its_lines_areas_and_the_waters_range(dive: Cover
     assert said["range_limit"] == pytest.approx(np.log(6.0) / 0.5, abs=1e-3)
     assert said["areas"]["well"] > 10.0
     assert said["next_line"]["new_share"] > 0.3
+    plan = dive.live.plan(0)
+    assert plan is not None
+    assert plan.cells[Seen.WELL] * (plan.frame.cell**2) > 0.0
+    assert dive.live.plan(7) is None
     page = PlanView(lambda: dive.parts, coverage=dive.live).to_json()
     assert page["hints"] == []
     assert page["sub_maps"][0]["coverage"] == said

@@ -21,7 +21,7 @@ import numpy as np
 
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.export.ply import PlyGaussians, write_ply
-from aquaflow.viewer.finished import read_dive, show_dive
+from aquaflow.viewer.finished import prepare, read_dive, show_dive
 from tests.browser import Browser
 
 ROUND_TRIP_S = 0.02
@@ -99,6 +99,7 @@ def measure(dive: Path, mbit: float, picture: Path | None) -> dict[str, float]:
     began = time.monotonic()
     read = read_dive(dive, 10**9)
     page = show_dive(read, ViewerConfig(port=0))
+    behind = prepare(dive, read, page)
     ready_s = time.monotonic() - began
     link = SlowLink(int(page.address.rstrip("/").rpartition(":")[2]), mbit * 1e6 / 8)
     with tempfile.TemporaryDirectory() as profile:
@@ -116,6 +117,7 @@ def measure(dive: Path, mbit: float, picture: Path | None) -> dict[str, float]:
         finally:
             browser.close()
             page.close()
+            behind.join()
     seconds = {name: times[name] / 1000.0 for name in ("script", "data", "first", "whole")}
     megabytes = {f"{name}_mb": link.until(opened + t_s) / 1e6 for name, t_s in seconds.items()}
     return {"server_ready": ready_s, **seconds, **megabytes, "gaussian_us": cost_us}
@@ -133,8 +135,10 @@ def main() -> None:
         dive = shutil.copytree(given.dive, Path(folder) / "dive")
         for name, splats in zip(("map", "map_clear"), relief(given.gaussians), strict=True):
             write_ply(dive / f"{name}.ply", splats)
-        found = measure(dive, given.mbit, given.picture)
-    print(json.dumps({name: round(value, 3) for name, value in found.items()}))
+        for look in ("first", "second"):  # the second one has the packed map of the first
+            found = measure(dive, given.mbit, given.picture)
+            rounded = {name: round(value, 3) for name, value in found.items()}
+            print(json.dumps({"look": look} | rounded), flush=True)
 
 
 if __name__ == "__main__":

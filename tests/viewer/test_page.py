@@ -76,9 +76,13 @@ def test_a_finished_dive_is_read_with_its_colours_poses_and_pictures(small_dive:
     dive = read_dive(small_dive, budget=500)
     assert len(dive.splats) == 500
     assert set(dive.splats.levels) == set(dive.palettes) == {"range", "coverage"}
-    assert len(dive.poses) == len(dive.quality) == len(dive.pictures)
-    kept = [picture for picture in dive.pictures if picture is not None]
-    assert len(kept) == len(list((small_dive / "heldout").glob("*_real.png")))
+    assert len(dive.poses) == len(dive.quality) == len(dive.moments)
+    held_out = {int(path.name[:6]) for path in (small_dive / "heldout").glob("*_real.png")}
+    kept = {int(path.stem) for path in (small_dive / "pictures").glob("*.jpg")}
+    assert held_out
+    assert kept
+    assert set(dive.pictures) == held_out | kept
+    assert set(dive.moments[:, 3].astype(int)) <= held_out | kept
 
 
 def test_the_water_of_a_dive_is_read_and_a_damaged_one_costs_itself(dive: Path) -> None:

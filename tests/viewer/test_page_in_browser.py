@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterator
+from datetime import datetime, timezone
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,10 @@ import pytest
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.viewer.dive_coverage import CLASSES, COVERAGE
 from aquaflow.viewer.finished import open_dive
 from aquaflow.viewer.levels import RANGE, range_level
 from aquaflow.viewer.page import ViewerPage
-from aquaflow.viewer.seen_classes import CLASSES, COVERAGE
 from aquaflow.viewer.seen_water import seen_water
 from tests.browser import Browser, needs_browser
 from tests.viewer.planes import floor
@@ -25,11 +26,15 @@ pytestmark = [pytest.mark.ci, needs_browser]
 
 SCREEN = (800, 500)
 TABLET = (768, 640)
+TABLETS = ((768, 1024), (1024, 768))
+"""Upright and lying."""
 PICTURES = os.environ.get("AQUAFLOW_PAGE_PICTURES")
 """Folder that gets the screenshots, to look at them."""
 CAMERA_ABOVE = """
     document.querySelector('#pose').value = 0;
     document.querySelector('#pose').dispatchEvent(new Event('input'));"""
+MOMENTS = np.array([[0.0, 4.2, 271.6, 0, 0.0], [75.0, np.nan, 90.0, 0, 0.0]], np.float32)
+"""Of the two poses: seconds, depth, heading, and the picture of the first, which is kept."""
 Box = tuple[float, float, float, float]
 
 
@@ -52,7 +57,9 @@ def page(small_dive: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator
     plane.levels.update({RANGE: ranges, COVERAGE: classes})
     water = seen_water([0.5] * 3, [0.0, 0.0, 0.9], [0.5] * 3, [0.0] * 3, [0.5] * 3, [1.0] * 3, 5.0)
     page.show_splats(plane, water, {RANGE: palette, COVERAGE: CLASSES})
-    page.show_path(np.array([[x, 0, 0, 1, 0, 0, 0, 1] for x in (0.0, 1.0)], np.float32))
+    page.show_path(np.array([[x, 0, 0, 1, 0, 0, 0, 1] for x in (0.0, 1.0)], np.float32), MOMENTS)
+    page.show_pictures({0: next(iter((folder / "pictures").glob("*.jpg")))})
+    page._exhibit.north = "true north"
     yield page
     page.close()
 
@@ -204,9 +211,84 @@ def test_a_note_is_kept_in_the_dive_shown_and_removed(shown: Browser) -> None:
 def test_the_cameras_picture_stands_beside_the_map_from_its_pose(shown: Browser) -> None:
     shown.click("#beside")
     shown.wait("document.querySelector('#picture').naturalWidth > 0")
-    assert "picture" in shown.text("#caption") or "pose" in shown.text("#caption")
     assert box(shown, "#seen")[2] > 100
-    assert shown.text("#where").startswith("pose ")
+    assert shown.text("#caption") == "0:00"
+    assert shown.text("#where") == "0:00 of 1:15 \u00b7 4.2 m deep \u00b7 heading 272\u00b0"
+    put(shown, "#pose", 1)
+    assert shown.text("#caption") == "of 0:00: 75.0 s before this pose"
+    assert shown.text("#where") == "1:15 of 1:15 \u00b7 heading 90\u00b0"
+
+
+def test_the_slider_says_utc_where_the_dive_knows_it(browser: Browser, page: ViewerPage) -> None:
+    page._exhibit.began = datetime(2026, 11, 24, 23, 59, 30, tzinfo=timezone.utc)
+    try:
+        browser.emulate(*SCREEN)
+        browser.open("about:blank")
+        browser.open(page.address)
+        browser.wait("window.aquaflowTimes && window.aquaflowTimes.whole")
+        put(browser, "#pose", 1)
+        assert browser.text("#where") == "00:00:45 UTC \u00b7 heading 90\u00b0"
+    finally:
+        page._exhibit.began = None
+
+
+def eye(browser: Browser) -> tuple[np.ndarray, float]:
+    """Where the eye is [3], and its distance from what it turns about."""
+    place, target = browser.run("return [aquaflowEye.place, aquaflowEye.target]")
+    return np.array(place), float(np.linalg.norm(np.subtract(place, target)))
+
+
+def moved(browser: Browser, before: np.ndarray) -> float:
+    """How far the eye is from where it was."""
+    return float(np.linalg.norm(eye(browser)[0] - before))
+
+
+@pytest.mark.parametrize("size", TABLETS)
+def test_one_finger_turns_two_move_and_zoom_and_a_tap_points(
+    shown: Browser, size: tuple[int, int], tmp_path: Path
+) -> None:
+    shown.emulate(*size)
+    shown.click("#home")
+    left, top, width, height = box(shown, "#map")
+    x, y = left + width / 2, top + height / 2
+    _, away = eye(shown)
+    right = np.array(shown.run("return aquaflowEye.axes[0]"))
+    shown.swipe((x, y), (x + 90, y))
+    shown.until(lambda: right @ shown.run("return aquaflowEye.axes[0]") < 0.98, "one finger turns")
+    assert eye(shown)[1] == pytest.approx(away, rel=1e-6)
+    shown.two_fingers(((x - 40, y), (x + 40, y)), ((x - 80, y), (x + 80, y)))
+    shown.until(lambda: eye(shown)[1] < 0.6 * away, "two fingers zoom")
+    place, nearer = eye(shown)
+    shown.two_fingers(((x - 40, y), (x + 40, y)), ((x - 40, y + 60), (x + 40, y + 60)))
+    shown.until(lambda: moved(shown, place) > 0.05 * nearer, "two fingers move")
+    assert eye(shown)[1] == pytest.approx(nearer, rel=0.05)
+    shown.run(CAMERA_ABOVE)
+    shown.click("[data-tool=distance]")
+    left, top, width, height = box(shown, "#map")
+    for count, share in ((1, 0.45), (2, 0.55)):
+        shown.touch(left + share * width, top + 0.5 * height)
+        shown.wait(f"Number(document.querySelector('#tools').dataset.points) === {count}")
+    shown.wait("document.querySelector('#result').innerText.includes('\u00b1')")
+    if PICTURES:
+        shown.screenshot(Path(PICTURES) / f"viewer_tablet_{size[0]}.png")
+
+
+@pytest.mark.parametrize("size", TABLETS)
+def test_on_a_tablet_everything_is_within_reach(shown: Browser, size: tuple[int, int]) -> None:
+    shown.emulate(*size)
+    shown.click("#beside")
+    for selector in ("#map", "#seen", "#panel", "#time", "#beside", "#pose", "#where", "#fold"):
+        x, y, width, height = box(shown, selector)
+        assert width > 20, selector
+        assert x >= 0 <= y, selector
+        assert x + width <= size[0] + 1, selector
+        assert y + height <= size[1] + 1, selector
+    assert box(shown, "#map")[2] >= 0.3 * size[0] or box(shown, "#map")[3] >= 0.3 * size[1]
+    small = shown.run(
+        "return [...document.querySelectorAll('button')].filter(b => b.offsetParent &&"
+        " b.getBoundingClientRect().height < 44).map(b => b.textContent)"
+    )
+    assert small == []
 
 
 def test_a_live_dive_is_followed(browser: Browser, tmp_path: Path) -> None:

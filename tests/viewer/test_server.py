@@ -128,7 +128,7 @@ def test_a_chunk_is_kept_by_the_browser_and_another_map_has_another_address(
 
 
 def test_path_and_newest_picture_are_sent(page: ViewerPage) -> None:
-    rows = np.frombuffer(get(page, "/path/1")[1], "<f4").reshape(-1, 8)
+    rows = np.frombuffer(get(page, "/path/1")[1], "<f4").reshape(-1, 13)
     assert rows[:, 0].tolist() == [0.0, 1.0]
     status, jpeg, headers = get(page, "/picture/newest?3")
     assert (status, jpeg[:2], headers["Content-Type"]) == (200, b"\xff\xd8", "image/jpeg")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,16 +20,13 @@ from aquaflow.service.foxglove.map_moment import MapMoment, cloud_of, taken, wat
 from aquaflow.service.foxglove.server import FoxgloveServer
 from aquaflow.service.loop import LiveLoop
 from aquaflow.service.report import GOOD
+from aquaflow.service.showing import LOOK_S, Showing
 from aquaflow.sources.newest import Newest
 from aquaflow.sources.preprocessing import Preparation
 from aquaflow.tracking.frames import Tracked
 
-log = logging.getLogger(__name__)
-
 LONGEST_PATH = 5000
 """Most poses of the path; a longer one is thinned, as in the viewer."""
-LOOK_S = 0.1
-"""Longest wait for something new; then the thread checks whether it shall end."""
 LASTING_S = 1.0
 """Between two messages of what lasts: who comes later waits no longer for it."""
 KEPT_STAMPS = 2000
@@ -65,9 +60,7 @@ class LiveFoxglove:
         self._moments: Newest[_Moment] = Newest()
         self._maps: Newest[MapMoment] = Newest()
         self._forget()
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="foxglove", daemon=True)
-        self._thread.start()
+        self._showing = Showing("foxglove", self._show, config.refresh_s)
 
     def _forget(self) -> None:
         self._path: list[tuple[int, int, Sim3]] = []
@@ -108,8 +101,7 @@ class LiveFoxglove:
 
     def close(self) -> None:
         """End the thread and let the clients go."""
-        self._closing.set()
-        self._thread.join(5.0)
+        self._showing.close()
         self._server.close()
 
     def _hand_over(self, loop: LiveLoop, latest: Tracked, t_ns: int, frame: MetricFrame) -> None:
@@ -131,14 +123,6 @@ class LiveFoxglove:
             self._maps.put(taken(mapper, sub_map, frame, points, drawn))
 
     # --- in the thread of its own -----------------------------------------------------------------
-
-    def _run(self) -> None:
-        while not self._closing.is_set():
-            try:
-                self._show()
-            except Exception:  # whatever a client did to the server, the dive goes on
-                log.exception("a dive could not be shown in Foxglove")
-                self._closing.wait(self._config.refresh_s)
 
     def _show(self) -> None:
         moment = self._moments.take(LOOK_S)

@@ -7,6 +7,8 @@ import logging
 import re
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from http.server import BaseHTTPRequestHandler
 from typing import Any, Protocol, TypeAlias
 from urllib.parse import parse_qs
@@ -70,6 +72,8 @@ class CoveragePictures(Protocol):
 
 Say: TypeAlias = Callable[[], dict[str, Any]]
 """What is answered as JSON; called in the thread of the request."""
+Answer: TypeAlias = tuple[int, str, str | bytes]
+"""Status, content type and body."""
 
 
 class HealthServer:
@@ -98,7 +102,8 @@ class HealthServer:
         """
         access = Access(config)
         try:
-            handler = _handler(access, report, path, control or Control(), picture, coverage)
+            answers = _Answers(access, report, path, control or Control(), picture, coverage)
+            handler = partial(_Handler, answers)
             self._server = BoundedServer((config.host, config.port), handler, MOST_CLIENTS)
         except OSError as error:
             raise InputError(
@@ -127,86 +132,107 @@ def _coverage_picture(path: str, coverage: CoveragePictures | None) -> bytes | N
     return None if of_cells is None else coverage.cells(int(of_cells[1]))
 
 
-def _handler(
-    access: Access,
-    report: Say,
-    plan: Say | None,
-    control: Control,
-    picture: Callable[[], bytes | None],
-    coverage: CoveragePictures | None,
-) -> type[BaseHTTPRequestHandler]:
-    class Handler(BaseHTTPRequestHandler):
-        timeout = PATIENCE_S
-        server_version, sys_version = "AquaFlow", ""
+@dataclass(frozen=True)
+class _Answers:
+    """What the server says to whom; called in the threads of requests."""
 
-        def do_GET(self) -> None:
-            path = path_of(self.path)
-            # The page holds no data, and BlueOS asks for both without a token.
-            if path is None:
-                self._say(400, {"error": "this is no address"})
-            elif path == "/register_service":
-                self._say(200, REGISTRATION)
-            elif (file := page_file(path)) is not None:
-                self._answer(200, file.kind, file.text)
-            elif not access.allows(self.path, self._named_headers(), self.client_address[0]):
-                self._say(403, NOT_ALLOWED)
-            elif path == "/health":
-                self._say(200, report())
-            elif path == "/path.json" and plan is not None:
-                self._say(200, plan())
-            elif path == "/metrics":
-                self._answer(200, TYPE, exposition(report()))
-            elif path == "/picture.jpg" and (jpeg := picture()) is not None:
-                self._answer(200, JPEG, jpeg)
-            elif (png := _coverage_picture(path, coverage)) is not None:
-                self._answer(200, PNG, png)
-            else:
-                self._say(404, {"error": "there is nothing here"})
+    access: Access
+    report: Say
+    plan: Say | None
+    control: Control
+    picture: Callable[[], bytes | None]
+    coverage: CoveragePictures | None
 
-        def do_POST(self) -> None:
-            body = self._body()
-            if body is None:
-                self._say(413, {"error": "a request holds a token at most"})
-            elif path_of(self.path) == "/login":
-                self._log_in(body)
-            else:
-                dive = report().get("dive") or {}
-                peer, headers = self.client_address[0], self._named_headers()
-                self._say(*answered(control, access, self.path, headers, dive.get("name"), peer))
+    def open_to_all(self, path: str) -> Answer | None:
+        """The page holds no data, and BlueOS asks for both without a token."""
+        if path == "/register_service":
+            return _json(200, REGISTRATION)
+        file = page_file(path)
+        return None if file is None else (200, file.kind, file.text)
 
-        def _log_in(self, form: str) -> None:
-            tokens = parse_qs(form).get("token", [""])
-            if access.is_token(tokens[-1].strip()):
-                self._say(200, {"ok": True}, [("Set-Cookie", access.cookie())])
-            else:
-                self._say(403, WRONG_TOKEN)
+    def data(self, path: str) -> Answer:
+        """What only those may have who are let in."""
+        if path == "/health":
+            return _json(200, self.report())
+        if path == "/path.json" and self.plan is not None:
+            return _json(200, self.plan())
+        if path == "/metrics":
+            return 200, TYPE, exposition(self.report())
+        if path == "/picture.jpg" and (jpeg := self.picture()) is not None:
+            return 200, JPEG, jpeg
+        if (png := _coverage_picture(path, self.coverage)) is not None:
+            return 200, PNG, png
+        return _json(404, {"error": "there is nothing here"})
 
-        def _named_headers(self) -> dict[str, str]:
-            return {name.lower(): value for name, value in self.headers.items()}
 
-        def _body(self) -> str | None:
-            """What was posted; None if it is too long, and then not read."""
-            length = self.headers.get("Content-Length", "0")
-            if not length.isdecimal() or int(length) > MOST_BYTES:
-                return None
-            return self.rfile.read(int(length)).decode("ascii", "replace")
+def _json(code: int, said: dict[str, Any]) -> Answer:
+    return code, JSON, json.dumps(said, default=str)
 
-        def _say(self, code: int, said: dict[str, Any], headers: Headers = ()) -> None:
-            self._answer(code, JSON, json.dumps(said, default=str), headers)
 
-        def _answer(self, code: int, kind: str, text: str | bytes, headers: Headers = ()) -> None:
-            data = text if isinstance(text, bytes) else text.encode()
-            host = self.headers.get("Host", "")
-            self.send_response(code)
-            for name, value in [("Content-Type", kind), *policies(host), *headers]:
-                self.send_header(name, value)
-            self.send_header("Content-Length", str(len(data)))
-            if access.by_query(self.path):
-                self.send_header("Set-Cookie", access.cookie())
-            self.end_headers()
-            self.wfile.write(data)
+class _Handler(BaseHTTPRequestHandler):
+    """One request."""
 
-        def log_message(self, format: str, *args: Any) -> None:
-            """Addresses may carry the token: nothing of a request goes to a log."""
+    timeout = PATIENCE_S
+    server_version, sys_version = "AquaFlow", ""
 
-    return Handler
+    def __init__(self, answers: _Answers, *request: Any) -> None:
+        """``request``: what the web server hands over."""
+        self._answers, self._access = answers, answers.access
+        super().__init__(*request)
+
+    def do_GET(self) -> None:
+        path = path_of(self.path)
+        if path is None:
+            self._answer(_json(400, {"error": "this is no address"}))
+        elif (said := self._answers.open_to_all(path)) is not None:
+            self._answer(said)
+        elif not self._access.allows(self.path, self._named_headers(), self.client_address[0]):
+            self._answer(_json(403, NOT_ALLOWED))
+        else:
+            self._answer(self._answers.data(path))
+
+    def do_POST(self) -> None:
+        body = self._body()
+        if body is None:
+            self._answer(_json(413, {"error": "a request holds a token at most"}))
+        elif path_of(self.path) == "/login":
+            self._log_in(body)
+        else:
+            dive = self._answers.report().get("dive") or {}
+            peer, headers = self.client_address[0], self._named_headers()
+            control, name = self._answers.control, dive.get("name")
+            said = answered(control, self._access, self.path, headers, name, peer)
+            self._answer(_json(*said))
+
+    def _log_in(self, form: str) -> None:
+        tokens = parse_qs(form).get("token", [""])
+        if self._access.is_token(tokens[-1].strip()):
+            self._answer(_json(200, {"ok": True}), [("Set-Cookie", self._access.cookie())])
+        else:
+            self._answer(_json(403, WRONG_TOKEN))
+
+    def _named_headers(self) -> dict[str, str]:
+        return {name.lower(): value for name, value in self.headers.items()}
+
+    def _body(self) -> str | None:
+        """What was posted; None if it is too long, and then not read."""
+        length = self.headers.get("Content-Length", "0")
+        if not length.isdecimal() or int(length) > MOST_BYTES:
+            return None
+        return self.rfile.read(int(length)).decode("ascii", "replace")
+
+    def _answer(self, answer: Answer, headers: Headers = ()) -> None:
+        code, kind, text = answer
+        data = text if isinstance(text, bytes) else text.encode()
+        host = self.headers.get("Host", "")
+        self.send_response(code)
+        for name, value in [("Content-Type", kind), *policies(host), *headers]:
+            self.send_header(name, value)
+        self.send_header("Content-Length", str(len(data)))
+        if self._access.by_query(self.path):
+            self.send_header("Set-Cookie", self._access.cookie())
+        self.end_headers()
+        self.wfile.write(data)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Addresses may carry the token: nothing of a request goes to a log."""

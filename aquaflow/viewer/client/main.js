@@ -29,6 +29,7 @@ const eye = new Eye([0, -1, 0]), marks = new Marks(find("marks"));
 const tools = new ToolBox(marks, changed);
 const line = new TimeLine(eye, changed);
 const looks = new Looks(changed);
+window.aquaflowEye = eye; // for who looks at the page from outside, as its tests do
 
 hands(find("marks"), eye, {
   changed: () => { drawing.moving = true; line.leave(); changed(); },

@@ -2,6 +2,7 @@
 
 import { add, axesOf } from "./camera.js";
 
+export const ROW = 13; // numbers of a pose: place, rotation, quality, and five of its moment
 const LONGEST = 2000; // poses of the path that are drawn
 const NOTE = "#7fd4ff", MARK = "#ffb454", CAMERA = "#eb7828";
 const PATH = ["#8a3ba8", "#2f9fc0", "#f4e04a"]; // pose hardly known, known, well known
@@ -11,11 +12,11 @@ export class Marks {
     Object.assign(this, { canvas, path: [], camera: null, points: [], closed: false, notes: [], picked: null, size: 1 });
   }
 
-  // Rows of eight numbers: place, rotation, quality.
+  // Rows of `ROW` numbers.
   setPath(rows) {
-    const count = rows.length / 8, step = Math.max(1, Math.ceil(count / LONGEST));
+    const count = rows.length / ROW, step = Math.max(1, Math.ceil(count / LONGEST));
     this.path = [];
-    for (let i = 0; i < count; i += step) this.path.push({ place: [...rows.subarray(8 * i, 8 * i + 3)], quality: rows[8 * i + 7] });
+    for (let i = 0; i < count; i += step) this.path.push({ place: [...rows.subarray(ROW * i, ROW * i + 3)], quality: rows[ROW * i + 7] });
   }
 
   draw(eye) {

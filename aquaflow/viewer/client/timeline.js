@@ -1,23 +1,37 @@
 // The slider along the path: the eye takes the camera's place, its picture stands beside.
 
+import { ROW } from "./marks.js";
+
+const SECONDS = 8, DEPTH = 9, HEADING = 10, PICTURE = 11, TAKEN = 12; // of a row, see aquaflow/viewer/moments.py
+const SAME_S = 0.005; // a picture that is so close to a pose is its own
 const find = id => document.getElementById(id);
+const two = number => String(Math.floor(number)).padStart(2, "0");
+
+// Minutes and seconds since the first pose, with hours where there are any.
+export function clock(seconds) {
+  const [h, m, s] = [seconds / 3600, seconds / 60 % 60, seconds % 60];
+  return h >= 1 ? `${Math.floor(h)}:${two(m)}:${two(s)}` : `${Math.floor(m)}:${two(s)}`;
+}
 
 export class TimeLine {
   constructor(eye, changed) {
-    Object.assign(this, { eye, changed, rows: new Float32Array(0), scene: null, beside: false, number: -1, shown: "", newest: true });
+    Object.assign(this, { eye, changed, rows: new Float32Array(0), scene: null, beside: false, number: -1, shown: null, newest: true });
     find("pose").addEventListener("input", () => this.go(Number(find("pose").value)));
     find("beside").addEventListener("click", () => this.besides(!this.beside));
   }
 
-  get count() { return this.rows.length / 8; }
+  get count() { return this.rows.length / ROW; }
 
   setPath(rows, scene) {
+    const first = this.number < 0 && !this.count;
     Object.assign(this, { rows, scene });
     find("time").hidden = !this.count || !scene.camera;
     find("pose").max = String(Math.max(0, this.count - 1));
+    if (first && !scene.live) {
+      this.newest = false;
+      find("pose").value = String(this.count >> 1);
+    }
     if (this.newest) find("pose").value = find("pose").max;
-    if (this.number < 0 && !scene.live) this.newest = false;
-    if (this.number < 0 && !scene.live && scene.pictures.length) find("pose").value = String(scene.pictures[scene.pictures.length >> 1]);
     this.words();
   }
 
@@ -31,7 +45,7 @@ export class TimeLine {
   get camera() {
     const { scene, rows } = this, number = Number(find("pose").value);
     if (!scene?.camera || this.newest || number >= this.count) return scene?.camera ?? null;
-    const row = [...rows.subarray(8 * number, 8 * number + 8)];
+    const row = [...rows.subarray(ROW * number, ROW * number + 7)];
     return { ...scene.camera, place: row.slice(0, 3), wxyz: row.slice(3, 7) };
   }
 
@@ -58,21 +72,41 @@ export class TimeLine {
     this.changed();
   }
 
+  // What is known of a moment: UTC where the dive knows it, else the time since the first pose.
+  moment(number, seconds) {
+    const { scene } = this;
+    if (!Number.isFinite(seconds)) return `pose ${number + 1} of ${this.count}`;
+    if (scene.began) return `${new Date(Date.parse(scene.began) + 1000 * seconds).toISOString().slice(11, 19)} UTC`;
+    return clock(seconds);
+  }
+
   words() {
-    const number = Number(find("pose").value);
-    find("where").textContent = `pose ${number + 1} of ${this.count}${this.newest ? ", now" : ""}`;
+    const number = Math.min(Number(find("pose").value), this.count - 1);
+    if (number < 0) return;
+    const at = k => this.rows[ROW * number + k], parts = [this.moment(number, at(SECONDS))];
+    if (!this.scene.began && Number.isFinite(at(SECONDS))) parts[0] += ` of ${clock(this.rows[ROW * (this.count - 1) + SECONDS])}`;
+    if (this.newest) parts[0] += ", now";
+    if (Number.isFinite(at(DEPTH))) parts.push(`${at(DEPTH).toFixed(1)} m deep`);
+    if (Number.isFinite(at(HEADING))) parts.push(this.heading(Math.round(at(HEADING)) % 360));
+    find("where").textContent = parts.join(" \u00b7 ");
+  }
+
+  // Of a compass, or of what x points to where no compass was heard.
+  heading(degrees) {
+    const { north } = this.scene;
+    return north.endsWith("north") ? `heading ${degrees}\u00b0` : north ? `${degrees}\u00b0 from the ${north}` : `turned ${degrees}\u00b0`;
   }
 
   // The picture of that pose, else the nearest one that is kept.
   picture() {
     if (!this.beside) return;
-    const { scene, number } = this;
+    const { scene, number, rows } = this, at = k => rows[ROW * number + k];
     let [address, words] = ["", "No picture of this dive is kept."];
-    if (scene.live) {
-      [address, words] = [scene.camera.picture ? `/picture/newest?${scene.camera.number}` : "", this.newest ? "now" : "now; the map beside is seen from an earlier pose"];
-    } else if (scene.pictures.length) {
-      const nearest = scene.pictures.reduce((best, i) => Math.abs(i - number) < Math.abs(best - number) ? i : best);
-      [address, words] = [`/picture/${nearest}`, nearest === number ? `pose ${number + 1}` : `of pose ${nearest + 1}: the nearest picture that is kept`];
+    if (this.newest) {
+      [address, words] = [scene.camera.picture ? `/picture/newest?${scene.camera.number}` : "", "now"];
+    } else if (Number.isFinite(at(PICTURE))) {
+      const apart = at(TAKEN) - at(SECONDS), taken = this.moment(number, at(TAKEN));
+      [address, words] = [`/picture/${at(PICTURE)}`, Math.abs(apart) < SAME_S ? taken : `of ${taken}: ${Math.abs(apart).toFixed(1)} s ${apart < 0 ? "before" : "after"} this pose`];
     }
     find("caption").textContent = words;
     if (address === this.shown) return;

@@ -127,7 +127,7 @@ def change(ago_s: float, before: str, after: str, reason: str) -> dict[str, Any]
 
 
 def with_buttons(
-    handler: type[BaseHTTPRequestHandler], dive: SimulatedDive, allows: Any
+    handler: type[BaseHTTPRequestHandler], dive: SimulatedDive
 ) -> type[BaseHTTPRequestHandler]:
     """The server's handler with the requests that control a dive, and its newest picture."""
 
@@ -147,7 +147,7 @@ def with_buttons(
 
         def allowed(self) -> bool:
             headers = {name.lower(): value for name, value in self.headers.items()}
-            if allows(self.path, headers):
+            if self._access.allows(self.path, headers):
                 return True
             self.reply(403, "application/json", b'{"error": "give the token"}')
             return False
