@@ -91,7 +91,8 @@ def measure(
         _pin(dive, note, found)
     if csv is not None:
         write_csv(csv, found.rows())
-    typer.echo(json.dumps(found.to_json()) if as_json else _in_words(found, units.value))
+    unit: LengthUnit = "feet" if units is Units.feet else "metres"
+    typer.echo(json.dumps(found.to_json()) if as_json else _in_words(found, unit))
 
 
 def _between(
