@@ -17,6 +17,7 @@ from aquaflow.errors import InputError
 if TYPE_CHECKING:
     from aquaflow.measure.answers import Answer
     from aquaflow.measure.reef_numbers import ReefNumbers
+    from aquaflow.measure.units import LengthUnit
 
 
 class Shape(str, Enum):
@@ -25,6 +26,13 @@ class Shape(str, Enum):
     line = "line"
     area = "area"
     profile = "profile"
+
+
+class Units(str, Enum):
+    """What lengths are printed in."""
+
+    metres = "metres"
+    feet = "feet"
 
 
 MAP_FILE = "map.aqf"
@@ -63,6 +71,9 @@ def measure(
         list[str] | None,
         typer.Option(help="Key of a note to remove, as --notes lists it; once for each."),
     ] = None,
+    units: Annotated[
+        Units, typer.Option(help="Of what is printed; files and --json are in metres.")
+    ] = Units.metres,
     as_json: Json = False,
 ) -> None:
     """Measure in a finished dive: the ground in numbers, or between points; or tend its notes."""
@@ -91,7 +102,8 @@ def measure(
         _pin(dive, note, found)
     if csv is not None:
         write_csv(csv, found.rows())
-    typer.echo(json.dumps(found.to_json()) if as_json else _in_words(found))
+    unit: LengthUnit = "feet" if units is Units.feet else "metres"
+    typer.echo(json.dumps(found.to_json()) if as_json else _in_words(found, unit))
 
 
 def _with_map(dive: Path) -> Path:
@@ -145,29 +157,38 @@ def _pin(dive: Path, text: str, found: Any) -> None:
     write_notes(dive, [*notes, note], frame)
 
 
-def _in_words(found: Any) -> str:
+def _in_words(found: Any, unit: LengthUnit) -> str:
     """Lines for people; of an answer or of reef numbers."""
+    from aquaflow.measure.quantity import Quantity
+    from aquaflow.measure.units import as_read
+
+    def read(length: float, of: str) -> Quantity:
+        return as_read(Quantity(length, 0.0, length, length, of), unit)
+
     if hasattr(found, "quantities"):
         named = [(name.replace("_", " "), q) for name, q in found.quantities.items()]
         said = list(found.notes)
         if found.profile is not None:
-            ends = f"{found.profile.height.min():.3f} to {found.profile.height.max():.3f}"
+            heights = found.profile.height
+            low, high = (read(float(h), found.profile.unit) for h in (heights.min(), heights.max()))
             said.append(
-                f"{len(found.profile.along)} heights from {ends} {found.profile.unit}; --csv or "
-                "--json gives them all."
+                f"{len(heights)} heights from {low.value:.3f} to {high.value:.3f} {low.unit}; "
+                "--csv or --json gives them all."
             )
     else:
         named = [(each.label, each.quantity) for each in found.numbers]
         said = [f"{what}: unknown, {why}." for what, why in found.missing.items()]
         if found.cell is not None:
+            cell = read(found.cell, found.unit)
             said.append(
-                f"On cells of {found.cell:g} {found.unit}; vertical is {found.vertical}. Other "
+                f"On cells of {cell.value:.4g} {cell.unit}; vertical is {found.vertical}. Other "
                 "cells have other numbers: compare dives on the same --cell."
             )
         if found.unit != "m":
             said.append(
                 "The dive has no metres: lengths are in map units; aquaflow scale gives it some."
             )
+    named = [(name, as_read(q, unit)) for name, q in named]
     width = max((len(name) for name, _ in named), default=0)
     lines = [
         f"{name:<{width}}  {q.in_words()}  (95 %: {q.low:.4g} to {q.high:.4g})" for name, q in named

@@ -9,15 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aquaflow.cli.console import Json
+from aquaflow.cli.console import Json, progress_bars
 
 if TYPE_CHECKING:
     from aquaflow.fusion.known_lengths.known_length import KnownLength
 
 RESCALED = (
     "The dive is in metres now: trajectory.tum, trajectory.csv, map.ply, map_clear.ply, "
-    "medium.json, metrics.json, metric.json, coverage.*, the notes and the ranges of heldout/. "
-    "report.html still shows map units; `aquaflow report` does not."
+    "medium.json, metrics.json, metric.json, coverage.*, the notes and the ranges of heldout/; "
+    "reef_numbers.* were measured anew. report.html still shows map units; `aquaflow report` does "
+    "not."
 )
 RULER_SIGMA_M = 0.001
 """1 sigma of a length measured with a ruler."""
@@ -46,7 +47,8 @@ def scale(
 
     read_known_lengths(dive)  # a damaged file is found before the map is drawn
     known = _measured(dive, frame, _numbers("--from", start), _numbers("--to", end), length, sigma)
-    marked = keep_length(dive, known)
+    with progress_bars(quiet=as_json) as bars:
+        marked = keep_length(dive, known, bars)
     together, unchanged = marked.together, marked.unchanged
     if as_json:
         said = {

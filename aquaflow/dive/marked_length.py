@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from aquaflow.dive.rescaling import rescale, why_not
+from aquaflow.errors import InputError
 from aquaflow.fusion.known_lengths.known_length import KnownLength, LengthScale, scale_of
 from aquaflow.fusion.known_lengths.known_lengths_file import (
     read_known_lengths,
     with_length,
     write_known_lengths,
 )
-from aquaflow.fusion.metric_file import read_metric_file
+from aquaflow.fusion.metric_file import read_main, read_metric_file
+from aquaflow.measure.reef_files import CSV, JSON, write_reef_numbers
+
+Progress = Callable[[str, int, int], None]
+"""Called with what is done, how much of it, and how much there is."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +43,10 @@ class Marked:
         return said
 
 
-def keep_length(dive: Path, known: KnownLength) -> Marked:
+def keep_length(dive: Path, known: KnownLength, progress: Progress | None = None) -> Marked:
     """Write ``known`` into the dive, and rescale its files where nothing speaks against it.
+
+    The ground is measured anew then: on cells of so many centimetres, as other dives are.
 
     Raises:
         InputError: a file of the dive cannot be read or written.
@@ -50,7 +59,25 @@ def keep_length(dive: Path, known: KnownLength) -> Marked:
     unchanged = why_not(read_metric_file(dive).get(known.sub_map), together)
     if unchanged is None:
         rescale(dive, known.sub_map, members, together)
+        if known.sub_map == read_main(dive):
+            _measure_anew(dive, progress)
     return Marked(known, together, unchanged)
+
+
+def _measure_anew(dive: Path, progress: Progress | None) -> None:
+    """The dive's reef numbers in its new unit; none where it had none, or cannot be measured."""
+    if not (dive / JSON).is_file():
+        return
+    from aquaflow.measure.finished_dive import numbers_of_dive  # loads torch
+
+    # Those in another unit would contradict the rest of the folder.
+    for name in (JSON, CSV):
+        (dive / name).unlink(missing_ok=True)
+    try:
+        with tempfile.TemporaryDirectory() as work:
+            write_reef_numbers(dive, numbers_of_dive(dive, Path(work), progress=progress))
+    except InputError:
+        return  # aquaflow measure says why
 
 
 def _plus_minus(metres: float, relative_sigma: float) -> str:

@@ -113,7 +113,7 @@ def _medium(dive: Path, frame: MetricFrame) -> MediumCurves | None:
 
 
 def _reef(path: Path, frame: MetricFrame) -> list[ReefRow]:
-    """Empty where they were measured in map units, before ``aquaflow scale`` knew metres."""
+    """Empty where there are none, or in another unit than the rest of the dive."""
     if not path.is_file():
         return []
     content = _json(path)

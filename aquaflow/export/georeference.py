@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.export.utm_grid import UtmGrid
 from aquaflow.fusion.metric_frame import MetricFrame, Origin
 from aquaflow.geometry.earth import latitude_longitude
 
 Array = npt.NDArray[np.float64]
 
 GEOREFERENCE = "georeference.json"
-LATITUDES_OF_UTM = (-80.0, 84.0)
-"""Degrees; beyond, maps are polar stereographic."""
 
 
 def to_geodetic(
@@ -29,23 +28,6 @@ def to_geodetic(
 ) -> tuple[Array, Array]:
     """Latitude [N] and longitude [N], degrees, WGS 84."""
     return latitude_longitude(points_n, (origin.latitude_deg, origin.longitude_deg))
-
-
-def utm_epsg(latitude_deg: float, longitude_deg: float) -> int | None:
-    """EPSG code of the UTM zone (WGS 84) of a place; None near the poles.
-
-    South-west Norway belongs to zone 32, and Svalbard has four wide zones.
-    """
-    low, high = LATITUDES_OF_UTM
-    if not low <= latitude_deg <= high:
-        return None
-    longitude = (longitude_deg + 180.0) % 360.0 - 180.0
-    zone = int((longitude + 180.0) // 6.0) + 1
-    if 56.0 <= latitude_deg < 64.0 and 3.0 <= longitude < 12.0:
-        zone = 32
-    elif latitude_deg >= 72.0 and 0.0 <= longitude < 42.0:
-        zone = 31 + 2 * int((longitude + 3.0) // 12.0)
-    return (32600 if latitude_deg >= 0.0 else 32700) + zone
 
 
 def georeference(frames: Mapping[int, MetricFrame], main: int) -> dict[str, Any] | None:
@@ -81,19 +63,19 @@ def georeference(frames: Mapping[int, MetricFrame], main: int) -> dict[str, Any]
 
 def _utm(origin: Origin) -> dict[str, Any] | None:
     """The origin on the grid, and how the grid's north differs from the true one there."""
-    epsg = utm_epsg(origin.latitude_deg, origin.longitude_deg)
-    if epsg is None:
+    grid = UtmGrid.of(origin)
+    if grid is None:
         return None
     from pyproj import Proj
 
-    grid = Proj(f"EPSG:{epsg}")
-    easting, northing = grid(origin.longitude_deg, origin.latitude_deg)
-    factors = grid.get_factors(origin.longitude_deg, origin.latitude_deg)
+    easting, northing = grid.places(np.zeros((1, 3)))[0].tolist()
+    epsg = grid.epsg
+    factors = Proj(f"EPSG:{epsg}").get_factors(origin.longitude_deg, origin.latitude_deg)
     return {
         "epsg": epsg,
         "zone": f"{epsg % 100}{'N' if epsg < 32700 else 'S'}",
-        "easting_m": float(easting),
-        "northing_m": float(northing),
+        "easting_m": easting,
+        "northing_m": northing,
         "convergence_deg": float(factors.meridian_convergence),
         "convergence": "grid bearing = true bearing - convergence_deg; nothing here is turned",
         "scale_factor": float(factors.meridional_scale),

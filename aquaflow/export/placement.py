@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.export.georeference import to_geodetic, utm_epsg
-from aquaflow.fusion.metric_frame import MetricFrame, Origin
+from aquaflow.export.utm_grid import UtmGrid, grid_of
+from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3
 
 Array = npt.NDArray[np.float64]
@@ -34,10 +34,13 @@ class Placement:
     """``m`` or ``map units``."""
     axes: str
     """The upright frame in words."""
-    origin: Origin | None = None
-    """Of n, where every point has a latitude and a longitude; else None."""
-    epsg: int | None = None
-    """Of the UTM zone of the origin; None where there is no origin, and near the poles."""
+    grid: UtmGrid | None = None
+    """Where the points are laid on one."""
+
+    @property
+    def epsg(self) -> int | None:
+        """Of the grid; None where there is none."""
+        return None if self.grid is None else self.grid.epsg
 
     def on_grid(
         self,
@@ -45,39 +48,25 @@ class Placement:
     ) -> Array:
         """[N, 3] easting, northing and height (m) in the UTM zone; unchanged where there is none.
 
-        The height is that above z = 0 of n. The UTM zone is that of the origin, for all points.
+        The height is that above z = 0 of n.
         """
-        if self.origin is None or self.epsg is None:
+        if self.grid is None:
             return points_u
-        from pyproj import Proj
-
-        latitude, longitude = to_geodetic(self.origin, self.T_un.inverse().apply(points_u))
-        easting, northing = Proj(f"EPSG:{self.epsg}")(longitude, latitude)
-        return np.stack([easting, northing, points_u[:, 2]], axis=1)
+        places = self.grid.places(self.T_un.inverse().apply(points_u))
+        return np.column_stack([places, points_u[:, 2]])
 
     def turned_to_grid(
         self,
         directions_u: Array,  # [N, 3] upright frame
     ) -> Array:
         """[N, 3] the same directions against the grid's north in place of the true one."""
-        if self.origin is None or self.epsg is None:
+        if self.grid is None:
             return directions_u
-        from pyproj import Proj
-
-        place = (self.origin.longitude_deg, self.origin.latitude_deg)
-        factors = Proj(f"EPSG:{self.epsg}").get_factors(*place)
-        angle = np.radians(factors.meridian_convergence)
-        c, s = np.cos(angle), np.sin(angle)
-        R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        return np.asarray(directions_u @ R.T)
+        return np.asarray(directions_u @ self.grid.axes(np.zeros(3))[0].T)
 
     def wkt(self) -> str | None:
         """The grid's coordinate reference system in OGC WKT 1, as LAS 1.4 demands; or None."""
-        if self.epsg is None:
-            return None
-        from pyproj import CRS
-
-        return str(CRS.from_epsg(self.epsg).to_wkt("WKT1_GDAL"))
+        return None if self.grid is None else self.grid.wkt()
 
     def in_words(self) -> str:
         """Axes, unit and grid of exported points, in one line."""
@@ -95,7 +84,4 @@ def placement(frame: MetricFrame) -> Placement:
     else:
         R, axes = UPRIGHT_FROM_DOWN, f"y {frame.north}, x to the right of it, z up"
     T_un = Sim3(R, np.zeros(3), 1.0)
-    if not frame.georeferenced or frame.origin is None:
-        return Placement(T_un, frame.unit, axes)
-    epsg = utm_epsg(frame.origin.latitude_deg, frame.origin.longitude_deg)
-    return Placement(T_un, frame.unit, axes, frame.origin, epsg)
+    return Placement(T_un, frame.unit, axes, grid_of(frame))

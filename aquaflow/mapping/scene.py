@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -26,6 +27,10 @@ from aquaflow.mapping.water.shading import TERMS, gain_map
 from aquaflow.mapping.water.sunlight import Sunlight
 from aquaflow.mapping.water.white_balance import Recovered, WhiteBalance
 from aquaflow.render.contract import Renderer
+
+MOST_DISTANCES = 1 << 22
+"""Between Gaussians and cameras at a time: 16 MB. Half a million Gaussians and 5,000 views at once
+would be 10 GB."""
 
 
 class Scene:
@@ -168,7 +173,11 @@ class Scene:
     def nearest_cameras(self, views: Sequence[View]) -> tuple[Tensor, Tensor, Tensor]:
         """Of the camera nearest to each Gaussian: centre [N, 3], distance [N], number [N]."""
         centres = pose_in(np.stack([view.T_wc.t for view in views]), self.device)
-        z, which = torch.cdist(self.gaussians.means, centres).min(dim=1)
+        means = self.gaussians.means
+        # Parts of one size: a product with a single row would be rounded otherwise.
+        parts = means.tensor_split(max(1, math.ceil(len(means) * len(views) / MOST_DISTANCES)))
+        nearest = [torch.cdist(part, centres).min(dim=1) for part in parts]
+        z, which = (torch.cat([each[k] for each in nearest]) for k in range(2))
         return centres[which], z, which
 
     @contextmanager

@@ -11,10 +11,15 @@ import numpy as np
 import pytest
 
 from aquaflow.coverage.coverage_file import read_coverage_file
+from aquaflow.dive.marked_length import keep_length
+from aquaflow.dive.report_of_folder import report_of_folder
+from aquaflow.errors import InputError
 from aquaflow.export.ply import read_ply
 from aquaflow.export.trajectory_csv import read_trajectory_csv
+from aquaflow.fusion.known_lengths.known_length import KnownLength
 from aquaflow.fusion.metric_file import read_metric_file, write_metric_file
 from aquaflow.fusion.metric_frame import MetricFrame
+from aquaflow.measure import finished_dive
 from aquaflow.measure.notes import Note, read_notes, write_notes
 from tests.command_line import Cli, refused
 from tests.metric_scenes import metric_frame
@@ -87,6 +92,36 @@ def test_a_length_that_is_marked_anew_replaces_the_scale(dive: Path, command: Cl
     assert said["rescaled"]
     assert_scaled(dive, before, said["all_metres_per_unit"])
     assert said["all_metres_per_unit"] == pytest.approx(3.1, abs=0.05)
+
+
+def test_the_ground_is_measured_anew_in_metres_and_in_the_report(dive: Path, command: Cli) -> None:
+    ran = command("scale", dive, *LENGTH)
+    assert ran.code == 0, ran.err
+    content = json.loads((dive / "reef_numbers.json").read_text())
+    assert content["unit"] == "m"
+    rows = [r for r in read_trajectory_csv(dive / "trajectory.csv") if r.sub_map == 0]
+    way = np.linalg.norm(np.diff([(r.x, r.y, r.z) for r in rows], axis=0), axis=1).sum()
+    path = content["numbers"]["path_length"]
+    assert path["value"] == pytest.approx(way, rel=1e-3)
+    scale_sigma = read_metric_file(dive)[0].scale_sigma
+    assert path["high_95"] - path["value"] == pytest.approx(1.96 * scale_sigma * way, rel=0.01)
+    assert "m\u00b2" in (dive / "reef_numbers.csv").read_text()
+    shown = {row.label: row.value for row in report_of_folder(dive).reef}
+    assert shown["length of the path"].endswith(" m")
+    assert shown["surveyed area"].endswith(" m\u00b2")
+
+
+def test_numbers_of_the_ground_that_cannot_be_measured_anew_are_taken_away(
+    dive: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise InputError("no two views of the dive see the same ground")
+
+    monkeypatch.setattr(finished_dive, "numbers_of_dive", fails)
+    known = KnownLength(-1, "ruler", 0.5, 0.005, 1.5, 0.001, 0)
+    assert keep_length(dive, known).unchanged is None
+    assert not list(dive.glob("reef_numbers.*"))
+    assert report_of_folder(dive).reef == []
 
 
 def test_notes_stay_where_they_are_in_the_map(dive: Path, command: Cli) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aquaflow.export.georeference import georeference, to_geodetic, utm_epsg
+from aquaflow.export.georeference import georeference, to_geodetic
+from aquaflow.export.utm_grid import utm_epsg
 from aquaflow.fusion.metric_frame import MetricFrame, Origin
 from tests.metric_scenes import TRONDHEIM, metric_frame
 

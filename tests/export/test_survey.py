@@ -96,6 +96,31 @@ def test_heights_and_places_are_those_of_the_ground(dive: Path, tmp_path: Path) 
     assert tags(tmp_path / "dem.tif")["HEIGHT_ZERO"] == "the water surface"
 
 
+def test_stated_heights_hold_the_truth_and_are_wider_where_the_map_is_rough(
+    local_dive: Path, tmp_path: Path
+) -> None:
+    frame = metric_frame(**LOCAL)
+    rough = surveyed(frame)
+    means = rough.scene.gaussians.parameters["means"]
+    down = torch.from_numpy(frame.T_nm.inverse().R[:, 2] * (0.03 / frame.T_nm.scale))
+    noise = torch.randn(len(means), 1, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        means += (noise * down).to(means.dtype)
+    north, east = ground_points()
+    sigmas = []
+    for number, dive in enumerate((local_dive, write_survey(tmp_path / "dive", rough, frame))):
+        export_survey(dive, tmp_path / str(number), "dem")
+        bands, dataset = read(tmp_path / str(number) / "dem.tif")
+        found, sigma = (at(band, dataset, np.column_stack([east, north])) for band in bands[:2])
+        if dive == local_dive:
+            error = np.abs(found - (height(north, east) - DEPTH_M))
+            assert (error < 1.96 * sigma).mean() > 0.95
+        sigmas.append(float(np.median(sigma)))
+    # Half a pixel of a view is 7 mm of ground, which the angles of this survey make 10.
+    assert sigmas[0] == pytest.approx(0.010, abs=0.002)
+    assert sigmas[1] > 1.5 * sigmas[0]
+
+
 def test_colours_lie_where_the_ground_has_them(dive: Path, tmp_path: Path) -> None:
     export_survey(dive, tmp_path, "ortho")
     bands, dataset = read(tmp_path / "ortho.tif")

@@ -8,6 +8,8 @@ import torch
 
 from aquaflow.config import MediumConfig
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.mapping import scene as scene_module
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.scene_water import rebalance
 from tests.mapping.mapping_scenes import (
@@ -210,3 +212,29 @@ def test_a_scene_without_water_has_no_balance_to_mend() -> None:
     dry = scene()
     rebalance(dry)
     assert dry.balance is None
+
+
+@pytest.mark.parametrize("most", [2, 7, 50])
+def test_nearest_cameras_are_the_same_bits_in_parts_as_at_once(
+    most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ready, (first, *_) = submerged()
+    places = np.random.default_rng(0).normal(size=(30, 3))
+    views = [first.with_pixels(first.image, first.camera, None) for _ in places]
+    for view, place in zip(views, places, strict=True):
+        view.T_wc = Sim3(np.eye(3), place)
+    at_once = ready.nearest_cameras(views)
+    # Every part has two Gaussians at least.
+    monkeypatch.setattr(scene_module, "MOST_DISTANCES", 2 * most * len(views))
+    asked = []
+    cdist = torch.cdist
+
+    def counted(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+        asked.append(len(a) * len(b))
+        return cdist(a, b)
+
+    monkeypatch.setattr(torch, "cdist", counted)
+    in_parts = ready.nearest_cameras(views)
+    assert all(torch.equal(a, b) for a, b in zip(at_once, in_parts, strict=True))
+    assert max(asked) <= 2 * most * len(views)
+    assert len(asked) > 1

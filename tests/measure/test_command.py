@@ -63,6 +63,22 @@ def test_two_points_are_a_distance(typed: Any, dive: Path, command: Cli) -> None
     assert said["unit"] == "m"
 
 
+def test_feet_are_printed_and_files_stay_in_metres(
+    dive: Path, command: Cli, tmp_path: Path
+) -> None:
+    points, table = in_map(ground_n(CORNERS[:2])), tmp_path / "line.csv"
+    said = asked(command, dive, *points, "--units", "feet")["measured"]["length"]
+    assert said["unit"] == "m"
+    ran = command("measure", dive, *points, "--units", "feet", "--csv", table)
+    assert ran.code == 0, ran.err
+    shown = re.search(r"length +([\d.]+) .* ft ", ran.out)
+    assert shown is not None
+    assert float(shown[1]) == pytest.approx(said["value"] / 0.3048, rel=0.01)
+    assert ",m" in table.read_text()
+    profile = command("measure", dive, *points, "--as", "profile", "--units", "feet").out
+    assert re.search(r"heights from -3\d\.\d+ to -3\d\.\d+ ft", profile)
+
+
 def test_a_pixel_is_where_its_ray_meets_the_map(dive: Path, command: Cli) -> None:
     """The cameras look straight down with north on top, 2 m above the ground."""
     said = asked(command, dive, "--point", "5:80,60", "--point", "10:80,60")

@@ -15,8 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.errors import InputError
-from aquaflow.export.georeference import to_geodetic, utm_epsg
-from aquaflow.fusion.metric_frame import MetricFrame, Origin
+from aquaflow.export.placement import UPRIGHT_FROM_DOWN
+from aquaflow.export.utm_grid import grid_of
+from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3, nearest_rotation
 
 if TYPE_CHECKING:
@@ -24,9 +25,6 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 
-BASE_M = 100.0
-"""Length over which north and the scale of the UTM grid are measured. Taken as the same over the
-dive, which 1 km from its middle is wrong by 3 mm in the scale and by less in the turn."""
 LEAST_VIEWS = 2
 """That see a pixel, or it is a hole: what one view alone sees has no parallax. On the surveys 1 and
 7 it is smears along the rim, whose heights are guesses."""
@@ -70,45 +68,20 @@ def ground_of(frame: MetricFrame, views: Sequence[View]) -> Ground:
     middle = np.mean([T_nc.t for T_nc in poses], axis=0)
     epsg, corner, grid_scale = None, (0.0, 0.0), 1.0
     if frame.level:
-        north = np.array([0.0, 1.0])
-        if frame.georeferenced and frame.origin is not None:
-            epsg = utm_epsg(frame.origin.latitude_deg, frame.origin.longitude_deg)
-        if epsg is not None and frame.origin is not None:
-            place, step = _on_grid(epsg, frame.origin, middle)
-            grid_scale = float(np.hypot(*step))
-            north = step / grid_scale
-        R_gn = _level(north)
-        if epsg is not None:
+        R_gn, vertical = UPRIGHT_FROM_DOWN, "along gravity"
+        grid = grid_of(frame)
+        if grid is not None:
+            epsg = grid.epsg
+            turn, grid_scale = grid.axes(middle)
+            R_gn = turn @ UPRIGHT_FROM_DOWN
+            place = grid.places(middle[None])[0]
             corner = tuple((place - grid_scale * (R_gn @ middle)[:2]).tolist())
-        vertical = "along gravity"
     else:
         R_gn, vertical = _below_views(poses), "against the mean viewing direction of the cameras"
     return Ground(
         Sim3(R_gn, np.zeros(3)) @ frame.T_nm, frame.unit, epsg, corner, grid_scale,
         _axes_in_words(frame, epsg), vertical, _zero_in_words(frame),
     )  # fmt: skip
-
-
-def _level(
-    north: Array,  # [2] unit: where x of n points to in the raster
-) -> Array:
-    """R_gn [3, 3] of a frame n whose z points down."""
-    x, y = north
-    return np.array([[x, y, 0.0], [y, -x, 0.0], [0.0, 0.0, -1.0]])
-
-
-def _on_grid(
-    epsg: int,
-    origin: Origin,
-    point_n: Array,  # [3] m, n
-) -> tuple[Array, Array]:
-    """Easting and northing [2] of a point of n, and how they change with each metre along its x."""
-    from pyproj import Proj
-
-    half = 0.5 * BASE_M * np.array([1.0, 0.0, 0.0])
-    latitude, longitude = to_geodetic(origin, np.array([point_n, point_n - half, point_n + half]))
-    places = np.column_stack(Proj(f"EPSG:{epsg}")(longitude, latitude))
-    return places[0], (places[2] - places[1]) / BASE_M
 
 
 def _below_views(poses: Sequence[Sim3]) -> Array:
