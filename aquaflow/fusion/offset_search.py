@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
-from scipy.signal import correlate, find_peaks
 
 from aquaflow.fusion.turns import Turns
 from aquaflow.geometry.similarity import nearest_rotation
@@ -85,6 +84,8 @@ class Peak:
 
 def peaks(camera: Cells, body: Cells, R_cb: Array | None) -> list[Peak]:  # [3, 3]
     """The best offset and its rivals, best first; empty where none explains anything."""
+    from scipy.signal import find_peaks  # half a second, for the dives that have logs
+
     explained, H, offsets_s = explained_at_all_offsets(camera, body, R_cb)
     if not len(explained) or not np.isfinite(explained).any() or explained.max() <= 0.0:
         return []
@@ -106,6 +107,8 @@ def explained_at_all_offsets(
     R_cb: Array | None,  # [3, 3]
 ) -> tuple[Array, Array, Array]:
     """Share explained [L] (-inf where the overlap is short), H [L, 3, 3], offsets [L] in s."""
+    from scipy.signal import correlate
+
     v, g, mv, mg = camera.rate_rad_s, body.rate_rad_s, camera.measured, body.measured
 
     def sums(a: Array, b: Array) -> Array:  # [Nv] and [Ng]

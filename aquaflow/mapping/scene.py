@@ -112,15 +112,19 @@ class Scene:
         learn: bool = False,
         active: Tensor | None = None,  # [rows, columns] bool, the tiles to draw
     ) -> Shown:
-        """The scene from ``view``; differentiable in what is given, and in the medium.
+        """The scene from ``view``; differentiable in what is given.
 
-        ``parameters`` are decoded ones, where there is a decoder. With ``learn``, the view's
+        ``parameters`` are decoded ones, where there is a decoder. With ``learn`` it is
+        differentiable in the medium too (where that is directional: in any case), and the view's
         exposure and its light are set from its picture in passing.
         """
         viewmat = view.viewmat() if viewmat is None else viewmat
         if parameters is None:
             parameters = self.seen_from(view, viewmat)
-        water, gain, uneven = self.water(view), self.gain(view), self.uneven(view)
+        water_learns = learn or self.medium.directional  # no fit finds what orientation does
+        with torch.set_grad_enabled(water_learns and torch.is_grad_enabled()):
+            water = self.water(view)
+        gain, uneven = self.gain(view), self.uneven(view)
         shown = show(parameters, water, gain, self.renderer, view, viewmat, active, uneven)
         if learn:
             self._learn_light(view, shown)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from aquaflow.geometry.lens_error import LENS_PRIOR_SIGMA, TERMS
 from aquaflow.keyframes import Keyframe
@@ -155,7 +155,7 @@ def _chance(
     off = error - within
     squared = np.einsum("ni,ij,nj->n", off, np.linalg.inv(covariance), off).min()
     freedom = clusters - 2
-    return float(f_distribution.sf(squared * freedom / (2.0 * (clusters - 1)), 2, freedom))
+    return float(fdtrc(2, freedom, squared * freedom / (2.0 * (clusters - 1))))
 
 
 def most_turning(keyframes: Sequence[Keyframe], most: int = MAX_VIEWS) -> list[Keyframe]:

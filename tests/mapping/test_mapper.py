@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from aquaflow.config import MappingConfig
+from aquaflow.config import MappingConfig, OptimiserConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.mapping.mapper import Mapper
 from tests.mapping.mapping_scenes import (
@@ -160,6 +160,16 @@ def test_a_bad_gradient_of_the_medium_costs_the_mediums_step_only() -> None:
     for name in mapper.medium.state_dict():
         assert torch.equal(before[name], after[name]), name
     assert not torch.equal(before["raw_colours"], after["raw_colours"])
+
+
+def test_the_water_learns_from_full_looks_alone() -> None:
+    mapper, learned = grown(WET), list[int]()
+    view = mapper.views[0]
+    view.looks = 0
+    mapper.medium.b_raw.register_hook(lambda _: learned.append(view.looks))
+    for _ in range(2 * OptimiserConfig().full_look_every):
+        mapper.optimiser.step(view, refine_pose=False)
+    assert len(learned) == 2
 
 
 # --- pruning --------------------------------------------------------------------------------------

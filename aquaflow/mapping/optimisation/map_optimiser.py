@@ -87,7 +87,7 @@ class MapOptimiser:
             return
         neural = self.scene.neural
         seen = leaves if neural is None else neural.decode(view, leaves, viewmat)
-        # A view's light hardly changes from step to step: full looks are enough to follow it.
+        # Water and a view's light hardly change from step to step: full looks follow them.
         learn = is_full_look(view, config)
         shown = self.scene.draw(view, seen, viewmat, learn, active)
         record_explained(view, shown.image, self.config.optimiser)
@@ -112,7 +112,7 @@ class MapOptimiser:
 
     def _step_medium(self, view: View) -> None:
         medium = self.scene.medium
-        if not medium.active:
+        if all(tensor.grad is None for tensor in self.medium_adam.tensors):
             return
         norm = torch.nn.utils.clip_grad_norm_(medium.parameters(), self.config.medium.max_gradient)
         if not is_number(norm):
