@@ -53,5 +53,9 @@ def of_size(
     height, width = shape
     if flow.shape[:2] == shape:
         return flow
-    growth = np.array([width / flow.shape[1], height / flow.shape[0]], np.float32)
-    return np.asarray(cv2.resize(flow, (width, height)) * growth, dtype=np.float32)
+    # OpenCV's, for NumPy takes four times as long over an axis of two.
+    growth = np.diag([width / flow.shape[1], height / flow.shape[0]])
+    if flow.size < 2 * width * height:
+        flow = np.asarray(cv2.transform(flow, growth), dtype=np.float32)
+        return np.asarray(cv2.resize(flow, (width, height)), dtype=np.float32)
+    return np.asarray(cv2.transform(cv2.resize(flow, (width, height)), growth), dtype=np.float32)
