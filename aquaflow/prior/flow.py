@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.prior.backward_flow import backward_flow, reverse
-from aquaflow.prior.fields import halved, length, of_size, pixel_grid, sample
+from aquaflow.prior.fields import half_by_area, halved, length, of_size, pixel_grid, sample
 from aquaflow.prior.refinement import is_refinable, refine
 from aquaflow.render.library import library_or_none
 
@@ -234,9 +234,10 @@ class FlowMatcher:
         start: Float,  # [H, W, 2] px, a to b
     ) -> Float:
         """DIS down to a quarter of the size, fitted at half of it."""
-        half_a, half_b = small_a, small_b = halved(a), halved(b)
-        for _ in range(QUARTER_SCALE - 1):
-            small_a, small_b = halved(small_a), halved(small_b)
+        half_a, half_b = halved(a), halved(b)
+        small_a, small_b = a, b
+        for _ in range(QUARTER_SCALE):
+            small_a, small_b = half_by_area(small_a), half_by_area(small_b)
         initial = np.array(of_size(start, small_a.shape), dtype=np.float32, order="C")
         flow = np.asarray(self._coarse.calc(small_a, small_b, initial), dtype=np.float32)
         flow = of_size(flow, half_a.shape)
