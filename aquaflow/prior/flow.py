@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.prior.backward_flow import backward_flow, reverse
-from aquaflow.prior.fields import halved, length, of_size, pixel_grid, sample
+from aquaflow.prior.fields import half_by_area, halved, length, of_size, pixel_grid, sample
 from aquaflow.prior.refinement import is_refinable, refine
 from aquaflow.render.library import library_or_none
 
@@ -50,9 +50,9 @@ MIN_TEXTURE = 30.0
 """Smoothed squared Sobel gradient of the normalised grey image below which flow only guesses."""
 
 QUARTER_SCALE = 2
-"""DIS stops at this halving where the last matches are known; its matches are then fitted at
-half and at all of the size. To half the size DIS costs three times as much, and trajectories are no
-more accurate (docs/measurements.md#seeded)."""
+"""DIS is given pictures halved so often where the last matches are known; its matches are then
+fitted at half and at all of the size. To half the size DIS costs three times as much, and
+trajectories are no more accurate (docs/measurements.md#seeded)."""
 
 HALF_SIZE_FITS = 2
 """Times that such a flow is fitted at half the size: once, trajectories err by a quarter more."""
@@ -77,7 +77,7 @@ class Flow:
     @property
     def share(self) -> float:
         """Part of the picture that is matched."""
-        return float(self.valid.mean())
+        return int(np.count_nonzero(self.valid)) / self.valid.size
 
 
 def normalised_grey(
@@ -127,11 +127,15 @@ def confidence(
     The mean around a pixel is the flow itself where that is affine, however much it turns or grows.
     """
     window = (EDGE_WINDOW_PX, EDGE_WINDOW_PX)
-    departure = flow.forward - cv2.blur(flow.forward, window)
-    size = np.sqrt(departure[..., 0] ** 2 + departure[..., 1] ** 2)
-    edge = cv2.dilate(size, np.ones(window, np.uint8)) * (EDGE_WEIGHT / CONFIDENCE_SIGMA_PX)
-    certain = np.exp(-0.5 * (flow.error / CONFIDENCE_SIGMA_PX) ** 2) / (1.0 + edge * edge)
-    return np.where(flow.valid, certain, 0.0).astype(np.float32)
+    # In OpenCV's vectors, and no [H, W, 2] in NumPy: half the time.
+    size = cv2.magnitude(*cv2.split(flow.forward - cv2.blur(flow.forward, window)))
+    edge = cv2.dilate(size, np.ones(window, np.uint8)) * np.float32(
+        EDGE_WEIGHT / CONFIDENCE_SIGMA_PX
+    )
+    certain = np.asarray(
+        cv2.exp(flow.error * flow.error * np.float32(-0.5 / CONFIDENCE_SIGMA_PX**2))
+    )
+    return np.asarray(certain * flow.valid / (1.0 + edge * edge), dtype=np.float32)
 
 
 def check(
@@ -189,7 +193,7 @@ class FlowMatcher:
         self._unseeded: Any = cv2.DISOpticalFlow.create(cv2.DISOpticalFlow_PRESET_MEDIUM)
         self._seeded: Any = cv2.DISOpticalFlow.create(cv2.DISOpticalFlow_PRESET_MEDIUM)
         self._coarse: Any = cv2.DISOpticalFlow.create(cv2.DISOpticalFlow_PRESET_MEDIUM)
-        self._coarse.setFinestScale(QUARTER_SCALE)
+        self._coarse.setFinestScale(0)  # of pictures that are small already
 
     def __call__(
         self,
@@ -214,8 +218,10 @@ class FlowMatcher:
         quick: bool,
     ) -> tuple[Float, Float]:
         if is_refinable(a):
-            coarse = quick and start is not None and is_refinable(a[::2, ::2])
-            flow = self._from_coarse(a, b, start) if coarse else self._flow(a, b, start)
+            if quick and start is not None and is_refinable(a[::2, ::2]):
+                flow = self._from_coarse(a, b, start)
+            else:
+                flow = self._flow(a, b, start)
             forward = refine(a, b, flow)
             return forward, backward_flow(a, b, forward)
         back = None if start is None else reverse(start)
@@ -225,12 +231,15 @@ class FlowMatcher:
         self,
         a: Grey,  # [H, W]
         b: Grey,  # [H, W]
-        start: Float | None,  # [H, W, 2] px, a to b
+        start: Float,  # [H, W, 2] px, a to b
     ) -> Float:
         """DIS down to a quarter of the size, fitted at half of it."""
-        initial = np.array(start, dtype=np.float32, order="C")
         half_a, half_b = halved(a), halved(b)
-        flow = np.asarray(self._coarse.calc(a, b, initial), dtype=np.float32)
+        small_a, small_b = a, b
+        for _ in range(QUARTER_SCALE):
+            small_a, small_b = half_by_area(small_a), half_by_area(small_b)
+        initial = np.array(of_size(start, small_a.shape), dtype=np.float32, order="C")
+        flow = np.asarray(self._coarse.calc(small_a, small_b, initial), dtype=np.float32)
         flow = of_size(flow, half_a.shape)
         for _ in range(HALF_SIZE_FITS):
             flow = refine(half_a, half_b, flow)

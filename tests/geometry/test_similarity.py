@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
 
 from aquaflow.geometry.similarity import (
     Sim3,
@@ -190,3 +191,16 @@ def test_a_broken_similarity_says_so(broken: Sim3) -> None:
 def test_a_product_holds_no_more_than_its_own_numbers() -> None:
     product = Sim3.identity() @ Sim3(so3_exp(np.array([0.1, 0.2, 0.3])), np.zeros(3), 2.0)
     assert product.R.base is None
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-300, 1e-12, 1e-8, 1e-4, 1.0, np.pi, 6.0])
+def test_a_rotation_vector_turns_as_scipy_has_it(angle: float) -> None:
+    for axis in np.random.default_rng(2).normal(size=(8, 3)):
+        w = angle * axis / np.linalg.norm(axis)
+        expected = Rotation.from_rotvec(w).as_matrix()
+        np.testing.assert_allclose(so3_exp(w), expected, atol=1e-15)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e200])
+def test_a_rotation_vector_that_is_no_number_gives_none(bad: float) -> None:
+    assert np.isnan(so3_exp(np.array([0.1, bad, 0.2]))).all()

@@ -22,25 +22,17 @@ struct RefineFlow {
 
 class FlowRefiner {
  public:
-  // out [H, W, 2]; it may be in.flow.
+  // out [H, W, 2]; it may be in.flow. Every stage goes through the picture once, row by row, and
+  // keeps rows instead of pictures wherever the next stage needs no others.
   void run(const RefineFlow& in, float* out) {
     const size_t count = in.size.count();
-    for (auto* plane :
-         {&u_, &v_, &here_, &there_, &gx_, &gy_, &products_[0], &products_[1], &products_[2],
-          &products_[3], &products_[4], &slope_[0], &slope_[1], &slope_[2], &slope_[3]})
-      plane->resize(count);
-    for (size_t i = 0; i < count; i++) {
-      u_[i] = in.flow[2 * i];
-      v_[i] = in.flow[2 * i + 1];
-      here_[i] = (float)in.a[i];
-    }
+    for (auto* plane : {&u_, &v_, &here_, &there_, &left_, &mean_}) plane->resize(count);
+    for (auto& product : products_) product.resize(count);
+    for (auto& row : rows_) row.resize((size_t)in.size.width);
+    split(in);
     warp(in);
-    normalise_contrast(in, here_);
-    normalise_contrast(in, there_);
+    compare_contrast(in);
     multiply(in.size);
-    for (auto& product : products_) filter_.run(product.data(), in.size, in.window, product.data());
-    gradient(u_.data(), in.size, slope_[0].data(), slope_[1].data());
-    gradient(v_.data(), in.size, slope_[2].data(), slope_[3].data());
     solve(in, out);
   }
 
@@ -115,56 +107,92 @@ class FlowRefiner {
     }
   }
 
-  void normalise_contrast(const RefineFlow& in, Plane& plane) {
-    const size_t count = in.size.count();
-    Plane &mean = products_[0], &square = products_[1];
-    for (size_t i = 0; i < count; i++) square[i] = plane[i] * plane[i];
-    filter_.run(plane.data(), in.size, in.contrast, mean.data());
-    filter_.run(square.data(), in.size, in.contrast, square.data());
+  void split(const RefineFlow& in) {
+    float *u = u_.data(), *v = v_.data(), *here = here_.data();
+    const int count = (int)in.size.count();
+#pragma omp simd
+    for (int i = 0; i < count; i++) {
+      u[i] = in.flow[2 * i];
+      v[i] = in.flow[2 * i + 1];
+      here[i] = (float)in.a[i];
+    }
+  }
+
+  // left_ and mean_: difference and mean of both pictures, each of mean 0 and contrast 1 around
+  // every pixel.
+  void compare_contrast(const RefineFlow& in) {
+    const int width = in.size.width;
+    const float *here = rows_[0].data(), *there = rows_[1].data();
+    for (int y = 0; y < in.size.height; y++) {
+      normalise_row(in, here_.data(), y, rows_[0].data());
+      normalise_row(in, there_.data(), y, rows_[1].data());
+      float *left = left_.data() + (size_t)y * width, *mean = mean_.data() + (size_t)y * width;
+#pragma omp simd
+      for (int x = 0; x < width; x++) {
+        left[x] = here[x] - there[x];
+        mean[x] = 0.5f * (here[x] + there[x]);
+      }
+    }
+  }
+
+  void normalise_row(const RefineFlow& in, const float* plane, int y, float* out) {
+    float *mean = rows_[2].data(), *square = rows_[3].data();
+    filter_.row_and_square(plane, in.size, in.contrast, y, mean, square);
+    const float* value = plane + (size_t)y * in.size.width;
     const float noise = in.grey_noise * in.grey_noise;
-    for (size_t i = 0; i < count; i++) {
-      const float variance = std::max(square[i] - mean[i] * mean[i], 0.0f);
-      plane[i] = (plane[i] - mean[i]) / std::sqrt(variance + noise);
+#pragma omp simd
+    for (int x = 0; x < in.size.width; x++) {
+      const float variance = std::max(square[x] - mean[x] * mean[x], 0.0f);
+      out[x] = (value[x] - mean[x]) / std::sqrt(variance + noise);
     }
   }
 
   // products_: gx gx, gy gy, gx gy, gx e, gy e, with the gradient of both pictures' mean.
   void multiply(Size size) {
-    Plane& mean = products_[0];
-    const size_t count = size.count();
-    for (size_t i = 0; i < count; i++) mean[i] = 0.5f * (here_[i] + there_[i]);
-    gradient(mean.data(), size, gx_.data(), gy_.data());
-    for (size_t i = 0; i < count; i++) {
-      const float x = gx_[i], y = gy_[i], left = here_[i] - there_[i];
-      products_[0][i] = x * x;
-      products_[1][i] = y * y;
-      products_[2][i] = x * y;
-      products_[3][i] = x * left;
-      products_[4][i] = y * left;
+    const int width = size.width;
+    const float *gx = rows_[0].data(), *gy = rows_[1].data();
+    for (int y = 0; y < size.height; y++) {
+      gradient_row(mean_.data(), size, y, rows_[0].data(), rows_[1].data());
+      const size_t first = (size_t)y * width;
+      float *xx = products_[0].data() + first, *yy = products_[1].data() + first,
+            *xy = products_[2].data() + first, *xe = products_[3].data() + first,
+            *ye = products_[4].data() + first;
+      const float* left = left_.data() + first;
+#pragma omp simd
+      for (int x = 0; x < width; x++) {
+        xx[x] = gx[x] * gx[x];
+        yy[x] = gy[x] * gy[x];
+        xy[x] = gx[x] * gy[x];
+        xe[x] = gx[x] * left[x];
+        ye[x] = gy[x] * left[x];
+      }
     }
   }
 
   void solve(const RefineFlow& in, float* out) {
     const int width = in.size.width;
+    const float *u = rows_[9].data(), *v = rows_[10].data();
     for (int y = 0; y < in.size.height; y++) {
-      const size_t first = (size_t)y * width;
-      solve_row(in, first);
-      const float *u = gx_.data() + first, *v = gy_.data() + first;
+      for (int k = 0; k < 5; k++)
+        filter_.row(products_[k].data(), in.size, in.window, y, rows_[k].data());
+      gradient_row(u_.data(), in.size, y, rows_[5].data(), rows_[6].data());
+      gradient_row(v_.data(), in.size, y, rows_[7].data(), rows_[8].data());
+      solve_row(in, (size_t)y * width);
+      float* to = out + 2 * (size_t)y * width;
       for (int x = 0; x < width; x++) {
-        out[2 * (first + x)] = u[x];
-        out[2 * (first + x) + 1] = v[x];
+        to[2 * x] = u[x];
+        to[2 * x + 1] = v[x];
       }
     }
   }
 
-  // gx_ and gy_ become the new flow: into rows of their own, the loop is made of vectors.
+  // The new flow goes into rows of its own: so the loop is made of vectors.
   void solve_row(const RefineFlow& in, size_t first) {
-    const float *xx_ = products_[0].data() + first, *yy_ = products_[1].data() + first,
-                *xy_ = products_[2].data() + first, *xe_ = products_[3].data() + first,
-                *ye_ = products_[4].data() + first, *ux = slope_[0].data() + first,
-                *uy = slope_[1].data() + first, *vx = slope_[2].data() + first,
-                *vy = slope_[3].data() + first, *u = u_.data() + first, *v = v_.data() + first;
-    float *new_u = gx_.data() + first, *new_v = gy_.data() + first;
+    const float *xx_ = rows_[0].data(), *yy_ = rows_[1].data(), *xy_ = rows_[2].data(),
+                *xe_ = rows_[3].data(), *ye_ = rows_[4].data(), *ux = rows_[5].data(),
+                *uy = rows_[6].data(), *vx = rows_[7].data(), *vy = rows_[8].data(),
+                *u = u_.data() + first, *v = v_.data() + first;
+    float *new_u = rows_[9].data(), *new_v = rows_[10].data();
     const float singular = in.singular, most = in.most_step_px;
 #pragma omp simd
     for (int i = 0; i < in.size.width; i++) {
@@ -183,7 +211,7 @@ class FlowRefiner {
     }
   }
 
-  Plane u_, v_, here_, there_, gx_, gy_, products_[5], slope_[4], padded_, weights_[8];
+  Plane u_, v_, here_, there_, left_, mean_, products_[5], padded_, weights_[8], rows_[11];
   std::vector<int> corner_;
   Filter filter_;
 };

@@ -7,6 +7,7 @@ size, so that it costs the same at every resolution.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -25,9 +26,10 @@ SATURATED = 250.0
 """Grey level from which a pixel counts as saturated."""
 LEVEL_NOISE = 12.0**-0.5
 """Standard deviation of rounding to whole grey levels: the least noise of an 8-bit picture."""
-NOISE_MASK = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
-"""Second difference both ways: blind to planes and straight edges (Immerkaer 1996); its response
-to white noise of sigma 1 has the standard deviation 6 and the mean size 6 sqrt(2 / pi)."""
+NOISE_TAPS = np.array([1, -2, 1], np.float32)
+"""Second difference, taken both ways: blind to planes and straight edges (Immerkaer 1996); its
+response to white noise of sigma 1 has the standard deviation 6 and the mean size
+6 sqrt(2 / pi)."""
 NOISE_QUANTILE = 0.1
 """The calmest tiles show the noise, the others texture too."""
 MOTION_SNR = 3.0
@@ -75,16 +77,16 @@ def measure_thumbnail(
         # Half-masked pixels would show the mask's edge, not the scene's.
         scene = (_shrunk(mask.astype(np.float32), size) > 0.99).astype(np.float32)
     seen = scene * (thumbnail < SATURATED)
-    response = np.abs(np.asarray(cv2.filter2D(grey, cv2.CV_32F, NOISE_MASK)))
-    sigma = float(np.quantile(_shrunk(response, TILES), NOISE_QUANTILE)) * np.sqrt(np.pi / 2) / 6
+    response = np.abs(np.asarray(cv2.sepFilter2D(grey, cv2.CV_32F, NOISE_TAPS, NOISE_TAPS)))
+    sigma = float(np.quantile(_tile_means(response), NOISE_QUANTILE)) * np.sqrt(np.pi / 2) / 6
     # Area averaging divides white noise by the shrinking factor.
     noise = max(sigma, LEVEL_NOISE) * small_width / width
 
     gx, gy = _gradients(thumbnail)
-    weight = _shrunk(seen, TILES)
-    energy = _shrunk((gx * gx + gy * gy) * seen, TILES) / np.maximum(weight, 1e-6)
+    weight, energy, of_scene = _tile_means(np.stack([seen, (gx * gx + gy * gy) * seen, scene]))
+    energy = energy / np.maximum(weight, 1e-6)
     snr = np.where(weight > 0.5, np.sqrt(energy) / noise, 0.0).astype(np.float32)
-    unmasked = _shrunk(scene, TILES) > 0.5
+    unmasked = of_scene > 0.5
     usable = float((snr > min_snr)[unmasked].mean()) if unmasked.any() else 0.0
     level = float(thumbnail[scene > 0].mean()) if scene.any() else 0.0
     coarse = (COARSE_CELLS, max(round(size[1] * COARSE_CELLS / size[0]), 2))
@@ -106,8 +108,8 @@ def motion_widths(reference: Thumbnail, thumbnail: Thumbnail, share: float) -> f
     gx, gy = _gradients(0.5 * (old + new))
     d = (new - old) * seen
     gx, gy = gx * seen, gy * seen
-    xx, xy, yy = (_shrunk(product, TILES) for product in (gx * gx, gx * gy, gy * gy))
-    xd, yd, dd = (_shrunk(product, TILES) for product in (gx * d, gy * d, d * d))
+    products = np.stack([gx * gx, gx * gy, gy * gy, gx * d, gy * d, d * d])
+    xx, xy, yy, xd, yd, dd = _tile_means(products)
     textured = (np.minimum(reference.snr, thumbnail.snr) > MOTION_SNR) & (xx + yy > 0)
     if not textured.any():
         return float("inf")
@@ -144,6 +146,30 @@ def _shrunk(
     size: tuple[int, int],  # width, height
 ) -> Float:
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+
+
+def _tile_means(
+    pictures: Float,  # [..., H, W]
+) -> Float:
+    """[..., rows, columns] mean over each tile; several times as fast as ``_shrunk``, which has no
+    vectors for sides that are no whole numbers of pixels."""
+    columns, rows = TILES
+    down, across = (
+        _area_weights(pictures.shape[-2], rows),
+        _area_weights(pictures.shape[-1], columns),
+    )
+    return np.asarray(down @ pictures @ across.T, dtype=np.float32)
+
+
+@lru_cache(maxsize=8)
+def _area_weights(length: int, parts: int) -> Float:
+    """[parts, length] share of each pixel in the mean of each of ``parts`` equal parts."""
+    edges = np.linspace(0.0, length, parts + 1)[:, None]
+    pixels = np.arange(length)
+    overlap = np.minimum(edges[1:], pixels + 1) - np.maximum(edges[:-1], pixels)
+    weights = np.asarray(np.maximum(overlap, 0.0) * (parts / length), dtype=np.float32)
+    weights.setflags(write=False)
+    return weights
 
 
 def _gradients(

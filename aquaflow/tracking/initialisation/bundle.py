@@ -105,9 +105,16 @@ class _System:
         # One match that is no number would cost the whole system.
         self.observed = observed & measured(pixels)
         self.solve_focal = solve_focal
+        self._last: tuple[Bundle, tuple[Array, Array, Array]] | None = None
 
     def residuals(self, bundle: Bundle) -> tuple[Array, Array, Array]:
         """Errors [V, P, 2], camera points Y [V, P, 3] and reference rays [P, 3]."""
+        # A step is taken from where the cost was looked at.
+        if self._last is None or self._last[0] is not bundle:
+            self._last = bundle, self._residuals(bundle)
+        return self._last[1]
+
+    def _residuals(self, bundle: Bundle) -> tuple[Array, Array, Array]:
         rays = bundle.camera.unproject(self.pixels_reference)
         Y = np.stack([rays @ T.R.T + bundle.rho[:, None] * T.t for T in bundle.T])
         error = bundle.camera.project(Y) - self.pixels
@@ -179,9 +186,12 @@ class _System:
         H_cc, H_cp, H_pp, g_c, g_p = self._blocks(bundle)
         pp = H_pp * (1.0 + damping) + 1e-6
         cc = H_cc + damping * np.diag(np.diag(H_cc)) + 1e-6 * np.eye(len(H_cc))
-        S = cc - (H_cp / pp) @ H_cp.T
-        dc = np.asarray(-np.linalg.solve(S, g_c - (H_cp / pp) @ g_p), dtype=np.float64)
-        dp = -(g_p + H_cp.T @ dc) / pp
+        # A matrix times its own transpose is half the work of two.
+        root = 1.0 / np.sqrt(pp)
+        H_cp *= root
+        S = cc - H_cp @ H_cp.T
+        dc = np.asarray(-np.linalg.solve(S, g_c - H_cp @ (root * g_p)), dtype=np.float64)
+        dp = -(root * g_p + H_cp.T @ dc) * root
         views = []
         for v, T in enumerate(bundle.T):
             R = so3_exp(dc[6 * v + 3 : 6 * v + 6])

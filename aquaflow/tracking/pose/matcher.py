@@ -18,7 +18,7 @@ from aquaflow.tracking.pose.pnp import pose_from_scratch
 from aquaflow.tracking.pose.problem import pose_problem
 from aquaflow.tracking.pose.solver import PoseEstimate, PoseProblem, solve_pose
 from aquaflow.tracking.pose.surroundings import surroundings
-from aquaflow.tracking.pose.visibility import Visibility, visibility
+from aquaflow.tracking.pose.visibility import Visibility, evenly_taken, visibility
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,8 @@ class KeyframeMatcher:
             camera,
         )
         parallax_px = float(displacement.mean())
-        known_share = float((pair.valid & exact).sum() / max(pair.valid.sum(), 1))
+        both, every = (int(np.count_nonzero(m)) for m in (pair.valid & exact, pair.valid))
+        known_share = both / max(every, 1)
         return Matched(estimate, pair, share, parallax_px, problem.points, visible, known_share)
 
     def _depths(self, pointmap: Pointmap, pair: PairGeometry) -> Pointmap:
@@ -133,9 +134,7 @@ class KeyframeMatcher:
         known: Mask,  # [H, W]
     ) -> tuple[PoseProblem, npt.NDArray[np.float64]]:
         """At most ``matches`` matches whose depth is known, and their keyframe pixels."""
-        rows, columns = np.nonzero(pair.valid & known)
-        step = max(1, -(-len(rows) // self._config.matches))
-        rows, columns = rows[::step], columns[::step]
+        rows, columns = evenly_taken(pair.valid & known, self._config.matches)
         pixels_k = np.stack([columns + 0.5, rows + 0.5], -1)
         pixels = pair.matches[rows, columns].astype(np.float64)
         weights = pair.C[rows, columns].astype(np.float64)

@@ -49,12 +49,15 @@ def _mean_around(
     height, width = rho.shape
     cells = (max(1, round(width / CELL_PX)), max(1, round(height / CELL_PX)))
     mass = known.astype(np.float32)
-    sums = cv2.resize(np.dstack([mass, mass * rho]), cells, interpolation=cv2.INTER_AREA)
-    outer, inner = (
-        cv2.boxFilter(sums, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
-        for side in (OUTER_CELLS, INNER_CELLS)
-    )
-    count, total = np.moveaxis(outer - inner, -1, 0)
+    around = []
+    for field in (mass, mass * rho):
+        sums = cv2.resize(field, cells, interpolation=cv2.INTER_AREA)
+        outer, inner = (
+            cv2.boxFilter(sums, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
+            for side in (OUTER_CELLS, INNER_CELLS)
+        )
+        around.append(outer - inner)
+    count, total = around
     enough = count > LEAST_CELLS
     mean = np.where(enough, total / np.where(enough, count, 1.0), 0.0).astype(np.float32)
     everywhere = cv2.resize(mean, (width, height), interpolation=cv2.INTER_NEAREST)

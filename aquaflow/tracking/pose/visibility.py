@@ -83,15 +83,25 @@ def visibility(
     return Visibility(float(here.mean()), float(seen.mean()))
 
 
+def evenly_taken(
+    which: Mask,  # [H, W]
+    count: int,
+) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Rows and columns, [M] each, of at most ``count`` of the pixels, evenly taken row by row."""
+    # Of a picture in two dimensions NumPy looks for them ten times as long.
+    pixels = np.flatnonzero(which)
+    pixels = pixels[:: max(1, -(-len(pixels) // count))]
+    rows, columns = np.divmod(pixels, which.shape[1])
+    return rows, columns
+
+
 def sampled(
     pointmap: Pointmap,
     which: Mask,  # [H, W] pixels of known depth
     count: int,
 ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], Array]:
     """Rows, columns and points [M, 3] of at most ``count`` pixels, evenly taken."""
-    rows, columns = np.nonzero(which)
-    step = max(1, -(-len(rows) // count))
-    rows, columns = rows[::step], columns[::step]
+    rows, columns = evenly_taken(which, count)
     rays = pointmap.camera.unproject(np.stack([columns + 0.5, rows + 0.5], -1))
     return rows, columns, rays / pointmap.rho[rows, columns, None]
 

@@ -11,6 +11,7 @@ import pytest
 
 from aquaflow.config import GateConfig
 from aquaflow.tracking.gate.gate import FrameGate, GateKind, Verdict
+from aquaflow.tracking.gate.thumbnail import TILES, _tile_means
 from tests.tracking.tracking_scenes import CAMERA, SeaFloor, lawn_path, pose
 
 Picture = npt.NDArray[np.uint8]
@@ -265,3 +266,13 @@ def test_pictures_of_any_size_are_judged(size: tuple[int, int]) -> None:
 def test_the_same_stream_gets_the_same_verdicts() -> None:
     pictures = [noisy(p, i) for i, p in enumerate(swim(8))]
     assert repr(judged(pictures)) == repr(judged(pictures))
+
+
+@pytest.mark.parametrize("shape", [(9, 12), (90, 160), (104, 160), (313, 480), (7, 5)])
+def test_a_tiles_mean_is_that_of_its_area(shape: tuple[int, int]) -> None:
+    """Also where a tile ends within a pixel."""
+    pictures = np.random.default_rng(0).random((3, *shape), np.float32)
+    columns, rows = TILES
+    large = np.kron(pictures, np.ones((1, rows, columns)))
+    expected = large.reshape(3, rows, shape[0], columns, shape[1]).mean((2, 4))
+    np.testing.assert_allclose(_tile_means(pictures), expected, atol=1e-6)

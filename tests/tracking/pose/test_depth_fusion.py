@@ -91,16 +91,38 @@ def test_compiled_code_fuses_as_numpy_does(seed: int) -> None:
     with np.errstate(invalid="ignore"):
         expected = fuse_by_numpy(by_numpy, *arguments)
     assert fuse_compiled(load_library(), compiled, *arguments) == expected
-    np.testing.assert_allclose(compiled.rho, by_numpy.rho, rtol=1e-9)
-    np.testing.assert_allclose(compiled.variance, by_numpy.variance, rtol=1e-9)
+    # Single precision; a pixel that was not measured keeps its numbers to the bit.
+    np.testing.assert_allclose(compiled.rho, by_numpy.rho, rtol=1e-5)
+    np.testing.assert_allclose(compiled.variance, by_numpy.variance, rtol=1e-4)
+    untouched = (by_numpy.rho == rho) & (by_numpy.variance == variance)
+    np.testing.assert_array_equal(compiled.rho[untouched], rho[untouched])
+    np.testing.assert_array_equal(compiled.variance[untouched], variance[untouched])
     assert (compiled.rho != rho).mean() > 0.3
+
+
+@pytest.mark.parametrize("baseline", [0.005, 0.02])
+def test_single_precision_errs_by_a_hundredth_of_a_depths_sigma(baseline: float) -> None:
+    """Also where parallax is hardly enough, and what is rounded is a small difference."""
+    T_ba = Sim3(np.eye(3), np.array([-baseline, 0.1 * baseline, 0.2 * baseline]))
+    seen = SMALL.project(T_ba.apply(SMALL.unproject(SMALL.pixel_centres()) * DEPTH[..., None]))
+    pair = two_views()
+    noise = np.random.default_rng(3).normal(0.0, 0.02, seen.shape)
+    pair.matches, pair.valid = (seen + noise).astype(np.float32), np.ones(DEPTH.shape, bool)
+    by_numpy, compiled = Pointmap.unknown(SMALL), Pointmap.unknown(SMALL)
+    expected = fuse_by_numpy(by_numpy, pair, T_ba, SMALL, SIGMA_PX)
+    measured = fuse_compiled(load_library(), compiled, pair, T_ba, SMALL, SIGMA_PX)
+    assert expected > 0.1 * DEPTH.size
+    assert abs(measured - expected) <= 0.002 * DEPTH.size  # at a limit, rounding decides
+    both = (by_numpy.rho > 0.0) & (compiled.rho > 0.0)
+    off = np.abs(compiled.rho - by_numpy.rho)[both]
+    assert (off < 0.01 * np.sqrt(by_numpy.variance[both])).all()
 
 
 def test_without_compiled_code_depths_are_fused_too(monkeypatch: pytest.MonkeyPatch) -> None:
     with_it = fused_with(1.0 / DEPTH, (0.1 / DEPTH) ** 2)
     monkeypatch.setattr(depth_fusion, "library_or_none", lambda: None)
     without = fused_with(1.0 / DEPTH, (0.1 / DEPTH) ** 2)
-    np.testing.assert_allclose(without.rho, with_it.rho, rtol=1e-9)
+    np.testing.assert_allclose(without.rho, with_it.rho, rtol=1e-5)
 
 
 def test_matches_of_another_picture_are_refused() -> None:
@@ -116,7 +138,7 @@ def test_a_first_measurement_is_taken_as_it_is(first: Measured) -> None:
     rays = SMALL.unproject(SMALL.pixel_centres())[known]
     pair = two_views()
     points = triangulate(rays, pair.matches[known].astype(float), T_BA, SMALL, SIGMA_PX)
-    np.testing.assert_allclose(variance[known], points.variance)
+    np.testing.assert_allclose(variance[known], points.variance, rtol=1e-5)
     assert not rho[~known].any()
 
 
@@ -140,10 +162,10 @@ def test_a_measurement_of_low_confidence_weighs_less(first: Measured) -> None:
     pair = two_views()
     pair.C = (0.25 * pair.C).astype(np.float32)
     known = first[2]
-    np.testing.assert_allclose(measured(pair)[1][known], 4.0 * first[1][known], rtol=1e-6)
+    np.testing.assert_allclose(measured(pair)[1][known], 4.0 * first[1][known], rtol=1e-5)
     pair.C = np.zeros_like(pair.C)
     least = first[1][known] / LEAST_CONFIDENCE
-    np.testing.assert_allclose(measured(pair)[1][known], least, rtol=1e-6)
+    np.testing.assert_allclose(measured(pair)[1][known], least, rtol=1e-5)
 
 
 def test_a_disagreement_keeps_the_depth_and_lowers_the_trust(first: Measured) -> None:
@@ -153,7 +175,8 @@ def test_a_disagreement_keeps_the_depth_and_lowers_the_trust(first: Measured) ->
     far = known & (np.abs(old_rho - rho) > 3.5 * np.sqrt(first[1] + old_variance))
     assert far.mean() > 0.3
     np.testing.assert_array_equal(kept.rho[far], old_rho[far])
-    np.testing.assert_allclose(kept.variance[far], DISAGREEMENT_INFLATION * old_variance[far])
+    grown = DISAGREEMENT_INFLATION * old_variance[far]
+    np.testing.assert_allclose(kept.variance[far], grown, rtol=1e-6)
 
 
 def test_a_depth_that_lost_all_trust_is_replaced(first: Measured) -> None:
@@ -169,7 +192,7 @@ def test_no_single_measurement_is_trusted_beyond_its_floor() -> None:
     fuse(pointmap, two_views(), T_BA, SMALL, sigma_px=1e-6)
     known = pointmap.variance < UNKNOWN_VARIANCE
     np.testing.assert_allclose(
-        np.sqrt(pointmap.variance[known]), MEASUREMENT_FLOOR * pointmap.rho[known]
+        np.sqrt(pointmap.variance[known]), MEASUREMENT_FLOOR * pointmap.rho[known], rtol=1e-6
     )
 
 
@@ -178,7 +201,8 @@ def test_no_fused_depth_is_trusted_beyond_its_floor() -> None:
     for _ in range(40):
         fuse(pointmap, two_views(), T_BA, SMALL, sigma_px=1e-6)
     known = pointmap.variance < UNKNOWN_VARIANCE
-    np.testing.assert_allclose(np.sqrt(pointmap.variance[known]), FUSED_FLOOR * pointmap.rho[known])
+    least = FUSED_FLOOR * pointmap.rho[known]
+    np.testing.assert_allclose(np.sqrt(pointmap.variance[known]), least, rtol=1e-6)
 
 
 def test_a_pair_without_matches_changes_nothing() -> None:
