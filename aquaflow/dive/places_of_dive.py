@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from aquaflow.errors import InputError
-from aquaflow.geometry.pixels import at_pixels
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore
-from aquaflow.keyframes.place import KeypointDepths, Place
+from aquaflow.keyframes.place import KeypointDepths, Place, depths_at
 from aquaflow.keyframes.places_file import EDGE, NAME, Rows, write_places
 from aquaflow.slam import Slam
 from aquaflow.tracking.graph.table import Snapshot
@@ -38,24 +37,12 @@ def _places(
 ) -> Iterator[tuple[Place, KeypointDepths]]:
     for keyframe in keyframes.readable:
         try:
-            yield _place(keyframe, poses), keypoint_depths(keyframe)
+            yield (
+                _place(keyframe, poses),
+                depths_at(keyframe.encoding.keypoints, keyframe.pointmap),
+            )
         except InputError as error:
             log.warning("keyframe %d is not in %s: %s", keyframe.number, NAME, error)
-
-
-def keypoint_depths(keyframe: Keyframe) -> KeypointDepths:
-    """The keyframe's keypoints with their depths.
-
-    Raises:
-        InputError: the keyframe cannot be read back.
-    """
-    keypoints, pointmap = keyframe.encoding.keypoints, keyframe.pointmap
-    return KeypointDepths(
-        pointmap.camera,
-        keypoints,
-        at_pixels(pointmap.rho, keypoints.pixels),
-        at_pixels(pointmap.variance, keypoints.pixels),
-    )
 
 
 def _place(keyframe: Keyframe, poses: Mapping[int, Sim3]) -> Place:

@@ -13,8 +13,9 @@ import numpy.typing as npt
 
 from aquaflow.errors import DamagedError
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.pixels import at_pixels
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes.pointmap import UNKNOWN_VARIANCE
+from aquaflow.keyframes.pointmap import UNKNOWN_VARIANCE, Pointmap
 from aquaflow.prior.contract import Float, Keypoints
 
 Array = npt.NDArray[np.float64]
@@ -55,6 +56,13 @@ class KeypointDepths:
         rays = self.camera.unproject(self.keypoints.pixels.astype(np.float64))
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(self.rho[:, None] > 1e-6, rays / self.rho[:, None], np.nan)
+
+
+def depths_at(keypoints: Keypoints, pointmap: Pointmap) -> KeypointDepths:
+    """What the ``pointmap`` of their picture knows of the keypoints' depths."""
+    pixels = keypoints.pixels
+    rho, variance = at_pixels(pointmap.rho, pixels), at_pixels(pointmap.variance, pixels)
+    return KeypointDepths(pointmap.camera, keypoints, rho, variance)
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,12 @@ from aquaflow.dive import places_of_dive
 from aquaflow.dive.replay import map_recording
 from aquaflow.errors import InputError
 from aquaflow.fusion.metric_file import read_metric_file
-from aquaflow.keyframes import KeyframeStore
-from aquaflow.keyframes.places_file import NAME, PlacesFile
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes.place import Place
+from aquaflow.keyframes.places_file import NAME, PlacesFile, Rows
 from aquaflow.keyframes.store import Keyframe
 from aquaflow.sources import open_recording
+from aquaflow.tracking.graph.table import Snapshot
 
 TRACKING_ONLY = Config.model_validate({"mapping": {"enabled": False}})
 
@@ -47,14 +50,14 @@ def test_keyframes_lie_where_the_trajectory_says(small_recording: Path, tmp_path
 def test_a_keyframe_that_cannot_be_read_back_costs_itself(
     small_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = places_of_dive.keypoint_depths
+    whole = places_of_dive._place
 
-    def fail(keyframe: Keyframe) -> object:
+    def fail(keyframe: Keyframe, poses: Mapping[int, Sim3]) -> Place:
         if keyframe.number == 0:
             raise InputError("planted")
-        return whole(keyframe)
+        return whole(keyframe, poses)
 
-    monkeypatch.setattr(places_of_dive, "keypoint_depths", fail)
+    monkeypatch.setattr(places_of_dive, "_place", fail)
     dive = mapped(small_recording, tmp_path / "dive")
     file = PlacesFile(dive / NAME)
     assert [place.number for place in file.places] == list(range(1, len(file.places) + 1))
@@ -65,7 +68,7 @@ def test_a_keyframe_that_cannot_be_read_back_costs_itself(
 def test_places_that_cannot_be_written_cost_no_other_file(
     small_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(self: KeyframeStore) -> list[Keyframe]:
+    def fail(graph: Snapshot) -> Rows:
         raise RuntimeError("planted")
 
     monkeypatch.setattr(places_of_dive, "_edges", fail)
