@@ -62,7 +62,7 @@ def list_dives(site: Site, as_json: Json = False) -> None:
     from aquaflow.site.merged_file import read_merged
 
     dives, merged = read_site(site), read_merged(site)
-    rows = [
+    rows: list[dict[str, Any]] = [
         {
             "name": dive.name,
             "folder": str(dive.folder(site)),

@@ -124,7 +124,8 @@ class PlacesFile:
             InputError: it is damaged.
         """
         camera = self.by_number[number].camera
-        return self._guarded(lambda: unpacked(self._array(_name(number)), camera))
+        found: KeypointDepths = self._guarded(lambda: unpacked(self._array(_name(number)), camera))
+        return found
 
     def _guarded(self, read: Callable[[], Any]) -> Any:
         try:

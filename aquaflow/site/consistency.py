@@ -54,14 +54,13 @@ def agreement(
         clique = [first]
         while allowed.any():
             # The one that leaves the most open; of equals the strongest, then the earliest.
-            options = np.flatnonzero(allowed)
-            left = (compatible[options] & allowed).sum(axis=1)
-            chosen = max(
-                range(len(options)), key=lambda i: (left[i], strength[options[i]], -options[i])
-            )
-            clique.append(int(options[chosen]))
-            allowed &= compatible[options[chosen]]
-            allowed[clique] = False
+            options = np.flatnonzero(allowed).tolist()
+            left = (compatible[options] & allowed).sum(axis=1).tolist()
+            ranks = [(left[k], strength[i], -i) for k, i in enumerate(options)]
+            chosen = options[ranks.index(max(ranks))]
+            clique.append(chosen)
+            allowed &= compatible[chosen]
+            allowed[chosen] = False
         found = tuple(sorted(clique))
         if _rank(found, strength) > _rank(best, strength):
             best = found
@@ -89,7 +88,8 @@ def compatible_links(
     at, seen, measured = poses[links["a"]], poses[links["b"]], poses_of(links)
     for i in range(count):
         # Both sides in the world of a, as link i has it.
-        to_a = at[[i]] @ measured[[i]] @ seen[[i]].inverse()
+        own = slice(i, i + 1)
+        to_a = at[own] @ measured[own] @ seen[own].inverse()
         for j in range(i):
             both = np.array([j, i])
             pair = links[both]

@@ -73,7 +73,7 @@ def common_move(before: Sequence[Sim3], after: Sequence[Sim3]) -> tuple[Sim3, fl
     """The similarity nearest to what took each of ``before`` to ``after``, and how much the poses
     are bent: the root mean square distance, in the unit of ``after``, that it leaves."""
     moves = Sim3Batch.of(after) @ Sim3Batch.of(before).inverse()
-    mean = moves[[0]]
+    mean = moves[:1]
     for _ in range(3):  # converges quadratically, and all lie near to each other
         mean = mean @ Sim3Batch.exp((mean.inverse() @ moves).log().mean(axis=0)[None])
     move = mean.on_group().element(0)

@@ -106,8 +106,8 @@ def _compared(
     chains = Chains(poses, tables["edges"], np.flatnonzero(tables["trust"]["trust"] > 0.0))
     strength = [float(placed.link.inliers) for placed in compared]
     verdict = agreement(compatible_links(poses, chains, rows, graph.config), strength)
+    of_others: Verdict = "contradicts the others" if verdict.kept else "alone"
     for index in verdict.against:
-        of_others = "contradicts the others" if verdict.kept else "alone"
         verdicts[id(compared[index].link)] = of_others
     if not verdict.kept:
         verdicts.update((id(placed.link), "alone") for placed in others)

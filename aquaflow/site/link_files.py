@@ -16,7 +16,7 @@ from aquaflow.storage.atomic import write_json
 
 FOLDER = "links"
 """In a site."""
-METHOD = 1
+METHOD = 2
 """Raised whenever the same dives would give other links."""
 
 
@@ -67,7 +67,8 @@ def _of_json(stated: dict[str, Any]) -> CrossLink:
     information = np.array(stated["information"], np.float64)
     if T.R.shape != (3, 3) or T.t.shape != (3,) or information.shape != (7, 7):
         raise ValueError("it is no link")
-    numbers = (int(stated[name]) for name in ("inliers", "matched", "cells"))
+    inliers, matched, cells = (int(stated[name]) for name in ("inliers", "matched", "cells"))
     return CrossLink(
-        int(stated["a"]), int(stated["b"]), T, information, *numbers, float(stated["similarity"])
-    )
+        int(stated["a"]), int(stated["b"]), T, information, inliers, matched, cells,
+        float(stated["similarity"]),
+    )  # fmt: skip
