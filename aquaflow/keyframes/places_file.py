@@ -187,7 +187,11 @@ def _name(number: int) -> str:
     return f"keyframe_{number:06d}"
 
 
-def _add(archive: zipfile.ZipFile, name: str, array: Rows) -> None:
+def _add(
+    archive: zipfile.ZipFile,
+    name: str,
+    array: Rows,  # of any shape
+) -> None:
     stream = io.BytesIO()
     np.lib.format.write_array(stream, array, allow_pickle=False)
     entry = zipfile.ZipInfo(f"{name}.npy", EPOCH)

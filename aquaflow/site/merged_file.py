@@ -127,7 +127,10 @@ def _keyframes(path: Path) -> Rows:
     return np.asarray(rows)
 
 
-def _merged(data: dict[str, Any], keyframes: Rows) -> MergedSite:
+def _merged(
+    data: dict[str, Any],
+    keyframes: Rows,  # [N] KEYFRAME
+) -> MergedSite:
     sub_maps = tuple(
         PlacedSubMap(
             str(each["dive"]), int(each["number"]), int(each["component"]), _to_sim3(each["T_sm"]),
