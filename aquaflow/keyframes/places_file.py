@@ -190,7 +190,7 @@ def _name(number: int) -> str:
 def _add(
     archive: zipfile.ZipFile,
     name: str,
-    array: Rows,  # of any shape
+    array: Rows,  # [...]
 ) -> None:
     stream = io.BytesIO()
     np.lib.format.write_array(stream, array, allow_pickle=False)
