@@ -54,6 +54,7 @@ def merged(site: Path) -> MergedSite:
     return merge(site)
 
 
+@pytest.mark.ci
 def test_both_paths_fit_the_truth_by_one_similarity(
     site: Path, merged: MergedSite, recordings: list[Path]
 ) -> None:
