@@ -21,7 +21,7 @@ from aquaflow.keyframes.store import Keyframe
 from aquaflow.sources import open_recording
 from aquaflow.tracking.graph.table import Snapshot
 
-TRACKING_ONLY = Config.model_validate({"mapping": {"enabled": False}})
+TRACKING_ONLY = Config.model_validate({"mapping": {"enabled": False}, "source": {"stop": 14}})
 
 
 def mapped(recording: Path, dive: Path) -> Path:
