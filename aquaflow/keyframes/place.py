@@ -25,8 +25,8 @@ LEVELS = 15
 """Largest code of a descriptor's number: half a byte."""
 LARGEST_ROOT = 0.375
 """Root of a number's share that gets the largest code; beyond it is cut off. SIFT cuts its numbers
-at 0.2 of the length (D. Lowe, IJCV 2004), and of the shared clips' 0.02 % are beyond. The rounding
-moves a descriptor by 0.08, of the 0.5 between descriptors of one point in two pictures."""
+at 0.2 of the length (D. Lowe, IJCV 2004); of a frame each of the reef and Curasao clips none is
+beyond. The rounding moves a descriptor of length 1 by 0.075 there (median, measured)."""
 PIXEL_STEPS = 1 << 16
 """Steps of a coordinate over the side of the picture: 0.007 px at 480 px."""
 LARGEST_HALF = 6e4

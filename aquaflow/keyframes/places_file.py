@@ -35,7 +35,7 @@ ABOUT, INDEX, EDGES = "about", "index", "edges"
 EPOCH = (1980, 1, 1, 0, 0, 0)
 """Time of every array in the file: the same dive gives the same bytes."""
 EFFORT = 1
-"""Of the compression, of 9: more takes twice the time, for 3 % of the size (measured)."""
+"""Of the compression, of 9: 6 takes twice the time, for 1 % of the size (measured)."""
 ROTATION_TOLERANCE = 1e-6
 """Largest difference of R^T R from the identity: rounding is far below."""
 
