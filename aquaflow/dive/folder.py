@@ -62,7 +62,7 @@ RESULTS = (
     TELEMETRY,
     *("pictures/*.jpg", "view.zip"),
     *("coverage.npz", "coverage.json", "coverage.png", "overview.png", "report.pdf"),
-    *("metric.json", "trajectory.csv", "georeference.json", STATUS),
+    *("metric.json", "trajectory.csv", "georeference.json", "places.npz", STATUS),
     *(
         "restored/*.png",
         "points.laz",
