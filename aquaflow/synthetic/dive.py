@@ -153,7 +153,7 @@ def _write_pictures(
     snow = Snow(config, centres, stream(config.seed, "snow"))
     shade = vignette(camera, config.vignette)
     bodies = Bodies(config, t, R_sc, centres)
-    light = np.float32((1.0, 1.0, 1.0) if config.visit is None else config.visit.light)
+    light = np.array((1.0, 1.0, 1.0) if config.visit is None else config.visit.light, np.float32)
     with ThreadPoolExecutor(1) as pool:
         # Compressing a picture overlaps with rendering the next; one is waited for at a time.
         pending: Future[None] | None = None
