@@ -29,6 +29,7 @@ def map_recording(
     progress: Progress | None = None,
     telemetry: Sequence[str | os.PathLike[str]] = (),
     telemetry_offset_s: float | None = None,
+    in_site: str | os.PathLike[str] | None = None,
 ) -> Dive:
     """Map a recording into the dive folder ``out`` and read what came of it.
 
@@ -50,6 +51,7 @@ def map_recording(
         telemetry: logs that were recorded with ``source``, beside the telemetry in it.
         telemetry_offset_s: when these logs begin, s after the first picture; None: it is found
             from the rotations that the logs and the poses have in common.
+        in_site: an earlier dive, in whose frame this one goes on once it is recognised there.
 
     Raises:
         InputError: the recording cannot be read or the folder cannot be written.
@@ -67,9 +69,13 @@ def map_recording(
         recording, name = source, type(source).__name__
     path = Path(source) if isinstance(source, (str, os.PathLike)) else None
     given = open_telemetry(path, [Path(log) for log in telemetry], telemetry_offset_s)
+    from aquaflow.site.base import base_of
+
+    base = None if in_site is None else base_of(Path(in_site))
     from aquaflow.dive import replay  # loads torch: after what can be refused without it
 
     replay.map_recording(
-        recording, name, Path(out), chosen, camera, overwrite, progress, telemetry=given
-    )
+        recording, name, Path(out), chosen, camera, overwrite, progress, telemetry=given,
+        base=base,
+    )  # fmt: skip
     return read_dive(out)

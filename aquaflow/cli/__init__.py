@@ -16,7 +16,14 @@ import typer
 from aquaflow import __version__
 from aquaflow.cli.bench import register as register_bench
 from aquaflow.cli.calibrate import register as register_calibrate
-from aquaflow.cli.console import PRESETS, Json, progress_bars, unit_in_words
+from aquaflow.cli.console import (
+    PRESETS,
+    InSite,
+    Json,
+    checked_site,
+    progress_bars,
+    unit_in_words,
+)
 from aquaflow.cli.devices import register as register_devices
 from aquaflow.cli.dive import register as register_dive
 from aquaflow.cli.export import register as register_export
@@ -98,6 +105,7 @@ def map_command(
         bool, typer.Option(help="As the live loop would: newest frame only, mapping in parallel.")
     ] = False,
     profile: Annotated[bool, typer.Option(help="Write trace.json for Chrome's tracing.")] = False,
+    in_site: InSite = None,
     as_json: Json = False,
 ) -> None:
     """Turn a recording into a dive folder: trajectory, map, water, report."""
@@ -126,9 +134,11 @@ def map_command(
             "--telemetry needs the poses of the whole recording; leave out --realtime, or name the "
             "log in a replay.yaml"
         )
+    if in_site is not None:
+        checked_site(in_site, out)
     if realtime:
         print_finished(
-            map_realtime(source, settings, calibration, out, overwrite, as_json), as_json
+            map_realtime(source, settings, calibration, out, overwrite, as_json, in_site), as_json
         )
         return
     recording = open_recording(source, fps=settings.source.fps)
@@ -137,11 +147,13 @@ def map_command(
     from aquaflow.dive.replay import (
         map_recording,  # loads torch: after what can be refused without it
     )
+    from aquaflow.site.base import base_of
 
     with progress_bars(quiet=as_json) as progress:
         replayed = map_recording(
-            recording, source.name, out, settings, calibration, overwrite, progress, profile, given
-        )
+            recording, source.name, out, settings, calibration, overwrite, progress, profile,
+            given, base=None if in_site is None else base_of(in_site),
+        )  # fmt: skip
     if as_json:
         typer.echo(json.dumps({"dive": str(replayed.dive), **replayed.metrics}))
         raise typer.Exit(exit_code(replayed))

@@ -6,6 +6,7 @@ import logging
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -44,6 +45,28 @@ def one_of(choices: Sequence[str], value: str, option: str) -> str:
 
 
 Seconds = Annotated[float | None, typer.Option(callback=duration, help="Stop after this long.")]
+
+InSite = Annotated[
+    Path | None,
+    typer.Option(
+        "--in", metavar="SITE", help="Earlier dive, or site, in whose frame this one shall go on."
+    ),
+]
+
+
+def checked_site(folder: Path, out: Path | None) -> Path:
+    """The folder of ``--in``, refused before anything heavy begins.
+
+    Raises:
+        InputError: it is no dive in which places can be found again, or the one in ``--out``.
+    """
+    from aquaflow.site.base import base_of
+
+    if out is not None and out.resolve() == folder.resolve():
+        raise InputError(f"--in and --out are both {folder}; a dive is never changed by another")
+    base_of(folder)
+    return folder
+
 
 LOG_WIDTH = 200
 """Table width without a terminal: a log must neither cut nor fold numbers."""

@@ -13,8 +13,10 @@ import typer
 
 from aquaflow.cli.console import (
     PRESETS,
+    InSite,
     Json,
     Seconds,
+    checked_site,
     devices_on_stderr,
     progress_bars,
     table_console,
@@ -64,15 +66,18 @@ def run(
         typer.Option(min=0.001, max=1000.0, help="Of --source: 1 as it was, 2 twice as fast."),
     ] = 1.0,
     seconds: Seconds = None,
+    in_site: InSite = None,
     as_json: Json = False,
 ) -> None:
     """Map live: cameras and telemetry in, dive folder out; resumes what was interrupted."""
-    from aquaflow.config.vehicle import load_vehicle
+    from aquaflow.config.vehicle import load_vehicle, looking_in
     from aquaflow.errors import InputError
     from aquaflow.geometry.camera import load_camera
     from aquaflow.service.sources import devices, recording
 
     vehicle = load_vehicle(config, preset)
+    if in_site is not None:
+        vehicle = looking_in(vehicle, checked_site(in_site, out))
     if source is None and not vehicle.cameras:
         raise InputError("nothing to map: give --config with cameras, or --source")
     if source is None and calib is not None:
@@ -185,6 +190,7 @@ def map_realtime(
     out: Path,
     overwrite: bool,
     quiet: bool,
+    in_site: Path | None = None,
 ) -> Finished | None:
     """``map --realtime``: a recording through the live loop, refined as a replay is."""
     from aquaflow.config.vehicle import VehicleConfig
@@ -192,6 +198,7 @@ def map_realtime(
     from aquaflow.service.sources import recording
 
     alone = VehicleConfig().service.model_dump()
+    alone["dive"]["site"] = in_site
     alone["health"]["enabled"], alone["mapping"]["refine_seconds"] = False, None
     vehicle = VehicleConfig.model_validate(settings.model_dump() | {"service": alone})
     feed = recording(source, vehicle, calibration=calibration)

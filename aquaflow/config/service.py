@@ -123,6 +123,11 @@ class DiveConfig(Stage):
         description="obey MAV_CMD_USER_1 to 4 (start, stop, finish, new) of any ground station on "
         "the MAVLink network, which has no token",
     )
+    site: Path | None = Field(
+        None,
+        description="folder of an earlier dive, or of a site, in which each dive is looked for; it "
+        "goes on in that frame once it was recognised there; as `aquaflow run --in`",
+    )
 
 
 class CheckpointConfig(Stage):

@@ -36,3 +36,10 @@ def load_vehicle(path: Path | None, preset_name: str | None = None) -> VehicleCo
     written = {} if path is None else read_yaml(path)
     changed = {} if preset_name is None else preset(preset_name)
     return validated(VehicleConfig, merged(written, changed), str(path or preset_name))
+
+
+def looking_in(vehicle: VehicleConfig, site: Path) -> VehicleConfig:
+    """The same vehicle, whose dives are looked for in the earlier one in the folder ``site``."""
+    dive = vehicle.service.dive.model_copy(update={"site": site})
+    service = vehicle.service.model_copy(update={"dive": dive})
+    return vehicle.model_copy(update={"service": service})

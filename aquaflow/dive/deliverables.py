@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from aquaflow.clocks.deadline import Deadline
 from aquaflow.coverage import DiveCoverage, PageView
 from aquaflow.dive.coverage_files import final_views, write_coverage
-from aquaflow.dive.folder import DiveFolder
+from aquaflow.dive.folder import IN_SITE, DiveFolder
 from aquaflow.dive.found_camera import FoundCamera
 from aquaflow.dive.from_maps import (
     OVERVIEW,
@@ -23,6 +23,7 @@ from aquaflow.dive.from_maps import (
     water_in_numbers,
 )
 from aquaflow.dive.held_out_example import HeldOut, mean_amplification
+from aquaflow.dive.in_site import in_site
 from aquaflow.dive.medium_json import medium_json
 from aquaflow.dive.metric_outputs import MetricOutputs, held_out_in, water_in, worlds_in_words
 from aquaflow.dive.path_rows import path_rows
@@ -149,6 +150,7 @@ class Deliverables:
         attempt("writing trajectory.csv", self._write_path_table)
         attempt("writing metric.json", self._write_metric_file)
         attempt("writing georeference.json", self._write_georeference)
+        attempt(f"writing {IN_SITE}", self._write_in_site)
         camera = self.slam.tracker.camera
         if camera is not None:
             attempt("writing camera.yaml", partial(self._write_cameras, camera))
@@ -207,6 +209,10 @@ class Deliverables:
         content = georeference(self.outputs.frames, self._main)
         if content is not None:
             self.folder.write_json(GEOREFERENCE, content)
+
+    def _write_in_site(self) -> None:
+        if self.slam.in_base is not None:
+            self.folder.write_json(IN_SITE, in_site(self.slam.in_base, self.slam.keyframes))
 
     def _water(self) -> WaterSummary | None:
         """Of the largest sub-map, in the unit of its metric frame."""

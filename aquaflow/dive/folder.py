@@ -54,6 +54,9 @@ CALIBRATION = "calibration.yaml"
 SUGGESTED = "found_camera.yaml"
 """Calibration that a dive without one found too late to use it."""
 
+IN_SITE = "in_site.json"
+"""Where a dive lies in an earlier one that it was looked for in."""
+
 RESULTS = (
     *("trajectory.tum", "camera.yaml", "map*.ply", "map*.aqf", "medium.json"),
     *(CALIBRATION, SUGGESTED),
@@ -62,6 +65,7 @@ RESULTS = (
     TELEMETRY,
     *("pictures/*.jpg", "view.zip"),
     *("coverage.npz", "coverage.json", "coverage.png", "overview.png", "report.pdf"),
+    IN_SITE,
     *("metric.json", "trajectory.csv", "georeference.json", "places.npz", STATUS),
     *(
         "restored/*.png",

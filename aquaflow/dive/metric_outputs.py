@@ -125,7 +125,7 @@ def sub_maps_in_words(frames: list[MetricFrame]) -> str:
 
 def worlds_in_words(frames: Mapping[int, MetricFrame]) -> str:
     """The worlds of the sub-maps, for the first lines of trajectory.tum."""
-    if not any(frame.metric or frame.level for frame in frames.values()):
+    if not any(frame.metric or frame.level or frame.site for frame in frames.values()):
         return CAMERA_WORLD
     said = {number: _world_in_words(frame) for number, frame in frames.items()}
     if len(set(said.values())) == 1:
@@ -134,8 +134,9 @@ def worlds_in_words(frames: Mapping[int, MetricFrame]) -> str:
 
 
 def _world_in_words(frame: MetricFrame) -> str:
-    axes = "world is the first keyframe's camera (x right, y down, z forward)"
+    whose = f" of {frame.site}, in which this dive was recognised" if frame.site else ""
+    axes = f"world is the first keyframe's camera (x right, y down, z forward){whose}"
     if frame.level:
         zero = "the water surface" if frame.depth_known else "the start"
-        axes = f"world is n: x to {frame.north}, y to the right of it, z down from {zero}"
+        axes = f"world is n{whose}: x to {frame.north}, y to the right of it, z down from {zero}"
     return f"{axes}; unit: {frame.unit}"

@@ -20,6 +20,7 @@ from aquaflow.slam import Slam
 from aquaflow.sources import RecordedCamera, mounting_of
 from aquaflow.sources.reading import read_past_failures
 from aquaflow.sources.telemetry_input import TelemetryInput
+from aquaflow.tracking.base.base import Base
 from aquaflow.tracking.frames import FrameClass
 
 Progress = Callable[[str, int, int | None], None]
@@ -41,16 +42,18 @@ def map_recording(
     trace: bool = False,
     telemetry: TelemetryInput | None = None,
     settle: Callable[[], None] = lambda: None,
+    base: Base | None = None,
 ) -> Finished:
     """Map a recording into the dive folder ``out``; with ``trace`` it gets a ``trace.json`` too.
 
     ``settle`` is called at the end of each stage: a benchmark lets it wait for a GPU.
 
     Logs of ``telemetry`` that are on a clock of their own are used from the last frame on, when
-    the poses have shown their offset.
+    the poses have shown their offset. In ``base``, an earlier dive, this one is looked for, and is
+    in its frame once it was recognised there.
 
     Raises:
-        InputError: the folder cannot be written.
+        InputError: the folder cannot be written, or ``base`` was described by another prior.
         ConfigError: crop or calibration do not fit the pictures.
         NotMappedError: the frames were read but gave no map; the folder says why.
     """
@@ -62,6 +65,8 @@ def map_recording(
         calibration = calibration or recording.camera
         run = DiveRun(name, folder, config, slam, calibration, recording.name_of, trace)
         try:
+            if base is not None:
+                slam.look_in(base)
             if slam.metric.mounting is None:
                 with failures.contain("camera mounting"):
                     slam.metric.mounting = mounting_of(recording)

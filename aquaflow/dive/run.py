@@ -18,6 +18,7 @@ from aquaflow.dive.deliverables import Deliverables
 from aquaflow.dive.folder import SUGGESTED, TRACE, DiveFolder
 from aquaflow.dive.found_camera import FoundCamera, from_keyframes, in_words
 from aquaflow.dive.frames_csv import FrameRow
+from aquaflow.dive.in_site import in_site_notes, in_site_numbers
 from aquaflow.dive.metric_outputs import (
     MetricOutputs,
     Navigation,
@@ -281,6 +282,8 @@ class DiveRun:
                 "was full"
             )
         self.notes += self.slam.tracker.monitor.counts.notes()
+        if self.slam.in_base is not None:
+            self.notes += in_site_notes(self.slam.in_base, self.slam.keyframes)
         for note in self.notes:
             log.info(note)
 
@@ -369,6 +372,8 @@ class DiveRun:
         numbers["warnings"], numbers["failures"] = self.warnings, self.slam.failures.to_json()
         numbers["calibration_check"] = self._calibration_numbers()
         numbers["self_calibration"] = None if self.found is None else self.found.to_json()
+        in_base = self.slam.in_base
+        numbers["in_site"] = None if in_base is None else in_site_numbers(in_base)
         numbers["cpu_s"] = round(time.process_time() - self._cpu_before_s, 3)  # of all threads
         if self.live is not None:
             numbers["live"] = self.live

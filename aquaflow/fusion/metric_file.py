@@ -34,7 +34,7 @@ def write_metric_file(folder: Path, frames: Mapping[int, MetricFrame], main: int
         ValueError: a number is not finite.
     """
     sub_maps = {
-        str(number): {"map": _map_name(number, main), **_to_json(frame)}
+        str(number): {"map": _map_name(number, main), **frame_to_json(frame)}
         for number, frame in sorted(frames.items())
     }
     write_json(folder / NAME, {"format": FORMAT, "main": main, "sub_maps": sub_maps})
@@ -72,7 +72,8 @@ def _map_name(number: int, main: int) -> str:
     return "map.aqf" if number == main else f"map_{number}.aqf"
 
 
-def _to_json(frame: MetricFrame) -> dict[str, Any]:
+def frame_to_json(frame: MetricFrame) -> dict[str, Any]:
+    """The frame as plain values, for this file and for checkpoints."""
     T, T_bc = frame.T_nm, frame.T_bc
     return {
         "unit": frame.unit,
@@ -86,6 +87,7 @@ def _to_json(frame: MetricFrame) -> dict[str, Any]:
         "origin": None if frame.origin is None else asdict(frame.origin),
         "scale_source": frame.scale_source,
         "sources": [asdict(source) for source in frame.sources],
+        **({"site": frame.site} if frame.site else {}),
     }
 
 
@@ -104,7 +106,7 @@ def _read(folder: Path) -> dict[int, tuple[str, MetricFrame]]:
             raise DamagedError("its format is no number")
         if data["format"] == FORMAT:
             return {
-                int(number): (str(stated["map"]), _to_frame(stated))
+                int(number): (str(stated["map"]), frame_of_json(stated))
                 for number, stated in data["sub_maps"].items()
             }
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
@@ -115,7 +117,12 @@ def _read(folder: Path) -> dict[int, tuple[str, MetricFrame]]:
     )
 
 
-def _to_frame(stated: dict[str, Any]) -> MetricFrame:
+def frame_of_json(stated: dict[str, Any]) -> MetricFrame:
+    """The frame that :func:`frame_to_json` made.
+
+    Raises:
+        DamagedError, KeyError, TypeError, ValueError: it is none.
+    """
     covariance = np.asarray(stated["covariance"], np.float64)
     if covariance.shape != (7, 7) or not np.isfinite(covariance).all():
         raise DamagedError("a covariance is not 7 x 7 finite numbers")
@@ -133,6 +140,7 @@ def _to_frame(stated: dict[str, Any]) -> MetricFrame:
         T_bc=None if T_bc is None else _to_sim3(T_bc),
         scale_source=str(stated["scale_source"]),
         sources=tuple(SourceReport(**source) for source in stated["sources"]),
+        site=str(stated.get("site", "")),
     )
 
 

@@ -79,6 +79,8 @@ class MetricFrame:
     scale_source: str = ""
     """Devices that the scale comes from, or why there is none."""
     sources: tuple[SourceReport, ...] = ()
+    site: str = ""
+    """The earlier dive whose frame n is, where this one was recognised in it; empty otherwise."""
 
     @staticmethod
     def unknown(reason: str = "") -> MetricFrame:

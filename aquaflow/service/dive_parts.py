@@ -19,6 +19,7 @@ from aquaflow.profiler import Profiler
 from aquaflow.recording.kept_pictures import PictureThread
 from aquaflow.recording.telemetry_lines import NAME as TELEMETRY
 from aquaflow.recording.telemetry_lines import TelemetryLog
+from aquaflow.service.checkpoint.base import look_in_base
 from aquaflow.service.checkpoint.checkpoint import Checkpointer, restore
 from aquaflow.service.checkpoint.generations import Checkpoint
 from aquaflow.service.checkpoint.resume import Choice
@@ -85,6 +86,7 @@ def assembled(
         maps, service.mapping, vitals.heartbeats, lambda: vitals.degradation.level
     )  # fmt: skip
     slam = Slam(config, profiler, folder.work, True, thread, failures)
+    said = look_in_base(slam, service.dive.site, choice.checkpoint)
     with failures.contain("camera mounting"):
         stated = camera_mounting(config, service, feed)
         slam.metric.mounting = stated or (before.stated_mounting() if before else None)
@@ -92,7 +94,7 @@ def assembled(
     continued = Continued()
     if choice.checkpoint is not None:
         continued = _restored(choice.checkpoint, slam, run, maps)
-    run.notes += [*choice.notes, *losses]
+    run.notes += [*choice.notes, *losses, *said]
     for note in run.notes:
         log.warning("%s", note)
     feed.continue_from(continued)

@@ -9,6 +9,7 @@ from typing import Any
 
 from aquaflow import __version__
 from aquaflow.config.viewer import ViewerConfig
+from aquaflow.dive.in_site import in_site_numbers
 from aquaflow.service.control import Control
 from aquaflow.service.dive_parts import Parts
 from aquaflow.service.feed import Feed
@@ -42,6 +43,7 @@ def report(
         **loop.status(),
         "keyframes": len(parts.slam.keyframes),
         "consistency": parts.slam.tracker.monitor.counts.to_json(),
+        "in_site": None if parts.slam.in_base is None else in_site_numbers(parts.slam.in_base),
         "gaussians": sum(len(mapper.gaussians) for mapper in list(parts.maps.mappers.values())),
         "checkpoint": {
             "taken": parts.checkpointer.taken,
@@ -78,6 +80,7 @@ def report_between_dives(
         "stage_failures": feed.failures.to_json(),
         "keyframes": 0,
         "consistency": None,
+        "in_site": None,
         "gaussians": 0,
         "checkpoint": None,
         "deliverables": None,

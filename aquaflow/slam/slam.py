@@ -22,6 +22,8 @@ from aquaflow.slam.finish_time import FinishTime
 from aquaflow.slam.map_parts import make_contributions, make_maps
 from aquaflow.tracking.adjustment.adjuster import Adjuster
 from aquaflow.tracking.anchored import Anchored, Anchors
+from aquaflow.tracking.base.base import Base
+from aquaflow.tracking.base.in_base import InBase
 from aquaflow.tracking.frame_table import FrameTable
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.tracking.gate.gate import FrameGate, GateKind, Verdict
@@ -100,6 +102,8 @@ class Slam:
             learned_scales(self.keyframes, self.prior.unit_sigma, config.tracking.learned),
             self.side_work,
         )  # fmt: skip
+        self.in_base: InBase | None = None
+        """Where this dive lies in an earlier one; None: none was given."""
         self.maps: MapWork = maps or make_maps(
             config, self.profiler, work, self.failures, config.mapping.enabled
         )
@@ -116,6 +120,18 @@ class Slam:
         """None with mapping off."""
         self._latest: int | None = None
         """The row of the frame linked last, if it has a pose."""
+
+    def look_in(self, base: Base) -> None:
+        """Look for this dive in an earlier one, whose frame it has once it was recognised there;
+        before the first frame.
+
+        Raises:
+            InputError: the keypoints of ``base`` are those of another prior.
+        """
+        base.refuse_other_prior(self.prior.name)
+        self.in_base = self.metric.base = InBase(
+            base, self.keyframes, self.config.tracking, self.side_work, self.failures, self._live
+        )
 
     def process(self, frame: Frame) -> list[Tracked]:
         """One frame's way through the paper; returns the frames that it finished."""
@@ -298,6 +314,9 @@ class Slam:
             index = tracked.frame.index
             with self.profiler.stage("graph"), self.failures.contain("keyframe graph", index):
                 self.graph.add(tracked.keyframe, tracked.link)
+            if self.in_base is not None:
+                with self.profiler.stage("base"):
+                    self.in_base.look(tracked.keyframe)
             tracked = replace(tracked, link=None)  # its matches are let go
         settled = self._anchors.settled(tracked, T_kf)
         linked = Anchored(settled, None if settled.T_wc is None else T_kf)
@@ -349,6 +368,8 @@ class Slam:
 
     def _follow_graph(self, wait: bool) -> None:
         """Take over what the graph's optimisation found; the map follows its keyframes."""
+        if self.in_base is not None and self.in_base.has_news():
+            self.graph.straighten()
         with self.failures.contain("correction of the map"):
             with self.profiler.stage("correct"):
                 correction = self.graph.correction(wait)

@@ -9,7 +9,15 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from aquaflow.geometry.port_file import PortFile
 from aquaflow.synthetic.telemetry_noise import TelemetryNoise
 
-__all__ = ["FACED", "Display", "SceneKind", "SyntheticConfig", "TelemetryNoise", "WaterType"]
+__all__ = [
+    "FACED",
+    "Display",
+    "SceneKind",
+    "SyntheticConfig",
+    "TelemetryNoise",
+    "Visit",
+    "WaterType",
+]
 
 SceneKind: TypeAlias = Literal["reef", "flat_sand", "wall", "pipe", "pool", "survey", "hull", "net"]
 Display: TypeAlias = Literal["clock", "clock_and_crosshair", "panel"]
@@ -46,6 +54,35 @@ SCENE_DEFAULTS: dict[str, dict[str, object]] = {
     },
 }  # fmt: skip
 """What differs from the fields' defaults where nothing else is asked for."""
+
+
+class Visit(BaseModel):
+    """A dive over the sea floor of another dive, which keeps its seed, water and path to itself."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    over: SyntheticConfig = Field(
+        description="the dive whose sea floor it is; its margin_m must hold what this one sees"
+    )
+    heading_deg: float = Field(
+        0.0, ge=-180, le=180, description="by which this way is turned, seen from above, clockwise"
+    )
+    offset_m: tuple[float, float] = Field(
+        (0.0, 0.0), description="m in x and y from the middle of that dive's way to that of this"
+    )
+    light: tuple[float, float, float] = Field(
+        (1.0, 1.0, 1.0),
+        description="daylight over that of the water's table, red, green, blue: time of day, "
+        "clouds, white balance",
+    )
+
+    @model_validator(mode="after")
+    def _over_a_first_visit(self) -> Visit:
+        if self.over.visit is not None:
+            raise ValueError("over must be a dive with a sea floor of its own, without a visit")
+        if min(self.light) <= 0.0:
+            raise ValueError("light must be above 0 in every channel")
+        return self
 
 
 class SyntheticConfig(BaseModel):
@@ -150,6 +187,12 @@ class SyntheticConfig(BaseModel):
     )
     arm: bool = Field(False, description="true: an arm of the vehicle reaches into the picture")
     telemetry: TelemetryNoise = TelemetryNoise.model_validate({})
+    margin_m: float | None = Field(
+        None, gt=0, le=20, description="m of sea floor beyond what is seen, for visits; None: 0"
+    )
+    visit: Visit | None = Field(
+        None, description="swim over the sea floor of another dive; None: over one of its own"
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -165,6 +208,17 @@ class SyntheticConfig(BaseModel):
                 f"a vehicle at a {self.scene} faces it; turns must be false for this scene"
             )
         return self
+
+    @model_validator(mode="after")
+    def _visits_the_same_scene(self) -> SyntheticConfig:
+        if self.visit is not None and self.visit.over.scene != self.scene:
+            raise ValueError(f"the dive that is visited has the scene {self.visit.over.scene}")
+        return self
+
+    @property
+    def home(self) -> SyntheticConfig:
+        """The dive whose sea floor this one swims over: itself, but for a visit."""
+        return self if self.visit is None else self.visit.over
 
     @property
     def duration_s(self) -> float:

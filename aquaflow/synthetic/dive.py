@@ -52,8 +52,9 @@ def build(config: SyntheticConfig) -> tuple[render.SyntheticScene, paths.Path]:
 
 def _scene(config: SyntheticConfig, site: Site) -> render.SyntheticScene:
     """The site with its colours."""
-    colours = stream(config.seed, "colours")
-    floor = radiance.bake(config.scene, site.relief, site.crests, colours)
+    home = config.home
+    colours = stream(home.seed, "colours")
+    floor = radiance.bake(home.scene, site.relief, site.crests, colours)
     return render.SyntheticScene(
         site.relief.area,
         HeightField(site.relief.area, site.relief.height),
@@ -152,6 +153,7 @@ def _write_pictures(
     snow = Snow(config, centres, stream(config.seed, "snow"))
     shade = vignette(camera, config.vignette)
     bodies = Bodies(config, t, R_sc, centres)
+    light = np.array((1.0, 1.0, 1.0) if config.visit is None else config.visit.light, np.float32)
     with ThreadPoolExecutor(1) as pool:
         # Compressing a picture overlaps with rendering the next; one is waited for at a time.
         pending: Future[None] | None = None
@@ -162,7 +164,7 @@ def _write_pictures(
             )
             water = view.water.copy()
             snow.draw(water, view.range_m, camera, R_sc[k], centres[k], float(t[k]), medium)
-            picture = expose(water, shade, config.noise_sigma, noise_rng)
+            picture = expose(water * light, shade, config.noise_sigma, noise_rng)
             if config.display is not None:
                 burn_in(picture, config.display, float(t[k]))
             if pending is not None:

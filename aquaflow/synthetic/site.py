@@ -71,19 +71,20 @@ def site_of(config: SyntheticConfig, least_cell_m: float = 0.0) -> Site:
     Cells of ``least_cell_m`` that are larger than the pictures need make another relief with the
     same statistics: the finest shapes are missing, and the objects lie elsewhere.
     """
-    loop = way_of(config).points
-    flat = paths.plan_path(config, stream(config.seed, "sway"))
-    low, high = _seen(config, flat)
+    home = config.home
+    around = way_of(home).points
+    low, high = _seen(home, paths.plan_path(home, stream(home.seed, "sway")))
+    low, high = low - (home.margin_m or 0.0), high + (home.margin_m or 0.0)
     texel = max(
-        TEXEL_PX * (config.altitude_m - 0.2) / config.focal_px,
+        TEXEL_PX * (home.altitude_m - 0.2) / home.focal_px,
         math.sqrt(float(np.prod(high - low)) / TEXELS_MOST),
     )
     area = Area.around(low, high, max(texel * TEXELS_PER_CELL, least_cell_m))
-    relief = build_relief(config.scene, area, loop, stream(config.seed, "terrain"))
-    shapes = place_objects(config.scene, relief, loop, stream(config.seed, "objects"))
+    relief = build_relief(home.scene, area, around, stream(home.seed, "terrain"))
+    shapes = place_objects(home.scene, relief, around, stream(home.seed, "objects"))
     # A net hangs where the floor of other scenes is; what is behind it is not followed.
     followed = np.zeros(area.shape, np.float32) if config.scene == "net" else relief.height
-    below = area.sample(followed, loop)
+    below = area.sample(followed, way_of(config).points)
     path = paths.plan_path(config, stream(config.seed, "sway"), below)
     motion = BodyMotion(path, mountings_of(config))
     return Site(relief, shapes, objects.casters(relief, shapes), path, motion)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -47,7 +47,20 @@ class Way:
 
 
 def way_of(config: SyntheticConfig) -> Way:
-    """The way of a dive's scene, as long as its speed and duration make it."""
+    """The way of a dive's scene, as long as its speed and duration make it; that of a visit is
+    turned and moved over the floor that it visits."""
+    own = _own_way(config)
+    if config.visit is None:
+        return own
+    turn = math.radians(config.visit.heading_deg)
+    c, s = math.cos(turn), math.sin(turn)
+    middle = _own_way(config.visit.over).points.mean(axis=0) + config.visit.offset_m
+    points = (own.points - own.points.mean(axis=0)) @ np.array([[c, s], [-s, c]]) + middle
+    return replace(own, points=points, heading=own.heading + turn)
+
+
+def _own_way(config: SyntheticConfig) -> Way:
+    """As it is over a floor of its own."""
     held = np.zeros(DENSE + 1)
     if config.scene == "pool":
         points = _oval(config)

@@ -55,7 +55,11 @@ class SideWork:
 
     def awaits(self, stage: str) -> bool:
         """True if a result of ``stage`` has not been taken yet."""
-        return any(each.stage == stage for each in self._pending)
+        return self.waiting(stage) > 0
+
+    def waiting(self, stage: str) -> int:
+        """Results of ``stage`` that have not been taken yet."""
+        return sum(each.stage == stage for each in self._pending)
 
     def close(self) -> None:
         """End the thread; what it has not begun is left out, and so are all results."""

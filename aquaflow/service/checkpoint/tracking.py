@@ -10,6 +10,7 @@ import numpy as np
 from aquaflow.config import Config
 from aquaflow.dive.run import DiveRun
 from aquaflow.errors import ConfigError, InputError
+from aquaflow.service.checkpoint import base as in_site
 from aquaflow.slam import Slam
 from aquaflow.storage.arrays import (
     Arrays,
@@ -52,7 +53,11 @@ def serialise(slam: Slam, run: DiveRun) -> tuple[dict[str, Any], Arrays] | None:
         "notes": list(run.notes),
         "lost_keyframes": sorted(slam.keyframes.lost),
     }
+    own: Arrays = {}
+    if slam.in_base is not None:
+        facts["in_site"], own = in_site.serialise(slam.in_base)
     arrays = {
+        **own,
         "frames": slam.frames.rows(),
         "keyframes": np.array(rows, np.int64).reshape(-1, 5),
         "poses": of_sim3([keyframe.T_wc for keyframe in keyframes]),
@@ -92,6 +97,8 @@ def deserialise(
     assert last is not None
     slam.tracker.resume(camera, float(facts["focal_sigma"]), int(facts["sub_maps"]), last)
     run.notes += facts["notes"]
+    if slam.in_base is not None and "in_site" in facts:
+        in_site.restore(slam.in_base, facts["in_site"], arrays)
     for keyframe in slam.keyframes.keyframes:
         if keyframe.number not in slam.keyframes.lost:
             slam.tracker.recall(keyframe)

@@ -90,16 +90,21 @@ class Retrieval:
         self._file.add(signature)
 
     def candidates(
-        self, encoding: HasKeypoints, exclude: Callable[[int], bool], count: int | None = None
+        self,
+        encoding: HasKeypoints,
+        exclude: Callable[[int], bool],
+        count: int | None = None,
+        least: float | None = None,
     ) -> list[SimilarKeyframe]:
-        """At most ``count`` (default: the config's) plausible keyframes, most similar first."""
+        """At most ``count`` (default: the config's) plausible keyframes, most similar first;
+        ``least``: similarity of those, where it shall not be a share of that of neighbours."""
         if not self._numbers:
             return []
         signature = self._signature(encoding)
         if signature is None:
             return []
         similarity = self._file.similarities(signature)
-        plausible = np.flatnonzero(similarity >= self.plausible)
+        plausible = np.flatnonzero(similarity >= (self.plausible if least is None else least))
         wanted = self._config.candidates if count is None else count
         best: list[SimilarKeyframe] = []
         for i in plausible[np.argsort(-similarity[plausible], kind="stable")]:

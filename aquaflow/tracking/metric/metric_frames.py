@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -24,8 +25,30 @@ from aquaflow.tracking.metric.motion import motion_of_camera
 from aquaflow.tracking.metric.sightings import Sightings
 from aquaflow.tracking.metric.straightening import estimates_of, straightened
 from aquaflow.tracking.metric.survey import Survey, sampled_points
+from aquaflow.tracking.metric.world_edges import World
 
 Array = npt.NDArray[np.float64]
+
+
+class EarlierDive(Protocol):
+    """An earlier dive in which this one may be recognised (``tracking/base``)."""
+
+    @property
+    def recognised(self) -> bool:
+        """True once this dive, or a part of it, has a place there."""
+        ...
+
+    def frame(self, sub_map: int, own: MetricFrame) -> MetricFrame:
+        """The earlier dive's frame, or ``own`` where the sub-map was not recognised."""
+        ...
+
+    def worlds(self, snapshot: Snapshot) -> list[World]:
+        """The earlier dive as a world of the components of the graph."""
+        ...
+
+    def moved(self) -> None:
+        """Keyframes have other poses or sub-maps than before."""
+        ...
 
 
 class MetricFrames:
@@ -49,11 +72,15 @@ class MetricFrames:
         self._since = 0
         self._solved: dict[int, MetricFrame] = {}
         """By component; set in the thread of the last job."""
+        self.base: EarlierDive | None = None
+        """An earlier dive in which this one may be recognised."""
 
     @property
     def present(self) -> bool:
-        """True once there is telemetry, or an object of known size was seen."""
-        return bool(self.telemetry) or bool(self.sightings)
+        """True once there is telemetry, an object of known size was seen, or the dive was
+        recognised in an earlier one."""
+        recognised = self.base is not None and self.base.recognised
+        return bool(self.telemetry) or bool(self.sightings) or recognised
 
     def add(self, sample: TelemetrySample) -> None:
         """A sample of telemetry, in the order of arrival."""
@@ -115,10 +142,11 @@ class MetricFrames:
         """The optimisation of a snapshot together with telemetry, to be called in any thread."""
         survey = self.survey(snapshot)
         t_s = {k.number: k.t_ns * 1e-9 for k in self._keyframes.keyframes}
+        bases = [] if self.base is None else self.base.worlds(snapshot)
 
         def together(better: Snapshot) -> GraphResult:
             with self._failures.contain("telemetry in the keyframe graph"):
-                solved = straightened(better, replace(survey, nodes=better.nodes), t_s)
+                solved = straightened(better, replace(survey, nodes=better.nodes), t_s, bases)
                 self._solved = solved.frames
                 return solved.result
             return solve(better)  # what telemetry cannot do must not cost the loops
@@ -127,6 +155,8 @@ class MetricFrames:
 
     def applied(self) -> None:
         """The last job's result has been taken over by the keyframes."""
+        if self.base is not None:
+            self.base.moved()
         self._take(self._solved)
 
     def update(self, snapshot: Snapshot) -> dict[int, MetricFrame]:
@@ -151,5 +181,7 @@ class MetricFrames:
         }
 
     def of(self, sub_map: int) -> MetricFrame:
-        """The frame of a sub-map, as last estimated."""
-        return self.frames.get(sub_map, MetricFrame.unknown())
+        """The frame of a sub-map, as last estimated: that of an earlier dive where this one was
+        recognised in it."""
+        own = self.frames.get(sub_map, MetricFrame.unknown())
+        return own if self.base is None else self.base.frame(sub_map, own)

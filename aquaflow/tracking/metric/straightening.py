@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -62,12 +62,15 @@ class Straightened:
     """By component."""
 
 
-def straightened(snapshot: Snapshot, survey: Survey, t_s: Mapping[int, float]) -> Straightened:
+def straightened(
+    snapshot: Snapshot, survey: Survey, t_s: Mapping[int, float], bases: Sequence[World] = ()
+) -> Straightened:
     """Optimise a snapshot together with what telemetry says of its keyframes.
 
-    ``t_s``: moment of each keyframe, by number. Reads nothing else, and changes nothing.
+    ``t_s``: moment of each keyframe, by number; ``bases``: worlds of an earlier dive, in which
+    keyframes were recognised. Reads nothing else, and changes nothing.
     """
-    nodes, worlds = snapshot.nodes, []
+    nodes, worlds = snapshot.nodes, list(bases)
     estimates = estimates_of(survey)
     for component, found in estimates.items():
         inside = nodes[nodes["component"] == component]
@@ -94,7 +97,11 @@ def solve_with_worlds(
     edges, count = len(snapshot.edges), len(snapshot.nodes)
     result = Optimisation(_with_worlds(snapshot, worlds), everything=False).run()
     own = result.rows < count
-    T_mn = {world.component: result.poses.get(-1 - world.component, world.T_mn) for world in worlds}
+    T_mn = {
+        world.component: result.poses.get(world.number, world.T_mn)
+        for world in worlds
+        if not world.of_base
+    }
     poses = {number: T for number, T in result.poses.items() if number >= 0}
     keyframes = replace(
         result,
@@ -116,7 +123,7 @@ def _with_worlds(snapshot: Snapshot, worlds: list[World]) -> Snapshot:
     k = 0
     for i, world in enumerate(worlds):
         T = world.T_mn
-        nodes[i] = (-1 - world.component, world.component, T.R, T.t, T.scale)
+        nodes[i] = (world.number, world.component, T.R, T.t, T.scale)
         for edge in world.edges:
             edges[k]["a"], edges[k]["b"] = len(snapshot.nodes) + i, row[edge.keyframe]
             edges[k]["R"], edges[k]["t"], edges[k]["scale"] = (

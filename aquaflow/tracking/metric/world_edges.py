@@ -101,6 +101,13 @@ class World:
     component: int
     T_mn: Sim3
     edges: Sequence[WorldEdge]
+    of_base: bool = False
+    """True for the world of an earlier dive, beside that of telemetry."""
+
+    @property
+    def number(self) -> int:
+        """Of its node: negative, and no other's."""
+        return -2 - 2 * self.component if self.of_base else -1 - 2 * self.component
 
     @property
     def strain(self) -> float:

@@ -1,0 +1,227 @@
+"""A dive in the base: looks its keyframes up, decides what is believed, and says where it lies.
+
+Every keyframe is looked up once, as side work that no frame waits for. In a live run few look-ups
+wait at a time: while they do, further keyframes go without.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from aquaflow.config import TrackingConfig
+from aquaflow.errors.failures import Failures
+from aquaflow.fusion.metric_frame import MetricFrame
+from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.keyframes import KeyframeStore
+from aquaflow.tracking.base.base import Base
+from aquaflow.tracking.base.known_places import KnownPlaces, Recognised
+from aquaflow.tracking.base.links import BaseLink, Placed, agree, link_covariance, placed
+from aquaflow.tracking.graph.table import Snapshot
+from aquaflow.tracking.metric.world_edges import World, WorldEdge
+from aquaflow.tracking.side_work import SideWork
+
+STAGE = "look-up in the base"
+"""Name of this side work."""
+MOST_WAITING = 3
+"""Look-ups in a live run: as many keyframes as the start of a map makes at once."""
+LEAST_AGREEING = 2
+"""Keyframes that must put the dive at the same place before anything is believed."""
+TO_OVERRULE = 3
+"""Keyframes that must agree against those that are believed, and be more than they are."""
+WAITING = 32
+"""Recognitions that are kept while no other agrees with them."""
+
+
+@dataclass(frozen=True)
+class FirstRecognised:
+    """The moment at which the dive was found in the base."""
+
+    frame: int
+    t_ns: int
+    """Of the keyframe whose recognition made it sure."""
+
+
+class InBase:
+    """To be used from the tracking thread."""
+
+    def __init__(
+        self,
+        base: Base,
+        keyframes: KeyframeStore,
+        config: TrackingConfig,
+        side_work: SideWork,
+        failures: Failures,
+        live: bool = False,
+    ) -> None:
+        self.base = base
+        self.links: list[BaseLink] = []
+        """Those that are believed."""
+        self.looked_up = self.passed_over = self.refused = 0
+        """Keyframes: looked up; not, because others still were; recognised where the others
+        say that they cannot be."""
+        self.first: FirstRecognised | None = None
+        self._places = KnownPlaces(base, config)
+        self._keyframes, self._side_work, self._failures = keyframes, side_work, failures
+        self._live = live
+        self._waiting: list[BaseLink] = []
+        self._news = False
+        self._placed: dict[int, Placed] | None = None
+
+    @property
+    def recognised(self) -> bool:
+        """True once the dive, or a part of it, has a place in the base."""
+        return bool(self.links)
+
+    def look(self, number: int) -> None:
+        """Look a new keyframe up."""
+        if self._live and self._side_work.waiting(STAGE) >= MOST_WAITING:
+            self.passed_over += 1
+            return
+        keyframe = self._keyframes[number]
+        with self._failures.contain(STAGE, keyframe.frame_index):
+            encoding, pointmap = keyframe.encoding, keyframe.pointmap.copy()  # fused meanwhile
+            self.looked_up += 1
+            look_up = partial(self._places.of, encoding, pointmap)
+            self._side_work.do(STAGE, keyframe.frame_index, look_up, partial(self._answer, number))
+
+    def has_news(self) -> bool:
+        """True once after links were added: the graph should take them in."""
+        news, self._news = self._news, False
+        return news
+
+    def moved(self) -> None:
+        """Keyframes have other poses or sub-maps than before."""
+        self._placed = None
+
+    def resume(
+        self, links: Sequence[BaseLink], first: FirstRecognised | None, counts: Sequence[int]
+    ) -> None:
+        """Take up what an earlier run of the dive had found; ``counts``: of keyframes looked up,
+        passed over and refused."""
+        self.links, self.first = list(links), first
+        self.looked_up, self.passed_over, self.refused = counts
+        self._news, self._placed = bool(links), None
+
+    # --- what is believed ---------------------------------------------------------------------
+
+    def _answer(self, number: int, found: Recognised | None) -> None:
+        if found is None:
+            return
+        known, estimate = found.place, found.proof.estimate
+        covariance = link_covariance(estimate.covariance)
+        self.add(
+            BaseLink(
+                number, known.number, known.sub_map, found.T_sk, covariance, found.proof.inliers
+            )
+        )
+
+    def add(self, link: BaseLink) -> None:
+        """Believe a recognition if others agree with it; else keep it until one does."""
+        near = self._nearest(link)
+        if near is not None and self._agree(link, near):
+            self._believe([link])
+            return
+        agreeing = [other for other in self._waiting if self._agree(link, other)]
+        self._waiting = [*self._waiting, link][-WAITING:]
+        self.refused += near is not None
+        if near is None and len(agreeing) + 1 >= LEAST_AGREEING:
+            self._believe([*agreeing, link])
+        elif near is not None and len(agreeing) + 1 >= max(TO_OVERRULE, self._count(link) + 1):
+            sub_map = self._keyframes[link.keyframe].sub_map
+            self.links = [
+                each for each in self.links if self._keyframes[each.keyframe].sub_map != sub_map
+            ]
+            self._believe([*agreeing, link])
+
+    def _believe(self, links: Sequence[BaseLink]) -> None:
+        if self.first is None:
+            latest = self._keyframes[links[-1].keyframe]
+            self.first = FirstRecognised(latest.frame_index, latest.t_ns)
+        self.links = sorted([*self.links, *links], key=lambda link: link.keyframe)
+        self._waiting = [each for each in self._waiting if each not in links]
+        self._news, self._placed = True, None
+
+    def _nearest(self, link: BaseLink) -> BaseLink | None:
+        """Of the believed links of the same sub-map, the one nearest on the path."""
+        sub_map = self._keyframes[link.keyframe].sub_map
+        same = [each for each in self.links if self._keyframes[each.keyframe].sub_map == sub_map]
+        return min(same, key=lambda each: abs(each.keyframe - link.keyframe), default=None)
+
+    def _count(self, link: BaseLink) -> int:
+        sub_map = self._keyframes[link.keyframe].sub_map
+        return sum(self._keyframes[each.keyframe].sub_map == sub_map for each in self.links)
+
+    def _agree(self, a: BaseLink, b: BaseLink) -> bool:
+        at_a, at_b = self._keyframes[a.keyframe], self._keyframes[b.keyframe]
+        if at_a.sub_map != at_b.sub_map or a.keyframe == b.keyframe:
+            return False
+        first, last = sorted((a.keyframe, b.keyframe))
+        path = np.array([
+            self._keyframes[number].T_wc.t
+            for number in range(first, last + 1)
+            if self._keyframes[number].sub_map == at_a.sub_map
+        ])  # fmt: skip
+        travelled = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+        return agree(a, at_a.T_wc, b, at_b.T_wc, travelled / at_a.T_wc.scale)
+
+    # --- what follows -------------------------------------------------------------------------
+
+    def by_sub_map(self) -> dict[int, list[BaseLink]]:
+        """The links of each sub-map of this dive: those to the part of the base that most lead
+        to."""
+        found: dict[int, list[BaseLink]] = {}
+        for link in self.links:
+            found.setdefault(self._keyframes[link.keyframe].sub_map, []).append(link)
+        for sub_map, links in found.items():
+            parts = [link.base_sub_map for link in links]
+            most = max(sorted(set(parts)), key=parts.count)
+            found[sub_map] = [link for link in links if link.base_sub_map == most]
+        return found
+
+    def places(self) -> Mapping[int, Placed]:
+        """Where each sub-map that was recognised lies in the base."""
+        if self._placed is None:
+            self._placed = {
+                sub_map: placed(links, [self._keyframes[link.keyframe].T_wc for link in links])
+                for sub_map, links in self.by_sub_map().items()
+            }
+        return self._placed
+
+    def frame(self, sub_map: int, own: MetricFrame) -> MetricFrame:
+        """The base's frame with the place of ``sub_map`` in it; ``own``, by the dive's telemetry,
+        where that was not recognised."""
+        where = self.places().get(sub_map)
+        if where is None:
+            return own
+        base = self.base.frame(self.by_sub_map()[sub_map][0].base_sub_map)
+        carried = Sim3Batch.of([base.T_nm]).adjoint()[0]
+        unit = base.scale_source if base.metric else "none: a map unit is that of the base"
+        return replace(
+            base,
+            T_nm=base.T_nm @ where.T_sm,
+            covariance=carried @ where.covariance @ carried.T + base.covariance,
+            T_bc=own.T_bc,
+            scale_source=f"{self.base.name}: {unit}" if base.metric else unit,
+            sources=own.sources,
+            site=self.base.name,
+        )
+
+    def worlds(self, snapshot: Snapshot) -> list[World]:
+        """The base as a world of each component of the graph: read-only, for any thread."""
+        component = dict(zip(snapshot.nodes["number"], snapshot.nodes["component"], strict=True))
+        worlds, places = [], self.places()
+        for sub_map, links in self.by_sub_map().items():
+            edges = [
+                WorldEdge(link.keyframe, link.T_sk, link.information, 0.0, 7)
+                for link in links
+                if link.keyframe in component
+            ]
+            if edges:
+                T_ms = places[sub_map].T_sm.inverse()
+                number = int(component[edges[0].keyframe])
+                worlds.append(World(number, T_ms, edges, of_base=True))
+        return worlds
