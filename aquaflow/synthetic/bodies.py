@@ -56,7 +56,7 @@ class Bodies:
         R_sc: Array,  # [N, 3, 3] camera axes in the survey frame (z down)
         centres: Array,  # [N, 3] m, survey frame (z down)
     ) -> None:
-        rng = stream(config.seed, "bodies")
+        rng = stream(config.day_seed, "bodies")
         up = np.diag([1.0, 1.0, -1.0])
         self._t, self._R, self._centres = times_s, up @ R_sc, centres @ up
         self._arm = Arm(rng.uniform(0.0, 2.0 * np.pi, 3)) if config.arm else None

@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from aquaflow.geometry.port_file import PortFile
 from aquaflow.synthetic.telemetry_noise import TelemetryNoise
+from aquaflow.synthetic.visit import Bleached, Placed, Visit
 
 __all__ = ["FACED", "Display", "SceneKind", "SyntheticConfig", "TelemetryNoise", "WaterType"]
 
@@ -149,6 +150,14 @@ class SyntheticConfig(BaseModel):
         0, ge=0, le=200, description="fish that cross the view, each at a time of its own"
     )
     arm: bool = Field(False, description="true: an arm of the vehicle reaches into the picture")
+    margin_m: float = Field(
+        0.5, ge=0.5, le=10.0, description="m of floor around what is seen, for visits elsewhere"
+    )
+    placed: tuple[Placed, ...] = Field((), description="objects besides those of the scene")
+    bleached: tuple[Bleached, ...] = Field((), description="patches without colour")
+    visit: Visit | None = Field(
+        None, description="another day's dive over the site that all other settings make"
+    )
     telemetry: TelemetryNoise = TelemetryNoise.model_validate({})
 
     @model_validator(mode="before")
@@ -165,6 +174,16 @@ class SyntheticConfig(BaseModel):
                 f"a vehicle at a {self.scene} faces it; turns must be false for this scene"
             )
         return self
+
+    @property
+    def first_day(self) -> SyntheticConfig:
+        """The dive whose settings lay out the site: this one without its ``visit``."""
+        return self if self.visit is None else self.model_copy(update={"visit": None})
+
+    @property
+    def day_seed(self) -> int:
+        """Seed of what each day draws anew."""
+        return self.seed if self.visit is None else self.visit.seed
 
     @property
     def duration_s(self) -> float:

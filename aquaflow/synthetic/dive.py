@@ -22,6 +22,7 @@ from aquaflow.synthetic.bodies import Bodies
 from aquaflow.synthetic.config import SyntheticConfig
 from aquaflow.synthetic.display import burn_in
 from aquaflow.synthetic.march import HeightField
+from aquaflow.synthetic.planted import bleach, in_light
 from aquaflow.synthetic.sensor import Snow, expose, quantised, vignette
 from aquaflow.synthetic.site import Site, camera_of, site_of
 from aquaflow.synthetic.streams import stream
@@ -54,11 +55,15 @@ def _scene(config: SyntheticConfig, site: Site) -> render.SyntheticScene:
     """The site with its colours."""
     colours = stream(config.seed, "colours")
     floor = radiance.bake(config.scene, site.relief, site.crests, colours)
+    bleach(floor, site.relief.area, config.bleached)
+    shapes = site.shapes
+    if config.visit is not None:
+        shapes = in_light(floor, shapes, config.visit.light)
     return render.SyntheticScene(
         site.relief.area,
         HeightField(site.relief.area, site.relief.height),
         MipAtlas(floor, MIP_LEVELS),
-        site.shapes,
+        shapes,
         objects.object_texture(colours),
         config.max_range_m,
     )
@@ -148,8 +153,8 @@ def _write_pictures(
     R_wc = path.R_wc(t)
     R_sc, centres = path.R_ws.T @ R_wc, path.centre_s(t)
     camera, mean = camera_of(config), WATER_TYPES[config.water]
-    noise_rng = stream(config.seed, "sensor")
-    snow = Snow(config, centres, stream(config.seed, "snow"))
+    noise_rng = stream(config.day_seed, "sensor")
+    snow = Snow(config, centres, stream(config.day_seed, "snow"))
     shade = vignette(camera, config.vignette)
     bodies = Bodies(config, t, R_sc, centres)
     with ThreadPoolExecutor(1) as pool:

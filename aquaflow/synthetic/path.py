@@ -104,7 +104,9 @@ def plan_path(
     at = np.linspace(0.0, period, DENSE + 1)
     omega = 2.0 * math.pi * (config.rises or way.rounds) / period
     swing = min(config.altitude_swing_m, MAX_CLIMB_M_S / omega)
-    altitude = config.altitude_m + swing * np.cos(omega * at)
+    visit = config.visit
+    height = config.altitude_m if visit is None else visit.altitude_m or config.altitude_m
+    altitude = height + swing * np.cos(omega * at)
     ground = np.zeros(DENSE + 1) if relief is None else _followed(relief, config, way)
     points = np.column_stack([way.points, -(ground + altitude)])
     if way.closed:

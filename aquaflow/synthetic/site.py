@@ -18,6 +18,7 @@ from aquaflow.synthetic.config import SyntheticConfig
 from aquaflow.synthetic.motion import BodyMotion
 from aquaflow.synthetic.mounting import mountings_of
 from aquaflow.synthetic.placement import place_objects
+from aquaflow.synthetic.planted import placed_shapes
 from aquaflow.synthetic.radiance import TEXELS_PER_CELL
 from aquaflow.synthetic.relief import Area, Relief
 from aquaflow.synthetic.streams import stream
@@ -71,9 +72,10 @@ def site_of(config: SyntheticConfig, least_cell_m: float = 0.0) -> Site:
     Cells of ``least_cell_m`` that are larger than the pictures need make another relief with the
     same statistics: the finest shapes are missing, and the objects lie elsewhere.
     """
-    loop = way_of(config).points
-    flat = paths.plan_path(config, stream(config.seed, "sway"))
-    low, high = _seen(config, flat)
+    first = config.first_day
+    loop = way_of(first).points
+    flat = paths.plan_path(first, stream(first.seed, "sway"))
+    low, high = _seen(first, flat)
     texel = max(
         TEXEL_PX * (config.altitude_m - 0.2) / config.focal_px,
         math.sqrt(float(np.prod(high - low)) / TEXELS_MOST),
@@ -81,10 +83,11 @@ def site_of(config: SyntheticConfig, least_cell_m: float = 0.0) -> Site:
     area = Area.around(low, high, max(texel * TEXELS_PER_CELL, least_cell_m))
     relief = build_relief(config.scene, area, loop, stream(config.seed, "terrain"))
     shapes = place_objects(config.scene, relief, loop, stream(config.seed, "objects"))
+    shapes += placed_shapes(config.placed, relief)
     # A net hangs where the floor of other scenes is; what is behind it is not followed.
     followed = np.zeros(area.shape, np.float32) if config.scene == "net" else relief.height
-    below = area.sample(followed, loop)
-    path = paths.plan_path(config, stream(config.seed, "sway"), below)
+    below = area.sample(followed, way_of(config).points)
+    path = paths.plan_path(config, stream(config.day_seed, "sway"), below)
     motion = BodyMotion(path, mountings_of(config))
     return Site(relief, shapes, objects.casters(relief, shapes), path, motion)
 
@@ -108,4 +111,4 @@ def _seen(config: SyntheticConfig, flat: paths.Path) -> tuple[Array, Array]:
     reach = np.minimum((1.0 - centre[..., 2]) / drop, config.max_range_m)
     points = (centre + reach[..., None] * directions)[..., :2].reshape(-1, 2)
     points = np.vstack([points, centre[:, 0, :2]])
-    return points.min(axis=0) - 0.5, points.max(axis=0) + 0.5
+    return points.min(axis=0) - config.margin_m, points.max(axis=0) + config.margin_m

@@ -47,7 +47,20 @@ class Way:
 
 
 def way_of(config: SyntheticConfig) -> Way:
-    """The way of a dive's scene, as long as its speed and duration make it."""
+    """The way of a dive's scene, as long as its speed and duration make it; a visit's lies
+    elsewhere."""
+    way = _way_of_first_day(config)
+    if config.visit is None:
+        return way
+    turn = math.radians(config.visit.turn_deg)
+    c, s = math.cos(turn), math.sin(turn)
+    middle = way.points.mean(axis=0)
+    turned = (way.points - middle) @ np.array([[c, s], [-s, c]]) + middle
+    points = turned + np.array(config.visit.shift_m)
+    return Way(points, way.heading + turn, way.rounds, way.closed)
+
+
+def _way_of_first_day(config: SyntheticConfig) -> Way:
     held = np.zeros(DENSE + 1)
     if config.scene == "pool":
         points = _oval(config)

@@ -42,7 +42,7 @@ class Constants:
 
 def draw_constants(config: SyntheticConfig) -> Constants:
     """The constants of a dive: another seed draws others, another sigma only scales them."""
-    rng = instrument_stream(config.seed, "constants")
+    rng = instrument_stream(config.day_seed, "constants")
     noise = config.telemetry
     dvl, depth, heading = (float(draw) for draw in rng.standard_normal(3))
     rate, acceleration = rng.standard_normal((2, 3))

@@ -46,7 +46,7 @@ def measure(
         if rate_hz == 0.0:
             continue
         t = np.arange(int(last * rate_hz + 1e-9) + 1) / rate_hz
-        rng = instrument_stream(config.seed, kind)
+        rng = instrument_stream(config.day_seed, kind)
         late = rng.exponential(1.0, len(t)) * noise.latency_s
         # One device's messages arrive in the order in which they were sent.
         arrival = np.maximum.accumulate(t + late)
