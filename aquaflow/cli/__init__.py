@@ -16,6 +16,7 @@ import typer
 from aquaflow import __version__
 from aquaflow.cli.bench import register as register_bench
 from aquaflow.cli.calibrate import register as register_calibrate
+from aquaflow.cli.change import register as register_change
 from aquaflow.cli.console import PRESETS, Json, progress_bars, unit_in_words
 from aquaflow.cli.devices import register as register_devices
 from aquaflow.cli.dive import register as register_dive
@@ -284,6 +285,7 @@ def _print_summary(finished: Finished) -> None:
 
 register_bench(app)
 register_calibrate(app)
+register_change(app)
 register_devices(app)
 register_dive(app)
 register_export(app)
