@@ -1,4 +1,4 @@
-"""``change.tif``: the changes as seen from above, on the first dive's ground axes or its UTM grid."""
+"""``change.tif``: the changes from above, on the first dive's ground axes or UTM grid."""
 
 from __future__ import annotations
 
