@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import norm
 
 from aquaflow.change.neighbours import means_by, pairs_within, parts
-from aquaflow.change.significance import null_spread
+from aquaflow.change.significance import measured_spread
 from aquaflow.change.surface import Surface
 
 Array = npt.NDArray[np.float64]
@@ -121,6 +121,10 @@ def _centred(
     values: Array,  # [N]
     sigma: Array,  # [N]
 ) -> tuple[Array, Array]:
-    """Values less their median, and sigmas that cover their spread."""
+    """Values less their median, and sigmas of their spread.
+
+    What restoration leaves open is shared by all places of a range, and most of it was taken off
+    with the median: sigmas keep their proportions, and their size is measured.
+    """
     values = values - (np.nanmedian(values) if np.isfinite(values).any() else 0.0)
-    return values, sigma * null_spread(values / sigma)[1]
+    return values, sigma * measured_spread(values / sigma)

@@ -6,26 +6,28 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
-from aquaflow.change.colour_change import shown_at
+from aquaflow.change.colour_change import DARKEST, shown_at
 from aquaflow.change.comparison import GAINED, LOST, MOVED_AWAY, MOVED_HERE, Comparison
 from aquaflow.change.patches import Patch, heights_of, window_of
 from aquaflow.change.registration import Registration
-from aquaflow.change.relief import Move, Window, best_shift, filled, hull_of
+from aquaflow.change.relief import Window, best_shift, hull_of
 from aquaflow.change.surface import Surface
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 FARTHEST = 6.0
-"""Between the two patches' middles, in the diameter of the larger: judgement; what moved further is
-told from another thing of its kind by nothing."""
-LEAST_LIKENESS = 0.8
-"""Correlation of the two shapes above the ground."""
-MOST_RATIO = 1.5
-"""Of the volumes of the two shapes."""
+"""Between the two patches' middles, in the root of the larger's area: judgement; what moved further
+is told from another thing of its kind by nothing."""
+LEAST_LIKENESS = 0.7
+"""Mean correlation of heights and brightness: 0.81 of a box that moved 10 cm on the synthetic reef,
+0.3 of the same place without a shift."""
 MOST_COLOUR = 0.35
-"""Relative difference of the colours, largest of RGB: two sigmas of restored colours."""
+"""Natural log of the ratio of the colours, largest of RGB: two sigmas of restored colours."""
+NEAREST_POINTS = 8
+"""Whose mean brightness a cell has."""
 
 
 @dataclass(frozen=True)
@@ -83,57 +85,48 @@ def _matched(
 ) -> _Pair | None:
     """The two as one thing; None where they are not."""
     apart = float(np.linalg.norm(lost.place - gained.place))
-    if apart > FARTHEST * np.sqrt(max(lost.area, gained.area)):
+    size = float(np.sqrt(max(lost.area, gained.area)))
+    if apart > FARTHEST * size or not _same_colour(lost, gained, compared, first, second):
         return None
     window = window_of(np.concatenate([lost.which, gained.which]), compared)
-    before, after = _things(window, lost, gained, compared, first, second)
-    volumes = before.sum(), after.sum()
-    if min(volumes) <= 0.0 or max(volumes) > MOST_RATIO * min(volumes):
-        return None
-    move = best_shift(before, after, 1.0)
-    if move.likeness < LEAST_LIKENESS or not _same_colour(lost, gained, compared, first, second):
+    thing = _thing(window, lost, gained, compared)
+    before = _layers(window, compared, first, np.ones(3))
+    after = _layers(window, compared, second, np.array(compared.colours.gains))
+    move = best_shift(before, after, thing, int(np.ceil((apart + size) / window.cell)))
+    if move.likeness < LEAST_LIKENESS:
         return None
     across = window.axes[:, :2] @ (move.cells[::-1] * window.cell)
-    # The height of the ground below it changes with the place.
     places = compared.places[lost.which].mean(axis=0)
     drift = registration.sigma_along(places[None], window.axes[:, :1].T)[0]
     sigma = float(np.hypot(move.sigma_cells * window.cell, drift))
-    return _Pair(a, b, 1.0 - move.likeness + _mismatch(move, volumes), across, sigma)
+    return _Pair(a, b, 1.0 - move.likeness, across, sigma)
 
 
-def _mismatch(move: Move, volumes: tuple[float, float]) -> float:
-    """What makes one partner less likely than another: unlike volumes, longer ways."""
-    return abs(float(np.log(volumes[0] / volumes[1]))) + 0.01 * float(np.linalg.norm(move.cells))
+def _thing(window: Window, lost: Patch, gained: Patch, compared: Comparison) -> Flags:
+    """[h, w] cells that the thing covered on the first day.
 
-
-def _things(
-    window: Window,
-    lost: Patch,
-    gained: Patch,
-    compared: Comparison,
-    first: Surface,
-    second: Surface,
-) -> tuple[Array, Array]:
-    """[h, w] heights of the thing above the ground on both days; 0 around it.
-
-    Where the patches are neighbours, what lies between them may be covered by the thing on both
-    days: the ground there is interpolated.
+    Where the patches are neighbours it covered what lies between them on both days, where no height
+    changed: all within the hull of both but what was gained.
     """
-    before, after = heights_of(window, compared, first), heights_of(window, compared, second)
-    masks = [
+    was, now = (
         window.mask(np.vstack([compared.places[p.which], compared.after[p.which]]))
         for p in (lost, gained)
-    ]
-    one_place = _gap(masks[0], masks[1]) <= np.sqrt(max(mask.sum() for mask in masks))
-    both = hull_of(masks[0] | masks[1]) if one_place else masks[0] | masks[1]
-    ground = np.where(both, np.nan, 0.5 * (before + after))
-    ground[masks[0]], ground[masks[1]] = after[masks[0]], before[masks[1]]
-    ground = filled(ground)
-    was, now = (both, both) if one_place else (masks[0], masks[1])
-    return (
-        np.where(was, np.maximum(before - ground, 0.0), 0.0),
-        np.where(now, np.maximum(after - ground, 0.0), 0.0),
     )
+    neighbours = _gap(was, now) <= np.sqrt(max(was.sum(), now.sum()))
+    return (hull_of(was | now) & ~now) if neighbours else hull_of(was)
+
+
+def _layers(
+    window: Window,
+    compared: Comparison,
+    surface: Surface,
+    gains: Array,  # [3] that are taken off
+) -> Array:
+    """[2, h, w] heights, and logarithms of the brightness."""
+    heights = heights_of(window, compared, surface)
+    _, near = cKDTree(surface.points).query(window.at_height(heights), k=NEAREST_POINTS)
+    bright = (surface.colours[near] / gains).mean(axis=(1, 2)).reshape(window.shape)
+    return np.stack([heights, np.log(np.maximum(bright, DARKEST))])
 
 
 def _gap(

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import binary_dilation
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -133,6 +134,9 @@ def _volume(
     """Between the upper sides of both days over the patch, across the plane of its surroundings."""
     window = window_of(which, compared)
     mask = window.mask(np.vstack([compared.places[which], compared.after[which]]))
+    # At a thing's rim a cylinder still holds ground of both days, and so it is not in the patch.
+    rim = int(np.ceil(compared.scales.cylinder / window.cell))
+    mask = binary_dilation(mask, iterations=rim)
     before, after = heights_of(window, compared, first), heights_of(window, compared, second)
     return float((after - before)[mask].sum() * window.cell**2)
 

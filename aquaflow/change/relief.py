@@ -8,8 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import griddata
-from scipy.ndimage import shift
-from scipy.signal import fftconvolve
 from scipy.spatial import ConvexHull, QhullError
 
 Array = npt.NDArray[np.float64]
@@ -68,6 +66,15 @@ class Window:
         found[row[inside], column[inside]] = True
         return found
 
+    def at_height(
+        self,
+        heights: Array,  # [h, w]
+    ) -> Array:
+        """[h w, 3] the middles of the cells at these heights."""
+        row, column = np.indices(self.shape)
+        local = np.stack([(column + 0.5) * self.cell, (row + 0.5) * self.cell, heights], axis=-1)
+        return np.asarray(local.reshape(-1, 3) @ self.axes.T + self.origin)
+
     def heights(
         self,
         points: Array,  # [N, 3]
@@ -120,50 +127,63 @@ class Move:
     """[2] rows, columns."""
     sigma_cells: float
     likeness: float
-    """Correlation of the two shapes, at most 1."""
+    """Mean correlation of heights and of brightness, at most 1."""
 
 
 def best_shift(
-    before: Array,  # [h, w] height of the thing above the ground; 0 around it
-    after: Array,  # [h, w]
-    apart_cells: float,
+    before: Array,  # [L, h, w] layers of the first day: heights, brightness
+    after: Array,  # [L, h, w] the same of the second
+    thing: Flags,  # [h, w] cells of the first day that it covers
+    most: int,
 ) -> Move:
-    """The shift that lays ``before`` onto ``after``: the peak of their correlation, which a
-    parabola around it refines; sigma follows from what is left over and the slopes.
+    """The shift, of ``most`` cells at most along each axis, by which the thing's cells look most
+    alike on both days: the peak of the mean correlation of the layers, refined by a parabola.
 
-    Args:
-        apart_cells: distance of cells from which they err independently.
+    Its sigma is the way on which that mean falls by its standard error, (1 - r^2) / sqrt(n).
     """
-    found = fftconvolve(after, before[::-1, ::-1])
+    at, shape = np.argwhere(thing), np.array(thing.shape)
+    own = _standard(before[:, at[:, 0], at[:, 1]])
+    found = np.full((2 * most + 1, 2 * most + 1), -1.0)
+    for row, column in np.ndindex(found.shape):
+        places = at + np.array([row - most, column - most])
+        inside = (places >= 0).all(axis=1) & (places < shape).all(axis=1)
+        if inside.all():
+            there = _standard(after[:, places[:, 0], places[:, 1]])
+            found[row, column] = float((own * there).mean())
     peak = np.array(np.unravel_index(int(np.argmax(found)), found.shape))
-    cells = (peak + _vertex(found, peak)) - (np.array(before.shape) - 1)
-    moved = shift(before, cells, order=1)
-    norm = float(np.sqrt((moved**2).sum() * (after**2).sum()))
-    likeness = float((moved * after).sum()) / norm if norm > 0.0 else 0.0
-    slopes = np.stack(np.gradient(moved)).reshape(2, -1)
-    thing = (moved > 0.0) | (after > 0.0)
-    left = float(np.sqrt(((moved - after)[thing] ** 2).mean())) if thing.any() else 0.0
-    least = float(np.linalg.eigvalsh(slopes @ slopes.T)[0])
-    sigma = left * apart_cells / np.sqrt(least) if least > 0.0 else np.inf
-    return Move(cells, float(sigma), likeness)
+    offset, bend = _vertex(found, peak)
+    likeness = float(found[tuple(peak)])
+    error = (1.0 - likeness**2) / np.sqrt(max(1, len(at)))
+    sigma = float(np.sqrt(2.0 * error / bend)) if bend > 0.0 else np.inf
+    return Move(peak - most + offset, sigma, likeness)
+
+
+def _standard(
+    values: Array,  # [L, n]
+) -> Array:
+    """[L, n] of mean 0 and variance 1; 0 where all are alike."""
+    centred = values - values.mean(axis=1, keepdims=True)
+    spread = centred.std(axis=1, keepdims=True)
+    return np.asarray(np.where(spread > 0.0, centred / np.where(spread > 0.0, spread, 1.0), 0.0))
 
 
 def _vertex(
     values: Array,  # [h, w]
     peak: npt.NDArray[np.intp],  # [2]
-) -> Array:
-    """[2] of a parabola through the peak and its neighbours along each axis, from the peak."""
-    found = np.zeros(2)
+) -> tuple[Array, float]:
+    """[2] of a parabola through the peak and its neighbours along each axis, from the peak, and
+    the smaller of its two bends; 0 at the raster's edge."""
+    found, bends = np.zeros(2), []
     for axis in range(2):
         at = [int(peak[0]), int(peak[1])]
         if not 0 < at[axis] < values.shape[axis] - 1:
-            continue
+            return np.zeros(2), 0.0
         near = []
         for step in (-1, 0, 1):
             place = at.copy()
             place[axis] += step
             near.append(float(values[place[0], place[1]]))
-        bend = near[0] - 2.0 * near[1] + near[2]
-        if bend < 0.0:
-            found[axis] = 0.5 * (near[0] - near[2]) / bend
-    return found
+        bends.append(2.0 * near[1] - near[0] - near[2])
+        if bends[-1] > 0.0:
+            found[axis] = -0.5 * (near[0] - near[2]) / bends[-1]
+    return found, min(bends)

@@ -24,6 +24,10 @@ MAD_OF_NORMAL = 0.6745
 """Median absolute deviation of a normal distribution with sigma 1."""
 
 
+LEAST_SPREAD = 1e-3
+"""Of measured scores: the same dive twice has none."""
+
+
 def null_spread(
     scores: Array,  # [N] over their sigmas; NaN: none
 ) -> tuple[float, float]:
@@ -34,6 +38,15 @@ def null_spread(
     middle = float(np.median(known))
     spread = float(np.median(np.abs(known - middle))) / MAD_OF_NORMAL
     return middle, max(1.0, spread)
+
+
+def measured_spread(
+    scores: Array,  # [N] over their sigmas, about 0; NaN: none
+) -> float:
+    """Spread of the unchanged, less than 1 too: what sigmas that all places share do not add to."""
+    known = np.abs(scores[np.isfinite(scores)])
+    spread = float(np.median(known)) / MAD_OF_NORMAL if len(known) else 1.0
+    return max(LEAST_SPREAD, spread)
 
 
 def two_sided(
