@@ -29,7 +29,7 @@ Array = npt.NDArray[np.float64]
 WIDTH_IN, DOTS_PER_INCH = 16.0, 110
 COLOURS = {
     NOT_SEEN: "#d9d9d9", UNCHANGED: "#8c9aa5", GAINED: "#1b9e77", LOST: "#d95f02",
-    BLEACHED: "#ffffff", MOVED_AWAY: "#e7298a", MOVED_HERE: "#7570b3",
+    BLEACHED: "#ffd92f", MOVED_AWAY: "#e7298a", MOVED_HERE: "#7570b3",
 }  # fmt: skip
 """Of the classes: ColorBrewer's Dark2, which most colour-blind people tell apart."""
 SHOWN_PERCENTILE = 99.0

@@ -187,7 +187,7 @@ def _along(
     # Balls strung along the axis hold the cylinder; each answers for the disc around its middle.
     half = scales.cylinder
     steps = 2 * math.ceil(scales.reach / (2.0 * half)) + 1
-    stops = 2.0 * half * (np.arange(steps) - steps // 2)
+    stops = np.asarray(2.0 * half * (np.arange(steps) - steps // 2), np.float64)
     ball = math.sqrt(2.0) * half * (1.0 + 1e-9)
     for part in parts(len(usable), max(1, CENTRES_AT_ONCE // steps)):
         which = usable[part]

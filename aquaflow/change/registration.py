@@ -62,7 +62,7 @@ class Registration:
         """[N] 1 sigma of places along their normals; 0 where a normal is NaN."""
         rows = _rows(points - self.middle, np.nan_to_num(normals))
         variance = np.einsum("ni,ij,nj->n", rows, self.covariance, rows)
-        return np.sqrt(np.maximum(variance, 0.0))
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
 def register(
@@ -119,8 +119,9 @@ class _Pairs:
 def _pairs(tree: cKDTree, normals: Array, points: Array, reach: float) -> _Pairs:
     distance, nearest = tree.query(points, distance_upper_bound=reach)
     which = np.flatnonzero(np.isfinite(distance))
-    of = normals[nearest[which]]
-    offset = points[which] - tree.data[nearest[which]]
+    nearest = np.asarray(nearest)[which]
+    of = normals[nearest]
+    offset = points[which] - tree.data[nearest]
     return _Pairs(which, of, (offset * of).sum(axis=1))
 
 

@@ -105,10 +105,10 @@ def surface_of(
         rgb, confidence = colours.of(radiance, seen.nearest[None])
         shown.append(rgb[0] / (255.0 * grey))
         sure.append(confidence[0])
-    confidence = np.clip(np.concatenate(sure).astype(np.float64), 0.0, 1.0)
+    known: Array = np.clip(np.concatenate(sure).astype(np.float64), 0.0, 1.0)
     surface = Surface(
         mesh.vertices, mesh.normals(), found.sigma, np.concatenate(shown),
-        relative_colour_sigma(confidence), MATCH_PX * views.footprint, mesh.area(), views,
+        relative_colour_sigma(known), MATCH_PX * views.footprint, mesh.area(), views,
         Sim3.identity(),
     )  # fmt: skip
     return surface, side

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
@@ -39,7 +40,7 @@ def _shape(placed: Placed, relief: Relief) -> Shape:
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     centre = np.array([x, y, ground + (1.0 - SUNK) * placed.half_m])
     growth = (0.26, 0.24, 0.15)
-    kind = "box" if placed.kind == "box" else "sphere"
+    kind: Literal["box", "sphere"] = "box" if placed.kind == "box" else "sphere"
     size = (placed.half_m,) * 3
     return Shape(
         kind, centre, R, size, placed.paint, growth, 0.35, pattern_m=placed.pattern_m

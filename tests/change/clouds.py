@@ -27,8 +27,10 @@ def cores(seed: int = 9, count: int = 400) -> Array:
     return np.column_stack([xy, np.zeros(count)])
 
 
-def compared(first: Cloud, second: Cloud, places: Array, up: Array, **options: bool) -> Distances:
+def compared(
+    first: Cloud, second: Cloud, places: Array, up: Array, of_surfaces: bool = False
+) -> Distances:
     """M3C2 with normals of the first cloud, towards ``up``."""
     towards = np.tile(up, (len(first.points), 1))
     normals = normals_at(places, first.points, towards, SCALES.normal)
-    return m3c2(first, second, places, normals, SCALES, **options)
+    return m3c2(first, second, places, normals, SCALES, of_surfaces=of_surfaces)

@@ -52,7 +52,7 @@ def views_of(box: tuple[float, float] | None, work: Path) -> ViewSurfaces:
     def ranges(centre: Array, rays: Array) -> Array:
         top, floor = ((z - centre[2]) / rays[..., 2] for z in (TALL, 0.0))
         places = (centre + rays * top[..., None])[..., :2]
-        return np.where(height(places, box) >= TALL, top, floor)
+        return np.asarray(np.where(height(places, box) >= TALL, top, floor))
 
     return surfaces_of(above_plane(), [ranges] * 5, work)
 

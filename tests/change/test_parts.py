@@ -30,7 +30,7 @@ def normals_of(points: np.ndarray) -> np.ndarray:
         -0.6 * np.cos(4.0 * x) * np.cos(5.0 * y), 0.75 * np.sin(4.0 * x) * np.sin(5.0 * y),
         np.ones(len(x)),
     ])  # fmt: skip
-    return slope / np.linalg.norm(slope, axis=1, keepdims=True)
+    return np.asarray(slope / np.linalg.norm(slope, axis=1, keepdims=True))
 
 
 def test_a_registration_finds_the_similarity_and_states_its_error() -> None:
