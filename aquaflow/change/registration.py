@@ -116,7 +116,12 @@ class _Pairs:
     residuals: Array
 
 
-def _pairs(tree: cKDTree, normals: Array, points: Array, reach: float) -> _Pairs:
+def _pairs(
+    tree: cKDTree,
+    normals: Array,  # [N, 3]
+    points: Array,  # [M, 3]
+    reach: float,
+) -> _Pairs:
     distance, nearest = tree.query(points, distance_upper_bound=reach)
     which = np.flatnonzero(np.isfinite(distance))
     nearest = np.asarray(nearest)[which]
