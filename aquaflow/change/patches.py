@@ -141,7 +141,10 @@ def _volume(
     return float((after - before)[mask].sum() * window.cell**2)
 
 
-def window_of(which: npt.NDArray[np.intp], compared: Comparison) -> Window:
+def window_of(
+    which: npt.NDArray[np.intp],  # [M]
+    compared: Comparison,
+) -> Window:
     """The raster over some core points, in the plane of what is unchanged around them."""
     places = np.vstack([compared.places[which], compared.after[which]])
     middle = places.mean(axis=0)
