@@ -19,14 +19,14 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from filelock import FileLock
 from hypothesis import settings
 
 from tests.command_line import Cli, Ran, refused, run_aquaflow
+from tests.made_once import made_once
 from tests.small_recording import FRAMES, HEIGHT, QUICK, WIDTH
 
 __all__ = ["Cli", "Ran", "refused", "run_aquaflow"]
@@ -45,19 +45,6 @@ settings.register_profile("aquaflow", deadline=None)
 settings.load_profile("aquaflow")
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
-
-
-def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
-    """A folder that ``make`` writes in the first process that needs it; the others wait."""
-    root = factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        root = root.parent  # each worker has a folder of its own in it
-    folder, finished = root / name, root / f"{name}.finished"
-    with FileLock(root / f"{name}.lock"):
-        if not finished.exists():
-            make(folder)
-            finished.touch()
-    return folder
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
     {"cli", "api"},
     {"evaluation", "service", "doctor"},
-    {"dive", "viewer", "training"},
+    {"change", "dive", "viewer", "training"},
     {"measure", "site"},
     {"slam", "export", "sim_drivers"},
     {"tracking", "mapping", "coverage", "recording", "drivers", "calibration"},

@@ -16,6 +16,7 @@ import typer
 from aquaflow import __version__
 from aquaflow.cli.bench import register as register_bench
 from aquaflow.cli.calibrate import register as register_calibrate
+from aquaflow.cli.change import register as register_change
 from aquaflow.cli.console import (
     PRESETS,
     InSite,
@@ -297,6 +298,7 @@ def _print_summary(finished: Finished) -> None:
 
 register_bench(app)
 register_calibrate(app)
+register_change(app)
 register_devices(app)
 register_dive(app)
 register_export(app)

@@ -22,6 +22,7 @@ from aquaflow.synthetic.bodies import Bodies
 from aquaflow.synthetic.config import SyntheticConfig
 from aquaflow.synthetic.display import burn_in
 from aquaflow.synthetic.march import HeightField
+from aquaflow.synthetic.planted import bleach
 from aquaflow.synthetic.sensor import Snow, expose, quantised, vignette
 from aquaflow.synthetic.site import Site, camera_of, site_of
 from aquaflow.synthetic.streams import stream
@@ -55,6 +56,7 @@ def _scene(config: SyntheticConfig, site: Site) -> render.SyntheticScene:
     home = config.home
     colours = stream(home.seed, "colours")
     floor = radiance.bake(home.scene, site.relief, site.crests, colours)
+    bleach(floor, site.relief.area, config.bleached)
     return render.SyntheticScene(
         site.relief.area,
         HeightField(site.relief.area, site.relief.height),

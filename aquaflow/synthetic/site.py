@@ -18,6 +18,7 @@ from aquaflow.synthetic.config import SyntheticConfig
 from aquaflow.synthetic.motion import BodyMotion
 from aquaflow.synthetic.mounting import mountings_of
 from aquaflow.synthetic.placement import place_objects
+from aquaflow.synthetic.planted import placed_shapes
 from aquaflow.synthetic.radiance import TEXELS_PER_CELL
 from aquaflow.synthetic.relief import Area, Relief
 from aquaflow.synthetic.streams import stream
@@ -82,6 +83,7 @@ def site_of(config: SyntheticConfig, least_cell_m: float = 0.0) -> Site:
     area = Area.around(low, high, max(texel * TEXELS_PER_CELL, least_cell_m))
     relief = build_relief(home.scene, area, around, stream(home.seed, "terrain"))
     shapes = place_objects(home.scene, relief, around, stream(home.seed, "objects"))
+    shapes += placed_shapes(config.placed, relief)
     # A net hangs where the floor of other scenes is; what is behind it is not followed.
     followed = np.zeros(area.shape, np.float32) if config.scene == "net" else relief.height
     below = area.sample(followed, way_of(config).points)

@@ -84,6 +84,7 @@ QUICK: dict[str, dict[str, str]] = {
     "stress": {"--family": "solvers"},
     "report": {"--pdf": "new.pdf"},
     "video": {"--out": "new.mp4"},
+    "change": {"--out": "new"},
 }
 """Given where nothing else was drawn, so that a run that works is over soon."""
 

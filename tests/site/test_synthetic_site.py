@@ -16,7 +16,7 @@ from aquaflow.site.merged_file import MergedSite
 from aquaflow.site.merging import merge
 from aquaflow.sources import open_recording
 from aquaflow.synthetic import SyntheticConfig, write_dive
-from tests.conftest import made_once
+from tests.made_once import made_once
 from tests.small_recording import FRAMES, HEIGHT, WIDTH
 
 OTHER = SyntheticConfig(

@@ -70,14 +70,15 @@ class WrittenMesh:
 
 
 @dataclass(frozen=True)
-class _Surface:
-    """A mesh in the upright frame with what its views say."""
+class FusedSurface:
+    """A mesh with what its views say, in their frame."""
 
     mesh: TriangleMesh
     sigma: Array
-    """[N]"""
+    """[N] of the vertices: :class:`aquaflow.export.mesh.colouring.Seen`."""
     views: ViewSurfaces
     voxel: float
+    """Side of a voxel."""
 
 
 def export_mesh(
@@ -110,7 +111,7 @@ def export_mesh(
     scale, report = frame.T_nm.scale, progress or _nothing
     drawn = drawn_surfaces(mapper, scale)
     views = ViewSurfaces(posed, drawn, path.parent, partial(report, "views"))
-    surface = _surface(views, resolution or rounded(VOXEL_PX * views.footprint), report)
+    surface = fused_surface(views, resolution or rounded(VOXEL_PX * views.footprint), report)
     through = views.median_range if water and mapper.medium.active else None
     colours = Colours(mapper, scale, through)
 
@@ -145,8 +146,12 @@ def _nothing(what: str, done: int, total: int) -> None:
     """No progress is shown."""
 
 
-def _surface(views: ViewSurfaces, voxel: float, report: Progress) -> _Surface:
-    """The fused surface without what too few views agree on, and without small pieces."""
+def fused_surface(views: ViewSurfaces, voxel: float, report: Progress) -> FusedSurface:
+    """The fused surface without what too few views agree on, and without small pieces.
+
+    Raises:
+        InputError: scikit-image is missing, or nothing is left.
+    """
     blocks = Blocks(views, voxel, partial(report, "blocks"))
     builder = SurfaceBuilder(voxel)
     for done, chunk in enumerate(blocks.chunks()):
@@ -161,7 +166,7 @@ def _surface(views: ViewSurfaces, voxel: float, report: Progress) -> _Surface:
             "too little of the map is seen well by two views to make a surface of it; give a "
             "larger --resolution, or map a recording that shows more"
         )
-    return _Surface(mesh, _sigmas(views, mesh, voxel), views, voxel)
+    return FusedSurface(mesh, _sigmas(views, mesh, voxel), views, voxel)
 
 
 def _sigmas(
@@ -175,7 +180,7 @@ def _sigmas(
     return np.concatenate(found)
 
 
-def _placed(surface: _Surface, where: Placement, seen: str) -> PlacedMesh:
+def _placed(surface: FusedSurface, where: Placement, seen: str) -> PlacedMesh:
     """The mesh in the coordinates that it is written in."""
     origin = np.zeros(3)
     if where.epsg is not None:

@@ -11,11 +11,13 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy.typing as npt
+
 from aquaflow.errors import InputError, first_line
 from aquaflow.errors.extra import load
 from aquaflow.export.ortho.grid import TILE_PX, Grid, Tile
 from aquaflow.export.ortho.ground import Ground
-from aquaflow.export.ortho.layers import NODATA, Layer, TilePixels
+from aquaflow.export.ortho.layers import NODATA, RasterFile
 
 CACHE_MB = 64
 """GDAL's cache of blocks; it takes a twentieth of the memory otherwise."""
@@ -35,20 +37,24 @@ def require_rasterio() -> Any:
 class Raster:
     """A raster that is being written."""
 
-    def __init__(self, dataset: Any, layer: Layer) -> None:
-        self._dataset, self._layer = dataset, layer
+    def __init__(self, dataset: Any) -> None:
+        self._dataset = dataset
 
-    def write(self, tile: Tile, pixels: TilePixels) -> None:
+    def write(
+        self,
+        tile: Tile,
+        values: npt.NDArray[Any],  # [bands, h, w]
+    ) -> None:
         """Put a tile into its place."""
         from rasterio.windows import Window
 
         window = Window(tile.column, tile.row, tile.width, tile.height)
-        self._dataset.write(self._layer.values(pixels), window=window)
+        self._dataset.write(values, window=window)
 
 
 @contextlib.contextmanager
 def writing_raster(
-    folder: Path, layer: Layer, grid: Grid, ground: Ground, tags: Mapping[str, str]
+    folder: Path, layer: RasterFile, grid: Grid, ground: Ground, tags: Mapping[str, str]
 ) -> Iterator[Raster]:
     """A raster that becomes the layer's file in ``folder`` when the block ends well.
 
@@ -65,7 +71,7 @@ def writing_raster(
             with rasterio.open(tiled, "w", **_profile(layer, grid, ground)) as dataset:
                 dataset.descriptions = tuple(band.format(unit=ground.unit) for band in layer.bands)
                 dataset.update_tags(**tags)
-                yield Raster(dataset, layer)
+                yield Raster(dataset)
             _optimise(tiled, part, layer)
         part.replace(path)
     except (OSError, rasterio.errors.RasterioError) as error:
@@ -78,7 +84,7 @@ def writing_raster(
         part.unlink(missing_ok=True)
 
 
-def _profile(layer: Layer, grid: Grid, ground: Ground) -> dict[str, Any]:
+def _profile(layer: RasterFile, grid: Grid, ground: Ground) -> dict[str, Any]:
     """Of the file that tiles are written into."""
     profile = {
         "driver": "GTiff", "width": grid.width, "height": grid.height, "count": len(layer.bands),
@@ -91,7 +97,7 @@ def _profile(layer: Layer, grid: Grid, ground: Ground) -> dict[str, Any]:
     return profile | {"dtype": "uint8", "photometric": "rgb", "alpha": "non-premultiplied"}
 
 
-def _optimise(tiled: Path, part: Path, layer: Layer) -> None:
+def _optimise(tiled: Path, part: Path, layer: RasterFile) -> None:
     """The file ``part`` with the tiles of ``tiled`` and overviews of them."""
     from rasterio import shutil
 

@@ -32,7 +32,7 @@ class TilePixels:
 
 
 @dataclass(frozen=True)
-class Layer:
+class RasterFile:
     """One file."""
 
     name: str
@@ -40,6 +40,12 @@ class Layer:
     """In words; ``{unit}`` is the ground's."""
     numbers: bool
     """True: float32 with NODATA; False: 8-bit red, green, blue and alpha."""
+
+
+@dataclass(frozen=True)
+class Layer(RasterFile):
+    """A file of what is known of tiles."""
+
     values: Callable[[TilePixels], npt.NDArray[Any]]
     """[bands, h, w] of a tile."""
 

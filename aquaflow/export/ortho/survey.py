@@ -106,8 +106,8 @@ def export_survey(
             pixels = looked.at(tile)
             if pixels is not None:
                 covered += int(pixels.mapped.sum())
-                for raster in rasters:
-                    raster.write(tile, pixels)
+                for layer, raster in zip(LAYERS[kind], rasters, strict=True):
+                    raster.write(tile, layer.values(pixels))
             if progress is not None:
                 progress("tiles", done + 1, grid.tile_count)
     share = covered / (grid.width * grid.height)
