@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 FLOORS = (
     {"cli", "api"},
-    {"evaluation", "service", "doctor"},
+    {"evaluation", "service", "doctor", "batch"},
     {"dive", "viewer", "training"},
     {"measure"},
     {"slam", "export", "sim_drivers"},
