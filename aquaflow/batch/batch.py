@@ -83,10 +83,12 @@ def _held(site: str, cache: Path) -> Iterator[Path]:
     except OSError as error:
         raise InputError(f"cannot make {folder}: {error.strerror}; give another --out") from error
     lock = FolderLock(folder)
+    works = folder if is_url(site) else folder / DIVES
     try:
-        remove_abandoned(folder if is_url(site) else folder / DIVES)
+        remove_abandoned(works)
         yield folder
     finally:
+        remove_abandoned(works)  # of killed attempts
         lock.release()
 
 

@@ -70,6 +70,7 @@ def site(
 Ran = tuple[Path, subprocess.CompletedProcess[str]]
 
 
+@pytest.mark.ci
 def test_one_poisoned_recording_costs_itself_alone(site: Ran) -> None:
     out, ran = site
     assert ran.returncode == 1
@@ -82,6 +83,7 @@ def test_one_poisoned_recording_costs_itself_alone(site: Ran) -> None:
     assert leftovers(out) == []
 
 
+@pytest.mark.ci
 def test_a_killed_attempt_is_made_again_and_a_crash_no_more_often_than_asked(site: Ran) -> None:
     out, _ = site
     begun = [line["dive"] for line in events(out, "started")]
@@ -91,6 +93,7 @@ def test_a_killed_attempt_is_made_again_and_a_crash_no_more_often_than_asked(sit
     assert [line["dive"] for line in events(out, "lost")].count("killed") == 1
 
 
+@pytest.mark.ci
 def test_a_dive_of_a_batch_has_the_bytes_of_map(
     site: Ran, recordings: Path, tmp_path: Path
 ) -> None:
@@ -106,6 +109,7 @@ def test_a_dive_of_a_batch_has_the_bytes_of_map(
     assert len(in_batch) > 5
 
 
+@pytest.mark.ci
 def test_again_nothing_is_done_twice_and_other_settings_are_refused(
     site: Ran, recordings: Path, poisoned: dict[str, str]
 ) -> None:
@@ -122,6 +126,7 @@ def test_again_nothing_is_done_twice_and_other_settings_are_refused(
     assert contents(out) == before
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_the_batch_in_a_sentence_and_room_lets_it_go_on(
     recordings: Path, poisoned: dict[str, str], tmp_path: Path
 ) -> None:
@@ -135,6 +140,7 @@ def test_a_full_disk_ends_the_batch_in_a_sentence_and_room_lets_it_go_on(
     assert [path.name for path in (tmp_path / "site" / "dives").iterdir()] == ["dive0"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
 def test_a_batch_that_is_stopped_leaves_no_process_and_can_be_continued(
     recordings: Path, poisoned: dict[str, str], tmp_path: Path, end: signal.Signals
