@@ -16,7 +16,7 @@ from aquaflow.batch.job import Job, Outcome
 from aquaflow.errors import InputError
 
 PROGRAM = "aquaflow.batch.ray_driver"
-JOIN_S = 120.0
+JOIN_S = 90.0
 """To reach a cluster; Ray tries for half a minute by itself."""
 SILENT_S = 45.0
 """Without a word of the cluster before it counts as gone. Ray's own nodes give a head that is

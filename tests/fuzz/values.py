@@ -13,6 +13,7 @@ DIVES = ("dive", "dive", "dive", "killed")
 FITTING: dict[str, tuple[str, ...]] = {
     "source": RECORDINGS,
     "recording": RECORDINGS,
+    "dives": (*RECORDINGS, "README.md"),
     "pictures": ("pictures", "recording"),
     "dive": DIVES,
     "out": ("dive", "killed", "recording", "recorded", "README.md"),
@@ -42,6 +43,7 @@ ABSURD_PATHS = (
 
 ONLY: dict[str, tuple[str, ...]] = {
     "opensplat": ("false", "true", "", "no-such-program", "'", "cat", "echo {}", "echo 1"),
+    "cluster": ("127.0.0.1:9", "", "é", "-1", "ray://127.0.0.1:9"),
     "url": (
         *("http://127.0.0.1:1", "http://[::1]:1", "127.0.0.1", "", "http://", "http://127.0.0.1:x"),
         *("http://127.0.0.1:99999", "http://127.0.0.1:-1", "http://[::1", "ftp://127.0.0.1"),
@@ -82,6 +84,7 @@ QUICK: dict[str, dict[str, str]] = {
     "stress": {"--family": "solvers"},
     "report": {"--pdf": "new.pdf"},
     "video": {"--out": "new.mp4"},
+    "batch": {"--out": "new", "--retries": "0"},
 }
 """Given where nothing else was drawn, so that a run that works is over soon."""
 
