@@ -50,16 +50,6 @@ class Journal:
         self._stream.close()
 
 
-def read_journal(path: Path) -> list[dict[str, Any]]:
-    """The whole lines of a journal, in order; none where there is no journal."""
-    try:
-        text = path.read_bytes()
-    except OSError:
-        return []
-    whole = text[: text.rfind(b"\n") + 1]
-    return [json.loads(line) for line in whole.splitlines()]
-
-
 def _mend(path: Path) -> None:
     """Cut off a last line that has no end."""
     if is_cut_short(path):

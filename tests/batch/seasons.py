@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import time
 from pathlib import Path
 from typing import Any
 
-from aquaflow.batch.journal import JOURNAL, read_journal
+from aquaflow.batch.journal import JOURNAL
 from tests.small_recording import GIVE_UP_S
 
 FROM_RUN_TO_RUN = {"metrics.json", "report.html", "log.jsonl", "manifest.json"}
@@ -72,6 +73,16 @@ def contents(site: Path) -> dict[str, bytes]:
         for path in sorted(dives.rglob("*"))
         if path.is_file() and path.name not in FROM_RUN_TO_RUN
     }
+
+
+def read_journal(path: Path) -> list[dict[str, Any]]:
+    """The whole lines of a journal, in order; none where there is no journal."""
+    try:
+        text = path.read_bytes()
+    except OSError:
+        return []
+    whole = text[: text.rfind(b"\n") + 1]
+    return [json.loads(line) for line in whole.splitlines()]
 
 
 def events(site: Path, event: str) -> list[dict[str, Any]]:

@@ -8,7 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from aquaflow.batch.journal import Journal, read_journal
+from aquaflow.batch.journal import Journal
+from tests.batch.seasons import read_journal
 
 WRITER = """
 import sys

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 from aquaflow.batch.job import Job, Outcome
-from aquaflow.batch.journal import Journal, read_journal
+from aquaflow.batch.journal import Journal
 from aquaflow.batch.season import End, Season, failed, run_season
 from aquaflow.batch.workers import LocalWorkers
 from aquaflow.errors import InputError
+from tests.batch.seasons import read_journal
 
 
 def job(name: str, size_bytes: int = 1, memory_mb: int = 100, threads: int = 1) -> Job:
