@@ -15,7 +15,7 @@ FLOORS = (
     {"cli", "api"},
     {"evaluation", "service", "doctor", "batch"},
     {"dive", "viewer", "training"},
-    {"measure"},
+    {"measure", "site"},
     {"slam", "export", "sim_drivers"},
     {"tracking", "mapping", "coverage", "recording", "drivers", "calibration"},
     {"keyframes", "sources", "synthetic", "fusion"},

@@ -28,6 +28,7 @@ from aquaflow.cli.report import register as register_report
 from aquaflow.cli.scale import register as register_scale
 from aquaflow.cli.service import exit_code, map_realtime, print_finished
 from aquaflow.cli.service import register as register_service
+from aquaflow.cli.site import register as register_site
 from aquaflow.cli.stress import register as register_stress
 from aquaflow.cli.video import register as register_video
 from aquaflow.errors.crash_report import one_sentence, print_anything, refuse_unreadable
@@ -295,5 +296,6 @@ register_report(app)
 register_scale(app)
 register_measure(app)
 register_service(app)
+register_site(app)
 register_stress(app)
 register_video(app)

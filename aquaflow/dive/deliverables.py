@@ -26,6 +26,7 @@ from aquaflow.dive.held_out_example import HeldOut, mean_amplification
 from aquaflow.dive.medium_json import medium_json
 from aquaflow.dive.metric_outputs import MetricOutputs, held_out_in, water_in, worlds_in_words
 from aquaflow.dive.path_rows import path_rows
+from aquaflow.dive.places_of_dive import write_places_of
 from aquaflow.dive.reef import numbers_at_the_end
 from aquaflow.dive.report_data import report_data
 from aquaflow.dive.results import (
@@ -73,7 +74,9 @@ class Deliverables:
         """None before they are measured, and where that failed."""
         self.notes: list[str] = []
         """What was left out."""
-        self.poses: dict[int, Sim3] = self._in_n(tracked_poses(results))
+        self._poses_m = tracked_poses(results)
+        """T_mc by frame index."""
+        self.poses: dict[int, Sim3] = self._in_n(self._poses_m)
         """T_nc by frame index."""
         self._main = largest_sub_map(results)
         self._waters: dict[int, WaterSummary | None] = {}
@@ -101,7 +104,8 @@ class Deliverables:
         """Poses as the map refined them, and the water of each sub-map."""
         attempt = self._attempt
         refined = attempt("refined poses", lambda: refined_poses(self.slam, self.results))
-        self.poses = self.poses if refined is None else self._in_n(refined)
+        self._poses_m = refined or self._poses_m
+        self.poses = self._in_n(self._poses_m)
         for sub_map in self.slam.mappers:
             attempt("water summary", partial(self._summarise_water, sub_map))
 
@@ -150,6 +154,8 @@ class Deliverables:
             attempt("writing camera.yaml", partial(self._write_cameras, camera))
         for sub_map in self.slam.mappers:
             self._write_map(sub_map)
+        places = partial(write_places_of, self.folder.path, self.slam, self._poses_m)
+        attempt("writing places.npz", places)
         attempt("writing the coverage", self._write_coverage)
         attempt("drawing the overview", self._draw_overview)
 

@@ -61,7 +61,7 @@ RESULTS = (
     KNOWN_LENGTHS,
     TELEMETRY,
     *("coverage.npz", "coverage.json", "coverage.png", "overview.png", "report.pdf"),
-    *("metric.json", "trajectory.csv", "georeference.json", STATUS),
+    *("metric.json", "trajectory.csv", "georeference.json", "places.npz", STATUS),
     *(
         "restored/*.png",
         "points.laz",

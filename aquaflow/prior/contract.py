@@ -33,6 +33,15 @@ class Keypoints:
     """[M, d]; alike where they are near each other. They do not change when the camera rolls."""
 
 
+class HasKeypoints(Protocol):
+    """A picture by its keypoints alone: an encoding, or what a finished dive kept of one."""
+
+    @property
+    def keypoints(self) -> Keypoints:
+        """Empty where the picture shows nothing."""
+        ...
+
+
 class Encoding(Protocol):
     """One picture, digested once and kept with its frame."""
 

@@ -61,6 +61,8 @@ def make_exemplars(root: Path) -> tuple[str, ...]:
         ["synth", "recording", f"--frames={FRAMES}", f"--width={WIDTH}", f"--height={HEIGHT}"],
         ["map", "recording", "--out=dive", "--refine-steps=3"],
         ["record", "--source=recording", "--out=recorded", "--seconds=1"],
+        ["site", "add", "site", "dive"],
+        ["site", "merge", "site"],
     ]
     for argv in aquaflow:
         _done(run_forked(main, ["aquaflow", *argv], root, MAKING), argv)

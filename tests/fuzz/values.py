@@ -16,6 +16,8 @@ FITTING: dict[str, tuple[str, ...]] = {
     "dives": (*RECORDINGS, "README.md"),
     "pictures": ("pictures", "recording"),
     "dive": DIVES,
+    "dives": DIVES,
+    "site": ("site",),
     "out": ("dive", "killed", "recording", "recorded", "README.md"),
     "csv": ("positions.csv", "README.md"),
     "truth": ("recording", "poses.tum", "positions.csv", "dive"),
@@ -92,7 +94,7 @@ INTERRUPTED = frozenset(
     {
         *QUICK,
         *("prior train mast3r", "prior verify", "prior export", "prior compare"),
-        *("export", "doctor"),
+        *("export", "doctor", "site merge"),
     }
 )
 """Commands that may rightly work for minutes, or until Ctrl-C; they get a Ctrl-C after a while."""

@@ -181,27 +181,32 @@ class Admission:
         nearest = others[np.argsort((far_a + far_b)[others], kind="stable")]
         votes = 0
         for j in nearest[:WITNESSES]:
-            votes += self._gap(loops[[j, i]], chains) <= config.loop_chi2
+            pair = loops[[j, i]]
+            ends = self.poses[pair["a"]], self.poses[pair["b"]]
+            votes += gap_chi2(pair, *ends, chains, config) <= config.loop_chi2
             if votes >= config.corroboration:
                 return True
         return False
 
-    def _gap(
-        self,
-        pair: Rows,  # [2] EDGE
-        chains: Chains,
-    ) -> float:
-        """chi2 of the difference between two loops, seen from the second loop's b."""
-        claimed, seen = self.poses[pair["a"]] @ poses_of(pair), self.poses[pair["b"]]
-        T_ji = seen[:1].inverse() @ seen[1:]
-        gap = (claimed[1:].inverse() @ (claimed[:1] @ T_ji)).log()[0]
-        back = T_ji.inverse().adjoint()[0]
-        ahead = (seen[1:].inverse() @ self.poses[pair["a"][1:]]).adjoint()[0]
-        at_b = chains.covariance(chains.path(int(pair["b"][0]), int(pair["b"][1])))
-        at_a = chains.covariance(chains.path(int(pair["a"][0]), int(pair["a"][1])))
-        own = pair["covariance"][1] + back @ pair["covariance"][0] @ back.T
-        between = at_b + ahead @ at_a @ ahead.T
-        return _chi2(gap, own + self.config.drift_factor**2 * between)
+
+def gap_chi2(
+    pair: Rows,  # [2] EDGE
+    at: Sim3Batch,  # [2] poses of their a
+    seen: Sim3Batch,  # [2] poses of their b
+    chains: Chains,
+    config: GraphConfig,
+) -> float:
+    """chi2 of the difference between two loops, seen from the second loop's b."""
+    claimed = at @ poses_of(pair)
+    T_ji = seen[:1].inverse() @ seen[1:]
+    gap = (claimed[1:].inverse() @ (claimed[:1] @ T_ji)).log()[0]
+    back = T_ji.inverse().adjoint()[0]
+    ahead = (seen[1:].inverse() @ at[1:]).adjoint()[0]
+    at_b = chains.covariance(chains.path(int(pair["b"][0]), int(pair["b"][1])))
+    at_a = chains.covariance(chains.path(int(pair["a"][0]), int(pair["a"][1])))
+    own = pair["covariance"][1] + back @ pair["covariance"][0] @ back.T
+    between = at_b + ahead @ at_a @ ahead.T
+    return _chi2(gap, own + config.drift_factor**2 * between)
 
 
 def _chi2(

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config import RetrievalConfig
-from aquaflow.prior.contract import Encoding, Float
+from aquaflow.prior.contract import Float, HasKeypoints
 from aquaflow.tracking.loops.keypoints import rooted
 
 SEED = 0
@@ -76,9 +76,9 @@ class Retrieval:
         self._file = _InvertedFile(config.words)
         self._latest: _Signature | None = None
         self._consecutive: list[float] = []
-        self._known: tuple[Encoding, _Signature] | None = None
+        self._known: tuple[HasKeypoints, _Signature] | None = None
 
-    def add(self, number: int, encoding: Encoding) -> None:
+    def add(self, number: int, encoding: HasKeypoints) -> None:
         """Remember keyframe ``number``; one that shows nothing to recognise is left out."""
         signature = self._signature(encoding)
         if signature is None:
@@ -90,7 +90,7 @@ class Retrieval:
         self._file.add(signature)
 
     def candidates(
-        self, encoding: Encoding, exclude: Callable[[int], bool], count: int | None = None
+        self, encoding: HasKeypoints, exclude: Callable[[int], bool], count: int | None = None
     ) -> list[SimilarKeyframe]:
         """At most ``count`` (default: the config's) plausible keyframes, most similar first."""
         if not self._numbers:
@@ -115,7 +115,7 @@ class Retrieval:
         usual = float(np.median(self._consecutive)) if self._consecutive else 0.0
         return max(self._config.min_similarity, self._config.neighbour_share * usual)
 
-    def _signature(self, encoding: Encoding) -> _Signature | None:
+    def _signature(self, encoding: HasKeypoints) -> _Signature | None:
         if self._known is not None and self._known[0] is encoding:
             return self._known[1]
         descriptors = rooted(encoding.keypoints.descriptors)

@@ -7,20 +7,22 @@ their pixels agree on no pose.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from aquaflow.config import VerificationConfig
 from aquaflow.geometry.camera import CameraModel
-from aquaflow.geometry.pixels import at_pixels
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, Pointmap
-from aquaflow.prior.contract import Encoding
-from aquaflow.tracking.loops.keypoints import match_keypoints
+from aquaflow.keyframes.place import KeypointDepths, depths_at
+from aquaflow.prior.contract import Encoding, Keypoints
+from aquaflow.tracking.loops.keypoints import Index, match_keypoints
 from aquaflow.tracking.pose.pnp import pose_from_scratch
-from aquaflow.tracking.pose.problem import Array, pose_problem
-from aquaflow.tracking.pose.solver import PoseEstimate, solve_pose
+from aquaflow.tracking.pose.solver import PoseEstimate, PoseProblem, solve_pose
+
+Array = npt.NDArray[np.float64]
 
 GRID = (8, 6)
 """Cells of the picture, across and down, in which inliers are counted as spread."""
@@ -53,14 +55,29 @@ def verify(
     ``pointmap`` is the frame's own, where it has one: then the two pointmaps' scales are compared
     too, and a pair whose scales are not known to ``max_scale_sigma`` is no proof.
     """
-    mine, theirs = match_keypoints(keyframe.encoding.keypoints, encoding.keypoints)
-    pixels_k = keyframe.encoding.keypoints.pixels[mine].astype(np.float64)
-    pixels = encoding.keypoints.pixels[theirs].astype(np.float64)
-    known = at_pixels(keyframe.pointmap.known(config.known_sigma), pixels_k)
-    pixels_k, pixels = pixels_k[known], pixels[known]
-    if len(pixels) < config.min_inliers:
+    past = depths_at(keyframe.encoding.keypoints, keyframe.pointmap)
+    own = None if pointmap is None else depths_at(encoding.keypoints, pointmap)
+    return verify_keypoints(past, encoding.keypoints, camera, config, own)
+
+
+def verify_keypoints(
+    past: KeypointDepths,
+    keypoints: Keypoints,
+    camera: CameraModel,
+    config: VerificationConfig,
+    own: KeypointDepths | None = None,
+) -> Verified | None:
+    """As :func:`verify`, of keypoints alone: ``own`` are the frame's ``keypoints`` with depths."""
+    mine, theirs = match_keypoints(past.keypoints, keypoints)
+    kept = past.known(config.known_sigma)[mine]
+    mine, theirs = mine[kept], theirs[kept]
+    if len(mine) < config.min_inliers:
         return None
-    problem = pose_problem(keyframe.pointmap, pixels_k, pixels, camera, config.sigma_px)
+    pixels = keypoints.pixels[theirs].astype(np.float64)
+    problem = PoseProblem(
+        past.points()[mine], past.variance[mine], pixels, np.ones(len(mine)), camera,
+        config.sigma_px,
+    )  # fmt: skip
     initial = pose_from_scratch(problem)
     estimate = None if initial is None else solve_pose(problem, initial)
     if estimate is None:
@@ -71,34 +88,39 @@ def verify(
     enough = inlier.sum() >= config.min_inliers and inlier.mean() >= config.min_inlier_share
     if not enough or cells < config.min_cells:
         return None
-    if pointmap is not None:
-        kept = (pixels_k[inlier], pixels[inlier])
-        estimate = _with_scale(keyframe.pointmap, pointmap, kept, estimate, config)
+    if own is not None:
+        estimate = _with_scale(past, own, (mine[inlier], theirs[inlier]), estimate, config)
         if estimate is None:
             return None
     return Verified(estimate, int(inlier.sum()), len(pixels), cells)
 
 
 def _with_scale(
-    pointmap_k: Pointmap,
-    pointmap: Pointmap,
-    inliers: tuple[Array, Array],  # pixels in the keyframe and in the frame, [M, 2] each
+    past: KeypointDepths,
+    own: KeypointDepths,
+    inliers: tuple[Index, Index],  # keypoints of past and own, [M] each
     estimate: PoseEstimate,
     config: VerificationConfig,
 ) -> PoseEstimate | None:
     """The similarity between the two pointmaps; None where its scale stays unknown."""
-    pixels_k, pixels = inliers
-    known = at_pixels(pointmap.known(config.known_sigma), pixels)
+    mine, theirs = inliers
+    known = own.known(config.known_sigma)[theirs]
     if known.sum() < config.min_inliers:
         return None
-    camera = pointmap.camera
-    plain = pose_problem(pointmap_k, pixels_k, pixels, camera, config.sigma_px)
-    rho = np.where(known, at_pixels(pointmap.rho, pixels), np.nan)
-    own = camera.unproject(pixels) / rho[:, None]
-    variance = np.where(known, at_pixels(pointmap.variance, pixels), np.nan)
-    problem = replace(plain, frame_points=own, frame_rho_variance=variance)
+    points = past.points()[mine]
+    own_points = np.where(known[:, None], own.points()[theirs], np.nan)
+    problem = PoseProblem(
+        points,
+        past.variance[mine],
+        own.keypoints.pixels[theirs].astype(np.float64),
+        np.ones(len(mine)),
+        own.camera,
+        config.sigma_px,
+        frame_points=own_points,
+        frame_rho_variance=np.where(known, own.variance[theirs], np.nan),
+    )
     # Where the frame's pointmap has another unit, the pose found so far is that far off in depth.
-    ratio = own[known][:, 2] / estimate.T.apply(plain.points[known])[:, 2]
+    ratio = own_points[known][:, 2] / estimate.T.apply(points[known])[:, 2]
     scale = float(np.median(ratio))
     start = Sim3(estimate.T.R, scale * estimate.T.t, scale)
     similar = solve_pose(problem, start, free_scale=True)

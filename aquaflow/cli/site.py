@@ -1,0 +1,130 @@
+"""The commands for several dives of one place: ``site add``, ``merge``, ``list``, ``check``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from aquaflow.cli.console import Json, progress_bars
+
+if TYPE_CHECKING:
+    from aquaflow.site.merged_file import MergedSite
+
+Site = Annotated[Path, typer.Argument(help="Site folder.")]
+
+app = typer.Typer(help="Several dives of one place: keep them together, bring them into one frame.")
+
+
+def register(root: typer.Typer) -> None:
+    """Add the commands to ``root``."""
+    root.add_typer(app, name="site")
+
+
+@app.command()
+def add(
+    site: Site,
+    dives: Annotated[list[Path], typer.Argument(help="Finished dive folders.")],
+    as_json: Json = False,
+) -> None:
+    """Add finished dives to a site, which is made if it is not there."""
+    from aquaflow.site.adding import add_to_site
+
+    new = add_to_site(site, dives)
+    if as_json:
+        typer.echo(json.dumps({"added": [dive.name for dive in new]}))
+        return
+    names = ", ".join(dive.name for dive in new)
+    typer.echo(f"Added: {names}." if new else "All of them are in the site already, unchanged.")
+
+
+@app.command()
+def merge(site: Site, as_json: Json = False) -> None:
+    """Recognise the dives of a site in each other, and optimise them together."""
+    from aquaflow.site.merging import merge as merged_site
+
+    with progress_bars(quiet=as_json) as progress:
+        merged = merged_site(site, progress)
+    if as_json:
+        typer.echo(json.dumps(_numbers(merged)))
+        return
+    for line in _in_words(merged):
+        typer.echo(line)
+    typer.echo(f"Written to {site}: merged.json, merged.npy, paths/.")
+
+
+@app.command("list")
+def list_dives(site: Site, as_json: Json = False) -> None:
+    """The dives of a site, and how they lie to each other since the last merge."""
+    from aquaflow.site.manifest import read_site
+    from aquaflow.site.merged_file import read_merged
+
+    dives, merged = read_site(site), read_merged(site)
+    rows: list[dict[str, Any]] = [
+        {
+            "name": dive.name,
+            "folder": str(dive.folder(site)),
+            "merged": merged is not None and merged.fingerprints.get(dive.name) == dive.fingerprint,
+            "components": []
+            if merged is None
+            else sorted({each.component for each in merged.of_dive(dive.name)}),
+        }
+        for dive in dives
+    ]
+    if as_json:
+        said = {"dives": rows, "merged": None if merged is None else _numbers(merged)}
+        typer.echo(json.dumps(said))
+        return
+    for row in rows:
+        where = ", ".join(map(str, row["components"])) if row["merged"] else "not merged yet"
+        typer.echo(f"{row['name']}: component {where}; {row['folder']}")
+    for line in [] if merged is None else _in_words(merged):
+        typer.echo(line)
+
+
+@app.command()
+def check(site: Site, as_json: Json = False) -> None:
+    """Whether the dives are as they were added and merged; exit code 1 if not."""
+    from aquaflow.site.checking import check_site
+
+    found = check_site(site)
+    if as_json:
+        typer.echo(json.dumps({"good": not found, "findings": found}))
+    else:
+        for finding in found or ["All dives are as they were added and merged."]:
+            typer.echo(finding)
+    if found:
+        raise typer.Exit(1)
+
+
+def _numbers(merged: MergedSite) -> dict[str, Any]:
+    used = sum(link["verdict"] == "used" for link in merged.links)
+    return {
+        "components": list(merged.components), "links": len(merged.links), "links_used": used,
+        "left_out": dict(merged.left_out),
+        "sub_maps": [
+            {
+                "dive": each.dive, "sub_map": each.number, "component": each.component,
+                "keyframes": each.keyframes, "bent": each.bent,
+            }
+            for each in merged.sub_maps
+        ],
+    }  # fmt: skip
+
+
+def _in_words(merged: MergedSite) -> list[str]:
+    used = sum(link["verdict"] == "used" for link in merged.links)
+    lines = [f"{used} of {len(merged.links)} links between dives agree."]
+    for number, component in enumerate(merged.components):
+        dives, unit = ", ".join(component["dives"]), component["unit"]
+        lines.append(
+            f"Component {number}: {dives}; {component['keyframes']} keyframes, lengths in {unit}."
+        )
+    if len(merged.components) > 1:
+        lines.append(
+            "Components never met: how they lie to each other is not known from the pictures."
+        )
+    lines += [f"Left out: {name}: {reason}." for name, reason in merged.left_out.items()]
+    return lines

@@ -1,0 +1,156 @@
+"""What a finished dive keeps of a keyframe, so that its place can be recognised another day.
+
+Descriptors are kept in four bits for each number. They are only ever compared after the square
+root of each number's share in the whole was taken (RootSIFT), and it is that root which is rounded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.errors import DamagedError
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.pixels import at_pixels
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes.pointmap import UNKNOWN_VARIANCE, Pointmap
+from aquaflow.prior.contract import Float, Keypoints
+
+Array = npt.NDArray[np.float64]
+Bytes = npt.NDArray[np.uint8]
+
+LEVELS = 15
+"""Largest code of a descriptor's number: half a byte."""
+LARGEST_ROOT = 0.375
+"""Root of a number's share that gets the largest code; beyond it is cut off. SIFT cuts its numbers
+at 0.2 of the length (D. Lowe, IJCV 2004), and of the shared clips' 0.02 % are beyond. The rounding
+moves a descriptor by 0.08, of the 0.5 between descriptors of one point in two pictures."""
+PIXEL_STEPS = 1 << 16
+"""Steps of a coordinate over the side of the picture: 0.007 px at 480 px."""
+LARGEST_HALF = 6e4
+"""Near the largest number that float16 holds."""
+
+
+@dataclass(frozen=True)
+class KeypointDepths:
+    """Keypoints of a picture, and what is known of how far away their points are."""
+
+    camera: CameraModel
+    keypoints: Keypoints
+    rho: Array
+    """[M] 1 / z in the unit of the keyframe; 0 where unknown."""
+    variance: Array
+    """[M] variance of ``rho``."""
+
+    def known(
+        self,
+        relative_sigma: float,
+    ) -> npt.NDArray[np.bool_]:
+        """[M] keypoints whose inverse depth is known to better than ``relative_sigma``."""
+        return (self.rho > 1e-6) & (self.variance < (relative_sigma * self.rho) ** 2)
+
+    def points(self) -> Array:
+        """[M, 3] in the camera's frame, in the unit of the keyframe; NaN where unknown."""
+        rays = self.camera.unproject(self.keypoints.pixels.astype(np.float64))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(self.rho[:, None] > 1e-6, rays / self.rho[:, None], np.nan)
+
+
+def depths_at(keypoints: Keypoints, pointmap: Pointmap) -> KeypointDepths:
+    """What the ``pointmap`` of their picture knows of the keypoints' depths."""
+    pixels = keypoints.pixels
+    rho, variance = at_pixels(pointmap.rho, pixels), at_pixels(pointmap.variance, pixels)
+    return KeypointDepths(pointmap.camera, keypoints, rho, variance)
+
+
+@dataclass(frozen=True)
+class Place:
+    """A keyframe of a finished dive without its picture."""
+
+    number: int
+    """Among the dive's keyframes."""
+    frame_index: int
+    sub_map: int
+    t_ns: int
+    T_mc: Sim3
+    """Camera to m, the world of the sub-map's ``map.aqf``; its scale takes the keyframe's unit to
+    that of m."""
+    camera: CameraModel
+
+
+def packed(seen: KeypointDepths) -> npt.NDArray[np.void]:
+    """[] one structured number: pixels, inverse depths, their sigmas, descriptors."""
+    count, dimension = seen.keypoints.descriptors.shape
+    if dimension % 2:
+        raise ValueError("a descriptor with an odd number of dimensions is not kept")
+    row = np.zeros((), features_dtype(count, dimension))
+    side = (seen.camera.width, seen.camera.height)
+    steps = np.floor(seen.keypoints.pixels / side * PIXEL_STEPS)
+    row["pixels"] = np.clip(steps, 0, PIXEL_STEPS - 1)
+    known = (seen.rho > 1e-6) & (seen.variance < UNKNOWN_VARIANCE)
+    row["rho"] = np.where(known, seen.rho, 0.0)
+    sigma = np.sqrt(np.maximum(seen.variance, 0.0)) / np.where(known, seen.rho, 1.0)
+    row["sigma"] = np.where(known, np.minimum(sigma, LARGEST_HALF), 0.0)
+    row["descriptors"] = _codes(seen.keypoints.descriptors)
+    return row
+
+
+def unpacked(
+    row: npt.NDArray[np.void],  # [] as from packed
+    camera: CameraModel,
+) -> KeypointDepths:
+    """What :func:`packed` took apart, rounded.
+
+    Raises:
+        DamagedError: it holds numbers that it cannot hold.
+    """
+    names = ("pixels", "rho", "sigma", "descriptors")
+    if row.shape != () or row.dtype.names != names:
+        raise DamagedError("it is not what a keyframe keeps")
+    count, half = row["descriptors"].shape
+    if row.dtype != features_dtype(count, 2 * half):
+        raise DamagedError("it is not what a keyframe keeps")
+    rho, sigma = row["rho"].astype(np.float64), row["sigma"].astype(np.float64)
+    if not (np.isfinite(rho).all() and np.isfinite(sigma).all()):
+        raise DamagedError("a depth is not finite")
+    if (rho < 0.0).any() or (sigma < 0.0).any():
+        raise DamagedError("a depth is negative")
+    pixels = (row["pixels"] + 0.5) / PIXEL_STEPS * (camera.width, camera.height)
+    variance = np.where(rho > 0.0, (sigma * rho) ** 2, UNKNOWN_VARIANCE)
+    keypoints = Keypoints(pixels.astype(np.float32), _descriptors(row["descriptors"]))
+    return KeypointDepths(camera, keypoints, rho, variance)
+
+
+def features_dtype(count: int, dimension: int) -> np.dtype[np.void]:
+    """Of ``count`` keypoints whose descriptors have ``dimension`` numbers, each kind together."""
+    return np.dtype(
+        [
+            ("pixels", "<u2", (count, 2)),
+            ("rho", "<f4", (count,)),
+            ("sigma", "<f2", (count,)),
+            ("descriptors", "u1", (count, dimension // 2)),
+        ]
+    )
+
+
+def _codes(
+    descriptors: Float,  # [M, d] not negative
+) -> Bytes:
+    """[M, d / 2]"""
+    if (descriptors < 0.0).any():
+        raise ValueError("a descriptor with negative numbers is not kept")
+    share = descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-12)
+    codes = np.rint(np.sqrt(share) * (LEVELS / LARGEST_ROOT))
+    codes = np.minimum(codes, LEVELS).astype(np.uint8)
+    return np.asarray((codes[:, ::2] << 4) | codes[:, 1::2], dtype=np.uint8)
+
+
+def _descriptors(
+    codes: Bytes,  # [M, d / 2]
+) -> Float:
+    """[M, d] shares, of which only the ratios count."""
+    count, half = codes.shape
+    both = np.stack([codes >> 4, codes & LEVELS], axis=-1).reshape(count, 2 * half)
+    return np.asarray((both * np.float32(LARGEST_ROOT / LEVELS)) ** 2, dtype=np.float32)
