@@ -11,9 +11,10 @@ from pathlib import Path
 
 from aquaflow.batch.estimate import memory_mb
 from aquaflow.batch.examine import Examiner
-from aquaflow.batch.job import Job
+from aquaflow.batch.job import WRITTEN, Job
 from aquaflow.batch.journal import JOURNAL, Journal
 from aquaflow.batch.machine import core_count, memory_for_dives_mb
+from aquaflow.batch.membership import add_members, make_site
 from aquaflow.batch.object_store import ObjectStore, is_url
 from aquaflow.batch.ray_workers import RayWorkers
 from aquaflow.batch.recordings import Recording, find_recordings
@@ -36,6 +37,8 @@ class Batched:
 
     jobs: list[Job]
     season: Season
+    notes: list[str]
+    """Sentences about dives that are there, but are no members of the site."""
 
 
 def run_batch(
@@ -56,6 +59,7 @@ def run_batch(
     """
     cache = batch.cache or _cache_for(site)
     recordings = find_recordings(dives)
+    make_site(site)
     with _held(site, cache) as folder:
         jobs = _jobs(recordings, site, settings, calibration, str(cache), progress)
         journal = Journal(folder / JOURNAL)
@@ -71,7 +75,8 @@ def run_batch(
         if is_url(site):
             with contextlib.suppress(InputError):  # the dives are there; the journal is a record
                 ObjectStore(site).write(JOURNAL, (folder / JOURNAL).read_bytes())
-    return Batched(jobs, season)
+    written = [n for n, outcome in season.outcomes.items() if outcome.state in WRITTEN]
+    return Batched(jobs, season, add_members(site, sorted(written)))
 
 
 @contextlib.contextmanager

@@ -113,6 +113,7 @@ def _as_json(batched: Batched, out: str) -> dict[str, object]:
             job.name: outcomes[job.name].to_json() if job.name in outcomes else None
             for job in batched.jobs
         },
+        "notes": batched.notes,
         "failed": [job.name for job in failed(batched.season, batched.jobs)],
     }
 
@@ -135,6 +136,8 @@ def _print_table(batched: Batched) -> None:
         outcome = outcomes.get(job.name)
         if outcome is not None and outcome.sentence:
             typer.echo(f"{job.name}: {outcome.sentence}")
+    for note in batched.notes:
+        typer.echo(f"Note: {note}.")
     season = batched.season
     missing = len(failed(season, batched.jobs))
     typer.echo(f"{len(batched.jobs) - missing} of {len(batched.jobs)} dives are there.")

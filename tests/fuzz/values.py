@@ -13,10 +13,9 @@ DIVES = ("dive", "dive", "dive", "killed")
 FITTING: dict[str, tuple[str, ...]] = {
     "source": RECORDINGS,
     "recording": RECORDINGS,
-    "dives": (*RECORDINGS, "README.md"),
+    "dives": (*DIVES, *RECORDINGS, "README.md"),
     "pictures": ("pictures", "recording"),
     "dive": DIVES,
-    "dives": DIVES,
     "site": ("site",),
     "out": ("dive", "killed", "recording", "recorded", "README.md"),
     "csv": ("positions.csv", "README.md"),
