@@ -9,6 +9,7 @@ stdin.
 from __future__ import annotations
 
 import json
+import logging
 import os
 import queue
 import sys
@@ -41,7 +42,7 @@ class Cluster:
         import ray
 
         self._ray: Any = ray
-        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
         # Retries are the batch's, which counts them; a worker may be used again, because each dive
         # gets a process of its own.
         self._attempt: Any = ray.remote(max_retries=0)(attempt)

@@ -11,6 +11,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 from signal import Signals
+from typing import Any
 
 from aquaflow import __version__
 from aquaflow.batch.job import WRITTEN, Job, Outcome
@@ -109,7 +110,7 @@ def _answer(process: subprocess.Popen[bytes], asked: bytes, memory_mb: int) -> O
     process.stdout.close()
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
-    measured = {
+    measured: dict[str, Any] = {
         "cpu_s": round(usage.ru_utime + usage.ru_stime, 3),
         "peak_mb": round(usage.ru_maxrss * KILOBYTE / MEGABYTE, 1),
     }
