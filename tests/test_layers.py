@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 FLOORS = (
     {"cli", "api"},
-    {"evaluation", "service", "doctor"},
+    {"evaluation", "service", "doctor", "batch"},
     {"change", "dive", "viewer", "training"},
     {"measure", "site"},
     {"slam", "export", "sim_drivers"},

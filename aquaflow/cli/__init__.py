@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from aquaflow import __version__
+from aquaflow.cli.batch import register as register_batch
 from aquaflow.cli.bench import register as register_bench
 from aquaflow.cli.calibrate import register as register_calibrate
 from aquaflow.cli.change import register as register_change
@@ -296,6 +297,7 @@ def _print_summary(finished: Finished) -> None:
         typer.echo(f"Note: {note}.")
 
 
+register_batch(app)
 register_bench(app)
 register_calibrate(app)
 register_change(app)

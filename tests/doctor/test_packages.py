@@ -20,7 +20,7 @@ else:
     tomllib = pytest.importorskip("tomli")
 
 PROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
-FOR_DEVELOPERS = {"dev", "docs"}
+FOR_DEVELOPERS = {"dev", "docs", "s3-tests"}
 HEAVY = ("depthai", "onnxruntime", "gsplat", "pymavlink.mavutil", "torch")
 
 

@@ -13,9 +13,9 @@ DIVES = ("dive", "dive", "dive", "killed")
 FITTING: dict[str, tuple[str, ...]] = {
     "source": RECORDINGS,
     "recording": RECORDINGS,
+    "dives": (*DIVES, *RECORDINGS, "README.md"),
     "pictures": ("pictures", "recording"),
     "dive": DIVES,
-    "dives": DIVES,
     "site": ("site",),
     "out": ("dive", "killed", "recording", "recorded", "README.md"),
     "csv": ("positions.csv", "README.md"),
@@ -44,6 +44,7 @@ ABSURD_PATHS = (
 
 ONLY: dict[str, tuple[str, ...]] = {
     "opensplat": ("false", "true", "", "no-such-program", "'", "cat", "echo {}", "echo 1"),
+    "cluster": ("127.0.0.1:9", "", "é", "-1", "ray://127.0.0.1:9"),
     "url": (
         *("http://127.0.0.1:1", "http://[::1]:1", "127.0.0.1", "", "http://", "http://127.0.0.1:x"),
         *("http://127.0.0.1:99999", "http://127.0.0.1:-1", "http://[::1", "ftp://127.0.0.1"),
@@ -85,6 +86,7 @@ QUICK: dict[str, dict[str, str]] = {
     "report": {"--pdf": "new.pdf"},
     "video": {"--out": "new.mp4"},
     "change": {"--out": "new"},
+    "batch": {"--out": "new", "--retries": "0"},
 }
 """Given where nothing else was drawn, so that a run that works is over soon."""
 

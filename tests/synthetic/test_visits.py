@@ -63,7 +63,7 @@ def test_the_light_of_a_visit_dims_its_pictures(tmp_path: Path) -> None:
     def mean_of(name: str, light: tuple[float, float, float]) -> npt.NDArray[np.float64]:
         of_visit = SITE | {"frames": 2, "visit": {"over": SITE, "light": light}}
         write_dive(tmp_path / name, SyntheticConfig.model_validate(of_visit))
-        picture = cv2.imread(str(min((tmp_path / name).rglob("*.png"))))
+        picture = cv2.imread(str(min((tmp_path / name / "images").iterdir())))
         assert picture is not None
         return np.asarray(picture[..., ::-1].mean(axis=(0, 1)), np.float64)
 

@@ -1,0 +1,87 @@
+"""One dive as a job: everything that its bytes depend on, and what came of it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from aquaflow import __version__
+
+State = Literal["done", "poor", "failed", "lost", "full"]
+"""``poor``: written, with a warning as of exit code 3 of `aquaflow map`. ``failed``: another
+attempt would fail as well. ``lost``: its process or machine died, another attempt may succeed.
+``full``: the disk was full."""
+
+WRITTEN = ("done", "poor")
+"""States in which the dive's folder is there."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A dive to be made; goes to another process or machine as JSON."""
+
+    name: str
+    """Of the dive's folder."""
+    source: str
+    """Path or URL of the recording."""
+    size_bytes: int
+    """Of the recording."""
+    site: str
+    """Folder or URL that the dive is written to."""
+    cache: str
+    """Local folder for recordings and results of object stores."""
+    settings: dict[str, Any]
+    """The whole configuration."""
+    calibration: str | None
+    """Content of a camera.yaml; None: the recording's own, or found from it."""
+    threads: int
+    """Cores that it takes; part of ``settings`` too."""
+    memory_mb: int
+    """Estimate of its peak, 1e6 bytes."""
+    version: str = __version__
+
+    def digest(self) -> str:
+        """Of what the dive's bytes depend on, but for the machine and AquaFlow's version."""
+        known = [self.name, self.size_bytes, self.settings, self.calibration]
+        return hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()
+
+    def to_json(self) -> dict[str, Any]:
+        """For :meth:`of_json` on another machine."""
+        return asdict(self)
+
+    @classmethod
+    def of_json(cls, content: dict[str, Any]) -> Job:
+        """The job that :meth:`to_json` described."""
+        return cls(**content)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one attempt."""
+
+    state: State
+    sentence: str = ""
+    """Why, where the state is not ``done``."""
+    frames: int | None = None
+    tracked: int | None = None
+    psnr: float | None = None
+    """Of held-out views, dB; None without a map."""
+    cpu_s: float | None = None
+    peak_mb: float | None = None
+    """Largest resident set of the process, 1e6 bytes."""
+    wall_s: float | None = None
+    node: str = ""
+    """Name of the machine."""
+    earlier: bool = False
+    """The dive was there before; nothing was done."""
+
+    def to_json(self) -> dict[str, Any]:
+        """For :meth:`of_json` on another machine, the journal and the table."""
+        return asdict(self)
+
+    @classmethod
+    def of_json(cls, content: dict[str, Any]) -> Outcome:
+        """The outcome that :meth:`to_json` described."""
+        return cls(**content)
