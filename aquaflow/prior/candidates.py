@@ -14,12 +14,7 @@ from aquaflow.prior.flow import Float, Flow, FlowMatcher
 from aquaflow.prior.flow_pair import FlowEncoding
 
 GOOD_SHARE = 0.5
-"""A flow that matches this part of what stays in view needs no rival."""
-LEAST_IN_VIEW = 0.5
-"""Part of the picture that counts as staying in view at least: a prediction of a wider turn may be
-wrong itself, and the matches of a quarter of the picture are what it must bring then."""
-COARSE_PX = 8
-"""Spacing of the pixels by which what stays in view is measured, to a percent."""
+"""A flow that matches this part of the picture needs no rival."""
 
 
 def best_flow(
@@ -31,36 +26,22 @@ def best_flow(
 ) -> Flow:
     """The flow of the first start that explains the pair, or the one that matches most.
 
-    From ``near``, where it is known well, a quicker flow comes first; what it takes out of view
-    cannot be matched, and counts for no flow. ``starts`` is asked for the next one only when those
-    before were not good enough.
+    From ``near``, where it is known well, a quicker flow comes first. ``starts`` is asked for the
+    next one only when those before were not good enough.
     """
-    enough = GOOD_SHARE
     if near is not None:
-        enough *= max(share_in_view(near), LEAST_IN_VIEW)
         flow = matcher(a.grey, b.grey, a.texture, b.texture, near, quick=True)
-        if flow.share >= enough:
+        if flow.share >= GOOD_SHARE:
             return flow
     best: Flow | None = None
     for start in starts:
         flow = matcher(a.grey, b.grey, a.texture, b.texture, start)
         if best is None or flow.share > best.share:
             best = flow
-        if best.share >= enough:
+        if best.share >= GOOD_SHARE:
             break
     assert best is not None
     return best
-
-
-def share_in_view(
-    displacement: Float,  # [H, W, 2] px, a to b
-) -> float:
-    """Part of the pixels whose match lies in the other picture too."""
-    height, width = displacement.shape[:2]
-    coarse = (slice(None, None, COARSE_PX), slice(None, None, COARSE_PX))
-    target = displacement[coarse] + pixel_grid(height, width)[coarse]
-    inside = ((target > 0.0) & (target < (width, height))).all(axis=-1)
-    return float(inside.mean())
 
 
 def from_prediction(
