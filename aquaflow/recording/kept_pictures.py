@@ -113,7 +113,7 @@ class PictureThread:
         while not (self._closing.is_set() and self._frames.ended):
             frame = self._frames.take(LOOK_S)
             if frame is not None:
-                with self._failures.contain("keeping of a picture"):
+                with self._failures.contain("keeping of a picture", full_disk=True):
                     self._kept.offer(frame)
 
 
