@@ -137,6 +137,7 @@ class Browser:
         self._command("Emulation.setDeviceMetricsOverride", metrics)
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self._command("Emulation.setEmulatedMedia", {"features": [scheme]})
+        self.wait(f"innerWidth === {width} && innerHeight === {height}")
 
     def screenshot(self, file: Path) -> None:
         """What the screen shows."""

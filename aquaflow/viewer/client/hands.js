@@ -16,6 +16,7 @@ export function hands(canvas, eye, { changed, rested, pointed }) {
   };
   canvas.addEventListener("pointerdown", event => {
     canvas.setPointerCapture(event.pointerId);
+    if (event.isPrimary) down.clear(); // one whose lifting was never told would count as a second finger
     if (!down.size) { moved = 0; several = false; }
     down.set(event.pointerId, { x: event.clientX, y: event.clientY, button: event.button });
     if (down.size > 1) several = true;
