@@ -10,12 +10,12 @@ import numpy as np
 from aquaflow.errors import DamagedError, InputError, reason_of
 from aquaflow.export.georeference import to_geodetic
 from aquaflow.export.map_file import SUFFIX
-from aquaflow.fusion.metric_file import read_frame_of_map, read_main
+from aquaflow.fusion.metric_file import read_frame_of_map
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.earth import north_east
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.site.manifest import SiteDive, read_site
-from aquaflow.site.merged_file import PlacedSubMap, read_merged
+from aquaflow.site.merged_file import PlacedSubMap, merge_of
 
 ROTATION_TOLERANCE = 1e-6
 """Largest difference of R^T R from the identity, as in metric.json."""
@@ -27,17 +27,13 @@ def T_site_dive(site: Path, dive: SiteDive) -> PlacedSubMap:
     Raises:
         InputError: the site was not merged, or not with this dive.
     """
-    merged = read_merged(site)
-    if merged is None:
-        raise InputError(f"{site} was never merged; run `aquaflow site merge {site}` first")
-    main = read_main(dive.folder(site))
-    found = [each for each in merged.of_dive(dive.name) if each.number == main]
-    if not found:
+    found = merge_of(site).main_of(dive, site)
+    if found is None:
         raise InputError(
             f"the map of {dive.name} is not in the merged site {site}; run `aquaflow site merge "
             f"{site}` again"
         )
-    return found[0]
+    return found
 
 
 def in_site(site: Path, first: str, second: str) -> tuple[Path, Path, Sim3]:

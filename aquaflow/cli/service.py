@@ -119,7 +119,10 @@ def status(
 
 
 def view(
-    dive: Annotated[Path, typer.Argument(help="Dive folder.")],
+    dive: Annotated[Path, typer.Argument(help="Dive folder, or a merged site.")],
+    component: Annotated[
+        int | None, typer.Option(help="Of a site, by default the one with most keyframes.")
+    ] = None,
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="0: any that is free.")] = 8231,
     token_file: Annotated[
@@ -127,14 +130,22 @@ def view(
     ] = None,
     splats: Annotated[int, typer.Option(help="Gaussians to show at most.")] = MOST_SPLATS,
 ) -> None:
-    """Show a finished dive in a browser, to look around and to measure; until Ctrl-C."""
+    """Show a finished dive or a site in a browser, to look around and to measure; until Ctrl-C."""
     from aquaflow.config.stage import validated
     from aquaflow.config.viewer import ViewerConfig
+    from aquaflow.errors import InputError
+    from aquaflow.site.manifest import is_site
     from aquaflow.viewer.finished import open_dive
+    from aquaflow.viewer.site_page import open_site
 
     asked = {"enabled": True, "host": host, "port": port, "token_file": token_file}
     config = validated(ViewerConfig, asked | {"splats": splats}, "command line")
-    window = open_dive(dive, config, partial(_mark, dive))
+    if is_site(dive):
+        window = open_site(dive, config, component)
+    elif component is None:
+        window = open_dive(dive, config, partial(_mark, dive))
+    else:
+        raise InputError(f"{dive} is no site: only a site has components; leave --component out")
     typer.echo(f"Open {window.address} in a browser; Ctrl-C ends it.")
     with contextlib.suppress(KeyboardInterrupt):
         threading.Event().wait()

@@ -5,18 +5,15 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from aquaflow.errors import InputError
-from aquaflow.fusion.metric_file import read_metric_file
-from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes.place import KeypointDepths, Place
 from aquaflow.keyframes.places_file import NAME as PLACES
 from aquaflow.keyframes.places_file import PlacesFile
-from aquaflow.site.manifest import NAME as MANIFEST
-from aquaflow.site.manifest import fingerprint, read_site
-from aquaflow.site.merged_file import MergedSite, read_merged
+from aquaflow.site.frames import frame_of
+from aquaflow.site.manifest import fingerprint, is_site, read_site
+from aquaflow.site.merged_file import MergedSite, merge_of
 from aquaflow.tracking.base.base import Base
 from aquaflow.tracking.base.opening import open_base, prior_of
 
@@ -32,11 +29,9 @@ def base_of(folder: Path) -> Base:
     Raises:
         InputError: it is neither, it was not merged, or nothing of it can be read.
     """
-    if not (folder / MANIFEST).is_file():
+    if not is_site(folder):
         return open_base(folder)
-    merged = read_merged(folder)
-    if merged is None:
-        raise InputError(f"{folder} was never merged; run `aquaflow site merge {folder}` first")
+    merged = merge_of(folder)
     dives = {dive.name: dive.folder(folder) for dive in read_site(folder)}
     files: dict[int, PlacesFile] = {}
     for number, (name, before) in enumerate(merged.fingerprints.items()):
@@ -54,7 +49,7 @@ def base_of(folder: Path) -> Base:
         dive, keyframe = origins[number]
         return files[dive].keypoints(keyframe)
 
-    frames = {i: _frame(stated, dives) for i, stated in enumerate(merged.components)}
+    frames = {i: frame_of(stated, dives) for i, stated in enumerate(merged.components)}
     prior = next((p for p in map(prior_of, dives.values()) if p), "")
     return Base(folder, prior, tuple(places), keypoints, frames)
 
@@ -79,17 +74,3 @@ def _places(
             places.append(replace(known, number=number, sub_map=component, T_mc=T_sc))
             origins[number] = dive, keyframe
     return places, origins
-
-
-def _frame(stated: dict[str, Any], dives: dict[str, Path]) -> MetricFrame:
-    """The world of a component: the axes and origin of one dive's sub-map, the scale of all."""
-    axes = stated["axes_of"]
-    folder = dives.get(axes["dive"])
-    frames = {} if folder is None else read_metric_file(folder)
-    first = frames.get(int(axes["sub_map"]), MetricFrame.unknown())
-    covariance = first.covariance.copy()
-    if stated["metric"]:
-        covariance[6, 6] = float(stated["scale_sigma"]) ** 2
-    return replace(
-        first, T_nm=Sim3.identity(), covariance=covariance, metric=bool(stated["metric"])
-    )

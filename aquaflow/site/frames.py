@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from aquaflow.fusion.metric_file import read_metric_file
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
@@ -57,6 +60,25 @@ def component_of(
     covariance[6, 6] = sigma**2
     frame = replace(first, T_nm=Sim3.identity(), covariance=covariance, metric=bool(metric))
     return Component(frame, sub_maps[0], tuple(sub_maps), chi), float(np.exp(log_scale))
+
+
+def frame_of(stated: Mapping[str, Any], dives: Mapping[str, Path]) -> MetricFrame:
+    """The world of a component as ``merged.json`` states it: the axes and origin of one dive's
+    sub-map, the scale of all. ``dives``: their folders by name.
+
+    Raises:
+        InputError: that dive's metric.json is damaged.
+    """
+    axes = stated["axes_of"]
+    folder = dives.get(axes["dive"])
+    frames = {} if folder is None else read_metric_file(folder)
+    first = frames.get(int(axes["sub_map"]), MetricFrame.unknown())
+    covariance = first.covariance.copy()
+    if stated["metric"]:
+        covariance[6, 6] = float(stated["scale_sigma"]) ** 2
+    return replace(
+        first, T_nm=Sim3.identity(), covariance=covariance, metric=bool(stated["metric"])
+    )
 
 
 def log_growth(before: Sequence[Sim3], after: Sequence[Sim3]) -> float:

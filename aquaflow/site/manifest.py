@@ -56,6 +56,11 @@ def fingerprint(dive: Path) -> str:
     return found.hexdigest()
 
 
+def is_site(folder: Path) -> bool:
+    """True of a folder with a site's manifest, also a damaged one."""
+    return (folder / NAME).is_file()
+
+
 def read_site(site: Path) -> tuple[SiteDive, ...]:
     """The dives of the site in the folder ``site``, in the order of adding.
 
@@ -63,7 +68,7 @@ def read_site(site: Path) -> tuple[SiteDive, ...]:
         InputError: there is none, it is damaged, or of a newer AquaFlow.
     """
     path = site / NAME
-    if not path.is_file():
+    if not is_site(site):
         raise InputError(f"{site} is no site: {NAME} is missing; make one by `aquaflow site add`")
     try:
         data = json.loads(path.read_text(encoding="utf-8"))

@@ -12,7 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.errors import DamagedError, InputError, reason_of
+from aquaflow.fusion.metric_file import read_main
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.site.manifest import SiteDive
 from aquaflow.storage.atomic import atomic_write, write_json
 
 NAME, ARRAYS = "merged.json", "merged.npy"
@@ -74,6 +76,15 @@ class MergedSite:
         """The sub-maps of a dive."""
         return tuple(each for each in self.sub_maps if each.dive == name)
 
+    def main_of(self, dive: SiteDive, site: Path) -> PlacedSubMap | None:
+        """The sub-map of a dive's ``map.ply``; None where the merge has none.
+
+        Raises:
+            InputError: the dive's metric.json is damaged.
+        """
+        main = read_main(dive.folder(site))
+        return next((each for each in self.of_dive(dive.name) if each.number == main), None)
+
 
 def write_merged(site: Path, merged: MergedSite) -> None:
     """Write both files; the arrays first, so that ``merged.json`` never speaks of others.
@@ -117,6 +128,18 @@ def read_merged(site: Path) -> MergedSite | None:
         raise InputError(
             f"cannot read {path}: {reason_of(error)}; run `aquaflow site merge` again"
         ) from error
+
+
+def merge_of(site: Path) -> MergedSite:
+    """What the last merge found.
+
+    Raises:
+        InputError: there was none, or a file is damaged, or of a newer AquaFlow.
+    """
+    merged = read_merged(site)
+    if merged is None:
+        raise InputError(f"{site} was never merged; run `aquaflow site merge {site}` first")
+    return merged
 
 
 def _keyframes(path: Path) -> Rows:

@@ -60,6 +60,24 @@ class ShownCamera:
     """Counts the cameras shown."""
 
 
+@dataclass(frozen=True)
+class PathPart:
+    """Poses that follow each other, of one dive among several."""
+
+    name: str
+    """Of the dive."""
+    first: int
+    """Number of its first pose in the path."""
+    began: datetime | None
+    """UTC of that pose; None where nothing stated it."""
+    camera: CameraModel
+
+    def to_json(self) -> dict[str, Any]:
+        """By the names that the page uses."""
+        began = None if self.began is None else self.began.isoformat()
+        return {"name": self.name, "first": self.first, "began": began, **_optics(self.camera)}
+
+
 @dataclass
 class Exhibit:
     """Attributes are replaced as a whole; they are not changed in place."""
@@ -76,6 +94,8 @@ class Exhibit:
         default_factory=lambda: np.zeros((0, PATH_NUMBERS), np.float32)
     )
     """[N, 13] of each pose, place, rotation and quality, and its moment."""
+    path_parts: tuple[PathPart, ...] = ()
+    """Where poses of several dives follow each other."""
     path_number: int = 0
     camera: ShownCamera | None = None
     pictures: Mapping[int, Path] = field(default_factory=dict)
@@ -98,7 +118,10 @@ class Exhibit:
         said: dict[str, Any] = {
             "title": self.title, "up": self.up, "live": self.live, "health": self.health,
             "unit": self.unit, "metres": self.metres, "can": self.can, "map": None, "camera": None,
-            "path": {"number": self.path_number, "count": len(self.path)},
+            "path": {
+                "number": self.path_number, "count": len(self.path),
+                "parts": [part.to_json() for part in self.path_parts],
+            },
             "began": None if self.began is None else self.began.isoformat(), "north": self.north,
         }  # fmt: skip
         if shown is not None and shown.packed.count:
@@ -106,12 +129,10 @@ class Exhibit:
             palettes = {name: each.to_json() for name, each in shown.palettes.items()}
             said["map"] = shown.packed.description() | {"water": water, "palettes": palettes}
         if camera is not None:
-            model = camera.camera
             said["camera"] = {
                 "number": camera.number, "place": camera.T_wc.t.tolist(),
-                "wxyz": camera.T_wc.quaternion.tolist(), "width": model.width,
-                "height": model.height, "fx": model.fx, "fy": model.fy,
-                "cx": model.cx, "cy": model.cy, "picture": camera.picture is not None,
+                "wxyz": camera.T_wc.quaternion.tolist(), **_optics(camera.camera),
+                "picture": camera.picture is not None,
             }  # fmt: skip
         return said
 
@@ -144,6 +165,13 @@ class Exhibit:
             if self._jpeg[0] != camera.number:
                 self._jpeg = camera.number, _jpeg(camera.picture[..., ::-1]) or b""
             return self._jpeg[1]
+
+
+def _optics(camera: CameraModel) -> dict[str, float]:
+    return {
+        "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy,
+        "cx": camera.cx, "cy": camera.cy,
+    }  # fmt: skip
 
 
 def _jpeg(

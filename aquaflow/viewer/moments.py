@@ -12,6 +12,8 @@ Float = npt.NDArray[np.float32]
 MOMENT_NUMBERS = 5
 """Of each pose: seconds since the first one, depth, heading, the nearest picture's frame, and that
 frame's seconds; what is not known is no number (NaN)."""
+HEADING, PICTURE = 2, 3
+"""Columns of them."""
 
 
 def moments(

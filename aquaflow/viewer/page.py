@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +14,7 @@ import numpy.typing as npt
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.messages import CameraModel
-from aquaflow.viewer.exhibit import POSE_NUMBERS, Exhibit, ShownCamera, ShownMap
+from aquaflow.viewer.exhibit import POSE_NUMBERS, Exhibit, PathPart, ShownCamera, ShownMap
 from aquaflow.viewer.levels import Palette
 from aquaflow.viewer.measuring import Frame
 from aquaflow.viewer.moments import unknown
@@ -104,13 +104,15 @@ class ViewerPage:
         poses: Float,  # [N, 8] place, rotation wxyz from the camera, quality in [0, 1]
         moments: Float | None = None,  # [N, 5] as aquaflow/viewer/moments.py has them
         began: datetime | None = None,
+        parts: Sequence[PathPart] = (),
     ) -> None:
         """The trajectory, with how well each pose is known, and what else is known of its moments;
-        ``began``: UTC of the first one."""
+        ``began``: UTC of the first one; ``parts``: of several dives, whose seconds each begin at
+        0."""
         rows = np.asarray(poses, np.float32).reshape(-1, POSE_NUMBERS)
         said = unknown(len(rows)) if moments is None else np.asarray(moments, np.float32)
         self._exhibit.path = np.concatenate([rows, said], axis=1)
-        self._exhibit.began = began
+        self._exhibit.began, self._exhibit.path_parts = began, tuple(parts)
         self._exhibit.path_number += 1
 
     def show_camera(

@@ -28,7 +28,7 @@ def looked_at(dive: Path) -> tuple[FinishedDive, ViewerPage]:
     """Shown once, until what is done behind the page is done."""
     found = read_dive(dive, BUDGET)
     page = show_dive(found, ViewerConfig(port=0))
-    prepare(dive, found, page).join(60.0)
+    prepare(dive, found.key, found.packed, found.map, page).join(60.0)
     return found, page
 
 

@@ -76,13 +76,13 @@ def test_a_finished_dive_is_read_with_its_colours_poses_and_pictures(small_dive:
     dive = read_dive(small_dive, budget=500)
     assert len(dive.splats) == 500
     assert set(dive.splats.levels) == set(dive.palettes) == {"range", "coverage"}
-    assert len(dive.poses) == len(dive.quality) == len(dive.moments)
+    assert len(dive.path.poses) == len(dive.path.quality) == len(dive.path.moments)
     held_out = {int(path.name[:6]) for path in (small_dive / "heldout").glob("*_real.png")}
     kept = {int(path.stem) for path in (small_dive / "pictures").glob("*.jpg")}
     assert held_out
     assert kept
-    assert set(dive.pictures) == held_out | kept
-    assert set(dive.moments[:, 3].astype(int)) <= held_out | kept
+    assert set(dive.path.pictures) == held_out | kept
+    assert set(dive.path.moments[:, 3].astype(int)) <= held_out | kept
 
 
 def test_the_water_of_a_dive_is_read_and_a_damaged_one_costs_itself(dive: Path) -> None:
@@ -119,8 +119,8 @@ def test_a_damaged_line_of_the_frames_costs_itself(small_dive: Path, dive: Path)
     lines[5] = lines[5].replace("0.", "0g.")
     (dive / "frames.csv").write_text("\n".join([header, "x", ",1e999,,,", *lines]))
     damaged, whole = read_dive(dive, budget=50), read_dive(small_dive, budget=50)
-    assert len(damaged.poses) == len(whole.poses)
-    assert (damaged.quality != whole.quality).sum() <= 1
+    assert len(damaged.path.poses) == len(whole.path.poses)
+    assert (damaged.path.quality != whole.path.quality).sum() <= 1
 
 
 @pytest.mark.parametrize(

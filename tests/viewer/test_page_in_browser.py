@@ -15,6 +15,7 @@ from aquaflow.config.viewer import ViewerConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.viewer.dive_coverage import CLASSES, COVERAGE
+from aquaflow.viewer.exhibit import PathPart
 from aquaflow.viewer.finished import open_dive
 from aquaflow.viewer.levels import RANGE, range_level
 from aquaflow.viewer.page import ViewerPage
@@ -244,6 +245,27 @@ def test_the_slider_says_utc_where_the_dive_knows_it(browser: Browser, page: Vie
         assert browser.text("#where") == "00:00:45 UTC \u00b7 heading 90\u00b0"
     finally:
         page._exhibit.began = None
+
+
+def test_each_pose_of_a_site_says_its_dive_and_has_its_lens(
+    browser: Browser, page: ViewerPage, tmp_path: Path
+) -> None:
+    lens = CameraModel(64, 48, 64.0, 64.0, 32.0, 24.0)
+    began = datetime(2026, 11, 24, 12, 0, 0, tzinfo=timezone.utc)
+    parts = [PathPart("monday", 0, None, lens), PathPart("tuesday", 2, began, lens.scaled(32, 24))]
+    poses = np.array([[x, 0, 0, 1, 0, 0, 0, 1] for x in (0.0, 1.0, 9.0, 9.5)], np.float32)
+    seen = page._exhibit.path
+    try:
+        page.show_path(poses, np.tile(MOMENTS, (2, 1)), parts=parts)
+        show(browser, page, SCREEN)
+        put(browser, "#pose", 1)
+        assert browser.text("#where").startswith("monday \u00b7 1:15 of 1:15")
+        assert browser.run("return aquaflowEye.lens.width") == 64
+        put(browser, "#pose", 3)
+        assert browser.text("#where").startswith("tuesday \u00b7 12:01:15 UTC")
+        assert browser.run("return aquaflowEye.lens.width") == 32
+    finally:
+        page.show_path(seen[:, :8], seen[:, 8:])
 
 
 def eye(browser: Browser) -> tuple[np.ndarray, float]:

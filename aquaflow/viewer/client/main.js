@@ -73,7 +73,7 @@ async function showPath(path) {
   if (path.number === pathShown) return;
   pathShown = path.number;
   const rows = new Float32Array(await (await asked(`/path/${path.number}`)).arrayBuffer());
-  marks.setPath(rows);
+  marks.setPath(rows, path.parts);
   line.setPath(rows, scene);
 }
 

@@ -12,11 +12,14 @@ export class Marks {
     Object.assign(this, { canvas, path: [], camera: null, points: [], closed: false, notes: [], picked: null, size: 1 });
   }
 
-  // Rows of `ROW` numbers.
-  setPath(rows) {
+  // Rows of `ROW` numbers; no line is drawn from one of the `parts` to the next.
+  setPath(rows, parts) {
     const count = rows.length / ROW, step = Math.max(1, Math.ceil(count / LONGEST));
     this.path = [];
-    for (let i = 0; i < count; i += step) this.path.push({ place: [...rows.subarray(ROW * i, ROW * i + 3)], quality: rows[ROW * i + 7] });
+    for (let i = 0; i < count; i += step) {
+      const part = parts.filter(each => each.first <= i).length;
+      this.path.push({ place: [...rows.subarray(ROW * i, ROW * i + 3)], quality: rows[ROW * i + 7], part });
+    }
   }
 
   draw(eye) {
@@ -59,6 +62,7 @@ export class Marks {
 
   drawPath() {
     for (let i = 1; i < this.path.length; i++) {
+      if (this.path[i].part !== this.path[i - 1].part) continue;
       const grade = Math.min(2, Math.floor(3 * this.path[i].quality));
       this.line(this.path[i - 1].place, this.path[i].place, PATH[Math.max(0, grade)], 2);
     }

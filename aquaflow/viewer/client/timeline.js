@@ -35,6 +35,12 @@ export class TimeLine {
     this.words();
   }
 
+  // The dive that a pose is of, where the path has several: its name, first pose, begin and lens.
+  part(number) { return this.scene?.path.parts.findLast(each => each.first <= number) ?? null; }
+
+  // Number of the last pose of the same dive.
+  last(number) { return (this.scene.path.parts.find(each => each.first > number)?.first ?? this.count) - 1; }
+
   // A live dive: the newest picture, and its pose if that is looked at.
   setScene(scene) {
     this.scene = scene;
@@ -46,7 +52,7 @@ export class TimeLine {
     const { scene, rows } = this, number = Number(find("pose").value);
     if (!scene?.camera || this.newest || number >= this.count) return scene?.camera ?? null;
     const row = [...rows.subarray(ROW * number, ROW * number + 7)];
-    return { ...scene.camera, place: row.slice(0, 3), wxyz: row.slice(3, 7) };
+    return { ...scene.camera, ...this.part(number), place: row.slice(0, 3), wxyz: row.slice(3, 7) };
   }
 
   go(number) {
@@ -54,8 +60,8 @@ export class TimeLine {
     this.number = number;
     this.newest = scene.live && number === this.count - 1;
     find("pose").value = String(number);
-    const { place, wxyz } = this.camera;
-    eye.take(place, wxyz, scene.camera, scene.map ? 0.5 * scene.map.half[0] : 1);
+    const camera = this.camera;
+    eye.take(camera.place, camera.wxyz, camera, scene.map ? 0.5 * scene.map.half[0] : 1);
     this.words();
     this.picture();
     this.changed();
@@ -72,11 +78,13 @@ export class TimeLine {
     this.changed();
   }
 
+  began(number) { return (this.part(number) ?? this.scene).began; }
+
   // What is known of a moment: UTC where the dive knows it, else the time since the first pose.
   moment(number, seconds) {
-    const { scene } = this;
+    const began = this.began(number);
     if (!Number.isFinite(seconds)) return `pose ${number + 1} of ${this.count}`;
-    if (scene.began) return `${new Date(Date.parse(scene.began) + 1000 * seconds).toISOString().slice(11, 19)} UTC`;
+    if (began) return `${new Date(Date.parse(began) + 1000 * seconds).toISOString().slice(11, 19)} UTC`;
     return clock(seconds);
   }
 
@@ -84,8 +92,9 @@ export class TimeLine {
     const number = Math.min(Number(find("pose").value), this.count - 1);
     if (number < 0) return;
     const at = k => this.rows[ROW * number + k], parts = [this.moment(number, at(SECONDS))];
-    if (!this.scene.began && Number.isFinite(at(SECONDS))) parts[0] += ` of ${clock(this.rows[ROW * (this.count - 1) + SECONDS])}`;
+    if (!this.began(number) && Number.isFinite(at(SECONDS))) parts[0] += ` of ${clock(this.rows[ROW * this.last(number) + SECONDS])}`;
     if (this.newest) parts[0] += ", now";
+    if (this.part(number)) parts.unshift(this.part(number).name);
     if (Number.isFinite(at(DEPTH))) parts.push(`${at(DEPTH).toFixed(1)} m deep`);
     if (Number.isFinite(at(HEADING))) parts.push(this.heading(Math.round(at(HEADING)) % 360));
     find("where").textContent = parts.join(" \u00b7 ");

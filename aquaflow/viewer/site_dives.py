@@ -1,0 +1,126 @@
+"""The dives of a merged site that are shown together: those of one component, in its world."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from aquaflow.errors import InputError
+from aquaflow.fusion.metric_frame import MetricFrame
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.site.frames import frame_of
+from aquaflow.site.manifest import SiteDive, fingerprint, read_site
+from aquaflow.site.merged_file import MergedSite, PlacedSubMap, merge_of
+from aquaflow.site.paths import sub_maps_of_frames
+from aquaflow.viewer.dive_path import DivePath
+from aquaflow.viewer.finished import FinishedDive, read_dive
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class PlacedDive:
+    """A dive where the merge has put it."""
+
+    name: str
+    """In the site."""
+    dive: FinishedDive
+    T_sn: Sim3
+    """From the world of the dive's ``map.ply``."""
+    path: DivePath
+    """T_sc: of the frames whose sub-maps are in the component."""
+
+
+@dataclass(frozen=True)
+class ShownSite:
+    """What the viewer shows of a site."""
+
+    folder: Path
+    component: int
+    components: int
+    """How many there are."""
+    dives: tuple[PlacedDive, ...]
+    frame: MetricFrame
+    left_out: Mapping[str, str]
+    """Dives of the component that cannot be shown: name and reason."""
+
+
+def read_shown(site: Path, component: int | None, budget: int) -> ShownSite:
+    """The dives of a component, by default of the one with most keyframes.
+
+    Raises:
+        InputError: there is no merged site, no such component, or no dive of it that is as it was.
+    """
+    merged = merge_of(site)
+    chosen = _component(site, merged, component)
+    dives = {dive.name: dive for dive in read_site(site)}
+    shown, left_out = [], {}
+    for name, before in merged.fingerprints.items():
+        placed = [each for each in merged.of_dive(name) if each.component == chosen]
+        if not placed:
+            continue
+        try:
+            shown.append(_placed(site, merged, dives.get(name), name, before, placed, budget))
+        except InputError as error:
+            log.warning("%s is not shown: %s", name, error)
+            left_out[name] = str(error)
+    if not shown:
+        reasons = "; ".join(left_out.values())
+        raise InputError(
+            f"no dive of component {chosen} of {site} can be shown: {reasons}; run `aquaflow site "
+            f"merge {site}` again"
+        )
+    folders = {name: dive.folder(site) for name, dive in dives.items()}
+    frame = frame_of(merged.components[chosen], folders)
+    return ShownSite(site, chosen, len(merged.components), tuple(shown), frame, left_out)
+
+
+def _component(site: Path, merged: MergedSite, asked: int | None) -> int:
+    count = len(merged.components)
+    if asked is None:
+        sizes = np.bincount(merged.keyframes["component"], minlength=count)
+        return int(sizes.argmax())
+    if not 0 <= asked < count:
+        raise InputError(
+            f"{site} has components 0 to {count - 1}, not {asked}; `aquaflow site list {site}` "
+            "shows them"
+        )
+    return asked
+
+
+def _placed(
+    site: Path,
+    merged: MergedSite,
+    dive: SiteDive | None,
+    name: str,
+    before: str,
+    placed: Sequence[PlacedSubMap],
+    budget: int,
+) -> PlacedDive:
+    if dive is None:
+        raise InputError(f"{name} is no longer a dive of {site}")
+    folder = dive.folder(site)
+    if fingerprint(folder) != before:
+        raise InputError(f"{folder} is not what it was when the site was merged")
+    main = merged.main_of(dive, site)
+    if main is None or main not in placed:
+        raise InputError(f"the map of {name} is of a sub-map that is not in this component")
+    read = read_dive(folder, budget)
+    return PlacedDive(name, read, main.T_sn, _moved(read.path, sub_maps_of_frames(folder), placed))
+
+
+def _moved(path: DivePath, sub_maps: Mapping[int, int], placed: Sequence[PlacedSubMap]) -> DivePath:
+    """``sub_maps``: by the microsecond of a frame."""
+    T_sn = {each.number: each.T_sn for each in placed}
+    inside, poses = [], []
+    for i, (t_s, T_nc) in enumerate(zip(path.t_s, path.poses, strict=True)):
+        number = sub_maps.get(round(float(t_s) * 1e6))
+        if number in T_sn:
+            T_sc = T_sn[number] @ T_nc
+            inside.append(i)
+            poses.append(Sim3(T_sc.R, T_sc.t))
+    return replace(path.among(inside), poses=poses)

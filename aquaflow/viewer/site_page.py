@@ -1,0 +1,154 @@
+"""A merged site in the viewer, ``aquaflow view SITE``: maps, paths and pictures of its dives."""
+
+from __future__ import annotations
+
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.config.viewer import ViewerConfig
+from aquaflow.export.ply import PlyGaussians, read_ply
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.viewer.dive_coverage import CLASSES, COVERAGE, coverage_of_dive
+from aquaflow.viewer.dive_map import DiveMap
+from aquaflow.viewer.dive_path import LONGEST_PATH
+from aquaflow.viewer.exhibit import PathPart
+from aquaflow.viewer.finished import frame_in_words, prepare
+from aquaflow.viewer.levels import RANGE, RGB, Palette, range_level
+from aquaflow.viewer.measuring import Frame
+from aquaflow.viewer.moments import HEADING, PICTURE
+from aquaflow.viewer.packed_file import read_packed
+from aquaflow.viewer.page import ViewerPage
+from aquaflow.viewer.site_dives import PlacedDive, ShownSite, read_shown
+from aquaflow.viewer.splats import Levels, splats
+
+DIVE = "dive"
+"""Name of the level that says whose a Gaussian is."""
+DIVE_COLOURS: tuple[RGB, ...] = (
+    (230, 159, 0),
+    (86, 180, 233),
+    (0, 158, 115),
+    (240, 228, 66),
+    (0, 114, 178),
+    (213, 94, 0),
+    (204, 121, 167),
+)
+"""Those of Okabe and Ito (2008), told apart without red and green; more dives share them."""
+MOST_NAMED = 255
+"""Dives that have a number of their own in that level."""
+
+
+def open_site(site: Path, config: ViewerConfig, component: int | None = None) -> ViewerPage:
+    """The page of the merged site in ``site``; ``component``: by default its largest.
+
+    Raises:
+        InputError: there is nothing to show, or the address is taken.
+        ConfigError: the token will not do.
+    """
+    shown = read_shown(site, component, config.splats)
+    key = _key(shown)
+    packed = read_packed(site, key)
+    whole = cache(partial(map_of_site, shown, config.splats))
+    page = ViewerPage(config, "AquaFlow", live=False)
+    frame = shown.frame
+    page.set_frame(Frame.of(frame), up="-z" if frame.level else "-y", north=frame.north)
+    if packed is not None:
+        page.show_packed(packed, lambda: whole().splats, None, packed.palettes)
+        count, total = packed.count, packed.total
+    else:
+        page.show_splats(whole().splats, None, whole().palettes)
+        count, total = len(whole().splats), whole().total
+    page.show_health(_in_words(shown, count, total))
+    _show_paths(page, shown)
+    prepare(site, key, packed, whole, page)
+    return page
+
+
+def map_of_site(shown: ShownSite, budget: int) -> DiveMap:
+    """The Gaussians of all dives in the site's world, at most ``budget``, those that cover most.
+
+    Raises:
+        InputError: a map cannot be read.
+    """
+    maps: list[PlyGaussians] = []
+    numbers: list[Levels] = []
+    classes: list[Levels | None] = []
+    for number, placed in enumerate(shown.dives):
+        own = read_ply(placed.dive.ply)
+        classes.append(coverage_of_dive(placed.dive.folder, own.means, placed.dive.frame))
+        maps.append(own.transformed(placed.T_sn))
+        numbers.append(np.full(len(own.means), min(number, MOST_NAMED), np.uint8))
+    names = tuple(placed.name for placed in shown.dives)[: MOST_NAMED + 1]
+    stops = tuple(DIVE_COLOURS[i % len(DIVE_COLOURS)] for i in range(len(names)))
+    levels: dict[str, Levels] = {DIVE: np.concatenate(numbers)}
+    palettes = {DIVE: Palette("by dive", stops, names)}
+    covered = [each for each in classes if each is not None]
+    if len(covered) == len(maps):
+        levels[COVERAGE], palettes[COVERAGE] = np.concatenate(covered), CLASSES
+    joined = [_joined(maps, name) for name in ("means", "wxyz", "scales", "opacities", "colours")]
+    cameras = np.concatenate([placed.path.places for placed in shown.dives])
+    if len(cameras) and len(joined[0]):
+        levels[RANGE], palettes[RANGE] = range_level(joined[0], cameras, shown.frame.unit)
+    means, wxyz, scales, opacities, colours = joined
+    return DiveMap(
+        splats(means, wxyz, scales, opacities, colours, budget, levels), palettes, len(means)
+    )
+
+
+def _joined(maps: list[PlyGaussians], name: str) -> npt.NDArray[np.float32]:
+    return np.concatenate([np.asarray(getattr(each, name), np.float32) for each in maps])
+
+
+def _show_paths(page: ViewerPage, shown: ShownSite) -> None:
+    """One after the other; a picture's number is its frame's, after those of the dives before."""
+    rows, moments, parts = [], [], []
+    pictures: dict[int, Path] = {}
+    first = before = 0
+    for placed in shown.dives:
+        path = placed.path.thinned(max(1, LONGEST_PATH // len(shown.dives)))
+        own = path.moments.copy()
+        own[:, PICTURE] += before
+        if not _same_north(placed, shown):
+            own[:, HEADING] = np.nan
+        pictures |= {before + index: file for index, file in path.pictures.items()}
+        parts.append(PathPart(placed.name, first, path.began, placed.dive.camera))
+        rows.append(path.rows)
+        moments.append(own)
+        first += len(path.poses)
+        before += max(path.pictures, default=-1) + 1
+    page.show_path(np.concatenate(rows), np.concatenate(moments), parts=parts)
+    page.show_pictures(pictures)
+    start = next((T for placed in shown.dives for T in placed.path.poses), Sim3.identity())
+    page.show_camera(start, shown.dives[0].dive.camera, None)
+
+
+def _same_north(placed: PlacedDive, shown: ShownSite) -> bool:
+    """Headings of a dive are counted from what those of the site are."""
+    north = shown.frame.north
+    return placed.dive.frame.north == north and north.endswith("north")
+
+
+def _key(shown: ShownSite) -> dict[str, Any]:
+    """By what a packed map is known to be of these dives, where they are now."""
+    return {
+        placed.name: [placed.dive.key, placed.T_sn.matrix.tolist()] for placed in shown.dives
+    } | {"component": shown.component}
+
+
+def _in_words(shown: ShownSite, count: int, total: int) -> str:
+    poses = sum(len(placed.path.poses) for placed in shown.dives)
+    dives = len(shown.dives)
+    words = [
+        f"{shown.folder.name}: {dives} {'dive' if dives == 1 else 'dives'}, {poses} poses, "
+        f"{count} of {total} Gaussians",
+        frame_in_words(shown.frame),
+    ]
+    if shown.components > 1:
+        words.append(
+            f"Component {shown.component} of 0 to {shown.components - 1}; the others never met it"
+        )
+    words += [f"{name} is not shown: {reason}" for name, reason in shown.left_out.items()]
+    return "\n\n".join(words)
