@@ -75,8 +75,9 @@ class LiveMappingConfig(Stage):
     """How mapping runs in parallel to tracking."""
 
     backlog: int = Field(
-        8, ge=1, description="frames that wait for mapping; then common frames are left out, at "
-        "three times as many mapping frames too, at eight times keyframes",
+        8, ge=1, description="frames that wait for mapping; then common frames come as views, "
+        "without steps of their own, at three times as many mapping frames are left out, at eight "
+        "times keyframes, and common frames where so many requests wait",
     )  # fmt: skip
     steps_per_view: int = Field(
         40, ge=0, description="steps of the optimiser for each view in the end, as far as time "

@@ -129,6 +129,7 @@ class LiveLoop:
             "steps_up": self.degradation.steps_up,
             "visits": {state.value: count for state, count in self.health.visits.items()},
             "left_out_of_the_map": dict(self.maps.left_out),
+            "mapped_without_steps": self.maps.without_steps,
             "mapping_failures": self.maps.failures,
             "mapping_waits": self.maps.waiting,
             "mapping_rests": self.maps.rests,

@@ -1,7 +1,8 @@
 """Mapping in parallel to tracking: one thread that runs tracking's requests in order.
 
-Tracking never waits for it. Requests beyond the backlog limit are dropped and counted, common
-frames first; between requests the thread goes on optimising until every view has had its steps.
+Tracking never waits for it. Beyond the backlog limit common frames come as views without steps of
+their own, then requests are dropped and counted, common frames first; between requests the thread
+goes on optimising until every view has had its steps.
 """
 
 from __future__ import annotations
@@ -47,7 +48,9 @@ JOIN_S = 30.0
 BACKLOG_SHARE = 0.5
 """Of the time until refining must end; frames that still wait for mapping then are left out."""
 MAPPING_AT, KEYFRAME_AT = 3, 8
-"""Backlogs after which mapping frames, and then keyframes, are left out."""
+"""Backlogs of requests with steps after which mapping frames, and then keyframes, are left out."""
+VIEW_AT = 8
+"""Backlogs of all requests after which common frames are left out: each holds a picture."""
 
 Job = Callable[[OwnedMaps], None]
 
@@ -78,6 +81,8 @@ class MapThread:
         thread."""
         self.left_out: Counter[str] = Counter()
         """Frames that the map never saw, by reason."""
+        self.without_steps = 0
+        """Common frames that came as views alone: idle time and refining learn from them."""
         self.failures = 0
         """Requests that raised an error; each was skipped."""
         self.last_failure = ""
@@ -90,7 +95,7 @@ class MapThread:
         self._maps, self._config, self._heartbeats, self._level = maps, config, heartbeats, level
         self._jobs: deque[tuple[str, Job]] = deque()
         self._growing = 0
-        """Growth requests in the queue."""
+        """Growth requests with steps in the queue."""
         self._newest: int | None = None
         """The sub-map that grew last."""
         self._changed = threading.Condition()
@@ -112,12 +117,15 @@ class MapThread:
             return
         level = self._level()
         growth = replace(growth, retired=tuple(map(_owned, growth.retired)))
+        if growth.view.robust and self._growing >= self._config.backlog:
+            growth = replace(growth, steps=0)
+            self.without_steps += 1
         if level >= DegradationLevel.FEWER_STEPS:
             growth = replace(growth, steps=growth.steps // FEWER)
         if level >= DegradationLevel.SMALLER_IMAGES:
             growth = halved(growth)
         with self._changed:
-            self._growing += 1
+            self._growing += growth.steps > 0
         self._post("grow", partial(self._grow, growth))
 
     def hold_out(self, view: View, sub_map: int) -> None:
@@ -184,7 +192,7 @@ class MapThread:
         if self._level() >= DegradationLevel.TRACKING_ONLY:
             return "tracking only"
         backlog, waiting = self._config.backlog, self._growing
-        if waiting >= backlog and growth.view.robust:
+        if self.waiting >= VIEW_AT * backlog and growth.view.robust:
             return "common frame, mapping was behind"
         if waiting >= MAPPING_AT * backlog and not growth.retired:
             return "mapping frame, mapping was behind"
@@ -199,7 +207,7 @@ class MapThread:
 
     def _grow(self, growth: Growth, maps: OwnedMaps) -> None:
         with self._changed:
-            self._growing -= 1
+            self._growing -= growth.steps > 0
         if self._until.over:
             self.left_out["the dive ended before mapping had caught up"] += 1
             return

@@ -76,7 +76,9 @@ def report_between_dives(
         "level": vitals.degradation.level.words,
         "visits": {state.value: count for state, count in vitals.health.visits.items()},
         "left_out_of_the_map": {},
-        **dict.fromkeys(("mapping_failures", "mapping_waits", "mapping_rests"), 0),
+        **dict.fromkeys(
+            ("mapped_without_steps", "mapping_failures", "mapping_waits", "mapping_rests"), 0
+        ),
         "stage_failures": feed.failures.to_json(),
         "keyframes": 0,
         "consistency": None,

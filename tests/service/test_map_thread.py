@@ -67,16 +67,31 @@ def test_requests_are_done_in_their_order(beside: Beside) -> None:
     assert beside.maps.asked == ["grow 0 64px 8", "grow 1 64px 8"]
 
 
+def test_common_frames_beyond_the_backlog_come_as_views_without_steps(beside: Beside) -> None:
+    held = beside.hold()
+    for index in range(4):
+        beside.thread.grow(growth(index, robust=True))
+    held.set()
+    beside.thread.close()
+    assert beside.maps.asked == [
+        "grow 0 64px 8", "grow 1 64px 8", "grow 2 64px 0", "grow 3 64px 0",
+    ]  # fmt: skip
+    assert beside.thread.without_steps == 2
+    assert not beside.thread.left_out
+
+
 def test_common_frames_are_left_out_first_and_counted(beside: Beside) -> None:
     held = beside.hold()
     for index in range(20):
-        beside.thread.grow(growth(index, robust=index % 2 == 1))
+        beside.thread.grow(growth(index, robust=True))
+    for index in range(20, 30):
+        beside.thread.grow(growth(index))
     held.set()
     beside.thread.close()
     left_out = beside.thread.left_out
-    assert left_out["common frame, mapping was behind"] == 9
-    assert left_out["mapping frame, mapping was behind"] == 5
-    assert len(beside.maps.asked) == 6
+    assert left_out["common frame, mapping was behind"] == 4
+    assert left_out["mapping frame, mapping was behind"] == 6
+    assert len(beside.maps.asked) == 20
 
 
 def test_a_keyframe_that_the_map_never_saw_does_not_retire_into_it(beside: Beside) -> None:
