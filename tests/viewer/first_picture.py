@@ -99,7 +99,7 @@ def measure(dive: Path, mbit: float, picture: Path | None) -> dict[str, float]:
     began = time.monotonic()
     read = read_dive(dive, 10**9)
     page = show_dive(read, ViewerConfig(port=0))
-    behind = prepare(dive, read, page)
+    behind = prepare(dive, read.key, read.packed, read.map, page)
     ready_s = time.monotonic() - began
     link = SlowLink(int(page.address.rstrip("/").rpartition(":")[2]), mbit * 1e6 / 8)
     with tempfile.TemporaryDirectory() as profile:
