@@ -12,7 +12,7 @@ from aquaflow.keyframes.place import KeypointDepths, Place
 from aquaflow.keyframes.places_file import NAME as PLACES
 from aquaflow.keyframes.places_file import PlacesFile
 from aquaflow.site.frames import frame_of
-from aquaflow.site.manifest import fingerprint, is_site, read_site
+from aquaflow.site.manifest import check_unchanged, is_site, read_site
 from aquaflow.site.merged_file import MergedSite, merge_of
 from aquaflow.tracking.base.base import Base
 from aquaflow.tracking.base.opening import open_base, prior_of
@@ -55,8 +55,7 @@ def base_of(folder: Path) -> Base:
 
 
 def _unchanged(dive: Path, before: str) -> PlacesFile:
-    if fingerprint(dive) != before:
-        raise InputError(f"{dive} is not what it was when the site was merged")
+    check_unchanged(dive, before)
     return PlacesFile(dive / PLACES)
 
 

@@ -56,6 +56,16 @@ def fingerprint(dive: Path) -> str:
     return found.hexdigest()
 
 
+def check_unchanged(dive: Path, before: str) -> None:
+    """Compare the folder ``dive`` with the fingerprint that it was merged with.
+
+    Raises:
+        InputError: it is another one now, or cannot be read.
+    """
+    if fingerprint(dive) != before:
+        raise InputError(f"{dive} is not what it was when the site was merged")
+
+
 def is_site(folder: Path) -> bool:
     """True of a folder with a site's manifest, also a damaged one."""
     return (folder / NAME).is_file()

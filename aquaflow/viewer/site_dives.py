@@ -13,7 +13,7 @@ from aquaflow.errors import InputError
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.site.frames import frame_of
-from aquaflow.site.manifest import SiteDive, fingerprint, read_site
+from aquaflow.site.manifest import SiteDive, check_unchanged, read_site
 from aquaflow.site.merged_file import MergedSite, PlacedSubMap, merge_of
 from aquaflow.site.paths import sub_maps_of_frames
 from aquaflow.viewer.dive_path import DivePath
@@ -104,8 +104,7 @@ def _placed(
     if dive is None:
         raise InputError(f"{name} is no longer a dive of {site}")
     folder = dive.folder(site)
-    if fingerprint(folder) != before:
-        raise InputError(f"{folder} is not what it was when the site was merged")
+    check_unchanged(folder, before)
     main = merged.main_of(dive, site)
     if main is None or main not in placed:
         raise InputError(f"the map of {name} is of a sub-map that is not in this component")

@@ -133,9 +133,8 @@ def _same_north(placed: PlacedDive, shown: ShownSite) -> bool:
 
 def _key(shown: ShownSite) -> dict[str, Any]:
     """By what a packed map is known to be of these dives, where they are now."""
-    return {
-        placed.name: [placed.dive.key, placed.T_sn.matrix.tolist()] for placed in shown.dives
-    } | {"component": shown.component}
+    dives = [[placed.name, placed.dive.key, placed.T_sn.matrix.tolist()] for placed in shown.dives]
+    return {"component": shown.component, "dives": dives}
 
 
 def _in_words(shown: ShownSite, count: int, total: int) -> str:
