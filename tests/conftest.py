@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -139,3 +140,16 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_watchdog_is_left() -> Iterator[None]:
+    """No file of tests leaves a watchdog behind: that of a dive which was not closed ends this
+    process, and the tests that follow, once its heartbeats are old (health/heartbeats.py)."""
+    before = _watchdogs()
+    yield
+    assert _watchdogs() <= before, "a live dive or a service was not closed"
+
+
+def _watchdogs() -> set[threading.Thread]:
+    return {thread for thread in threading.enumerate() if thread.name == "watchdog"}

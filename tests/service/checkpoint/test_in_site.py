@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,9 @@ def base(small_dive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def cut(small_recording: Path, base: Path, tmp_path_factory: pytest.TempPathFactory) -> LiveDive:
+def cut(
+    small_recording: Path, base: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[LiveDive]:
     """A dive of the same place, up to its checkpoint, as a process that was killed leaves it."""
     folder = tmp_path_factory.mktemp("dives") / "cut"
     frames = open_recording(small_recording).frames(stop=16)
@@ -37,7 +40,8 @@ def cut(small_recording: Path, base: Path, tmp_path_factory: pytest.TempPathFact
     dive.parts.checkpointer.take()
     caught_up(dive)
     dive.folder._lock.release()
-    return dive
+    yield dive
+    dive.close()
 
 
 def test_the_pilot_is_told_that_the_place_was_found(cut: LiveDive) -> None:
