@@ -7,8 +7,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 WORKERS ?= 2
-# Tests of one file run in one process: they share what the file's fixtures made.
-TESTS := $(BIN)/pytest -n $(WORKERS) --dist loadfile
+# Tests of one file run in one process: they share what the file's fixtures made. A test that hangs
+# fails, and one that ends its process ends the run, which would wait for ever with another process.
+TESTS := $(BIN)/pytest -n $(WORKERS) --dist loadfile --max-worker-restart 0 --timeout 900
 MKDOCS := NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 QUICK := -m 'not slow and not kernel and not ci'
 KERNELS := $(wildcard aquaflow/render/native/*.cpp aquaflow/render/native/*.h)
