@@ -130,6 +130,20 @@ def test_buttons_ask_for_what_is_possible_and_confirm_what_cannot_be_undone(
     assert dive.asked == ["stop", "finish"]
 
 
+def test_a_question_asked_right_after_another_was_closed_is_answered_for_itself(
+    browser: Browser, address: str, dive: SimulatedDive
+) -> None:
+    log_in(browser, address)
+    browser.click("[data-action=finish]")
+    browser.run(
+        "document.querySelector('dialog').close();"
+        "document.querySelector('[data-action=finish]').click()"
+    )
+    browser.wait("document.querySelector('dialog').open")
+    browser.click("#agree")
+    browser.until(lambda: dive.asked == ["finish"], "the dive's end")
+
+
 def test_what_the_vehicle_refuses_is_said(
     browser: Browser, address: str, dive: SimulatedDive
 ) -> None:

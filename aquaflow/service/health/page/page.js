@@ -193,15 +193,21 @@ async function send(action) {
   await look().catch(() => {});
 }
 
-async function confirmed(action) {
+let decide = () => {};  // to the question that was asked last
+
+function confirmed(action) {
   if (!QUESTIONS[action]) return true;
   const dialog = $("confirm");
   [$("question").textContent, $("consequence").textContent, $("agree").textContent] = QUESTIONS[action];
   dialog.returnValue = "";
   dialog.showModal();
-  await new Promise(resolve => dialog.addEventListener("close", resolve, { once: true }));
-  return dialog.returnValue === "yes";
+  return new Promise(resolve => decide = resolve);
 }
+
+$("confirm").addEventListener("close", () => {
+  // The event comes some time after the closing: the next question may be open by then.
+  if (!$("confirm").open) decide($("confirm").returnValue === "yes");
+});
 
 $("buttons").addEventListener("click", async event => {
   const action = event.target.dataset.action;
