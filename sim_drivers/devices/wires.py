@@ -132,11 +132,13 @@ class TcpWire:
 
     def receive(self) -> bytes | None:
         client = self._accepted()
-        if client is None or not select.select([client], [], [], 0.0)[0]:
+        if client is None:
             return None
         try:
+            if not select.select([client], [], [], 0.0)[0]:
+                return None
             data = client.recv(READ_BYTES)
-        except OSError:
+        except (OSError, ValueError):  # ValueError: another thread has just unplugged it
             data = b""
         if not data:
             self.unplug()
@@ -149,8 +151,9 @@ class TcpWire:
     def _accepted(self) -> socket.socket | None:
         if self._client is None:
             with contextlib.suppress(OSError):
-                self._client, _ = self._server.accept()
-                self._client.settimeout(PATIENCE_S)
+                client, _ = self._server.accept()
+                client.settimeout(PATIENCE_S)
+                self._client = client
         return self._client
 
 
