@@ -3,7 +3,7 @@ time."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 from aquaflow.config import TrackingConfig
 from aquaflow.errors.failures import Failures
@@ -20,16 +20,17 @@ from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
 
 @dataclass(frozen=True)
 class PosedFrame:
-    """A frame of the initialisation: its pose against the reference and its matches."""
+    """A frame of the initialisation: its pose against the reference and its matches; without them
+    one that the initialisation had left out."""
 
     frame: Frame
-    T_fk: Sim3
-    pair: PairGeometry
+    T_fk: Sim3 | None = None
+    pair: PairGeometry | None = None
 
 
 @dataclass(frozen=True)
 class Started:
-    """The first keyframe of a map, and the frames that were placed with it."""
+    """The first keyframe of a map, and the frames after it that are followed from there."""
 
     reference: Frame
     encoding: Encoding
@@ -39,6 +40,8 @@ class Started:
     """With the refined focal length, where it was unknown."""
     focal_sigma: float
     posed: list[PosedFrame]
+    T_waiting: Sim3 = field(default_factory=Sim3.identity)
+    """T_fk about which the newest of the frames that still wait is looked for."""
 
 
 class MapStart:
@@ -130,8 +133,12 @@ class MapStart:
             PosedFrame(waiting.frame, T, waiting.pair)
             for waiting, T in zip(solution.waiting, solution.T, strict=True)
         ]
-        posed = posed[-1:] if self._live else posed
-        return Started(reference, encoding, pointmap, camera, solution.focal_sigma, posed)
+        start = Started(reference, encoding, pointmap, camera, solution.focal_sigma, posed)
+        if self._live:
+            return replace(start, posed=posed[-1:], T_waiting=solution.T[-1])
+        thinned = [PosedFrame(frame) for frame in self._waiting.of(Wait.THINNED)]
+        in_order = sorted([*posed, *thinned], key=lambda each: each.frame.index)
+        return replace(start, posed=in_order)
 
     def restart(self, frame: Frame, encoding: Encoding) -> None:
         """Use ``frame`` as the reference from now on."""

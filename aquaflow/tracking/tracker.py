@@ -190,11 +190,12 @@ class Tracker:
         new = self._keyframe_tracker.at_new_keyframe
         at = self._at = new(first, encoding, self._origin, pointmap, self.sub_map)
         tracked = [at.tracked(first, FrameClass.KEYFRAME, Quality(), pointmap.copy())]
+        at.T_fk = started.T_waiting
         tracked += self._back_fill()
         for posed in started.posed:
             on_reference = self._at is at
-            if on_reference:
-                at.T_fk = posed.T_fk
+            if on_reference and posed.T_fk is not None:
+                at.motion = posed.T_fk @ at.T_fk.inverse()
             encoded, result = self._encode(posed.frame), None
             if encoded is not None:
                 result = self._follow(posed.frame, encoded, posed.pair if on_reference else None)

@@ -15,6 +15,7 @@ from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, Prior
 from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
 from aquaflow.tracking.frames import FrameClass, Tracked
+from aquaflow.tracking.pose.expected_matches import expected_matches
 from aquaflow.tracking.pose.matcher import Matched
 from aquaflow.tracking.side_work import SideWork
 from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
@@ -61,15 +62,16 @@ class BackFill:
         keyframe_tracker: KeyframeTracker,
         failures: Failures,
     ) -> None:
-        """``at``: where the newest of the frames, which come oldest first, is looked for."""
+        """``at``: where the newest of the frames is looked for, with the motion towards there."""
         self._indices = frozenset(frame.index for frame in frames)
-        self._at, self._camera = replace(at), camera
+        self._at, self._camera = replace(at, motion=at.motion.inverse()), camera
         self._prior, self._keyframe_tracker, self._failures = prior, keyframe_tracker, failures
         self._last: Placed | None = None
 
     def left(self, waiting: Sequence[Frame]) -> list[Frame]:
-        """Those of its frames that still wait."""
-        return [frame for frame in waiting if frame.index in self._indices]
+        """Those of its frames that still wait, the oldest first."""
+        left = [frame for frame in waiting if frame.index in self._indices]
+        return sorted(left, key=lambda frame: frame.index)
 
     def place(self, frame: Frame) -> Placed | None:
         """Look for the newest frame that is left; in any thread, one frame at a time."""
@@ -83,7 +85,10 @@ class BackFill:
         if placed is None:
             return Tracked.lost(frame, at.keyframe.sub_map)
         self._last = placed
-        at.T_fk = placed.T_fk
+        matches = placed.solved.pair.matches
+        if placed.at is not at:  # those are of another picture
+            matches = expected_matches(at.keyframe.pointmap, placed.T_fk, self._camera)
+        at.moved_to(placed.T_fk, matches)
         return at.tracked(frame, FrameClass.COMMON, placed.solved.quality)
 
     def _place(self, frame: Frame) -> Placed | None:
@@ -139,7 +144,7 @@ class BackFills:
             return []
         fill = BackFill(frames, at, camera, self._prior, self._keyframe_tracker, self._failures)
         if not self._live:
-            return fill.all(frames)
+            return fill.all(fill.left(frames))
         waiting = self._waiting.of(Wait.IN_IDLE_TIME)
         self._left = [each for each in (*self._left, fill) if each.left(waiting)]
         return []

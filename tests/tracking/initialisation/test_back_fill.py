@@ -8,7 +8,7 @@ from threading import Event
 import pytest
 
 from aquaflow.clocks.deadline import Deadline
-from aquaflow.config import TrackingConfig
+from aquaflow.config import InitialisationConfig, TrackingConfig
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.messages import Frame
 from aquaflow.prior.classical import ClassicalPrior
@@ -16,10 +16,18 @@ from aquaflow.tracking.frames import Tracked
 from aquaflow.tracking.side_work import SideWork
 from aquaflow.tracking.tracker import Tracker
 from aquaflow.tracking.waiting_frames import BOUNDS, Bound, Wait
-from tests.tracking.tracked_clips import error_share
+from tests.tracking.tracked_clips import error_share, run
 from tests.tracking.tracking_scenes import SeaFloor, black, filmed, lawn_path
 
 POSES = lawn_path(12, step_m=0.12)
+
+
+SLOW_POSES = lawn_path(24, step_m=0.03)
+
+
+def thinning(**settings: float) -> TrackingConfig:
+    """Of a slow clip, initialisation leaves most frames out."""
+    return TrackingConfig(initialisation=InitialisationConfig.model_validate(settings))
 
 
 @pytest.fixture(scope="module")
@@ -27,8 +35,8 @@ def clip() -> list[Frame]:
     return filmed(SeaFloor(), POSES)
 
 
-def live() -> Tracker:
-    return Tracker(ClassicalPrior(), KeyframeStore(), TrackingConfig(), live=True)
+def live(config: TrackingConfig | None = None) -> Tracker:
+    return Tracker(ClassicalPrior(), KeyframeStore(), config or TrackingConfig(), live=True)
 
 
 def until_started(tracker: Tracker, clip: list[Frame]) -> tuple[list[Tracked], int]:
@@ -62,6 +70,27 @@ def test_the_past_is_placed_frame_by_frame_and_as_well(clip: list[Frame]) -> Non
     assert sorted(tracked.frame.index for tracked in decided) == list(range(len(clip)))
     assert all(tracked.T_wc is not None for tracked in decided)
     assert error_share(decided, POSES) < 0.01
+
+
+def test_a_replay_follows_what_initialisation_left_out_from_keyframe_to_keyframe() -> None:
+    poses = lawn_path(24, step_m=0.06)
+    until_the_end = thinning(max_waiting=3, parallax_widths=0.15)
+    followed = run(filmed(SeaFloor(), poses), until_the_end)
+    numbers = [tracked.keyframe for _, tracked in sorted(followed.by_index().items())]
+    assert numbers == sorted(numbers)
+    assert len(followed.store) > 2
+    assert error_share(followed.tracked, poses) < 5e-4
+
+
+def test_a_live_run_looks_back_from_the_newest_frame_to_the_oldest() -> None:
+    tracker = live(thinning(max_waiting=6))
+    decided, newest = until_started(tracker, filmed(SeaFloor(), SLOW_POSES))
+    placed = []
+    while tracker.past is not None:
+        placed += tracker.back_fill()
+    assert newest > 6
+    assert [tracked.frame.index for tracked in placed] == list(range(newest - 1, 0, -1))
+    assert error_share([*decided, *placed], SLOW_POSES) < 1e-3
 
 
 def test_a_frame_of_the_past_is_looked_for_beside_tracking(clip: list[Frame]) -> None:
