@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.config import GraphConfig, RetrievalConfig, VerificationConfig
+from aquaflow.config import RetrievalConfig, VerificationConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes.place import Place
 from aquaflow.keyframes.places_file import PlacesFile
@@ -22,9 +22,15 @@ RETRIEVAL = RetrievalConfig(neighbour_share=0.0, min_similarity=0.01, candidates
 """A place in another dive, seen in other water and light, is less like itself than neighbours on a
 path are: the true pairs of the reef clip's halves have similarities from 0.02. So only what chance
 gives is asked for, more candidates are tried, and verification decides."""
-SCALE_SIGMA = GraphConfig().link_scale_sigma
-"""Relative scale that a link may be wrong by, beside its own covariance: as one along the path. On
-the reef clip's halves the scales of 12 links differ by 0.5 %, with a stated sigma of 0.15 %."""
+SCALE_SIGMA = 0.05
+"""Relative scale that a link may be wrong by, beside its own covariance. The depths of two dives
+differ by what each dive's start left wrong: against structure from motion, the scales of the links
+of two dives are 0.3 to 2.2 % off on the reef and Curasao clips, and those of one pair of dives all
+to one side. A dozen links do not average that out: 1.5 % times the root of 12. What the cameras
+moved, seen in both dives, says more of the scale (docs/sites.md#measured)."""
+ROTATION_SIGMA = 5e-4
+"""rad, likewise: the rotations of links of the same dives differ by 3 to 15 times that (0.1 to 0.4
+degrees), with a stated 0.01 to 0.05 degrees."""
 VERIFICATION = VerificationConfig()
 """As within a dive."""
 
@@ -81,7 +87,8 @@ def _of_keyframe(
             continue
         T_ba, covariance = proof.estimate.T, proof.estimate.covariance
         sigma = float(np.hypot(np.sqrt(covariance[6, 6]), SCALE_SIGMA))
-        information = edge_information(covariance[:6, :6], sigma, T_ba)
+        pose = covariance[:6, :6] + np.diag([0.0, 0.0, 0.0, *[ROTATION_SIGMA**2] * 3])
+        information = edge_information(pose, sigma, T_ba)
         yield CrossLink(
             candidate.number, place.number, T_ba, information, proof.inliers, proof.matched,
             proof.cells, candidate.similarity,
