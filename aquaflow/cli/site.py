@@ -1,8 +1,11 @@
-"""The commands for several dives of one place: ``site add``, ``merge``, ``list``, ``check``."""
+"""The commands for several dives of one place: ``site add``, ``merge``, ``map``, ``list``,
+``check``."""
 
 from __future__ import annotations
 
 import json
+import tempfile
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -53,6 +56,30 @@ def merge(site: Site, as_json: Json = False) -> None:
     for line in _in_words(merged):
         typer.echo(line)
     typer.echo(f"Written to {site}: merged.json, merged.npy, paths/.")
+
+
+@app.command("map")
+def write_map(
+    site: Site,
+    component: Annotated[
+        int | None, typer.Option(help="Its number in `site list`; else the largest.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """One map of the merged dives: of every place the dive that shows it last, or much closer."""
+    from aquaflow.change.make_site_map import make_site_map
+
+    with progress_bars(quiet=as_json) as progress, tempfile.TemporaryDirectory() as work:
+        ply, parts = make_site_map(site, component, Path(work), progress)
+    if as_json:
+        typer.echo(json.dumps({"map": str(ply), "dives": [asdict(part) for part in parts]}))
+        return
+    for part in parts:
+        typer.echo(
+            f"{part.name}: {part.gaussians} Gaussians stay; {part.gone} are gone since, "
+            f"{part.replaced} are of places that another dive shows."
+        )
+    typer.echo(f"Wrote {ply}; `aquaflow view {site}` shows it.")
 
 
 @app.command("list")

@@ -63,6 +63,16 @@ class PlyGaussians:
     colours: Array
     """[N, 3] RGB, usually in [0, 1]."""
 
+    def rows(
+        self,
+        which: slice | npt.NDArray[np.bool_],  # [N] bool
+    ) -> PlyGaussians:
+        """Some of the Gaussians."""
+        return PlyGaussians(
+            self.means[which], self.wxyz[which], self.scales[which], self.opacities[which],
+            self.colours[which],
+        )  # fmt: skip
+
     def transformed(self, T: Sim3) -> PlyGaussians:
         """The same Gaussians in the frame that ``T`` maps to; their covariance C becomes
         s^2 R C R^T. Colours stay: they are the same from every direction (degree 0)."""

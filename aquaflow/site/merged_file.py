@@ -76,6 +76,22 @@ class MergedSite:
         """The sub-maps of a dive."""
         return tuple(each for each in self.sub_maps if each.dive == name)
 
+    def chosen(self, component: int | None, site: Path) -> int:
+        """The component that was asked for; None: the one with most keyframes.
+
+        Raises:
+            InputError: there is no such component.
+        """
+        count = len(self.components)
+        if component is None:
+            return int(np.bincount(self.keyframes["component"], minlength=count).argmax())
+        if not 0 <= component < count:
+            raise InputError(
+                f"{site} has components 0 to {count - 1}, not {component}; `aquaflow site list "
+                f"{site}` shows them"
+            )
+        return component
+
     def main_of(self, dive: SiteDive, site: Path) -> PlacedSubMap | None:
         """The sub-map of a dive's ``map.ply``; None where the merge has none.
 

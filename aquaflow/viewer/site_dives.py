@@ -7,8 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from aquaflow.errors import InputError
 from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3
@@ -16,6 +14,7 @@ from aquaflow.site.frames import frame_of
 from aquaflow.site.manifest import SiteDive, check_unchanged, read_site
 from aquaflow.site.merged_file import MergedSite, PlacedSubMap, merge_of
 from aquaflow.site.paths import sub_maps_of_frames
+from aquaflow.site.site_map_file import SiteMapPart, parts_of
 from aquaflow.viewer.dive_path import DivePath
 from aquaflow.viewer.finished import FinishedDive, read_dive
 
@@ -47,6 +46,8 @@ class ShownSite:
     frame: MetricFrame
     left_out: Mapping[str, str]
     """Dives of the component that cannot be shown: name and reason."""
+    one_map: list[SiteMapPart] | None
+    """What that of ``aquaflow site map`` is made of, where it is of these dives as they lie now."""
 
 
 def read_shown(site: Path, component: int | None, budget: int) -> ShownSite:
@@ -56,7 +57,7 @@ def read_shown(site: Path, component: int | None, budget: int) -> ShownSite:
         InputError: there is no merged site, no such component, or no dive of it that is as it was.
     """
     merged = merge_of(site)
-    chosen = _component(site, merged, component)
+    chosen = merged.chosen(component, site)
     dives = {dive.name: dive for dive in read_site(site)}
     shown, left_out = [], {}
     for name, before in merged.fingerprints.items():
@@ -76,20 +77,13 @@ def read_shown(site: Path, component: int | None, budget: int) -> ShownSite:
         )
     folders = {name: dive.folder(site) for name, dive in dives.items()}
     frame = frame_of(merged.components[chosen], folders)
-    return ShownSite(site, chosen, len(merged.components), tuple(shown), frame, left_out)
-
-
-def _component(site: Path, merged: MergedSite, asked: int | None) -> int:
-    count = len(merged.components)
-    if asked is None:
-        sizes = np.bincount(merged.keyframes["component"], minlength=count)
-        return int(sizes.argmax())
-    if not 0 <= asked < count:
-        raise InputError(
-            f"{site} has components 0 to {count - 1}, not {asked}; `aquaflow site list {site}` "
-            "shows them"
-        )
-    return asked
+    T_sn = {placed.name: placed.T_sn for placed in shown}
+    one_map = None
+    try:
+        one_map = parts_of(site, chosen, merged.fingerprints, T_sn)
+    except InputError as error:
+        log.warning("the dives' own maps are shown: %s", error)
+    return ShownSite(site, chosen, len(merged.components), tuple(shown), frame, left_out, one_map)
 
 
 def _placed(

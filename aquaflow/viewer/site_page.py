@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from aquaflow.config.viewer import ViewerConfig
+from aquaflow.errors import InputError
 from aquaflow.export.ply import PlyGaussians, read_ply
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.site.site_map_file import joined, read_site_map
 from aquaflow.viewer.dive_coverage import CLASSES, COVERAGE, coverage_of_dive
 from aquaflow.viewer.dive_map import DiveMap
 from aquaflow.viewer.dive_path import LONGEST_PATH
@@ -24,6 +26,8 @@ from aquaflow.viewer.packed_file import read_packed
 from aquaflow.viewer.page import ViewerPage
 from aquaflow.viewer.site_dives import PlacedDive, ShownSite, read_shown
 from aquaflow.viewer.splats import Levels, splats
+
+log = logging.getLogger(__name__)
 
 DIVE = "dive"
 """Name of the level that says whose a Gaussian is."""
@@ -73,13 +77,12 @@ def map_of_site(shown: ShownSite, budget: int) -> DiveMap:
     Raises:
         InputError: a map cannot be read.
     """
-    maps: list[PlyGaussians] = []
     numbers: list[Levels] = []
     classes: list[Levels | None] = []
-    for number, placed in enumerate(shown.dives):
-        own = read_ply(placed.dive.ply)
-        classes.append(coverage_of_dive(placed.dive.folder, own.means, placed.dive.frame))
-        maps.append(own.transformed(placed.T_sn))
+    maps = _one_map(shown) or [_own_map(placed) for placed in shown.dives]
+    for number, (placed, own) in enumerate(zip(shown.dives, maps, strict=True)):
+        in_n = placed.T_sn.inverse().apply(np.asarray(own.means, np.float64))
+        classes.append(coverage_of_dive(placed.dive.folder, in_n, placed.dive.frame))
         numbers.append(np.full(len(own.means), min(number, MOST_NAMED), np.uint8))
     names = tuple(placed.name for placed in shown.dives)[: MOST_NAMED + 1]
     stops = tuple(DIVE_COLOURS[i % len(DIVE_COLOURS)] for i in range(len(names)))
@@ -88,18 +91,30 @@ def map_of_site(shown: ShownSite, budget: int) -> DiveMap:
     covered = [each for each in classes if each is not None]
     if len(covered) == len(maps):
         levels[COVERAGE], palettes[COVERAGE] = np.concatenate(covered), CLASSES
-    joined = [_joined(maps, name) for name in ("means", "wxyz", "scales", "opacities", "colours")]
+    all_of = joined(maps)
     cameras = np.concatenate([placed.path.places for placed in shown.dives])
-    if len(cameras) and len(joined[0]):
-        levels[RANGE], palettes[RANGE] = range_level(joined[0], cameras, shown.frame.unit)
-    means, wxyz, scales, opacities, colours = joined
-    return DiveMap(
-        splats(means, wxyz, scales, opacities, colours, budget, levels), palettes, len(means)
+    if len(cameras) and len(all_of.means):
+        levels[RANGE], palettes[RANGE] = range_level(all_of.means, cameras, shown.frame.unit)
+    found = splats(
+        all_of.means, all_of.wxyz, all_of.scales, all_of.opacities, all_of.colours, budget, levels
     )
+    return DiveMap(found, palettes, len(all_of.means))
 
 
-def _joined(maps: list[PlyGaussians], name: str) -> npt.NDArray[np.float32]:
-    return np.concatenate([np.asarray(getattr(each, name), np.float32) for each in maps])
+def _own_map(placed: PlacedDive) -> PlyGaussians:
+    return read_ply(placed.dive.ply).transformed(placed.T_sn)
+
+
+def _one_map(shown: ShownSite) -> list[PlyGaussians] | None:
+    """What the site's one map has of each dive that is shown, where there is one of these."""
+    if shown.one_map is None:
+        return None
+    try:
+        parts = read_site_map(shown.folder, shown.component, shown.one_map)
+    except InputError as error:
+        log.warning("the dives' own maps are shown: %s", error)
+        return None
+    return [parts[placed.name] for placed in shown.dives]
 
 
 def _show_paths(page: ViewerPage, shown: ShownSite) -> None:
@@ -134,7 +149,8 @@ def _same_north(placed: PlacedDive, shown: ShownSite) -> bool:
 def _key(shown: ShownSite) -> dict[str, Any]:
     """By what a packed map is known to be of these dives, where they are now."""
     dives = [[placed.name, placed.dive.key, placed.T_sn.matrix.tolist()] for placed in shown.dives]
-    return {"component": shown.component, "dives": dives}
+    one_map = None if shown.one_map is None else [part.gaussians for part in shown.one_map]
+    return {"component": shown.component, "dives": dives, "one_map": one_map}
 
 
 def _in_words(shown: ShownSite, count: int, total: int) -> str:
@@ -142,7 +158,8 @@ def _in_words(shown: ShownSite, count: int, total: int) -> str:
     dives = len(shown.dives)
     words = [
         f"{shown.folder.name}: {dives} {'dive' if dives == 1 else 'dives'}, {poses} poses, "
-        f"{count} of {total} Gaussians",
+        f"{count} of {total} Gaussians"
+        + ("" if shown.one_map is None else " of the one map of all of them"),
         frame_in_words(shown.frame),
     ]
     if shown.components > 1:

@@ -13,8 +13,9 @@ from aquaflow.change.patches import Patch, find_patches
 from aquaflow.change.registration import Registration
 from aquaflow.change.surface import Surface
 from aquaflow.export.mesh.view_surfaces import ViewSurfaces
+from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from tests.export.mesh_scenes import above_plane, surfaces_of
+from tests.export.mesh_scenes import CAMERA, above_plane, surfaces_of
 
 Array = npt.NDArray[np.float64]
 
@@ -46,7 +47,9 @@ def brightness(places: Array, box: tuple[float, float] | None) -> Array:
     return np.where(inside, own, ground)
 
 
-def views_of(box: tuple[float, float] | None, work: Path) -> ViewSurfaces:
+def views_of(
+    box: tuple[float, float] | None, work: Path, camera: CameraModel = CAMERA
+) -> ViewSurfaces:
     """What five cameras show; the box has no sides, and hides what is behind its upper side."""
 
     def ranges(centre: Array, rays: Array) -> Array:
@@ -54,7 +57,7 @@ def views_of(box: tuple[float, float] | None, work: Path) -> ViewSurfaces:
         places = (centre + rays * top[..., None])[..., :2]
         return np.asarray(np.where(height(places, box) >= TALL, top, floor))
 
-    return surfaces_of(above_plane(), [ranges] * 5, work)
+    return surfaces_of(above_plane(), [ranges] * 5, work, camera)
 
 
 def day(

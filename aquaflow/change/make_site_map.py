@@ -1,0 +1,81 @@
+"""``aquaflow site map``: reads the merged dives of a site, and writes their one map."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+from aquaflow.change.site_map import DayMap, Part, combine
+from aquaflow.change.surface import Progress
+from aquaflow.errors import InputError
+from aquaflow.export.mesh.view_surfaces import ViewSurfaces, drawn_surfaces
+from aquaflow.export.ortho.survey import read_map
+from aquaflow.export.ply import read_ply
+from aquaflow.export.posed_views import PosedView
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.mapping.views import in_time
+from aquaflow.site.manifest import check_unchanged, read_site
+from aquaflow.site.merged_file import PlacedSubMap, merge_of
+from aquaflow.site.site_map_file import SiteMapPart, names_of, write_site_map
+
+
+def make_site_map(
+    site: Path, component: int | None, work: Path, progress: Progress
+) -> tuple[Path, list[SiteMapPart]]:
+    """Write the one map of a component, by default of the one with most keyframes.
+
+    A dive that was added to the site later counts as the later one.
+
+    Args:
+        work: folder of files that end with the call.
+
+    Returns:
+        The PLY, and what it has of each dive.
+
+    Raises:
+        InputError: the site was never merged, a dive has no map or is not what was merged, or the
+            site cannot be written to.
+        ConfigError: a dive's settings cannot be read.
+    """
+    merged = merge_of(site)
+    chosen = merged.chosen(component, site)
+    days, placed = [], []
+    for dive in read_site(site):
+        main = merged.main_of(dive, site) if dive.name in merged.fingerprints else None
+        if main is None or main.component != chosen:
+            continue
+        folder = dive.folder(site)
+        check_unchanged(folder, merged.fingerprints[dive.name])
+        days.append(_day(folder, main, work, progress))
+        placed.append(main)
+    if not days:
+        raise InputError(
+            f"component {chosen} of {site} has no dive with a map; map one, merge again"
+        )
+    parts = combine(days)
+    stated = [
+        _stated(part, main, merged.fingerprints[main.dive])
+        for part, main in zip(parts, placed, strict=True)
+    ]
+    write_site_map(site, chosen, stated, [part.gaussians for part in parts])
+    return names_of(site, chosen)[0], stated
+
+
+def _day(folder: Path, placed: PlacedSubMap, work: Path, progress: Progress) -> DayMap:
+    mapper, _ = read_map(folder)
+    posed = []
+    for view in in_time(mapper.views):
+        T = placed.T_sm @ view.T_wc
+        posed.append(PosedView(view.frame_index, view.camera, Sim3(T.R, T.t)))
+    drawn = drawn_surfaces(mapper, placed.T_sm.scale)
+    views = ViewSurfaces(posed, drawn, work, partial(progress, f"views of {placed.dive}"))
+    ply = folder / "map_clear.ply"
+    gaussians = read_ply(ply if ply.is_file() else folder / "map.ply")
+    return DayMap(placed.dive, gaussians.transformed(placed.T_sn), views)
+
+
+def _stated(part: Part, placed: PlacedSubMap, fingerprint: str) -> SiteMapPart:
+    return SiteMapPart(
+        part.name, fingerprint, placed.T_sn.matrix.tolist(), len(part.gaussians.means),
+        part.gone, part.replaced, list(part.gains),
+    )  # fmt: skip
