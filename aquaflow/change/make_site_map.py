@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from aquaflow.change.site_map import DayMap, Part, combine
 from aquaflow.change.surface import Progress
-from aquaflow.errors import InputError
+from aquaflow.errors import AquaFlowError, InputError
 from aquaflow.export.mesh.view_surfaces import ViewSurfaces, drawn_surfaces
 from aquaflow.export.ortho.survey import read_map
 from aquaflow.export.ply import read_ply
@@ -19,46 +20,56 @@ from aquaflow.site.merged_file import PlacedSubMap, merge_of
 from aquaflow.site.site_map_file import SiteMapPart, names_of, write_site_map
 
 
-def make_site_map(
-    site: Path, component: int | None, work: Path, progress: Progress
-) -> tuple[Path, list[SiteMapPart]]:
+@dataclass(frozen=True)
+class MadeMap:
+    """What was written."""
+
+    ply: Path
+    parts: list[SiteMapPart]
+    left_out: dict[str, str]
+    """Dives of the component that have no part in it: name and reason."""
+
+
+def make_site_map(site: Path, component: int | None, work: Path, progress: Progress) -> MadeMap:
     """Write the one map of a component, by default of the one with most keyframes.
 
-    A dive that was added to the site later counts as the later one.
+    A dive that was added to the site later counts as the later one; one that has no map, or is not
+    what was merged, is left out.
 
     Args:
         work: folder of files that end with the call.
 
-    Returns:
-        The PLY, and what it has of each dive.
-
     Raises:
-        InputError: the site was never merged, a dive has no map or is not what was merged, or the
-            site cannot be written to.
-        ConfigError: a dive's settings cannot be read.
+        InputError: the site was never merged, none of the dives is left, or the site cannot be
+            written to.
     """
     merged = merge_of(site)
     chosen = merged.chosen(component, site)
     days, placed = [], []
+    left_out: dict[str, str] = {}
     for dive in read_site(site):
-        main = merged.main_of(dive, site) if dive.name in merged.fingerprints else None
-        if main is None or main.component != chosen:
+        if dive.name not in merged.fingerprints:
             continue
-        folder = dive.folder(site)
-        check_unchanged(folder, merged.fingerprints[dive.name])
-        days.append(_day(folder, main, work, progress))
-        placed.append(main)
+        try:
+            main = merged.main_of(dive, site)
+            if main is None or main.component != chosen:
+                continue
+            folder = dive.folder(site)
+            check_unchanged(folder, merged.fingerprints[dive.name])
+            days.append(_day(folder, main, work, progress))
+            placed.append(main)
+        except AquaFlowError as error:
+            left_out[dive.name] = str(error)
     if not days:
-        raise InputError(
-            f"component {chosen} of {site} has no dive with a map; map one, merge again"
-        )
+        reasons = "; ".join(left_out.values()) or "no dive has its map there"
+        raise InputError(f"component {chosen} of {site} has nothing to make a map of: {reasons}")
     parts = combine(days)
     stated = [
         _stated(part, main, merged.fingerprints[main.dive])
         for part, main in zip(parts, placed, strict=True)
     ]
     write_site_map(site, chosen, stated, [part.gaussians for part in parts])
-    return names_of(site, chosen)[0], stated
+    return MadeMap(names_of(site, chosen)[0], stated, left_out)
 
 
 def _day(folder: Path, placed: PlacedSubMap, work: Path, progress: Progress) -> DayMap:

@@ -70,16 +70,20 @@ def write_map(
     from aquaflow.change.make_site_map import make_site_map
 
     with progress_bars(quiet=as_json) as progress, tempfile.TemporaryDirectory() as work:
-        ply, parts = make_site_map(site, component, Path(work), progress)
+        made = make_site_map(site, component, Path(work), progress)
     if as_json:
-        typer.echo(json.dumps({"map": str(ply), "dives": [asdict(part) for part in parts]}))
+        dives = [asdict(part) for part in made.parts]
+        said = {"map": str(made.ply), "dives": dives, "left_out": made.left_out}
+        typer.echo(json.dumps(said))
         return
-    for part in parts:
+    for part in made.parts:
         typer.echo(
             f"{part.name}: {part.gaussians} Gaussians stay; {part.gone} are gone since, "
             f"{part.replaced} are of places that another dive shows."
         )
-    typer.echo(f"Wrote {ply}; `aquaflow view {site}` shows it.")
+    for name, reason in made.left_out.items():
+        typer.echo(f"Left out: {name}: {reason}.")
+    typer.echo(f"Wrote {made.ply}; `aquaflow view {site}` shows it.")
 
 
 @app.command("list")

@@ -29,8 +29,8 @@ of two dives are 0.3 to 2.2 % off on the reef and Curasao clips, and those of on
 to one side. A dozen links do not average that out: 1.5 % times the root of 12. What the cameras
 moved, seen in both dives, says more of the scale (docs/sites.md#measured)."""
 ROTATION_SIGMA = 5e-4
-"""rad, likewise: the rotations of links of the same dives differ by 3 to 15 times that (0.1 to 0.4
-degrees), with a stated 0.01 to 0.05 degrees."""
+"""rad, likewise: the rotations of links of the same dives differ by 0.1 to 0.3 degrees, with a
+stated 0.01 to 0.05."""
 VERIFICATION = VerificationConfig()
 """As within a dive."""
 

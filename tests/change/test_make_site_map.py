@@ -82,11 +82,21 @@ def test_damaged_files_cost_the_one_map_and_not_the_view(command: Cli, site: Pat
     assert read_shown(site, None, MOST).one_map is None
 
 
-def test_sites_that_are_not_merged_as_they_are_now_are_refused(command: Cli, site: Path) -> None:
-    assert "components 0 to 0, not 2" in command("site", "map", site, "--component", "2").err
+def test_a_dive_that_is_not_what_was_merged_costs_itself(command: Cli, site: Path) -> None:
     (site.with_name("monday") / "trajectory.tum").write_text("# another\n")
+    said = json.loads(command("site", "map", site, "--json").out)
+    assert [each["name"] for each in said["dives"]] == ["tuesday"]
+    assert "is not what it was when the site was merged" in said["left_out"]["monday"]
+    assert (
+        len(map_of_site(read_shown(site, None, MOST), MOST).splats) == said["dives"][0]["gaussians"]
+    )
+    (site.with_name("tuesday") / "map.aqf").unlink()
     refused = command("site", "map", site)
     assert refused.code == 1
-    assert "is not what it was when the site was merged" in refused.err
+    assert "nothing to make a map of" in refused.err
+
+
+def test_sites_without_a_merge_or_the_component_are_refused(command: Cli, site: Path) -> None:
+    assert "components 0 to 0, not 2" in command("site", "map", site, "--component", "2").err
     (site / MERGED).unlink()
     assert "never merged" in command("site", "map", site).err
