@@ -107,7 +107,11 @@ def _overruled(days: Sequence[DayMap], number: int) -> tuple[Mask, Mask]:
     return gone, replaced
 
 
-def _look(day: DayMap, places: Array, resolution: float) -> Look:
+def _look(
+    day: DayMap,
+    places: Array,  # [M, 3]
+    resolution: float,
+) -> Look:
     margin = np.full(len(places), MARGIN_RESOLUTIONS * resolution)
     return look_at_places(day.views, places, margin)
 
@@ -125,7 +129,11 @@ def _blocks(
     yield from (finite[block] for block in np.split(order, ends) if len(block))
 
 
-def _gains(day: DayMap, replaced: Mask, later: Sequence[Part]) -> Array:
+def _gains(
+    day: DayMap,
+    replaced: Mask,  # [N] of the day's Gaussians
+    later: Sequence[Part],
+) -> Array:
     """[3] the ratio of the later dives' colours to the day's, on the ground that both show."""
     mine = np.flatnonzero(replaced & (np.asarray(day.gaussians.opacities) > OPAQUE))
     means = [part.gaussians.means[part.gaussians.opacities > OPAQUE] for part in later]
