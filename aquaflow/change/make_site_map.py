@@ -9,12 +9,9 @@ from pathlib import Path
 from aquaflow.change.site_map import DayMap, Part, combine
 from aquaflow.change.surface import Progress
 from aquaflow.errors import AquaFlowError, InputError
-from aquaflow.export.mesh.view_surfaces import ViewSurfaces, drawn_surfaces
+from aquaflow.export.mesh.view_surfaces import surfaces_of_map
 from aquaflow.export.ortho.survey import read_map
 from aquaflow.export.ply import read_ply
-from aquaflow.export.posed_views import PosedView
-from aquaflow.geometry.similarity import Sim3
-from aquaflow.mapping.views import in_time
 from aquaflow.site.manifest import check_unchanged, read_site
 from aquaflow.site.merged_file import PlacedSubMap, merge_of
 from aquaflow.site.site_map_file import SiteMapPart, names_of, write_site_map
@@ -74,12 +71,7 @@ def make_site_map(site: Path, component: int | None, work: Path, progress: Progr
 
 def _day(folder: Path, placed: PlacedSubMap, work: Path, progress: Progress) -> DayMap:
     mapper, _ = read_map(folder)
-    posed = []
-    for view in in_time(mapper.views):
-        T = placed.T_sm @ view.T_wc
-        posed.append(PosedView(view.frame_index, view.camera, Sim3(T.R, T.t)))
-    drawn = drawn_surfaces(mapper, placed.T_sm.scale)
-    views = ViewSurfaces(posed, drawn, work, partial(progress, f"views of {placed.dive}"))
+    views = surfaces_of_map(mapper, placed.T_sm, work, partial(progress, f"views of {placed.dive}"))
     ply = folder / "map_clear.ply"
     gaussians = read_ply(ply if ply.is_file() else folder / "map.ply")
     return DayMap(placed.dive, gaussians.transformed(placed.T_sn), views)

@@ -15,16 +15,14 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.change.visibility import seen_past
+from aquaflow.change.visibility import look_at_places
 from aquaflow.export.mesh.colouring import batches, look_at
 from aquaflow.export.mesh.export_mesh import VOXEL_PX, fused_surface
-from aquaflow.export.mesh.view_surfaces import ViewSurfaces, drawn_surfaces
+from aquaflow.export.mesh.view_surfaces import ViewSurfaces, surfaces_of_map
 from aquaflow.export.ortho.colours import Colours
-from aquaflow.export.posed_views import PosedView
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.transfers import checkpoint_in
-from aquaflow.mapping.views import in_time
 from aquaflow.mapping.water.white_balance import CONTRAST
 from aquaflow.measure.drawn_heights import MATCH_PX
 
@@ -71,7 +69,8 @@ class Surface:
         margin: Array,  # [N]
     ) -> npt.NDArray[np.bool_]:
         """[N] True for places past which this day's pictures show something, by ``margin``."""
-        return seen_past(self.views, self.T_views.apply(places), self.T_views.scale * margin)
+        at, across = self.T_views.apply(places), self.T_views.scale * margin
+        return look_at_places(self.views, at, across).seen_past
 
 
 def surface_of(
@@ -87,12 +86,7 @@ def surface_of(
     Raises:
         InputError: scikit-image is missing, or too little is seen by two views.
     """
-    posed = []
-    for view in in_time(mapper.views):
-        T = T_gm @ view.T_wc
-        posed.append(PosedView(view.frame_index, view.camera, Sim3(T.R, T.t)))
-    drawn = drawn_surfaces(mapper, T_gm.scale)
-    views = ViewSurfaces(posed, drawn, work, partial(progress, "views"))
+    views = surfaces_of_map(mapper, T_gm, work, partial(progress, "views"))
     side = voxel or VOXEL_PX * views.footprint
     found = fused_surface(views, side, progress)
     mesh, colours = found.mesh, Colours(mapper, T_gm.scale, None)

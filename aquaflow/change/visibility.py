@@ -70,12 +70,3 @@ def look_at_places(
         near = ahead[shown]
         footprint[near] = np.minimum(footprint[near], away[shown] / view.camera.fx)
     return Look(there, past, footprint)
-
-
-def seen_past(
-    views: ViewSurfaces,
-    places: Array,  # [N, 3]
-    margin: Array,  # [N]
-) -> Mask:
-    """[N] :attr:`Look.seen_past` of the places."""
-    return look_at_places(views, places, margin).seen_past

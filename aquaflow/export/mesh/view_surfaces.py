@@ -19,6 +19,7 @@ from aquaflow.errors import InputError
 from aquaflow.export.ortho.sightings import FAR, PICTURE_SIGMA_PX
 from aquaflow.export.posed_views import PosedView
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.transfers import picture_out
 from aquaflow.mapping.views import View, in_time
@@ -158,6 +159,21 @@ def surface_normals(
     with np.errstate(invalid="ignore", divide="ignore"):
         normals[step:-step, step:-step] = across / np.linalg.norm(across, axis=-1, keepdims=True)
     return normals
+
+
+def surfaces_of_map(
+    mapper: Mapper, T: Sim3, work: Path, progress: Callable[[int, int], None]
+) -> ViewSurfaces:
+    """What all views of a map show, in the frame and unit that ``T`` takes its world to.
+
+    Raises:
+        InputError: the views show nothing, or a file cannot be written.
+    """
+    posed = []
+    for view in in_time(mapper.views):
+        T_wc = T @ view.T_wc
+        posed.append(PosedView(view.frame_index, view.camera, Sim3(T_wc.R, T_wc.t)))
+    return ViewSurfaces(posed, drawn_surfaces(mapper, T.scale), work, progress)
 
 
 def drawn_surfaces(mapper: Mapper, unit: float) -> Iterator[tuple[Float, Float]]:

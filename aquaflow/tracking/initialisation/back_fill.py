@@ -62,16 +62,16 @@ class BackFill:
         keyframe_tracker: KeyframeTracker,
         failures: Failures,
     ) -> None:
-        """``at``: where the newest of the frames is looked for, with the motion towards there."""
+        """``at``: where the newest of the frames, which come oldest first, is looked for, with the
+        motion towards there."""
         self._indices = frozenset(frame.index for frame in frames)
         self._at, self._camera = replace(at, motion=at.motion.inverse()), camera
         self._prior, self._keyframe_tracker, self._failures = prior, keyframe_tracker, failures
         self._last: Placed | None = None
 
     def left(self, waiting: Sequence[Frame]) -> list[Frame]:
-        """Those of its frames that still wait, the oldest first."""
-        left = [frame for frame in waiting if frame.index in self._indices]
-        return sorted(left, key=lambda frame: frame.index)
+        """Those of its frames that still wait."""
+        return [frame for frame in waiting if frame.index in self._indices]
 
     def place(self, frame: Frame) -> Placed | None:
         """Look for the newest frame that is left; in any thread, one frame at a time."""
@@ -139,12 +139,13 @@ class BackFills:
     def start(self, at: CurrentKeyframe, camera: CameraModel) -> list[Tracked]:
         """Against ``at``, all frames that wait for a keyframe; those that are placed at once."""
         after = Wait.IN_IDLE_TIME if self._live else Wait.IN_HAND
-        frames = self._waiting.move(Wait.FOR_A_KEYFRAME, after)
+        frames = sorted(self._waiting.of(Wait.FOR_A_KEYFRAME), key=lambda frame: frame.index)
+        self._waiting.put(frames, after)
         if not frames:
             return []
         fill = BackFill(frames, at, camera, self._prior, self._keyframe_tracker, self._failures)
         if not self._live:
-            return fill.all(fill.left(frames))
+            return fill.all(frames)
         waiting = self._waiting.of(Wait.IN_IDLE_TIME)
         self._left = [each for each in (*self._left, fill) if each.left(waiting)]
         return []
