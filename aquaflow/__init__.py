@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from aquaflow.api.dive import Dive, read_dive
     from aquaflow.api.map import Map, load_map
     from aquaflow.api.recording import map_recording
-    from aquaflow.errors import AquaFlowError
+    from aquaflow.base.errors import AquaFlowError
 
 try:
     __version__ = version("aquaflow")
@@ -37,7 +37,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "AquaFlowError": "aquaflow.errors",
+    "AquaFlowError": "aquaflow.base.errors",
     "Dive": "aquaflow.api.dive",
     "Map": "aquaflow.api.map",
     "load_map": "aquaflow.api.map",

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.messages import CameraModel, EncodedPicture
+from aquaflow.types import CameraModel, EncodedPicture
 
 
 class UnusablePictureError(Exception):

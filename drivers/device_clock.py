@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from aquaflow.clocks.device import ClockMapping
+from aquaflow.base.clocks.device import ClockMapping
 
 MAX_AGE_NS = 2_000_000_000
 """No link delays a message longer; an older stamp means that a clock was set."""

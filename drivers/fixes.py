@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 from aquaflow.config.device import PositioningConfig
-from aquaflow.messages import Position, TelemetrySample
+from aquaflow.types import Position, TelemetrySample
 
 UERE_M = 5.1
 """m, 1 sigma of a range to a satellite, single frequency without corrections: B. Parkinson, "GPS

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from aquaflow.messages import TelemetrySample
+from aquaflow.types import TelemetrySample
 
 MAX_READ_BYTES = 65_536
 """Most that one read returns: the largest UDP datagram."""

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
+from aquaflow.base.errors import InputError
 from aquaflow.config.cameras import LiveCameraConfig
 from aquaflow.drivers.camera_state import CameraCounters, CameraState
 from aquaflow.drivers.capture import Capture, OpenCapture, RawPicture, UnusablePictureError
@@ -18,11 +19,10 @@ from aquaflow.drivers.events import Event, about
 from aquaflow.drivers.exposure_clock import ExposureClock
 from aquaflow.drivers.flow import Flow
 from aquaflow.drivers.sequence import SequenceGaps
-from aquaflow.errors import InputError
 from aquaflow.geometry.camera import guess_camera, load_camera
-from aquaflow.messages import CameraModel, Dropped, Frame
 from aquaflow.sources import is_asked
 from aquaflow.sources.newest import Newest
+from aquaflow.types import CameraModel, Dropped, Frame
 
 READ_S = 0.2
 """Longest wait for a picture before the thread checks whether it shall end."""

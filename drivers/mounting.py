@@ -8,7 +8,7 @@ from dataclasses import replace
 from aquaflow.config.device import MountingConfig
 from aquaflow.drivers.fixes import moved
 from aquaflow.drivers.rotation import Vector, cross, from_euler, inverse, product, rotate
-from aquaflow.messages import (
+from aquaflow.types import (
     Acceleration,
     Altitude,
     AngularRate,

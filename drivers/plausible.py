@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from aquaflow.messages import (
+from aquaflow.types import (
     Acceleration,
     Altitude,
     AngularRate,

@@ -13,8 +13,8 @@ from aquaflow.drivers.events import Event, about
 from aquaflow.drivers.flow import Flow
 from aquaflow.drivers.link import ByteLink, LinkCounters, LinkDecoder, LinkLostError
 from aquaflow.drivers.transport import OpenLink
-from aquaflow.messages import TelemetrySample
 from aquaflow.sources import RawTap
+from aquaflow.types import TelemetrySample
 
 log = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from importlib import import_module
 from typing import NamedTuple
 
-from aquaflow.clocks.device import ClockReport, Learned
+from aquaflow.base.clocks.device import ClockReport, Learned
 from aquaflow.config.telemetry import AnyDevice, TelemetryConfig
 from aquaflow.drivers.link import LinkCounters
 from aquaflow.drivers.mounting import BodyFrame, Mounting
@@ -16,11 +16,11 @@ from aquaflow.drivers.protocol.packets import PacketDecoder
 from aquaflow.drivers.shared_ports import shared_ports
 from aquaflow.drivers.supervisor import Deliver, Supervisor
 from aquaflow.drivers.transport import OpenLink, opener
-from aquaflow.messages import TelemetrySample
 from aquaflow.sources import RawTap
 from aquaflow.sources.newest import Newest
 from aquaflow.sources.outbound import AcceptsMessages, OutboundMessage
 from aquaflow.sources.pilot import HearsPilot, Obey
+from aquaflow.types import TelemetrySample
 
 log = logging.getLogger(__name__)
 

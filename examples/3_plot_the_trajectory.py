@@ -12,8 +12,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import aquaflow
-from aquaflow.evaluation.trajectory import associate, read_tum
 from aquaflow.geometry.alignment import align
+from aquaflow.lab.evaluation.trajectory import associate, read_tum
 
 
 def main(dive_folder: str, truth_file: str, plot: str) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 
 import aquaflow
 from aquaflow.geometry.camera import guess_camera
-from aquaflow.messages import CameraModel, Frame
+from aquaflow.types import CameraModel, Frame
 
 
 class NumpyRecording:

@@ -13,8 +13,8 @@ from itertools import islice
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.messages import Frame
 from aquaflow.sources import CameraSource
+from aquaflow.types import Frame
 
 NS_PER_S = 1_000_000_000
 """Nanoseconds of a second."""

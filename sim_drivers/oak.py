@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.camera import guess_camera
-from aquaflow.messages import CameraModel
 from aquaflow.sim_drivers.camera_feed import CameraFeed, Shot
+from aquaflow.types import CameraModel
 
 DEVICE_EPOCH_NS = 1_000_000_000_000
 """The device's clock started at another moment than the host's."""

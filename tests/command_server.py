@@ -18,8 +18,8 @@ from typing import TypedDict
 
 IMPORTED = (
     *("torch", "cv2", "scipy.ndimage", "scipy.optimize", "scipy.spatial", "matplotlib.pyplot"),
-    *("aquaflow.cli", "aquaflow.dive.replay", "aquaflow.evaluation.summary"),
-    *("aquaflow.export.report", "aquaflow.service.onboard", "aquaflow.synthetic"),
+    *("aquaflow.cli", "aquaflow.dive.replay", "aquaflow.lab.evaluation.summary"),
+    *("aquaflow.survey.report", "aquaflow.live.onboard", "aquaflow.lab.synthetic"),
 )
 """Slow to import; none of them starts a thread when it is imported, so a fork is whole."""
 

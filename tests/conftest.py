@@ -11,7 +11,7 @@ What a new test has to respect, so that `make test` stays quick and passes on a 
 - `aquaflow(...)` costs 0.1 s of CPU; a new interpreter that imports torch costs 3 s.
 - Nothing may depend on how fast the machine is. Wait for a state or an event, never for a time;
   give code that looks at a clock a simulated one; a give-up limit is GIVE_UP_S, since it only ends
-  a test that fails. A live dive takes every picture with `tests/service/paced.py`.
+  a test that fails. A live dive takes every picture with `tests/live/paced.py`.
 - Two CPU seconds are much. What needs minutes is marked `slow` and has a quick relative here.
 """
 
@@ -33,7 +33,7 @@ from tests.small_recording import FRAMES, HEIGHT, QUICK, WIDTH
 __all__ = ["Cli", "Ran", "refused", "run_aquaflow"]
 
 # What a stage raises ends a test: a contained defect would stay hidden
-# (aquaflow/errors/failures.py).
+# (aquaflow/base/errors/failures.py).
 os.environ["AQUAFLOW_STRICT"] = "1"
 
 # Before torch, OpenCV and BLAS are loaded, here and in the processes that tests start: tests run
@@ -105,7 +105,7 @@ def small_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A synthetic dive of 24 small pictures, made once."""
 
     def make(folder: Path) -> None:
-        from aquaflow.synthetic import SyntheticConfig, write_dive
+        from aquaflow.lab.synthetic import SyntheticConfig, write_dive
 
         write_dive(folder, SyntheticConfig(frames=FRAMES, width=WIDTH, height=HEIGHT))
 

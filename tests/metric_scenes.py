@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from aquaflow.fusion.metric_frame import MetricFrame, Origin, SourceReport
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.telemetry.metric_frame import MetricFrame, Origin, SourceReport
 
 SCALE = 2.5
 TURN = Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix()

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from aquaflow.clocks.deadline import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.config import Config, parse_config
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
-from aquaflow.messages import Frame
 from aquaflow.slam import Slam
 from aquaflow.tracking.frames import FrameClass, Revisit, Tracked
+from aquaflow.types import Frame
 
 CAMERA = CameraModel(64, 48, 55.0, 55.0, 32.0, 24.0)
 STEPS = {"steps_keyframe": 3, "steps_mapping": 2, "steps_common": 1, "refine_steps": 4}

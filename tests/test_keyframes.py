@@ -11,15 +11,15 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from aquaflow.config import TrackingConfig
-from aquaflow.evaluation.stress.soak import TINY
-from aquaflow.evaluation.stress.swim import Floor, film, pose
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
-from aquaflow.messages import Frame
+from aquaflow.lab.stress.soak import TINY
+from aquaflow.lab.stress.swim import Floor, film, pose
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.flow_pair import FlowEncoding
 from aquaflow.tracking.tracker import Tracker
+from aquaflow.types import Frame
 
 CAMERA = CameraModel(96, 72, 80.0, 80.0, 48.0, 36.0)
 GUESS = CameraModel(96, 72, 70.0, 70.0, 48.0, 36.0, calibrated=False)

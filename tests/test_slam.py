@@ -13,16 +13,16 @@ from aquaflow.config import Config
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.views import View
-from aquaflow.messages import Frame
+from aquaflow.render.views import View
 from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation
 from aquaflow.tracking.frames import FrameClass, Tracked
+from aquaflow.types import Frame
 from tests.slam_scenes import OPEN_GATE, STEPS, ToldTracker, config, frame_of
 
 DRY = {"medium": {"enabled": False}}
-"""Fitting water takes longer than all the rest; tests/mapping does it."""
+"""Fitting water takes longer than all the rest; tests/render does it."""
 
 
 @dataclass

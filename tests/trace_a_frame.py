@@ -15,10 +15,10 @@ from types import FrameType
 from typing import Any
 
 from aquaflow.config import Config
-from aquaflow.messages import Frame
 from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation
+from aquaflow.types import Frame
 
 ROOT = Path(__file__).resolve().parents[1]
 OWN = f"{ROOT}/aquaflow/"

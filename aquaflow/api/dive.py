@@ -11,15 +11,15 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.dive.frames_csv import FrameRow, read_rows
-from aquaflow.evaluation.dive_files import read_metrics, rows_of_poses
-from aquaflow.evaluation.medium import read_recovered
-from aquaflow.evaluation.trajectory import Trajectory, read_tum
-from aquaflow.export.trajectory_csv import NAME as TRAJECTORY_CSV
-from aquaflow.export.trajectory_csv import PoseRow, read_trajectory_csv
-from aquaflow.fusion.metric_file import read_metric_file
-from aquaflow.fusion.metric_frame import MetricFrame
+from aquaflow.dive.trajectory_csv import NAME as TRAJECTORY_CSV
+from aquaflow.dive.trajectory_csv import PoseRow, read_trajectory_csv
 from aquaflow.geometry.camera import CameraModel, load_camera
-from aquaflow.synthetic.water import Medium
+from aquaflow.lab.evaluation.dive_files import read_metrics, rows_of_poses
+from aquaflow.lab.evaluation.medium import read_recovered
+from aquaflow.lab.evaluation.trajectory import Trajectory, read_tum
+from aquaflow.lab.synthetic.water import Medium
+from aquaflow.telemetry.metric_file import read_metric_file
+from aquaflow.telemetry.metric_frame import MetricFrame
 
 
 @dataclass(frozen=True)

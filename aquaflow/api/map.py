@@ -10,20 +10,20 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from aquaflow.errors import InputError
-from aquaflow.export.map_file import SUFFIX, read_map_file
-from aquaflow.export.map_splats import splats_of
-from aquaflow.export.ply import PlyGaussians
-from aquaflow.fusion.metric_file import read_frame_of_map
-from aquaflow.fusion.metric_frame import MetricFrame
+from aquaflow.base.errors import InputError
+from aquaflow.dive.map_file import SUFFIX, read_map_file
+from aquaflow.dive.map_splats import splats_of
+from aquaflow.dive.ply import PlyGaussians
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.lab.synthetic.water import Medium, Rgb
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.state import NO_PIXELS
-from aquaflow.mapping.transfers import picture_out, water_out
-from aquaflow.mapping.views import View, in_time
 from aquaflow.render import RendererName, select_renderer
-from aquaflow.synthetic.water import Medium, Rgb
+from aquaflow.render.transfers import picture_out, water_out
+from aquaflow.render.views import View, in_time
+from aquaflow.telemetry.metric_file import read_frame_of_map
+from aquaflow.telemetry.metric_frame import MetricFrame
 
 FloatImage = npt.NDArray[np.float32]
 

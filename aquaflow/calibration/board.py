@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.errors import ConfigError, InputError, reason_of
+from aquaflow.base.errors import ConfigError, InputError, reason_of
 
 Array = npt.NDArray[np.float64]
 BoardKind = Literal["charuco", "apriltag"]

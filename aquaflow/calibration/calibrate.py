@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.base.errors import ConfigError, InputError
+from aquaflow.base.storage.atomic import write_json
 from aquaflow.calibration.board import Board, Detector
 from aquaflow.calibration.fit import Fit, fit_lens, fit_port
 from aquaflow.calibration.plots import draw_residuals
 from aquaflow.calibration.views import Views, find_views
-from aquaflow.errors import ConfigError, InputError
 from aquaflow.geometry.camera import CameraModel, DistortionModel
+from aquaflow.geometry.camera_file import save_camera
 from aquaflow.geometry.port import FlatPort
-from aquaflow.messages import Frame
 from aquaflow.sources import open_recording
-from aquaflow.storage.atomic import write_json
-from aquaflow.storage.camera_file import save_camera
+from aquaflow.types import Frame
 
 LEAST_CERTAIN = 5e-3
 """Relative sigma of the focal length up to which a calibration is worth having: at one percent,

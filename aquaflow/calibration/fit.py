@@ -11,9 +11,9 @@ import numpy.typing as npt
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from aquaflow.base.errors import InputError
 from aquaflow.calibration.parameters import Parameters
 from aquaflow.calibration.views import View
-from aquaflow.errors import InputError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.optics import pixels_of_points, rays_of_pixels, virtual_centre
 

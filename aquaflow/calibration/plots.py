@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from aquaflow.base.errors import InputError, reason_of
 from aquaflow.calibration.fit import Fit
 from aquaflow.calibration.views import Views
-from aquaflow.errors import InputError, reason_of
 
 ARROW_SHARE = 0.04
 """Length of the 95th percentile's arrow, over the picture's width."""

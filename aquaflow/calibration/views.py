@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.base.errors import InputError
 from aquaflow.calibration.board import Detector, Found
-from aquaflow.errors import InputError
 
 Array = npt.NDArray[np.float64]
 

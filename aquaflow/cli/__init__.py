@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from aquaflow import __version__
+from aquaflow.base.errors.crash_report import one_sentence, print_anything, refuse_unreadable
 from aquaflow.cli.batch import register as register_batch
 from aquaflow.cli.bench import register as register_bench
 from aquaflow.cli.calibrate import register as register_calibrate
@@ -39,7 +40,6 @@ from aquaflow.cli.service import register as register_service
 from aquaflow.cli.site import register as register_site
 from aquaflow.cli.stress import register as register_stress
 from aquaflow.cli.video import register as register_video
-from aquaflow.errors.crash_report import one_sentence, print_anything, refuse_unreadable
 
 if TYPE_CHECKING:
     from aquaflow.dive.run import Finished
@@ -125,7 +125,7 @@ def map_command(
         {"seed": seed, "threads": threads, "source": source_settings, "mapping": mapping},
         "command line",
     )
-    from aquaflow.errors import InputError
+    from aquaflow.base.errors import InputError
     from aquaflow.geometry.camera import load_camera
     from aquaflow.sources import open_recording
     from aquaflow.sources.telemetry_input import open_telemetry
@@ -149,7 +149,7 @@ def map_command(
     from aquaflow.dive.replay import (
         map_recording,  # loads torch: after what can be refused without it
     )
-    from aquaflow.site.base import base_of
+    from aquaflow.survey.site.base import base_of
 
     with progress_bars(quiet=as_json) as progress:
         replayed = map_recording(
@@ -188,8 +188,8 @@ def synth(
     """Write a synthetic dive with its ground truth."""
     from pydantic import ValidationError
 
-    from aquaflow.errors import ConfigError
-    from aquaflow.synthetic import SyntheticConfig, write_dive
+    from aquaflow.base.errors import ConfigError
+    from aquaflow.lab.synthetic import SyntheticConfig, write_dive
 
     asked = {
         "scene": scene, "water": water, "frames": frames, "width": width, "height": height,
@@ -224,12 +224,12 @@ def evaluate(
     as_json: Json = False,
 ) -> None:
     """Measure a dive: colours of restored views, and what the truth allows to compare."""
-    from aquaflow.errors import InputError
-    from aquaflow.evaluation.epipolar_error import evaluate_epipolar
-    from aquaflow.evaluation.naturalness import evaluate_naturalness
-    from aquaflow.evaluation.protocol import evaluate_dive
-    from aquaflow.evaluation.restoration import evaluate_restoration
-    from aquaflow.evaluation.summary import in_words
+    from aquaflow.base.errors import InputError
+    from aquaflow.lab.evaluation.epipolar_error import evaluate_epipolar
+    from aquaflow.lab.evaluation.naturalness import evaluate_naturalness
+    from aquaflow.lab.evaluation.protocol import evaluate_dive
+    from aquaflow.lab.evaluation.restoration import evaluate_restoration
+    from aquaflow.lab.evaluation.summary import in_words
 
     natural = evaluate_naturalness(dive)
     if truth is None and clean is None and recording is None and natural is None:

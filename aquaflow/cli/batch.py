@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from aquaflow.base.errors.crash_report import FAILED, INTERRUPTED
 from aquaflow.cli.console import PRESETS, Json, progress_bars, table_console
-from aquaflow.errors.crash_report import FAILED, INTERRUPTED
 
 if TYPE_CHECKING:
-    from aquaflow.batch.batch import Batched
-    from aquaflow.batch.job import Outcome
+    from aquaflow.lab.batch.batch import Batched
+    from aquaflow.lab.batch.job import Outcome
 
 POOR_RESULT = 3
 """Exit status where every dive was written, and some with warnings, as of `map`."""
@@ -70,7 +70,7 @@ def batch(
         },
         "command line",
     )  # fmt: skip
-    from aquaflow.batch.batch import run_batch
+    from aquaflow.lab.batch.batch import run_batch
 
     with progress_bars(quiet=as_json) as progress:
         batched = run_batch(dives, out, settings, _content(calib), asked, progress)
@@ -92,7 +92,7 @@ def _content(calib: Path | None) -> str | None:
 
 
 def _exit_code(batched: Batched) -> int:
-    from aquaflow.batch.season import End, failed
+    from aquaflow.lab.batch.season import End, failed
 
     if batched.season.end is End.STOPPED:
         return INTERRUPTED
@@ -103,7 +103,7 @@ def _exit_code(batched: Batched) -> int:
 
 
 def _as_json(batched: Batched, out: str) -> dict[str, object]:
-    from aquaflow.batch.season import failed
+    from aquaflow.lab.batch.season import failed
 
     outcomes = batched.season.outcomes
     return {
@@ -122,7 +122,7 @@ def _print_table(batched: Batched) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from aquaflow.batch.season import End, failed
+    from aquaflow.lab.batch.season import End, failed
 
     table = Table(box=None, padding=(0, 2, 0, 0))
     for title in ("dive", "state", "frames", "posed", "PSNR dB", "CPU s", "MB", "node"):

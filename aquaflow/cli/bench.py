@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from aquaflow.base.errors import InputError
 from aquaflow.cli.console import PRESETS, Json, one_of, progress_bars, table_console
-from aquaflow.errors import InputError
 
 Suite = Annotated[str | None, typer.Option(help="ci (synthetic) | real DATA_DIR")]
 Data = Annotated[Path | None, typer.Argument(help="Of --suite real: a folder for each clip.")]
@@ -70,8 +70,8 @@ def dives(
     `aquaflow bench growth` measures dives of several lengths.
     """
     from aquaflow.config.presets import BY_EFFORT, FOR_A_GPU
-    from aquaflow.evaluation.bench import benchmark as bm
-    from aquaflow.evaluation.bench.readme import around_section
+    from aquaflow.lab.bench import benchmark as bm
+    from aquaflow.lab.bench.readme import around_section
 
     if data is not None and suite is None and not scene:
         raise InputError(
@@ -82,7 +82,7 @@ def dives(
     if readme is not None:
         around_section(readme)
     if device is not None:
-        from aquaflow.evaluation.bench.meter import DEVICES, require
+        from aquaflow.lab.bench.meter import DEVICES, require
 
         require(one_of(DEVICES, device, "--device"))
     presets = (*BY_EFFORT, *FOR_A_GPU) if device == "cuda" else BY_EFFORT
@@ -91,13 +91,13 @@ def dives(
         scenes = bm.scenes_of(suite, data, scene or [], out, progress)
         result = bm.benchmark(scenes, contenders, repeats, out, progress, device=device)
     if readme is not None:
-        from aquaflow.evaluation.bench.readme import write_readme
+        from aquaflow.lab.bench.readme import write_readme
 
         write_readme(readme, out / bm.PICTURE_FILE, result["machine"], result["runs"])
     if as_json:
         typer.echo(json.dumps(result))
         return
-    from aquaflow.evaluation.bench.table import print_table
+    from aquaflow.lab.bench.table import print_table
 
     print_table(result["runs"], table_console())
     if result["machine"]["gpu"]:
@@ -116,9 +116,9 @@ def render(
     as_json: Json = False,
 ) -> None:
     """Forward and backward ms of every renderer here: table, picture, render_bench.json."""
-    from aquaflow.evaluation.bench.meter import DEVICES
-    from aquaflow.evaluation.bench.render import benchmark as bm
-    from aquaflow.evaluation.bench.render.sizes import QUICK_SIZES, SIZES
+    from aquaflow.lab.bench.meter import DEVICES
+    from aquaflow.lab.bench.render import benchmark as bm
+    from aquaflow.lab.bench.render.sizes import QUICK_SIZES, SIZES
 
     device = None if device is None else one_of(DEVICES, device, "--device")
     sizes = QUICK_SIZES if quick else SIZES
@@ -127,7 +127,7 @@ def render(
     if as_json:
         typer.echo(json.dumps(result))
         return
-    from aquaflow.evaluation.bench.render.table import print_result
+    from aquaflow.lab.bench.render.table import print_result
 
     print_result(result, table_console())
     typer.echo(f"Look at {out / bm.PICTURE_FILE}; all numbers are in {out / bm.JSON_FILE}.")
@@ -145,7 +145,7 @@ def growth(
     as_json: Json = False,
 ) -> None:
     """What a frame costs in long dives: synthetic surveys, CPU time, memory, files, viewer."""
-    from aquaflow.evaluation.bench.growth import benchmark as bm
+    from aquaflow.lab.bench.growth import benchmark as bm
 
     counts = frames or (bm.QUICK_FRAMES if quick else bm.FRAMES)
     jobs = bm.jobs_of(counts, width, preset, tracking_only, out)
@@ -169,8 +169,8 @@ def ablate(
     as_json: Json = False,
 ) -> None:
     """What each part is worth: everything once without it, error and time against full."""
-    from aquaflow.evaluation.bench import ablation
-    from aquaflow.evaluation.bench.benchmark import scenes_of
+    from aquaflow.lab.bench import ablation
+    from aquaflow.lab.bench.benchmark import scenes_of
 
     parts = ablation.parts_called(part or [])
     with progress_bars(as_json) as progress:

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from aquaflow.base.errors import InputError
 from aquaflow.cli.console import Json, progress_bars
-from aquaflow.errors import InputError
 
 if TYPE_CHECKING:
-    from aquaflow.change.find_changes import Changes
+    from aquaflow.survey.change.find_changes import Changes
 
 MAP_FILE = "map.aqf"
 """What every finished dive with a map has."""
@@ -62,8 +62,8 @@ def change(
                 raise InputError(f"{name} holds no finished dive: {MAP_FILE} is missing")
     names = f"{Path(first).resolve().name}_{Path(second).resolve().name}"
     target = out or (site or Path("out")) / f"change_{names}"
-    from aquaflow.change.find_changes import Asked, find_changes, refuse_taken, write_changes
-    from aquaflow.change.frames import between, in_site
+    from aquaflow.survey.change.find_changes import Asked, find_changes, refuse_taken, write_changes
+    from aquaflow.survey.change.frames import between, in_site
 
     refuse_taken(target, overwrite)
     if site is None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from aquaflow.errors import InputError
+from aquaflow.base.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -60,7 +60,7 @@ def checked_site(folder: Path, out: Path | None) -> Path:
     Raises:
         InputError: it is no dive in which places can be found again, or the one in ``--out``.
     """
-    from aquaflow.site.base import base_of
+    from aquaflow.survey.site.base import base_of
 
     if out is not None and out.resolve() == folder.resolve():
         raise InputError(f"--in and --out are both {folder}; a dive is never changed by another")

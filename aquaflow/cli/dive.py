@@ -28,7 +28,7 @@ def finish(
 ) -> None:
     """Finish a live dive whose process was killed: refine, evaluate, write every file."""
     from aquaflow.cli.service import print_finished
-    from aquaflow.service.finish import FinishedAlreadyError, finish_dive  # loads torch
+    from aquaflow.live.finish import FinishedAlreadyError, finish_dive  # loads torch
 
     try:
         with progress_bars(quiet=as_json) as progress:

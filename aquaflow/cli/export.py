@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from aquaflow.base.errors import InputError
 from aquaflow.cli.console import Json, progress_bars
-from aquaflow.errors import InputError
 
 
 class ExportFormat(str, Enum):
@@ -159,7 +159,7 @@ def _refuse_others(format: ExportFormat, given: dict[str, bool]) -> None:
 def _restored(
     dive: Path, folder: Path, recording: Path | None, progress: Progress
 ) -> tuple[str, dict[str, Any]]:
-    from aquaflow.export.restored import export_restored
+    from aquaflow.dive.restored import export_restored
 
     count = export_restored(dive, folder, recording, progress)
     return f"Wrote {count} restored frames to {folder}.", {"frames": count}
@@ -168,9 +168,9 @@ def _restored(
 def _points(
     dive: Path, path: Path, format: ExportFormat, water: bool, progress: Progress
 ) -> tuple[str, dict[str, Any]]:
-    from aquaflow.export.e57 import write_e57
-    from aquaflow.export.laz import write_laz
-    from aquaflow.export.point_cloud import read_point_cloud
+    from aquaflow.dive.point_cloud import read_point_cloud
+    from aquaflow.survey.export.e57 import write_e57
+    from aquaflow.survey.export.laz import write_laz
 
     cloud = read_point_cloud(dive, water)
     write = write_laz if format is ExportFormat.laz else write_e57
@@ -185,7 +185,7 @@ def _points(
 
 
 def _compressed(dive: Path, path: Path, water: bool) -> tuple[str, dict[str, Any]]:
-    from aquaflow.export.spz import export_spz
+    from aquaflow.survey.export.spz import export_spz
 
     count, where = export_spz(dive, path, water)
     facts = {"gaussians": count, "unit": where.unit}
@@ -200,7 +200,7 @@ def _mesh(
     water: bool,
     bars: Callable[[str, int, int], None],
 ) -> tuple[str, dict[str, Any]]:
-    from aquaflow.export.mesh.export_mesh import export_mesh
+    from aquaflow.survey.export.mesh.export_mesh import export_mesh
 
     mesh = export_mesh(dive, path, kind, resolution, water, bars)
     unit, names = mesh.where.unit, " and ".join(str(file) for file in mesh.files)
@@ -226,9 +226,9 @@ def _posed_pictures(
     restored: bool,
     progress: Progress,
 ) -> tuple[str, dict[str, Any]]:
-    from aquaflow.export.colmap import write_colmap
-    from aquaflow.export.nerfstudio import write_nerfstudio
-    from aquaflow.export.posed_pictures import export_posed_pictures
+    from aquaflow.dive.posed_pictures import export_posed_pictures
+    from aquaflow.survey.export.colmap import write_colmap
+    from aquaflow.survey.export.nerfstudio import write_nerfstudio
 
     write = write_colmap if format is ExportFormat.colmap else write_nerfstudio
     count = export_posed_pictures(dive, folder, write, recording, restored, progress)
@@ -238,7 +238,7 @@ def _posed_pictures(
 def _messages(
     dive: Path, path: Path, recording: Path | None, progress: Progress
 ) -> tuple[str, dict[str, Any]]:
-    from aquaflow.dive.mcap_export import export_mcap
+    from aquaflow.survey.export.mcap_export import export_mcap
 
     wrote = export_mcap(dive, path, recording, progress)
     where = wrote.where
@@ -261,7 +261,7 @@ def _survey(
     water: bool,
     bars: Callable[[str, int, int], None],
 ) -> tuple[str, dict[str, Any]]:
-    from aquaflow.export.ortho.survey import export_survey
+    from aquaflow.survey.export.ortho.survey import export_survey
 
     survey = export_survey(dive, folder, kind, resolution, water, bars)
     ground, names = survey.ground, " and ".join(str(path) for path in survey.files)

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from aquaflow.base.errors import InputError
 from aquaflow.cli.console import Json, progress_bars
-from aquaflow.errors import InputError
 
 if TYPE_CHECKING:
-    from aquaflow.measure.answers import Answer
-    from aquaflow.measure.reef_numbers import ReefNumbers
-    from aquaflow.measure.units import LengthUnit
+    from aquaflow.survey.measure.answers import Answer
+    from aquaflow.survey.measure.reef_numbers import ReefNumbers
+    from aquaflow.survey.measure.units import LengthUnit
 
 
 class Shape(str, Enum):
@@ -89,8 +89,8 @@ def measure(
     if not point and (shape is not None or note is not None):
         raise InputError("--as and --note need points; give --point for each")
     _with_map(dive)
-    from aquaflow.measure.finished_dive import numbers_of_dive
-    from aquaflow.measure.reef_files import write_csv
+    from aquaflow.survey.measure.finished_dive import numbers_of_dive
+    from aquaflow.survey.measure.reef_files import write_csv
 
     with progress_bars(quiet=as_json) as bars, tempfile.TemporaryDirectory() as work:
         found: Answer | ReefNumbers
@@ -114,8 +114,8 @@ def _with_map(dive: Path) -> Path:
 
 def _tend_notes(dive: Path, delete: list[str], as_json: bool) -> None:
     """Remove the notes with these keys, and list what is left."""
-    from aquaflow.fusion.metric_file import read_frame_of_map
-    from aquaflow.measure.notes import listed, read_notes, without, write_notes
+    from aquaflow.survey.measure.notes import listed, read_notes, without, write_notes
+    from aquaflow.telemetry.metric_file import read_frame_of_map
 
     frame = read_frame_of_map(dive / MAP_FILE)
     notes = read_notes(dive, frame)
@@ -136,18 +136,18 @@ def _between(
     work: Path,
     progress: Any,
 ) -> Answer:
-    from aquaflow.measure.asked import parse_point
+    from aquaflow.survey.measure.asked import parse_point
 
     asked = [parse_point(text) for text in texts]
-    from aquaflow.measure.answers import answer  # loads torch
+    from aquaflow.survey.measure.answers import answer  # loads torch
 
     return answer(dive, asked, None if shape is None else shape.value, work, cell, progress)
 
 
 def _pin(dive: Path, text: str, found: Any) -> None:
-    from aquaflow.export.map_file import SUFFIX
-    from aquaflow.fusion.metric_file import read_frame_of_map
-    from aquaflow.measure.notes import new_note, read_notes, write_notes
+    from aquaflow.dive.map_file import SUFFIX
+    from aquaflow.survey.measure.notes import new_note, read_notes, write_notes
+    from aquaflow.telemetry.metric_file import read_frame_of_map
 
     frame = read_frame_of_map(dive / f"map{SUFFIX}")
     notes = read_notes(dive, frame)
@@ -159,8 +159,8 @@ def _pin(dive: Path, text: str, found: Any) -> None:
 
 def _in_words(found: Any, unit: LengthUnit) -> str:
     """Lines for people; of an answer or of reef numbers."""
-    from aquaflow.measure.quantity import Quantity
-    from aquaflow.measure.units import as_read
+    from aquaflow.survey.measure.quantity import Quantity
+    from aquaflow.survey.measure.units import as_read
 
     def read(length: float, of: str) -> Quantity:
         return as_read(Quantity(length, 0.0, length, length, of), unit)

@@ -9,10 +9,10 @@ from typing import Annotated
 
 import typer
 
+from aquaflow.base.cores import usable_threads
 from aquaflow.cli.console import Json, progress_bars, table_console
 from aquaflow.cli.prior_describe import describe
 from aquaflow.cli.prior_verify import print_parity, verify
-from aquaflow.cores import usable_threads
 
 
 class Exported(str, Enum):
@@ -71,7 +71,7 @@ def oracle(
     as_json: Json = False,
 ) -> None:
     """Write a prior that knows one dive, to find out what a good prior is worth."""
-    from aquaflow.evaluation.oracle_views import make_oracle
+    from aquaflow.lab.evaluation.oracle_views import make_oracle
 
     with progress_bars(as_json) as advance:
         count = make_oracle(recording, out, range_sigma, advance, dive)
@@ -91,8 +91,8 @@ def bench(
     as_json: Json = False,
 ) -> None:
     """Milliseconds a frame, matching included, and matches found, of every prior that is here."""
-    from aquaflow.evaluation.prior_bench.benchmark import bench_prior
-    from aquaflow.evaluation.prior_bench.table import print_result
+    from aquaflow.lab.prior_bench.benchmark import bench_prior
+    from aquaflow.lab.prior_bench.table import print_result
 
     with progress_bars(as_json) as advance:
         counts = list(dict.fromkeys(map(usable_threads, threads or [1])))
@@ -122,10 +122,10 @@ def compare(
     """Priors and keypoint networks of others on the same pairs: how right, and at what cost."""
     import torch
 
-    from aquaflow.evaluation.prior_bench.benchmark import pictures_in
-    from aquaflow.evaluation.prior_bench.comparison import compare as compared
-    from aquaflow.evaluation.prior_bench.comparison import methods_here, pairs_of
-    from aquaflow.evaluation.prior_bench.table import print_comparison
+    from aquaflow.lab.prior_bench.benchmark import pictures_in
+    from aquaflow.lab.prior_bench.comparison import compare as compared
+    from aquaflow.lab.prior_bench.comparison import methods_here, pairs_of
+    from aquaflow.lab.prior_bench.table import print_comparison
 
     torch.set_num_threads(1)
     seen = [picture for folder in pictures or [] for picture in pictures_in(folder)]
@@ -155,9 +155,9 @@ def train_mast3r(
 
     Several GPUs: torchrun --nproc-per-node 4 --no-python aquaflow prior train mast3r ...
     """
+    from aquaflow.lab.training import finetune
+    from aquaflow.lab.training.distributed import joined_processes
     from aquaflow.prior.mast3r.weights import LICENCE_NOTICE, load_checkpoint
-    from aquaflow.training import finetune
-    from aquaflow.training.distributed import joined_processes
 
     settings = finetune.FineTuningSettings(
         width, height, epochs, max(1, epochs * 2 // 15), batch, accumulate, seed
@@ -206,9 +206,9 @@ def train_compact(
     """
     import torch
 
-    from aquaflow.training.compact import CompactSettings
-    from aquaflow.training.compact_run import PRIOR, CompactRun
-    from aquaflow.training.compact_run import train_compact as run_training
+    from aquaflow.lab.training.compact import CompactSettings
+    from aquaflow.lab.training.compact_run import PRIOR, CompactRun
+    from aquaflow.lab.training.compact_run import train_compact as run_training
 
     torch.set_num_threads(usable_threads(threads))
     settings = CompactSettings(batch=batch, scenes=scenes, first_scenes=min(160, scenes))

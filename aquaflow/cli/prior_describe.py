@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
+from aquaflow.base.errors import InputError
 from aquaflow.cli.console import Json
-from aquaflow.errors import InputError
 
 DEFAULT_WIDTH, DEFAULT_HEIGHT = 518, 392
 """px: multiples of 14, as transformers of patches of 14 px need them."""

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from aquaflow.base.errors import AquaFlowError, InputError
 from aquaflow.cli.console import Json, one_of, progress_bars, table_console
-from aquaflow.errors import AquaFlowError, InputError
 
 if TYPE_CHECKING:
     from aquaflow.prior.folder import PriorCard

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from aquaflow.base.signals import stop_on_signals
 from aquaflow.cli.console import Json, Seconds, progress_bars
-from aquaflow.signals import stop_on_signals
 
 if TYPE_CHECKING:
     from aquaflow.config.vehicle import VehicleConfig
-    from aquaflow.recording.session import RecordingSession
-    from aquaflow.recording.status import RecorderStatus
+    from aquaflow.live.recorder.session import RecordingSession
+    from aquaflow.live.recorder.status import RecorderStatus
 
 SOURCE_CAMERA = "camera"
 """Name of the camera of a recording that is recorded again."""
@@ -40,10 +40,10 @@ def record(
     as_json: Json = False,
 ) -> None:
     """Record cameras and telemetry to MCAP files; Ctrl-C ends it cleanly."""
+    from aquaflow.base.errors import InputError
     from aquaflow.config.vehicle import VehicleConfig, load_vehicle
-    from aquaflow.errors import InputError
-    from aquaflow.recording.recorder import Recorder
-    from aquaflow.recording.session import RecordingSession
+    from aquaflow.live.recorder.recorder import Recorder
+    from aquaflow.live.recorder.session import RecordingSession
 
     vehicle = VehicleConfig() if config is None else load_vehicle(config)
     if picture is not None:
@@ -75,7 +75,7 @@ def _with_picture(vehicle: VehicleConfig, picture: str) -> VehicleConfig:
 
 def _devices(vehicle: VehicleConfig) -> Callable[[RecordingSession], None]:
     """Open the cameras; links are opened with the recorder, which gets their first byte."""
-    from aquaflow.service.mounting import record_mountings
+    from aquaflow.live.mounting import record_mountings
     from aquaflow.sources import open_camera, open_links
 
     cameras = {name: open_camera(name, config) for name, config in vehicle.cameras.items()}
@@ -92,7 +92,7 @@ def _devices(vehicle: VehicleConfig) -> Callable[[RecordingSession], None]:
 
 def _recording(path: Path) -> Callable[[RecordingSession], None]:
     """Open what lies at ``path``, camera and telemetry."""
-    from aquaflow.recording.playback import Playback
+    from aquaflow.recordings.playback import Playback
     from aquaflow.sources import camera_reader, open_recording, telemetry_reader
 
     reader = telemetry_reader(path)

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
+from aquaflow.base.errors import InputError
 from aquaflow.cli.console import Json
-from aquaflow.errors import InputError
 
 NAME = "report.pdf"
 """In the dive's folder, where no other place is given."""
@@ -28,8 +28,8 @@ def report(
     """Write the report of a finished dive as one PDF, to print or to send."""
     if pdf is not None and pdf.suffix.lower() != ".pdf":
         raise InputError(f"{pdf} does not end in .pdf; give the report a file of its own")
-    from aquaflow.dive.report_of_folder import report_of_folder
-    from aquaflow.export.report.pdf import write_pdf
+    from aquaflow.survey.report.pdf import write_pdf
+    from aquaflow.survey.report.report_of_folder import report_of_folder
 
     out = pdf or dive / NAME
     pages = write_pdf(out, report_of_folder(dive))

@@ -12,7 +12,7 @@ import typer
 from aquaflow.cli.console import Json, progress_bars
 
 if TYPE_CHECKING:
-    from aquaflow.fusion.known_lengths.known_length import KnownLength
+    from aquaflow.telemetry.known_lengths.known_length import KnownLength
 
 RESCALED = (
     "The dive is in metres now: trajectory.tum, trajectory.csv, map.ply, map_clear.ply, "
@@ -42,8 +42,8 @@ def scale(
     for name, value in (("length", length), ("sigma", sigma)):
         if not (math.isfinite(value) and value > 0.0):
             raise typer.BadParameter(f"--{name} must be a positive number of metres")
-    from aquaflow.dive.marked_length import keep_length
-    from aquaflow.fusion.known_lengths.known_lengths_file import FILE, read_known_lengths
+    from aquaflow.survey.measure.marked_length import keep_length
+    from aquaflow.telemetry.known_lengths.known_lengths_file import FILE, read_known_lengths
 
     read_known_lengths(dive)  # a damaged file is found before the map is drawn
     known = _measured(dive, frame, _numbers("--from", start), _numbers("--to", end), length, sigma)
@@ -80,7 +80,7 @@ def _measured(
         raise typer.BadParameter("points x,y need --frame, the number of the picture's frame")
     if len(start) == 3 and frame is not None:
         raise typer.BadParameter("points x,y,z are of the map; leave out --frame")
-    from aquaflow.dive.scale_bar import between_pixels, between_points  # loads torch
+    from aquaflow.survey.measure.scale_bar import between_pixels, between_points  # loads torch
 
     if frame is None:
         ends = [(point[0], point[1], point[2]) for point in (start, end)]

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from aquaflow.config import Config
     from aquaflow.dive.run import Finished
     from aquaflow.geometry.camera import CameraModel
-    from aquaflow.service.feed import Feed
+    from aquaflow.live.feed import Feed
 
 
 POOR_RESULT = 3
@@ -70,10 +70,10 @@ def run(
     as_json: Json = False,
 ) -> None:
     """Map live: cameras and telemetry in, dive folder out; resumes what was interrupted."""
+    from aquaflow.base.errors import InputError
     from aquaflow.config.vehicle import load_vehicle, looking_in
-    from aquaflow.errors import InputError
     from aquaflow.geometry.camera import load_camera
-    from aquaflow.service.sources import devices, recording
+    from aquaflow.live.sources import devices, recording
 
     vehicle = load_vehicle(config, preset)
     if in_site is not None:
@@ -86,7 +86,7 @@ def run(
             "cameras"
         )
 
-    from aquaflow.service.onboard import map_live  # loads torch
+    from aquaflow.live.onboard import map_live  # loads torch
 
     if source is None:
         devices_on_stderr()
@@ -107,8 +107,8 @@ def status(
     as_json: Json = False,
 ) -> None:
     """Ask the running service how it is; exit code 0 only if nothing is to be done about it."""
-    from aquaflow.access import read_token
-    from aquaflow.service.health.client import ask
+    from aquaflow.live.health.client import ask
+    from aquaflow.web.access import read_token
 
     report = ask(url, None if token_file is None else read_token(token_file))
     if as_json:
@@ -131,12 +131,12 @@ def view(
     splats: Annotated[int, typer.Option(help="Gaussians to show at most.")] = MOST_SPLATS,
 ) -> None:
     """Show a finished dive or a site in a browser, to look around and to measure; until Ctrl-C."""
+    from aquaflow.base.errors import InputError
     from aquaflow.config.stage import validated
     from aquaflow.config.viewer import ViewerConfig
-    from aquaflow.errors import InputError
-    from aquaflow.site.manifest import is_site
-    from aquaflow.viewer.finished import open_dive
-    from aquaflow.viewer.site_page import open_site
+    from aquaflow.survey.site.manifest import is_site
+    from aquaflow.survey.viewer.finished import open_dive
+    from aquaflow.survey.viewer.site_page import open_site
 
     asked = {"enabled": True, "host": host, "port": port, "token_file": token_file}
     config = validated(ViewerConfig, asked | {"splats": splats}, "command line")
@@ -159,8 +159,8 @@ def _mark(
     sigma_m: float,
 ) -> tuple[str, bool]:
     """Keep a length that was marked in the viewer; what came of it, and whether files changed."""
-    from aquaflow.dive.marked_length import keep_length
-    from aquaflow.dive.scale_bar import between_points  # loads torch
+    from aquaflow.survey.measure.marked_length import keep_length
+    from aquaflow.survey.measure.scale_bar import between_points  # loads torch
 
     marked = keep_length(dive, between_points(dive, *ends, length_m, sigma_m))
     return f"{marked.in_words()}\n{marked.unchanged or ''}".rstrip(), marked.unchanged is None
@@ -205,8 +205,8 @@ def map_realtime(
 ) -> Finished | None:
     """``map --realtime``: a recording through the live loop, refined as a replay is."""
     from aquaflow.config.vehicle import VehicleConfig
-    from aquaflow.service.onboard import map_live
-    from aquaflow.service.sources import recording
+    from aquaflow.live.onboard import map_live
+    from aquaflow.live.sources import recording
 
     alone = VehicleConfig().service.model_dump()
     alone["dive"]["site"] = in_site

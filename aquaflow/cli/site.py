@@ -14,7 +14,7 @@ import typer
 from aquaflow.cli.console import Json, progress_bars
 
 if TYPE_CHECKING:
-    from aquaflow.site.merged_file import MergedSite
+    from aquaflow.survey.site.merged_file import MergedSite
 
 Site = Annotated[Path, typer.Argument(help="Site folder.")]
 
@@ -33,7 +33,7 @@ def add(
     as_json: Json = False,
 ) -> None:
     """Add finished dives to a site, which is made if it is not there."""
-    from aquaflow.site.adding import add_to_site
+    from aquaflow.survey.site.adding import add_to_site
 
     new = add_to_site(site, dives)
     if as_json:
@@ -46,7 +46,7 @@ def add(
 @app.command()
 def merge(site: Site, as_json: Json = False) -> None:
     """Recognise the dives of a site in each other, and optimise them together."""
-    from aquaflow.site.merging import merge as merged_site
+    from aquaflow.survey.site.merging import merge as merged_site
 
     with progress_bars(quiet=as_json) as progress:
         merged = merged_site(site, progress)
@@ -67,7 +67,7 @@ def write_map(
     as_json: Json = False,
 ) -> None:
     """One map of the merged dives: of every place the dive that shows it last, or much closer."""
-    from aquaflow.change.make_site_map import make_site_map
+    from aquaflow.survey.change.make_site_map import make_site_map
 
     with progress_bars(quiet=as_json) as progress, tempfile.TemporaryDirectory() as work:
         made = make_site_map(site, component, Path(work), progress)
@@ -89,8 +89,8 @@ def write_map(
 @app.command("list")
 def list_dives(site: Site, as_json: Json = False) -> None:
     """The dives of a site, and how they lie to each other since the last merge."""
-    from aquaflow.site.manifest import read_site
-    from aquaflow.site.merged_file import read_merged
+    from aquaflow.survey.site.manifest import read_site
+    from aquaflow.survey.site.merged_file import read_merged
 
     dives, merged = read_site(site), read_merged(site)
     rows: list[dict[str, Any]] = [
@@ -118,7 +118,7 @@ def list_dives(site: Site, as_json: Json = False) -> None:
 @app.command()
 def check(site: Site, as_json: Json = False) -> None:
     """Whether the dives are as they were added and merged; exit code 1 if not."""
-    from aquaflow.site.checking import check_site
+    from aquaflow.survey.site.checking import check_site
 
     found = check_site(site)
     if as_json:

@@ -12,7 +12,7 @@ from aquaflow.cli.console import Json, table_console
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from aquaflow.evaluation.stress.suite import Result
+    from aquaflow.lab.stress.suite import Result
 
 
 def register(app: typer.Typer) -> None:
@@ -32,7 +32,7 @@ def stress(
     """Feed AquaFlow what no sane dive has, and see that it stays finite and keeps its word."""
     from rich.console import Console
 
-    from aquaflow.evaluation.stress.suite import cases, on_few_threads, run_cases
+    from aquaflow.lab.stress.suite import cases, on_few_threads, run_cases
 
     chosen = cases(family, case, long)
     screen = Console(stderr=True)

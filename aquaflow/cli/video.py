@@ -10,8 +10,8 @@ from typing import Annotated, Any
 
 import typer
 
+from aquaflow.base.errors import InputError
 from aquaflow.cli.console import Json, progress_bars
-from aquaflow.errors import InputError
 
 
 class VideoKind(str, Enum):
@@ -76,18 +76,18 @@ def video(
 
         facts: dict[str, Any]
         if kind is VideoKind.fly_through:
-            from aquaflow.dive.video.fly_through import fly_through
+            from aquaflow.survey.video.fly_through import fly_through
 
             flight_s = FLIGHT_S if seconds is None else seconds
             count = fly_through(dive, out, flight_s, water, width, progress)
             said, facts = f"Wrote a flight of {count} pictures to {out}.", {"frames": count}
         elif kind is VideoKind.side_by_side:
-            from aquaflow.dive.video.side_by_side import side_by_side
+            from aquaflow.survey.video.side_by_side import side_by_side
 
             count = side_by_side(dive, out, recording, progress)
             said, facts = f"Wrote {count} frames side by side to {out}.", {"frames": count}
         else:
-            from aquaflow.dive.video.every_frame import restore_every_frame
+            from aquaflow.survey.video.every_frame import restore_every_frame
 
             if recording is None:
                 raise InputError("--kind restored needs --recording: a dive keeps no pictures")

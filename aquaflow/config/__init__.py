@@ -11,6 +11,7 @@ from typing import Any
 
 from pydantic import Field
 
+from aquaflow.base.errors.plain_yaml import read_mapping
 from aquaflow.config.coverage import CoverageConfig
 from aquaflow.config.fusion import FusionConfig
 from aquaflow.config.mapping import (
@@ -37,7 +38,6 @@ from aquaflow.config.tracking import (
     TrackingConfig,
     VerificationConfig,
 )
-from aquaflow.errors.plain_yaml import read_mapping
 
 __all__ = [
     "Config",

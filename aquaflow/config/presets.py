@@ -6,8 +6,8 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
+from aquaflow.base.errors import ConfigError
 from aquaflow.config import Config, load_config, parse_config
-from aquaflow.errors import ConfigError
 
 PRESETS: dict[str, dict[str, Any]] = {
     "fast": {

@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from aquaflow.errors import ConfigError, path_of_key, words_of
+from aquaflow.base.errors import ConfigError, path_of_key, words_of
 
 
 class Stage(BaseModel):

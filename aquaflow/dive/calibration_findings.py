@@ -8,8 +8,8 @@ import numpy as np
 
 from aquaflow.geometry.optics import virtual_centre
 from aquaflow.geometry.port import FlatPort, Port
-from aquaflow.messages import CameraModel
 from aquaflow.tracking.calibration_check import TOLERANCE, LensError
+from aquaflow.types import CameraModel
 
 REMEDY = (
     "calibrate the camera in water, or in air with its port's measures, or leave out --calib to "

@@ -15,15 +15,14 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.base.errors import InputError
+from aquaflow.base.errors.failures import Failures
 from aquaflow.config import Config
 from aquaflow.dive.found_camera import FoundCamera, usable
-from aquaflow.errors import InputError
-from aquaflow.errors.failures import Failures
 from aquaflow.geometry.camera import CameraModel, guess_camera
 from aquaflow.geometry.lens_error import TERMS
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe
-from aquaflow.messages import Frame
 from aquaflow.prior.contract import Keypoints
 from aquaflow.slam import Slam
 from aquaflow.sources import CameraSource
@@ -32,6 +31,7 @@ from aquaflow.tracking.frames import Tracked
 from aquaflow.tracking.lens_views import LensViews
 from aquaflow.tracking.overlay.finder import OverlayFinder
 from aquaflow.tracking.self_calibration import FoundLens, found_lens
+from aquaflow.types import Frame
 
 MOST_FRAMES = 600
 """Looked at for the lens: a minute of the dive at 10 frames/s, and a minute of two cores."""

@@ -8,13 +8,13 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from aquaflow.base.errors import DamagedError, InputError, reason_of
 from aquaflow.dive.frames_csv import FrameRow, read_rows
-from aquaflow.errors import DamagedError, InputError, reason_of
-from aquaflow.export.trajectory_csv import NAME as TRAJECTORY_CSV
-from aquaflow.export.trajectory_csv import PoseRow, read_trajectory_csv
-from aquaflow.export.tum import read_tum
-from aquaflow.fusion.metric_file import read_main
+from aquaflow.dive.trajectory_csv import NAME as TRAJECTORY_CSV
+from aquaflow.dive.trajectory_csv import PoseRow, read_trajectory_csv
+from aquaflow.dive.tum import read_tum
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.telemetry.metric_file import read_main
 
 NS = 1_000_000_000
 

@@ -14,28 +14,28 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.base.errors import InputError
+from aquaflow.base.storage.atomic import atomic_write, write_json, write_yaml
+from aquaflow.base.storage.folder_lock import FolderLock
 from aquaflow.config import Config
 from aquaflow.dive import from_maps
 from aquaflow.dive.frames_csv import FrameRow, header, of_text, to_text
 from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.dive.log import JsonLog
+from aquaflow.dive.png import write_png
 from aquaflow.dive.results import WaterSummary
 from aquaflow.dive.status import NAME as STATUS
-from aquaflow.errors import InputError
-from aquaflow.export.png import write_png
-from aquaflow.export.report import ReportData, write_report
-from aquaflow.export.trajectory_csv import NAME as PATH_TABLE
-from aquaflow.export.trajectory_csv import PoseRow, write_trajectory_csv
-from aquaflow.export.tum import write_tum
-from aquaflow.fusion.known_lengths.known_lengths_file import FILE as KNOWN_LENGTHS
-from aquaflow.fusion.metric_file import write_metric_file
-from aquaflow.fusion.metric_frame import MetricFrame
+from aquaflow.dive.trajectory_csv import NAME as PATH_TABLE
+from aquaflow.dive.trajectory_csv import PoseRow, write_trajectory_csv
+from aquaflow.dive.tum import write_tum
 from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.camera_file import save_camera
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.recording.telemetry_lines import NAME as TELEMETRY
-from aquaflow.storage.atomic import atomic_write, write_json, write_yaml
-from aquaflow.storage.camera_file import save_camera
-from aquaflow.storage.folder_lock import FolderLock
+from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
+from aquaflow.survey.report import ReportData, write_report
+from aquaflow.telemetry.known_lengths.known_lengths_file import FILE as KNOWN_LENGTHS
+from aquaflow.telemetry.metric_file import write_metric_file
+from aquaflow.telemetry.metric_frame import MetricFrame
 
 if TYPE_CHECKING:
     from aquaflow.mapping.mapper import Mapper

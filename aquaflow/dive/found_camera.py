@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from aquaflow.errors import ConfigError
+from aquaflow.base.errors import ConfigError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.lens_error import LENS_PRIOR_SIGMA
 from aquaflow.geometry.rectification import Rectifier

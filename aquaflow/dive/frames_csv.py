@@ -8,7 +8,7 @@ from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from aquaflow.errors import InputError, reason_of
+from aquaflow.base.errors import InputError, reason_of
 
 MOST_LINES = 20
 """Lines of one reason; a library's message has a few."""

@@ -10,12 +10,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from aquaflow.clocks.deadline import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.dive.results import WaterSummary
-from aquaflow.export.ortho.ground import Ground, ground_of
-from aquaflow.fusion.metric_frame import MetricFrame
-from aquaflow.measure.height_field import HeightField
+from aquaflow.survey.export.ortho.ground import Ground, ground_of
+from aquaflow.survey.measure.height_field import HeightField
+from aquaflow.telemetry.metric_frame import MetricFrame
 
 if TYPE_CHECKING:
     from aquaflow.mapping.mapper import Mapper
@@ -67,8 +67,8 @@ def attenuations(mappers: Mapping[int, Mapper]) -> dict[int, list[float]]:
 
 
 def overview(mapper: Mapper, frame: MetricFrame) -> bytes:
-    """See :func:`aquaflow.export.ortho.overview.overview_png`."""
-    from aquaflow.export.ortho.overview import overview_png
+    """See :func:`aquaflow.survey.export.ortho.overview.overview_png`."""
+    from aquaflow.survey.export.ortho.overview import overview_png
 
     return overview_png(mapper, frame)
 
@@ -76,8 +76,8 @@ def overview(mapper: Mapper, frame: MetricFrame) -> bytes:
 def drawn_ground(
     mapper: Mapper, frame: MetricFrame, work: Path, progress: Callable[[str, int, int], None]
 ) -> tuple[HeightField, Ground]:
-    """See :func:`aquaflow.measure.drawn_heights.draw_heights`."""
-    from aquaflow.measure.drawn_heights import draw_heights
+    """See :func:`aquaflow.survey.measure.drawn_heights.draw_heights`."""
+    from aquaflow.survey.measure.drawn_heights import draw_heights
 
     ground = ground_of(frame, mapper.views)
     return draw_heights(mapper, ground, work, progress=progress), ground

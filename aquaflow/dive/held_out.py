@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from aquaflow.clocks.deadline import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.dive.held_out_example import Fidelity, HeldOut
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.rendering import Shown
@@ -19,11 +19,11 @@ from aquaflow.mapping.restoration import (
     restored_picture,
     to_bytes,
 )
-from aquaflow.mapping.transfers import picture_out
-from aquaflow.mapping.views import View
-from aquaflow.mapping.water.posed_picture import SOLID
 from aquaflow.render.image_metrics import lpips, psnr, ssim
+from aquaflow.render.transfers import picture_out
+from aquaflow.render.views import View
 from aquaflow.slam import Slam
+from aquaflow.water.posed_picture import SOLID
 
 REGISTERING = 0.85
 """Of the time for held-out views, for their poses: a dozen drawings each, where comparing takes a

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.keyframes import KeyframeStore
+from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.tracking.base.in_base import InBase
 from aquaflow.tracking.base.links import BaseLink
 

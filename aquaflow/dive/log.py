@@ -11,8 +11,8 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from aquaflow.base.storage.lines import is_cut_short
 from aquaflow.dive.log_repeats import Repeats
-from aquaflow.storage.lines import is_cut_short
 
 LOGGERS = ("aquaflow", "py.warnings")
 """Loggers whose records go to log.jsonl."""

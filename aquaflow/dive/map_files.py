@@ -7,15 +7,15 @@ from pathlib import Path
 
 import torch
 
+from aquaflow.dive.map_file import write_map_file
+from aquaflow.dive.ply import PlyGaussians, write_ply
 from aquaflow.dive.results import WaterSummary
 from aquaflow.dive.water_summary import water_of
-from aquaflow.export.map_file import write_map_file
-from aquaflow.export.ply import PlyGaussians, write_ply
-from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.mapping.clear_colours import restored_gaussians
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.transfers import map_out
 from aquaflow.render.activation import radiance
+from aquaflow.render.transfers import map_out
+from aquaflow.telemetry.metric_frame import MetricFrame
 
 
 def write_exact(folder: Path, mapper: Mapper, suffix: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from aquaflow.dive.results import WaterSummary
-from aquaflow.fusion.metric_frame import MetricFrame
+from aquaflow.telemetry.metric_frame import MetricFrame
 
 
 def medium_json(

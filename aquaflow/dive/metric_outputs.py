@@ -11,11 +11,11 @@ import numpy as np
 
 from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.dive.results import WaterSummary
-from aquaflow.fusion.interpolation import Interpolation
-from aquaflow.fusion.metric_frame import MetricFrame
-from aquaflow.fusion.telemetry import Telemetry
-from aquaflow.fusion.utc import UtcClock, fit_utc
-from aquaflow.messages import Altitude, Depth
+from aquaflow.telemetry.interpolation import Interpolation
+from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.telemetry import Telemetry
+from aquaflow.telemetry.utc import UtcClock, fit_utc
+from aquaflow.types import Altitude, Depth
 
 CAMERA_WORLD = (
     "camera to world; world is the first keyframe's camera (x right, y down, z forward); scale: "

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.dive.georeference import to_geodetic
 from aquaflow.dive.metric_outputs import MetricOutputs
-from aquaflow.export.georeference import to_geodetic
-from aquaflow.export.trajectory_csv import PoseRow
-from aquaflow.fusion.metric_frame import MetricFrame
+from aquaflow.dive.trajectory_csv import PoseRow
 from aquaflow.geometry.similarity import BODY_FROM_CAMERA, Sim3
+from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.tracking.frames import Tracked
 
 Array = npt.NDArray[np.float64]

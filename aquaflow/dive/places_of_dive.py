@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from aquaflow.errors import InputError
+from aquaflow.base.errors import InputError
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore
 from aquaflow.keyframes.place import KeypointDepths, Place, depths_at

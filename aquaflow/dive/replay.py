@@ -5,23 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from aquaflow.base.cores import usable_threads
+from aquaflow.base.errors import NotMappedError
+from aquaflow.base.errors.failures import Failures
+from aquaflow.base.profiler import Profiler
 from aquaflow.config import Config, SourceConfig
-from aquaflow.cores import usable_threads
 from aquaflow.dive.calibration_pass import found_in
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import DiveRun, Finished
 from aquaflow.dive.synchronisation import synchronise
-from aquaflow.errors import NotMappedError
-from aquaflow.errors.failures import Failures
-from aquaflow.messages import CameraModel, Dropped, Frame
-from aquaflow.profiler import Profiler
-from aquaflow.recording.playback import Event, Playback
+from aquaflow.recordings.playback import Event, Playback
 from aquaflow.slam import Slam
 from aquaflow.sources import RecordedCamera, mounting_of
 from aquaflow.sources.reading import read_past_failures
 from aquaflow.sources.telemetry_input import TelemetryInput
 from aquaflow.tracking.base.base import Base
 from aquaflow.tracking.frames import FrameClass
+from aquaflow.types import CameraModel, Dropped, Frame
 
 Progress = Callable[[str, int, int | None], None]
 """Called with the stage, the steps done and, where known, the steps there are."""

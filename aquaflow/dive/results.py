@@ -11,11 +11,11 @@ import numpy as np
 from aquaflow import __version__
 from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.mapping.transfer_counts import transfers
-from aquaflow.messages import Dropped
 from aquaflow.render.image_metrics import lpips_network
+from aquaflow.render.transfer_counts import transfers
 from aquaflow.slam import Slam
 from aquaflow.tracking.frames import FrameClass, Tracked
+from aquaflow.types import Dropped
 
 PROTOCOL = {
     "held_out": "i % n == 0 and i != 0 of the used frames: tracked, never mapped; pose refined "

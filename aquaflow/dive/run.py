@@ -11,10 +11,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from aquaflow.base.errors import InputError, NotMappedError
+from aquaflow.base.profiler import pace
 from aquaflow.config import Config
-from aquaflow.coverage import DiveCoverage
 from aquaflow.dive import calibration_findings
-from aquaflow.dive.deliverables import Deliverables
 from aquaflow.dive.folder import SUGGESTED, TRACE, DiveFolder
 from aquaflow.dive.found_camera import FoundCamera, from_keyframes, in_words
 from aquaflow.dive.frames_csv import FrameRow
@@ -28,18 +28,18 @@ from aquaflow.dive.metric_outputs import (
 )
 from aquaflow.dive.results import metrics
 from aquaflow.dive.shortcomings import shortcomings
-from aquaflow.errors import InputError, NotMappedError
 from aquaflow.mapping.work import MIN_VIEWS, Progress
-from aquaflow.messages import CameraModel, Dropped, Frame, TelemetrySample
-from aquaflow.profiler import pace
-from aquaflow.recording.kept_pictures import KeptPictures, PictureThread
-from aquaflow.recording.telemetry_lines import NAME as TELEMETRY
-from aquaflow.recording.telemetry_lines import TelemetryLog
+from aquaflow.recordings.kept_pictures import KeptPictures, PictureThread
+from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
+from aquaflow.recordings.telemetry_lines import TelemetryLog
 from aquaflow.slam import Slam
 from aquaflow.slam.finish_time import FinishTime
 from aquaflow.sources.preprocessing import Preparation
+from aquaflow.survey.coverage import DiveCoverage
+from aquaflow.survey.deliverables import Deliverables
 from aquaflow.tracking.calibration_check import LensError, lens_error
 from aquaflow.tracking.frames import Tracked
+from aquaflow.types import CameraModel, Dropped, Frame, TelemetrySample
 
 log = logging.getLogger(__name__)
 

@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 from enum import Enum
 from pathlib import Path
 
+from aquaflow.base.storage.atomic import write_json
 from aquaflow.config.device import MountingConfig
-from aquaflow.storage.atomic import write_json
 
 NAME = "dive.json"
 

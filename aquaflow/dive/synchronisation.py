@@ -8,15 +8,15 @@ import numpy as np
 
 from aquaflow.config.device import MountingConfig
 from aquaflow.dive.run import DiveRun
-from aquaflow.fusion.start import camera_in_body
-from aquaflow.fusion.time_offset import (
+from aquaflow.sources.telemetry_input import TelemetryInput
+from aquaflow.telemetry.start import camera_in_body
+from aquaflow.telemetry.time_offset import (
     NotSynchronisedError,
     TimeOffset,
     offset_of_log,
     synchronised,
 )
-from aquaflow.fusion.turns import Array, Turns
-from aquaflow.sources.telemetry_input import TelemetryInput
+from aquaflow.telemetry.turns import Array, Turns
 from aquaflow.tracking.frames import Tracked
 
 

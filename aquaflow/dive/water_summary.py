@@ -9,11 +9,11 @@ import torch
 
 from aquaflow.dive.results import WaterSummary
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.transfers import picture_out, water_in, water_out
-from aquaflow.mapping.views import View
-from aquaflow.mapping.water.image_formation import Water
-from aquaflow.mapping.water.posed_picture import SOLID
 from aquaflow.render.contract import CPU
+from aquaflow.render.transfers import picture_out, water_in, water_out
+from aquaflow.render.views import View
+from aquaflow.water.image_formation import Water
+from aquaflow.water.posed_picture import SOLID
 
 RANGE_PERCENTILES = (5.0, 95.0)
 """Percent; values outside are single pixels at edges of the map."""

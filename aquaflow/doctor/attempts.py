@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING
 
-from aquaflow.errors import AquaFlowError, first_line
+from aquaflow.base.errors import AquaFlowError, first_line
 
 if TYPE_CHECKING:
     from aquaflow.prior.runtime import Device

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.errors import InputError
+from aquaflow.base.errors import InputError
 from aquaflow.geometry.similarity import Sim3
 
 MINIMUM_POINTS = 3

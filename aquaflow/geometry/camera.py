@@ -22,8 +22,8 @@ from pydantic import (
     model_validator,
 )
 
-from aquaflow.errors import ConfigError, path_of_key, words_of
-from aquaflow.errors.plain_yaml import read_mapping
+from aquaflow.base.errors import ConfigError, path_of_key, words_of
+from aquaflow.base.errors.plain_yaml import read_mapping
 from aquaflow.geometry.port import Port
 from aquaflow.geometry.port_file import DomePortFile, FlatPortFile, PortFile, port_of, stated
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.errors import ConfigError
+from aquaflow.base.errors import ConfigError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.distortion import undistort_points
 from aquaflow.geometry.optics import pixels_of_points, points_at_depth, virtual_centre

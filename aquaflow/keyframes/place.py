@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.errors import DamagedError
+from aquaflow.base.errors import DamagedError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.pixels import at_pixels
 from aquaflow.geometry.similarity import Sim3

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.errors import DamagedError, InputError, reason_of
+from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes.place import KeypointDepths, Place, packed, unpacked
-from aquaflow.storage.atomic import atomic_write
 
 Rows = npt.NDArray[Any]
 """A structured array."""

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.errors import InputError
+from aquaflow.base.errors import InputError
+from aquaflow.base.storage.array_file import Arrays
+from aquaflow.base.storage.spill import Spill
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes.pointmap import LearnedDepths, Pointmap
 from aquaflow.prior.contract import Encoding, Prior
-from aquaflow.storage.array_file import Arrays
-from aquaflow.storage.spill import Spill
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

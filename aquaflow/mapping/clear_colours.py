@@ -17,10 +17,10 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from aquaflow.mapping.scene import Scene, orientations
-from aquaflow.mapping.transfers import map_out, water_in
-from aquaflow.mapping.views import View
-from aquaflow.mapping.water.image_formation import MIN_TRANSMISSION, Water
-from aquaflow.mapping.water.white_balance import Recovered
+from aquaflow.render.transfers import map_out, water_in
+from aquaflow.render.views import View
+from aquaflow.water.image_formation import MIN_TRANSMISSION, Water
+from aquaflow.water.white_balance import Recovered
 
 
 @torch.no_grad()

@@ -11,9 +11,9 @@ import logging
 from collections import Counter
 from collections.abc import Callable
 
+from aquaflow.base.errors import first_line, is_device_failure, is_device_full
+from aquaflow.base.errors.failures import Failures
 from aquaflow.config import Config
-from aquaflow.errors import first_line, is_device_failure, is_device_full
-from aquaflow.errors.failures import Failures
 from aquaflow.mapping.host_copies import HostCopies
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render import cpu_renderer

@@ -13,11 +13,11 @@ import logging
 from collections import Counter, defaultdict
 from collections.abc import Mapping
 
+from aquaflow.geometry.arrays import Arrays
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.state import Facts, deserialise, serialise
 from aquaflow.render.contract import Renderer
-from aquaflow.storage.arrays import Arrays
 
 log = logging.getLogger(__name__)
 

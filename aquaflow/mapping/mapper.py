@@ -7,13 +7,12 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor
 
-from aquaflow.clocks.deadline import Deadline
+from aquaflow.base.clocks.deadline import Deadline
+from aquaflow.base.errors import is_device_failure, is_device_full
+from aquaflow.base.errors.failures import Failures
 from aquaflow.config import MappingConfig
-from aquaflow.errors import is_device_failure, is_device_full
-from aquaflow.errors.failures import Failures
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
-from aquaflow.mapping.decoder.neural import NeuralGaussians
 from aquaflow.mapping.gaussians.gaussians import GaussianMap
 from aquaflow.mapping.gaussians.insertion import (
     alpha_where_agreed,
@@ -26,6 +25,7 @@ from aquaflow.mapping.gaussians.insertion import (
     worth_keeping,
 )
 from aquaflow.mapping.gaussians.reanchoring import move_gaussians, move_views
+from aquaflow.mapping.neural.neural import NeuralGaussians
 from aquaflow.mapping.optimisation.map_optimiser import MapOptimiser
 from aquaflow.mapping.optimisation.objective import Objective
 from aquaflow.mapping.optimisation.registration import register
@@ -33,11 +33,11 @@ from aquaflow.mapping.optimisation.schedule import refining_rates, sampled_views
 from aquaflow.mapping.rendering import Shown
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.scene_water import rebalance
-from aquaflow.mapping.views import View, in_time
-from aquaflow.mapping.water.medium import Medium
 from aquaflow.mapping.water_fitting import WaterFitting
 from aquaflow.render.contract import Renderer
 from aquaflow.render.device_memory import give_back_after
+from aquaflow.render.views import View, in_time
+from aquaflow.water.medium import Medium
 
 MOST_FAILED_STEPS = 10
 """Steps in a row that raise until the final refinement gives up: the next would, too."""

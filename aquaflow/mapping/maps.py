@@ -6,22 +6,22 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from aquaflow.clocks.deadline import Deadline
+from aquaflow.base.clocks.deadline import Deadline
+from aquaflow.base.errors.failures import Failures
+from aquaflow.base.profiler import Profiler
 from aquaflow.config import Config
-from aquaflow.errors.failures import Failures
+from aquaflow.geometry.arrays import Arrays
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.device_work import DeviceWork
 from aquaflow.mapping.gaussians.reanchoring import move_views
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.maps_state import restored, serialised
 from aquaflow.mapping.view_budget import drop_surplus, same_group
-from aquaflow.mapping.views import View, ViewStore
 from aquaflow.mapping.work import MIN_VIEWS, Growth, Insertion, Progress
-from aquaflow.profiler import Profiler
 from aquaflow.render import select_renderer
 from aquaflow.render.contract import Renderer
 from aquaflow.render.device_memory import give_back_idle, usable_share
-from aquaflow.storage.arrays import Arrays
+from aquaflow.render.views import View, ViewStore
 
 
 class Maps:

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from aquaflow.errors.failures import Failures
+from aquaflow.base.errors.failures import Failures
+from aquaflow.geometry.arrays import Arrays, of_camera, of_sim3, prefixed, to_camera, to_sim3, under
 from aquaflow.mapping import state
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.state import NO_PIXELS
-from aquaflow.mapping.views import View
 from aquaflow.render.contract import Renderer
-from aquaflow.storage.arrays import Arrays, of_camera, of_sim3, prefixed, to_camera, to_sim3, under
+from aquaflow.render.views import View
 
 
 def serialised(

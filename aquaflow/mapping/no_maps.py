@@ -6,16 +6,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from aquaflow.clocks.deadline import Deadline
-from aquaflow.errors.failures import Failures
+from aquaflow.base.clocks.deadline import Deadline
+from aquaflow.base.errors.failures import Failures
+from aquaflow.base.profiler import Profiler
+from aquaflow.geometry.arrays import Arrays
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.work import Growth, Insertion, Progress
-from aquaflow.profiler import Profiler
-from aquaflow.storage.arrays import Arrays
 
 if TYPE_CHECKING:
     from aquaflow.mapping.mapper import Mapper
-    from aquaflow.mapping.views import View
+    from aquaflow.render.views import View
 
 
 class NoMaps:

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from aquaflow.mapping.views import View
-from aquaflow.mapping.water.image_formation import Water
 from aquaflow.render.activation import activate
 from aquaflow.render.contract import Renderer
+from aquaflow.render.views import View
 from aquaflow.render.water import MIN_SOLID, compose_water
+from aquaflow.water.image_formation import Water
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,10 @@ from torch import Tensor
 from aquaflow.mapping.clear_colours import restored_radiance
 from aquaflow.mapping.rendering import Shown
 from aquaflow.mapping.scene import Scene
-from aquaflow.mapping.transfers import picture_out, water_in
-from aquaflow.mapping.views import View
-from aquaflow.mapping.water.posed_picture import SOLID
+from aquaflow.render.transfers import picture_out, water_in
+from aquaflow.render.views import View
 from aquaflow.render.water import MIN_SOLID
+from aquaflow.water.posed_picture import SOLID
 
 EDGE_PX = 3.0
 """Deviation of the Gaussian over which open water begins."""

@@ -13,20 +13,20 @@ import torch
 from torch import Tensor
 
 from aquaflow.config import MediumConfig, SunlightConfig
-from aquaflow.mapping.decoder.neural import NeuralGaussians
 from aquaflow.mapping.gaussians.gaussians import GaussianMap
+from aquaflow.mapping.neural.neural import NeuralGaussians
 from aquaflow.mapping.rendering import Shown, show
-from aquaflow.mapping.transfers import picture_out, pose_in, water_in, water_out, weights_in
-from aquaflow.mapping.views import View
-from aquaflow.mapping.water.exposure import gain_of, learn_gain
-from aquaflow.mapping.water.image_formation import Water
-from aquaflow.mapping.water.medium import Medium
-from aquaflow.mapping.water.nearest import Nearest
-from aquaflow.mapping.water.open_water import open_water
-from aquaflow.mapping.water.shading import TERMS, gain_map
-from aquaflow.mapping.water.sunlight import Sunlight
-from aquaflow.mapping.water.white_balance import Recovered, WhiteBalance
 from aquaflow.render.contract import Renderer
+from aquaflow.render.transfers import picture_out, pose_in, water_in, water_out, weights_in
+from aquaflow.render.views import View
+from aquaflow.water.exposure import gain_of, learn_gain
+from aquaflow.water.image_formation import Water
+from aquaflow.water.medium import Medium
+from aquaflow.water.nearest import Nearest
+from aquaflow.water.open_water import open_water
+from aquaflow.water.shading import TERMS, gain_map
+from aquaflow.water.sunlight import Sunlight
+from aquaflow.water.white_balance import Recovered, WhiteBalance
 
 MOST_DISTANCES = 1 << 22
 """Between Gaussians and cameras at a time: 16 MB. Half a million Gaussians and 5,000 views at once

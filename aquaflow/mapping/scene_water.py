@@ -11,16 +11,16 @@ import torch
 
 from aquaflow.mapping.gaussians.gaussians import raw_colour
 from aquaflow.mapping.scene import Scene, orientations
-from aquaflow.mapping.transfers import water_in, water_out
-from aquaflow.mapping.views import View
-from aquaflow.mapping.water.estimation import WaterEstimate, estimating, models_for
-from aquaflow.mapping.water.exposure import gain_of, log_gains_of, set_log_gains
-from aquaflow.mapping.water.image_formation import Water
-from aquaflow.mapping.water.nearest import kept_by
-from aquaflow.mapping.water.posed_picture import PosedPicture
-from aquaflow.mapping.water.shading import shading_basis
-from aquaflow.mapping.water.sightings import sighting
 from aquaflow.render.activation import radiance
+from aquaflow.render.transfers import water_in, water_out
+from aquaflow.render.views import View
+from aquaflow.water.estimation import WaterEstimate, estimating, models_for
+from aquaflow.water.exposure import gain_of, log_gains_of, set_log_gains
+from aquaflow.water.image_formation import Water
+from aquaflow.water.nearest import kept_by
+from aquaflow.water.posed_picture import PosedPicture
+from aquaflow.water.shading import shading_basis
+from aquaflow.water.sightings import sighting
 
 
 @torch.no_grad()

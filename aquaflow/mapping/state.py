@@ -15,20 +15,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from aquaflow.base.errors import DamagedError
+from aquaflow.base.errors.failures import Failures
 from aquaflow.config import MappingConfig
-from aquaflow.errors import DamagedError
-from aquaflow.errors.failures import Failures
+from aquaflow.geometry.arrays import Arrays, of_camera, of_sim3, prefixed, to_camera, to_sim3, under
 from aquaflow.geometry.camera import CameraModel
-from aquaflow.mapping.decoder.neural import NeuralGaussians
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.transfers import checkpoint_in, checkpoint_out
-from aquaflow.mapping.views import View
-from aquaflow.mapping.water.exposure import log_gains_of, set_log_gain
-from aquaflow.mapping.water.white_balance import WhiteBalance
+from aquaflow.mapping.neural.neural import NeuralGaussians
 from aquaflow.render.adam import SelectiveAdam
 from aquaflow.render.contract import CPU, Renderer
 from aquaflow.render.dense_adam import STEP, DenseAdam
-from aquaflow.storage.arrays import Arrays, of_camera, of_sim3, prefixed, to_camera, to_sim3, under
+from aquaflow.render.transfers import checkpoint_in, checkpoint_out
+from aquaflow.render.views import View
+from aquaflow.water.exposure import log_gains_of, set_log_gain
+from aquaflow.water.white_balance import WhiteBalance
 
 Facts = dict[str, Any]
 

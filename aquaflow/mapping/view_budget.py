@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from aquaflow.mapping.views import View, in_time
+from aquaflow.render.views import View, in_time
 
 
 def same_group(view: View, views: Sequence[View]) -> list[View]:

@@ -9,13 +9,13 @@ from collections.abc import Generator, Mapping, Sequence
 import numpy as np
 import torch
 
+from aquaflow.base.errors.failures import Failures
 from aquaflow.config import MediumConfig
-from aquaflow.errors.failures import Failures
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.scene_water import adopt_water, fitting_water
-from aquaflow.mapping.views import View, in_time
-from aquaflow.mapping.water.pauses import finished
+from aquaflow.render.views import View, in_time
+from aquaflow.water.pauses import finished
 
 log = logging.getLogger(__name__)
 

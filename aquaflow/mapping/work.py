@@ -10,17 +10,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from aquaflow.clocks.deadline import Deadline
-from aquaflow.errors.failures import Failures
+from aquaflow.base.clocks.deadline import Deadline
+from aquaflow.base.errors.failures import Failures
+from aquaflow.base.profiler import Profiler
+from aquaflow.geometry.arrays import Arrays
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
-from aquaflow.profiler import Profiler
-from aquaflow.storage.arrays import Arrays
 
 if TYPE_CHECKING:
     from aquaflow.mapping.mapper import Mapper
-    from aquaflow.mapping.views import View
     from aquaflow.render.contract import Renderer
+    from aquaflow.render.views import View
 
 MIN_VIEWS = 3
 """Fewer posed frames are not a map, and not worth refining."""

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.errors import InputError
+from aquaflow.base.errors import InputError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.contract import Float
 from aquaflow.prior.depth_card import NETWORK, UNITS, DepthCard

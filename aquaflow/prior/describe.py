@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from aquaflow.errors import InputError, first_line, words_of
+from aquaflow.base.errors import InputError, first_line, words_of
 from aquaflow.prior.depth_card import NETWORK, DepthCard
 from aquaflow.prior.depth_describer import DepthDescriber
 from aquaflow.prior.example_picture import example_picture

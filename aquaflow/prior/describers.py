@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from aquaflow.errors import InputError
+from aquaflow.base.errors import InputError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.compact.quantise import INT8_ENCODER
 from aquaflow.prior.contract import Float, RangeUnit

@@ -7,8 +7,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from aquaflow.base.cores import core_count
 from aquaflow.config.prior import PriorConfig
-from aquaflow.cores import core_count
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.contract import Prior
 from aquaflow.prior.folder import CARD

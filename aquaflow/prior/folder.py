@@ -8,8 +8,8 @@ from typing import Any, Literal
 
 from pydantic import ValidationError
 
+from aquaflow.base.errors import InputError, path_of_key
 from aquaflow.config.stage import Stage
-from aquaflow.errors import InputError, path_of_key
 from aquaflow.prior.depth_card import DepthCard
 
 CARD = "prior.json"

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from aquaflow.errors import AquaFlowError
+from aquaflow.base.errors import AquaFlowError
 
 OPSET = 18
 """ONNX operator set of exported files."""

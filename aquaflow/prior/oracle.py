@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.errors import InputError, reason_of
+from aquaflow.base.errors import InputError, reason_of
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.contract import Float, RangeUnit
 from aquaflow.prior.folder import PriorCard, read_card, sha256_of, write_card

@@ -20,7 +20,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.errors import AquaFlowError, InputError, first_line, reason_of
+from aquaflow.base.errors import AquaFlowError, InputError, first_line, reason_of
 
 log = logging.getLogger(__name__)
 

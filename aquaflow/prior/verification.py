@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.errors import AquaFlowError
+from aquaflow.base.errors import AquaFlowError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.describers import describer_in
 from aquaflow.prior.example_picture import example_picture

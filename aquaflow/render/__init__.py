@@ -8,7 +8,7 @@ from __future__ import annotations
 import warnings
 from typing import TYPE_CHECKING, Literal
 
-from aquaflow.cores import core_count
+from aquaflow.base.cores import core_count
 
 if TYPE_CHECKING:
     from aquaflow.render.contract import Renderer

@@ -15,7 +15,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from aquaflow.errors import AquaFlowError
+from aquaflow.base.errors import AquaFlowError
 from aquaflow.render.adam_rows import Moved, fused_kernel, step_rows, step_rows_fused
 from aquaflow.render.library import Library, library_or_none
 from aquaflow.render.tensor_address import pointer

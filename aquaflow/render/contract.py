@@ -13,7 +13,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from aquaflow.errors import AquaFlowError
+from aquaflow.base.errors import AquaFlowError
 
 DILATION_PX2 = 0.3
 """Low-pass filter of EWA splatting: added to both variances of the projected covariance."""

@@ -2,7 +2,7 @@
 
 The view-independent part of the decoder comes in as a row of ``trunk`` for each Gaussian;
 out come the attributes as they are seen from one camera. Readable definition, and fallback:
-``Decoder.residuals`` and ``apply_residuals`` of :mod:`aquaflow.mapping.decoder.decoder`.
+``Decoder.residuals`` and ``apply_residuals`` of :mod:`aquaflow.mapping.neural.decoder`.
 """
 
 from __future__ import annotations

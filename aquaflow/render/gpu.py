@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from aquaflow.errors import first_line
+from aquaflow.base.errors import first_line
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from importlib import metadata
 import torch
 from torch import Tensor
 
-from aquaflow.errors import AquaFlowError
+from aquaflow.base.errors import AquaFlowError
 from aquaflow.render.activity import active_pixels, touches_active
 from aquaflow.render.contract import (
     DILATION_PX2,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from aquaflow.errors import AquaFlowError
+from aquaflow.base.errors import AquaFlowError
 
 
 def pointer(

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from aquaflow.errors import AquaFlowError
+from aquaflow.base.errors import AquaFlowError
 from aquaflow.render.known_gradient import KnownGradient
 from aquaflow.render.library import Library, library_or_none
 from aquaflow.render.tensor_address import pointer

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from aquaflow.config import MappingConfig
-from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.keyframes import KeyframeStore
-from aquaflow.mapping.views import View
 from aquaflow.mapping.work import Growth, Insertion, MapWork
+from aquaflow.render.views import View
+from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.tracking.frames import FrameClass, Tracked
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 
-from aquaflow.clocks.deadline import Deadline, Now
+from aquaflow.base.clocks.deadline import Deadline, Now
 
 SETTLED, REFINED, EVALUATED = 0.25, 0.55, 0.80
 """Shares of the whole after which a phase ends (docs/measurements.md#finishing)."""

@@ -10,13 +10,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from aquaflow.base.errors.failures import Failures
+from aquaflow.base.profiler import Profiler
 from aquaflow.config import Config
-from aquaflow.errors.failures import Failures
-from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.mapping.no_maps import NoMaps
 from aquaflow.mapping.work import MapWork, OwnedMaps
-from aquaflow.profiler import Profiler
+from aquaflow.telemetry.metric_frame import MetricFrame
 
 if TYPE_CHECKING:
     from aquaflow.slam.contributions import Contributions

@@ -8,18 +8,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from aquaflow.clocks.deadline import Deadline
+from aquaflow.base.clocks.deadline import Deadline
+from aquaflow.base.errors import ConfigError
+from aquaflow.base.errors.failures import Failures
+from aquaflow.base.profiler import Profiler
 from aquaflow.config import Config
-from aquaflow.errors import ConfigError
-from aquaflow.errors.failures import Failures
-from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.mapping.work import MapWork
-from aquaflow.messages import Frame
 from aquaflow.prior.factory import make_prior
-from aquaflow.profiler import Profiler
 from aquaflow.slam.finish_time import FinishTime
 from aquaflow.slam.map_parts import make_contributions, make_maps
+from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.tracking.adjustment.adjuster import Adjuster
 from aquaflow.tracking.anchored import Anchored, Anchors
 from aquaflow.tracking.base.base import Base
@@ -34,11 +33,12 @@ from aquaflow.tracking.metric.metric_frames import MetricFrames
 from aquaflow.tracking.overlay.finder import OverlayFinder
 from aquaflow.tracking.side_work import SideWork
 from aquaflow.tracking.tracker import Tracker
+from aquaflow.types import Frame
 
 if TYPE_CHECKING:
     from aquaflow.mapping.mapper import Mapper
-    from aquaflow.mapping.views import View
     from aquaflow.render.contract import Renderer
+    from aquaflow.render.views import View
 
 SETTLING_ROUNDS = 2
 """Optimisations with telemetry at the end: the second starts from a path that the first pulled

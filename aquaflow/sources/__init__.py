@@ -11,11 +11,11 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
+from aquaflow.base.errors import InputError
 from aquaflow.config.cameras import CameraConfig
 from aquaflow.config.device import MountingConfig
 from aquaflow.config.telemetry import TelemetryConfig
-from aquaflow.errors import InputError
-from aquaflow.messages import CameraModel, Dropped, Frame, TelemetrySample
+from aquaflow.types import CameraModel, Dropped, Frame, TelemetrySample
 
 CAMERAS = "aquaflow.cameras"
 """Group of entry points whose classes are cameras, live or recorded."""

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.errors import ConfigError
+from aquaflow.base.errors import ConfigError
 
 Mask = npt.NDArray[np.bool_]
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.config import SourceConfig
-from aquaflow.errors import ConfigError, InputError
 from aquaflow.geometry.camera import ASPECT_TOLERANCE, CameraModel, guess_camera
 from aquaflow.geometry.rectification import Rectifier
-from aquaflow.messages import Frame
 from aquaflow.sources.mask_file import Mask, fit_mask, read_mask
+from aquaflow.types import Frame
 
 DEFAULT_WIDTH_PX = 480
 """Width mapped when none is asked for: two CPU cores track and map a few such frames a second."""

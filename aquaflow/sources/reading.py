@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import TypeVar
 
+from aquaflow.base.errors.failures import Failures
 from aquaflow.config import SourceConfig
-from aquaflow.errors.failures import Failures
-from aquaflow.messages import Dropped, Frame, TelemetrySample
+from aquaflow.types import Dropped, Frame, TelemetrySample
 
 Event = TypeVar("Event", bound=Frame | Dropped | TelemetrySample)
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from aquaflow.errors import InputError
+from aquaflow.base.errors import InputError
 from aquaflow.sources import RecordedTelemetry, open_recorded_telemetry, telemetry_reader
 
 

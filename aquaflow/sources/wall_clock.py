@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 
-from aquaflow.clocks.wall import WallClockWatch
-from aquaflow.messages import UtcTime
+from aquaflow.base.clocks.wall import WallClockWatch
+from aquaflow.types import UtcTime
 
 SOURCE = "computer/clock"
 """Name of the samples' source."""

@@ -14,12 +14,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.base.errors import InputError
 from aquaflow.config import TrackingConfig
-from aquaflow.errors import InputError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
-from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, Float, Mask, PairGeometry, Prior
 from aquaflow.tracking.frames import FrameClass, Link, Quality, Tracked
 from aquaflow.tracking.learned.fusion import add_learned
@@ -31,6 +30,7 @@ from aquaflow.tracking.pose.expected_matches import expected_matches, is_wide
 from aquaflow.tracking.pose.matcher import KeyframeMatcher, Matched
 from aquaflow.tracking.pose.visibility import agreeing, predicted_matches
 from aquaflow.tracking.wide_steps import WideSteps
+from aquaflow.types import Frame
 
 
 @dataclass

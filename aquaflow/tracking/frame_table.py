@@ -10,10 +10,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from aquaflow.geometry.arrays import SIM3, Array, of_sim3, to_sim3
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.messages import CameraModel, Frame
-from aquaflow.storage.arrays import SIM3, Array, of_sim3, to_sim3
 from aquaflow.tracking.frames import FrameClass, Quality, Tracked
+from aquaflow.types import CameraModel, Frame
 
 CLASSES = list(FrameClass)
 """A row holds a class by its place in here."""

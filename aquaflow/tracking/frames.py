@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
-from aquaflow.messages import Frame
 from aquaflow.prior.contract import PairGeometry
+from aquaflow.types import Frame
 
 
 class FrameClass(str, Enum):

@@ -5,17 +5,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+from aquaflow.base.errors.failures import Failures
 from aquaflow.config import TrackingConfig
-from aquaflow.errors.failures import Failures
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
-from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, PairGeometry, Prior
 from aquaflow.tracking.initialisation.initialiser import Initialiser, calibrated, fused_pointmap
 from aquaflow.tracking.initialisation.learned_start import learned_start
 from aquaflow.tracking.learned.fusion import add_learned
 from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
+from aquaflow.types import Frame
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
+from aquaflow.base.errors.failures import Failures
 from aquaflow.config import TrackingConfig
-from aquaflow.errors.failures import Failures
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.prior.contract import Encoding

@@ -8,7 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from aquaflow.errors.failures import Failures
+from aquaflow.base.errors.failures import Failures
 
 T = TypeVar("T")
 

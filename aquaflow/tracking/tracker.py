@@ -6,13 +6,12 @@ import logging
 from collections.abc import Callable
 from typing import TypeAlias
 
-from aquaflow.clocks.deadline import Deadline
+from aquaflow.base.clocks.deadline import Deadline
+from aquaflow.base.errors.failures import Failures
 from aquaflow.config import TrackingConfig
-from aquaflow.errors.failures import Failures
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore
-from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, PairGeometry, Prior
 from aquaflow.tracking.consistency import ConsistencyMonitor
 from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
@@ -26,6 +25,7 @@ from aquaflow.tracking.returning import Look, Returning, carry
 from aquaflow.tracking.revisits import revisited
 from aquaflow.tracking.side_work import SideWork
 from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
+from aquaflow.types import Frame
 
 log = logging.getLogger(__name__)
 

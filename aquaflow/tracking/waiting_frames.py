@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterable
 from enum import Enum
 from typing import NamedTuple
 
-from aquaflow.messages import Frame
 from aquaflow.tracking.frames import Tracked
+from aquaflow.types import Frame
 
 
 class Wait(Enum):

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.cameras import OakConfig
-from aquaflow.messages import CameraModel
+from aquaflow.types import CameraModel
 
 
 class OakPicture(Protocol):

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.camera import DistortionModel
-from aquaflow.messages import CameraModel
+from aquaflow.types import CameraModel
 
 HALF_PIXEL = 0.5
 """OpenCV puts the centre of the first pixel at 0, AquaFlow at 0.5."""

@@ -19,14 +19,8 @@ from aquaflow.drivers.mounting import BodyFrame, Mounting
 from aquaflow.drivers.oak.backend import ImuReading, OakBackend, OakPicture, OpenBackend
 from aquaflow.drivers.oak.dai_backend import DaiBackend
 from aquaflow.geometry.similarity import BODY_FROM_CAMERA
-from aquaflow.messages import (
-    Acceleration,
-    AngularRate,
-    CameraModel,
-    EncodedPicture,
-    TelemetrySample,
-)
 from aquaflow.sources.newest import Newest
+from aquaflow.types import Acceleration, AngularRate, CameraModel, EncodedPicture, TelemetrySample
 
 MAX_SAMPLES = 8_000
 """IMU samples kept until fetched, then the oldest go: 10 s of both sensors at 400 Hz."""

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.base.errors.extra import load
 from aquaflow.config.cameras import OakConfig
 from aquaflow.drivers.oak.calibration import camera_model, imu_rotation
 from aquaflow.drivers.oak.encoding import JPEG_QUALITY, chosen, said
 from aquaflow.drivers.oak.messages import DaiImuReading, DaiPicture, imu_readings, picture_of
-from aquaflow.errors.extra import load
-from aquaflow.messages import CameraModel
+from aquaflow.types import CameraModel
 
 SEARCH_MS = 500
 """Longest search; the library's own 10 s are long if only the cable is missing."""

@@ -8,14 +8,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from aquaflow.base.errors import ConfigError, reason_of
+from aquaflow.base.errors.extra import load
 from aquaflow.config.can_devices import DbcConfig, DbcSignal
 from aquaflow.drivers.fixes import Fixes, sigma_of
 from aquaflow.drivers.protocol.can_records import CanFraming, frame_of
 from aquaflow.drivers.protocol.packets import PacketDecoder
 from aquaflow.drivers.rotation import Vector, from_euler, normalised
-from aquaflow.errors import ConfigError, reason_of
-from aquaflow.errors.extra import load
-from aquaflow.messages import (
+from aquaflow.types import (
     Acceleration,
     Altitude,
     AngularRate,

@@ -15,9 +15,9 @@ from aquaflow.drivers.protocol.mavlink_samples import SINCE_1970_US, MessageTime
 from aquaflow.drivers.protocol.mavlink_senders import MavlinkSenders
 from aquaflow.drivers.protocol.packets import PacketDecoder
 from aquaflow.drivers.transport.mavlink2rest import Wanted
-from aquaflow.messages import TelemetrySample
 from aquaflow.sources.outbound import OutboundMessage, StatusText
 from aquaflow.sources.pilot import Obey
+from aquaflow.types import TelemetrySample
 
 OUR_COMPONENT = 197
 """MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY."""

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeAlias
 from aquaflow.config.telemetry import MavlinkConfig
 from aquaflow.drivers.fixes import Fixes, sigma_of
 from aquaflow.drivers.rotation import Quaternion, from_euler, inverse, normalised, rotate
-from aquaflow.messages import (
+from aquaflow.types import (
     Acceleration,
     Altitude,
     AngularRate,

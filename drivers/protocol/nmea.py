@@ -17,7 +17,7 @@ from aquaflow.drivers.protocol.nmea_gnss import NmeaGnss
 from aquaflow.drivers.protocol.nmea_sentence import framing, number, parse
 from aquaflow.drivers.protocol.packets import PacketDecoder
 from aquaflow.drivers.protocol.partial import PartialMotion
-from aquaflow.messages import Altitude, Depth, TelemetrySample
+from aquaflow.types import Altitude, Depth, TelemetrySample
 
 log = logging.getLogger(__name__)
 

@@ -16,7 +16,7 @@ from aquaflow.drivers.protocol.can_records import CanFraming, frame_of
 from aquaflow.drivers.protocol.fast_packet import FastPackets
 from aquaflow.drivers.protocol.packets import PacketDecoder
 from aquaflow.drivers.protocol.partial import PartialMotion
-from aquaflow.messages import Altitude, TelemetrySample, UtcTime
+from aquaflow.types import Altitude, TelemetrySample, UtcTime
 
 HEADING, RATE_OF_TURN, ATTITUDE, SPEED, WATER_DEPTH = 127250, 127251, 127257, 128259, 128267
 SYSTEM_TIME, POSITION, FIX, DILUTION = 126992, 129025, 129029, 129539

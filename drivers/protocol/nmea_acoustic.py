@@ -15,7 +15,7 @@ from aquaflow.config.telemetry import NmeaConfig
 from aquaflow.drivers.events import about
 from aquaflow.drivers.fixes import Fixes, sigma_of
 from aquaflow.drivers.protocol.nmea_sentence import number
-from aquaflow.messages import TelemetrySample
+from aquaflow.types import TelemetrySample
 
 log = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ from datetime import datetime, timezone
 from aquaflow.config.telemetry import NmeaConfig
 from aquaflow.drivers.fixes import Fixes, sigma_of
 from aquaflow.drivers.protocol.nmea_sentence import number
-from aquaflow.messages import TelemetrySample, UtcTime
+from aquaflow.types import TelemetrySample, UtcTime
 
 GGA_FIXES = frozenset({1, 2, 3, 4, 5})
 """Qualities of GGA: autonomous, differential, PPS, RTK fixed and float; not: none (0), dead

@@ -16,7 +16,7 @@ from aquaflow.config.instruments import NucleusConfig
 from aquaflow.drivers.device_clock import DeviceClock
 from aquaflow.drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing, PacketDecoder
 from aquaflow.drivers.rotation import from_euler
-from aquaflow.messages import (
+from aquaflow.types import (
     Acceleration,
     Altitude,
     AngularRate,

@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from aquaflow.drivers.device_clock import DeviceClock
 from aquaflow.drivers.link import LinkCounters
 from aquaflow.drivers.plausible import plausible
-from aquaflow.messages import TelemetrySample
+from aquaflow.types import TelemetrySample
 
 log = logging.getLogger(__name__)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from aquaflow.config.device import Assumptions
 from aquaflow.drivers.rotation import from_euler
-from aquaflow.messages import AngularRate, Attitude, TelemetrySample, Velocity
+from aquaflow.types import AngularRate, Attitude, TelemetrySample, Velocity
 
 TILT_LIFE_NS = 500_000_000
 """Roll and pitch older than this are not used: an ROV rocks within a second."""

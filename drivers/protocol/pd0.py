@@ -22,7 +22,7 @@ from aquaflow.drivers.protocol.pd0_axes import (
     from_beams,
     from_earth,
 )
-from aquaflow.messages import Altitude, TelemetrySample, Velocity
+from aquaflow.types import Altitude, TelemetrySample, Velocity
 
 log = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ import struct
 from aquaflow.config.instruments import PingConfig
 from aquaflow.drivers.events import about
 from aquaflow.drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing, PacketDecoder
-from aquaflow.messages import Altitude, TelemetrySample
+from aquaflow.types import Altitude, TelemetrySample
 
 log = logging.getLogger(__name__)
 

@@ -24,13 +24,7 @@ from aquaflow.drivers.protocol.vectornav_frames import (
     line_of,
 )
 from aquaflow.drivers.rotation import from_euler, normalised
-from aquaflow.messages import (
-    Acceleration,
-    AngularRate,
-    Attitude,
-    TelemetrySample,
-    UtcTime,
-)
+from aquaflow.types import Acceleration, AngularRate, Attitude, TelemetrySample, UtcTime
 
 STARTUP = (Field(1, 0), Field(2, 0))
 """Nanoseconds since it was switched on."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from aquaflow.drivers.rotation import from_euler
-from aquaflow.messages import Altitude, Attitude, TelemetrySample, Velocity
+from aquaflow.types import Altitude, Attitude, TelemetrySample, Velocity
 
 NO_BOTTOM_M = -1.0
 """Altitude where the DVL sees no bottom."""

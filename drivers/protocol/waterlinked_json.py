@@ -10,7 +10,7 @@ from aquaflow.config.instruments import WaterLinkedJsonConfig
 from aquaflow.drivers.protocol.lines import LineFraming
 from aquaflow.drivers.protocol.packets import PacketDecoder
 from aquaflow.drivers.protocol.waterlinked import attitude, bottom_track, measured_ns
-from aquaflow.messages import TelemetrySample
+from aquaflow.types import TelemetrySample
 
 LONGEST = 16_384
 """Bytes; a velocity report has about 1000, answers to commands a few times that."""

@@ -8,7 +8,7 @@ from aquaflow.config.instruments import WaterLinkedSerialConfig
 from aquaflow.drivers.protocol.lines import LineFraming
 from aquaflow.drivers.protocol.packets import PacketDecoder
 from aquaflow.drivers.protocol.waterlinked import attitude, bottom_track, measured_ns
-from aquaflow.messages import TelemetrySample
+from aquaflow.types import TelemetrySample
 
 LONGEST = 512
 """Bytes; a velocity report with covariance has about 200."""

@@ -13,7 +13,7 @@ from aquaflow.drivers.ffmpeg import rgb_of
 from aquaflow.drivers.stream.address import for_logs, is_at_a_port
 from aquaflow.drivers.stream.ages import Ages
 from aquaflow.drivers.stream.ffmpeg import OPEN_TIMEOUT_S, format_of, opened
-from aquaflow.messages import CameraModel
+from aquaflow.types import CameraModel
 
 MAX_DAMAGED = 30
 """Pictures in a row that fail to decode before the stream counts as broken: 1 s."""

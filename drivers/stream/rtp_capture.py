@@ -21,7 +21,7 @@ from aquaflow.drivers.stream.ages import Ages
 from aquaflow.drivers.stream.depacketizer import Depacketizer, ReceivedPicture
 from aquaflow.drivers.stream.ffmpeg import OPEN_TIMEOUT_S
 from aquaflow.drivers.stream.session import Session
-from aquaflow.messages import CameraModel
+from aquaflow.types import CameraModel
 
 NEEDED = frozenset({KEY_PICTURE, SEQUENCE_PARAMETERS, PICTURE_PARAMETERS})
 """Types of the units with which decoding begins."""

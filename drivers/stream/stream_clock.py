@@ -4,14 +4,14 @@ A picture's arrival says nothing of its age: what a broken connection, a server 
 back arrives late, and looks fresh. The presentation time that RTP and MPEG-TS carry does tell: its
 distance to the arrival is smallest for the picture that was held back the least, and what another
 one has more, it was late. The least distance of two minutes, the drift of the two clocks taken out,
-is :class:`aquaflow.clocks.device.ClockMapping`'s.
+is :class:`aquaflow.base.clocks.device.ClockMapping`'s.
 """
 
 from __future__ import annotations
 
 from collections import deque
 
-from aquaflow.clocks.device import ClockMapping
+from aquaflow.base.clocks.device import ClockMapping
 
 PACED = 5
 """Pictures by whose pace a connection is judged: 0.13 s at 30 pictures/s."""

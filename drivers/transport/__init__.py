@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeAlias
 
+from aquaflow.base.errors.extra import load
 from aquaflow.config.link import (
     CanConfig,
     Mavlink2restConfig,
@@ -17,7 +18,6 @@ from aquaflow.drivers.transport.can import open_can
 from aquaflow.drivers.transport.mavlink2rest import Wants, open_mavlink2rest
 from aquaflow.drivers.transport.serial import open_serial
 from aquaflow.drivers.transport.socket import open_tcp, open_udp
-from aquaflow.errors.extra import load
 
 OpenLink: TypeAlias = Callable[[], ByteLink]
 """Opens a link anew; raises LinkLostError where the device or its peer is not there."""

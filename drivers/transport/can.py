@@ -9,9 +9,9 @@ import struct
 import time
 from typing import TYPE_CHECKING, Any
 
+from aquaflow.base.errors.extra import load
 from aquaflow.config.link import CanConfig
 from aquaflow.drivers.link import MAX_READ_BYTES, LinkLostError
-from aquaflow.errors.extra import load
 
 if TYPE_CHECKING:
     from can import BusABC, Message

@@ -16,12 +16,12 @@ from itertools import cycle
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 from urllib.parse import quote, urlsplit
 
+from aquaflow.base.errors.extra import load
 from aquaflow.config.link import Mavlink2restConfig
 from aquaflow.drivers.events import about
 from aquaflow.drivers.link import MAX_READ_BYTES, ByteLink, LinkLostError
 from aquaflow.drivers.mavlink_dialect import dialect
 from aquaflow.drivers.transport.mavlink_json import packet_of, report_of
-from aquaflow.errors.extra import load
 
 log = logging.getLogger(__name__)
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from aquaflow.base.errors.extra import load
 from aquaflow.config.link import SerialConfig
 from aquaflow.drivers.link import MAX_READ_BYTES, LinkLostError
-from aquaflow.errors.extra import load
 
 if TYPE_CHECKING:
     from serial import Serial

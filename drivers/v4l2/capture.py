@@ -21,7 +21,7 @@ from aquaflow.drivers.v4l2.discovery import capabilities
 from aquaflow.drivers.v4l2.pixels import JPEG_PIXELS, STREAMED, to_rgb
 from aquaflow.drivers.v4l2.planes import Layout, SinglePlanar, layout_of
 from aquaflow.drivers.v4l2.system import KernelInterface, call, supported
-from aquaflow.messages import CameraModel, EncodedPicture
+from aquaflow.types import CameraModel, EncodedPicture
 
 
 class V4l2Capture:

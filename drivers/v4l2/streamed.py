@@ -10,7 +10,7 @@ from aquaflow.drivers.capture import RawPicture, no_file, nothing_to_release
 from aquaflow.drivers.ffmpeg import rgb_of
 from aquaflow.drivers.h264 import Units, decoded, units_of
 from aquaflow.drivers.v4l2.capture import V4l2Capture
-from aquaflow.messages import CameraModel
+from aquaflow.types import CameraModel
 
 WAIT_S = 0.2
 """Longest wait for one buffer."""

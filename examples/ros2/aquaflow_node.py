@@ -7,7 +7,7 @@ AquaFlow sends CDR messages of ROS 2's own types over Foxglove's websocket (docs
 this node hands them on byte for byte, so that nothing is encoded twice. It needs rclpy and
 ``python3-websockets`` 11 or newer, and nothing of AquaFlow.
 
-Never run under ROS: there is none where AquaFlow is tested. The tests (tests/service/foxglove) read
+Never run under ROS: there is none where AquaFlow is tested. The tests (tests/live/foxglove) read
 a running dive with ``Connection``, compare all definitions with ROS's published type hashes, and
 let ``republish`` call a stand-in for rclpy. Whether other nodes get the messages was not tried.
 """

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from aquaflow.messages import (
+from aquaflow.sim_drivers.devices.visual_odometry import VisualOdometry
+from aquaflow.types import (
     Acceleration,
     Altitude,
     AngularRate,
@@ -21,7 +22,6 @@ from aquaflow.messages import (
     UtcTime,
     Velocity,
 )
-from aquaflow.sim_drivers.devices.visual_odometry import VisualOdometry
 
 GRAVITY_M_S2 = 9.80665
 """Standard gravity: MAVLink sends accelerations in milli-g."""

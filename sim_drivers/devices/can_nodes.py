@@ -7,7 +7,9 @@ import struct
 from typing import TYPE_CHECKING, Any
 
 from aquaflow.config.can_devices import DbcSignal
-from aquaflow.messages import (
+from aquaflow.sim_drivers.devices.device import OneWayDevice
+from aquaflow.sim_drivers.devices.waterlinked import euler_deg
+from aquaflow.types import (
     Acceleration,
     Altitude,
     AngularRate,
@@ -19,8 +21,6 @@ from aquaflow.messages import (
     UtcTime,
     Velocity,
 )
-from aquaflow.sim_drivers.devices.device import OneWayDevice
-from aquaflow.sim_drivers.devices.waterlinked import euler_deg
 
 if TYPE_CHECKING:
     from can import Message

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Generic, Protocol, TypeAlias, TypeVar
 
-from aquaflow.messages import TelemetrySample
+from aquaflow.types import TelemetrySample
 
 Packet = TypeVar("Packet")
 """bytes on serial lines and sockets, can.Message on a bus."""

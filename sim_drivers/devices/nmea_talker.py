@@ -6,7 +6,9 @@ import math
 from datetime import datetime, timezone
 from functools import reduce
 
-from aquaflow.messages import (
+from aquaflow.sim_drivers.devices.device import OneWayDevice
+from aquaflow.sim_drivers.devices.waterlinked import euler_deg
+from aquaflow.types import (
     Altitude,
     AngularRate,
     Attitude,
@@ -16,8 +18,6 @@ from aquaflow.messages import (
     UtcTime,
     Velocity,
 )
-from aquaflow.sim_drivers.devices.device import OneWayDevice
-from aquaflow.sim_drivers.devices.waterlinked import euler_deg
 
 KNOT_M_S = 1852.0 / 3600.0
 """m/s; a nautical mile of 1852 m in an hour."""

@@ -7,7 +7,8 @@ import struct
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from aquaflow.messages import (
+from aquaflow.sim_drivers.devices.waterlinked import euler_deg
+from aquaflow.types import (
     Acceleration,
     Altitude,
     AngularRate,
@@ -16,7 +17,6 @@ from aquaflow.messages import (
     TelemetrySample,
     Velocity,
 )
-from aquaflow.sim_drivers.devices.waterlinked import euler_deg
 
 ALL_VALID = 0x7FFF
 """Status of a bottom track whose beams and axes are all good."""

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from aquaflow.messages import Altitude, Attitude, TelemetrySample, Velocity
 from aquaflow.sim_drivers.devices.device import OneWayDevice
+from aquaflow.types import Altitude, Attitude, TelemetrySample, Velocity
 
 COORDINATES = {"beam": 0 << 3, "ship": 2 << 3, "earth": 3 << 3 | 4}
 """Byte 25 of the fixed leader; in earth axes the tilts are used."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 
-from aquaflow.messages import Altitude, TelemetrySample
+from aquaflow.types import Altitude, TelemetrySample
 
 POINTS = 200
 """Of a profile."""

@@ -9,16 +9,9 @@ from typing import TypeAlias
 
 import numpy as np
 
-from aquaflow.messages import (
-    Acceleration,
-    AngularRate,
-    Attitude,
-    Position,
-    TelemetrySample,
-    UtcTime,
-)
 from aquaflow.sim_drivers.devices.device import OneWayDevice
 from aquaflow.sim_drivers.devices.waterlinked import euler_deg
+from aquaflow.types import Acceleration, AngularRate, Attitude, Position, TelemetrySample, UtcTime
 
 TRACKING = 0b110
 """Status of a filter that tracks, with a fix of its receiver."""

@@ -7,8 +7,8 @@ import json
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from aquaflow.messages import Altitude, Attitude, TelemetrySample, Velocity
 from aquaflow.sim_drivers.devices.device import OneWayDevice
+from aquaflow.types import Altitude, Attitude, TelemetrySample, Velocity
 
 NO_BOTTOM_M = -1.0
 """What a DVL sends as altitude while it has none."""

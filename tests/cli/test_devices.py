@@ -16,8 +16,8 @@ from aquaflow.cli import devices
 from aquaflow.config.cameras import OakConfig, V4l2Config
 from aquaflow.config.link import CanConfig, SerialConfig
 from aquaflow.drivers import discovery as drivers
+from aquaflow.recordings.images import ImageFolder
 from aquaflow.sim_drivers.camera_feed import CameraFeed
-from aquaflow.sim_drivers.images import ImageFolder
 from aquaflow.sim_drivers.v4l2_kernel import V4l2Kernel
 from aquaflow.sources import discovery
 from aquaflow.sources.discovery import DiscoveryResult, FoundDevice, discover

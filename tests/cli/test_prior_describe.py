@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from aquaflow import cli
-from aquaflow.errors import AquaFlowError
+from aquaflow.base.errors import AquaFlowError
 from aquaflow.prior.folder import read_card
 from tests.prior.tiny_depth import write_network
 

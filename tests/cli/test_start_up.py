@@ -47,7 +47,7 @@ def test_a_heavy_import_would_be_seen() -> None:
 
 @pytest.mark.parametrize(
     "module",
-    ["aquaflow", "aquaflow.config", "aquaflow.errors", "aquaflow.messages", "aquaflow.sources"],
+    ["aquaflow", "aquaflow.config", "aquaflow.base.errors", "aquaflow.types", "aquaflow.sources"],
 )
 def test_importing_the_light_modules_loads_nothing_heavy(module: str) -> None:
     assert loaded_by(f"import {module}")[0] == []

@@ -10,9 +10,9 @@ import pytest
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from aquaflow.base.errors import ConfigError, InputError
+from aquaflow.base.storage.atomic import write_yaml
 from aquaflow.config import Config, Stage, load_config, parse_config
-from aquaflow.errors import ConfigError, InputError
-from aquaflow.storage.atomic import write_yaml
 
 
 def nested(path: str, value: object) -> dict[str, Any]:

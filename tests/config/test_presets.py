@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from aquaflow.base.errors import ConfigError
 from aquaflow.cli.console import PRESETS as PRESETS_IN_HELP
 from aquaflow.config import Config, parse_config
 from aquaflow.config.presets import BY_EFFORT, PRESETS, configured, merged, preset
 from aquaflow.config.vehicle import load_vehicle
-from aquaflow.errors import ConfigError
 
 ON_A_GPU = ("onboard-gpu", "paper")
 

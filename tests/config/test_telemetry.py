@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import yaml
 
+from aquaflow.base.errors import ConfigError
 from aquaflow.config.instruments import WaterLinkedSerialConfig
 from aquaflow.config.telemetry import MavlinkConfig, TelemetryConfig, parse_telemetry
-from aquaflow.errors import ConfigError
 
 VEHICLE = """
 devices:

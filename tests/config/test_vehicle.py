@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 import yaml
 
+from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.config.cameras import OakConfig, StreamConfig, V4l2Config
 from aquaflow.config.vehicle import VehicleConfig, load_vehicle
-from aquaflow.errors import ConfigError, InputError
 from aquaflow.sources import open_camera
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "deploy" / "config").glob("*.yaml"))

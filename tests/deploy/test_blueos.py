@@ -18,10 +18,10 @@ from pydantic import ValidationError
 from aquaflow.config.service import ListenConfig
 from aquaflow.config.vehicle import VehicleConfig, load_vehicle
 from aquaflow.drivers.discovery import SERIAL_PORTS
-from aquaflow.messages import Attitude, Depth
-from aquaflow.service.health.http import HealthServer
+from aquaflow.live.health.http import HealthServer
 from aquaflow.sim_drivers.devices.ardusub import ArduSub
 from aquaflow.sim_drivers.devices.wires import TcpWire
+from aquaflow.types import Attitude, Depth
 from tests.deploy.blueos_models import ExtensionVersion, ServiceMetadata, manifest_entry
 from tests.deploy.dockerfile import instructions, labels_of
 from tests.drivers.simulated_links import Rig, motion, running, until

@@ -12,9 +12,9 @@ from torch import Tensor
 from aquaflow.config import MappingConfig
 from aquaflow.mapping import state
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.transfer_counts import transfers
 from aquaflow.render.contract import CPU, Rendering
 from aquaflow.render.reference import ReferenceRenderer
+from aquaflow.render.transfer_counts import transfers
 from tests.mapping.mapping_scenes import (
     CAMERA,
     flat_pointmap,
@@ -30,7 +30,7 @@ from tests.pretended_device import PRETENDED
 
 KERNELS = ("photometric", "view_loss", "water", "adam", "activation")
 FITTED = tuple(f"aquaflow.render.{name}" for name in KERNELS)
-DECODE = "aquaflow.mapping.decoder.decode"
+DECODE = "aquaflow.mapping.neural.decode"
 """Modules that take the compiled kernels where there are any."""
 
 ALL_PARTS: dict[str, dict[str, Any]] = {

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from aquaflow.base.errors.failures import Failures
 from aquaflow.config import Config
-from aquaflow.errors.failures import Failures
-from aquaflow.mapping.decoder.regrouping import is_whole
 from aquaflow.mapping.maps import Maps
+from aquaflow.mapping.neural.regrouping import is_whole
 from aquaflow.mapping.state import serialise
 from aquaflow.mapping.work import Growth
 from aquaflow.render.contract import CPU

@@ -19,13 +19,13 @@ from typing import Any
 import pytest
 import torch
 
-from aquaflow.errors import NotMappedError
-from aquaflow.evaluation.bench.ci_suite import ci_scenes
-from aquaflow.evaluation.bench.job import Job
-from aquaflow.evaluation.bench.scene import BenchmarkScene
-from aquaflow.evaluation.bench.worker import perform
-from aquaflow.mapping.transfer_counts import transfers
+from aquaflow.base.errors import NotMappedError
+from aquaflow.lab.bench.ci_suite import ci_scenes
+from aquaflow.lab.bench.job import Job
+from aquaflow.lab.bench.scene import BenchmarkScene
+from aquaflow.lab.bench.worker import perform
 from aquaflow.render.contract import CPU
+from aquaflow.render.transfer_counts import transfers
 from tests.device.device_scenes import without_kernels
 from tests.device.gsplats_place import machine_with
 from tests.pretended_device import PRETENDED, pretended_device

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 from aquaflow.api.map import load_map
-from aquaflow.dive.scale_bar import between_pixels
-from aquaflow.evaluation.bench.measure import measured
-from aquaflow.evaluation.bench.scene import BenchmarkScene
-from aquaflow.export.map_file import read_map_file
-from aquaflow.export.ply import read_ply
-from aquaflow.export.restored import export_restored
+from aquaflow.base.storage.facts_file import read_facts_file
+from aquaflow.dive.map_file import read_map_file
+from aquaflow.dive.ply import read_ply
+from aquaflow.dive.restored import export_restored
+from aquaflow.lab.bench.measure import measured
+from aquaflow.lab.bench.scene import BenchmarkScene
 from aquaflow.render.contract import CPU
-from aquaflow.storage.facts_file import read_facts_file
+from aquaflow.survey.measure.scale_bar import between_pixels
 from tests.device.device_scenes import WHERE, counted
 from tests.device.gsplats_place import KernelsOfTheDevice, machine_with
 from tests.device.whole_dives import map_on, write_dimmed_dive

@@ -13,20 +13,20 @@ import pytest
 
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.config.viewer import ViewerConfig
-from aquaflow.messages import Frame
-from aquaflow.service.checkpoint.generations import read_state, state_file
-from aquaflow.service.checkpoint.resume import resumed
-from aquaflow.service.health.degradation import DegradationLevel
-from aquaflow.service.live_dive import LiveDive
-from aquaflow.service.live_viewer import LiveViewer
-from aquaflow.service.report import report
+from aquaflow.live.checkpoint.generations import read_state, state_file
+from aquaflow.live.checkpoint.resume import resumed
+from aquaflow.live.health.degradation import DegradationLevel
+from aquaflow.live.live_dive import LiveDive
+from aquaflow.live.live_viewer import LiveViewer
+from aquaflow.live.report import report
 from aquaflow.sources import open_recording
+from aquaflow.types import Frame
 from tests.device.device_scenes import on_host
 from tests.device.gsplats_place import machine_with
 from tests.device.whole_dives import FRAMES, write_dimmed_dive
+from tests.live.live_scenes import ToldFeed, caught_up
 from tests.pretended_allocator import DEFAULT_BYTES
 from tests.pretended_device import PRETENDED, Device
-from tests.service.live_scenes import ToldFeed, caught_up
 from tests.small_recording import GIVE_UP_S
 
 pytestmark = [pytest.mark.usefixtures("nothing_strays", "repaired"), pytest.mark.ci]

@@ -6,17 +6,17 @@ import threading
 
 import pytest
 
+from aquaflow.base.errors.failures import Failures
 from aquaflow.config import Config
 from aquaflow.config.service import LiveMappingConfig
-from aquaflow.errors.failures import Failures
+from aquaflow.live.health.degradation import DegradationLevel
+from aquaflow.live.health.heartbeats import Heartbeats
+from aquaflow.live.map_thread import MapThread
 from aquaflow.mapping.maps import Maps
 from aquaflow.mapping.work import Growth
 from aquaflow.render.contract import CPU
-from aquaflow.service.health.degradation import DegradationLevel
-from aquaflow.service.health.heartbeats import Heartbeats
-from aquaflow.service.map_thread import MapThread
-from aquaflow.viewer.copies import MapCopy
-from aquaflow.viewer.snapshot import copied
+from aquaflow.survey.viewer.copies import MapCopy
+from aquaflow.survey.viewer.snapshot import copied
 from tests.device.device_scenes import SMALL, SinglePrecision, everything
 from tests.mapping.mapping_scenes import flat_pointmap, floor, path, picture, view_of
 from tests.pretended_allocator import DEFAULT_BYTES

@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from aquaflow.api.map import Map
-from aquaflow.errors import AquaFlowError
+from aquaflow.base.errors import AquaFlowError
 from aquaflow.mapping import state
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.contract import CPU
 from aquaflow.render.cpu import CpuRenderer
-from aquaflow.viewer.copies import shown
-from aquaflow.viewer.snapshot import copied
+from aquaflow.survey.viewer.copies import shown
+from aquaflow.survey.viewer.snapshot import copied
 from tests.device.device_scenes import (
     SMALL,
     WHERE,

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from aquaflow.evaluation.bench.ci_suite import DIMMED, PAUSED, PLAIN
-from aquaflow.evaluation.bench.scene import BenchmarkScene
+from aquaflow.lab.bench.ci_suite import DIMMED, PAUSED, PLAIN
+from aquaflow.lab.bench.scene import BenchmarkScene
 from tests.device.suite import (
     COMPILED,
     DEVICE,

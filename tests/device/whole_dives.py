@@ -11,9 +11,9 @@ from aquaflow.config import Config
 from aquaflow.config.presets import merged
 from aquaflow.dive.replay import map_recording
 from aquaflow.dive.run import Finished
-from aquaflow.evaluation.bench.altered import dim_light
+from aquaflow.lab.bench.altered import dim_light
+from aquaflow.lab.synthetic import SyntheticConfig, write_dive
 from aquaflow.sources import open_recording
-from aquaflow.synthetic import SyntheticConfig, write_dive
 from tests.device.device_scenes import ALL_PARTS
 from tests.device.gsplats_place import machine_with
 

@@ -14,9 +14,9 @@ import pytest
 from aquaflow.config import Config
 from aquaflow.dive import replay, run
 from aquaflow.geometry.camera import load_camera
+from aquaflow.geometry.camera_file import save_camera
 from aquaflow.keyframes import Keyframe
 from aquaflow.sources import open_recording
-from aquaflow.storage.camera_file import save_camera
 from tests.command_line import Cli
 
 TRACKING = Config.model_validate({"threads": 1, "mapping": {"enabled": False}})

@@ -9,11 +9,11 @@ import yaml
 
 from aquaflow.config import Config
 from aquaflow.dive.replay import map_recording
-from aquaflow.evaluation.protocol import evaluate_dive
 from aquaflow.geometry.camera import load_camera
 from aquaflow.geometry.port import FlatPort
+from aquaflow.lab.evaluation.protocol import evaluate_dive
+from aquaflow.lab.synthetic import SyntheticConfig, write_dive
 from aquaflow.sources import open_recording
-from aquaflow.synthetic import SyntheticConfig, write_dive
 
 SMALL = {"frames": 16, "width": 160, "height": 120, "supersampling": 1, "speed_m_s": 0.4}
 HASTY = yaml.safe_load((Path(__file__).parents[1] / "hasty.yaml").read_text())

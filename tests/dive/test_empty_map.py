@@ -9,9 +9,9 @@ import pytest
 
 from aquaflow.config import Config
 from aquaflow.dive.shortcomings import shortcomings
-from aquaflow.evaluation.bench.job import Job
-from aquaflow.evaluation.bench.runner import in_process
-from aquaflow.evaluation.bench.scene import BenchmarkScene
+from aquaflow.lab.bench.job import Job
+from aquaflow.lab.bench.runner import in_process
+from aquaflow.lab.bench.scene import BenchmarkScene
 from tests.command_line import run_aquaflow
 
 THE_PAPERS = {"mapping": {"insertion": {"tau_a": 1.0}, "medium": {"fit": False}}}

@@ -13,13 +13,13 @@ import pytest
 from aquaflow.config import Config, load_config
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.held_out import spread
+from aquaflow.dive.ply import read_ply
 from aquaflow.dive.run import DiveRun, Finished
-from aquaflow.evaluation.trajectory import read_tum
-from aquaflow.export.ply import read_ply
-from aquaflow.messages import Frame
+from aquaflow.lab.evaluation.trajectory import read_tum
 from aquaflow.slam import Slam
 from aquaflow.slam.finish_time import EVALUATED, REFINED, SETTLED, FinishTime
 from aquaflow.sources import open_recording
+from aquaflow.types import Frame
 
 SECONDS = 30.0
 FRAMES = 14

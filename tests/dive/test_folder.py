@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 import pytest
 
+from aquaflow.base.errors import InputError
 from aquaflow.config import Config, load_config
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.frames_csv import FrameRow
-from aquaflow.errors import InputError
-from aquaflow.evaluation.trajectory import read_tum
-from aquaflow.export.ply import read_ply
+from aquaflow.dive.ply import read_ply
 from aquaflow.geometry.camera import load_camera
+from aquaflow.lab.evaluation.trajectory import read_tum
 from tests.small_recording import FRAMES, HEIGHT, WIDTH
 
 METRICS = {

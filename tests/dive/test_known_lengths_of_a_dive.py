@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from aquaflow.config import parse_config
-from aquaflow.evaluation.trajectory import associate, read_tum
 from aquaflow.geometry.alignment import align
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.lab.evaluation.trajectory import associate, read_tum
 from tests.command_line import run_aquaflow
-from tests.fusion.known_lengths.boards_in_pictures import Printed
 from tests.small_recording import HASTY
+from tests.telemetry.known_lengths.boards_in_pictures import Printed
 
 TAG = {"kind": "markers", "dictionary": "APRILTAG_16h5", "marker_m": 0.7, "sigma_m": 0.002}
 """A poster, so that the small pictures show it with 50 px."""

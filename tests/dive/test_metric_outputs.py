@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 import aquaflow
 from aquaflow.config import Config, load_config
-from aquaflow.dive.deliverables import Deliverables
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.metric_outputs import (
     MetricOutputs,
@@ -20,16 +19,17 @@ from aquaflow.dive.metric_outputs import (
     utc_numbers,
     worlds_in_words,
 )
-from aquaflow.evaluation.trajectory import read_tum
-from aquaflow.export.ply import read_ply
-from aquaflow.export.trajectory_csv import read_trajectory_csv
-from aquaflow.fusion.metric_frame import MetricFrame
-from aquaflow.fusion.telemetry import Telemetry
+from aquaflow.dive.ply import read_ply
+from aquaflow.dive.trajectory_csv import read_trajectory_csv
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.messages import Frame, UtcTime
+from aquaflow.lab.evaluation.trajectory import read_tum
 from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation
+from aquaflow.survey.deliverables import Deliverables
+from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.telemetry import Telemetry
+from aquaflow.types import Frame, UtcTime
 from tests.metric_scenes import SCALE, SHIFT, TURN, metric_frame
 
 SETTINGS = load_config(Path(__file__).parents[1] / "hasty.yaml")

@@ -10,12 +10,12 @@ import pytest
 from aquaflow.config import Config, parse_config
 from aquaflow.dive import calibration_pass
 from aquaflow.dive.replay import map_recording
-from aquaflow.messages import Frame
+from aquaflow.lab.synthetic import SyntheticConfig, write_dive
 from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
-from aquaflow.synthetic import SyntheticConfig, write_dive
 from aquaflow.tracking.lens_matches import LensView
 from aquaflow.tracking.overlay.finder import OverlayFinder
+from aquaflow.types import Frame
 from tests.slam_scenes import ToldTracker, frame_of
 
 FRAMES = 12

@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow.dive.metric_outputs import MetricOutputs, Navigation
 from aquaflow.dive.path_rows import path_rows
-from aquaflow.export.trajectory_csv import PoseRow
-from aquaflow.fusion.metric_frame import MetricFrame
-from aquaflow.fusion.telemetry import Telemetry
+from aquaflow.dive.trajectory_csv import PoseRow
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.messages import Depth, Frame, UtcTime
+from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.telemetry import Telemetry
 from aquaflow.tracking.frames import FrameClass, Tracked
+from aquaflow.types import Depth, Frame, UtcTime
 from tests.metric_scenes import SIGMAS, TRONDHEIM, metric_frame
 
 S = 1_000_000_000

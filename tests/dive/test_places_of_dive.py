@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aquaflow.base.errors import InputError
 from aquaflow.config import Config
 from aquaflow.dive import places_of_dive
 from aquaflow.dive.replay import map_recording
-from aquaflow.errors import InputError
-from aquaflow.fusion.metric_file import read_metric_file
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes.place import Place
 from aquaflow.keyframes.places_file import NAME, PlacesFile, Rows
 from aquaflow.keyframes.store import Keyframe
 from aquaflow.sources import open_recording
+from aquaflow.telemetry.metric_file import read_metric_file
 from aquaflow.tracking.graph.table import Snapshot
 
 TRACKING_ONLY = Config.model_validate({"mapping": {"enabled": False}, "source": {"stop": 14}})

@@ -11,14 +11,14 @@ import cv2
 import numpy as np
 import pytest
 
+from aquaflow.base.errors import InputError, NotMappedError
 from aquaflow.config import Config, SourceConfig
 from aquaflow.dive.replay import map_recording
-from aquaflow.errors import InputError, NotMappedError
-from aquaflow.messages import Frame
-from aquaflow.sim_drivers.synthetic import SyntheticDive
+from aquaflow.recordings.synthetic import SyntheticDive
 from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation
+from aquaflow.types import Frame
 from tests.command_line import Cli
 from tests.small_recording import FRAMES, HASTY, HEIGHT, QUICK, WIDTH
 

@@ -17,9 +17,9 @@ from aquaflow.dive.results import (
 from aquaflow.dive.water_summary import water_of
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.messages import Dropped, Frame
 from aquaflow.slam import Slam
 from aquaflow.tracking.frames import FrameClass, Tracked
+from aquaflow.types import Dropped, Frame
 
 PICTURE = np.zeros((48, 64, 3), np.uint8)
 

@@ -17,9 +17,9 @@ from aquaflow.dive import calibration_pass, replay, run
 from aquaflow.dive.calibration_pass import found_in
 from aquaflow.dive.found_camera import FoundCamera, in_words, usable
 from aquaflow.geometry.camera import guess_camera, load_camera
-from aquaflow.messages import Dropped, Frame
 from aquaflow.sources import RecordedCamera, open_recording
 from aquaflow.tracking.self_calibration import FoundLens
+from aquaflow.types import Dropped, Frame
 from tests.small_recording import FRAMES, WIDTH
 
 TRACKING = Config.model_validate({"threads": 1, "mapping": {"enabled": False}})

@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from aquaflow.base.errors import InputError
+from aquaflow.base.errors.failures import Failures
 from aquaflow.dive.run import DiveRun
 from aquaflow.dive.synchronisation import synchronise, turns_of
-from aquaflow.errors import InputError
-from aquaflow.errors.failures import Failures
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.messages import AngularRate, Depth, TelemetrySample
-from aquaflow.sim_drivers.images import SUBFOLDER
+from aquaflow.recordings.images import SUBFOLDER
 from aquaflow.sources import RecordedTelemetry
 from aquaflow.sources.telemetry_input import TelemetryInput, open_telemetry
+from aquaflow.types import AngularRate, Depth, TelemetrySample
 from tests.command_line import Cli, refused
-from tests.fusion.turning import random_rates
 from tests.small_recording import HASTY
+from tests.telemetry.turning import random_rates
 
 OFFSET_S = 4.25
 SECONDS, STEP_S = 30.0, 0.05

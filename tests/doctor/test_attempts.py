@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import torch
 
+from aquaflow.base.errors import AquaFlowError
 from aquaflow.doctor import attempts
 from aquaflow.doctor.attempts import Attempt, apart, draw, infer
-from aquaflow.errors import AquaFlowError
 from aquaflow.prior import runtime
 from aquaflow.prior.runtime import PROVIDERS
 from aquaflow.render import example_scene, gpu

@@ -16,12 +16,12 @@ from aquaflow.drivers.oak import OakCamera
 from aquaflow.drivers.stream import StreamCamera
 from aquaflow.drivers.v4l2 import V4l2Camera
 from aquaflow.geometry.camera import guess_camera
-from aquaflow.messages import CameraModel, Dropped, Frame
 from aquaflow.sim_drivers.camera_feed import CameraFaults, CameraFeed
 from aquaflow.sim_drivers.mjpeg_server import MjpegServer
 from aquaflow.sim_drivers.oak import ReplayOak
 from aquaflow.sim_drivers.rtp_camera import RtpCamera
 from aquaflow.sim_drivers.v4l2_kernel import CameraSpec, V4l2Kernel
+from aquaflow.types import CameraModel, Dropped, Frame
 from tests.small_recording import GIVE_UP_S
 
 WIDTH, HEIGHT, COUNT = 64, 48, 40

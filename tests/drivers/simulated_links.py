@@ -22,18 +22,6 @@ from aquaflow.config.telemetry import TelemetryConfig, parse_telemetry
 from aquaflow.drivers.link import LinkCounters
 from aquaflow.drivers.telemetry import LinkTelemetry
 from aquaflow.drivers.transport import opener
-from aquaflow.messages import (
-    Acceleration,
-    Altitude,
-    AngularRate,
-    Attitude,
-    Depth,
-    Lights,
-    Position,
-    TelemetrySample,
-    UtcTime,
-    Velocity,
-)
 from aquaflow.sim_drivers.devices.ardusub import ArduSub
 from aquaflow.sim_drivers.devices.can_nodes import DbcNode, Nmea2000Instruments
 from aquaflow.sim_drivers.devices.device import SimulatedDevice
@@ -45,6 +33,18 @@ from aquaflow.sim_drivers.devices.vectornav import VectorNav
 from aquaflow.sim_drivers.devices.waterlinked import WaterLinkedJson, WaterLinkedSerial
 from aquaflow.sim_drivers.devices.wires import CanWire, PtyWire, TcpWire, UdpWire
 from aquaflow.sim_drivers.faults import Faults, faulty
+from aquaflow.types import (
+    Acceleration,
+    Altitude,
+    AngularRate,
+    Attitude,
+    Depth,
+    Lights,
+    Position,
+    TelemetrySample,
+    UtcTime,
+    Velocity,
+)
 from tests.small_recording import GIVE_UP_S
 
 SPEED = 4.0

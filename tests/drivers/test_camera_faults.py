@@ -9,8 +9,8 @@ import pytest
 
 from aquaflow.drivers.camera_state import CameraState
 from aquaflow.drivers.exposure_clock import MAX_LATENCY_NS
-from aquaflow.messages import Dropped, Frame
 from aquaflow.sim_drivers.camera_feed import CameraFaults, first_images
+from aquaflow.types import Dropped, Frame
 from tests.drivers.camera_scenes import COUNT, KINDS, Pictures, live, settled, until
 
 every_kind = pytest.mark.parametrize("kind", KINDS)

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from aquaflow.base.errors import ConfigError
 from aquaflow.config.can_devices import DbcConfig, Nmea2000Config
 from aquaflow.drivers.protocol.dbc import DbcDecoder
 from aquaflow.drivers.protocol.nmea2000 import Nmea2000Decoder, group_of
 from aquaflow.drivers.transport.can import EXTENDED, RECORD
-from aquaflow.errors import ConfigError
-from aquaflow.messages import Altitude, Attitude, Depth, Position, UtcTime, Velocity
+from aquaflow.types import Altitude, Attitude, Depth, Position, UtcTime, Velocity
 from tests.drivers.simulated_links import DBC, DBC_SIGNALS
 
 NOW = 9_000_000_000

@@ -14,13 +14,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from aquaflow.base.errors import InputError
 from aquaflow.config.cameras import OakConfig
 from aquaflow.drivers.oak import OakCamera
 from aquaflow.drivers.oak.calibration import camera_model, imu_rotation
 from aquaflow.drivers.oak.dai_backend import DaiBackend, find_device
 from aquaflow.drivers.oak.encoding import LINK_BYTES_S
 from aquaflow.drivers.oak.messages import imu_readings, nanoseconds, picture_of
-from aquaflow.errors import InputError
 
 os.environ.setdefault("DEPTHAI_LEVEL", "off")
 dai = pytest.importorskip("depthai", reason="depthai is not installed: pip install aquaflow[oak]")

@@ -11,9 +11,9 @@ import pytest
 
 from aquaflow.drivers.camera_state import CameraState
 from aquaflow.drivers.live import LiveCamera
-from aquaflow.messages import Frame
 from aquaflow.sim_drivers.camera_feed import CameraFaults, CameraFeed, Shot
 from aquaflow.sim_drivers.rtp_camera import RtspCamera
+from aquaflow.types import Frame
 from tests.drivers.camera_scenes import COUNT, Pictures, closing, settled, stream
 
 FPS = 25.0

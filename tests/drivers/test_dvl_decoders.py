@@ -10,9 +10,9 @@ from aquaflow.config.instruments import Pd0Config, WaterLinkedJsonConfig, WaterL
 from aquaflow.drivers.protocol.pd0 import Pd0Decoder
 from aquaflow.drivers.protocol.waterlinked_json import WaterLinkedJsonDecoder
 from aquaflow.drivers.protocol.waterlinked_serial import WaterLinkedSerialDecoder, crc8
-from aquaflow.messages import Altitude, Attitude, Velocity
 from aquaflow.sim_drivers.devices.pd0 import Pd0Dvl, ensemble
 from aquaflow.sim_drivers.devices.waterlinked import line
+from aquaflow.types import Altitude, Attitude, Velocity
 
 NOW = 90_000_000_000
 LINK = {"kind": "serial", "port": "/dev/null"}

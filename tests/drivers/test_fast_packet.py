@@ -11,7 +11,7 @@ from aquaflow.config.can_devices import Nmea2000Config
 from aquaflow.drivers.protocol.fast_packet import FastPackets
 from aquaflow.drivers.protocol.nmea2000 import Nmea2000Decoder
 from aquaflow.drivers.transport.can import EXTENDED, RECORD
-from aquaflow.messages import Position, TelemetrySample, UtcTime
+from aquaflow.types import Position, TelemetrySample, UtcTime
 
 NOW = 9_000_000_000
 COUNT = 2000

@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aquaflow.base.errors import InputError
 from aquaflow.config.cameras import LiveCameraConfig
 from aquaflow.drivers.camera_state import CameraState
 from aquaflow.drivers.capture import Capture, RawPicture
 from aquaflow.drivers.live import LiveCamera
-from aquaflow.errors import InputError
 from aquaflow.geometry.camera import guess_camera
-from aquaflow.messages import CameraModel, Dropped, Frame
-from aquaflow.storage.camera_file import save_camera
+from aquaflow.geometry.camera_file import save_camera
+from aquaflow.types import CameraModel, Dropped, Frame
 from tests.drivers.camera_scenes import QUICK, closing, settled
 
 SIZE = (32, 24)

@@ -14,19 +14,19 @@ from typing import Any, get_args
 
 import pytest
 
+from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.config.telemetry import MavlinkConfig, MavlinkSource, parse_telemetry
 from aquaflow.drivers.link import LinkLostError
 from aquaflow.drivers.protocol.mavlink import MavlinkDecoder
 from aquaflow.drivers.telemetry import LinkTelemetry
 from aquaflow.drivers.transport import opener
 from aquaflow.drivers.transport.mavlink2rest import binary
-from aquaflow.errors import ConfigError, InputError
-from aquaflow.messages import Altitude, Attitude, Depth, TelemetrySample
+from aquaflow.recordings.telemetry_log import DecodedReads, Read
 from aquaflow.sim_drivers.devices.ardusub import ArduSub
 from aquaflow.sim_drivers.devices.device import SimulatedDevice
 from aquaflow.sim_drivers.devices.mavlink2rest import Mavlink2restWire
-from aquaflow.sim_drivers.telemetry_log import DecodedReads, Read
 from aquaflow.sources.outbound import NamedValue, StatusText
+from aquaflow.types import Altitude, Attitude, Depth, TelemetrySample
 from tests.drivers.simulated_links import AUTOPILOT, MAVLINK, motion, until
 
 DIALECT: Any = import_module("pymavlink.dialects.v20.ardupilotmega")

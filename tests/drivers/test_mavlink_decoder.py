@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from aquaflow.config.telemetry import MavlinkConfig
 from aquaflow.drivers.protocol.mavlink import MavlinkDecoder
 from aquaflow.drivers.protocol.mavlink_frames import MavlinkFraming
-from aquaflow.messages import (
+from aquaflow.types import (
     Acceleration,
     Altitude,
     AngularRate,

@@ -12,7 +12,7 @@ import pytest
 
 from aquaflow.config.telemetry import MavlinkConfig
 from aquaflow.drivers.protocol.mavlink import MavlinkDecoder
-from aquaflow.messages import Altitude, AngularRate, Position, TelemetrySample, UtcTime, Velocity
+from aquaflow.types import Altitude, AngularRate, Position, TelemetrySample, UtcTime, Velocity
 
 DIALECT: Any = import_module("pymavlink.dialects.v20.ardupilotmega")
 COUNT = 2000

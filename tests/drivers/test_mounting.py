@@ -10,7 +10,7 @@ from aquaflow.config.device import MountingConfig
 from aquaflow.drivers import rotation
 from aquaflow.drivers.mounting import BodyFrame, Mounting
 from aquaflow.drivers.plausible import plausible
-from aquaflow.messages import (
+from aquaflow.types import (
     Acceleration,
     Altitude,
     AngularRate,

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from aquaflow.base.errors import InputError
 from aquaflow.config.cameras import StreamConfig
 from aquaflow.config.telemetry import TelemetryConfig
 from aquaflow.drivers.network_discovery import conversation
@@ -18,7 +19,6 @@ from aquaflow.drivers.network_discovery.onvif import onvif_cameras
 from aquaflow.drivers.network_discovery.rtp import rtp_payload, rtp_streams
 from aquaflow.drivers.network_discovery.rtsp import rtsp_streams
 from aquaflow.drivers.network_discovery.waterlinked import NAME, waterlinked_dvls
-from aquaflow.errors import InputError
 from aquaflow.sim_drivers.devices.ardusub import ArduSub
 from aquaflow.sim_drivers.devices.device import SimulatedDevice
 from aquaflow.sim_drivers.devices.waterlinked import WaterLinkedJson

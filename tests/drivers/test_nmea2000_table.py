@@ -13,7 +13,7 @@ import pytest
 from aquaflow.config.can_devices import Nmea2000Config
 from aquaflow.drivers.protocol.nmea2000 import Nmea2000Decoder
 from aquaflow.drivers.transport.can import EXTENDED, RECORD
-from aquaflow.messages import Position, UtcTime
+from aquaflow.types import Position, UtcTime
 
 COUNT = 3000
 NOW = 9_000_000_000

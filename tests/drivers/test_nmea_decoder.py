@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow.config.telemetry import NmeaConfig
 from aquaflow.drivers.protocol.nmea import NmeaDecoder
-from aquaflow.messages import Altitude, AngularRate, Attitude, Depth, Position, UtcTime, Velocity
 from aquaflow.sim_drivers.devices.nmea_talker import sentence
+from aquaflow.types import Altitude, AngularRate, Attitude, Depth, Position, UtcTime, Velocity
 
 NOW = 9_000_000_000
 LINK = {"kind": "serial", "port": "/dev/null"}

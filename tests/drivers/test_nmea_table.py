@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow.config.telemetry import NmeaConfig
 from aquaflow.drivers.protocol.nmea import NmeaDecoder
-from aquaflow.messages import Attitude, Position, TelemetrySample, UtcTime
 from aquaflow.sim_drivers.devices.nmea_talker import sentence
+from aquaflow.types import Attitude, Position, TelemetrySample, UtcTime
 
 pynmea2: Any = import_module("pynmea2")
 COUNT = 2000

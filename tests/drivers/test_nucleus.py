@@ -20,10 +20,10 @@ from aquaflow.config.instruments import NucleusConfig
 from aquaflow.config.telemetry import parse_telemetry
 from aquaflow.drivers.protocol.nucleus import PATIENCE_NS, NucleusDecoder, checksum
 from aquaflow.drivers.telemetry import LinkTelemetry
-from aquaflow.messages import Acceleration, Altitude, AngularRate, Attitude, Depth, Velocity
 from aquaflow.sim_drivers.devices.device import SimulatedDevice
 from aquaflow.sim_drivers.devices.nucleus import Nucleus, packet, summed
 from aquaflow.sim_drivers.devices.wires import TcpWire
+from aquaflow.types import Acceleration, Altitude, AngularRate, Attitude, Depth, Velocity
 from tests.drivers.simulated_links import endless, motion, until
 
 COUNT = 2000

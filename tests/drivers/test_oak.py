@@ -7,12 +7,12 @@ import itertools
 import numpy as np
 import pytest
 
+from aquaflow.base.errors import InputError
 from aquaflow.drivers.oak.camera import MAX_SAMPLES
-from aquaflow.errors import InputError
 from aquaflow.geometry.camera import guess_camera
-from aquaflow.messages import Acceleration, AngularRate, Frame
 from aquaflow.sim_drivers.camera_feed import CameraFaults, CameraFeed
 from aquaflow.sim_drivers.oak import EXPOSURE_S, GRAVITY_M_S2, ISO, ReplayImuReading
+from aquaflow.types import Acceleration, AngularRate, Frame
 from tests.drivers.camera_scenes import HEIGHT, WIDTH, Pictures, closing, feed, oak, until
 
 GRAVITY = (0.0, 0.0, -GRAVITY_M_S2)

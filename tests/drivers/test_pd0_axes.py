@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow.config.instruments import Pd0Config
 from aquaflow.drivers.protocol.pd0 import Pd0Decoder
-from aquaflow.messages import Altitude, Velocity
 from aquaflow.sim_drivers.devices.pd0 import ensemble
+from aquaflow.types import Altitude, Velocity
 
 COUNT = 3000
 NOW = 90_000_000_000

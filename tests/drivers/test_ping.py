@@ -13,10 +13,10 @@ from aquaflow.config.instruments import PingConfig
 from aquaflow.config.telemetry import parse_telemetry
 from aquaflow.drivers.protocol.ping import ANSWER_NS, STREAM_NS, PingDecoder, message
 from aquaflow.drivers.telemetry import LinkTelemetry
-from aquaflow.messages import Altitude
 from aquaflow.sim_drivers.devices.device import SimulatedDevice
 from aquaflow.sim_drivers.devices.ping import Ping1D, frame
 from aquaflow.sim_drivers.devices.wires import UdpWire
+from aquaflow.types import Altitude
 from tests.drivers.simulated_links import motion, until
 
 brping: Any = import_module("brping")

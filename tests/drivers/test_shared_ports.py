@@ -12,19 +12,19 @@ from typing import Any
 
 import pytest
 
+from aquaflow.base.errors import ConfigError
 from aquaflow.config.telemetry import parse_telemetry
 from aquaflow.drivers.link import LinkLostError
 from aquaflow.drivers.shared_ports import PortDivision
 from aquaflow.drivers.telemetry import LinkTelemetry, decoder_of
 from aquaflow.drivers.transport.shared_udp import MOST_WAITING, SharedUdp
-from aquaflow.errors import ConfigError
-from aquaflow.messages import Altitude, Attitude, Velocity
 from aquaflow.sim_drivers.devices.ardusub import ArduSub
 from aquaflow.sim_drivers.devices.device import SimulatedDevice
 from aquaflow.sim_drivers.devices.nmea_talker import NmeaTalker, sentence
 from aquaflow.sim_drivers.devices.pd0 import Pd0Dvl
 from aquaflow.sim_drivers.devices.waterlinked import line
 from aquaflow.sim_drivers.devices.wires import UdpWire
+from aquaflow.types import Altitude, Attitude, Velocity
 from tests.drivers.simulated_links import free_port, motion, until
 
 DIALECT: Any = import_module("pymavlink.dialects.v20.ardupilotmega")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aquaflow.messages import (
+from aquaflow.types import (
     Acceleration,
     Altitude,
     AngularRate,

@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aquaflow.base.errors import InputError
 from aquaflow.drivers import ffmpeg
 from aquaflow.drivers.camera_state import CameraState
 from aquaflow.drivers.stream.address import for_logs
-from aquaflow.errors import InputError
-from aquaflow.messages import Frame
+from aquaflow.recordings.transport_stream import UdpCamera
 from aquaflow.sim_drivers.camera_feed import CameraFeed, first_images
 from aquaflow.sim_drivers.mjpeg_server import MjpegServer
 from aquaflow.sim_drivers.rtp_camera import RtspCamera
-from aquaflow.sim_drivers.transport_stream import UdpCamera
+from aquaflow.types import Frame
 from tests.drivers.camera_scenes import (
     COUNT,
     HEIGHT,

@@ -8,14 +8,14 @@ from importlib.metadata import entry_points
 
 import pytest
 
+from aquaflow.base.errors import InputError
 from aquaflow.config.telemetry import parse_telemetry
 from aquaflow.drivers.telemetry import LinkTelemetry
-from aquaflow.errors import InputError
-from aquaflow.messages import Altitude, Depth, Velocity
+from aquaflow.recordings.telemetry_log import DecodedReads, Read
 from aquaflow.sim_drivers.devices.device import SimulatedDevice, boot_clock
 from aquaflow.sim_drivers.faults import jumping_clock
-from aquaflow.sim_drivers.telemetry_log import DecodedReads, Read
 from aquaflow.sources import TELEMETRY
+from aquaflow.types import Altitude, Depth, Velocity
 from tests.drivers.simulated_links import (
     RIGS,
     endless,

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from aquaflow.base.errors import InputError
 from aquaflow.config.cameras import V4l2Config
 from aquaflow.drivers.capture import UnusablePictureError
 from aquaflow.drivers.v4l2 import V4l2Camera, abi, abi_planes
@@ -20,8 +21,6 @@ from aquaflow.drivers.v4l2.capture import V4l2Capture
 from aquaflow.drivers.v4l2.discovery import camera_nodes, find_camera, modes
 from aquaflow.drivers.v4l2.pixels import to_rgb
 from aquaflow.drivers.v4l2.planes import PictureFormat
-from aquaflow.errors import InputError
-from aquaflow.messages import Frame
 from aquaflow.sim_drivers.camera_feed import CameraFaults, first_images
 from aquaflow.sim_drivers.v4l2_kernel import (
     EXPOSURE_ABSOLUTE,
@@ -30,6 +29,7 @@ from aquaflow.sim_drivers.v4l2_kernel import (
     V4l2Kernel,
 )
 from aquaflow.sim_drivers.v4l2_multiplanar import MultiPlanarKernel
+from aquaflow.types import Frame
 from tests.drivers.camera_scenes import (
     HEIGHT,
     QUICK,

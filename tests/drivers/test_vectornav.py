@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow.config.instruments import VectorNavConfig
 from aquaflow.drivers.protocol.vectornav import VectorNavDecoder
-from aquaflow.messages import Acceleration, AngularRate, Attitude, Position, UtcTime
 from aquaflow.sim_drivers.devices.vectornav import binary, line
+from aquaflow.types import Acceleration, AngularRate, Attitude, Position, UtcTime
 
 COUNT = 3000
 NOW = 60_000_000_000

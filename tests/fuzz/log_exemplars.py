@@ -48,8 +48,8 @@ def _nmea() -> bytes:
 
 def _tlog() -> bytes:
     """MAVLink packets with their times."""
-    from aquaflow.messages import Acceleration, AngularRate, Attitude, Depth
     from aquaflow.sim_drivers.devices.ardusub import ArduSub
+    from aquaflow.types import Acceleration, AngularRate, Attitude, Depth
 
     autopilot, log = ArduSub(), b""
     for k in range(LINES):

@@ -113,7 +113,7 @@ def _how_it_ended(command: str, argv: list[str], folder: Path, ended: Ended) -> 
 
 
 def _kept_traceback(folder: Path) -> str:
-    """What aquaflow/errors/crash_report.py writes for a mistake of our own."""
+    """What aquaflow/base/errors/crash_report.py writes for a mistake of our own."""
     kept = sorted(home_of(folder).rglob("aquaflow-mistake-*.txt"))
     return kept[0].read_text(errors="replace") if kept else ""
 

@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from aquaflow.errors import InputError
+from aquaflow.base.errors import InputError
 from aquaflow.geometry.alignment import align
 from aquaflow.geometry.similarity import Sim3
 

@@ -12,7 +12,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aquaflow.errors import ConfigError, InputError
+from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.geometry.camera import (
     GUESSED_FOCAL_WIDTHS,
     CameraModel,
@@ -21,9 +21,9 @@ from aquaflow.geometry.camera import (
     has_unmeasured_port,
     load_camera,
 )
+from aquaflow.geometry.camera_file import save_camera
 from aquaflow.geometry.port import DomePort, FlatPort, Port
 from aquaflow.geometry.water_index import FRESH_WATER, SEA_WATER, water_index
-from aquaflow.storage.camera_file import save_camera
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 CALIBRATIONS = sorted(SHARED.glob("*/camera.yaml"))

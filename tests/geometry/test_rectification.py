@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from aquaflow.errors import ConfigError
+from aquaflow.base.errors import ConfigError
 from aquaflow.geometry.camera import CameraModel, DistortionModel
 from aquaflow.geometry.distortion import undistort_points
 from aquaflow.geometry.optics import pixels_of_points

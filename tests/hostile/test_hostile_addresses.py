@@ -11,7 +11,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 import pytest
 
 from aquaflow.config.service import ListenConfig
-from aquaflow.service.health.http import HealthServer
+from aquaflow.live.health.http import HealthServer
 from tests.command_line import Cli, refused
 
 

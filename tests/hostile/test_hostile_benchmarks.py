@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from aquaflow.evaluation.bench.picture import draw
-from aquaflow.evaluation.bench.readme import BEGIN, END
+from aquaflow.lab.bench.picture import draw
+from aquaflow.lab.bench.readme import BEGIN, END
 from tests.command_line import Cli, refused
 
 FAILED_ROW = {"scene": "reef", "preset": "fast", "peer": None, "repeat": 0, "failed": "no map"}

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import aquaflow.config
-from aquaflow.errors import crash_report
+from aquaflow.base.errors import crash_report
 from tests.command_line import Cli, refused
 
 OUR_MISTAKE = 70

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from aquaflow.errors import reason_of
+from aquaflow.base.errors import reason_of
 from tests.command_line import Cli
 
 SECRET = "$6$saltsalt$hashhashhash"

@@ -19,7 +19,7 @@ from .child import Ended, forked
 from .dives import Dive
 from .watch import Found, Moment, Site, Strike, Watch
 
-REPORT = "aquaflow/export/report/"
+REPORT = "aquaflow/survey/report/"
 """Our files that draw with matplotlib, which takes a third of a tiny dive's time."""
 
 WATCH = Watch()

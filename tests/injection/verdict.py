@@ -117,8 +117,8 @@ def _is_stated(name: str, stated: str) -> bool:
 
 
 def _read_pose_file(path: Path) -> None:
-    from aquaflow.evaluation.trajectory import read_tum
     from aquaflow.geometry.camera import load_camera
+    from aquaflow.lab.evaluation.trajectory import read_tum
 
     if path.suffix == ".yaml":
         load_camera(path)
@@ -128,8 +128,8 @@ def _read_pose_file(path: Path) -> None:
 
 
 def _read_map_file(path: Path) -> None:
-    from aquaflow.export.map_file import read_map_file
-    from aquaflow.export.ply import read_ply
+    from aquaflow.dive.map_file import read_map_file
+    from aquaflow.dive.ply import read_ply
     from aquaflow.render import select_renderer
 
     if path.suffix == ".html":

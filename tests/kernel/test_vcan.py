@@ -16,7 +16,7 @@ from aquaflow.config.link import CanConfig
 from aquaflow.config.telemetry import parse_telemetry
 from aquaflow.drivers.telemetry import LinkTelemetry
 from aquaflow.drivers.transport import opener
-from aquaflow.messages import Altitude, TelemetrySample
+from aquaflow.types import Altitude, TelemetrySample
 from tests.kernel.virtual_machine import in_guest
 
 pytest.importorskip("can", reason="python-can is not installed")

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aquaflow.base.errors import InputError
 from aquaflow.config.cameras import V4l2Config
 from aquaflow.drivers.camera_state import CameraState
 from aquaflow.drivers.v4l2 import V4l2Camera
 from aquaflow.drivers.v4l2.discovery import camera_nodes, modes
 from aquaflow.drivers.v4l2.system import Kernel
-from aquaflow.errors import InputError
-from aquaflow.messages import Frame
+from aquaflow.types import Frame
 from tests.kernel.virtual_machine import in_guest
 
 BUS, PLANAR_BUS = "platform:vivid-000", "platform:vivid-001"

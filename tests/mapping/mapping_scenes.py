@@ -19,12 +19,12 @@ from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.rendering import show
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.scene_water import adopt_water, fitting_water
-from aquaflow.mapping.views import View
-from aquaflow.mapping.water.estimation import WaterEstimate
-from aquaflow.mapping.water.image_formation import Water
-from aquaflow.mapping.water.pauses import finished
 from aquaflow.render import select_renderer
 from aquaflow.render.contract import Renderer
+from aquaflow.render.views import View
+from aquaflow.water.estimation import WaterEstimate
+from aquaflow.water.image_formation import Water
+from aquaflow.water.pauses import finished
 
 Array = npt.NDArray[np.float64]
 

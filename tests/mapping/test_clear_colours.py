@@ -10,15 +10,15 @@ import torch
 
 from aquaflow.config import Config, MappingConfig
 from aquaflow.dive.folder import DiveFolder
+from aquaflow.dive.ply import read_ply
 from aquaflow.dive.water_summary import summarise_water
-from aquaflow.export.ply import read_ply
-from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.mapping.clear_colours import mean_water, restored_gaussians, restored_radiance
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import drawn_without_water
-from aquaflow.mapping.water.white_balance import WhiteBalance
 from aquaflow.render.activation import radiance
-from aquaflow.viewer.snapshot import copied
+from aquaflow.survey.viewer.snapshot import copied
+from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.water.white_balance import WhiteBalance
 from tests.mapping.mapping_scenes import CAMERA, floor, pose, renderer, view_of
 
 WATER = ((0.9, 0.15, 0.1), (0.05, 0.25, 0.3), (0.5, 0.3, 0.2))

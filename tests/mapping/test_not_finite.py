@@ -11,9 +11,9 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.gaussians.gaussians import GaussianMap
 from aquaflow.mapping.gaussians.insertion import new_gaussians
 from aquaflow.mapping.gaussians.reanchoring import move_gaussians, move_views
-from aquaflow.mapping.views import View, refine_pose
-from aquaflow.mapping.water.exposure import learn_gain, set_log_gains
-from aquaflow.mapping.water.sunlight import learn_light
+from aquaflow.render.views import View, refine_pose
+from aquaflow.water.exposure import learn_gain, set_log_gains
+from aquaflow.water.sunlight import learn_light
 from tests.mapping.mapping_scenes import cloud, view_of
 
 NOWHERE = Sim3(np.eye(3), np.array([np.nan, 0.0, 0.0]))
@@ -70,7 +70,7 @@ def test_a_correction_that_is_not_finite_moves_no_view() -> None:
 def test_a_pose_is_not_refined_to_nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
     view = grey_view()
     before, moments = view.T_wc, view.moments
-    monkeypatch.setattr("aquaflow.mapping.views.so3_exp", lambda w: np.full((3, 3), np.nan))
+    monkeypatch.setattr("aquaflow.render.views.so3_exp", lambda w: np.full((3, 3), np.nan))
     monkeypatch.setattr(Sim3, "__matmul__", lambda self, other: self)
     with pytest.raises(ArithmeticError):
         refine_pose(view, torch.ones(4, 4), 1e-3)

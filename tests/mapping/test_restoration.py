@@ -15,8 +15,8 @@ from aquaflow.mapping.restoration import (
     to_bytes,
 )
 from aquaflow.mapping.scene import Scene
-from aquaflow.mapping.views import View
-from aquaflow.mapping.water.white_balance import WhiteBalance
+from aquaflow.render.views import View
+from aquaflow.water.white_balance import WhiteBalance
 from tests.mapping.mapping_scenes import floor, renderer, view_of
 
 BRIGHTER_ABOVE = torch.tensor([0.1, -0.6, -0.1, 0.0, 0.2])

@@ -9,7 +9,7 @@ from aquaflow.config import InsertionConfig, MediumConfig
 from aquaflow.mapping.gaussians.insertion import colour_range, select
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.scene import orientations
-from aquaflow.mapping.water.estimation import models_for
+from aquaflow.water.estimation import models_for
 from tests.mapping.mapping_scenes import (
     filmed,
     fit_water,
@@ -24,7 +24,7 @@ from tests.mapping.mapping_scenes import (
     view_of,
     water,
 )
-from tests.mapping.water.water_observations import B_RES, LAMP, D, estimate_water, sighted
+from tests.water.water_observations import B_RES, LAMP, D, estimate_water, sighted
 
 
 def test_without_shading_the_fit_knows_no_lamp() -> None:

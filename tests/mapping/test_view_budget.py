@@ -10,8 +10,8 @@ import pytest
 from aquaflow.config import parse_config
 from aquaflow.mapping.maps import Maps
 from aquaflow.mapping.view_budget import drop_surplus, same_group
-from aquaflow.mapping.views import View, ViewStore
 from aquaflow.mapping.work import Growth
+from aquaflow.render.views import View, ViewStore
 from tests.mapping.mapping_scenes import CAMERA, view_of
 
 MOST = 4

@@ -11,7 +11,7 @@ import torch
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.views import View, ViewStore
+from aquaflow.render.views import View, ViewStore
 from tests.mapping.mapping_scenes import (
     CAMERA,
     copied,

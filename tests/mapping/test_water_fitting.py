@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import torch
 
+from aquaflow.base.errors.failures import Failures
 from aquaflow.config import MediumConfig
-from aquaflow.errors.failures import Failures
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping import water_fitting as module
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.scene_water import fitting_water
-from aquaflow.mapping.views import View
-from aquaflow.mapping.water.estimation import WaterEstimate
 from aquaflow.mapping.water_fitting import STEPS, WaterFitting
+from aquaflow.render.views import View
+from aquaflow.water.estimation import WaterEstimate
 from tests.mapping.mapping_scenes import filmed, floor, pose, renderer, settings, view_of, water
 
 PAUSES = 5

@@ -7,7 +7,7 @@ import torch
 
 from aquaflow.config import MediumConfig
 from aquaflow.mapping.scene import Scene
-from aquaflow.mapping.views import View
+from aquaflow.render.views import View
 from tests.mapping.mapping_scenes import filmed, floor, gaussians_at, pose, renderer, view_of, water
 
 NEAR_AND_FAR = [pose((0.02 * i, 0.0, -0.35 * i)) for i in range(5)]

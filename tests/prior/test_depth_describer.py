@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from aquaflow.base.errors import InputError
 from aquaflow.config.prior import PriorConfig
-from aquaflow.errors import InputError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.depth_describer import DepthDescriber

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aquaflow.errors import InputError
+from aquaflow.base.errors import InputError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior import describers
 from aquaflow.prior.describers import CompactDescriber, describer_in

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from aquaflow.base.errors import AquaFlowError, InputError
 from aquaflow.config import PriorConfig
-from aquaflow.errors import AquaFlowError, InputError
 from aquaflow.prior import factory
 from aquaflow.prior.factory import make_prior
 from aquaflow.prior.folder import ENCODER

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from aquaflow.errors import InputError
+from aquaflow.base.errors import InputError
 from aquaflow.prior.folder import CARD, PriorCard, read_card, sha256_of, write_card
 
 

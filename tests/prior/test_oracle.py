@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aquaflow.base.errors import InputError
 from aquaflow.config import PriorConfig
-from aquaflow.errors import InputError
 from aquaflow.prior.factory import make_prior
 from aquaflow.prior.oracle import TRUTH, TrueView, write_oracle
 from aquaflow.tracking.learned.scaling import unscaled_depth

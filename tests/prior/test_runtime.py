@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aquaflow.errors import AquaFlowError
+from aquaflow.base.errors import AquaFlowError
 from aquaflow.prior import runtime
 from aquaflow.prior.runtime import PROVIDERS, NetworkSession, RuntimeSettings
 

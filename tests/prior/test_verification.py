@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from aquaflow import cli
-from aquaflow.errors import AquaFlowError
+from aquaflow.base.errors import AquaFlowError
 from aquaflow.prior import runtime
 from aquaflow.prior.describe import describe
 from aquaflow.prior.factory import SHIPPED

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from aquaflow.errors import AquaFlowError
+from aquaflow.base.errors import AquaFlowError
 from aquaflow.render.activity import active_pixels, touches_active
 from aquaflow.render.contract import TILE_PX, Renderer, tile_grid
 from aquaflow.render.cpu import CpuRenderer

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from aquaflow.errors import AquaFlowError
+from aquaflow.base.errors import AquaFlowError
 from aquaflow.render import gsplat
 from aquaflow.render.adam import SelectiveAdam
 from aquaflow.render.adam_rows import fused_kernel

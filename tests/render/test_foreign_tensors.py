@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from aquaflow.errors import AquaFlowError
+from aquaflow.base.errors import AquaFlowError
 from aquaflow.render.adam import SelectiveAdam
 from aquaflow.render.contract import Renderer
 from aquaflow.render.cpu import CpuRenderer

@@ -9,7 +9,7 @@ from types import ModuleType
 import pytest
 import torch
 
-from aquaflow.errors import AquaFlowError
+from aquaflow.base.errors import AquaFlowError
 from aquaflow.render import gsplat, select_renderer
 from aquaflow.render.cpu import CpuRenderer
 from aquaflow.render.native import build as native

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from aquaflow.errors import AquaFlowError
+from aquaflow.base.errors import AquaFlowError
 from aquaflow.render.photometric import photometric_loss, photometric_loss_torch, ssim
 
 

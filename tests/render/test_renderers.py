@@ -9,7 +9,7 @@ from functools import cache
 import pytest
 import torch
 
-from aquaflow.errors import AquaFlowError
+from aquaflow.base.errors import AquaFlowError
 from aquaflow.render import contract
 from aquaflow.render.contract import Renderer, Rendering
 from aquaflow.render.cpu import CpuRenderer

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from aquaflow.errors import AquaFlowError
+from aquaflow.base.errors import AquaFlowError
 from aquaflow.render import library, select_renderer
 from aquaflow.render.cpu import CpuRenderer
 from aquaflow.render.native import build as native

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from aquaflow.errors import AquaFlowError
+from aquaflow.base.errors import AquaFlowError
 from aquaflow.render.view_loss import (
     MIN_RANGE,
     depth_loss,

@@ -206,7 +206,7 @@ def test_a_checkout_of_git_is_built_with_its_drivers(tmp_path: Path) -> None:
     wheel, _ = built_wheel(tmp_path, CXX=NO_COMPILER["CXX"])
     with zipfile.ZipFile(wheel) as archive:
         assert "aquaflow/drivers/v4l2/abi.py" in archive.namelist()
-        assert "aquaflow/sim_drivers/video.py" in archive.namelist()
+        assert "aquaflow/recordings/video.py" in archive.namelist()
 
 
 def test_a_checkout_that_lost_its_links_is_refused_in_a_sentence(tmp_path: Path) -> None:

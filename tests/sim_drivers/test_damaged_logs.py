@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
+from aquaflow.base.errors import InputError
 from aquaflow.config.recording import RecordingConfig
-from aquaflow.errors import InputError
-from aquaflow.messages import Acceleration, Depth
-from aquaflow.recording.pictures import encode
-from aquaflow.sim_drivers.csv_telemetry import CsvTelemetry
-from aquaflow.sim_drivers.dataflash import Dataflash
-from aquaflow.sim_drivers.mcap_camera import OURS, McapCamera
-from aquaflow.sim_drivers.mcap_messages import McapMessages
-from aquaflow.sim_drivers.tlog import Tlog
-from aquaflow.synthetic.telemetry import HEADER
+from aquaflow.lab.synthetic.telemetry import HEADER
+from aquaflow.live.recorder.pictures import encode
+from aquaflow.recordings.csv_telemetry import CsvTelemetry
+from aquaflow.recordings.dataflash import Dataflash
+from aquaflow.recordings.mcap_camera import OURS, McapCamera
+from aquaflow.recordings.mcap_messages import McapMessages
+from aquaflow.recordings.tlog import Tlog
+from aquaflow.types import Acceleration, Depth
 
 ZEROS = bytes(1 << 22)
 

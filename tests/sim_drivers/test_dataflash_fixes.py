@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from pymavlink.DFReader import DFReaderClock
 
-from aquaflow.messages import Position, UtcTime
-from aquaflow.sim_drivers.dataflash import Dataflash
+from aquaflow.recordings.dataflash import Dataflash
+from aquaflow.types import Position, UtcTime
 
 SIZES = {"Q": 8, "B": 1, "I": 4, "H": 2, "c": 2, "C": 2, "L": 4}
 GPS = (1, b"GPS", b"QBBIHBcLL", b"TimeUS,I,Status,GMS,GWk,NSats,HDop,Lat,Lng")

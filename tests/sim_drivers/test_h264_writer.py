@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aquaflow.sim_drivers.h264 import decode_units, is_key
+from aquaflow.recordings.h264 import decode_units, is_key
 from aquaflow.sim_drivers.h264_writer import access_unit
 from aquaflow.sim_drivers.rtp_packets import LARGEST, Packetizer
 

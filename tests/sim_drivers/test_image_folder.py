@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from aquaflow.errors import ConfigError, InputError
+from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.geometry.camera import guess_camera
-from aquaflow.messages import Dropped, Frame
-from aquaflow.sim_drivers.images import ImageFolder
-from aquaflow.sim_drivers.synthetic import SyntheticDive
-from aquaflow.storage.camera_file import save_camera
+from aquaflow.geometry.camera_file import save_camera
+from aquaflow.recordings.images import ImageFolder
+from aquaflow.recordings.synthetic import SyntheticDive
+from aquaflow.types import Dropped, Frame
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 

@@ -17,21 +17,20 @@ import pytest
 from mcap import stream_reader
 from mcap.writer import Writer
 
+from aquaflow.base.errors import InputError
 from aquaflow.config.link import SerialConfig
 from aquaflow.config.recording import RecordingConfig
 from aquaflow.config.telemetry import NmeaConfig
-from aquaflow.errors import InputError
 from aquaflow.geometry.camera import guess_camera
-from aquaflow.messages import Attitude, Depth, Dropped, EncodedPicture, Frame
-from aquaflow.recording import Recorder
-from aquaflow.recording.pictures import encode
-from aquaflow.sim_drivers import mcap_messages
-from aquaflow.sim_drivers.h264 import is_key
-from aquaflow.sim_drivers.mcap_camera import McapCamera
-from aquaflow.sim_drivers.mcap_messages import McapMessages
-from aquaflow.sim_drivers.mcap_telemetry import McapTelemetry
-from aquaflow.sim_drivers.video import VideoFile
+from aquaflow.live.recorder import Recorder, mcap_messages
+from aquaflow.live.recorder.pictures import encode
+from aquaflow.recordings.h264 import is_key
+from aquaflow.recordings.mcap_camera import McapCamera
+from aquaflow.recordings.mcap_messages import McapMessages
+from aquaflow.recordings.mcap_telemetry import McapTelemetry
+from aquaflow.recordings.video import VideoFile
 from aquaflow.sources import camera_reader, open_recorded_telemetry, open_recording
+from aquaflow.types import Attitude, Depth, Dropped, EncodedPicture, Frame
 
 Write = Callable[[Writer], None]
 RED = np.zeros((4, 6, 3), np.uint8) + np.array([200, 10, 30], np.uint8)

@@ -14,9 +14,13 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
+from aquaflow.base.errors import InputError
 from aquaflow.config.recording import RecordingConfig
-from aquaflow.errors import InputError
-from aquaflow.messages import (
+from aquaflow.live.recorder.pictures import encode
+from aquaflow.recordings.rosbag import messages_in
+from aquaflow.recordings.rosbag_camera import RosbagCamera
+from aquaflow.sources import open_recorded_telemetry, open_recording
+from aquaflow.types import (
     Acceleration,
     Altitude,
     AngularRate,
@@ -28,10 +32,6 @@ from aquaflow.messages import (
     UtcTime,
     Velocity,
 )
-from aquaflow.recording.pictures import encode
-from aquaflow.sim_drivers.rosbag import messages_in
-from aquaflow.sim_drivers.rosbag_camera import RosbagCamera
-from aquaflow.sources import open_recorded_telemetry, open_recording
 
 SECOND = 1_000_000_000
 BEGAN_NS = 1_700_000_000 * SECOND

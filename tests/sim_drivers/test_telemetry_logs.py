@@ -10,11 +10,25 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.config.device import MountingConfig
 from aquaflow.config.link import SerialConfig
 from aquaflow.config.telemetry import NmeaConfig
-from aquaflow.errors import ConfigError, InputError
-from aquaflow.messages import (
+from aquaflow.recordings.candump import Candump
+from aquaflow.recordings.csv_telemetry import CsvTelemetry
+from aquaflow.recordings.dataflash import Dataflash
+from aquaflow.recordings.images import ImageFolder
+from aquaflow.recordings.manifest import ManifestTelemetry
+from aquaflow.recordings.nmea_text import NmeaText
+from aquaflow.recordings.telemetry_log import LogTime
+from aquaflow.recordings.tlog import Tlog
+from aquaflow.sources import (
+    mounting_of,
+    open_recorded_telemetry,
+    open_recording,
+    telemetry_reader,
+)
+from aquaflow.types import (
     Acceleration,
     Altitude,
     AngularRate,
@@ -24,20 +38,6 @@ from aquaflow.messages import (
     TelemetrySample,
     UtcTime,
     Velocity,
-)
-from aquaflow.sim_drivers.candump import Candump
-from aquaflow.sim_drivers.csv_telemetry import CsvTelemetry
-from aquaflow.sim_drivers.dataflash import Dataflash
-from aquaflow.sim_drivers.images import ImageFolder
-from aquaflow.sim_drivers.manifest import ManifestTelemetry
-from aquaflow.sim_drivers.nmea_text import NmeaText
-from aquaflow.sim_drivers.telemetry_log import LogTime
-from aquaflow.sim_drivers.tlog import Tlog
-from aquaflow.sources import (
-    mounting_of,
-    open_recorded_telemetry,
-    open_recording,
-    telemetry_reader,
 )
 
 SECOND = 1_000_000_000

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aquaflow.errors import InputError
+from aquaflow.base.errors import InputError
 from aquaflow.geometry.camera import guess_camera
-from aquaflow.messages import Dropped
-from aquaflow.sim_drivers import video
-from aquaflow.sim_drivers.video import VideoFile
-from aquaflow.storage.camera_file import save_camera
+from aquaflow.geometry.camera_file import save_camera
+from aquaflow.recordings import video
+from aquaflow.recordings.video import VideoFile
+from aquaflow.types import Dropped
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
+from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.config import SourceConfig
-from aquaflow.errors import ConfigError, InputError
 from aquaflow.geometry.camera import CameraModel, guess_camera
-from aquaflow.messages import Frame
 from aquaflow.sources.preprocessing import DEFAULT_WIDTH_PX, Preparation, crop_box, fit_calibration
+from aquaflow.types import Frame
 
 WHOLE = CameraModel(640, 240, 300.0, 300.0, 330.0, 118.0)
 """A calibration for the whole side-by-side picture."""

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from aquaflow.base.errors.failures import Failures
 from aquaflow.config import SourceConfig
-from aquaflow.errors.failures import Failures
 from aquaflow.geometry.camera import guess_camera
-from aquaflow.messages import Depth, Dropped, Frame
 from aquaflow.sources.reading import MOST_UNREADABLE, read_past_failures
+from aquaflow.types import Depth, Dropped, Frame
 
 COUNT = 20
 CAMERA = guess_camera(8, 6)

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from aquaflow import sources
-from aquaflow.errors import InputError
-from aquaflow.messages import CameraModel, Dropped, Frame
+from aquaflow.base.errors import InputError
 from aquaflow.sources import CameraSource, open_recording
+from aquaflow.types import CameraModel, Dropped, Frame
 
 
 class AnyFolder:

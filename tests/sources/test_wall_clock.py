@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from aquaflow.messages import UtcTime
 from aquaflow.sources.wall_clock import WallClock
+from aquaflow.types import UtcTime
 
 SECOND = 1_000_000_000
 UTC_NS = 1_795_365_000 * SECOND

@@ -9,9 +9,9 @@ import numpy as np
 from aquaflow.dive.frames_csv import FrameRow, of_text, to_text
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.messages import Frame
 from aquaflow.tracking.frame_table import CHUNK, FrameTable
 from aquaflow.tracking.frames import FrameClass, Quality, Tracked
+from aquaflow.types import Frame
 
 CAMERA = guess_camera(64, 48)
 PICTURE = np.zeros((48, 64, 3), np.uint8)

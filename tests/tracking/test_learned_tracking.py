@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from aquaflow.config import PriorConfig, SourceConfig
-from aquaflow.evaluation.trajectory import read_tum
 from aquaflow.geometry.alignment import align
-from aquaflow.messages import Frame
+from aquaflow.lab.evaluation.trajectory import read_tum
 from aquaflow.prior.factory import SHIPPED, make_prior
 from aquaflow.prior.folder import CARD
 from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation
+from aquaflow.types import Frame
 from tests.tracking.tracked_clips import PLACED, run
 
 EVERY = 3

@@ -9,7 +9,7 @@ from threading import Event
 
 import pytest
 
-from aquaflow.errors.failures import Failures
+from aquaflow.base.errors.failures import Failures
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.tracking.current_keyframe import KeyframeTracker

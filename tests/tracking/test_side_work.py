@@ -8,7 +8,7 @@ from threading import Event
 
 import pytest
 
-from aquaflow.errors.failures import Failures
+from aquaflow.base.errors.failures import Failures
 from aquaflow.tracking.side_work import SideWork
 
 GIVE_UP_S = 60.0

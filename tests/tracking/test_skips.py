@@ -8,11 +8,11 @@ import pytest
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.keyframes import KeyframeStore
-from aquaflow.messages import Frame
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.contract import Encoding
 from aquaflow.prior.flow_pair import FlowEncoding, FlowPair
 from aquaflow.tracking.tracker import Tracker
+from aquaflow.types import Frame
 from tests.tracking.tracking_scenes import SeaFloor, filmed, lawn_path
 
 

@@ -7,10 +7,10 @@ import pytest
 
 from aquaflow.config import InitialisationConfig, TrackingConfig
 from aquaflow.keyframes import KeyframeStore
-from aquaflow.messages import Frame
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.tracking.frames import FrameClass
 from aquaflow.tracking.tracker import Tracker
+from aquaflow.types import Frame
 from tests.tracking.tracked_clips import PLACED, Run, error_share, run
 from tests.tracking.tracking_scenes import CAMERA, SeaFloor, black, filmed, lawn_path, pose
 

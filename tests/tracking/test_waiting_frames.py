@@ -11,18 +11,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from aquaflow.base.errors.failures import Failures
 from aquaflow.config import TrackingConfig
-from aquaflow.errors.failures import Failures
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
-from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, PairGeometry
 from aquaflow.tracking import map_start
 from aquaflow.tracking.current_keyframe import CurrentKeyframe
 from aquaflow.tracking.frames import FrameClass, Quality, Tracked
 from aquaflow.tracking.tracker import Tracker
 from aquaflow.tracking.waiting_frames import BOUNDS, Bound, Wait, WaitingFrames
+from aquaflow.types import Frame
 
 CAMERA = guess_camera(8, 6)
 PICTURE = np.zeros((6, 8, 3), np.uint8)

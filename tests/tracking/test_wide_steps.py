@@ -10,7 +10,6 @@ import pytest
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry.similarity import Sim3, so3_log
 from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
-from aquaflow.messages import Frame
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.contract import Keypoints
 from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
@@ -18,6 +17,7 @@ from aquaflow.tracking.loops.keypoint_poses import keypoint_poses
 from aquaflow.tracking.pose.matcher import KeyframeMatcher
 from aquaflow.tracking.pose.visibility import Visibility
 from aquaflow.tracking.wide_steps import WideSteps
+from aquaflow.types import Frame
 from tests.tracking.tracked_clips import error_share, run
 from tests.tracking.tracking_scenes import CAMERA, SeaFloor, black, filmed, pose
 

@@ -12,11 +12,11 @@ from aquaflow.geometry.alignment import align
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
-from aquaflow.messages import Frame
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.prior.contract import Prior
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.tracking.tracker import Tracker
+from aquaflow.types import Frame
 from tests.tracking.tracking_scenes import KnownPrior, KnownView, pose
 
 PLACED = {FrameClass.KEYFRAME, FrameClass.MAPPING, FrameClass.COMMON}

@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.messages import Frame
 from aquaflow.prior.contract import Keypoints, RangeUnit
 from aquaflow.tracking.pose.solver import PoseProblem
+from aquaflow.types import Frame
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

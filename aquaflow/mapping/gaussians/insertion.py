@@ -12,8 +12,8 @@ from torch import Tensor
 from aquaflow.config import InsertionConfig
 from aquaflow.keyframes import Pointmap
 from aquaflow.mapping.gaussians.gaussians import GaussianMap, raw_colour
-from aquaflow.mapping.transfers import insertion_in, insertion_out, picture_out, pointmap_in
-from aquaflow.mapping.views import View
+from aquaflow.render.transfers import insertion_in, insertion_out, picture_out, pointmap_in
+from aquaflow.render.views import View
 
 LOG_GAIN = 3.0
 """A Laplacian-of-Gaussian response, L1 over RGB, of 1 / LOG_GAIN counts as certain structure."""

@@ -11,8 +11,8 @@ import torch
 from aquaflow.geometry.similarity import Sim3, on_so3
 from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.mapping.gaussians.gaussians import GaussianMap
-from aquaflow.mapping.transfers import moves_in
-from aquaflow.mapping.views import View
+from aquaflow.render.transfers import moves_in
+from aquaflow.render.views import View
 
 
 @torch.no_grad()

@@ -12,8 +12,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from aquaflow.config import OptimiserConfig
-from aquaflow.mapping.views import View
 from aquaflow.render.contract import TILE_PX
+from aquaflow.render.views import View
 
 
 def is_full_look(view: View, config: OptimiserConfig) -> bool:

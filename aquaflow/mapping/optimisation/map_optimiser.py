@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from aquaflow.config import MappingConfig
-from aquaflow.mapping.decoder.decode import DECODED
+from aquaflow.mapping.neural.decode import DECODED
 from aquaflow.mapping.optimisation.active_tiles import (
     is_full_look,
     is_nothing_to_draw,
@@ -23,9 +23,9 @@ from aquaflow.mapping.optimisation.objective import Objective
 from aquaflow.mapping.optimisation.schedule import Rates
 from aquaflow.mapping.rendering import Shown
 from aquaflow.mapping.scene import Scene
-from aquaflow.mapping.views import View, refine_pose
 from aquaflow.render.adam import SelectiveAdam
 from aquaflow.render.dense_adam import DenseAdam
+from aquaflow.render.views import View, refine_pose
 
 log = logging.getLogger(__name__)
 

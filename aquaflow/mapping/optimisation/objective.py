@@ -9,10 +9,10 @@ from torch import Tensor
 from aquaflow.config import LossConfig
 from aquaflow.mapping.optimisation.losses import radial_weight, scale_loss
 from aquaflow.mapping.rendering import Shown
-from aquaflow.mapping.views import View
 from aquaflow.render.activity import active_pixels
 from aquaflow.render.photometric import photometric_loss
 from aquaflow.render.view_loss import depth_loss, outlier_mask
+from aquaflow.render.views import View
 
 
 class Objective:

@@ -19,10 +19,10 @@ from aquaflow.config import OptimiserConfig
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.mapping.optimisation.losses import radial_weight
 from aquaflow.mapping.scene import Scene
-from aquaflow.mapping.transfers import pose_in, registration_out
-from aquaflow.mapping.views import View
-from aquaflow.mapping.water.exposure import log_gain_at, set_log_gain
-from aquaflow.mapping.water.sunlight import light_at
+from aquaflow.render.transfers import pose_in, registration_out
+from aquaflow.render.views import View
+from aquaflow.water.exposure import log_gain_at, set_log_gain
+from aquaflow.water.sunlight import light_at
 
 Array = npt.NDArray[np.float64]
 

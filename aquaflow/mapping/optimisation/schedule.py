@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from aquaflow.config import OptimiserConfig
-from aquaflow.mapping.views import View
+from aquaflow.render.views import View
 
 
 def sampled_views(

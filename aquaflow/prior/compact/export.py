@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from aquaflow.errors import InputError, reason_of
+from aquaflow.base.errors import InputError, reason_of
 from aquaflow.prior.compact.network import COARSE, STRIDE, CompactPrior, Compared, Encoded
 from aquaflow.prior.compact.quantise import INT8_ENCODER, quantise
 from aquaflow.prior.folder import CARD, DECODER, ENCODER, PriorCard, sha256_of, write_card

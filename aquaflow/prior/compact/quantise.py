@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.errors import AquaFlowError
+from aquaflow.base.errors import AquaFlowError
 
 INT8_ENCODER = "encoder_int8.onnx"
 """File of the encoder in 8 bits, next to the one in 32."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from aquaflow.errors import AquaFlowError
+from aquaflow.base.errors import AquaFlowError
 
 
 def torch_device(prior: str, asked: str) -> str:

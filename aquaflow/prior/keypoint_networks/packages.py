@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from aquaflow.errors import AquaFlowError, InputError, first_line
+from aquaflow.base.errors import AquaFlowError, InputError, first_line
 
 if TYPE_CHECKING:
     import torch

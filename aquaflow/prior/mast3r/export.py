@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from aquaflow.errors import InputError
+from aquaflow.base.errors import InputError
 from aquaflow.prior.folder import DECODER, ENCODER, PriorCard, sha256_of, write_card
 from aquaflow.prior.mast3r.network import Mast3r, ViewGeometry
 from aquaflow.prior.mast3r.settings import PATCH_PX, TINY

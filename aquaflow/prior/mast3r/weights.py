@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from aquaflow.errors import InputError, reason_of
+from aquaflow.base.errors import InputError, reason_of
 from aquaflow.prior.mast3r.network import Mast3r
 from aquaflow.prior.mast3r.settings import FULL, Mast3rSize
 

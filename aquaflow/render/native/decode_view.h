@@ -6,7 +6,7 @@
 //
 // Gaussians are taken in blocks, one lane each, so that every line of the arithmetic is a vector of
 // them. The definition is Decoder.residuals and apply_residuals in
-// aquaflow/mapping/decoder/decoder.py.
+// aquaflow/mapping/neural/decoder.py.
 #pragma once
 
 #include <algorithm>

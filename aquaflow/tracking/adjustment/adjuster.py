@@ -14,8 +14,8 @@ from time import thread_time
 
 import numpy as np
 
+from aquaflow.base.errors import InputError
 from aquaflow.config.tracking import AdjustmentConfig
-from aquaflow.errors import InputError
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore
 from aquaflow.prior.flow_pair import FlowEncoding

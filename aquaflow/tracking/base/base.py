@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from aquaflow.errors import InputError
-from aquaflow.fusion.metric_frame import MetricFrame
+from aquaflow.base.errors import InputError
 from aquaflow.keyframes.place import KeypointDepths, Place
+from aquaflow.telemetry.metric_frame import MetricFrame
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,11 @@ from functools import partial
 
 import numpy as np
 
+from aquaflow.base.errors.failures import Failures
 from aquaflow.config import TrackingConfig
-from aquaflow.errors.failures import Failures
-from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.keyframes import KeyframeStore
+from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.tracking.base.base import Base
 from aquaflow.tracking.base.known_places import KnownPlaces, Recognised
 from aquaflow.tracking.base.links import BaseLink, Placed, agree, link_covariance, placed

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 
+from aquaflow.base.errors import InputError
 from aquaflow.config import TrackingConfig
-from aquaflow.errors import InputError
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
 from aquaflow.keyframes.place import Place, depths_at

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from aquaflow.errors import InputError
-from aquaflow.fusion.metric_file import read_metric_file
+from aquaflow.base.errors import InputError
 from aquaflow.keyframes.places_file import NAME, PlacesFile
+from aquaflow.telemetry.metric_file import read_metric_file
 from aquaflow.tracking.base.base import Base
 
 METRICS = "metrics.json"

@@ -18,8 +18,8 @@ from typing import Protocol
 
 import numpy as np
 
+from aquaflow.base.errors.failures import Failures
 from aquaflow.config import TrackingConfig
-from aquaflow.errors.failures import Failures
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.keyframes import Keyframe, KeyframeStore

@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-from aquaflow.clocks.deadline import Deadline
-from aquaflow.errors.failures import Failures
+from aquaflow.base.clocks.deadline import Deadline
+from aquaflow.base.errors.failures import Failures
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
-from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, Prior
 from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
 from aquaflow.tracking.frames import FrameClass, Tracked
@@ -19,6 +18,7 @@ from aquaflow.tracking.pose.expected_matches import expected_matches
 from aquaflow.tracking.pose.matcher import Matched
 from aquaflow.tracking.side_work import SideWork
 from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
+from aquaflow.types import Frame
 
 STAGE = "back-fill"
 """Name of this side work."""

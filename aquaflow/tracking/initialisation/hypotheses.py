@@ -16,10 +16,10 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.triangulation import triangulate
 from aquaflow.geometry.two_view import MIN_MATCHES, pose_candidates
-from aquaflow.messages import Frame
 from aquaflow.prior.contract import PairGeometry
 from aquaflow.tracking.initialisation.bundle import MAX_ITERATIONS, Bundle, BundleResult, adjust
 from aquaflow.tracking.pose.solver import PoseProblem, solve_pose
+from aquaflow.types import Frame
 
 Array = npt.NDArray[np.float64]
 

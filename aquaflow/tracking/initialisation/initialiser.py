@@ -19,11 +19,11 @@ from aquaflow.geometry.two_view import (
     rotation_compensated_parallax_px,
 )
 from aquaflow.keyframes import Pointmap
-from aquaflow.messages import Frame
 from aquaflow.prior.contract import Encoding, Prior
 from aquaflow.tracking.initialisation.bundle import BundleResult
 from aquaflow.tracking.initialisation.hypotheses import Hypotheses, MatchedFrame
 from aquaflow.tracking.pose.depth_fusion import fuse
+from aquaflow.types import Frame
 
 Array = npt.NDArray[np.float64]
 

@@ -6,8 +6,8 @@ import threading
 from collections.abc import Container
 from dataclasses import dataclass
 
+from aquaflow.base.errors import InputError
 from aquaflow.config import TrackingConfig
-from aquaflow.errors import InputError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
 from aquaflow.prior.contract import Encoding

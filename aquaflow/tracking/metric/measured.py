@@ -8,16 +8,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.fusion.estimator import Estimate
-from aquaflow.fusion.factors.altitude import AltitudeFactor
-from aquaflow.fusion.factors.attitude import HeadingFactor, TiltFactor
-from aquaflow.fusion.factors.depth import DepthFactor
-from aquaflow.fusion.factors.factor import Factor
-from aquaflow.fusion.factors.position import PositionFactor
-from aquaflow.fusion.factors.velocity import VelocityFactor
-from aquaflow.fusion.state import State
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.telemetry.estimator import Estimate
+from aquaflow.telemetry.factors.altitude import AltitudeFactor
+from aquaflow.telemetry.factors.attitude import HeadingFactor, TiltFactor
+from aquaflow.telemetry.factors.depth import DepthFactor
+from aquaflow.telemetry.factors.factor import Factor
+from aquaflow.telemetry.factors.position import PositionFactor
+from aquaflow.telemetry.factors.velocity import VelocityFactor
+from aquaflow.telemetry.state import State
 from aquaflow.tracking.metric.world_edges import Measured, WorldEdge, world_edge
 
 Array = npt.NDArray[np.float64]

@@ -9,15 +9,14 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.base.errors.failures import Failures
 from aquaflow.config import FusionConfig
-from aquaflow.errors.failures import Failures
-from aquaflow.fusion.metric_frame import MetricFrame
-from aquaflow.fusion.recent_motion import RecentMotion
-from aquaflow.fusion.start import camera_in_body
-from aquaflow.fusion.telemetry import Telemetry
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore
-from aquaflow.messages import TelemetrySample
+from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.recent_motion import RecentMotion
+from aquaflow.telemetry.start import camera_in_body
+from aquaflow.telemetry.telemetry import Telemetry
 from aquaflow.tracking.frame_table import FrameTable
 from aquaflow.tracking.graph.pose_graph import solve
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
@@ -26,6 +25,7 @@ from aquaflow.tracking.metric.sightings import Sightings
 from aquaflow.tracking.metric.straightening import estimates_of, straightened
 from aquaflow.tracking.metric.survey import Survey, sampled_points
 from aquaflow.tracking.metric.world_edges import World
+from aquaflow.types import TelemetrySample
 
 Array = npt.NDArray[np.float64]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from aquaflow.fusion.recent_motion import RecentMotion
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.telemetry.recent_motion import RecentMotion
 
 LONGEST_S = 2.0
 """Between two frames of which the second is expected; a survey camera takes one a second."""

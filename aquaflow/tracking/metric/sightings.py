@@ -10,13 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config import FusionConfig
-from aquaflow.fusion.known_lengths.board_size import PixelDepths, PosedView
-from aquaflow.fusion.known_lengths.finder import KnownLengthFinder
-from aquaflow.fusion.known_lengths.known_length import KnownLength
-from aquaflow.fusion.metric_frame import SourceReport
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
+from aquaflow.telemetry.known_lengths.board_size import PixelDepths, PosedView
+from aquaflow.telemetry.known_lengths.finder import KnownLengthFinder
+from aquaflow.telemetry.known_lengths.known_length import KnownLength
+from aquaflow.telemetry.metric_frame import SourceReport
 
 Array = npt.NDArray[np.float64]
 PlaceOf = Callable[[int], tuple[Sim3, int] | None]

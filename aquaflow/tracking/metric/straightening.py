@@ -8,12 +8,12 @@ from functools import partial
 
 import numpy as np
 
-from aquaflow.fusion.camera_path import CameraPath
-from aquaflow.fusion.dead_reckoning import carried_from
-from aquaflow.fusion.estimator import Estimate, estimate
-from aquaflow.fusion.factors.length import length_factors
-from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.telemetry.camera_path import CameraPath
+from aquaflow.telemetry.dead_reckoning import carried_from
+from aquaflow.telemetry.estimator import Estimate, estimate
+from aquaflow.telemetry.factors.length import length_factors
+from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.tracking.graph.equations import Rows, poses_of
 from aquaflow.tracking.graph.optimisation import Optimisation
 from aquaflow.tracking.graph.table import EDGE, NODE, TRUST, GraphResult, Snapshot

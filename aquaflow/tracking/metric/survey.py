@@ -11,12 +11,12 @@ import numpy.typing as npt
 
 from aquaflow.config import FusionConfig
 from aquaflow.config.device import MountingConfig
-from aquaflow.fusion.camera_path import CameraPath
-from aquaflow.fusion.telemetry import Telemetry
+from aquaflow.geometry.arrays import to_sim3
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.keyframes import Pointmap
-from aquaflow.storage.arrays import to_sim3
+from aquaflow.telemetry.camera_path import CameraPath
+from aquaflow.telemetry.telemetry import Telemetry
 from aquaflow.tracking.graph.equations import Rows, poses_of
 from aquaflow.tracking.metric.sightings import SeenLengths, Sightings
 

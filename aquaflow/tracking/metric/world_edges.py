@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3, so3_exp
+from aquaflow.telemetry.metric_frame import MetricFrame
 
 Array = npt.NDArray[np.float64]
 

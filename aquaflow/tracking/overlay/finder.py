@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.messages import Frame
 from aquaflow.tracking.overlay.regions import WIDTH_PX, Mask, overlay_regions
 from aquaflow.tracking.overlay.static_structure import Float, StaticStructure, gradients
+from aquaflow.types import Frame
 
 THUMBNAIL_PX = 160
 """Width at which the scene is seen to move; a shift of 2 % of the width shows."""

@@ -12,8 +12,8 @@ import torch
 from typer.testing import CliRunner
 
 from aquaflow import cli
+from aquaflow.base.errors import AquaFlowError, InputError
 from aquaflow.cli import prior
-from aquaflow.errors import AquaFlowError, InputError
 from aquaflow.prior.compact.export import (
     INPUTS,
     LICENCE,

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from aquaflow.base.errors import AquaFlowError, InputError
 from aquaflow.config import PriorConfig
-from aquaflow.errors import AquaFlowError, InputError
 from aquaflow.prior.factory import make_prior
 from aquaflow.prior.keypoint_networks import packages
 from aquaflow.prior.keypoint_networks.device import torch_device

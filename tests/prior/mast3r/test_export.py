@@ -15,8 +15,8 @@ import torch
 from typer.testing import CliRunner
 
 from aquaflow import cli
+from aquaflow.base.errors import AquaFlowError, InputError
 from aquaflow.config import PriorConfig
-from aquaflow.errors import AquaFlowError, InputError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior import runtime
 from aquaflow.prior.factory import make_prior

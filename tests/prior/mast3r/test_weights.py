@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from aquaflow.errors import InputError
+from aquaflow.base.errors import InputError
 from aquaflow.prior.mast3r.network import Mast3r
 from aquaflow.prior.mast3r.settings import TINY
 from aquaflow.prior.mast3r.weights import load_checkpoint

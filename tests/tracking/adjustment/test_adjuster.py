@@ -9,9 +9,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from aquaflow.base.errors.failures import Failures
 from aquaflow.config import TrackingConfig
 from aquaflow.config.tracking import AdjustmentConfig, GraphConfig
-from aquaflow.errors.failures import Failures
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore, Pointmap
 from aquaflow.prior.classical import ClassicalPrior

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from aquaflow.base.errors.failures import Failures
 from aquaflow.config import TrackingConfig
-from aquaflow.errors.failures import Failures
-from aquaflow.fusion.metric_frame import MetricFrame, Origin
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.keyframes import KeyframeStore, Pointmap
+from aquaflow.telemetry.metric_frame import MetricFrame, Origin
 from aquaflow.tracking.base.base import Base
 from aquaflow.tracking.base.in_base import InBase
 from aquaflow.tracking.base.links import BaseLink, agree, link_covariance, placed

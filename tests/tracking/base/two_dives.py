@@ -10,8 +10,8 @@ import numpy as np
 from aquaflow.config import Config, parse_config
 from aquaflow.dive.places_of_dive import write_places_of
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.messages import Frame
 from aquaflow.slam import Slam
+from aquaflow.types import Frame
 from tests.tracking.tracking_scenes import SeaFloor, filmed, pose
 
 FRAMES = 13

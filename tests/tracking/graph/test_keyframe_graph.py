@@ -12,12 +12,12 @@ from aquaflow.config import TrackingConfig
 from aquaflow.geometry.alignment import align
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.keyframes import KeyframeStore
-from aquaflow.messages import Frame
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.tracking.frames import FrameClass, Revisit, Tracked
 from aquaflow.tracking.graph.keyframe_graph import Correction, KeyframeGraph
 from aquaflow.tracking.loops.relocaliser import Places
 from aquaflow.tracking.tracker import Tracker
+from aquaflow.types import Frame
 from tests.tracking.tracking_scenes import SeaFloor, black, filmed, pose
 
 COUNT, RADIUS_M = 24, 0.9

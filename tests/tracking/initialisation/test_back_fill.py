@@ -7,15 +7,15 @@ from threading import Event
 
 import pytest
 
-from aquaflow.clocks.deadline import Deadline
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.config import InitialisationConfig, TrackingConfig
 from aquaflow.keyframes import KeyframeStore
-from aquaflow.messages import Frame
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.tracking.frames import Tracked
 from aquaflow.tracking.side_work import SideWork
 from aquaflow.tracking.tracker import Tracker
 from aquaflow.tracking.waiting_frames import BOUNDS, Bound, Wait
+from aquaflow.types import Frame
 from tests.tracking.tracked_clips import error_share, run
 from tests.tracking.tracking_scenes import SeaFloor, black, filmed, lawn_path
 

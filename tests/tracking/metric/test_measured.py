@@ -10,13 +10,13 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from aquaflow.fusion.estimator import Estimate
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
-from aquaflow.synthetic import SyntheticConfig
+from aquaflow.lab.synthetic import SyntheticConfig
+from aquaflow.telemetry.estimator import Estimate
 from aquaflow.tracking.metric.measured import NEAR_S, Corrections, world_edges
 from aquaflow.tracking.metric.world_edges import WorldEdge
-from tests.fusion.simulated_dives import Swum, estimated, part_of, swum
+from tests.telemetry.simulated_dives import Swum, estimated, part_of, swum
 
 Array = npt.NDArray[np.float64]
 

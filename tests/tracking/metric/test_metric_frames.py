@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from aquaflow.base.errors.failures import Failures
 from aquaflow.config import FusionConfig
-from aquaflow.errors.failures import Failures
-from aquaflow.fusion.metric_frame import MetricFrame
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
-from aquaflow.messages import AngularRate, Depth
+from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.tracking.frame_table import FrameTable
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph
 from aquaflow.tracking.metric import metric_frames
 from aquaflow.tracking.metric.metric_frames import MetricFrames
+from aquaflow.types import AngularRate, Depth
 
 
 def of_a_dive(failures: Failures) -> MetricFrames:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from aquaflow.fusion.recent_motion import RecentMotion
 from aquaflow.geometry.similarity import BODY_FROM_CAMERA, Sim3
-from aquaflow.messages import AngularRate, Velocity
+from aquaflow.telemetry.recent_motion import RecentMotion
 from aquaflow.tracking.metric.motion import LONGEST_S, motion_of_camera
+from aquaflow.types import AngularRate, Velocity
 
 T_BC = Sim3(
     Rotation.from_euler("y", -40, degrees=True).as_matrix() @ BODY_FROM_CAMERA,

@@ -9,8 +9,8 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from aquaflow.config import FusionConfig
-from aquaflow.fusion.telemetry import Telemetry
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.telemetry.telemetry import Telemetry
 from aquaflow.tracking.frame_table import FRAME, NONE
 from aquaflow.tracking.graph.table import NODE
 from aquaflow.tracking.metric.survey import MOST_POINTS, Survey

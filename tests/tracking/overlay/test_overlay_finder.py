@@ -8,9 +8,9 @@ import numpy.typing as npt
 import pytest
 
 from aquaflow.geometry.camera import guess_camera
-from aquaflow.messages import Frame
-from aquaflow.synthetic.display import burn_in
+from aquaflow.lab.synthetic.display import burn_in
 from aquaflow.tracking.overlay.finder import OverlayFinder
+from aquaflow.types import Frame
 
 WIDTH, HEIGHT = 480, 360
 CAMERA = guess_camera(WIDTH, HEIGHT)

@@ -1,0 +1,1 @@
+"""What every folder stands on: errors, files, clocks, and what the computer has."""

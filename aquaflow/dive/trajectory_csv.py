@@ -1,0 +1,117 @@
+"""``trajectory.csv``: every pose with time, depth, attitude and place on the earth, for surveyors.
+
+What is unknown is an empty cell. Positions are those of ``trajectory.tum``.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from datetime import datetime, timezone
+from pathlib import Path
+
+from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.storage.atomic import atomic_write
+
+NAME = "trajectory.csv"
+DECIMALS = {"t_s": 9, "latitude_deg": 9, "longitude_deg": 9, "x": 6, "y": 6, "z": 6}
+"""Nanoseconds; a tenth of a millimetre on the ground; micrometres."""
+OTHER_DECIMALS = 4
+"""Of depths and speeds: 0.1 mm; of angles: 0.4 mm at 200 m."""
+
+
+@dataclass(frozen=True)
+class PoseRow:
+    """One line: a pose of the camera; its fields are the columns."""
+
+    index: int
+    """Position in the recording."""
+    t_s: float
+    """Seconds since the recording's first frame."""
+    utc: datetime | None
+    """With its time zone."""
+    sub_map: int
+    x: float
+    """Of the camera's centre in n, as in trajectory.tum."""
+    y: float
+    z: float
+    unit: str
+    """Of x, y, z: ``m``, or ``map units`` where the sub-map's scale is unknown."""
+    latitude_deg: float | None = None
+    longitude_deg: float | None = None
+    """Of the camera's centre, WGS 84."""
+    depth_m: float | None = None
+    """Below the surface, as the vehicle measured it."""
+    altitude_m: float | None = None
+    """Above the bottom, as the vehicle measured it."""
+    heading_deg: float | None = None
+    """From 0 to 360, clockwise from what x points to."""
+    roll_deg: float | None = None
+    pitch_deg: float | None = None
+    speed_m_s: float | None = None
+    sigma_position_m: float | None = None
+    """1 sigma in the direction that is known least."""
+    sigma_heading_deg: float | None = None
+
+    def cells(self) -> list[str]:
+        """As text."""
+        return [_text(field.name, getattr(self, field.name)) for field in fields(self)]
+
+
+COLUMNS = tuple(field.name for field in fields(PoseRow))
+_REQUIRED = ("t_s", "x", "y", "z")
+
+
+def _text(name: str, value: int | float | str | datetime | None) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, datetime):
+        utc = value.astimezone(timezone.utc)
+        return utc.replace(tzinfo=None).isoformat(timespec="microseconds") + "Z"
+    if isinstance(value, float):
+        decimals = DECIMALS.get(name, OTHER_DECIMALS)
+        return f"{round(value, decimals) + 0.0:.{decimals}f}"  # no -0.000
+    return str(value)
+
+
+def write_trajectory_csv(path: Path, rows: Sequence[PoseRow]) -> None:
+    """Write the rows, whole or not at all.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n").writerows([COLUMNS, *(row.cells() for row in rows)])
+    with atomic_write(path) as stream:
+        stream.write(text.getvalue().encode("utf-8"))
+
+
+def read_trajectory_csv(path: Path) -> list[PoseRow]:
+    """The rows of :func:`write_trajectory_csv`.
+
+    Raises:
+        InputError: it cannot be read, or holds what is no such row.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as stream:
+            header, *lines = csv.reader(stream)
+        if tuple(header) != COLUMNS:
+            raise DamagedError("its columns are others")
+        return [_row(dict(zip(COLUMNS, line, strict=True))) for line in lines]
+    except (OSError, ValueError, csv.Error) as error:
+        raise InputError(f"cannot read {path}: {reason_of(error)}; map the dive again") from error
+
+
+def _row(cells: dict[str, str]) -> PoseRow:
+    numbers = {
+        name: float(cells[name]) if cells[name] or name in _REQUIRED else None
+        for name in COLUMNS
+        if name not in ("index", "utc", "sub_map", "unit")
+    }
+    utc = datetime.fromisoformat(cells["utc"].replace("Z", "+00:00")) if cells["utc"] else None
+    return PoseRow(
+        index=int(cells["index"]), utc=utc, sub_map=int(cells["sub_map"]), unit=cells["unit"],
+        **numbers,  # type: ignore[arg-type]
+    )  # fmt: skip

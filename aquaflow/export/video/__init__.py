@@ -1,1 +1,0 @@
-"""Videos of a dive: the file, its clock, words over pictures, a camera's smooth path."""

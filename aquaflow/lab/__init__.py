@@ -1,0 +1,1 @@
+"""What judges and feeds the SLAM: synthetic dives, evaluation, benchmarks, training, batches."""

@@ -1,0 +1,84 @@
+"""``manifest.json`` of a dive of a batch: which files it has, and of which job it is.
+
+It is written last: a dive with a manifest is whole.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from aquaflow import __version__
+from aquaflow.base.errors import InputError
+from aquaflow.base.storage.atomic import write_json
+from aquaflow.lab.batch.job import Job, Outcome
+
+MANIFEST = "manifest.json"
+
+
+def write_manifest(dive: Path, job: Job, outcome: Outcome) -> None:
+    """Write the manifest of the finished ``dive``.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    files = sorted(path for path in dive.rglob("*") if path.is_file() and path.name != MANIFEST)
+    listed = {
+        path.relative_to(dive).as_posix(): {
+            "bytes": path.stat().st_size,
+            "sha256": _sha256(path),
+        }
+        for path in files
+    }
+    write_json(
+        dive / MANIFEST,
+        {
+            "dive": job.name,
+            "job": job.digest(),
+            "version": __version__,
+            "outcome": outcome.to_json(),
+            "files": listed,
+        },
+    )
+
+
+def earlier_outcome(manifest: dict[str, Any], job: Job, where: str) -> Outcome:
+    """What came of ``job`` when the dive with this manifest was written.
+
+    Raises:
+        InputError: the dive is of another recording or other settings, or the manifest is none.
+    """
+    try:
+        same = manifest["job"] == job.digest()
+        found = Outcome.of_json(manifest["outcome"] | {"earlier": True})
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{where}/{MANIFEST} is damaged; remove that dive") from error
+    if not same:
+        raise InputError(
+            f"{where} was made of another recording or with other settings; remove it, or give "
+            "another --out"
+        )
+    return found
+
+
+def read_manifest(text: bytes, where: str) -> dict[str, Any]:
+    """The manifest in ``text``.
+
+    Raises:
+        InputError: it is none.
+    """
+    try:
+        content = json.loads(text)
+    except ValueError as error:
+        raise InputError(f"{where}/{MANIFEST} is damaged; remove that dive") from error
+    return content if isinstance(content, dict) else {}
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as stream:
+        while block := stream.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()

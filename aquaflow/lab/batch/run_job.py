@@ -1,0 +1,131 @@
+"""One attempt at one dive, wherever it is made: the same function on this machine and on a node."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from signal import Signals
+from typing import Any
+
+from aquaflow import __version__
+from aquaflow.base.errors import InputError
+from aquaflow.lab.batch.job import WRITTEN, Job, Outcome
+from aquaflow.lab.batch.manifest import write_manifest
+from aquaflow.lab.batch.mapping_process import outcome_of_failure
+from aquaflow.lab.batch.object_store import ObjectStore, StoreError, is_url
+from aquaflow.lab.batch.site import Site, open_site, working_folder
+from aquaflow.lab.batch.started import Started
+
+PROGRAM = "aquaflow.lab.batch.mapping_process"
+KILOBYTE = 1024
+"""Bytes; what Linux counts resident sets in."""
+MEGABYTE = 1e6
+"""Bytes."""
+
+
+def run_job(job: Job, started: Started | None = None) -> Outcome:
+    """Make the dive of ``job`` if it is not there yet; raises nothing.
+
+    ``started`` is told of the process, so that it can be stopped.
+    """
+    begin_s = time.monotonic()
+    try:
+        outcome = _attempt(job, started or Started())
+    except StoreError as error:
+        outcome = Outcome("lost", str(error))
+    except Exception as error:
+        outcome = Outcome(**outcome_of_failure(error))
+    if outcome.earlier:
+        return outcome
+    return replace(outcome, node=socket.gethostname(), wall_s=round(time.monotonic() - begin_s, 3))
+
+
+def _attempt(job: Job, started: Started) -> Outcome:
+    if job.version != __version__:
+        raise InputError(
+            f"{socket.gethostname()} has AquaFlow {__version__}, the batch is of {job.version}; "
+            "install the same on every machine"
+        )
+    site = open_site(job.site)
+    found = site.finished(job)
+    if found is not None:
+        return found
+    with working_folder(site.work_parent(job), job.name) as work:
+        return _make(job, site, work, started)
+
+
+def _make(job: Job, site: Site, work: Path, started: Started) -> Outcome:
+    source = job.source
+    if is_url(source):
+        source = str(ObjectStore(source).fetch(work / "recording"))
+    dive = work / "dive"
+    outcome = _map(job, source, work, dive, started)
+    if outcome.state in WRITTEN:
+        write_manifest(dive, job, outcome)
+        site.publish(dive, job)
+    return outcome
+
+
+def _map(job: Job, source: str, work: Path, dive: Path, started: Started) -> Outcome:
+    """Map in a new process, and wait for it."""
+    calibration = None
+    if job.calibration is not None:
+        calibration = work / "camera.yaml"
+        calibration.write_text(job.calibration, encoding="utf-8")
+    asked = {
+        "source": source, "out": str(dive), "settings": job.settings, "parent": os.getpid(),
+        "calibration": None if calibration is None else str(calibration),
+    }  # fmt: skip
+    with (work / "said").open("w+b") as said:
+        process = subprocess.Popen(
+            [sys.executable, "-m", PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=said, env=_environment(job.threads), start_new_session=True,
+        )  # fmt: skip
+        with started.running(process):
+            return _answer(process, json.dumps(asked).encode(), job.memory_mb)
+
+
+def _environment(threads: int) -> dict[str, str]:
+    """This process's variables, with the number of threads of the job whoever runs it: Ray sets
+    its own."""
+    fixed = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    return dict(os.environ) | dict.fromkeys(fixed, str(threads))
+
+
+def _answer(process: subprocess.Popen[bytes], asked: bytes, memory_mb: int) -> Outcome:
+    assert process.stdin is not None
+    assert process.stdout is not None
+    try:
+        process.stdin.write(asked)
+        process.stdin.close()
+    except BrokenPipeError:
+        pass  # it died at once; how is seen below
+    text = process.stdout.read()
+    process.stdout.close()
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    measured: dict[str, Any] = {
+        "cpu_s": round(usage.ru_utime + usage.ru_stime, 3),
+        "peak_mb": round(usage.ru_maxrss * KILOBYTE / MEGABYTE, 1),
+    }
+    try:
+        return Outcome(**json.loads(text), **measured)
+    except (ValueError, TypeError):
+        return Outcome("lost", _died(process.returncode, memory_mb), **measured)
+
+
+def _died(code: int, memory_mb: int) -> str:
+    if code == -Signals.SIGKILL:
+        return (
+            f"its process was killed; if that was for want of memory ({memory_mb} MB were expected)"
+            ", give fewer --jobs"
+        )
+    if code < 0:
+        return f"its process crashed ({Signals(-code).name}); the recording may be damaged"
+    return f"its process ended with status {code} and said nothing"

@@ -1,0 +1,111 @@
+"""A batch: every recording becomes a dive, once, whoever makes it and whatever dies meanwhile."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+
+from aquaflow.base.errors import AquaFlowError
+from aquaflow.lab.batch.job import WRITTEN, Job, Outcome
+from aquaflow.lab.batch.journal import Journal
+from aquaflow.lab.batch.workers import Workers
+
+LOOK_S = 0.5
+"""s between looks at whether a Ctrl-C has come."""
+
+
+class End(Enum):
+    """Why a batch is over."""
+
+    ALL = "every dive was tried"
+    STOPPED = "stopped"
+    FULL_DISK = "the disk is full"
+    NO_WORKERS = "no one is left to make dives"
+
+
+@dataclass
+class Season:
+    """What came of each dive."""
+
+    outcomes: dict[str, Outcome] = field(default_factory=dict)
+    """By name; of a dive that was not tried to its end, none."""
+    end: End = End.ALL
+    reason: str = ""
+    """Why no one is left."""
+
+
+@dataclass
+class _Queue:
+    """Jobs that wait, and how often each was tried."""
+
+    waiting: deque[Job]
+    attempts: dict[str, int] = field(default_factory=dict)
+    running: dict[str, Job] = field(default_factory=dict)
+
+
+def run_season(
+    jobs: Sequence[Job],
+    workers: Workers,
+    journal: Journal,
+    retries: int,
+    ended: Callable[[int, int], None],
+) -> Season:
+    """Make every dive of ``jobs``; one whose process dies is tried ``retries`` times more.
+
+    Long dives are begun first, so that none is left at the end alone. ``ended`` is told how many
+    have ended, of how many. After a full disk nothing more is begun. Ctrl-C stops what runs.
+    """
+    longest_first = sorted(jobs, key=lambda job: (-job.size_bytes, job.name))
+    queue, season = _Queue(deque(longest_first)), Season()
+    try:
+        while queue.waiting or queue.running:
+            _start(queue, workers, journal)
+            found = workers.wait(LOOK_S)
+            if found is None:
+                continue
+            _settle(*found, queue, season, journal, retries)
+            ended(len(season.outcomes), len(jobs))
+    except KeyboardInterrupt:
+        season.end = End.STOPPED
+    except AquaFlowError as error:
+        season.end, season.reason = End.NO_WORKERS, str(error)
+    finally:
+        workers.close()
+    journal.write("ended", reason=season.reason or season.end.value)
+    return season
+
+
+def _start(queue: _Queue, workers: Workers, journal: Journal) -> None:
+    """Begin every waiting job that has room now."""
+    for job in list(queue.waiting):
+        if workers.takes(job):
+            queue.waiting.remove(job)
+            queue.running[job.name] = job
+            queue.attempts[job.name] = attempt = queue.attempts.get(job.name, 0) + 1
+            journal.write("started", job.name, attempt=attempt, memory_mb=job.memory_mb)
+            workers.start(job)
+
+
+def _settle(
+    name: str, outcome: Outcome, queue: _Queue, season: Season, journal: Journal, retries: int
+) -> None:
+    """Note what came of an attempt; what was lost waits again, unless it was tried often enough."""
+    job = queue.running.pop(name)
+    again = outcome.state == "lost" and queue.attempts[name] <= retries
+    event = "lost" if again else outcome.state
+    journal.write(event, name, attempt=queue.attempts[name], outcome=outcome.to_json())
+    if again:
+        queue.waiting.append(job)
+        return
+    if outcome.state == "full":
+        queue.waiting.clear()
+        season.end = End.FULL_DISK
+    season.outcomes[name] = outcome
+
+
+def failed(season: Season, jobs: Sequence[Job]) -> list[Job]:
+    """Jobs without a dive."""
+    outcomes = season.outcomes
+    return [j for j in jobs if j.name not in outcomes or outcomes[j.name].state not in WRITTEN]

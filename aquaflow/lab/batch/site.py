@@ -1,0 +1,131 @@
+"""Where a batch writes: a folder, or an address in an object store. A dive appears in it whole."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Protocol
+
+from aquaflow.base.errors import InputError
+from aquaflow.base.storage.folder_lock import FolderLock, is_held
+from aquaflow.lab.batch.job import Job, Outcome
+from aquaflow.lab.batch.manifest import MANIFEST, earlier_outcome, read_manifest
+from aquaflow.lab.batch.object_store import ObjectStore, is_url
+
+DIVES = "dives"
+WORK = ".work"
+"""Suffix of the hidden folder that a dive is made in."""
+
+
+class Site(Protocol):
+    """Takes finished dives."""
+
+    def finished(self, job: Job) -> Outcome | None:
+        """What came of ``job`` if its dive is there already, else None.
+
+        Raises:
+            InputError: there is a dive of this name of another recording or other settings.
+        """
+        ...
+
+    def work_parent(self, job: Job) -> Path:
+        """The local folder in which the dive's working folder is made."""
+        ...
+
+    def publish(self, dive: Path, job: Job) -> None:
+        """Let the finished local folder ``dive`` be a dive of the site, whole or not at all.
+
+        Raises:
+            InputError, OSError: there is no room for it.
+        """
+        ...
+
+
+def open_site(where: str) -> Site:
+    """The site at a path or URL; makes nothing."""
+    return StoreSite(where) if is_url(where) else FolderSite(Path(where))
+
+
+class FolderSite:
+    """A site on a disk, which on a cluster every node sees under the same path."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def finished(self, job: Job) -> Outcome | None:
+        dive = self.path / DIVES / job.name
+        if not dive.exists():
+            return None
+        try:
+            text = (dive / MANIFEST).read_bytes()
+        except OSError as error:
+            raise InputError(
+                f"{dive} is not of a batch; remove it, or give another --out"
+            ) from error
+        return earlier_outcome(read_manifest(text, str(dive)), job, str(dive))
+
+    def work_parent(self, job: Job) -> Path:
+        return self.path / DIVES
+
+    def publish(self, dive: Path, job: Job) -> None:
+        target = self.path / DIVES / job.name
+        try:
+            dive.rename(target)
+        except OSError:
+            # Another machine, thought dead, was first: its dive is as good.
+            if not (target / MANIFEST).exists():
+                raise
+
+
+class StoreSite:
+    """A site in an object store, where nothing can be renamed: the manifest comes last."""
+
+    def __init__(self, url: str) -> None:
+        self.store = ObjectStore(url)
+
+    def finished(self, job: Job) -> Outcome | None:
+        where = f"{self.store.url}/{DIVES}/{job.name}"
+        text = self.store.read(f"{DIVES}/{job.name}/{MANIFEST}")
+        return None if text is None else earlier_outcome(read_manifest(text, where), job, where)
+
+    def work_parent(self, job: Job) -> Path:
+        return Path(job.cache)
+
+    def publish(self, dive: Path, job: Job) -> None:
+        if self.finished(job) is not None:  # another machine, thought dead, was first
+            return
+        to = f"{DIVES}/{job.name}"
+        self.store.remove(to)  # of an attempt that was cut off
+        files = sorted(path for path in dive.rglob("*") if path.is_file())
+        for path in sorted(files, key=lambda path: path.name == MANIFEST):
+            self.store.put(path, f"{to}/{path.relative_to(dive).as_posix()}")
+
+
+@contextlib.contextmanager
+def working_folder(parent: Path, name: str) -> Iterator[Path]:
+    """A new hidden folder that no other attempt uses; it is gone afterwards.
+
+    Raises:
+        InputError: it cannot be made.
+    """
+    folder = parent / f".{name}.{uuid.uuid4().hex[:8]}{WORK}"
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise InputError(f"cannot make {folder}: {error.strerror}; give another --out") from error
+    lock = FolderLock(folder)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        lock.release()
+
+
+def remove_abandoned(parent: Path) -> None:
+    """Remove working folders whose process was killed; those of running ones stay."""
+    for folder in parent.glob(f".*{WORK}"):
+        if folder.is_dir() and not is_held(folder):
+            shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,51 @@
+"""One run of the benchmark as JSON: what the runner asks of a worker process."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from aquaflow.config import Config, parse_config
+from aquaflow.config.presets import merged, preset
+from aquaflow.lab.bench.scene import BenchmarkScene
+
+RENDERERS = {"cpu": "cpu", "cuda": "gsplat"}
+"""What draws on each device."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One contender on one scene."""
+
+    scene: BenchmarkScene
+    preset: str
+    out: str
+    """Dive folder to write."""
+    peer: str | None = None
+    """Another program in AquaFlow's place, on the frames that ``preset`` prepares."""
+    overrides: dict[str, Any] | None = None
+    """Of the config, on top of the preset."""
+    repeat: int = 0
+    device: str | None = None
+    """cpu or cuda: map and learned prior run there or the run fails; None: as the preset says."""
+
+    def config(self) -> Config:
+        """The scene's settings, then the preset's, then this job's own."""
+        wanted = merged(merged(Config().model_dump(), self.scene.overrides), preset(self.preset))
+        steps = wanted["mapping"]["optimiser"]["refine_steps"]
+        wanted["mapping"]["optimiser"]["refine_steps"] = round(self.scene.refine_share * steps)
+        if self.device is not None:
+            wanted["mapping"]["renderer"] = RENDERERS[self.device]
+            wanted["prior"]["device"] = self.device
+        return parse_config(merged(wanted, self.overrides or {}), f"benchmark of {self.scene.name}")
+
+    def to_text(self) -> str:
+        """As JSON, for the worker process."""
+        return json.dumps(asdict(self))
+
+    @staticmethod
+    def from_text(text: str) -> Job:
+        """The job that :meth:`to_text` wrote."""
+        data = json.loads(text)
+        return Job(**{**data, "scene": BenchmarkScene(**data["scene"])})

@@ -1,0 +1,103 @@
+"""A fit in the manner of Sea-thru (Akkaynak and Treibitz, CVPR 2019) on given ranges.
+
+Backscatter comes from the darkest pixels of every range, the attenuation from how the local
+illumination falls with range. The paper fits single raw pictures. Here they are those that the map
+was made from, and one water is fitted to all of them, which restores them better.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.lab.evaluation.water_peers.attenuation import fit_attenuation, two_exponentials
+from aquaflow.lab.evaluation.water_peers.backscatter import backscatter, fit_backscatter
+from aquaflow.lab.evaluation.water_peers.contract import NotRestoredError, Pictures, Ranges
+from aquaflow.lab.evaluation.water_peers.local_average import local_average
+
+Array = npt.NDArray[np.float64]
+
+FEWEST_PIXELS = 2000
+"""With known range, in all pictures: a tenth of the range holds some hundred of them, and their
+darkest percentile at least one."""
+SMALLEST_SPAN = 1.1
+"""Farthest over nearest range; less says nothing about how light falls with range."""
+RANGE_PERCENTILES = (1.0, 50.0, 99.0)
+"""Percent; values outside are single pixels at edges of the map."""
+FIT_VIEWS = 20
+"""Evenly taken from all; more would add time and memory, and no other water."""
+LONGEST_DEPTH = 30.0
+"""Optical depth; exp(30) exceeds any picture's values by far and is still a number."""
+
+
+@dataclass(frozen=True)
+class _Water:
+    near: float
+    far: float
+    """Ranges outside of these are held there: only edges of the map have them."""
+    median: float
+    """Of the ranges; the rates below are per this range."""
+    veil: Array
+    """[3, 4] for ``backscatter``."""
+    rates: Array
+    """[3, 4] for ``two_exponentials``."""
+
+
+def restore(
+    pictures: Pictures,  # [N, H, W, 3] in [0, 1]
+    ranges: Ranges | None,  # [N, H, W] in any unit
+) -> Pictures:
+    """Take backscatter and attenuation off; black where the range is unknown.
+
+    Raises:
+        NotRestoredError: there are no ranges, too few, or they and the pictures show no water.
+    """
+    if ranges is None:
+        raise NotRestoredError("the ranges of the held-out views are missing or damaged")
+    every = -(-len(pictures) // FIT_VIEWS)
+    water = _fit(pictures[::every], ranges[::every])
+    restored = np.stack([_restored(*view, water) for view in zip(pictures, ranges, strict=True)])
+    # In each channel the brightest of all views is white; some light is left, or there was no fit.
+    return np.asarray(restored / restored.max(axis=(0, 1, 2)), np.float32)
+
+
+def _fit(
+    pictures: Pictures,  # [N, H, W, 3]
+    ranges: Ranges,  # [N, H, W]
+) -> _Water:
+    known = _known(ranges)
+    if known.sum() < FEWEST_PIXELS:
+        raise NotRestoredError(f"fewer than {FEWEST_PIXELS} pixels have a range")
+    near, median, far = map(float, np.percentile(ranges[known], RANGE_PERCENTILES))
+    if far < SMALLEST_SPAN * near:
+        raise NotRestoredError(f"the ranges span less than 1:{SMALLEST_SPAN}")
+    z = np.where(known, np.clip(ranges.astype(np.float64), near, far) / median, 0.0)
+    veil = fit_backscatter(pictures[known].astype(np.float64), z[known])
+    direct = np.zeros(pictures.shape)
+    direct[known] = np.maximum(pictures[known] - backscatter(veil, z[known]), 0.0)
+    found = [local_average(*view) for view in zip(direct, z, known, strict=True)]
+    light, at = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return _Water(near, far, median, veil, fit_attenuation(light, at))
+
+
+def _restored(
+    picture: Pictures,  # [H, W, 3]
+    ranges: Ranges,  # [H, W]
+    water: _Water,
+) -> Pictures:
+    """[H, W, 3] J, 0 where the range is unknown; its unit is the light of the fit."""
+    known = _known(ranges)
+    z = np.clip(ranges[known].astype(np.float64), water.near, water.far) / water.median
+    direct = np.maximum(picture[known] - backscatter(water.veil, z), 0.0)
+    depth = np.stack([two_exponentials(rate, z) * z for rate in water.rates], axis=-1)
+    restored = np.zeros(picture.shape, np.float32)
+    restored[known] = direct * np.exp(np.minimum(depth, LONGEST_DEPTH))
+    return restored
+
+
+def _known(
+    ranges: Ranges,  # [...]
+) -> npt.NDArray[np.bool_]:
+    return np.asarray(np.isfinite(ranges) & (ranges > 0.0))

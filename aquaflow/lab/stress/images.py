@@ -1,0 +1,199 @@
+"""Pictures that show nothing, too much, or something else: they cost those frames, not the dive."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from aquaflow.base.errors import InputError
+from aquaflow.config import SourceConfig
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.lab.stress.case import Check, case
+from aquaflow.lab.stress.snow import marine_snow
+from aquaflow.lab.stress.swim import (
+    CAMERA,
+    FRAMES,
+    Floor,
+    Picture,
+    clear_swim,
+    clear_tracking,
+    film,
+    on_path,
+    only_these_lost,
+    path,
+    sound,
+    spoiled,
+    track,
+)
+from aquaflow.prior.classical import ClassicalPrior
+from aquaflow.sources.preprocessing import Preparation
+from aquaflow.types import Frame
+
+HURT = 2
+"""Frames in a row that show nothing: fewer than what starts a new sub-map."""
+
+
+def _worst_moment(seed: int) -> range:
+    """The frames right after a keyframe, for which no motion is predicted yet.
+
+    There flow starts from nothing, and onto an empty picture it ends there: a match everywhere.
+    """
+    keyframes = [k.frame_index for k in clear_tracking(seed).keyframes.keyframes]
+    after = max(k for k in keyframes if k + HURT + 1 < FRAMES) + 1
+    return range(after, after + HURT)
+
+
+def _blind(check: Check, seed: int, change: Callable[[Picture, int], Picture]) -> None:
+    """Frames that show nothing get no pose; all others keep theirs, and it is right."""
+    hurt = _worst_moment(seed)
+    frames = spoiled(clear_swim(seed), hurt, change)
+    result = track(frames)
+    sound(check, frames, result)
+    only_these_lost(check, result, hurt, share=0.9)
+    on_path(check, result, path())
+
+
+def _empty(check: Check, seed: int, grey: int) -> None:
+    """A picture of one colour: not one pixel of it is matched, and its frames get no pose."""
+    prior, seen = ClassicalPrior(), clear_swim(seed)[0].image
+    pair = prior.decode(prior.encode(seen, CAMERA), prior.encode(np.full_like(seen, grey), CAMERA))
+    check.below("matched share of an empty picture", float(pair.valid.mean()), 1e-3)
+    _blind(check, seed, lambda picture, i: np.full_like(picture, grey))
+
+
+def _hard(
+    check: Check, seed: int, change: Callable[[Picture, int], Picture], share: float = 0.9
+) -> None:
+    """Pictures that still show the place: ``share`` of the frames are placed, and placed right."""
+    frames = spoiled(clear_swim(seed), range(FRAMES), change)
+    result = track(frames)
+    sound(check, frames, result)
+    only_these_lost(check, result, (), share)
+    on_path(check, result, path())
+
+
+@case("images", "prior.flow.MIN_TEXTURE")
+def black(check: Check, seed: int) -> None:
+    """Two black pictures, as when the lamps fail at night."""
+    _empty(check, seed, 0)
+
+
+@case("images", "prior.flow.MIN_TEXTURE")
+def white(check: Check, seed: int) -> None:
+    """Two white pictures, as when the camera looks into the sun."""
+    _empty(check, seed, 255)
+
+
+@case("images", "prior.flow.MIN_TEXTURE")
+def constant(check: Check, seed: int) -> None:
+    """Two pictures of open water."""
+    _empty(check, seed, 60)
+
+
+@case("images", "prior.flow.FORWARD_BACKWARD_PX")
+def one_pixel_texture(check: Check, seed: int) -> None:
+    """Two checkerboards of one-pixel squares: every match is as good as every other."""
+
+    def checkerboard(picture: Picture, i: int) -> Picture:
+        row, column, _ = np.indices(picture.shape)
+        return np.asarray(np.where((row + column + i) % 2 == 0, 255, 0), dtype=np.uint8)
+
+    _blind(check, seed, checkerboard)
+
+
+@case("images", "prior.flow.FlowMatcher")
+def salt_and_pepper(check: Check, seed: int) -> None:
+    """One pixel in fifty black or white, in every picture."""
+
+    def sprinkle(picture: Picture, i: int) -> Picture:
+        rng = np.random.default_rng([seed, i])
+        hit = rng.random(picture.shape[:2]) < 0.02
+        salted = picture.copy()
+        salted[hit] = np.where(rng.random((int(hit.sum()), 1)) < 0.5, 0, 255)
+        return salted
+
+    _hard(check, seed, sprinkle, share=0.7)
+
+
+@case("images", "prior.flow.normalised_grey")
+def saturation(check: Check, seed: int) -> None:
+    """Over-exposed: half the picture is at 255."""
+    _hard(
+        check, seed, lambda p, i: np.clip(p.astype(np.float64) * 2.0, 0, 255).astype(np.uint8), 0.7
+    )
+
+
+@case("images", "prior.flow.normalised_grey")
+def lamp_on_and_off(check: Check, seed: int) -> None:
+    """A lamp with a bright middle goes on and off every third frame."""
+
+    def lit(picture: Picture, i: int) -> Picture:
+        y, x = np.indices(picture.shape[:2])
+        middle = np.exp(-((x - CAMERA.cx) ** 2 + (y - CAMERA.cy) ** 2) / 60.0**2)
+        gain = 0.35 + 0.8 * middle * (i // 3 % 2)
+        return np.asarray(np.clip(picture * gain[..., None], 0, 255), dtype=np.uint8)
+
+    _hard(check, seed, lit, share=0.7)
+
+
+@case("images", "prior.flow.normalised_grey")
+def exposure_steps(check: Check, seed: int) -> None:
+    """Exposure jumps by a factor of three from frame to frame."""
+    gains = (0.5, 1.5, 0.8)
+    _hard(check, seed, lambda p, i: np.clip(p * gains[i % 3], 0, 255).astype(np.uint8), share=0.7)
+
+
+@case("images", "tracking.current_keyframe.KeyframeTracker.classify")
+def snow(check: Check, seed: int) -> None:
+    """Two seconds of marine snow over two fifths of the picture: it makes no keyframe."""
+    camera, poses, snowy = CAMERA.scaled(320, 240), path(34, step_m=0.015), range(8, 28)
+    clear = film(Floor(seed), poses, camera)
+    frames = spoiled(clear, snowy, marine_snow(camera, 0.4, seed))
+    result = track(frames)
+    sound(check, frames, result)
+    only_these_lost(check, result, (), share=0.9)
+    on_path(check, result, poses, bound=0.02)
+    keyframes = {k.frame_index for k in result.keyframes.keyframes}
+    check.true("no keyframe shows snow", not keyframes & set(snowy))
+
+
+@case("images", "sources.preprocessing.check_picture")
+def nan_in_float_picture(check: Check, seed: int) -> None:
+    """A source that hands over floats, some of them NaN, is refused in one sentence."""
+    frame = clear_swim(seed)[0]
+    floats = frame.image.astype(np.float32) / 255.0
+    floats[::7] = np.nan
+    wrong = replace(frame, image=floats)  # type: ignore[arg-type]
+    check.true("a float picture is refused", _refused(wrong))
+
+
+@case("images", "sources.preprocessing.check_picture")
+def one_by_one(check: Check, seed: int) -> None:
+    """Pictures of one pixel are refused in one sentence."""
+    camera = CameraModel(1, 1, 1.0, 1.0, 0.5, 0.5)
+    image = np.full((1, 1, 3), seed % 256, np.uint8)
+    check.true("a picture of one pixel is refused", _refused(Frame(0, 0, 0, image, camera)))
+
+
+@case("images", "sources.preprocessing.Preparation")
+def width_8192(check: Check, seed: int) -> None:
+    """Pictures 8192 pixels wide are made small, then tracked."""
+    large = CAMERA.scaled(8192, 6144)
+    floor, prepare = Floor(seed), Preparation(SourceConfig(width=CAMERA.width), large)
+    frames = []
+    for frame in film(floor, path(6)):
+        wide = np.repeat(np.repeat(frame.image, 52, axis=0)[:6144], 52, axis=1)[:, :8192]
+        frames.append(prepare(replace(frame, image=np.ascontiguousarray(wide), camera=large)))
+    result = track(frames)
+    sound(check, frames, result)
+    only_these_lost(check, result, (), share=0.8)
+
+
+def _refused(frame: Frame) -> bool:
+    try:
+        Preparation(SourceConfig(), None)(frame)
+    except InputError:
+        return True
+    return False

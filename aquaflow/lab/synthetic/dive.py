@@ -1,0 +1,201 @@
+"""Writing a synthetic dive: the pictures, and everything that is true about them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import yaml
+from scipy.spatial.transform import Rotation
+
+from aquaflow.base.errors import InputError, reason_of
+from aquaflow.geometry.camera_file import save_camera
+from aquaflow.lab.synthetic import objects, radiance, render
+from aquaflow.lab.synthetic import path as paths
+from aquaflow.lab.synthetic.bodies import Bodies
+from aquaflow.lab.synthetic.config import SyntheticConfig
+from aquaflow.lab.synthetic.display import burn_in
+from aquaflow.lab.synthetic.march import HeightField
+from aquaflow.lab.synthetic.planted import bleach
+from aquaflow.lab.synthetic.sensor import Snow, expose, quantised, vignette
+from aquaflow.lab.synthetic.site import Site, camera_of, site_of
+from aquaflow.lab.synthetic.streams import stream
+from aquaflow.lab.synthetic.telemetry.constants import Constants, draw_constants
+from aquaflow.lab.synthetic.telemetry.measurement import measure
+from aquaflow.lab.synthetic.telemetry.sonar import Sonar
+from aquaflow.lab.synthetic.texture import MipAtlas
+from aquaflow.lab.synthetic.water import WATER_TYPES, save_medium
+from aquaflow.recordings.sample_table import write_telemetry
+
+__all__ = ["FORMAT_VERSION", "build", "camera_of", "write_dive"]
+
+MARKER = "synth.yaml"
+"""The file by which a folder is known to be a synthetic dive."""
+
+FORMAT_VERSION = 3
+"""Of the files and of the generator: the same config gives the same dive within a version."""
+
+MIP_LEVELS = 6
+"""Of the floor's texture, each half as fine as the one before."""
+
+
+def build(config: SyntheticConfig) -> tuple[render.SyntheticScene, paths.Path]:
+    """The scene and the way through it."""
+    site = site_of(config)
+    return _scene(config, site), site.path
+
+
+def _scene(config: SyntheticConfig, site: Site) -> render.SyntheticScene:
+    """The site with its colours."""
+    home = config.home
+    colours = stream(home.seed, "colours")
+    floor = radiance.bake(home.scene, site.relief, site.crests, colours)
+    bleach(floor, site.relief.area, config.bleached)
+    return render.SyntheticScene(
+        site.relief.area,
+        HeightField(site.relief.area, site.relief.height),
+        MipAtlas(floor, MIP_LEVELS),
+        site.shapes,
+        objects.object_texture(colours),
+        config.max_range_m,
+    )
+
+
+def write_dive(
+    out: Path, config: SyntheticConfig, progress: Callable[[int, int], None] | None = None
+) -> None:
+    """Write a dive with its ground truth (files: see :mod:`aquaflow.lab.synthetic.truth`).
+
+    Args:
+        out: folder, made if needed; a dive that is there is replaced.
+        config: what to make.
+        progress: called with (pictures written, pictures in all).
+
+    Raises:
+        InputError: ``out`` cannot be written to, or holds files that are not a synthetic dive.
+    """
+    if out.is_dir() and not (out / MARKER).is_file() and any(p.is_file() for p in out.rglob("*")):
+        raise InputError(f"{out} holds files that are not a synthetic dive; choose another folder")
+    try:
+        for name in ("images", "range", "clean"):
+            folder = out / name
+            folder.mkdir(parents=True, exist_ok=True)
+            for old in folder.iterdir():
+                old.unlink()
+        site = site_of(config)
+        _write_tables(out, config, site)
+        _write_pictures(out, config, _scene(config, site), site.path, progress)
+    except OSError as error:
+        raise InputError(
+            f"cannot write the dive to {out}: {reason_of(error)}; choose another folder"
+        ) from error
+
+
+def _write_tables(out: Path, config: SyntheticConfig, site: Site) -> None:
+    t, path = np.arange(config.frames) / config.fps, site.path
+    save_camera(camera_of(config), out / "camera.yaml")
+    save_medium(WATER_TYPES[config.water], out / "medium.yaml")
+    (out / "timestamps.txt").write_text("".join(f"{value:.9f}\n" for value in t))
+    xyzw = Rotation.from_matrix(path.R_wc(t)).as_quat(canonical=True)
+    rows = np.column_stack([path.centre_w(t), xyzw]).tolist()
+    lines = [f"{t[k]:.9f} " + " ".join(map(repr, row)) + "\n" for k, row in enumerate(rows)]
+    (out / "poses.tum").write_text("".join(lines))
+    constants = draw_constants(config)
+    sonar = Sonar(site.relief.area, site.crests)
+    write_telemetry(out / "telemetry.csv", measure(config, site.motion, sonar, constants))
+    (out / MARKER).write_text(yaml.safe_dump(_stated(config, site, constants), sort_keys=False))
+
+
+def _stated(config: SyntheticConfig, site: Site, constants: Constants) -> dict[str, Any]:
+    """What synth.yaml says."""
+    mountings = site.motion.mountings
+    place = mountings.p_bc.tolist()
+    return {
+        "version": FORMAT_VERSION,
+        "config": config.model_dump(mode="json", exclude_none=True),
+        "frames": {
+            "world": "z down, metres, z = 0 at the surface (NED-like)",
+            "camera": "x right, y down, z forward; poses are camera to world",
+            "body": "forward, right, down; telemetry is that of its origin",
+        },
+        "mounting": {
+            "R_body_camera": mountings.R_bc_stated.tolist(),
+            "t_body_camera_m": place,
+            "camera": mountings.stated.model_dump(mode="json"),
+        },
+        "truth": {
+            "R_body_camera": mountings.R_bc.tolist(),
+            "t_body_camera_m": place,
+            "R_body_dvl": mountings.R_bd.tolist(),
+            **constants.as_dict(),
+        },
+        "vignette": "image = water * (1 - vignette * r^2 / r_corner^2), before noise",
+        "loop_length_m": config.speed_m_s * config.duration_s,
+    }
+
+
+def _write_pictures(
+    out: Path,
+    config: SyntheticConfig,
+    scene: render.SyntheticScene,
+    path: paths.Path,
+    progress: Callable[[int, int], None] | None,
+) -> None:
+    t = np.arange(config.frames) / config.fps
+    R_wc = path.R_wc(t)
+    R_sc, centres = path.R_ws.T @ R_wc, path.centre_s(t)
+    camera, mean = camera_of(config), WATER_TYPES[config.water]
+    noise_rng = stream(config.seed, "sensor")
+    snow = Snow(config, centres, stream(config.seed, "snow"))
+    shade = vignette(camera, config.vignette)
+    bodies = Bodies(config, t, R_sc, centres)
+    light = np.array((1.0, 1.0, 1.0) if config.visit is None else config.visit.light, np.float32)
+    with ThreadPoolExecutor(1) as pool:
+        # Compressing a picture overlaps with rendering the next; one is waited for at a time.
+        pending: Future[None] | None = None
+        for k in range(config.frames):
+            medium = mean.looking(R_wc[k, :, 2], config.directional_attenuation)
+            view = render.render(
+                scene, camera, R_sc[k], centres[k], medium, config.supersampling, bodies.at(k)
+            )
+            water = view.water.copy()
+            snow.draw(water, view.range_m, camera, R_sc[k], centres[k], float(t[k]), medium)
+            picture = expose(water * light, shade, config.noise_sigma, noise_rng)
+            if config.display is not None:
+                burn_in(picture, config.display, float(t[k]))
+            if pending is not None:
+                pending.result()
+            pending = pool.submit(_save, out, k, picture, replace(view, water=water))
+            if progress is not None:
+                progress(k + 1, config.frames)
+        if pending is not None:
+            pending.result()
+
+
+def _save(
+    out: Path,
+    index: int,
+    picture: npt.NDArray[np.uint8],  # [H, W, 3] RGB
+    view: render.RenderedView,
+) -> None:
+    name = f"{index:06d}"
+    _save_png(out / "images" / f"{name}.png", picture)
+    _save_png(out / "clean" / f"{name}.png", quantised(view.clean))
+    hit = np.isfinite(view.range_m)
+    stored = np.where(hit, view.range_m, 0.0).astype(np.float32)
+    masks = {"hit": hit, "moving": view.moving} if view.moving.any() else {"hit": hit}
+    np.savez(out / "range" / f"{name}.npz", allow_pickle=False, range_m=stored, **masks)
+
+
+def _save_png(
+    path: Path,
+    rgb: npt.NDArray[np.uint8],  # [H, W, 3] RGB
+) -> None:
+    if not cv2.imwrite(str(path), rgb[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 2]):
+        raise OSError(f"{path} was not written")

@@ -1,0 +1,187 @@
+"""`aquaflow prior train compact`: a pool of scenes, a training, and the folder that tracks."""
+
+from __future__ import annotations
+
+import os
+import platform
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from aquaflow.base.errors import InputError
+from aquaflow.lab.training.compact import CompactSettings, CompactTask
+from aquaflow.lab.training.compact_figures import with_figures, with_honest_range
+from aquaflow.lab.training.curve import NOT_FIGURES
+from aquaflow.lab.training.held_out import RANGE_SET, SETS, held_out_pairs, turned_pictures
+from aquaflow.lab.training.held_out import SEED as HELD_OUT_SEED
+from aquaflow.lab.training.pair_generator.draw import Draw
+from aquaflow.lab.training.pair_generator.drawing import WindowVariation, through_water
+from aquaflow.lab.training.pair_generator.map_pairs import MapPairs
+from aquaflow.lab.training.pair_generator.pool import Pool
+from aquaflow.lab.training.pair_generator.real_pictures import RealPictures
+from aquaflow.lab.training.pair_generator.scene import Detail
+from aquaflow.lab.training.pair_generator.stored_pairs import SHARD
+from aquaflow.lab.training.schedule import Schedule
+from aquaflow.lab.training.trainer import Progress, TrainingPlan, has_ended, train
+from aquaflow.prior.compact.export import export
+from aquaflow.prior.compact.network import CompactPrior
+from aquaflow.prior.folder import PriorCard
+
+POOL, PRIOR = "pool", "prior"
+"""Folders of a run: training pairs, the exported prior."""
+REGULAR_SHARE = 0.2
+"""Of the pool's scenes: tiles and nets."""
+VALIDATE_EVERY = 1000
+"""Steps: a validation takes as long as 60 of them."""
+CALIBRATION_SEED = 2000
+"""Of the water over the pictures that 8-bit ranges are taken from."""
+CALIBRATION_SHARDS = 2
+"""Of the pool, 16 pairs: the pictures that the ranges are taken from."""
+
+
+@dataclass(frozen=True)
+class CompactRun:
+    """All that a run's result follows from, together with the code."""
+
+    seed: int = 1
+    steps: int = 36_000
+    hold: float = 0.7
+    """Share of the steps at the highest rate; the rest anneals, on larger windows and with maps."""
+    warm_up: int = 100
+    rate: float = 2e-3
+    lowest_rate: float = 2e-5
+    settings: CompactSettings = field(default_factory=CompactSettings)
+    looks: WindowVariation = field(default_factory=WindowVariation)
+    late_looks: WindowVariation = field(
+        default_factory=lambda: WindowVariation(width=160, height=112)
+    )
+    pictures: tuple[Path, ...] = ()
+    """Folders of real pictures and clips; none: generated pairs only."""
+    maps: tuple[Path, ...] = ()
+    """Dive folders whose maps give pairs too, once the rate falls: up to there a run is the same
+    with and without them, and a map may be made by the weights of that time."""
+    held_out: tuple[Path, ...] = ()
+    """Folders of others, for figures of turned real pictures."""
+
+    @property
+    def schedule(self) -> Schedule:
+        """Warm-up, hold, half a cosine."""
+        hold = round(self.hold * self.steps)
+        return Schedule(self.steps, self.warm_up, self.rate, self.lowest_rate, hold)
+
+    def looks_at(self, step: int) -> WindowVariation:
+        """Small windows first: most is learnt there, in half the time."""
+        return self.looks if step < self.schedule.hold else self.late_looks
+
+
+def train_compact(
+    run: CompactRun, out: Path, progress: Progress, device: str = "cpu", hours: float | None = None
+) -> PriorCard | None:
+    """Train on ``device`` in ``out``, continuing an earlier run there; export to ``out``/prior.
+
+    None if ``hours`` were over before the training was: the same call goes on.
+
+    Raises:
+        InputError: ``out`` holds the checkpoint of another network, there is no such device, a
+            folder of pictures holds none, or a dive no map that can be learnt from.
+    """
+    place = device_called(device)
+    torch.manual_seed(run.seed)
+    network = CompactPrior().to(place)
+    pool = Pool(out / POOL, run.seed, detail=Detail(regular=REGULAR_SHARE))
+    real = RealPictures(run.pictures, pool.width, pool.height) if run.pictures else None
+    maps = map_pairs(run, pool, progress) if run.maps else None
+    first = -(-min(run.settings.first_scenes, run.settings.scenes) // SHARD)
+    for shard in range(first):
+        pool.ensure(shard)
+        progress("scenes", shard + 1, first)
+    held_out = held_out_pairs(out, SETS["wide"])
+    task = CompactTask(
+        network,
+        pool,
+        held_out,
+        run.settings,
+        run.looks_at,
+        run.seed,
+        real,
+        maps,
+        run.schedule.hold,
+    )
+    plan = TrainingPlan(run.schedule, validate_every=VALIDATE_EVERY, hours=hours)
+    history = train(task, plan, out, progress)
+    if not has_ended(history, run.schedule):
+        return None
+    record = training_record(run, history, hardware_of(device))
+    card = export(network.cpu(), out / PRIOR, record, calibration(pool), progress)
+    card = with_honest_range(out / PRIOR, card, held_out_pairs(out, RANGE_SET))
+    sets = {name: held_out_pairs(out, chosen) for name, chosen in SETS.items()}
+    if run.held_out:
+        sets["real"] = turned_pictures(run.held_out)
+    return with_figures(out / PRIOR, card, sets)
+
+
+def map_pairs(run: CompactRun, pool: Pool, progress: Progress) -> MapPairs:
+    """Pairs of the run's maps, rendered into the pool's folder."""
+    count = run.settings.map_pairs
+    pairs = MapPairs(run.maps, pool.folder, run.seed, pool.width, pool.height, count)
+    pairs.render(progress)
+    return pairs
+
+
+def device_called(name: str) -> torch.device:
+    """cpu, cuda or cuda:N.
+
+    Raises:
+        InputError: torch knows no such device, or it is not here.
+    """
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise InputError(f"there is no device '{name}'; give cpu or cuda") from error
+    if device.type not in ("cpu", "cuda"):
+        raise InputError(f"training on '{name}' is not supported; give cpu or cuda")
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise InputError(f"torch finds no GPU for device '{name}'; give cpu")
+    return device
+
+
+def training_record(
+    run: CompactRun, history: list[dict[str, float]], hardware: str
+) -> dict[str, Any]:
+    """What prior.json keeps of a training."""
+    return {
+        "data": "generated pictures (aquaflow.lab.training.pair_generator)",
+        "pictures": [folder.name for folder in run.pictures],
+        "maps": [folder.name for folder in run.maps],
+        "seed": run.seed,
+        "pool_seed": run.seed,
+        "held_out_seed": HELD_OUT_SEED,
+        "steps": run.steps,
+        "pairs": run.steps * run.settings.batch,
+        "scenes": run.settings.scenes,
+        "hardware": hardware,
+        "torch": torch.__version__,
+        "cpu_s": history[-1]["cpu_s"],
+        "held_out": {
+            name: round(value, 4)
+            for name, value in history[-1].items()
+            if name not in NOT_FIGURES and not name.startswith("loss_")
+        },
+    }
+
+
+def hardware_of(device: str) -> str:
+    """What trains, in words."""
+    if torch.device(device).type == "cuda":
+        return f"{torch.cuda.get_device_name(device)}, bfloat16"
+    cores, threads = os.cpu_count(), torch.get_num_threads()
+    return f"{platform.machine()} CPU, {threads} of {cores} cores, bfloat16"
+
+
+def calibration(pool: Pool) -> list[Any]:
+    """[1, 3, H, W] pictures of the pool, through water, for the 8-bit encoder."""
+    pairs = pool.pairs(torch.arange(CALIBRATION_SHARDS * SHARD))
+    seen = through_water(Draw(CALIBRATION_SEED), pairs)
+    return [image[None].numpy() for image in seen.a.image]

@@ -1,0 +1,90 @@
+"""Pairs that the compact prior is never trained on: generated ones, and turned real pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+
+from aquaflow.lab.training.correspondences import overlap
+from aquaflow.lab.training.pair_generator.cameras import TRAINING, WIDE, WIDER, Motion
+from aquaflow.lab.training.pair_generator.conditions import CALM, Conditions
+from aquaflow.lab.training.pair_generator.draw import Draw
+from aquaflow.lab.training.pair_generator.drawing import WindowVariation, through_water, windows
+from aquaflow.lab.training.pair_generator.pool import Pool
+from aquaflow.lab.training.pair_generator.real_pictures import RealPictures
+from aquaflow.lab.training.pair_generator.scene import Detail
+from aquaflow.lab.training.pair_generator.sensor import taken
+from aquaflow.lab.training.pair_generator.stored_pairs import SHARD
+from aquaflow.lab.training.pairs import Pair
+
+SEED = 1000
+"""Of the scenes that are never trained on, and of their water."""
+LEAST_OVERLAP = 0.3
+"""As in the paper's pair mining."""
+COUNT = 64
+"""Pairs of a set."""
+TOGETHER = 8
+"""Pairs of a batch."""
+REAL_SIZE = (480, 360)
+"""px of the real pictures that windows are cut from."""
+REAL_WINDOWS = WindowVariation(width=320, height=240)
+"""Of pairs of real pictures: the size that is tracked, turned and zoomed as in training."""
+
+
+@dataclass(frozen=True)
+class HeldOutSet:
+    """Generated pairs of one kind."""
+
+    folder: str
+    """Of the run, that keeps them."""
+    motion: Motion
+    detail: Detail = field(default_factory=Detail)
+    conditions: Conditions = CALM
+    seed: int = SEED
+
+
+SETS = {
+    "wide": HeldOutSet("held_out", WIDE),
+    "wider": HeldOutSet("held_out_wider", WIDER),
+    "hard": HeldOutSet(
+        "held_out_hard", TRAINING, Detail(regular=0.3), Conditions().scaled(2.0), SEED + 1
+    ),
+}
+"""Those that figures are given for; ``hard`` has all that a training has, twice as often."""
+RANGE_SET = HeldOutSet("held_out_range", TRAINING, conditions=Conditions(), seed=SEED + 2)
+"""That the factor of the range's variance is fitted on."""
+
+
+def held_out_pairs(run: Path, chosen: HeldOutSet, count: int = COUNT) -> list[Pair]:
+    """Batches of pairs that overlap enough, rendered where the folder of ``run`` lacks them."""
+    pool = Pool(run / chosen.folder, chosen.seed, motion=chosen.motion, detail=chosen.detail)
+    numbers: list[int] = []
+    number = 0
+    while len(numbers) < count:
+        pair = pool.pairs(torch.arange(number, number + SHARD))
+        numbers += [number + int(i) for i in torch.nonzero(overlap(pair) >= LEAST_OVERLAP)]
+        number += SHARD
+    draw = Draw(chosen.seed)
+    parts = [numbers[i : min(i + TOGETHER, count)] for i in range(0, count, TOGETHER)]
+    return [
+        through_water(draw, pool.pairs(torch.tensor(part)), chosen.conditions) for part in parts
+    ]
+
+
+def turned_pictures(folders: Sequence[Path], count: int = COUNT) -> list[Pair]:
+    """Batches of pairs of real pictures related by homographies, each as taken by another camera.
+
+    Raises:
+        InputError: a folder does not exist or holds no picture that can be read.
+    """
+    pictures = RealPictures(folders, *REAL_SIZE)
+    draw = Draw(SEED)
+    pairs = []
+    for _ in range(0, count, TOGETHER):
+        pair = windows(draw, pictures.pairs(draw, TOGETHER), REAL_WINDOWS)
+        a, b = (replace(view, image=taken(draw, view.image)) for view in (pair.a, pair.b))
+        pairs.append(Pair(a, b))
+    return pairs

@@ -1,0 +1,97 @@
+"""Pairs on disk, before water: geometry costs 50 times what water and sensor cost, and is kept.
+
+A file's content follows from its number alone, so that a second process may make files ahead of the
+one that trains, and a folder that was cut short is continued.
+"""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from aquaflow.lab.training.pair_generator.render import BRIGHTEST
+from aquaflow.lab.training.pairs import Pair, ViewBatch
+
+SHARD = 8
+"""Pairs of a file."""
+STRIDE = 1_000_003
+"""Between the seeds of pools: shards of different pools never share a seed."""
+
+
+@dataclass
+class StoredPairs(ABC):
+    """Pairs by number, rendered when first asked for."""
+
+    folder: Path
+    _loaded: dict[int, dict[str, Tensor]] = field(default_factory=dict, init=False, repr=False)
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """Start of the files' names: that of all that their content follows from."""
+
+    @abstractmethod
+    def rendered(self, shard: int) -> Pair:
+        """The SHARD pairs of a file: radiances without water."""
+
+    def pairs(
+        self,
+        numbers: Tensor,  # [B] int64
+    ) -> Pair:
+        """Pairs of radiances without water."""
+        rows = [self._shard(n // SHARD) for n in numbers.tolist()]
+        places = (numbers % SHARD).tolist()
+        stacked = {
+            name: torch.stack([row[name][place] for row, place in zip(rows, places, strict=True)])
+            for name in rows[0]
+        }
+        return Pair(_view(stacked, "a"), _view(stacked, "b"))
+
+    def ensure(self, shard: int) -> bool:
+        """Render the shard if it is not on disk; true if it was rendered."""
+        path = self._path(shard)
+        if path.is_file():
+            return False
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with torch.no_grad():
+            pair = self.rendered(shard)
+        part = path.with_suffix(f".{os.getpid()}.part")
+        torch.save(_packed(pair.a, "a") | _packed(pair.b, "b"), part)
+        part.replace(path)
+        return True
+
+    def _shard(self, shard: int) -> dict[str, Tensor]:
+        if shard not in self._loaded:
+            self.ensure(shard)
+            self._loaded[shard] = torch.load(self._path(shard), weights_only=True)
+        return self._loaded[shard]
+
+    def _path(self, shard: int) -> Path:
+        return self.folder / f"{self.name}_{shard:05d}.pt"
+
+
+def _packed(view: ViewBatch, name: str) -> dict[str, Tensor]:
+    """Radiance in 8 bits, depth in 16: a twentieth of a pixel at the widest parallax.
+
+    A depth that water is drawn with but nothing is learnt from is stored as a negative one.
+    """
+    return {
+        f"image_{name}": (view.image * (255.0 / BRIGHTEST)).round().byte(),
+        f"depth_{name}": torch.where(view.valid, view.depth, -view.depth).half(),
+        f"K_{name}": view.K,
+        f"T_wc_{name}": view.T_wc,
+    }
+
+
+def _view(
+    stacked: dict[str, Tensor],  # as from _packed
+    name: str,
+) -> ViewBatch:
+    depth = stacked[f"depth_{name}"].float()
+    image = stacked[f"image_{name}"].float() * (BRIGHTEST / 255.0)
+    return ViewBatch(image, depth.abs(), stacked[f"K_{name}"], stacked[f"T_wc_{name}"], depth > 0)

@@ -1,0 +1,196 @@
+"""Training of any prior: resumable, repeatable, and drawn as a curve while it goes on.
+
+A step's batch follows from the seed and the step's number, so that a run that was stopped and
+resumed ends with the same weights as one that was not.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from aquaflow.base.errors import InputError, reason_of
+from aquaflow.lab.training.curve import draw_curve
+from aquaflow.lab.training.distributed import TrainingProcess
+from aquaflow.lab.training.schedule import Schedule
+
+log = logging.getLogger(__name__)
+
+CHECKPOINT, HISTORY, CURVE = "checkpoint.pt", "history.json", "curve.png"
+"""Files of a run."""
+
+Progress = Callable[[str, int, int], None]
+
+
+class Task(Protocol):
+    """What is learnt."""
+
+    @property
+    def network(self) -> nn.Module:
+        """What is trained."""
+        ...
+
+    def loss(self, step: int) -> tuple[Tensor, dict[str, float]]:
+        """Of the batch that ``step`` stands for, and the terms it is made of."""
+        ...
+
+    def validate(self) -> dict[str, float]:
+        """Figures on data that is never trained on."""
+        ...
+
+
+@dataclass(frozen=True)
+class TrainingPlan:
+    """How long and how carefully."""
+
+    schedule: Schedule
+    accumulate: int = 1
+    """Batches whose gradients make one step."""
+    weight_decay: float = 0.01
+    betas: tuple[float, float] = (0.9, 0.95)
+    longest_gradient: float = 1.0
+    """Norm to which gradients are cut."""
+    validate_every: int = 500
+    """Steps."""
+    save_every: int = 250
+    """Steps; a checkpoint holds all that is needed to go on."""
+    hours: float | None = None
+    """After which a call stops, to be continued by another; None: when the schedule ends."""
+
+
+@dataclass
+class _Run:
+    """What a checkpoint holds."""
+
+    step: int
+    cpu_s: float
+    history: list[dict[str, float]]
+
+
+def train(
+    task: Task,
+    plan: TrainingPlan,
+    out: Path,
+    progress: Progress,
+    process: TrainingProcess | None = None,
+) -> list[dict[str, float]]:
+    """Train until the schedule or the plan's hours end, from ``out``'s checkpoint if there is one.
+
+    Gradients are averaged over all processes, and the one that leads writes files.
+
+    Returns:
+        One row per validation: step, cpu_s, rate, the mean training terms and the figures.
+
+    Raises:
+        InputError: the checkpoint is of another network.
+    """
+    process = process or TrainingProcess()
+    out.mkdir(parents=True, exist_ok=True)
+    optimiser = torch.optim.AdamW(
+        task.network.parameters(), lr=0.0, betas=plan.betas, weight_decay=plan.weight_decay
+    )
+    run = _resumed(task.network, optimiser, out / CHECKPOINT)
+    began, steps = time.process_time() - run.cpu_s, plan.schedule.steps
+    sums: dict[str, list[float]] = {}
+    until = math.inf if plan.hours is None else time.monotonic() + 3600.0 * plan.hours
+    while run.step < steps:
+        for name, value in _step(task, optimiser, plan, run.step, process).items():
+            sums.setdefault(name, []).append(value)
+        run.step += 1
+        last, over = run.step == steps, time.monotonic() >= until
+        if process.leads and (last or run.step % plan.validate_every == 0):
+            run.cpu_s = time.process_time() - began
+            run.history.append(_row(task, plan, run, sums))
+            sums = {}
+            (out / HISTORY).write_text(json.dumps(run.history, indent=1) + "\n")
+            draw_curve(run.history, out / CURVE)
+            log.info("%s", json.dumps(run.history[-1]))
+        if process.leads and (last or over or run.step % plan.save_every == 0):
+            run.cpu_s = time.process_time() - began
+            _save(task.network, optimiser, run, out / CHECKPOINT)
+        progress("train", run.step, steps)
+        if over:
+            break
+    return run.history
+
+
+def has_ended(history: list[dict[str, float]], schedule: Schedule) -> bool:
+    """Whether the last validation came after the schedule's last step."""
+    return bool(history) and history[-1]["step"] >= schedule.steps
+
+
+def _step(
+    task: Task,
+    optimiser: torch.optim.Optimizer,
+    plan: TrainingPlan,
+    step: int,
+    process: TrainingProcess,
+) -> dict[str, float]:
+    """One step of the optimiser; a loss that is no number moves nothing."""
+    task.network.train()
+    for group in optimiser.param_groups:
+        group["lr"] = plan.schedule.rate(step)
+    optimiser.zero_grad(set_to_none=True)
+    means: dict[str, float] = {}
+    for part in range(plan.accumulate):
+        loss, terms = task.loss(step * plan.accumulate + part)
+        (loss / plan.accumulate).backward()  # type: ignore[no-untyped-call]
+        for name, value in terms.items():
+            means[name] = means.get(name, 0.0) + value / plan.accumulate
+    process.average(task.network.parameters())
+    norm = nn.utils.clip_grad_norm_(task.network.parameters(), plan.longest_gradient)
+    if bool(torch.isfinite(norm)):
+        optimiser.step()
+    else:
+        log.warning("step %d has no finite gradient; left out", step)
+    return means
+
+
+def _row(
+    task: Task, plan: TrainingPlan, run: _Run, sums: dict[str, list[float]]
+) -> dict[str, float]:
+    row = {"step": float(run.step), "cpu_s": round(run.cpu_s, 1)}
+    row["rate"] = plan.schedule.rate(run.step - 1)
+    row |= {f"loss_{name}": sum(values) / len(values) for name, values in sums.items()}
+    return row | task.validate()
+
+
+def _save(network: nn.Module, optimiser: torch.optim.Optimizer, run: _Run, path: Path) -> None:
+    state: dict[str, Any] = {
+        "step": run.step,
+        "cpu_s": run.cpu_s,
+        "history": run.history,
+        "network": network.state_dict(),
+        "optimiser": optimiser.state_dict(),
+    }
+    part = path.with_suffix(".part")
+    torch.save(state, part)
+    part.replace(path)
+
+
+def _resumed(network: nn.Module, optimiser: torch.optim.Optimizer, path: Path) -> _Run:
+    if not path.is_file():
+        return _Run(0, 0.0, [])
+    try:
+        state = torch.load(path, weights_only=True, map_location="cpu")
+    except Exception as error:  # the unpickler lets through whatever damaged bytes make it do
+        raise InputError(
+            f"{path} cannot be read as a checkpoint ({reason_of(error)}); give another --out"
+        ) from error
+    try:
+        network.load_state_dict(state["network"])
+        optimiser.load_state_dict(state["optimiser"])
+    except (KeyError, RuntimeError, ValueError) as error:
+        raise InputError(
+            f"{path} is the checkpoint of another network; give another --out"
+        ) from error
+    return _Run(int(state["step"]), float(state["cpu_s"]), list(state["history"]))

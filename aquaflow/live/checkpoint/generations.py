@@ -1,0 +1,155 @@
+"""The last two checkpoints of a dive on the disk; the older replaces a newer that is damaged.
+
+``checkpoint/state.npz`` is the newest, ``checkpoint/previous.npz`` the one before. Both are written
+whole and hold no pickle. The CRC-32 of every entry is verified before it is used.
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from aquaflow.base.clocks.device import Learned
+from aquaflow.base.errors import InputError
+from aquaflow.base.storage.facts_file import UNREADABLE, read_facts_file, write_facts_file
+from aquaflow.dive.folder import CHECKPOINT
+from aquaflow.geometry.arrays import Arrays
+from aquaflow.live.moment import Moment
+
+STATE, PREVIOUS = "state.npz", "previous.npz"
+"""The newest checkpoint, and the one before it."""
+FORMAT = 3
+"""Version of the checkpoint; raised when older checkpoints can no longer be resumed."""
+
+
+class OtherFormatError(InputError):
+    """A checkpoint of another version of AquaFlow: not damaged, but not usable."""
+
+
+def state_file(dive: Path) -> Path:
+    """Path of a dive's newest checkpoint."""
+    return dive / CHECKPOINT / STATE
+
+
+def previous_file(dive: Path) -> Path:
+    """Path of the checkpoint before."""
+    return dive / CHECKPOINT / PREVIOUS
+
+
+def generations(dive: Path) -> list[Path]:
+    """The files of its checkpoints, the newest first."""
+    return [path for path in (state_file(dive), previous_file(dive)) if path.is_file()]
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint as it was read."""
+
+    file: Path
+    facts: dict[str, Any]
+    arrays: Arrays
+
+    @property
+    def moment(self) -> Moment:
+        """When it was taken."""
+        return Moment(**self.facts["moment"])
+
+    @property
+    def clocks(self) -> dict[str, Learned]:
+        """Learned clock mappings of the devices."""
+        known: dict[str, Learned] = self.facts["clocks"]
+        return known
+
+    @property
+    def frames(self) -> set[int]:
+        """Indices of its finished frames."""
+        return {int(index) for index in self.arrays["tracking.frames"]["index"]}
+
+    @property
+    def keyframes(self) -> int:
+        """Number of its keyframes."""
+        return len(self.arrays["tracking.keyframes"])
+
+
+def write_state(
+    dive: Path,
+    facts: dict[str, Any],
+    arrays: Arrays,  # by name, of any shape
+) -> None:
+    """Write the newest checkpoint of ``dive``; the newest so far becomes the previous one.
+
+    Raises:
+        InputError, OSError: it cannot be written; those that there are stay.
+    """
+    path = state_file(dive)
+    path.parent.mkdir(exist_ok=True)
+    fresh = path.with_name("fresh.npz")
+    try:
+        write_facts_file(fresh, facts, arrays, allow_nan=False)
+        if path.is_file():
+            _rename_or_link(path, previous_file(dive))
+        fresh.replace(path)
+    finally:
+        fresh.unlink(missing_ok=True)
+    bring_to_disk([path.parent])
+
+
+def _rename_or_link(path: Path, name: Path) -> None:
+    """Let the file have another name, and keep this one until it is replaced, where the file
+    system can do that (FAT cannot): at no moment is there no newest checkpoint."""
+    link = path.with_name("link.npz")
+    link.unlink(missing_ok=True)
+    try:
+        os.link(path, link)
+        link.replace(name)
+    except OSError:
+        path.replace(name)
+    finally:
+        link.unlink(missing_ok=True)  # still there if it was the same file as ``name``
+
+
+def read_state(path: Path) -> Checkpoint:
+    """The checkpoint in the file ``path``.
+
+    Raises:
+        OtherFormatError: another version of AquaFlow wrote it.
+        InputError: it is not there, or is damaged.
+    """
+    try:
+        with zipfile.ZipFile(path) as file:
+            damaged = file.testzip()
+        if damaged is not None:
+            raise InputError(f"{path} is damaged: {damaged} differs from its checksum")
+        facts, arrays = read_facts_file(path)
+        checkpoint = Checkpoint(path, facts, arrays)
+        known = facts["format"] == FORMAT
+        if known:
+            _ = checkpoint.moment, checkpoint.clocks, checkpoint.frames, checkpoint.keyframes
+    except FileNotFoundError as error:
+        raise InputError(f"{path} is not there") from error
+    except (*UNREADABLE, *UNEXPECTED) as error:
+        raise InputError(f"{path} is damaged: {type(error).__name__}") from error
+    if not known:
+        raise OtherFormatError(f"{path} was written by version {facts.get('version')}")
+    return checkpoint
+
+
+UNEXPECTED = (NotImplementedError, RuntimeError, MemoryError, OverflowError, AttributeError)
+"""Further errors that zipfile raises where bits of its directory are wrong."""
+
+
+def bring_to_disk(paths: Iterable[Path]) -> None:
+    """fsync files that must survive a power cut; missing files are ignored."""
+    for path in paths:
+        try:
+            descriptor = os.open(path, os.O_RDONLY)
+        except FileNotFoundError:
+            continue
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

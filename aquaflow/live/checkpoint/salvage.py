@@ -1,0 +1,158 @@
+"""Salvage of a dive before it is resumed: damaged files are set aside, losses are reported.
+
+Every file of ``work/`` has a checksum of its own. A keyframe without its file
+keeps its pose, and so do the frames relative to it; a view without its file leaves the map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from aquaflow.base.errors import InputError
+from aquaflow.base.storage.folder_lock import refuse_held
+from aquaflow.base.storage.spill import SUFFIX, read_item
+from aquaflow.config import Config
+from aquaflow.dive.folder import MARKER, WORK
+from aquaflow.dive.frames_csv import FrameRow, or_lost
+from aquaflow.live.checkpoint.generations import (
+    Checkpoint,
+    OtherFormatError,
+    previous_file,
+    read_state,
+    state_file,
+)
+from aquaflow.live.checkpoint.resume import Choice
+from aquaflow.live.checkpoint.salvage_rows import SalvagedRows, salvaged_rows
+from aquaflow.live.checkpoint.set_aside import SetAside
+from aquaflow.live.checkpoint.telemetry import cut_at_checkpoint
+from aquaflow.live.checkpoint.tracking import lost_since, refuse_another_size
+from aquaflow.live.moment import Moment
+from aquaflow.mapping.work import OwnedMaps
+from aquaflow.slam import Slam
+
+MOST_NAMED = 5
+"""Numbers that a sentence lists."""
+
+
+@dataclass(frozen=True)
+class Salvaged:
+    """The rows that a resumed dive continues, and what was lost."""
+
+    rows: list[FrameRow]
+    losses: list[str]
+    """A sentence for each loss that the checkpoint's own files and the rows show."""
+
+
+def salvaged(
+    checkpoint: Checkpoint, dive: Path, name_of: Callable[[int], str], now: Moment | None = None
+) -> Salvaged:
+    """Prepare ``dive`` for resuming from ``checkpoint``; ``name_of`` gives a frame index's name.
+
+    Raises:
+        InputError: a damaged file cannot be set aside.
+    """
+    aside, losses = SetAside(dive), []
+    rows = salvaged_rows(dive / MARKER, checkpoint, name_of)
+    older = checkpoint.file != state_file(dive)
+    if older or not rows.whole:
+        for name in (MARKER, "trajectory.tum"):
+            aside.copy(dive / name, "as it was before the dive was resumed")
+    if older:
+        losses.append(_newest_set_aside(dive, aside))
+    elif previous_file(dive).is_file() and not _is_whole(previous_file(dive)):
+        aside.move(previous_file(dive), "it is damaged")
+        losses.append("the checkpoint before the newest one was damaged, which the dive can spare")
+    for path in sorted((dive / WORK).glob(f"*/*{SUFFIX}")):
+        _look_at(path, checkpoint.keyframes if older else None, aside)
+    known = checkpoint.frames
+    cut_at_checkpoint(dive, checkpoint.moment, now or Moment.now(), aside)
+    after = [or_lost(row, known) for row in rows.rows]
+    return Salvaged(after, losses + _row_losses(rows, dive / MARKER))
+
+
+def salvaged_from(choice: Choice, config: Config, name_of: Callable[[int], str]) -> Salvaged | None:
+    """The dive that goes on in the chosen folder; None for a new one.
+
+    Raises:
+        ConfigError: it is of pictures of another size.
+        InputError: another process writes to it, or a damaged file cannot be set aside.
+    """
+    if choice.checkpoint is None:
+        return None
+    refuse_another_size(choice.folder, choice.checkpoint.facts["tracking"], config)
+    refuse_held(choice.folder)
+    return salvaged(choice.checkpoint, choice.folder, name_of)
+
+
+def lost_with_their_files(checkpoint: Checkpoint, slam: Slam, maps: OwnedMaps) -> list[str]:
+    """A sentence for keyframes, and one for views, whose files were missing when ``slam`` and
+    ``maps`` were restored."""
+    said = []
+    keyframes = lost_since(slam, checkpoint.facts["tracking"])
+    if keyframes:
+        hang = sum(tracked.keyframe in keyframes for tracked in slam.results())
+        said.append(
+            f"the files of {_named('keyframe', keyframes)} were damaged or gone: their {hang} "
+            "frames keep their poses, but these places are no longer recognised"
+        )
+    lost = maps.lost_pictures
+    if lost:
+        said.append(
+            f"the pictures of {_named('mapped frame', lost)} were damaged or gone: the "
+            "map goes on without them"
+        )
+    return said
+
+
+def _newest_set_aside(dive: Path, aside: SetAside) -> str:
+    if state_file(dive).is_file():
+        aside.move(state_file(dive), "it is damaged, or another version's")
+    return (
+        "the newest checkpoint was damaged or gone: the dive was resumed from the one before, and "
+        "frames that came between the two have no pose"
+    )
+
+
+def _look_at(path: Path, keyframes: int | None, aside: SetAside) -> None:
+    """Set a file of ``work/`` aside if it is damaged, or would be overwritten: with an older
+    checkpoint, the keyframes that it does not contain."""
+    try:
+        read_item(path)
+    except InputError:
+        aside.move(path, "it is damaged, or not the one that it is named after")
+        return
+    if keyframes is not None and path.parent.name == "keyframes" and int(path.stem) >= keyframes:
+        aside.move(path, "it is whole, but the newest checkpoint, which knew it, is damaged")
+
+
+def _is_whole(path: Path) -> bool:
+    try:
+        read_state(path)
+    except OtherFormatError:
+        return True
+    except InputError:
+        return False
+    return True
+
+
+def _row_losses(rows: SalvagedRows, path: Path) -> list[str]:
+    if not path.is_file():
+        return [
+            f"{MARKER} was gone: {rows.rebuilt} rows were made from the checkpoint, those of "
+            "frames that were left out, and all reasons, are lost"
+        ]
+    if rows.whole:
+        return []
+    return [
+        f"{rows.unreadable} lines of {MARKER} were damaged, and {rows.rebuilt} rows were made from "
+        "the checkpoint"
+    ]
+
+
+def _named(kind: str, numbers: Iterable[int]) -> str:
+    ordered = sorted(numbers)
+    listed = ", ".join(map(str, ordered[:MOST_NAMED]))
+    more = "" if len(ordered) <= MOST_NAMED else f" and {len(ordered) - MOST_NAMED} more"
+    return f"{kind}{'' if len(ordered) == 1 else 's'} {listed}{more}"

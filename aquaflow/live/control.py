@@ -1,0 +1,126 @@
+"""What the pilot asked for: between those who ask, in any thread, and the service, which obeys.
+
+One process serves several dives, one after the other. Requests come from HTTP, MAVLink and signals;
+the service looks here at every turn.
+"""
+
+from __future__ import annotations
+
+import threading
+from enum import Enum
+
+from aquaflow.base.errors import AquaFlowError
+
+
+class Phase(str, Enum):
+    """Where the service is in a dive; a request changes it at once, the service follows."""
+
+    IDLE = "idle"
+    MAPPING = "mapping"
+    PAUSED = "paused"
+    FINISHING = "finishing"
+
+
+class Request(str, Enum):
+    """What a pilot may ask for."""
+
+    START = "start"
+    """Begin a dive, or go on with the paused one."""
+    STOP = "stop"
+    """Pause: pictures are not mapped any more, the dive stays open."""
+    FINISH = "finish"
+    """Refine, write the deliverables, and be idle."""
+    NEW = "new"
+    """Finish the present dive, if there is one, and begin another."""
+
+
+AFTER: dict[tuple[Request, Phase], Phase] = {
+    (Request.START, Phase.IDLE): Phase.MAPPING,
+    (Request.START, Phase.PAUSED): Phase.MAPPING,
+    (Request.STOP, Phase.MAPPING): Phase.PAUSED,
+    (Request.FINISH, Phase.MAPPING): Phase.FINISHING,
+    (Request.FINISH, Phase.PAUSED): Phase.FINISHING,
+    (Request.NEW, Phase.IDLE): Phase.MAPPING,
+    (Request.NEW, Phase.MAPPING): Phase.FINISHING,
+    (Request.NEW, Phase.PAUSED): Phase.FINISHING,
+}
+"""Requests that make sense, and what they lead to."""
+
+REFUSALS = {
+    Phase.IDLE: "there is no dive; start one first",
+    Phase.MAPPING: "the dive is being mapped already",
+    Phase.PAUSED: "the dive is paused already",
+    Phase.FINISHING: "the dive is being finished; ask again when that is done",
+}
+"""Why the others do not, in each phase."""
+
+
+class RefusedError(AquaFlowError):
+    """A request that makes no sense now."""
+
+
+class Control:
+    """The present phase, and whether the service shall end."""
+
+    def __init__(self) -> None:
+        self.stopping = threading.Event()
+        """Set: the service ends, and leaves a dive that can be gone on with. For any thread, and
+        for signal handlers."""
+        self._lock, self._asked = threading.Lock(), threading.Event()
+        self._phase = Phase.IDLE
+        self._another = False
+        """A new dive is wanted, whatever could be gone on with."""
+
+    @property
+    def phase(self) -> Phase:
+        """What is wanted now."""
+        return self._phase
+
+    @property
+    def paused(self) -> bool:
+        """True while pictures shall not be mapped."""
+        return self._phase is Phase.PAUSED
+
+    @property
+    def dive_ends(self) -> bool:
+        """True once the dive in progress shall come to its end."""
+        return self.stopping.is_set() or self._phase is Phase.FINISHING
+
+    def ask(self, request: Request) -> Phase:
+        """Ask for something; the phase that follows from it.
+
+        Raises:
+            RefusedError: it makes no sense now.
+        """
+        with self._lock:
+            if self.stopping.is_set():
+                raise RefusedError("the service is ending")
+            after = AFTER.get((request, self._phase))
+            if after is None:
+                raise RefusedError(REFUSALS[self._phase])
+            self._another |= request is Request.NEW
+            self._phase = after
+            self._asked.set()
+            return after
+
+    # --- the service's side ---------------------------------------------------------------------
+
+    def wait(self, seconds: float) -> None:
+        """Until somebody asks for something, at most so long."""
+        self._asked.wait(max(seconds, 0.0))
+        self._asked.clear()
+
+    def wake(self) -> None:
+        """End a :meth:`wait`."""
+        self._asked.set()
+
+    def begin(self) -> bool:
+        """The wanted dive is being begun; True if it shall be a new one."""
+        with self._lock:
+            another, self._another = self._another, False
+            return another
+
+    def ended(self) -> None:
+        """The dive was closed, or could not be begun: the service is idle, or begins the next."""
+        with self._lock:
+            self._phase = Phase.MAPPING if self._another else Phase.IDLE

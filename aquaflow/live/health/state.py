@@ -1,0 +1,142 @@
+"""Health of the service: one state with its reason, and the list of its changes."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from typing import NamedTuple
+
+log = logging.getLogger(__name__)
+
+KEPT = 50
+"""Changes of state that are remembered."""
+
+
+class State(str, Enum):
+    """What the service does at the moment."""
+
+    STARTING = "starting"
+    WAITING = "waiting for camera"
+    INITIALISING = "initialising"
+    TRACKING = "tracking"
+    LOST = "lost"
+    DEGRADED = "degraded"
+    STOPPING = "stopping"
+    INCONSISTENT = "tracking, inconsistent"
+    IDLE = "idle"
+    PAUSED = "paused"
+    FINISHING = "finishing a dive"
+
+    @property
+    def number(self) -> int:
+        """For NAMED_VALUE_FLOAT and Prometheus."""
+        return list(State).index(self)
+
+
+@dataclass(frozen=True)
+class Change:
+    """From one state to another, and why."""
+
+    t_s: float
+    """CLOCK_MONOTONIC."""
+    before: State
+    after: State
+    reason: str
+
+
+class Health:
+    """The state machine; to be written by the loop alone, read by anyone."""
+
+    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
+        self.state = State.STARTING
+        self.reason = "the service starts"
+        self.sentences: tuple[str, ...] = ()
+        """What the pilot shall hear of the reason; none: the state alone."""
+        self.changes: deque[Change] = deque(maxlen=KEPT)
+        self.visits: Counter[State] = Counter({State.STARTING: 1})
+        self._now_s = now_s
+        self.since_s = now_s()
+
+    def set(self, state: State, reason: str, sentences: tuple[str, ...] = ()) -> bool:
+        """Set the state; True if it changed. A new reason alone is no change."""
+        if self.state is State.STOPPING:  # nothing comes after the end
+            return False
+        before, self.reason, self.sentences = self.state, reason, sentences
+        if state is before:
+            return False
+        self.since_s = self._now_s()
+        self.changes.append(Change(self.since_s, before, state, reason))
+        self.visits[state] += 1
+        self.state = state
+        fields = {"event": "state", "before": before.value, "after": state.value}
+        log.info("%s -> %s: %s", before.value, state.value, reason, extra={"fields": fields})
+        return True
+
+    def begin(self) -> None:
+        """A dive begins: visits are counted anew."""
+        self.visits.clear()
+        self.visits[self.state] = 1
+
+
+class Trouble(NamedTuple):
+    """Why something does not work."""
+
+    reason: str
+    """A clause, with what is known."""
+    sentence: str
+    """For the pilot: see :mod:`aquaflow.live.health.sentences`."""
+
+
+class Judgement(NamedTuple):
+    """The arguments of :meth:`Health.set`."""
+
+    state: State
+    reason: str
+    sentences: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Facts:
+    """The facts that determine the state."""
+
+    frame_age_s: float
+    """Since the last frame, or since the start."""
+    patience_s: float
+    """Longest time without a frame before the state is WAITING."""
+    pictured: bool
+    """A frame came since the start."""
+    camera: Trouble
+    """Why the camera sends nothing, as its driver says."""
+    posed: bool
+    """The newest frame has a pose."""
+    ever_posed: bool
+    inconsistent: Trouble | None
+    """Why the poses of the last seconds are doubtful, by the monitor of scale."""
+    troubles: list[Trouble]
+    """Why the service works with less than everything."""
+
+
+def judged(facts: Facts) -> Judgement:
+    """The state that follows from the facts, and its reason."""
+    if facts.frame_age_s > facts.patience_s:
+        said = f": {facts.camera.reason}" if facts.camera.reason else ""
+        reason = f"no picture for {facts.frame_age_s:.0f} s{said}"
+        return Judgement(State.WAITING, reason, (facts.camera.sentence,))
+    if not facts.pictured:
+        return Judgement(State.STARTING, "no picture yet")
+    if not facts.ever_posed:
+        reason = "no pose yet: the camera must move sideways over texture"
+        return Judgement(State.INITIALISING, reason)
+    if not facts.posed:
+        reason = "the newest frames have no pose; the place is being looked for"
+        return Judgement(State.LOST, reason)
+    troubles = [each for each in (facts.inconsistent, *facts.troubles) if each is not None]
+    if not troubles:
+        return Judgement(State.TRACKING, "every frame has a pose")
+    state = State.DEGRADED if facts.inconsistent is None else State.INCONSISTENT
+    reason = "; ".join(each.reason for each in troubles)
+    return Judgement(state, reason, tuple(each.sentence for each in troubles))

@@ -1,0 +1,216 @@
+"""Coverage while the dive goes on: a thread of its own, which tracking never waits for.
+
+Tracking's thread leaves a place for each picture; everything else is read from the keyframe store
+and computed here, for at most ``SHARE`` of a core.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from aquaflow.base.errors.failures import Failures
+from aquaflow.dive.from_maps import attenuations
+from aquaflow.live.dive_parts import Parts
+from aquaflow.live.loop import LiveLoop
+from aquaflow.mapping.work import OwnedMaps
+from aquaflow.survey.coverage import DiveCoverage, PageView, mapping_range
+from aquaflow.survey.coverage.hints import Hint, Hints, Measured, Place, forward_steps
+from aquaflow.survey.coverage.picture import cells_affine, cells_png, coverage_png
+from aquaflow.survey.coverage.plan import CoveragePlan
+from aquaflow.survey.coverage.swath import MOST_SIGHTS, extent
+
+log = logging.getLogger(__name__)
+
+TURN_S = 1.0
+"""Between two turns: keyframes come about once a second."""
+SHARE = 0.05
+"""Of one core, at most; a turn costs 5 to 40 ms."""
+WATER_S = 20.0
+"""Between two looks at the water, which changes with its fits."""
+PLACES = 200
+"""Places that are kept for the speed: 5 s at 40 pictures a second."""
+NO_VIEWS: Mapping[int, PageView] = MappingProxyType({})
+
+
+class LiveCoverage:
+    """Construct once; :meth:`show` and :meth:`hide` a dive; asked from any thread."""
+
+    def __init__(
+        self,
+        failures: Failures,
+        now_s: Callable[[], float] = time.monotonic,
+        cpu_s: Callable[[], float] = time.thread_time,
+    ) -> None:
+        """``cpu_s``: what the calling thread has used."""
+        self.hints: tuple[Hint, ...] = ()
+        """That hold now."""
+        self.turns, self.took_s = 0, 0.0
+        """Turns so far, and the CPU time that they took."""
+        self._failures, self._now_s, self._cpu_s = failures, now_s, cpu_s
+        self._parts: Parts | None = None
+        self._views: Mapping[int, PageView] = NO_VIEWS
+        self._hints: Hints | None = None
+        self._measured = Measured()
+        self._places: deque[Place] = deque(maxlen=PLACES)
+        self._limits: dict[int, float | None] = {}
+        self._water_s = -WATER_S
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="coverage", daemon=True)
+        self._thread.start()
+
+    # --- in the service's threads ---------------------------------------------------------------
+
+    def show(self, parts: Parts) -> None:
+        """From here on, this dive."""
+        self.hide()
+        if parts.run.coverage is not None:
+            self._hints = Hints(parts.run.coverage.config)
+            self._parts = parts
+
+    def hide(self) -> None:
+        """From here on, none."""
+        self._parts, self._hints, self._views, self.hints = None, None, NO_VIEWS, ()
+        self._measured, self._limits, self._water_s = Measured(), {}, -WATER_S
+        self._places.clear()
+
+    def update(self, loop: LiveLoop) -> None:
+        """A watcher of the loop, in tracking's thread: notes where the newest picture was taken."""
+        latest = loop.latest
+        if latest is None or latest.T_wc is None:
+            return
+        t_s = latest.frame.t_ns * 1e-9
+        if not self._places or self._places[-1].t_s != t_s:
+            self._places.append(Place(t_s, latest.sub_map, latest.T_wc.t))
+
+    def close(self) -> None:
+        """End the thread."""
+        self._closing.set()
+        self._thread.join(5.0)
+
+    # --- what the page asks for -----------------------------------------------------------------
+
+    def to_json(self) -> dict[int, dict[str, Any]]:
+        """By sub-map: the picture of the cells and how it lies on the page, lines and areas."""
+        return {number: described(view) for number, view in self._views.items()}
+
+    def in_words(self) -> list[str]:
+        """The hints that hold, with their values."""
+        measured, words = self._measured, []
+        for hint in self.hints:
+            value = {
+                Hint.TOO_HIGH: measured.range_share,
+                Hint.TOO_FAST: measured.forward_overlap,
+                Hint.TOO_FAR_ASIDE: measured.line_overlap,
+            }[hint]
+            said = "" if value is None else f": {100 * value:.0f} %"
+            words.append(hint.value + said)
+        return words
+
+    def png(self) -> bytes | None:
+        """The finished picture of the newest sub-map; None before there is one."""
+        views = self._views
+        if not views:
+            return None
+        newest = self._places[-1].sub_map if self._places else max(views)
+        return coverage_png(views.get(newest, views[max(views)]), "; ".join(self.in_words()))
+
+    def cells(self, sub_map: int) -> bytes | None:
+        """The picture of a sub-map's cells alone; None where there is none."""
+        view = self._views.get(sub_map)
+        return None if view is None else cells_png(view)
+
+    def plan(self, sub_map: int) -> CoveragePlan | None:
+        """The cells of a sub-map as they are known by now; None where there are none."""
+        view = self._views.get(sub_map)
+        return None if view is None else view.plan
+
+    # --- the thread -----------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        pause = TURN_S
+        while not self._closing.wait(pause):
+            before_s = self._cpu_s()
+            with self._failures.contain("coverage"):
+                self.turn()
+            took_s = self._cpu_s() - before_s
+            self.took_s += took_s
+            pause = max(TURN_S, took_s / SHARE)
+
+    def turn(self) -> None:
+        """Take in what is new, and show it."""
+        parts, hints = self._parts, self._hints
+        if parts is None or hints is None or parts.run.coverage is None:
+            return
+        self._ask_for_the_water(parts)
+        coverage, slam = parts.run.coverage, parts.slam
+        coverage.look(slam.keyframes, slam.metric_frame)
+        coverage.update()
+        views = coverage.views(slam.keyframes, slam.metric_frame, self._limits)
+        measured = self._judged(coverage, views)
+        if self._parts is parts:  # else the dive ended meanwhile
+            self.turns += 1
+            self._views, self._measured = views, measured
+            self.hints = hints.judge(measured)
+
+    def _judged(self, coverage: DiveCoverage, views: Mapping[int, PageView]) -> Measured:
+        """The newest values of what hints are about."""
+        if not self._places:
+            return Measured()
+        sub_map, ways = self._places[-1].sub_map, forward_steps(self._places)
+        view, own = views.get(sub_map), coverage.sub_maps.get(sub_map)
+        if view is None or own is None:
+            return Measured()
+        with coverage.lock:
+            newest = [own.seen[number] for number in sorted(own.seen)[-MOST_SIGHTS:]]
+        measured = Measured(line_overlap=view.state.overlap)
+        limit = self._limits.get(sub_map)
+        if newest and limit:
+            footprint, T_mc = newest[-1]
+            measured.range_share = T_mc.scale * footprint.depth / limit
+        steps = np.linalg.norm(ways, axis=1)
+        total = ways.sum(axis=0)
+        if newest and len(steps) and np.linalg.norm(total) > 0.0:
+            length = extent(newest, total / np.linalg.norm(total))
+            if length > 0.0:
+                measured.forward_overlap = 1.0 - float(np.median(steps)) / length
+        return measured
+
+    def _ask_for_the_water(self, parts: Parts) -> None:
+        """The mapping thread answers when it finds time; it is not waited for."""
+        now = self._now_s()
+        if now - self._water_s < WATER_S:
+            return
+        self._water_s, config = now, parts.run.config.coverage
+
+        def read(maps: OwnedMaps, _: object) -> None:
+            for number, attenuation in attenuations(maps.mappers).items():
+                self._limits[number] = mapping_range(attenuation, config.least_contrast)
+
+        parts.maps.inspect("water for the coverage", read)
+
+
+def described(view: PageView) -> dict[str, Any]:
+    """For the page: lengths in the view's unit, places right and up."""
+    state, plan = view.state, view.plan
+    suggestion = state.suggestion
+    return {
+        "size": [plan.classes.shape[1], plan.classes.shape[0]],
+        "to_page": np.round(cells_affine(view), 6).tolist(),
+        "areas": {seen.name.lower(): round(view.area(seen), 3) for seen in plan.cells},
+        "range_limit": None if plan.limit is None else round(plan.limit * view.scale, 3),
+        "swath": round(state.swath, 3),
+        "overlap": None if state.overlap is None else round(state.overlap, 3),
+        "lines": [np.round([line.start, line.end], 3).tolist() for line in state.lines],
+        "next_line": None if suggestion is None else {
+            "places": np.round([suggestion.start, suggestion.end], 3).tolist(),
+            "new_share": round(suggestion.gain, 3),
+        },
+    }  # fmt: skip

@@ -1,0 +1,243 @@
+"""The live loop: tracks the newest frame, maps in parallel, publishes the results."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from typing import Any
+
+from aquaflow.base.clocks.deadline import Deadline
+from aquaflow.base.errors import AquaFlowError
+from aquaflow.config.service import ServiceConfig
+from aquaflow.dive.run import DiveRun
+from aquaflow.live import troubles
+from aquaflow.live.control import Control
+from aquaflow.live.feed import Feed
+from aquaflow.live.health.counters import Counters
+from aquaflow.live.health.degradation import DegradationLevel
+from aquaflow.live.health.pressure import Need, Pressure, Shortage
+from aquaflow.live.health.state import Facts, Judgement, State, judged
+from aquaflow.live.map_thread import MapThread
+from aquaflow.live.vitals import Vitals
+from aquaflow.tracking.frames import FrameClass, Tracked
+from aquaflow.types import Dropped, Frame
+
+log = logging.getLogger(__name__)
+
+STAGE = "tracking"
+"""Name of this thread among the heartbeats."""
+IDLE_S = 0.25
+"""Longest wait for a frame; then the loop sends its heartbeat as idle."""
+BUSY_S = 0.01
+"""The same while earlier frames wait for their poses: then one that was placed is taken."""
+LATE_MS = 150.0
+"""A frame that took longer from its arrival on is late, and mapping gives way; at 10 frames/s one
+that found tracking idle is ready in 60 to 100 ms."""
+PATIENCE_S = 2.0
+"""Longest time without a frame before the state becomes WAITING."""
+LOST_AFTER = 3
+"""Frames in a row without a pose until the state is LOST; one may be a flake of marine snow."""
+MOST_FAILURES = 10
+"""Frames in a row that raise before the process exits: then the pictures are not the cause."""
+PAUSED = "the pilot paused the dive: pictures are shown, not mapped"
+"""The reason of the state PAUSED."""
+
+
+class LiveLoop:
+    """Runs until the dive shall end, or a recording does; obeys the pilot."""
+
+    def __init__(
+        self,
+        run: DiveRun,
+        feed: Feed,
+        maps: MapThread,
+        config: ServiceConfig,
+        vitals: Vitals,
+        control: Control,
+        pressure: Callable[[], Pressure],
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.run_, self.feed, self.maps, self.config = run, feed, maps, config
+        self.vitals, self.control = vitals, control
+        self.health, self.heartbeats = vitals.health, vitals.heartbeats
+        self.degradation, self.counters = vitals.degradation, Counters(run.profiler, now_s)
+        self.latest: Tracked | None = None
+        """The newest frame that has a pose, without its picture."""
+        self.picture: Frame | None = None
+        """The newest frame, prepared or not, for the viewer."""
+        self.pressure = pressure()
+        self.watchers: list[Callable[[LiveLoop], None]] = []
+        """Called after every frame and every idle moment; must not wait."""
+        self._read_pressure, self._now_s = pressure, now_s
+        self._frame_s = now_s()
+        self._pictured = False
+        self._overtaken_before = feed.newest.overtaken
+        self._ever_posed = any(tracked.T_wc is not None for tracked in run.results)
+        self._unposed = LOST_AFTER
+        """Frames in a row without a pose."""
+        self._failed_in_a_row = 0
+        self._gpu_full = 0
+        """How often mapping had found the GPU's memory full at the last turn."""
+
+    def run(self) -> None:
+        """Run the loop.
+
+        Raises:
+            AquaFlowError: the source failed, or frame after frame did.
+        """
+        self.feed.start()
+        while not self.control.dive_ends and not self.feed.newest.ended:
+            self.take(self.feed.take(IDLE_S if self._past is None else BUSY_S))
+        if self.feed.failure is not None:
+            raise AquaFlowError(f"{self.feed.failure}; the service ends, to be started anew")
+
+    def take(self, frame: Frame | Dropped | None) -> None:
+        """One turn: a frame, the note that one is missing, or an idle moment."""
+        self.run_.samples(self.feed.latest_samples.taken())
+        if frame is not None:
+            self._frame_s, self._pictured = self._now_s(), True
+        if self.control.paused:
+            self.picture = frame if isinstance(frame, Frame) else self.picture
+            frame = None
+        if isinstance(frame, Dropped):
+            self.run_.drop(frame)
+        elif frame is not None:
+            self._frame(frame)
+        elif self._past is not None:
+            self._catch_up(self._past)
+        self._tend()
+
+    def catch_up(self, until: Deadline) -> None:
+        """Poses of the frames that wait for idle moments, as many as there is time for."""
+        while self._past is not None and not until.over:
+            self._catch_up(self._past)
+            self.run_.slam.side_work.settle(wait=True)
+
+    def end(self) -> None:
+        """After the last turn: telemetry of after the last frame is taken."""
+        self.run_.samples(self.feed.latest_samples.taken())
+        self.heartbeats.retire(STAGE)
+
+    def status(self) -> dict[str, Any]:
+        """Dropped-work and degradation counters, for health and metrics.json."""
+        return {
+            **self.counters.to_json(),
+            "overtaken": self.feed.newest.overtaken - self._overtaken_before,
+            "level": self.degradation.level.words,
+            "steps_down": self.degradation.steps_down,
+            "steps_up": self.degradation.steps_up,
+            "visits": {state.value: count for state, count in self.health.visits.items()},
+            "left_out_of_the_map": dict(self.maps.left_out),
+            "mapped_without_steps": self.maps.without_steps,
+            "mapping_failures": self.maps.failures,
+            "mapping_waits": self.maps.waiting,
+            "mapping_rests": self.maps.rests,
+            "stage_failures": self.run_.slam.failures.to_json(),
+        }
+
+    # --- one frame ------------------------------------------------------------------------------
+
+    def _frame(self, frame: Frame) -> None:
+        self.picture = frame
+        if self.degradation.level is DegradationLevel.RECORDING_ONLY:
+            self.run_.drop(
+                Dropped(frame.index, frame.t_ns, f"recording only: {self.degradation.reason}")
+            )
+        else:
+            self._track(frame)
+        self.maps.late = self.counters.frame(frame.arrival_ns) > LATE_MS
+
+    def _track(self, frame: Frame) -> None:
+        try:
+            decided = self.run_.frame(frame)
+        # A bad frame never ends the dive (docs/architecture.md#numbers-stay-finite).
+        except Exception as error:
+            self._failed(frame, error)
+            return
+        self._failed_in_a_row = 0
+        self.counters.classes.update(tracked.frame_class.value for tracked in decided)
+        own = [tracked for tracked in decided if tracked.frame.index == frame.index]
+        self._place(own[0] if own else None)
+
+    @property
+    def _past(self) -> Frame | None:
+        """An earlier frame that waits for its pose until there is time."""
+        return self.run_.slam.tracker.past
+
+    def _catch_up(self, past: Frame) -> None:
+        try:
+            decided = self.run_.catch_up()
+        except Exception as error:  # costs that frame
+            self._failed(past, error)
+            return
+        self.counters.classes.update(tracked.frame_class.value for tracked in decided)
+
+    def _place(self, tracked: Tracked | None) -> None:
+        """Record whether the newest frame has a pose; a skipped frame does not count."""
+        if tracked is not None and tracked.T_wc is not None:
+            self.latest = tracked.bare()
+            self._ever_posed, self._unposed = True, 0
+        elif tracked is None or tracked.frame_class is not FrameClass.SKIPPED:
+            self._unposed += 1
+
+    def _failed(self, frame: Frame, error: Exception) -> None:
+        self.counters.failures += 1
+        self._failed_in_a_row += 1
+        log.exception("frame %d failed", frame.index)
+        self.run_.drop(Dropped(frame.index, frame.t_ns, f"failed: {error}"))
+        if self._failed_in_a_row >= MOST_FAILURES:
+            raise AquaFlowError(
+                f"{MOST_FAILURES} frames in a row failed, the last with: {error}; see log.jsonl"
+            ) from error
+
+    # --- between frames -------------------------------------------------------------------------
+
+    def _tend(self) -> None:
+        self.heartbeats.beat(STAGE)
+        contain = self.run_.slam.failures.contain
+        with contain("resource check"):
+            self._give_way_to_mapping()
+            self.degradation.update(self._need)
+            self.counters.update()
+        with contain("health state"):
+            paused = self.control.paused
+            self.health.set(*(Judgement(State.PAUSED, PAUSED) if paused else judged(self._facts())))
+        self.tell_watchers()
+        with contain("notification of systemd"):
+            self.vitals.notify()
+
+    def tell_watchers(self) -> None:
+        """Let those who look on see the service as it is now."""
+        contain = self.run_.slam.failures.contain
+        for watch in self.watchers:
+            with contain(f"service: {getattr(watch, '__qualname__', type(watch).__name__)}"):
+                watch(self)
+
+    def _give_way_to_mapping(self) -> None:
+        """What found no memory on the GPU was left out; less is asked for from now on."""
+        full = self.run_.slam.failures.device_full
+        if full > self._gpu_full:
+            self.degradation.give_way(Need(Shortage.GPU_MEMORY, "the GPU's memory was full"))
+        self._gpu_full = full
+
+    def _need(self) -> Need | None:
+        self.pressure = self._read_pressure()
+        return self.pressure.need(self.config.limits)
+
+    def _facts(self) -> Facts:
+        devices, slam = self.feed.describe(), self.run_.slam
+        return Facts(
+            self._now_s() - self._frame_s,
+            PATIENCE_S,
+            self._pictured,
+            troubles.silent_camera(devices),
+            self._unposed < LOST_AFTER,
+            self._ever_posed,
+            troubles.inconsistency(slam.tracker.monitor.trouble),
+            [
+                *troubles.of_the_machine(self.degradation, self.pressure, self.config.limits),
+                *troubles.of_the_stages(self.maps, slam.failures),
+                *troubles.of_the_devices(devices),
+            ],
+        )

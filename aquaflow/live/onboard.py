@@ -1,0 +1,228 @@
+"""``aquaflow run``: dives one after the other, as the pilot asks for them."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from aquaflow.base.errors import AquaFlowError
+from aquaflow.base.signals import stop_on_signals
+from aquaflow.config.vehicle import VehicleConfig
+from aquaflow.dive.run import Finished
+from aquaflow.dive.status import DiveState, read_status
+from aquaflow.live.checkpoint.checkpoint import UnusableStateError
+from aquaflow.live.checkpoint.resume import Choice, choose, is_begun, resumed, tidy
+from aquaflow.live.checkpoint.set_aside import SetAside
+from aquaflow.live.control import Control, Phase, Request
+from aquaflow.live.feed import Feed
+from aquaflow.live.health.state import State
+from aquaflow.live.live_dive import LiveDive
+from aquaflow.live.moment import Moment
+from aquaflow.live.standby import FINISHING, IDLE
+from aquaflow.live.station import Station
+from aquaflow.live.vehicle.arming import refuse_without_autopilot
+from aquaflow.live.vehicle.scale_sources import refuse_without_scale
+from aquaflow.live.vitals import Vitals
+from aquaflow.mapping.work import Progress
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Where the dives go."""
+
+    out: Path | None = None
+    """The first dive's folder; None: one in ``service.dives`` for each."""
+    new: bool = False
+    """Begin a new dive, even if one could be resumed."""
+    overwrite: bool = False
+    """A dive that is in ``out`` already, instead of going on with it."""
+
+
+def map_live(
+    feed: Feed,
+    vehicle: VehicleConfig,
+    out: Path | None = None,
+    new: bool = False,
+    seconds: float | None = None,
+    progress: Progress | None = None,
+    overwrite: bool = False,
+    control: Control | None = None,
+) -> Finished | None:
+    """Map what ``feed`` brings until it ends, ``seconds`` have passed, or it is stopped; where
+    pictures may come for ever, in as many dives as are asked for in ``control``.
+
+    Args:
+        out: the dive's folder, or a new one next to it if it holds another dive; None: the
+            unfinished dive in ``service.dives``, or a new one there.
+        new: start a new dive even if one could be resumed.
+        overwrite: a dive that is in ``out`` already, instead of going on with it.
+
+    Returns the last dive; None where nothing could be mapped.
+
+    Raises:
+        AquaFlowError: the folder, the config, the source or the loop; the checkpoint stays.
+    """
+    if vehicle.service.pose.enabled:
+        refuse_without_scale(vehicle)
+    if feed.lasting:
+        refuse_without_autopilot(vehicle)
+    control = control or Control()
+    with contextlib.ExitStack() as around:
+        around.callback(feed.close)
+        vitals = around.enter_context(Vitals(vehicle.service))
+        station = around.enter_context(Station(feed, vehicle, control, vitals))
+        around.callback(_stop_after(seconds, control).cancel)
+        around.enter_context(stop_on_signals(control.stopping, once=True))
+        onboard = Onboard(feed, vehicle, control, station, progress)
+        return onboard.serve(Asked(out, new, overwrite))
+
+
+class Onboard:
+    """One process of the service."""
+
+    def __init__(
+        self,
+        feed: Feed,
+        vehicle: VehicleConfig,
+        control: Control,
+        station: Station,
+        progress: Progress | None = None,
+    ) -> None:
+        self._feed, self._vehicle, self._control = feed, vehicle, control
+        self._station, self._progress = station, progress
+        self._reason = IDLE
+
+    def serve(self, asked: Asked) -> Finished | None:
+        """Dives and idle times, until the service shall end or nothing comes any more.
+
+        Raises:
+            AquaFlowError: the source, the loop, the first dive's beginning or the last one's end.
+        """
+        control, finished = self._control, None
+        automatic = self._begins_by_itself(asked)
+        if automatic:
+            control.ask(Request.START)
+        while not control.stopping.is_set():
+            if control.phase is Phase.IDLE:
+                self._idle()
+                continue
+            self._reason = IDLE
+            finished = self._dive(asked, automatic)
+            control.ended()
+            if not self._feed.lasting:
+                break
+            self._feed.forget()
+            asked, automatic = Asked(asked.out, new=asked.out is not None), False
+        return finished
+
+    def _idle(self) -> None:
+        self._feed.start()
+        self._station.standby.turn(State.IDLE, self._reason)
+        if self._feed.failure is not None:
+            raise AquaFlowError(f"{self._feed.failure}; the service ends, to be started anew")
+
+    def _begins_by_itself(self, asked: Asked) -> bool:
+        """Without a pilot's word: as the config says, and where a process was cut off in a dive."""
+        if not self._feed.lasting or self._vehicle.service.dive.begin == "at_once":
+            return True
+        choice = chosen(self._vehicle, asked)
+        status = read_status(choice.folder)
+        interrupted = status is not None and status.state is DiveState.OPEN
+        return choice.checkpoint is not None and interrupted
+
+    def _dive(self, asked: Asked, automatic: bool) -> Finished | None:
+        """One dive from its first frame to its report."""
+        control, station, another = self._control, self._station, self._control.begin()
+        asked = Asked(asked.out, asked.new or another, asked.overwrite)
+        try:
+            dive = begun(self._feed, self._vehicle, asked, station.standby.vitals, control)
+        except AquaFlowError as error:
+            if automatic:
+                raise
+            self._came_to_nothing(error)
+            return None
+        with dive:
+            if automatic and dive.parts.standing.was_paused:
+                control.ask(Request.STOP)
+            station.show(dive)
+            try:
+                dive.map()
+                return self._finished(dive)
+            finally:
+                station.hide()
+
+    def _finished(self, dive: LiveDive) -> Finished | None:
+        """The end of a dive in a thread of its own, while the service goes on to answer."""
+        control = self._control
+        with ThreadPoolExecutor(1, "finishing") as threads:
+            work = threads.submit(dive.finish, self._progress)
+            work.add_done_callback(lambda _: control.wake())
+            while not work.done():
+                self._station.standby.turn(State.FINISHING, FINISHING)
+            self._station.standby.end()
+        try:
+            return work.result()
+        except AquaFlowError as error:
+            if control.stopping.is_set() or not self._feed.lasting:
+                raise
+            self._came_to_nothing(error)
+            return None
+
+    def _came_to_nothing(self, error: AquaFlowError) -> None:
+        """What a pilot asked for failed; he may ask again."""
+        log.error("%s", error)
+        self._reason = f"the last dive came to nothing: {error}"
+
+
+def begun(
+    feed: Feed,
+    vehicle: VehicleConfig,
+    asked: Asked,
+    vitals: Vitals | None = None,
+    control: Control | None = None,
+) -> LiveDive:
+    """The dive of :func:`map_live`, before its first frame. If a checkpoint cannot be resumed, the
+    one before is used, and then a new dive; in an unattended run also if the config does not fit.
+
+    Raises:
+        AquaFlowError: the folder, or the config.
+    """
+    while True:
+        choice = chosen(vehicle, asked)
+        folder = choice.folder
+        replaces = asked.overwrite or is_begun(folder)
+        try:
+            return LiveDive(folder.name, choice, feed, vehicle, replaces, vitals, control)
+        except UnusableStateError as error:
+            assert choice.checkpoint is not None
+            log.error("%s", error)
+            SetAside(folder).move(choice.checkpoint.file, str(error))
+        except AquaFlowError as error:
+            if choice.checkpoint is None or asked.out is not None:
+                raise
+            log.error("%s: %s; a new dive begins", folder, error)
+            asked = Asked(new=True)
+
+
+def chosen(vehicle: VehicleConfig, asked: Asked) -> Choice:
+    """The folder, and what is resumed in it."""
+    if asked.out is not None:
+        return Choice(asked.out) if asked.overwrite else resumed(asked.out, asked.new)
+    service = vehicle.service
+    choice = choose(service.dives, service.checkpoint, asked.new, Moment.now())
+    tidy(service.dives, choice)
+    return choice
+
+
+def _stop_after(seconds: float | None, control: Control) -> threading.Timer:
+    timer = threading.Timer(seconds or 0.0, control.stopping.set)
+    timer.daemon = True
+    if seconds is not None:
+        timer.start()
+    return timer

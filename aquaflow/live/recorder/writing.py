@@ -1,0 +1,180 @@
+"""Items into files: topics, and when a new file begins."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow import __version__
+from aquaflow.base.clocks.wall import WallClockWatch
+from aquaflow.config.device import MountingConfig
+from aquaflow.config.recording import RecordingConfig
+from aquaflow.live.recorder.pictures import (
+    calibration_message,
+    camera_to_json,
+    mask_message,
+    picture_message,
+)
+from aquaflow.live.recorder.status import RecorderStatus
+from aquaflow.live.recorder.write_queue import Item, LinkBytes, QueuedPicture
+from aquaflow.recordings.dive_file import DiveFile
+from aquaflow.recordings.telemetry_json import sample_to_json
+from aquaflow.types import KIND_OF, CameraModel, Dropped, Frame, TelemetrySample
+
+FORMAT = "1"
+"""Of topics and metadata."""
+
+MB = 1_000_000
+"""Bytes of a megabyte, the unit of the settings."""
+
+LATE_KEY_S = 10.0
+"""A video's next key frame is waited for this long before a new file begins without it."""
+
+
+class DiveWriter:
+    """Writes to the file in progress and begins the next when it is long enough.
+
+    Every file stands alone: calibrations and masks are repeated, video begins with a key frame.
+    """
+
+    def __init__(self, folder: Path, settings: RecordingConfig, status: RecorderStatus) -> None:
+        self._folder, self._settings, self._status = folder, settings, status
+        self._watch = WallClockWatch(tell=False)  # the source of UTC tells
+        self._finished_bytes = 0
+        self._masks: dict[str, npt.NDArray[np.bool_]] = {}
+        self._has_video = False
+        self.mountings: dict[str, MountingConfig] = {}
+        """Of cameras in the vehicle, as far as they are known; for the metadata of each file."""
+        self._begin()
+
+    def write(self, item: Item) -> None:
+        """Write one item.
+
+        Raises:
+            OSError: the disk does not take it.
+            ValueError: it cannot be encoded.
+        """
+        if self._is_long() and self._may_cut_before(item):
+            self._finish()
+            self._begin()
+        if isinstance(item, LinkBytes):
+            self._file.raw(item.topic, item.data, item.arrival_ns)
+            self._status.link_bytes += len(item.data)
+        elif not isinstance(item, QueuedPicture):
+            self._sample(item.topic, item.sample)
+        elif isinstance(item.frame, Dropped):
+            self._missing(item.topic, item.frame)
+        else:
+            self._picture(item.camera, item.frame)
+        self._status.written_bytes = self._finished_bytes + self._file.size
+
+    def flush(self) -> None:
+        """Bring everything to the disk, with the clocks and the counts of this moment."""
+        now = self._watch.read()
+        self._status.wall_clock_jumps = self._watch.jumps
+        self._json("/clock", "WallClock", vars(now), now.monotonic_ns)
+        self._json("/recorder", "Recorder", self._status.to_json(), now.monotonic_ns)
+        begun = time.monotonic()
+        self._file.flush()
+        took = time.monotonic() - begun
+        self._status.slowest_flush_s = max(self._status.slowest_flush_s, round(took, 4))
+
+    def close(self) -> None:
+        """The last counts, the index, and the end."""
+        self.flush()
+        self._finish()
+
+    def abandon(self) -> None:
+        """Close the file as it is."""
+        self._file.abandon()
+
+    def _begin(self) -> None:
+        path = self._folder / f"{len(self._status.files):04d}.mcap"
+        self._file = DiveFile(path, 1000 * self._settings.chunk_kb)
+        self._begun = time.monotonic()
+        self._status.files.append(path)
+        self._announced: set[str] = set()
+        self._masks.clear()
+        clock = self._watch.read()
+        facts = {
+            "format": FORMAT,
+            "version": __version__,
+            "file": str(len(self._status.files) - 1),
+            "clock": "CLOCK_MONOTONIC, ns",
+            "wall_clock_offset_ns": str(clock.offset_ns),
+        }
+        self._file.metadata("aquaflow", facts)
+
+    def _finish(self) -> None:
+        self._file.close()
+        self._finished_bytes += self._file.size
+
+    def _is_long(self) -> bool:
+        old = time.monotonic() - self._begun >= self._settings.file_s
+        return old or self._file.size >= self._settings.file_mb * MB
+
+    def _may_cut_before(self, item: Item) -> bool:
+        if not self._has_video:
+            return True
+        late = time.monotonic() - self._begun >= self._settings.file_s + LATE_KEY_S
+        frame = item.frame if isinstance(item, QueuedPicture) else None
+        encoded = frame.encoded if isinstance(frame, Frame) else None
+        return late or (encoded is not None and encoded.format == "h264" and encoded.key)
+
+    def _picture(self, camera: str, frame: Frame) -> None:
+        message = picture_message(frame, camera, self._settings)
+        if camera not in self._announced:
+            self._announced.add(camera)
+            self._file.metadata(f"camera:{camera}", self._facts_of(camera, frame.camera))
+            calibration = calibration_message(frame.camera, frame.t_ns, camera)
+            self._protobuf(f"/{camera}/calibration", calibration, frame)
+        known = self._masks.get(camera)
+        if frame.mask is not None and (known is None or not np.array_equal(frame.mask, known)):
+            self._masks[camera] = frame.mask
+            mask = mask_message(frame.mask, frame.t_ns, camera)
+            self._protobuf(f"/{camera}/mask", mask, frame)
+        if frame.exposure_s is not None or frame.gain is not None:
+            exposure = {"exposure_s": frame.exposure_s, "gain": frame.gain}
+            self._json(
+                f"/{camera}/exposure", "Exposure", exposure, frame.arrival_ns, frame.t_ns,
+                frame.index,
+            )  # fmt: skip
+        video = message.DESCRIPTOR.name == "CompressedVideo"
+        self._has_video |= video
+        self._protobuf(f"/{camera}/{'video' if video else 'image'}", message, frame)
+        self._status.frames += 1
+
+    def _facts_of(self, camera: str, model: CameraModel) -> dict[str, str]:
+        facts = {"model": camera_to_json(model)}
+        mounting = self.mountings.get(camera)
+        return facts if mounting is None else facts | {"mounting": mounting.model_dump_json()}
+
+    def _missing(self, topic: str, dropped: Dropped) -> None:
+        reason = {"reason": dropped.reason}
+        self._json(f"{topic}/dropped", "Dropped", reason, dropped.t_ns, dropped.t_ns, dropped.index)
+
+    def _sample(self, topic: str, sample: TelemetrySample) -> None:
+        kind = KIND_OF[type(sample)]
+        data = sample_to_json(sample)
+        self._file.json(f"{topic}/{kind}", kind, data, sample.arrival_ns, sample.t_ns)
+        self._status.samples += 1
+
+    def _protobuf(self, topic: str, message: Any, frame: Frame) -> None:
+        self._file.protobuf(topic, message, frame.arrival_ns, frame.t_ns, frame.index)
+
+    def _json(
+        self,
+        topic: str,
+        kind: str,
+        values: dict[str, Any],
+        arrival_ns: int,
+        t_ns: int | None = None,
+        number: int = 0,
+    ) -> None:
+        data = json.dumps(values, allow_nan=False).encode()
+        self._file.json(topic, kind, data, arrival_ns, arrival_ns if t_ns is None else t_ns, number)

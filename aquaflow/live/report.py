@@ -1,0 +1,132 @@
+"""The report of a running service as one object, for /health, /metrics and `status`."""
+
+from __future__ import annotations
+
+import resource
+import time
+from dataclasses import asdict
+from typing import Any
+
+from aquaflow import __version__
+from aquaflow.config.viewer import ViewerConfig
+from aquaflow.dive.in_site import in_site_numbers
+from aquaflow.live.control import Control
+from aquaflow.live.dive_parts import Parts
+from aquaflow.live.feed import Feed
+from aquaflow.live.health.state import State
+from aquaflow.live.health.telemetry import metric_frame_numbers, newest_values
+from aquaflow.live.standby import Standby
+from aquaflow.live.vehicle.pose_output import PoseOutput
+from aquaflow.live.vitals import Vitals
+
+GOOD = (State.TRACKING, State.INITIALISING, State.IDLE, State.PAUSED, State.FINISHING)
+"""States that need no action."""
+CHANGES_LISTED = 10
+"""Latest changes of state that the report lists."""
+
+
+def report(
+    parts: Parts, hang_s: float, poses: PoseOutput | None = None, now_s: float | None = None
+) -> dict[str, Any]:
+    """The report, with stable keys; may be called from any thread."""
+    loop, folder = parts.loop, parts.choice.folder
+    return {
+        **_state(loop.vitals, hang_s, now_s),
+        "dive": {
+            "state": loop.control.phase.value,
+            "name": folder.name,
+            "folder": str(folder),
+            "begun_utc": parts.standing.status.begun_utc,
+            "frames": parts.frames_before + loop.counters.frames,
+        },
+        "resumed": parts.choice.checkpoint is not None,
+        **loop.status(),
+        "keyframes": len(parts.slam.keyframes),
+        "consistency": parts.slam.tracker.monitor.counts.to_json(),
+        "in_site": None if parts.slam.in_base is None else in_site_numbers(parts.slam.in_base),
+        "gaussians": sum(len(mapper.gaussians) for mapper in list(parts.maps.mappers.values())),
+        "checkpoint": {
+            "taken": parts.checkpointer.taken,
+            "failures": parts.checkpointer.failures,
+            "bytes": parts.checkpointer.size_bytes,
+            "seconds": round(parts.checkpointer.wrote_s, 3),
+        },
+        "deliverables": parts.refresher.to_json(),
+        "machine": asdict(loop.pressure) | {"peak_rss_mb": _peak_rss_mb()},
+        **_devices(loop.feed),
+        "metric_frame": metric_frame_numbers(parts.slam.metric_frame(parts.slam.tracker.sub_map)),
+        "pose_output": None if poses is None else poses.to_json(),
+    }
+
+
+def report_between_dives(
+    standby: Standby, control: Control, feed: Feed, now_s: float | None = None
+) -> dict[str, Any]:
+    """The same keys while there is no dive: its numbers are 0, or null."""
+    vitals = standby.vitals
+    return {
+        **_state(vitals, vitals.hang_s, now_s),
+        "dive": {
+            "state": control.phase.value, "name": None, "folder": None, "begun_utc": None,
+            "frames": 0,
+        },
+        "resumed": False,
+        **standby.counters.to_json(),
+        **dict.fromkeys(("overtaken", "steps_down", "steps_up"), 0),
+        "level": vitals.degradation.level.words,
+        "visits": {state.value: count for state, count in vitals.health.visits.items()},
+        "left_out_of_the_map": {},
+        **dict.fromkeys(
+            ("mapped_without_steps", "mapping_failures", "mapping_waits", "mapping_rests"), 0
+        ),
+        "stage_failures": feed.failures.to_json(),
+        "keyframes": 0,
+        "consistency": None,
+        "in_site": None,
+        "gaussians": 0,
+        "checkpoint": None,
+        "deliverables": None,
+        "machine": {"peak_rss_mb": _peak_rss_mb()},
+        **_devices(feed),
+        "metric_frame": None,
+        "pose_output": None,
+    }  # fmt: skip
+
+
+def _state(vitals: Vitals, hang_s: float, now_s: float | None) -> dict[str, Any]:
+    now = time.monotonic() if now_s is None else now_s
+    health, hung = vitals.health, vitals.heartbeats.hung(hang_s)
+    return {
+        "version": __version__,
+        "state": health.state.value,
+        "reason": health.reason,
+        "ok": health.state in GOOD and hung is None,
+        "hung_stage": hung,
+        "since_s": round(now - health.since_s, 1),
+        "changes": [
+            {
+                "ago_s": round(now - change.t_s, 1),
+                "before": change.before.value,
+                "after": change.after.value,
+                "reason": change.reason,
+            }
+            for change in list(health.changes)[-CHANGES_LISTED:]
+        ],
+    }
+
+
+def _devices(feed: Feed) -> dict[str, Any]:
+    return {
+        "devices": feed.describe(),
+        "telemetry_samples": feed.latest_samples.samples,
+        "telemetry": newest_values(feed.latest_samples.latest()),
+    }
+
+
+def viewer_facts(config: ViewerConfig) -> dict[str, Any] | None:
+    """Where the viewer listens, for the page's link to it; None if it does not."""
+    return {"host": config.host, "port": config.port} if config.enabled else None
+
+
+def _peak_rss_mb() -> float:
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)

@@ -1,0 +1,136 @@
+"""What stands around the dives of a service: its servers, its viewer, its words to the pilot."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from aquaflow.config.vehicle import VehicleConfig
+from aquaflow.live.control import Control
+from aquaflow.live.dive_parts import Parts
+from aquaflow.live.feed import Feed
+from aquaflow.live.health.http import HealthServer
+from aquaflow.live.live_coverage import LiveCoverage
+from aquaflow.live.live_dive import LiveDive
+from aquaflow.live.live_viewer import LiveViewer
+from aquaflow.live.picture import NewestPicture
+from aquaflow.live.plan_view import PlanView
+from aquaflow.live.report import report, report_between_dives, viewer_facts
+from aquaflow.live.standby import Standby
+from aquaflow.live.vehicle.arming import Arming
+from aquaflow.live.vehicle.pilot_messages import PilotMessages
+from aquaflow.live.vehicle.pose_output import PoseOutput
+from aquaflow.live.vitals import Vitals
+from aquaflow.live.watched import Watched
+from aquaflow.survey.coverage.hints import Hint
+
+if TYPE_CHECKING:
+    from aquaflow.live.foxglove.live import LiveFoxglove
+
+
+class Station:
+    """Close it after the last dive."""
+
+    def __init__(
+        self, feed: Feed, vehicle: VehicleConfig, control: Control, vitals: Vitals
+    ) -> None:
+        """Begin to listen.
+
+        Raises:
+            InputError: an address is taken, or a token file cannot be read.
+            ConfigError: a token will not do.
+        """
+        service = vehicle.service
+        self.standby = Standby(feed, control, vitals)
+        self._feed, self._control, self._config = feed, control, service
+        self._shown: tuple[Parts, PoseOutput | None] | None = None
+        self._closing = contextlib.ExitStack()
+        self.picture = NewestPicture()
+        self._coverage = LiveCoverage(feed.failures) if vehicle.coverage.enabled else None
+        messages = PilotMessages(service.report, feed, self._hints)
+        self._watchers: list[Callable[[Watched], None]] = [self.picture.update, messages.update]
+        if feed.pilot is not None:
+            self._watchers.append(Arming(service.dive, control, feed.pilot).update)
+        self.standby.watchers += self._watchers
+        self._viewer: LiveViewer | None = None
+        self._foxglove: LiveFoxglove | None = None
+        self._viewer_config = vehicle.viewer
+        with contextlib.ExitStack() as opened:
+            if self._coverage is not None:
+                opened.callback(self._contained, self._coverage.close)
+            if service.health.enabled:
+                plan = PlanView(self._dive_shown, coverage=self._coverage)
+                server = HealthServer(
+                    service.health, self._page, plan.to_json, control, self.picture.jpeg,
+                    self._coverage,
+                )  # fmt: skip
+                opened.callback(self._contained, server.close)
+            if vehicle.viewer.enabled:
+                plan_of = (lambda number: None) if self._coverage is None else self._coverage.plan
+                self._viewer = LiveViewer(vehicle.viewer, self.report, plan_of)
+                opened.callback(self._contained, self._viewer.close)
+            if service.foxglove.enabled:
+                from aquaflow.live.foxglove.live import LiveFoxglove  # it loads torch
+
+                self._foxglove = LiveFoxglove(service.foxglove, self.report)
+                opened.callback(self._contained, self._foxglove.close)
+            self._closing = opened.pop_all()
+
+    def report(self) -> dict[str, Any]:
+        """The service as it is now; for any thread."""
+        shown = self._shown
+        if shown is None:
+            return report_between_dives(self.standby, self._control, self._feed)
+        parts, poses = shown
+        return report(parts, self._config.hang_s, poses)
+
+    def _page(self) -> dict[str, Any]:
+        """The report, and where the page finds the viewer."""
+        return self.report() | {"viewer": viewer_facts(self._viewer_config)}
+
+    def show(self, dive: LiveDive) -> None:
+        """From here on, this dive."""
+        self.standby.end()
+        parts, pose = dive.parts, self._config.pose
+        poses = PoseOutput(pose, self._feed, parts.slam.metric_frame) if pose.enabled else None
+        parts.loop.watchers += self._watchers
+        if poses is not None:
+            parts.loop.watchers.append(poses.update)
+        if self._viewer is not None:
+            self._viewer.begin()
+            parts.loop.watchers.append(self._viewer.update)
+        if self._coverage is not None:
+            self._coverage.show(parts)
+            parts.loop.watchers.append(self._coverage.update)
+        if self._foxglove is not None:
+            self._foxglove.begin()
+            parts.loop.watchers.append(self._foxglove.update)
+        self._shown = parts, poses
+
+    def hide(self) -> None:
+        """From here on, no dive: what it holds may be let go."""
+        self._shown = None
+        if self._coverage is not None:
+            self._coverage.hide()
+
+    def _dive_shown(self) -> Parts | None:
+        return None if self._shown is None else self._shown[0]
+
+    def _hints(self) -> tuple[Hint, ...]:
+        return () if self._coverage is None else self._coverage.hints
+
+    def close(self) -> None:
+        """Stop listening."""
+        self.standby.end()
+        self._closing.close()
+
+    def _contained(self, close: Callable[[], None]) -> None:
+        with self._feed.failures.contain("closing"):
+            close()
+
+    def __enter__(self) -> Station:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,145 @@
+"""The body's last poses: its velocity, its last motion, and whether it jumped."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import block_diag
+
+from aquaflow.geometry.similarity import Sim3, so3_exp
+from aquaflow.live.vehicle.body_geometry import Pose
+
+Array = npt.NDArray[np.float64]
+
+Place: TypeAlias = Callable[[Sim3], Pose]
+"""The body's pose for a camera pose in the sub-map, as the map's place in the world is known."""
+
+WINDOW = 3
+"""Poses that a velocity is the mean over, so that it is 0.1 s old at 10 frames/s. With five, its
+error on a synthetic reef was 0.15 m/s instead of 0.09 at 0.64 m/s: all of it lag."""
+LEAST_POSES = 3
+"""For a velocity; from two, its scatter cannot be seen."""
+LONGEST_GAP_S = 1.0
+"""Between poses; after a longer one the motion is not predicted, and the velocity begins anew."""
+MOST_SPEED_M_S, MOST_RATE_RAD_S = 3.0, np.pi
+"""Of an ROV or AUV, while its velocity is not known yet (a BlueROV2 does 1.5 m/s)."""
+MOST_ACCELERATION_M_S2, MOST_TURN_RAD_S2 = 2.0, 4.0
+"""Of the same vehicles: thrusts of a fifth of the weight, half a turn within a second."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Velocity and angular rate of the body, along its own axes."""
+
+    velocity_m_s: Array
+    """[3]"""
+    rate_rad_s: Array
+    """[3]"""
+    covariance: Array
+    """[6, 6]"""
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A camera pose in a sub-map, at the moment of exposure."""
+
+    t_ns: int
+    sub_map: int
+    T_mc: Sim3
+
+
+class BodyTrack:
+    """Poses are computed anew from the map with its newest place in the world: a small correction
+    of that place moves the whole track, and no velocity comes of it."""
+
+    def __init__(self, jump_m: float, jump_rad: float) -> None:
+        self._jump_m, self._jump_rad = jump_m, jump_rad
+        self._sightings: deque[Sighting] = deque(maxlen=WINDOW)
+        self._poses: list[Pose] = []
+
+    def add(self, sighting: Sighting, place: Place) -> bool:
+        """Take the next pose; True if it jumped, or the place of the map did."""
+        pose = place(sighting.T_mc)
+        jumped = self._jumped(sighting, pose, place)
+        if jumped or not self._continues(sighting):
+            self._sightings.clear()
+        self._sightings.append(sighting)
+        self._poses = [place(each.T_mc) for each in self._sightings]
+        return jumped
+
+    @property
+    def pose(self) -> Pose:
+        """The newest pose."""
+        return self._poses[-1]
+
+    def step(self) -> tuple[int, Array, Array] | None:
+        """Nanoseconds, rotation vector [3] and translation [3] since the pose before, in the axes
+        of the newest; None after a jump or a gap."""
+        if len(self._poses) < 2:
+            return None
+        since_ns = self._sightings[-1].t_ns - self._sightings[-2].t_ns
+        return (since_ns, *self._poses[-2].to(self._poses[-1]))
+
+    def motion(self, sigma_m: float, sigma_rad: float) -> Motion | None:
+        """The mean motion of the window; None while there are too few poses.
+
+        ``sigma_m`` and ``sigma_rad`` are of one pose against the next. What the window's steps
+        scatter beyond that, as an acceleration makes them, is added to the covariance.
+        """
+        if len(self._poses) < LEAST_POSES:
+            return None
+        t_s = 1e-9 * np.array([each.t_ns - self._sightings[0].t_ns for each in self._sightings])
+        steps = [_mid_step(a, b) for a, b in zip(self._poses, self._poses[1:], strict=False)]
+        mean = np.sum(steps, axis=0) / t_s[-1]
+        rates = np.array(steps) / np.diff(t_s)[:, None]
+        noise = np.diag(np.repeat([sigma_m, sigma_rad], 3) * np.sqrt(2.0) / t_s[-1]) ** 2
+        scatter = (rates - mean).T @ (rates - mean) / (len(rates) * (len(rates) - 1))
+        covariance = noise + block_diag(scatter[:3, :3], scatter[3:, 3:])
+        return Motion(mean[:3], mean[3:], covariance)
+
+    def _continues(self, sighting: Sighting) -> bool:
+        """True if the motion since the newest pose is one of the same map, without a gap."""
+        if not self._sightings:
+            return False
+        newest = self._sightings[-1]
+        since_s = 1e-9 * (sighting.t_ns - newest.t_ns)
+        return newest.sub_map == sighting.sub_map and 0.0 < since_s <= LONGEST_GAP_S
+
+    def _jumped(self, sighting: Sighting, pose: Pose, place: Place) -> bool:
+        if not self._sightings:
+            return False
+        newest, before = self._sightings[-1], self.pose
+        same_map = newest.sub_map == sighting.sub_map
+        if same_map:
+            corrected = place(newest.T_mc)
+            if self._differ(before, corrected, 0.0, 0.0):
+                return True
+            before = corrected
+        since_s = 1e-9 * (sighting.t_ns - newest.t_ns)
+        if not 0.0 < since_s <= LONGEST_GAP_S:
+            return not same_map
+        slack_m = 0.5 * MOST_ACCELERATION_M_S2 * since_s**2
+        slack_rad = 0.5 * MOST_TURN_RAD_S2 * since_s**2
+        motion = self.motion(0.0, 0.0)
+        if motion is None:
+            slack_m, slack_rad = MOST_SPEED_M_S * since_s, MOST_RATE_RAD_S * since_s
+        else:
+            R = before.R @ so3_exp(motion.rate_rad_s * since_s)
+            before = Pose(R, before.t_m + before.R @ motion.velocity_m_s * since_s)
+        return self._differ(before, pose, slack_m, slack_rad)
+
+    def _differ(self, a: Pose, b: Pose, slack_m: float, slack_rad: float) -> bool:
+        turn, moved = a.to(b)
+        too_far = float(np.linalg.norm(moved)) > self._jump_m + slack_m
+        return bool(too_far or float(np.linalg.norm(turn)) > self._jump_rad + slack_rad)
+
+
+def _mid_step(a: Pose, b: Pose) -> Array:
+    """[6] translation in the axes halfway between the poses, and rotation vector."""
+    turn, moved_b = a.to(b)
+    return np.concatenate([so3_exp(0.5 * turn) @ moved_b, turn])

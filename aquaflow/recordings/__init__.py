@@ -1,0 +1,1 @@
+"""Whatever a person has on disk becomes pictures, times, calibration and telemetry."""

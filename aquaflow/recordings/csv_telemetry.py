@@ -1,0 +1,204 @@
+"""Tables of telemetry: what ``aquaflow synth`` writes, ``rostopic echo -p``, GoPro extracts, and
+plain tables of a survey (:mod:`aquaflow.recordings.survey_table`)."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeAlias
+
+from aquaflow.base.errors import InputError
+from aquaflow.recordings import survey_table
+from aquaflow.recordings.sample_table import HEADER, read_telemetry
+from aquaflow.recordings.telemetry_log import LoggedUtc, LogTime, TelemetryLog
+from aquaflow.types import Acceleration, Altitude, AngularRate, Depth, TelemetrySample, Velocity
+
+Line: TypeAlias = dict[str, str]
+Convert: TypeAlias = Callable[[Line, int, int, str], list[TelemetrySample]]
+Samples: TypeAlias = Iterator[TelemetrySample]
+
+NAVQUEST_SHARE, NAVQUEST_SIGMA_M_S = 0.002, 0.001
+"""LinkQuest NavQuest 600, data sheet: 0.2 % of the velocity and 1 mm/s."""
+
+TIME, STAMP = "%time", "field.header.stamp"
+"""Columns of a table that rostopic echo -p wrote: when a message was recorded, and measured; ns."""
+
+
+class CsvTelemetry(TelemetryLog):
+    """One table; the header says which. Velocities are in the instrument's own axes."""
+
+    suffixes = frozenset({".csv"})
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        return super().recognises(path) and _reader_of(path) is not None
+
+    def samples(self) -> Iterator[TelemetrySample]:
+        """Samples in the order of the lines; a line that holds no numbers is skipped.
+
+        Raises:
+            InputError: the table's header is not known.
+        """
+        reader = _reader_of(self.path)
+        if reader is None:
+            raise InputError(f"{self.path} is no table of telemetry that AquaFlow knows")
+        self.notes = []
+        yield from reader(self)
+
+    def lines(self, convert: Convert, stamps_of: Callable[[Line], tuple[int, int]]) -> Samples:
+        """Every line converted; ``stamps_of`` gives arrival and measurement, ns."""
+        clock, bad = LogTime(self.starts_s), 0
+        with self.path.open(newline="", encoding="utf-8", errors="replace") as file:
+            for line in self._as_far_as_it_is_a_table(csv.DictReader(file)):
+                try:
+                    arrival_stamp, stamp = stamps_of(line)
+                    arrival_ns = clock.at(arrival_stamp)
+                    t_ns = arrival_ns + min(stamp - arrival_stamp, 0)
+                    found = convert(line, t_ns, arrival_ns, self.path.stem)
+                except (KeyError, TypeError, ValueError, OverflowError):
+                    bad += 1
+                    continue
+                yield from found
+        self._note_left_out(bad)
+
+    def survey(self) -> Samples:
+        """A plain table; times of ``t_s`` stay as they are, those of ``utc`` count from the first
+        row."""
+        source, bad = self.path.stem, 0
+        times = list(self._survey_times())
+        utc = LoggedUtc(source, iter([time for time in times if time is not None]))
+        with self.path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
+            rows = self._as_far_as_it_is_a_table(csv.DictReader(file))
+            for row, time in zip(rows, times, strict=False):
+                try:
+                    if time is None:
+                        raise ValueError("no time")
+                    found = survey_table.samples_of(row, time[0], source)
+                except (TypeError, ValueError):
+                    bad += 1
+                    continue
+                yield from utc.at(*time)
+                yield from found
+        self._note_left_out(bad)
+
+    def _survey_times(self) -> Iterator[tuple[int, int | None] | None]:
+        """Of every row: time in the dive and UTC, ns; None where it states none."""
+        clock, newest_ns = LogTime(self.starts_s), -(10**18)
+        with (
+            self.path.open(newline="", encoding="utf-8-sig", errors="replace") as file,
+            contextlib.suppress(csv.Error),
+        ):
+            for row in csv.DictReader(file):
+                try:
+                    if survey_table.UTC in row:
+                        wall_ns = survey_table.utc_ns(row[survey_table.UTC])
+                        yield clock.at(wall_ns), wall_ns
+                        continue
+                    t_s = self.starts_s + float(row[survey_table.SECONDS])
+                    newest_ns = max(newest_ns, round(t_s * 1e9))
+                    yield newest_ns, None
+                except (AttributeError, TypeError, ValueError, OverflowError):
+                    yield None
+
+    def _note_left_out(self, lines: int) -> None:
+        if lines:
+            self.notes.append(f"{lines} lines of {self.path.name} were left out")
+
+    def _as_far_as_it_is_a_table(self, reader: csv.DictReader[str]) -> Iterator[Line]:
+        """Lines before the first of more than 131,072 characters in a field, csv's limit."""
+        try:
+            yield from reader
+        except csv.Error:
+            self.notes.append(
+                f"{self.path.name} is damaged after line {reader.line_num}; the rest was left out"
+            )
+
+
+Reader: TypeAlias = Callable[[CsvTelemetry], Samples]
+
+
+def _reader_of(path: Path) -> Reader | None:
+    """How to read the table, by its header."""
+    try:
+        with path.open(encoding="utf-8-sig", errors="replace") as file:
+            header = tuple(file.readline(10_000).strip().split(","))
+    except OSError:
+        return None
+    ros, gopro = header[0] == TIME, header == ("t_s", "c0", "c1", "c2")
+    stream = path.stem.rpartition("_")[2]
+    known: list[tuple[bool, Reader]] = [
+        (header == HEADER, _synthetic),
+        (survey_table.is_survey_table(header), CsvTelemetry.survey),
+        (ros and "field.depth" in header, lambda table: table.lines(_ros_depth, _ros_stamps)),
+        (
+            ros and "field.velocityInst0" in header,
+            lambda table: table.lines(_ros_dvl, _ros_stamps),
+        ),
+        (gopro and stream == "gyro", lambda table: table.lines(_gopro_rate, _gopro_stamps)),
+        (gopro and stream == "accl", lambda table: table.lines(_gopro_force, _gopro_stamps)),
+    ]
+    return next((reader for fits, reader in known if fits), None)
+
+
+def _synthetic(table: CsvTelemetry) -> Samples:
+    """Its times are those of its dive's pictures, not from the first line on."""
+    shift_ns = round(table.starts_s * 1e9)
+    for sample in read_telemetry(table.path):
+        t_ns, arrival_ns = sample.t_ns + shift_ns, sample.arrival_ns + shift_ns
+        yield replace(sample, t_ns=t_ns, arrival_ns=arrival_ns)
+
+
+def _ros_stamps(line: Line) -> tuple[int, int]:
+    return int(line[TIME]), int(line.get(STAMP) or line[TIME])
+
+
+def _gopro_stamps(line: Line) -> tuple[int, int]:
+    stamp = round(float(line["t_s"]) * 1e9)
+    return stamp, stamp
+
+
+def _numbers(line: Line, *columns: str) -> tuple[float, ...]:
+    numbers = tuple(float(line[column]) for column in columns)
+    if not all(map(math.isfinite, numbers)):
+        raise ValueError("not finite")
+    return numbers
+
+
+def _ros_depth(line: Line, t_ns: int, arrival_ns: int, source: str) -> list[TelemetrySample]:
+    (depth_m,) = _numbers(line, "field.depth")
+    return [Depth(t_ns, arrival_ns, source, depth_m)]
+
+
+def _ros_dvl(line: Line, t_ns: int, arrival_ns: int, source: str) -> list[TelemetrySample]:
+    """LinkQuest's message: velocity over ground where the flag is 1; altitude 0 means none."""
+    found: list[TelemetrySample] = []
+    if line["field.velocityInstFlag"] == "1":
+        x, y, z = _numbers(line, *(f"field.velocityInst{axis}" for axis in range(3)))
+        sigma = NAVQUEST_SHARE * math.hypot(x, y, z) + NAVQUEST_SIGMA_M_S
+        found.append(Velocity(t_ns, arrival_ns, source, (x, y, z), sigma))
+    (altitude_m,) = _numbers(line, "field.altitude")
+    if altitude_m > 0.0:
+        found.append(Altitude(t_ns, arrival_ns, source, altitude_m))
+    return found
+
+
+def _gopro_body(line: Line) -> tuple[float, float, float]:
+    """GoPro's axes in those of the camera's body: forward, right, down.
+
+    Found by fitting the gyro of shared/data/reef_clip to the rotations of its poses_sfm.tum; the
+    accelerometer then shows gravity downwards and a camera that looks 23 degrees down.
+    """
+    c0, c1, c2 = _numbers(line, "c0", "c1", "c2")
+    return -c2, -c1, -c0
+
+
+def _gopro_rate(line: Line, t_ns: int, arrival_ns: int, source: str) -> list[TelemetrySample]:
+    return [AngularRate(t_ns, arrival_ns, source, _gopro_body(line))]
+
+
+def _gopro_force(line: Line, t_ns: int, arrival_ns: int, source: str) -> list[TelemetrySample]:
+    return [Acceleration(t_ns, arrival_ns, source, _gopro_body(line))]

@@ -1,0 +1,257 @@
+"""A camera of an MCAP recording: ours, or any with foxglove's or ROS's picture messages."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.base.errors import InputError
+from aquaflow.config.device import MountingConfig
+from aquaflow.geometry.camera import (
+    CameraModel,
+    camera_of_values,
+    guess_camera,
+    has_unmeasured_port,
+)
+from aquaflow.recordings.h264 import decode_units, is_key
+from aquaflow.recordings.mcap_messages import McapMessage, McapMessages, mcap_files
+from aquaflow.recordings.mcap_payload import Payloads, UnreadablePayloadError
+from aquaflow.recordings.picture import UnreadablePictureError, received_as
+from aquaflow.recordings.picture_message import compressed_picture, raw_picture
+from aquaflow.sources import is_asked
+from aquaflow.types import Dropped, EncodedPicture, Frame
+
+COMPRESSED, RAW, VIDEO = "CompressedImage", "RawImage", "CompressedVideo"
+"""Foxglove's messages."""
+RAW_NAMES = frozenset({RAW, "Image"})
+"""Foxglove's and ROS's messages of pictures that are not compressed."""
+OURS = "aquaflow"
+"""Name of the metadata that AquaFlow's recorder writes."""
+MOUNTING = "mounting"
+"""Key of a camera's metadata: its mounting in the vehicle as JSON."""
+
+
+def picture_kind(message: McapMessage) -> str | None:
+    """CompressedImage, RawImage or CompressedVideo; None if it is no picture."""
+    name = "" if message.schema is None else message.schema.name.replace(".", "/").split("/")[-1]
+    if name in RAW_NAMES:
+        return RAW
+    return name if name in (COMPRESSED, VIDEO) else None
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Metadata that the recorder wrote with a picture."""
+
+    index: int
+    t_ns: int
+    arrival_ns: int
+    exposure_s: float | None = None
+    gain: float | None = None
+    mask: npt.NDArray[np.bool_] | None = None
+
+
+class McapCamera:
+    """Pictures of one topic; times count from the first of them."""
+
+    specificity = 2
+
+    def __init__(self, path: Path, camera: str | None = None) -> None:
+        """Look for the first picture, of ``camera`` or of the first camera that there is.
+
+        Raises:
+            InputError: the files hold no picture, or the extra ``recording`` is missing.
+        """
+        self.path = path
+        self._messages = McapMessages(mcap_files(path))
+        self._payloads = Payloads()
+        first, self.origin_ns = self._first_picture(camera)
+        self.topic = first.topic
+        self._base = first.topic.rpartition("/")[0]
+        self._ours = OURS in self._messages.facts
+        self._damage: list[str] = []
+        self._stated = self._calibration()
+        """As every frame carried it, be it only a guess."""
+        known = self._stated is not None and self._stated.calibrated
+        self.camera: CameraModel | None = self._stated if known else None
+        self.frame_count: int | None = self._count(self._messages.counts())
+        self.notes: list[str] = []
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        return bool(mcap_files(path)) and not (path / "metadata.yaml").is_file()
+
+    @classmethod
+    def open(cls, path: Path, fps: float | None = None) -> McapCamera:
+        return cls(path)
+
+    def name_of(self, index: int) -> str:
+        """The recording's name and the picture's number, ``dive.mcap#12``."""
+        return f"{self.path.name}#{index}"
+
+    def frames(
+        self, every: int = 1, start: int = 0, stop: int | None = None
+    ) -> Iterator[Frame | Dropped]:
+        """The pictures whose index is ``start, start + every, ...`` below ``stop``.
+
+        Raises:
+            InputError: none could be read, though there was one when the recording was opened.
+        """
+        any_read = False
+        pictures = self._video() if self._kind == VIDEO else self._pictures(every, start)
+        for frame in pictures:
+            any_read = True
+            if stop is not None and frame.index >= stop:
+                break
+            if is_asked(frame.index, every, start):
+                yield frame
+        self.notes = [*self._damage, *self._messages.notes]
+        if not any_read:
+            raise InputError(f"{self.path} holds no picture any more: {'; '.join(self.notes)}")
+
+    def close(self) -> None:
+        """Nothing stays open between passes."""
+
+    def stated_mounting(self) -> MountingConfig | None:
+        """Of the camera in the vehicle, as the recorder knew it.
+
+        Raises:
+            InputError: the statement in the file is damaged.
+        """
+        facts = self._messages.facts.get(f"camera:{self._base.strip('/')}", {})
+        if not self._ours or MOUNTING not in facts:
+            return None
+        try:
+            return MountingConfig.model_validate_json(facts[MOUNTING])
+        except ValueError:
+            raise InputError(
+                f"the mounting of the camera in {self.path.name} is damaged; give fusion.camera"
+            ) from None
+
+    def _first_picture(self, camera: str | None) -> tuple[McapMessage, int]:
+        """The first picture, and when it or a missing one before it was taken."""
+        missing: dict[str, int] = {}
+        for message in self._messages:
+            base, _, name = message.topic.rpartition("/")
+            kind = picture_kind(message)
+            if name == "dropped":
+                missing.setdefault(base, message.publish_ns)
+            elif kind is not None and name != "mask" and camera in (None, base.strip("/")):
+                self._kind = kind
+                return message, missing.get(base, message.publish_ns)
+        which = "" if camera is None else f" of camera '{camera}'"
+        raise InputError(f"{self.path} holds no picture{which}; give a recording with a camera")
+
+    def _calibration(self) -> CameraModel | None:
+        facts = self._messages.facts.get(f"camera:{self._base.strip('/')}")
+        if facts is None:
+            return None
+        try:
+            fields = json.loads(facts["model"])
+            if has_unmeasured_port(fields):
+                self._damage.append(
+                    f"the calibration in {self.path.name} names a {fields['port']['kind']} port "
+                    "without its measures, which was left out; give --calib with them"
+                )
+            return camera_of_values(fields)
+        except (KeyError, TypeError, ValueError, RecursionError):
+            self._damage.append(f"the calibration in {self.path.name} is damaged and was left out")
+            return None
+
+    def _count(self, counts: dict[str, int] | None) -> int | None:
+        if counts is None:
+            return None
+        return counts.get(self.topic, 0) + counts.get(f"{self._base}/dropped", 0)
+
+    def _placed(self) -> Iterator[tuple[_Place, McapMessage | str]]:
+        """Pictures with what belongs to them; a sentence instead of one that is missing."""
+        extra: dict[str, Any] = {}
+        mask: npt.NDArray[np.bool_] | None = None
+        topics = {self.topic: "picture"}
+        if self._ours:  # elsewhere, topics of these names hold what their makers mean by them
+            topics |= {f"{self._base}/{kind}": kind for kind in ("dropped", "exposure", "mask")}
+        for count, message in _numbered(self._messages.of(topics.__contains__), self.topic):
+            kind = topics[message.topic]
+            if kind == "mask":
+                mask = compressed_picture(self._payloads.decode(message).data)[..., 0] > 0
+            elif kind == "exposure":
+                extra = json.loads(message.data)
+            else:
+                place = _Place(
+                    message.number if self._ours else count,
+                    message.publish_ns - self.origin_ns,
+                    message.log_ns - self.origin_ns,
+                    mask=mask,
+                    **extra if kind == "picture" else {},
+                )
+                extra = {} if kind == "picture" else extra
+                gone = json.loads(message.data)["reason"] if kind == "dropped" else None
+                yield place, message if gone is None else gone
+
+    def _pictures(self, every: int, start: int) -> Iterator[Frame | Dropped]:
+        for place, found in self._placed():
+            if not is_asked(place.index, every, start):
+                continue
+            if isinstance(found, str):
+                yield Dropped(place.index, place.t_ns, found)
+                continue
+            try:
+                image, encoded = self._decode(found)
+            except (UnreadablePictureError, UnreadablePayloadError) as error:
+                yield Dropped(place.index, place.t_ns, f"{self.name_of(place.index)} {error}")
+                continue
+            yield self._frame(place, image, encoded)
+
+    def _decode(self, message: McapMessage) -> tuple[npt.NDArray[np.uint8], EncodedPicture | None]:
+        fields = self._payloads.decode(message)
+        if self._kind == COMPRESSED:
+            data = bytes(fields.data)
+            return compressed_picture(data), received_as(data)
+        shape = (fields.height, fields.width, fields.step)
+        return raw_picture(bytes(fields.data), *shape, fields.encoding), None
+
+    def _video(self) -> Iterator[Frame | Dropped]:
+        gone: list[Dropped] = []
+
+        def units() -> Iterator[tuple[tuple[_Place, EncodedPicture], bytes]]:
+            for place, found in self._placed():
+                if isinstance(found, str):
+                    gone.append(Dropped(place.index, place.t_ns, found))
+                    continue
+                data = bytes(self._payloads.decode(found).data)
+                yield (place, EncodedPicture("h264", data, is_key(data))), data
+
+        for (place, encoded), image in decode_units(units()):
+            while gone and gone[0].index < place.index:
+                yield gone.pop(0)
+            if image is None:
+                reason = f"{self.name_of(place.index)} cannot be decoded"
+                yield Dropped(place.index, place.t_ns, reason)
+            else:
+                yield self._frame(place, image, encoded)
+        yield from gone
+
+    def _frame(
+        self,
+        place: _Place,
+        image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
+        encoded: EncodedPicture | None,
+    ) -> Frame:
+        height, width = image.shape[:2]
+        camera = self._stated or guess_camera(width, height)
+        frame = Frame(place.index, place.t_ns, place.arrival_ns, image, camera, encoded=encoded)
+        return replace(frame, exposure_s=place.exposure_s, gain=place.gain, mask=place.mask)
+
+
+def _numbered(messages: Iterator[McapMessage], topic: str) -> Iterator[tuple[int, McapMessage]]:
+    """Messages with the number of messages of ``topic`` before them."""
+    count = 0
+    for message in messages:
+        yield count, message
+        count += message.topic == topic

@@ -1,0 +1,96 @@
+"""Telemetry of an MCAP recording: the decoded samples, or the links' bytes decoded once more."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from aquaflow.base.errors import InputError
+from aquaflow.config.telemetry import AnyDevice
+from aquaflow.recordings.mcap_camera import McapCamera
+from aquaflow.recordings.mcap_messages import McapMessages, mcap_files
+from aquaflow.recordings.telemetry_json import sample_from_json
+from aquaflow.recordings.telemetry_log import DecodedReads, Read
+from aquaflow.types import KINDS, TelemetrySample
+
+TELEMETRY = "/telemetry/"
+"""The recorder writes samples to topics below this one."""
+LINKS = "/links/"
+"""And what links received, as it came, below this one."""
+
+
+class McapTelemetry:
+    """Samples of all sources in the order of arrival; times count from the first picture."""
+
+    specificity = 2
+
+    def __init__(self, path: Path, origin_ns: int | None = None) -> None:
+        """``origin_ns`` becomes time 0; None: that of the first picture, else of the first message.
+
+        Raises:
+            InputError: the extra ``recording`` is missing.
+        """
+        self.path = path
+        self._messages = McapMessages(mcap_files(path))
+        self.origin_ns = self._origin() if origin_ns is None else origin_ns
+        self.invalid = 0
+        """Messages that are no samples."""
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        return McapCamera.recognises(path)
+
+    @classmethod
+    def open(cls, path: Path, starts_s: float = 0.0) -> McapTelemetry:
+        telemetry = cls(path)
+        telemetry.origin_ns -= round(starts_s * 1e9)
+        return telemetry
+
+    def samples(self) -> Iterator[TelemetrySample]:
+        """The samples as they were decoded during the dive."""
+        self.invalid = 0
+        for message in self._messages.of(lambda topic: topic.startswith(TELEMETRY)):
+            kind = message.topic.rpartition("/")[2]
+            try:
+                if kind not in KINDS:
+                    raise ValueError(f"unknown kind {kind}")
+                sample = sample_from_json(kind, message.data)
+            except ValueError:
+                self.invalid += 1
+                continue
+            yield replace(
+                sample,
+                t_ns=sample.t_ns - self.origin_ns,
+                arrival_ns=sample.arrival_ns - self.origin_ns,
+            )
+
+    def link_bytes(self) -> Iterator[Read]:
+        """Every read of every link, as it came."""
+        for message in self._messages.of(lambda topic: topic.startswith(LINKS)):
+            arrival_ns = message.log_ns - self.origin_ns
+            yield Read(message.topic[len(LINKS) :], arrival_ns, message.data)
+
+    def decoded_again(self, devices: dict[str, AnyDevice]) -> Iterator[TelemetrySample]:
+        """Samples from the links' bytes, through the live links' decoders.
+
+        Raises:
+            InputError: a decoder's library is missing.
+        """
+        yield from DecodedReads(devices).samples(self.link_bytes())
+
+    @property
+    def notes(self) -> list[str]:
+        """What was left out, complete once iteration ends."""
+        bad = [f"{self.invalid} samples of {self.path.name} make no sense"] if self.invalid else []
+        return self._messages.notes + bad
+
+    def close(self) -> None:
+        """Nothing stays open between passes."""
+
+    def _origin(self) -> int:
+        try:
+            return McapCamera(self.path).origin_ns
+        except InputError:
+            first = next(iter(self._messages), None)
+            return 0 if first is None else first.log_ns

@@ -1,0 +1,1 @@
+"""What a finished dive becomes: report, exports, measurements, sites, changes, viewer, videos."""

@@ -1,0 +1,184 @@
+"""``aquaflow change``: two dives compared, and what changed between them as files."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aquaflow import __version__
+from aquaflow.base.errors import InputError
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.survey.change.change_picture import change_png
+from aquaflow.survey.change.change_raster import write_change_raster
+from aquaflow.survey.change.change_table import csv_of, row_of
+from aquaflow.survey.change.comparison import NOT_SEEN, UNCHANGED, Comparison, compare
+from aquaflow.survey.change.moved import with_moves
+from aquaflow.survey.change.patches import NAMES, Patch, find_patches
+from aquaflow.survey.change.registration import Registration, register
+from aquaflow.survey.change.surface import Progress, Surface, surface_of
+from aquaflow.survey.export.ortho.geotiff import require_rasterio
+from aquaflow.survey.export.ortho.ground import Ground, ground_of
+from aquaflow.survey.export.ortho.survey import read_map
+
+FORMAT = 1
+"""Of change.json; raised whenever an older AquaFlow could no longer read it."""
+JSON, CSV, PNG = "change.json", "change.csv", "change.png"
+START_RESOLUTIONS = 12.0
+"""Distance up to which the second surface is looked for around the first, in resolutions: 0.3 m
+where a picture shows 1.9 m; a merged site's dives lie within some centimetres."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is compared, and how."""
+
+    first: Path
+    second: Path
+    T_ab: Sim3
+    """From the world of the second dive's map to that of the first's, as known before."""
+    false_discoveries: float = 0.05
+    """Share of the places that are called changed, at most, that did not."""
+    cylinder: float | None = None
+    reach: float | None = None
+    """Of M3C2, in the first dive's unit; None: from the maps' resolution."""
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What was found."""
+
+    asked: Asked
+    ground: Ground
+    registration: Registration
+    compared: Comparison
+    patches: list[Patch]
+    surfaces: tuple[Surface, Surface]
+
+    def to_json(self) -> dict[str, Any]:
+        """The content of ``change.json`` (docs/formats.md#change)."""
+        compared, moved = self.compared, self.registration
+        scales, level = compared.scales, compared.distances.level()
+        areas = {
+            name: float((compared.kinds == kind).sum() * compared.area)
+            for kind, name in {**NAMES, UNCHANGED: "unchanged", NOT_SEEN: "not seen"}.items()
+        }
+        return {
+            "format": FORMAT,
+            "from": self.asked.first.resolve().name, "to": self.asked.second.resolve().name,
+            "unit": self.ground.unit, "epsg": self.ground.epsg, "axes": self.ground.axes,
+            "vertical": self.ground.vertical,
+            "normal_radius": scales.normal, "cylinder_radius": scales.cylinder,
+            "reach": scales.reach, "resolution": scales.apart,
+            "false_discovery_rate": self.asked.false_discoveries,
+            "level_of_detection_median": _finite(np.nanmedian(level)),
+            "sigmas_widened_by": compared.null[1],
+            "registration": {
+                "shared": moved.shared, "residual_sigma": moved.spread,
+                "scale": float(moved.T.scale), "rotation": moved.T.R.tolist(),
+                "translation": moved.T.t.tolist(),
+                "sigma": np.sqrt(np.diag(moved.covariance)).tolist(),
+            },
+            "light_ratio": list(compared.colours.gains),
+            "areas": areas,
+            "patches": self.rows(),
+        }  # fmt: skip
+
+    def rows(self) -> list[dict[str, Any]]:
+        """The table, a patch a row."""
+        return [row_of(n, patch, self.ground) for n, patch in enumerate(self.patches, 1)]
+
+
+def find_changes(asked: Asked, work: Path, progress: Progress) -> Changes:
+    """Compare two dives.
+
+    Args:
+        work: folder of files that end with the call.
+
+    Raises:
+        InputError: a dive has no map or no surface, or the two share too little ground.
+        ConfigError: a dive's settings cannot be read.
+    """
+    (one, frame), (other, _) = read_map(asked.first), read_map(asked.second)
+    ground = ground_of(frame, one.views)
+    first, voxel = surface_of(one, ground.T_gm, work, None, progress)
+    second, _ = surface_of(other, ground.T_gm @ asked.T_ab, work, voxel, progress)
+    resolution = max(first.resolution, second.resolution)
+    registration = register(
+        first.points, first.normals, second.points, resolution, START_RESOLUTIONS * resolution
+    )
+    second = second.moved(registration.T)
+    compared = compare(
+        first, second, registration, asked.false_discoveries, asked.cylinder, asked.reach, progress
+    )
+    if not compared.distances.seen.any():
+        raise InputError(
+            f"no place is seen on both days, of {asked.first} and {asked.second}; compare dives "
+            "over the same ground"
+        )
+    patches, compared = find_patches(compared, first, second)
+    patches, compared = with_moves(patches, compared, first, second, registration)
+    return Changes(asked, ground, registration, compared, patches, (first, second))
+
+
+def write_changes(out: Path, found: Changes, overwrite: bool) -> list[Path]:
+    """Write the four files into the folder ``out``: all of them, or none.
+
+    Raises:
+        InputError: ``out`` is taken, or cannot be written to.
+    """
+    require_rasterio()
+    refuse_taken(out, overwrite)
+    data = found.to_json()
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        part = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+        try:
+            write_change_raster(part, found.compared, found.ground, _tags(data))
+            (part / CSV).write_bytes(csv_of(found.rows()))
+            text = json.dumps(data, indent=2, allow_nan=False) + "\n"
+            (part / JSON).write_text(text, encoding="utf-8")
+            unit = found.ground.unit
+            png = change_png(found.compared, found.patches, *found.surfaces, unit)
+            (part / PNG).write_bytes(png)
+            part.chmod(0o755)
+            if out.exists():
+                shutil.rmtree(out)
+            part.replace(out)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+    except OSError as error:
+        raise InputError(
+            f"cannot write {out}: {error.strerror or error}; give a folder with room that can be "
+            "written to"
+        ) from error
+    return sorted(out.iterdir())
+
+
+def refuse_taken(out: Path, overwrite: bool) -> None:
+    """Refuse a folder that holds something else, or changes that were not to be replaced.
+
+    Raises:
+        InputError: it does.
+    """
+    if out.is_dir() and not any(out.iterdir()):
+        return
+    if out.exists() and not (out / JSON).is_file():
+        raise InputError(f"{out} holds files that are no changes; give another --out")
+    if out.exists() and not overwrite:
+        raise InputError(f"{out} holds changes already; give --overwrite, or another --out")
+
+
+def _tags(data: dict[str, Any]) -> dict[str, str]:
+    """What the raster says of itself, in words."""
+    said = ("from", "to", "unit", "axes", "vertical", "false_discovery_rate")
+    return {"SOFTWARE": f"AquaFlow {__version__}", **{key.upper(): str(data[key]) for key in said}}
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

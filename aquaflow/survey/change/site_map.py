@@ -1,0 +1,152 @@
+"""One map of a site: of every place the dive that shows it last, or much closer than the last.
+
+Each dive's map stays what it is; the Gaussians of all are taken together, and where several dives
+show a place, one of them counts:
+
+- What a later dive's views see past is gone.
+- Of dives that show a surface there the latest counts, unless an earlier one shows it from so much
+  nearer that its pixels are less than half as wide: a look from afar does not replace a close one.
+- Where no other dive looked, a dive's Gaussians stay.
+
+Colours are without water, and every dive has its own light: those of earlier dives are multiplied
+by one gain per channel, the median ratio over the ground that they share with later ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from aquaflow.dive.ply import PlyGaussians
+from aquaflow.survey.change.colour_change import DARKEST
+from aquaflow.survey.change.visibility import Look, look_at_places
+from aquaflow.survey.export.mesh.view_surfaces import ViewSurfaces
+from aquaflow.survey.measure.drawn_heights import MATCH_PX
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+MARGIN_RESOLUTIONS = 6.0
+"""Distance across a surface up to which two dives show the same one, in resolutions of the coarser
+map: 0.15 m where a picture shows 1.9 m. Dives of a merged site lie within some centimetres of each
+other, and no finer than that is a thing gone, or new."""
+MUCH_CLOSER = 2.0
+"""Ratio of the pixels' width on the ground from which an earlier dive counts before a later."""
+BLOCK_RANGES = 2.0
+"""Side of the blocks that are looked at together, in median ranges of the views."""
+OPAQUE = 0.5
+"""Opacity from which a Gaussian's colour is compared."""
+LEAST_PAIRS = 100
+"""Gaussians in common from which a gain is taken: fewer could be one coral that grew."""
+
+
+@dataclass(frozen=True)
+class DayMap:
+    """A dive's map in the site's world."""
+
+    name: str
+    gaussians: PlyGaussians
+    """Colours without water."""
+    views: ViewSurfaces
+
+    @property
+    def resolution(self) -> float:
+        """Distance below which the map does not tell places apart."""
+        return MATCH_PX * self.views.footprint
+
+
+@dataclass(frozen=True)
+class Part:
+    """What the one map has of a dive."""
+
+    name: str
+    gaussians: PlyGaussians
+    gone: int
+    """Gaussians that later dives see past."""
+    replaced: int
+    """Gaussians of places that another dive shows later, or from much nearer."""
+    gains: tuple[float, float, float]
+    """That its colours were multiplied by."""
+
+
+def combine(days: Sequence[DayMap]) -> list[Part]:
+    """The parts of the one map, in the order of ``days``: the earliest first."""
+    parts: list[Part] = []
+    for number in reversed(range(len(days))):
+        gone, replaced = _overruled(days, number)
+        gains = _gains(days[number], replaced, parts)
+        finite = np.isfinite(days[number].gaussians.means).all(axis=1)
+        kept = days[number].gaussians.rows(finite & ~gone & ~replaced)
+        kept = replace(kept, colours=(kept.colours * gains).astype(np.float32))
+        counts = int(gone.sum()), int((replaced & ~gone).sum())
+        red, green, blue = gains.tolist()
+        parts.append(Part(days[number].name, kept, *counts, (red, green, blue)))
+    return parts[::-1]
+
+
+def _overruled(days: Sequence[DayMap], number: int) -> tuple[Mask, Mask]:
+    """[N], [N] the Gaussians of a day that are gone, and those that another day shows."""
+    day = days[number]
+    places = np.asarray(day.gaussians.means, np.float64)
+    gone, replaced = np.zeros(len(places), bool), np.zeros(len(places), bool)
+    for block in _blocks(places, BLOCK_RANGES * day.views.median_range):
+        own = _look(day, places[block], day.resolution)
+        for other_number, other in enumerate(days):
+            if other_number == number:
+                continue
+            seen = _look(other, places[block], max(day.resolution, other.resolution))
+            if other_number > number:
+                gone[block] |= seen.seen_past
+                replaced[block] |= seen.shown & (seen.footprint < MUCH_CLOSER * own.footprint)
+            else:
+                replaced[block] |= seen.shown & (MUCH_CLOSER * seen.footprint <= own.footprint)
+    return gone, replaced
+
+
+def _look(
+    day: DayMap,
+    places: Array,  # [M, 3]
+    resolution: float,
+) -> Look:
+    margin = np.full(len(places), MARGIN_RESOLUTIONS * resolution)
+    return look_at_places(day.views, places, margin)
+
+
+def _blocks(
+    places: Array,  # [N, 3]
+    side: float,
+) -> Iterator[npt.NDArray[np.intp]]:
+    """The numbers of the places in each cube of space that holds some."""
+    finite = np.flatnonzero(np.isfinite(places).all(axis=1))
+    cubes = np.floor(places[finite] / side).astype(np.int64)
+    _, cube = np.unique(cubes, axis=0, return_inverse=True)
+    order = np.argsort(cube, kind="stable")
+    ends = np.flatnonzero(np.diff(cube[order])) + 1
+    yield from (finite[block] for block in np.split(order, ends) if len(block))
+
+
+def _gains(
+    day: DayMap,
+    replaced: Mask,  # [N] of the day's Gaussians
+    later: Sequence[Part],
+) -> Array:
+    """[3] the ratio of the later dives' colours to the day's, on the ground that both show."""
+    mine = np.flatnonzero(replaced & (np.asarray(day.gaussians.opacities) > OPAQUE))
+    means = [part.gaussians.means[part.gaussians.opacities > OPAQUE] for part in later]
+    colours = [part.gaussians.colours[part.gaussians.opacities > OPAQUE] for part in later]
+    if len(mine) == 0 or sum(map(len, means)) == 0:
+        return np.ones(3)
+    away, nearest = cKDTree(np.concatenate(means)).query(
+        day.gaussians.means[mine], distance_upper_bound=MARGIN_RESOLUTIONS * day.resolution
+    )
+    near = np.isfinite(away)
+    theirs = np.concatenate(colours)[np.asarray(nearest)[near]].astype(np.float64)
+    own = day.gaussians.colours[mine[near]].astype(np.float64)
+    lit = (theirs > DARKEST).all(axis=1) & (own > DARKEST).all(axis=1)
+    if lit.sum() < LEAST_PAIRS:
+        return np.ones(3)
+    return np.asarray(np.median(theirs[lit] / own[lit], axis=0))

@@ -1,0 +1,26 @@
+"""What the camera has seen, in a plan view: how well each place, along which lines, what next."""
+
+from aquaflow.survey.coverage.classes import COLOURS, WORDS, Seen
+from aquaflow.survey.coverage.dive_coverage import DiveCoverage
+from aquaflow.survey.coverage.footprint import Footprint
+from aquaflow.survey.coverage.next_line import LineState, Suggestion
+from aquaflow.survey.coverage.page_view import PageView, page_view
+from aquaflow.survey.coverage.plan import CoveragePlan
+from aquaflow.survey.coverage.sub_map_coverage import SubMapCoverage
+from aquaflow.survey.coverage.water_range import mapping_range, visibility
+
+__all__ = [
+    "COLOURS",
+    "WORDS",
+    "CoveragePlan",
+    "DiveCoverage",
+    "Footprint",
+    "LineState",
+    "PageView",
+    "Seen",
+    "SubMapCoverage",
+    "Suggestion",
+    "mapping_range",
+    "page_view",
+    "visibility",
+]

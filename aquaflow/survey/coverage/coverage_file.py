@@ -1,0 +1,112 @@
+"""coverage.npz: the plan views of a dive, for viewers and other programs."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.base.errors import InputError
+from aquaflow.base.storage.atomic import atomic_write
+from aquaflow.survey.coverage.classes import Seen
+from aquaflow.survey.coverage.next_line import LineState, Suggestion
+from aquaflow.survey.coverage.page_view import PageView
+from aquaflow.survey.coverage.plan import CoveragePlan
+from aquaflow.survey.coverage.raster import GridFrame
+from aquaflow.survey.coverage.survey_lines import Line
+
+NAME = "coverage.npz"
+"""In a dive's folder (docs/formats.md#coverage)."""
+VALUES = "values"
+"""The array that holds what is no array, as JSON."""
+
+
+def write_coverage_file(path: Path, views: Mapping[int, PageView]) -> None:
+    """Write the plan views by sub-map.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    arrays: dict[str, npt.NDArray[Any]] = {}
+    values = {}
+    for number, view in views.items():
+        plan, state = view.plan, view.state
+        arrays |= {
+            f"{number}.{name}": array
+            for name, array in (
+                ("classes", plan.classes), ("views", plan.views), ("nearest", plan.nearest),
+                ("directions", plan.directions), ("to_page", view.to_page), ("path", view.path),
+                ("R_gm", plan.frame.R_gm),
+            )
+        }  # fmt: skip
+        values[str(number)] = {
+            "corner": plan.corner, "cell": plan.cell, "limit": plan.limit,
+            "grid_cell": plan.frame.cell, "reference": plan.frame.reference,
+            "cells": {seen.name: count for seen, count in plan.cells.items()},
+            "scale": view.scale, "unit": view.unit,
+            "seen": view.seen, "right": view.right, "up": view.up,
+            "swath": state.swath, "overlap": state.overlap,
+            "lines": [_listed(asdict(line)) for line in state.lines],
+            "next_line": None if state.suggestion is None else _listed(asdict(state.suggestion)),
+        }  # fmt: skip
+    arrays[VALUES] = np.frombuffer(json.dumps(values).encode(), np.uint8)
+    with atomic_write(path) as stream:
+        np.savez_compressed(stream, allow_pickle=False, **arrays)
+
+
+def read_coverage_file(path: Path) -> dict[int, PageView]:
+    """The plan views by sub-map.
+
+    Raises:
+        InputError: the file is missing, damaged or of something else.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        values = json.loads(arrays.pop(VALUES).tobytes())
+        return {int(number): _view(int(number), each, arrays) for number, each in values.items()}
+    except FileNotFoundError as error:
+        raise InputError(f"{path} is missing; map the dive again for its coverage") from error
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path} is no coverage of a dive, or damaged; map it again") from error
+
+
+def _view(
+    number: int,
+    values: dict[str, Any],
+    arrays: Mapping[str, npt.NDArray[Any]],  # all of the file
+) -> PageView:
+    def array(name: str) -> npt.NDArray[Any]:
+        return arrays[f"{number}.{name}"]
+
+    x, y = values["corner"]
+    plan = CoveragePlan(
+        GridFrame(array("R_gm"), values["grid_cell"], values["reference"]), (x, y), values["cell"],
+        array("classes"), array("views"), array("directions"), array("nearest"), values["limit"],
+        {Seen[name]: int(count) for name, count in values["cells"].items()},
+    )  # fmt: skip
+    lines = [
+        Line(np.array(each["start"]), np.array(each["end"]), each["first"], each["last"])
+        for each in values["lines"]
+    ]
+    line = values["next_line"]
+    found = line and Suggestion(np.array(line["start"]), np.array(line["end"]), line["gain"])
+    return PageView(
+        number, plan, array("to_page"), values["scale"], values["unit"], values["seen"],
+        values["right"], values["up"], array("path"),
+        LineState(lines, values["swath"], values["overlap"], found),
+    )  # fmt: skip
+
+
+def _listed(values: dict[str, Any]) -> dict[str, Any]:
+    """For JSON."""
+    return {
+        name: value.tolist() if isinstance(value, np.ndarray) else value
+        for name, value in values.items()
+    }

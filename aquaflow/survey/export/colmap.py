@@ -1,0 +1,78 @@
+"""A COLMAP folder: a sparse model in binary, beside its pictures.
+
+Format: COLMAP's documentation, "Output Format", of the files that every version reads (cameras.bin,
+images.bin, points3D.bin; little-endian). Poses are world to camera, quaternions wxyz; the camera
+looks along z with y down, and the centre of the top left pixel is (0.5, 0.5), both as here.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from aquaflow.base.storage.atomic import atomic_write
+from aquaflow.dive.point_cloud import PointCloud
+from aquaflow.dive.posed_pictures import picture_name
+from aquaflow.dive.posed_views import PosedView
+from aquaflow.geometry.camera import CameraModel
+
+MODEL = Path("sparse") / "0"
+"""Where COLMAP, gsplat, nerfstudio and OpenSplat look for the model."""
+PINHOLE = 1
+"""Number of the camera model with fx, fy, cx, cy."""
+NO_ERROR = -1.0
+"""What COLMAP writes of a point whose reprojection error was not computed."""
+POINT = np.dtype(
+    [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")]
+)
+"""Of points3D.bin, with a track of no observations."""
+
+
+def write_colmap(out: Path, views: Sequence[PosedView], cloud: PointCloud) -> None:
+    """Write ``out/sparse/0``: a camera for each that differs, a pose for each view, the points.
+
+    World is the upright frame. Points have no tracks: they come from the map, not from matches.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
+    folder = out / MODEL
+    folder.mkdir(parents=True, exist_ok=True)
+    numbers = {camera: n for n, camera in enumerate(dict.fromkeys(v.camera for v in views), 1)}
+    _write_cameras(folder / "cameras.bin", numbers)
+    _write_images(folder / "images.bin", views, numbers)
+    _write_points(folder / "points3D.bin", cloud)
+
+
+def _write_cameras(path: Path, numbers: dict[CameraModel, int]) -> None:
+    with atomic_write(path) as stream:
+        stream.write(struct.pack("<Q", len(numbers)))
+        for camera, number in numbers.items():
+            stream.write(struct.pack("<IiQQ", number, PINHOLE, camera.width, camera.height))
+            stream.write(struct.pack("<4d", camera.fx, camera.fy, camera.cx, camera.cy))
+
+
+def _write_images(path: Path, views: Sequence[PosedView], numbers: dict[CameraModel, int]) -> None:
+    with atomic_write(path) as stream:
+        stream.write(struct.pack("<Q", len(views)))
+        for number, view in enumerate(views, start=1):
+            T_cu = view.T_uc.inverse()
+            stream.write(struct.pack("<I7d", number, *T_cu.quaternion, *T_cu.t))
+            stream.write(struct.pack("<I", numbers[view.camera]))
+            stream.write(picture_name(view.frame_index).encode("ascii") + b"\0")
+            stream.write(struct.pack("<Q", 0))  # keypoints
+
+
+def _write_points(path: Path, cloud: PointCloud) -> None:
+    with atomic_write(path) as stream:
+        stream.write(struct.pack("<Q", len(cloud)))
+        first = 1
+        for points in cloud.chunks():
+            rows = np.zeros(len(points.positions), POINT)
+            rows["id"] = np.arange(first, first + len(rows))
+            rows["xyz"], rows["rgb"], rows["error"] = points.positions, points.colours, NO_ERROR
+            stream.write(rows.tobytes())
+            first += len(rows)

@@ -1,0 +1,232 @@
+"""A finished dive as one MCAP file of ROS 2 messages, with a layout for Foxglove beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aquaflow import __version__
+from aquaflow.base.errors import InputError
+from aquaflow.base.storage.atomic import write_json
+from aquaflow.dive.finished_frames import (
+    FinishedFrame,
+    read_facts,
+    read_finished_frames,
+    start_ns,
+)
+from aquaflow.dive.placement import Placement, placement
+from aquaflow.dive.point_cloud import read_point_cloud
+from aquaflow.dive.posed_views import read_mapper
+from aquaflow.dive.restored import SeenFrame, exposure_without_water, seen_frames, without_water
+from aquaflow.dive.ros import messages, topics
+from aquaflow.dive.ros.frames import MAP, OPTICAL, FrameTree
+from aquaflow.dive.ros.layout import layout, pictures
+from aquaflow.dive.ros.mcap_file import RosFile, ros_file
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.mapping.restoration import to_bytes
+from aquaflow.render.transfers import picture_out
+from aquaflow.telemetry.metric_file import read_frame_of_map
+from aquaflow.telemetry.metric_frame import MetricFrame
+
+Progress = Callable[[int, int], None]
+
+SINCE_START = "seconds since the recording's first frame; no source stated UTC"
+UTC = "UTC"
+NO_POSE = frozenset({"lost", "dropped"})
+"""Classes of frames that should have had a pose."""
+NUMBERS = {
+    topics.DEPTH: "depth_m",
+    topics.ALTITUDE: "altitude_m",
+    topics.HEADING: "heading_deg",
+    topics.SPEED: "speed_m_s",
+}
+"""Columns of trajectory.csv that have a topic of their own."""
+
+
+@dataclass(frozen=True)
+class McapExport:
+    """What was written."""
+
+    layout: Path
+    messages: int
+    poses: int
+    pictures: int
+    times: str
+    where: Placement
+
+
+class _Dive:
+    """What the parts of the file are made from."""
+
+    def __init__(self, dive: Path, recording: Path | None) -> None:
+        self.path, self.recording = dive, recording
+        self.frames = read_finished_frames(dive)
+        self.metrics = read_facts(dive / "metrics.json")
+        self.medium = read_facts(dive / "medium.json")
+        self.frame = read_frame_of_map(dive / "map.aqf")
+        self.where = placement(self.frame)
+        self.tree = FrameTree(self.frame, self.where)
+        self.mapper: Mapper = read_mapper(dive)
+        start = start_ns(self.metrics)
+        self.times = SINCE_START if start is None else UTC
+        self._start_ns = start or 0
+        self.posed = [frame for frame in self.frames if frame.T_nc is not None]
+        if not self.posed:
+            raise InputError(f"{dive} has no pose in its largest sub-map; map the dive again")
+
+    @property
+    def has_water(self) -> bool:
+        return bool(self.mapper.medium.active)
+
+    def at(self, frame: FinishedFrame) -> int:
+        """The time of a message, ns."""
+        return self._start_ns + frame.t_ns
+
+
+def export_mcap(
+    dive: Path, path: Path, recording: Path | None = None, progress: Progress | None = None
+) -> McapExport:
+    """Write the largest sub-map of ``dive`` to ``path``, and ``NAME.layout.json`` beside it.
+
+    The camera's pictures are in it with the ``recording``; what the map shows, and where there is
+    water the restored pictures, always. Message times are the dive's: see docs/formats.md#ros.
+
+    Raises:
+        InputError: the dive has no map or no pose, the recording is another, a library is missing,
+            or a file cannot be written.
+        ConfigError: the dive's settings cannot be read.
+    """
+    source = _Dive(dive, recording)
+    shown = 0
+    with ros_file(path, _facts(source)) as file:
+        seen = _Pictures(source, progress)
+        first = source.at(source.frames[0])
+        _write_lasting(file, source, first)
+        for frame in source.frames:
+            _write_frame(file, source, frame)
+            shown += seen.write(file, frame)
+        count = file.count
+    beside = path.with_suffix(".layout.json")
+    write_json(beside, layout(*pictures(recording is not None, source.has_water)))
+    return McapExport(beside, count, len(source.posed), shown, source.times, source.where)
+
+
+def _facts(source: _Dive) -> dict[str, str]:
+    """The metadata record of the file."""
+    return {
+        "version": __version__,
+        "dive": source.path.name,
+        "unit": source.where.unit,
+        "map": source.where.in_words() if source.where.epsg is None else source.where.axes,
+        "times": source.times,
+    }
+
+
+def _write_lasting(file: RosFile, source: _Dive, t_ns: int) -> None:
+    """What holds for the whole dive, at its beginning, so that it is seen from there on."""
+    tree, where = source.tree, source.where
+    file.write(topics.TF_STATIC, t_ns, messages.transforms(t_ns, tree.fixed))
+    poses = [(source.at(f), tree.moving(f.T_nc).T) for f in source.posed if f.T_nc is not None]
+    file.write(topics.PATH, t_ns, messages.path(t_ns, MAP, poses))
+    points = messages.packed_points(read_point_cloud(source.path))
+    file.write(topics.POINTS, t_ns, messages.point_cloud(t_ns, MAP, points))
+    warnings = source.metrics.get("warnings", [])
+    level = messages.WARN if warnings else messages.OK
+    said = "; ".join(warnings) or "no warnings"
+    lengths = {"unit": where.unit, "scale": source.frame.scale_source, "x of n": source.frame.north}
+    statuses = [
+        messages.status(level, "aquaflow: dive", said, {**lengths, "times": source.times}),
+        _water_status(source.medium),
+    ]
+    file.write(topics.DIAGNOSTICS, t_ns, messages.diagnostics(t_ns, statuses))
+
+
+def _water_status(medium: dict[str, Any]) -> Any:
+    name = "aquaflow: water"
+    if not medium.get("active"):
+        return messages.status(messages.OK, name, "no water is modelled", {})
+    unit = medium["attenuation_unit"]
+    values: dict[str, object] = {}
+    rates = {"attenuation": medium["attenuation_per_unit"], **medium["backscatter"]}
+    for key, numbers in rates.items():
+        per = "" if key.startswith("B_") else f", {unit}"
+        for channel, value in zip(messages.CHANNELS, numbers, strict=True):
+            values[f"{key} {channel}{per}"] = f"{value:.6g}"
+    return messages.status(messages.OK, name, "parameters of the image formation", values)
+
+
+def _write_frame(file: RosFile, source: _Dive, frame: FinishedFrame) -> None:
+    """Tracking state of one frame, and its pose."""
+    t_ns, row = source.at(frame), frame.row
+    level = messages.WARN if row.frame_class in NO_POSE else messages.OK
+    values = {
+        "frame": row.index, "source": row.source,
+        "sub-map": "" if row.sub_map is None else row.sub_map,
+        "inlier share": "" if row.quality is None else row.quality,
+    }  # fmt: skip
+    said = f"{row.frame_class}: {row.reason}" if row.reason else row.frame_class
+    status = messages.status(level, "aquaflow: tracking", said, values)
+    file.write(topics.DIAGNOSTICS, t_ns, messages.diagnostics(t_ns, [status]))
+    if frame.T_nc is None:
+        return
+    link = source.tree.moving(frame.T_nc)
+    file.write(topics.TF, t_ns, messages.transforms(t_ns, [link]))
+    file.write(topics.POSE, t_ns, messages.pose(t_ns, link, *_sigmas(frame, source.frame)))
+    if row.quality is not None:
+        file.write(topics.QUALITY, t_ns, messages.number(row.quality))
+    known = frame.known
+    for topic, column in NUMBERS.items() if known is not None else ():
+        value = getattr(known, column)
+        if value is not None:
+            file.write(topic, t_ns, messages.number(value))
+    if known is not None and known.latitude_deg is not None and known.longitude_deg is not None:
+        fix = messages.fix(t_ns, OPTICAL, known.latitude_deg, known.longitude_deg)
+        file.write(topics.FIX, t_ns, fix)
+
+
+def _sigmas(
+    finished: FinishedFrame, frame: MetricFrame
+) -> tuple[float | None, float | None, float | None]:
+    """Of a pose: position (m), heading and tilt (rad)."""
+    known = finished.known
+    if known is None or known.sigma_position_m is None or known.sigma_heading_deg is None:
+        return None, None, None
+    heading = float(np.radians(known.sigma_heading_deg))
+    return known.sigma_position_m, heading, frame.tilt_sigma_rad
+
+
+class _Pictures:
+    """The pictures of the mapped frames, made as the frames come by."""
+
+    def __init__(self, source: _Dive, progress: Progress | None) -> None:
+        mapper = source.mapper
+        self._source, self._progress, self._done = source, progress, 0
+        self._exposure = exposure_without_water(source.path, mapper) if source.has_water else 1.0
+        self._seen: Iterator[SeenFrame] = seen_frames(source.path, mapper, source.recording)
+        self._next = next(self._seen, None)
+
+    def write(self, file: RosFile, frame: FinishedFrame) -> int:
+        """The pictures of ``frame``; how many."""
+        seen, source = self._next, self._source
+        if seen is None or seen.view.frame_index != frame.row.index:
+            return 0
+        t_ns = source.at(frame)
+        info = messages.camera_info(t_ns, OPTICAL, seen.view.camera)
+        file.write(topics.CAMERA_INFO, t_ns, info)
+        shown = {topics.RENDERED: to_bytes(picture_out(seen.shown.image))}
+        if seen.picture is not None:
+            shown[topics.CAMERA] = seen.picture
+        if source.has_water:
+            restored = without_water(source.mapper, seen).picture_bytes(self._exposure)
+            shown[topics.RESTORED] = restored[..., :3]
+        for topic, picture in shown.items():
+            file.write(topic, t_ns, messages.jpeg(t_ns, OPTICAL, picture))
+        self._next = next(self._seen, None)
+        self._done += 1
+        if self._progress is not None:
+            self._progress(self._done, len(source.mapper.views))
+        return len(shown)

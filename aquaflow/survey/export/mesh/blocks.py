@@ -1,0 +1,141 @@
+"""Which parts of space hold surface: cubes of voxels around what the views show.
+
+Voxels are the points of a lattice whose spacing is the voxel's side. Blocks are cubes of 8 voxels a
+side, chunks cubes of blocks. Chunks are worked on one after the other, so that memory does
+not grow with the dive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.base.errors import InputError
+from aquaflow.survey.export.mesh.view_surfaces import ViewSurfaces
+
+Array = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+
+BLOCK = 8
+"""Voxels along a block: more than the widest truncation, so that a surface and the points at that
+distance from it on either side meet every block that it needs."""
+CHUNK_BLOCKS = 8
+"""Blocks along a chunk: 65 x 65 x 65 voxels are 2 MB of float64."""
+MOST_BLOCKS = 1 << 19
+"""268 million voxels, of which some 30 million triangles come: more is a slip of the resolution."""
+BITS = 21
+"""Of each of three coordinates in one number."""
+LARGEST = 1 << (BITS - 1)
+TRUNCATION_SIGMAS = 3.0
+"""Distance from its surface, in sigmas of the range, up to which a pixel counts for a place."""
+TRUNCATION_VOXELS = (3.0, 6.0)
+"""Least and most of it: the least holds all corners of a cell that the surface cuts, with a margin
+of a voxel for views that differ; the most is what a block covers."""
+STRIDE_PX = 2
+"""Of the pixels that blocks are found by: what two voxels of the default side are apart."""
+
+
+def truncation(
+    sigmas: npt.NDArray[np.floating],  # [...] of ranges
+    voxel: float,
+) -> Array:
+    """[...] distance from a surface within which it counts, in the unit of both."""
+    least, most = TRUNCATION_VOXELS
+    return np.clip(TRUNCATION_SIGMAS * sigmas, least * voxel, most * voxel)
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """A cube of blocks."""
+
+    corner: Integers
+    """[3] its first voxel."""
+    blocks: Integers
+    """[B, 3] first voxels of the blocks in it, and of those that share its last layer."""
+
+    def voxels(self) -> Integers:
+        """[M, 3] all voxels of the blocks that lie in the chunk or in the layer after it."""
+        steps = np.stack(np.meshgrid(*[np.arange(BLOCK)] * 3, indexing="ij"), axis=-1)
+        voxels = (self.blocks[:, None] + steps.reshape(1, -1, 3)).reshape(-1, 3)
+        side = CHUNK_BLOCKS * BLOCK
+        return voxels[(voxels <= self.corner + side).all(axis=1)]
+
+
+class Blocks:
+    """The blocks around the surfaces of all views."""
+
+    def __init__(
+        self,
+        surfaces: ViewSurfaces,
+        voxel: float,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        """``voxel``: side of a voxel in the mesh's unit.
+
+        Raises:
+            InputError: there would be too many.
+        """
+        keys = np.empty(0, np.int64)
+        for number in range(len(surfaces.views)):
+            keys = np.union1d(keys, _touched(surfaces, number, voxel))
+            if len(keys) > MOST_BLOCKS:
+                raise InputError(
+                    f"voxels of {voxel:g} would be more than {MOST_BLOCKS * BLOCK**3 // 10**6} "
+                    "million; give a larger --resolution"
+                )
+            if progress is not None:
+                progress(number + 1, len(surfaces.views))
+        self._blocks = _unpacked(keys)
+
+    def __len__(self) -> int:
+        """Number of blocks."""
+        return len(self._blocks)
+
+    def chunks(self) -> Iterator[Chunk]:
+        """Every chunk that holds a block, in a fixed order."""
+        for chunk in _unpacked(np.unique(_packed(self._blocks // CHUNK_BLOCKS))):
+            first = chunk * CHUNK_BLOCKS
+            inside = (self._blocks >= first) & (self._blocks <= first + CHUNK_BLOCKS)
+            yield Chunk(first * BLOCK, self._blocks[inside.all(axis=1)] * BLOCK)
+
+    def chunk_count(self) -> int:
+        """How many chunks there are."""
+        return len(np.unique(_packed(self._blocks // CHUNK_BLOCKS)))
+
+
+def _touched(surfaces: ViewSurfaces, number: int, voxel: float) -> Integers:
+    """Keys of the blocks within the truncation of what one view shows."""
+    points, normals, sigmas = surfaces.points(number, STRIDE_PX)
+    reach = truncation(sigmas, voxel)[:, None] * normals
+    places = np.vstack([points - reach, points, points + reach]) / voxel
+    if np.abs(places).max(initial=0.0) >= BLOCK * (LARGEST - 2):
+        raise InputError(
+            f"voxels of {voxel:g} are too small for a dive of this extent; give a larger "
+            "--resolution"
+        )
+    # A surface that lies within a voxel of a block's side needs the block behind it, too.
+    low = np.floor((places - 1.0) / BLOCK).astype(np.int64)
+    high = np.floor((places + 1.0) / BLOCK).astype(np.int64)
+    pairs = np.unique(np.stack([_packed(low), _packed(high)], axis=1), axis=0)
+    low, high = _unpacked(pairs[:, 0]), _unpacked(pairs[:, 1])
+    corners = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    return np.unique(np.concatenate([_packed(np.where(c, high, low)) for c in corners]))
+
+
+def _packed(
+    coordinates: Integers,  # [N, 3]
+) -> Integers:
+    """[N] numbers in whose order x comes first, then y, then z."""
+    x, y, z = (coordinates + LARGEST).T
+    return np.asarray((x << 2 * BITS) | (y << BITS) | z)
+
+
+def _unpacked(
+    keys: Integers,  # [N]
+) -> Integers:
+    """[N, 3]"""
+    mask = (1 << BITS) - 1
+    return np.stack([keys >> 2 * BITS, keys >> BITS & mask, keys & mask], axis=1) - LARGEST

@@ -1,0 +1,101 @@
+"""The pixels of a raster, cut into tiles."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.base.errors import InputError
+
+Array = npt.NDArray[np.float64]
+
+TILE_PX = 512
+"""Side of a tile: what a Cloud-Optimised GeoTIFF has by default; 2 MB for two float32 bands."""
+MOST_SIDE_PX = 1 << 17
+"""Pixels along a side: at 4 mm half a kilometre. More is a slip of the resolution."""
+DIGITS = 2
+"""Significant digits of a resolution that was found and not asked for."""
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A rectangle of pixels."""
+
+    row: int
+    column: int
+    """Of its first pixel, in the raster."""
+    height: int
+    width: int
+    """Pixels."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The raster's pixels on the ground."""
+
+    left: float
+    top: float
+    """x and y of the outer corner of the first pixel, in the ground's unit."""
+    pixel: float
+    """Side of a pixel, in the ground's unit."""
+    width: int
+    height: int
+    """Pixels."""
+
+    @staticmethod
+    def around(
+        low: Array,  # [2] x, y on the ground
+        high: Array,  # [2] x, y on the ground
+        pixel: float,
+        start: Array,  # [2] x, y on the ground, of the corner of some pixel
+    ) -> Grid:
+        """The smallest grid that holds what lies between.
+
+        Raises:
+            InputError: it would have too many pixels.
+        """
+        first, last = np.floor((low - start) / pixel), np.ceil((high - start) / pixel)
+        sides = np.maximum(last - first, 1.0)
+        if float(sides.max()) > MOST_SIDE_PX:
+            raise InputError(
+                f"a raster of {pixel:g} a pixel would have {sides[0]:.0f} x {sides[1]:.0f} pixels, "
+                f"and {MOST_SIDE_PX} a side are the most; give a coarser --resolution"
+            )
+        left, top = start[0] + first[0] * pixel, start[1] + last[1] * pixel
+        return Grid(float(left), float(top), pixel, int(sides[0]), int(sides[1]))
+
+    def tiles(self) -> Iterator[Tile]:
+        """From the top left, row by row."""
+        for row in range(0, self.height, TILE_PX):
+            for column in range(0, self.width, TILE_PX):
+                yield Tile(
+                    row, column,
+                    min(TILE_PX, self.height - row), min(TILE_PX, self.width - column),
+                )  # fmt: skip
+
+    @property
+    def tile_count(self) -> int:
+        """How many :meth:`tiles` gives."""
+        return math.ceil(self.height / TILE_PX) * math.ceil(self.width / TILE_PX)
+
+    def bounds(self, tile: Tile) -> tuple[Array, Array]:
+        """Lowest and highest x, y [2] of a tile on the ground."""
+        left, top = self.left + tile.column * self.pixel, self.top - tile.row * self.pixel
+        size = self.pixel * np.array([tile.width, tile.height])
+        low = np.array([left, top - size[1]])
+        return low, low + size
+
+    def centres(self, tile: Tile) -> Array:
+        """[h, w, 2] x and y of the pixels' centres on the ground."""
+        x = self.left + (tile.column + np.arange(tile.width) + 0.5) * self.pixel
+        y = self.top - (tile.row + np.arange(tile.height) + 0.5) * self.pixel
+        return np.stack(np.meshgrid(x, y), axis=-1)
+
+
+def rounded(length: float) -> float:
+    """``length`` with few digits."""
+    return float(f"{length:.{DIGITS}g}")

@@ -1,0 +1,183 @@
+"""``aquaflow export --format ortho`` and ``dem``: the rasters of a dive, tile by tile."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from aquaflow import __version__
+from aquaflow.base.errors import InputError
+from aquaflow.dive.map_file import SUFFIX
+from aquaflow.dive.posed_views import read_mapper
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.survey.export.ortho.colours import Colours
+from aquaflow.survey.export.ortho.drawing import MOST_FINER, Splats
+from aquaflow.survey.export.ortho.geotiff import require_rasterio, writing_raster
+from aquaflow.survey.export.ortho.grid import Grid, Tile, rounded
+from aquaflow.survey.export.ortho.ground import LEAST_VIEWS, Ground, ground_of
+from aquaflow.survey.export.ortho.layers import DEM, ORTHO, QUALITY, TilePixels
+from aquaflow.survey.export.ortho.sightings import PICTURE_SIGMA_PX, ViewRanges
+from aquaflow.telemetry.metric_file import read_frame_of_map
+from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.water.posed_picture import SOLID
+
+Kind = Literal["ortho", "dem"]
+Progress = Callable[[str, int, int], None]
+"""Called with what is done, how much of it, and how much there is."""
+
+LAYERS = {"ortho": (ORTHO, QUALITY), "dem": (DEM,)}
+"""Files of each kind."""
+HEIGHT_SIGMA_PX = 0.5
+"""1 sigma of where a view shows a point, for heights. What is missing to one pixel
+(sightings.PICTURE_SIGMA_PX) moves whole views, and hardly the heights between them."""
+SPREAD_SHARE = 0.75
+"""1 sigma of a height over the spread of the heights within the pixel. Both were chosen on surveys
+of sand and two reefs, so that the stated intervals hold the truth as often as they say
+(docs/measurements.md#orthos)."""
+SIGMA_IS = (
+    f"of where the rays of the views that see the pixel meet, each known to {HEIGHT_SIGMA_PX:g} "
+    f"pixel of its picture, and {SPREAD_SHARE:g} of the spread of the map's heights within the "
+    "pixel; poses are taken as exact"
+)
+"""What 1 sigma of the height covers, in words."""
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What was written."""
+
+    files: list[Path]
+    width: int
+    height: int
+    """Pixels."""
+    resolution: float
+    """Side of a pixel in the raster's coordinates."""
+    covered: float
+    """Share of the pixels that are no holes."""
+    ground: Ground
+    water_range: float | None
+    """Of the water that the ortho is seen through, in the ground's unit."""
+
+
+def export_survey(
+    dive: Path,
+    out: Path,
+    kind: Kind,
+    resolution: float | None = None,
+    water: bool = False,
+    progress: Progress | None = None,
+) -> Survey:
+    """Write the ortho or the elevations of the dive's largest sub-map into the folder ``out``.
+
+    Args:
+        resolution: side of a pixel, m, or map units where the dive has no metres; None: what a
+            pixel of the mapped pictures shows, median.
+        water: of an ortho: with the water, as seen from the views' median range.
+
+    Raises:
+        InputError: rasterio is missing, the dive has no map or views, the raster would be too
+            large, or a file cannot be written.
+        ConfigError: the dive's settings cannot be read.
+    """
+    require_rasterio()
+    mapper, frame = read_map(dive)
+    ground = ground_of(frame, mapper.views)
+    ranges = ViewRanges(mapper, ground, out, progress and partial(progress, "views"))
+    side = resolution or rounded(ranges.footprint)
+    start = -np.array(ground.origin) / ground.grid_scale
+    grid = Grid.around(ranges.low, ranges.high, side / ground.grid_scale, start)
+    through = ranges.median_range if water and mapper.medium.active else None
+    colours = Colours(mapper, ground.T_gm.scale, through) if kind == "ortho" else None
+    looked = _Tiles(grid, Splats(mapper, ground), ranges, colours)
+    tags = _tags(dive, frame, ground, side, through, colours is not None)
+    covered = 0
+    with ExitStack() as files:
+        rasters = [
+            files.enter_context(writing_raster(out, layer, grid, ground, tags))
+            for layer in LAYERS[kind]
+        ]
+        for done, tile in enumerate(grid.tiles()):
+            pixels = looked.at(tile)
+            if pixels is not None:
+                covered += int(pixels.mapped.sum())
+                for layer, raster in zip(LAYERS[kind], rasters, strict=True):
+                    raster.write(tile, layer.values(pixels))
+            if progress is not None:
+                progress("tiles", done + 1, grid.tile_count)
+    share = covered / (grid.width * grid.height)
+    paths = [out / layer.name for layer in LAYERS[kind]]
+    return Survey(paths, grid.width, grid.height, side, share, ground, through)
+
+
+@dataclass(frozen=True)
+class _Tiles:
+    """Everything that tiles are made of."""
+
+    grid: Grid
+    splats: Splats
+    ranges: ViewRanges
+    colours: Colours | None
+
+    def at(self, tile: Tile) -> TilePixels | None:
+        """The pixels of a tile; None where nothing is mapped."""
+        chosen = self.splats.reaching(self.grid, tile)
+        if len(chosen) == 0:
+            return None
+        finer = min(MOST_FINER, max(1, round(self.grid.pixel / self.ranges.footprint)))
+        drawn = self.splats.draw(self.grid, tile, chosen, finer)
+        solid = drawn.alpha > SOLID
+        if not solid.any():
+            return None
+        points = np.dstack([self.grid.centres(tile), drawn.height])[solid]
+        seen = self.ranges.see(points)
+        views, sigma = np.zeros(solid.shape, np.int32), np.full(solid.shape, np.nan)
+        nearest = np.full(solid.shape, np.inf)
+        views[solid], sigma[solid], nearest[solid] = seen.count, seen.sigma, seen.nearest
+        sigma = np.hypot(HEIGHT_SIGMA_PX / PICTURE_SIGMA_PX * sigma, SPREAD_SHARE * drawn.spread)
+        picture = None if self.colours is None else self.colours.of(drawn.radiance, nearest)
+        return TilePixels(solid & (views >= LEAST_VIEWS), drawn.height, sigma, views, picture)
+
+
+def read_map(dive: Path) -> tuple[Mapper, MetricFrame]:
+    """The largest sub-map of a dive and how it lies in the world.
+
+    Raises:
+        InputError: the dive has no map, or an empty one.
+        ConfigError: the dive's settings cannot be read.
+    """
+    mapper = read_mapper(dive)
+    if not mapper.views or len(mapper.gaussians) == 0:
+        raise InputError(f"the map of {dive} is empty; map a recording that shows more")
+    return mapper, read_frame_of_map(dive / f"map{SUFFIX}")
+
+
+def _tags(
+    dive: Path, frame: MetricFrame, ground: Ground, side: float, through: float | None, ortho: bool
+) -> dict[str, str]:
+    """What the files say of themselves, in words."""
+    tags = {
+        "SOFTWARE": f"AquaFlow {__version__}",
+        "DIVE": dive.resolve().name,
+        "UNIT": ground.unit,
+        "AXES": ground.axes,
+        "VERTICAL": ground.vertical,
+        "HEIGHT_ZERO": ground.height_zero,
+        "PIXEL": f"{side:g} {ground.unit}",
+        "SIGMA": SIGMA_IS,
+        "HOLES": f"not mapped, or seen by fewer than {LEAST_VIEWS} views",
+    }
+    if frame.metric:
+        tags["SCALE_SIGMA"] = f"{frame.scale_sigma:.3g} (relative, 1 sigma)"
+    if ground.epsg is not None and frame.origin is not None:
+        tags["POSITION_SIGMA"] = f"{frame.origin.sigma_m:.3g} m (1 sigma, of the whole raster)"
+    if ortho:
+        tags["COLOURS"] = (
+            "without water" if through is None else f"through {through:.3g} {ground.unit} of water"
+        )
+    return tags

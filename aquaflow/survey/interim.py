@@ -1,0 +1,217 @@
+"""The deliverables of a dive that goes on: what a container that is killed leaves behind.
+
+Maps, trajectory and report as they are at one moment, without refining, held-out views and tables.
+The moment is taken in tracking's thread, which costs it microseconds; everything else is for the
+thread that owns the maps. Each file is whole, and the next one replaces it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow import __version__
+from aquaflow.dive.from_maps import water_in_numbers
+from aquaflow.dive.metric_outputs import (
+    MetricOutputs,
+    frame_numbers,
+    water_in,
+    worlds_in_words,
+)
+from aquaflow.dive.results import WaterSummary
+from aquaflow.dive.run import DiveRun
+from aquaflow.geometry.arrays import Array
+from aquaflow.geometry.similarity import Sim3, quaternion_from_rotation
+from aquaflow.geometry.similarity_batch import Sim3Batch
+from aquaflow.survey.coverage import PageView
+from aquaflow.survey.coverage.coverage_files import current_views
+from aquaflow.survey.report import PathPlot, ReportData
+from aquaflow.survey.report.dive_measures import measures
+from aquaflow.survey.report.report_data import camera_summary, medium_curves
+from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.tracking.frame_table import CLASSES, NONE
+from aquaflow.tracking.frames import FrameClass
+from aquaflow.types import CameraModel
+
+if TYPE_CHECKING:
+    from aquaflow.mapping.mapper import Mapper
+
+WATER_VIEWS = 8
+"""Views that the water's ranges are taken from: 0.1 s at 480 px, where the end takes ten times as
+many."""
+NOTE = (
+    "this was written while the dive went on: the map is not refined and no view was held against "
+    "it; `aquaflow dive finish` does both for a dive that was cut off"
+)
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Posed frames in the order of the table, in n."""
+
+    index: npt.NDArray[np.int64]
+    """[P] of the frames."""
+    t_s: npt.NDArray[np.float64]
+    """[P] of the dive."""
+    positions: npt.NDArray[np.float64]
+    """[P, 3]"""
+    wxyz: npt.NDArray[np.float64]
+    """[P, 4] n from camera."""
+    sub_maps: npt.NDArray[np.int64]
+    """[P]"""
+    classes: npt.NDArray[np.uint8]
+    """[P] by their place in CLASSES."""
+
+
+class Interim:
+    """One moment of a dive."""
+
+    def __init__(self, run: DiveRun) -> None:
+        """In tracking's thread: tables that never change are shared, the others copied."""
+        slam = run.slam
+        self._run, self._parts = run, slam.frames.parts()
+        self._keyframes = [(each.T_wc, each.sub_map) for each in slam.keyframes.keyframes]
+        sub_maps = {sub_map for _, sub_map in self._keyframes}
+        self._outputs = MetricOutputs({number: slam.metric_frame(number) for number in sub_maps})
+        self._dropped, self._notes = len(run.dropped), list(run.notes)
+        self._waters: dict[int, WaterSummary | None] = {}
+        self._poses: Poses | None = None
+
+    def write_maps(self, mappers: Mapping[int, Mapper]) -> None:
+        """map.ply and map_clear.ply of every sub-map, with the water as it is known by now."""
+        main = self._main
+        for number, mapper in mappers.items():
+            if len(mapper.gaussians):
+                self._waters[number] = water_in_numbers(mapper, WATER_VIEWS)
+                suffix = "" if number == main else f"_{number}"
+                frame, water = self._outputs.frame(number), self._waters[number]
+                self._run.folder.write_splats(mapper, water, frame, suffix)
+
+    def write_path(self) -> None:
+        """trajectory.tum, metric.json and the cameras."""
+        poses, folder = self._posed(), self._run.folder
+        frames = {int(n): self._outputs.frame(int(n)) for n in np.unique(poses.sub_maps)}
+        order = np.argsort(poses.t_s, kind="stable")
+        folder.write_poses(
+            poses.t_s[order], poses.positions[order], poses.wxyz[order], worlds_in_words(frames)
+        )
+        folder.write_metric_frames(self._outputs.frames, self._main)
+        camera = self._run.slam.tracker.camera
+        if camera is not None:
+            folder.write_cameras(camera, self._run.calibration)
+
+    def write_report(self, mappers: Mapping[int, Mapper]) -> None:
+        """metrics.json and report.html."""
+        run, camera = self._run, self._run.slam.tracker.camera
+        numbers = self._numbers(sum(len(mapper.gaussians) for mapper in mappers.values()))
+        run.folder.write_json("metrics.json", numbers)
+        if camera is not None:
+            run.folder.write_report(self._report(camera, numbers))
+
+    @property
+    def _main(self) -> int:
+        """The sub-map with the most posed frames; the earliest of equals."""
+        counts = np.bincount(self._posed().sub_maps, minlength=1)
+        return int(counts.argmax())
+
+    def _posed(self) -> Poses:
+        if self._poses is None:
+            self._poses = posed(self._parts, self._keyframes, self._outputs)
+        return self._poses
+
+    def _numbers(self, gaussians: int) -> dict[str, Any]:
+        """The keys of metrics.json that are known."""
+        slam, poses = self._run.slam, self._posed()
+        kinds = Counter(np.concatenate([part["class"] for part in self._parts]).tolist())
+        count = {kind: kinds[CLASSES.index(kind)] for kind in FrameClass if kind in CLASSES}
+        return {
+            "complete": False,
+            "frames": sum(count.values()) + self._dropped,
+            "tracked": len(poses.index),
+            "lost": count[FrameClass.LOST],
+            "skipped": count[FrameClass.SKIPPED] + self._dropped,
+            "keyframes": count[FrameClass.KEYFRAME],
+            "mapping_frames": count[FrameClass.MAPPING],
+            "common_frames": count[FrameClass.COMMON],
+            "sub_maps": len(np.unique(poses.sub_maps)),
+            "loops": slam.graph.loops,
+            "gaussians": gaussians,
+            **dict.fromkeys(("psnr", "ssim", "lpips")),
+            "heldout_frames": 0,
+            "stage_ms": {},
+            "warnings": [],
+            "failures": slam.failures.to_json(),
+            "version": __version__,
+            **frame_numbers(self._outputs.frame(self._main)),
+        }
+
+    def _report(self, camera: CameraModel, numbers: dict[str, Any]) -> ReportData:
+        run, poses = self._run, self._posed()
+        frame, water = self._outputs.frame(self._main), self._waters.get(self._main)
+        known = None if water is None else water_in(water, frame.T_nm.scale)
+        path, seen = _plot(poses, frame, self._outputs), dict[int, PageView]()
+        if run.coverage is not None:
+            seen = current_views(run.coverage, run.slam, self._outputs, self._waters)
+        return ReportData(
+            name=run.name,
+            camera=camera_summary(camera, run.calibration is not None),
+            metrics=numbers,
+            path=path,
+            measures=measures(path, frame, known),
+            medium=medium_curves(known, frame.unit),
+            coverage=seen.get(self._main),
+            notes=[NOTE, *self._notes, *run.slam.failures.notes()],
+        )
+
+
+def posed(
+    parts: list[Array],  # each [n] FRAME
+    keyframes: list[tuple[Sim3, int]],  # pose and sub-map of each
+    outputs: MetricOutputs,
+) -> Poses:
+    """The posed frames of a table, each by its keyframe."""
+    rows = np.concatenate(parts)
+    rows = rows[rows["keyframe"] != NONE]
+    numbers = rows["keyframe"]
+    sub_maps = np.array([sub_map for _, sub_map in keyframes], np.int64)[numbers]
+    world = _in_n(keyframes, outputs)[numbers] @ _poses_of(rows["T_kf"])
+    numbers = np.hstack([world.R.reshape(-1, 9), world.t])
+    sound = np.flatnonzero(np.isfinite(numbers).all(axis=1))
+    rows, sub_maps, world = rows[sound], sub_maps[sound], world[sound]
+    wxyz = quaternion_from_rotation(world.R) if len(rows) else np.zeros((0, 4))
+    return Poses(
+        rows["index"], rows["t_ns"] * 1e-9, world.t, wxyz, sub_maps, rows["class"],
+    )  # fmt: skip
+
+
+def _in_n(keyframes: list[tuple[Sim3, int]], outputs: MetricOutputs) -> Sim3Batch:
+    """[K] from each keyframe to the n of its sub-map."""
+    if not keyframes:
+        return _poses_of(np.zeros((0, 13)))
+    return Sim3Batch.of([outputs.frame(number).T_nm @ T_wc for T_wc, number in keyframes])
+
+
+def _poses_of(
+    rows: npt.NDArray[np.float64],  # [N, 13] as of_sim3 makes them
+) -> Sim3Batch:
+    return Sim3Batch(rows[:, :9].reshape(-1, 3, 3), rows[:, 9:12], rows[:, 12])
+
+
+def _plot(poses: Poses, frame: MetricFrame, outputs: MetricOutputs) -> PathPlot:
+    order = np.argsort(poses.index, kind="stable")
+    frames = [outputs.frame(int(number)) for number in np.unique(poses.sub_maps)]
+    level = bool(frames) and all(each.level for each in frames)
+    return PathPlot(
+        poses.positions[order],
+        [CLASSES[kind].value for kind in poses.classes[order].tolist()],
+        poses.sub_maps[order].tolist(),
+        unit=frame.unit,
+        up=frame.north if level else "",
+        depth_known=frame.depth_known,
+        placed=level and all(each.metric for each in frames),
+    )

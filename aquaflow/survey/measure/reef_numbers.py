@@ -1,0 +1,173 @@
+"""The numbers of a dive's ground, path and water, together with what each of them means."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.base.errors import InputError
+from aquaflow.survey.export.ortho.ground import LEAST_VIEWS, Ground
+from aquaflow.survey.measure.areas import WELL_SEEN, areas
+from aquaflow.survey.measure.height_field import HeightField
+from aquaflow.survey.measure.path import way
+from aquaflow.survey.measure.quantity import Quantity
+from aquaflow.survey.measure.roughness import (
+    RELIEF_PERCENT,
+    chain_ratio,
+    relief,
+    slope,
+    surface_ratio,
+)
+from aquaflow.survey.measure.scale import Scale
+from aquaflow.survey.measure.visibility import DEFINITION, visibility
+
+Array = npt.NDArray[np.float64]
+
+SLOPES = {"slope_p10": 10.0, "slope_median": 50.0, "slope_p90": 90.0}
+"""Percentiles of the slope by the name of their number."""
+
+
+@dataclass(frozen=True)
+class ReefNumber:
+    """One of them."""
+
+    key: str
+    label: str
+    """For people."""
+    quantity: Quantity
+    meaning: str
+
+
+@dataclass(frozen=True)
+class Water:
+    """What is known of a dive's water, in the unit of its lengths."""
+
+    attenuation: list[float]
+    """Of red, green and blue, per unit."""
+    relative_sigma: list[float] | None
+
+
+@dataclass(frozen=True)
+class ReefNumbers:
+    """All numbers that a dive has, and why it has no others."""
+
+    numbers: list[ReefNumber]
+    missing: dict[str, str]
+    """By name of what is missing: the reason."""
+    unit: str
+    """Of lengths."""
+    cell: float | None
+    """Side of the cells on which the ground was measured."""
+    vertical: str
+    """What the ground was seen along, in words."""
+
+    def to_json(self) -> dict[str, Any]:
+        """The content of ``reef_numbers.json`` (docs/formats.md#reef-numbers)."""
+        return {
+            "unit": self.unit, "cell": self.cell, "vertical": self.vertical,
+            "numbers": {
+                each.key: each.quantity.to_json() | {"label": each.label, "meaning": each.meaning}
+                for each in self.numbers
+            },
+            "missing": self.missing,
+        }  # fmt: skip
+
+    def rows(self) -> list[list[str]]:
+        """The lines of ``reef_numbers.csv``, with a head."""
+        lines = [["number", "value", "sigma", "low_95", "high_95", "unit", "meaning"]]
+        for each in self.numbers:
+            q = each.quantity
+            values = [f"{v:.6g}" for v in (q.value, q.sigma, q.low, q.high)]
+            lines.append([each.key, *values, q.unit, each.meaning])
+        return lines
+
+
+def reef_numbers(
+    draw: Callable[[], tuple[HeightField, Ground]],
+    places: Array,  # [N, 3] camera centres in n, in order of time
+    water: Water | None,
+    scale: Scale,
+) -> ReefNumbers:
+    """The numbers of a dive.
+
+    Args:
+        draw: gives the ground, or raises InputError where there is none to measure.
+        water: None: the medium is off.
+        scale: of lengths in n.
+    """
+    numbers, missing = [], {}
+    cell, vertical = None, ""
+    try:
+        field, ground = draw()
+        cell, vertical = field.cell, ground.vertical
+        upright = scale if vertical == "along gravity" else replace(scale, tilt_sigma_rad=0.0)
+        numbers += of_area(field, upright)
+        numbers += of_relief(field, upright)
+    except InputError as error:
+        missing["relief" if numbers else "ground"] = str(error)
+    length = way(places, scale)
+    if length is not None:
+        meaning = "of the camera; its interval reaches down by what jitter may have added"
+        numbers.append(ReefNumber("path_length", "length of the path", length, meaning))
+    seen = water and visibility(water.attenuation, water.relative_sigma, scale)
+    if seen:
+        numbers.append(ReefNumber("visibility", "visibility range", seen, DEFINITION))
+    else:
+        missing["visibility"] = (
+            "the water is too clear to measure, or the dive saw nothing at several ranges"
+        )
+    return ReefNumbers(numbers, missing, scale.unit, cell, vertical)
+
+
+def of_area(field: HeightField, scale: Scale) -> list[ReefNumber]:
+    """Areas and shares; without that of the surface where too little is mapped for its relief."""
+    try:
+        ratio = surface_ratio(field)
+    except InputError:
+        ratio = None
+    found = areas(field, ratio, scale)
+    listed = [
+        ("surveyed_area", "surveyed area", found.surveyed,
+         f"seen from above, of what {LEAST_VIEWS} mapped pictures show, at least"),
+        ("surface_area", "its surface", found.surface,
+         f"with its relief on {_cells(field, scale)}; what is not mapped is taken to be as rough "
+         "as the rest"),
+        ("mapped_share", "share that is in the map", found.mapped, "of the surveyed area"),
+        ("seldom_seen_share", f"share that fewer than {WELL_SEEN} pictures show", found.seldom,
+         "of the surveyed area"),
+    ]  # fmt: skip
+    return [
+        ReefNumber(key, label, quantity, meaning)
+        for key, label, quantity, meaning in listed
+        if quantity is not None
+    ]
+
+
+def of_relief(field: HeightField, scale: Scale) -> list[ReefNumber]:
+    """Rugosity, relief and slope.
+
+    Raises:
+        InputError: too little is mapped.
+    """
+    tilt, cells = scale.tilt_sigma_rad, _cells(field, scale)
+    ends = f"{RELIEF_PERCENT[0]:g} % and {RELIEF_PERCENT[1]:g} %"
+    listed = [
+        ("rugosity", "rugosity, surface over plan", surface_ratio(field),
+         f"area of the surface over that of its plan, on {cells}"),
+        ("chain_rugosity", "rugosity, chain over line", chain_ratio(field),
+         f"length of virtual chains over that of their lines, on {cells}, one link a cell"),
+        ("relief", "relief", relief(field, tilt, scale.sigma, scale.unit),
+         f"height between {ends} of the cells, on {cells}"),
+        *((key, f"slope, {percent:g} %", slope(field, percent, tilt),
+           f"{percent:g} % of the ground is less steep, on {cells}")
+          for key, percent in SLOPES.items()),
+    ]  # fmt: skip
+    return [ReefNumber(*each) for each in listed]
+
+
+def _cells(field: HeightField, scale: Scale) -> str:
+    return f"cells of {field.cell:g} {scale.unit}"

@@ -1,0 +1,112 @@
+"""A length that a person marked in a finished dive: two points of a picture, or of the map.
+
+A finished dive keeps its Gaussians and the poses of the mapped views, but no keyframe's depths: a
+point of a picture is where its ray meets the map as the renderer draws it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from aquaflow.base.errors import InputError
+from aquaflow.config import load_config
+from aquaflow.dive.frames_csv import read_rows
+from aquaflow.dive.map_file import SUFFIX, read_map_file
+from aquaflow.mapping.mapper import Mapper
+from aquaflow.render import select_renderer
+from aquaflow.render.views import View
+from aquaflow.survey.measure.picked import (
+    CLICK_SIGMA_PX,
+    RANGE_SIGMA,
+    refuse_outside,
+    seen,
+    view_of_frame,
+)
+from aquaflow.telemetry.known_lengths.known_length import KnownLength
+from aquaflow.telemetry.metric_file import read_frame_of_map
+
+POINT_SIGMA = 0.01
+"""Of a point marked in the viewer, as a share of the marked length (judgement: a splat has a
+size)."""
+LEAST_LENGTH_PX = 10.0
+"""Between two points of a picture; nearer ones are the same, but for the click."""
+
+
+def between_pixels(
+    dive: Path,
+    frame: int,
+    start: tuple[float, float],
+    end: tuple[float, float],
+    length_m: float,
+    sigma_m: float,
+) -> KnownLength:
+    """The length between two points, in px of the mapped picture of a frame.
+
+    Raises:
+        InputError: the dive has no map, did not map the frame, or the map is not there.
+        ConfigError: the dive's settings cannot be read.
+    """
+    mapper, view, sub_map = _mapped(dive, frame)
+    points = np.array([start, end], np.float64)
+    refuse_outside(view, points)
+    if np.linalg.norm(points[1] - points[0]) < LEAST_LENGTH_PX:
+        raise InputError(
+            f"the two points are less than {LEAST_LENGTH_PX:.0f} pixels apart; mark a longer length"
+        )
+    a, b = seen(mapper, view, points)
+    length = float(np.linalg.norm(b.place - a.place))
+    along = (b.place - a.place) / length
+    click = CLICK_SIGMA_PX / view.camera.fx * float(np.hypot(a.range, b.range))
+    # The ranges of one picture may err together, or apart: the sum of both covers either.
+    apart = float(np.hypot(along @ a.ray * a.sigma, along @ b.ray * b.sigma))
+    sigma = float(np.hypot(np.hypot(click, apart), RANGE_SIGMA * length))
+    source = "scale bar {:g},{:g} to {:g},{:g}".format(*points.ravel())
+    return KnownLength(frame, source, length, sigma, length_m, sigma_m, sub_map)
+
+
+def between_points(
+    dive: Path,
+    start: tuple[float, float, float],
+    end: tuple[float, float, float],
+    length_m: float,
+    sigma_m: float,
+) -> KnownLength:
+    """The length between two points of the map of the largest sub-map, as map.ply has them.
+
+    Raises:
+        InputError: the dive has no table of its frames, its metric.json is damaged, or the points
+            are the same.
+    """
+    metres_per_unit = read_frame_of_map(dive / f"map{SUFFIX}").T_nm.scale
+    length = float(np.linalg.norm(np.subtract(end, start))) / metres_per_unit
+    if not np.isfinite(length) or length <= 0.0:
+        raise InputError("the two points are one and the same; mark both ends of a length")
+    source = "scale bar {:g},{:g},{:g} to {:g},{:g},{:g}".format(*start, *end)
+    sub_map = _largest(_sub_maps(dive))
+    return KnownLength(-1, source, length, POINT_SIGMA * length, length_m, sigma_m, sub_map)
+
+
+def _mapped(dive: Path, frame: int) -> tuple[Mapper, View, int]:
+    """The map that has a view of the frame, the view, and the sub-map's number."""
+    sub_maps = _sub_maps(dive)
+    if frame not in sub_maps:
+        raise InputError(f"frame {frame} of {dive} has no pose; choose another --frame")
+    number, largest = sub_maps[frame], _largest(sub_maps)
+    renderer = select_renderer(load_config(dive / "config.yaml").mapping.renderer)
+    name = "map" if number == largest else f"map_{number}"
+    mapper = read_map_file(dive / f"{name}{SUFFIX}", renderer)
+    return mapper, view_of_frame(mapper, frame, dive), number
+
+
+def _sub_maps(dive: Path) -> dict[int, int]:
+    """Sub-map by frame index, of the frames that have one."""
+    rows = read_rows(dive / "frames.csv")
+    return {row.index: row.sub_map for row in rows if row.sub_map is not None}
+
+
+def _largest(sub_maps: dict[int, int]) -> int:
+    counts = Counter(sub_maps.values())
+    return max(counts, key=lambda number: (counts[number], -number), default=0)

@@ -1,0 +1,157 @@
+"""Lengths and areas between marked points, each with its uncertainty.
+
+Sigmas are of first order in the errors of the points, J C J^T, and of the scale. What the errors
+across a length add to it, sqrt(d^2 + sigma^2) - d, is of second order and always lengthens; it is
+taken into sigma, so that lengths of a few sigma are not called exact.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.base.errors import InputError
+from aquaflow.geometry.similarity import hat
+from aquaflow.survey.measure.points import Points
+from aquaflow.survey.measure.quantity import Quantity
+from aquaflow.survey.measure.scale import Scale
+
+Array = npt.NDArray[np.float64]
+
+LEAST_CORNERS = 3
+"""Of an area."""
+
+
+def distance(points: Points, scale: Scale) -> Quantity:
+    """The straight length between two points.
+
+    Raises:
+        InputError: there are not two points.
+    """
+    if len(points.places) != 2:
+        raise InputError(f"a distance has 2 points, not {len(points.places)}; mark both ends")
+    return path_length(points, scale)
+
+
+def path_length(points: Points, scale: Scale) -> Quantity:
+    """The length of the line from point to point.
+
+    Raises:
+        InputError: there are fewer than two points.
+    """
+    count = len(points.places)
+    if count < 2:
+        raise InputError("a length needs 2 points at least; mark another one")
+    steps = np.diff(points.places, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    C = points.covariance().reshape(count, 3, count, 3)
+    directions, bias = np.zeros((count - 1, 3)), 0.0
+    for k, (step, length) in enumerate(zip(steps, lengths, strict=True)):
+        of_step = C[k, :, k] + C[k + 1, :, k + 1] - C[k, :, k + 1] - C[k + 1, :, k]
+        directions[k] = step / length if length > 0.0 else np.linalg.eigh(of_step)[1][:, -1]
+        bias += _lengthened(float(length), of_step, directions[k])
+    J = np.zeros((count, 3))
+    J[:-1] -= directions
+    J[1:] += directions
+    return _with_scale(float(lengths.sum()), J, points, bias, scale, 1)
+
+
+def area(points: Points, scale: Scale) -> Quantity:
+    """What an outline encloses, in the plane that fits it best; exact for a triangle.
+
+    It is the length of the vector area, half the sum of the products p_i x p_i+1: of a curved
+    outline the largest of its projections. The relief inside does not count.
+
+    Raises:
+        InputError: there are fewer than three points, or the outline crosses itself.
+    """
+    normal = _vector_area(points)
+    size = float(np.linalg.norm(normal))
+    C = points.covariance()
+    across = np.concatenate([-0.5 * hat(chord) for chord in _chords(points.places)], axis=1)
+    C_area = across @ C @ across.T
+    up = normal / size if size > 0.0 else np.linalg.eigh(C_area)[1][:, -1]
+    _refuse_crossing(points.places, up)
+    J = 0.5 * np.cross(_chords(points.places), up)
+    return _with_scale(size, J, points, _lengthened(size, C_area, up), scale, 2)
+
+
+def plan_area(
+    points: Points,
+    up: Array,  # [3] unit, in the points' frame
+    scale: Scale,
+) -> Quantity:
+    """What an outline encloses on a chart: its projection along the vertical.
+
+    Raises:
+        InputError: there are fewer than three points, or the outline crosses itself.
+    """
+    signed = float(_vector_area(points) @ up)
+    _refuse_crossing(points.places, up)
+    J = 0.5 * np.cross(_chords(points.places), up)
+    return _with_scale(abs(signed), J, points, 0.0, scale, 2)
+
+
+def _with_scale(
+    value: float,
+    J: Array,  # [N, 3]
+    points: Points,
+    bias: float,
+    scale: Scale,
+    dimensions: int,
+) -> Quantity:
+    """``dimensions`` 1: a length; 2: an area, which a scale changes twice as much."""
+    gradient = J.ravel()
+    variance = float(gradient @ points.covariance() @ gradient)
+    variance += bias**2 + (dimensions * scale.sigma * value) ** 2
+    unit = scale.unit if dimensions == 1 else scale.square_unit
+    return Quantity.normal(value, float(np.sqrt(max(variance, 0.0))), unit)
+
+
+def _lengthened(
+    length: float,
+    covariance: Array,  # [3, 3]
+    direction: Array,  # [3] unit
+) -> float:
+    """By how much errors across a vector lengthen it, in the root mean square."""
+    across = max(float(np.trace(covariance) - direction @ covariance @ direction), 0.0)
+    return float(np.sqrt(length**2 + across) - length)
+
+
+def _vector_area(points: Points) -> Array:
+    """[3] half the sum of the corners' products; its length is the area.
+
+    Raises:
+        InputError: there are fewer than three points.
+    """
+    if len(points.places) < LEAST_CORNERS:
+        raise InputError(f"an area needs {LEAST_CORNERS} points at least; mark another one")
+    local = points.places - points.places.mean(axis=0)
+    return np.asarray(0.5 * np.cross(local, np.roll(local, -1, axis=0)).sum(axis=0))
+
+
+def _chords(
+    places: Array,  # [N, 3]
+) -> Array:
+    """[N, 3] from each corner's last neighbour to its next."""
+    return np.roll(places, -1, axis=0) - np.roll(places, 1, axis=0)
+
+
+def _refuse_crossing(
+    places: Array,  # [N, 3]
+    up: Array,  # [3] unit
+) -> None:
+    """Raises InputError where two sides cross, seen along ``up``."""
+    basis = np.linalg.svd(up[None])[2][1:]
+    corners = (places - places.mean(axis=0)) @ basis.T
+    ends = np.roll(corners, -1, axis=0)
+
+    def side(
+        point: Array,  # [M, 2]
+    ) -> Array:  # [N, M] which side of each line a point lies on
+        along, to = (ends - corners)[:, None], point[None] - corners[:, None]
+        return np.asarray(np.sign(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0]))
+
+    parted = side(corners) * side(ends) < 0.0
+    if bool((parted & parted.T).any()):
+        raise InputError("the outline crosses itself; mark its corners in their order")

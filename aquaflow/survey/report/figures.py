@@ -1,0 +1,194 @@
+"""The report's figures as inline SVG that follows the page's light or dark colours."""
+
+from __future__ import annotations
+
+import io
+import re
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.survey.report.data import MediumCurves, PathPlot
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+INK, GRID = "#010203", "#040506"
+"""Colours that nothing else uses; in the SVG they become those of the page."""
+
+CHANNELS = (("red", "#e8505b"), ("green", "#2fa66a"), ("blue", "#3b82d6"))
+SUB_MAP_COLOURS = ("#1098ad", "#f08c00", "#7048e8", "#d6336c", "#66a80f", "#868e96")
+TRUTH_COLOUR = "#e8505b"
+"""Distinct on light and on dark paper; with more sub-maps the colours come again."""
+
+STYLE: Any = {
+    "svg.fonttype": "none",
+    "font.family": "sans-serif",
+    "font.size": 10.0,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": GRID,
+    "axes.grid": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlesize": 11.0,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "grid.color": GRID,
+    "grid.linewidth": 0.6,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "xtick.major.size": 0.0,
+    "ytick.major.size": 0.0,
+    "legend.frameon": False,
+}
+"""Matplotlib's settings; text stays text, so that the page's font is used."""
+
+CURVE_SAMPLES = 128
+"""Points of each drawn curve."""
+
+
+def path_svg(path: PathPlot) -> str:
+    """The path seen from two sides: from above and from the side where gravity is known, else along
+    the direction of least motion and across it."""
+    figure = drawn(9.0, 3.6, level_axes if path.up else path_axes, path)
+    return svg_of(figure, "path")
+
+
+def medium_svg(medium: MediumCurves) -> str:
+    """Transmission and backscatter over range."""
+    return svg_of(drawn(9.0, 3.1, medium_axes, medium), "medium")
+
+
+def drawn(width_in: float, height_in: float, draw: Any, data: Any) -> Figure:
+    """A figure in the report's style, into which ``draw`` has drawn ``data``."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(width_in, height_in), layout="constrained")
+        figure.patch.set_alpha(0.0)
+        draw(figure, data)
+        for axes in figure.axes:
+            axes.patch.set_alpha(0.0)
+            axes.set_axisbelow(True)
+    return figure
+
+
+def level_axes(figure: Figure, path: PathPlot) -> None:
+    """Draw a path from above, x up, and from the side with its depth, into an empty figure."""
+    finite = np.isfinite(path.positions).all(axis=1)
+    along = np.zeros(3)  # the horizontal direction in which the path is longest
+    along[:2] = _main_directions(path.positions[finite, :2])[1][0]
+    axes_3d = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], along, [0.0, 0.0, 1.0]])
+    ours = path.positions @ axes_3d.T
+    truth = None if path.truth is None else path.truth @ axes_3d.T
+    above, side = figure.subplots(1, 2)
+    for axes, (u, v) in ((above, (0, 1)), (side, (2, 3))):
+        _draw_view(axes, ours, truth, path, u, v)
+        axes.set_aspect("equal", adjustable="datalim")
+    above.set_title(f"From above, {path.up} up")
+    above.set_xlabel(f"{'east' if path.up == 'true north' else 'to the right'}, {path.unit}")
+    above.set_ylabel(f"{path.up}, {path.unit}")
+    side.set_title("From the side")
+    side.set_xlabel(f"along the path's longest direction, {path.unit}")
+    side.set_ylabel(f"{'depth' if path.depth_known else 'down'}, {path.unit}")
+    side.invert_yaxis()
+    handles, labels = above.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+
+
+def path_axes(figure: Figure, path: PathPlot) -> None:
+    """Draw the two views of a path into an empty figure."""
+    finite = np.isfinite(path.positions).all(axis=1)
+    centre, axes_3d = _main_directions(path.positions[finite])
+    ours = (path.positions - centre) @ axes_3d.T
+    truth = None if path.truth is None else (path.truth - centre) @ axes_3d.T
+    panels = figure.subplots(1, 2)
+    for axes, (u, v), title in zip(
+        panels, ((0, 1), (0, 2)), ("Widest view", "From the side"), strict=True
+    ):
+        _draw_view(axes, ours, truth, path, u, v)
+        axes.set_title(title)
+        axes.set_xlabel(path.unit)
+        axes.set_ylabel(path.unit)
+        axes.set_aspect("equal", adjustable="datalim")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+
+
+def _draw_view(
+    axes: Axes,
+    ours: npt.NDArray[np.floating],  # [N, A] along A directions
+    truth: npt.NDArray[np.floating] | None,  # [M, A] along the same
+    path: PathPlot,
+    u: int,
+    v: int,
+) -> None:
+    if truth is not None:
+        axes.plot(truth[:, u], truth[:, v], "--", color=TRUTH_COLOUR, lw=1.4, label="truth")
+    members = np.array(path.sub_maps)
+    ids = sorted(set(path.sub_maps))
+    for order, sub_map in enumerate(ids):
+        part = ours[members == sub_map]
+        colour = SUB_MAP_COLOURS[order % len(SUB_MAP_COLOURS)]
+        label = "camera path" if len(ids) == 1 else f"sub-map {sub_map}"
+        axes.plot(part[:, u], part[:, v], color=colour, lw=1.8, label=label)
+    keys = ours[np.array([name == "keyframe" for name in path.classes], dtype=bool)]
+    axes.plot(keys[:, u], keys[:, v], "o", color=INK, ms=3.0, label="keyframe")
+    axes.plot(ours[:1, u], ours[:1, v], "s", color=INK, ms=7.0, mfc="none", label="start")
+
+
+def _main_directions(
+    positions: npt.NDArray[np.floating],  # [M, D]
+) -> tuple[npt.NDArray[np.floating], npt.NDArray[np.floating]]:
+    """Centre [D] and axes [D, D] (rows) by falling spread, each with a fixed sign."""
+    centre, dimensions = positions.mean(axis=0), positions.shape[1]
+    _, _, axes = np.linalg.svd(positions - centre, full_matrices=len(positions) < dimensions)
+    largest = np.abs(axes).argmax(axis=1)
+    return centre, axes * np.sign(axes[np.arange(dimensions), largest])[:, None]
+
+
+def medium_axes(figure: Figure, medium: MediumCurves) -> None:
+    """Draw the two curves of the water into an empty figure."""
+    z = np.linspace(0.0, 1.5 * medium.range_p95, CURVE_SAMPLES)
+    left, right = figure.subplots(1, 2)
+    for channel, (name, colour) in enumerate(CHANNELS):
+        passed = 100.0 * np.exp(-medium.beta[channel] * z)
+        scattered = medium.B_inf[channel] * (1.0 - np.exp(-medium.b[channel] * z))
+        scattered = scattered + medium.B_res[channel] * np.exp(-medium.d[channel] * z)
+        left.plot(z, passed, color=colour, lw=2.0, label=name)
+        right.plot(z, 100.0 * scattered, color=colour, lw=2.0, label=name)
+    left.set_title("Scene light that arrives (%)")
+    right.set_title("Light that the water adds (%)")
+    left.set_ylim(0.0, 102.0)
+    right.set_ylim(bottom=0.0)
+    for axes in (left, right):
+        axes.axvspan(medium.range_p5, medium.range_p95, color=GRID, alpha=0.35, lw=0.0)
+        axes.set_xlim(0.0, z[-1])
+        axes.set_xlabel(f"distance from the camera ({medium.unit})")
+    handles, labels = left.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+
+
+def svg_of(figure: Figure, salt: str) -> str:
+    """Inline SVG: no header, no date, ids unique to the figure, colours those of the page."""
+    import matplotlib as mpl
+
+    buffer = io.StringIO()
+    with mpl.rc_context({**STYLE, "svg.hashsalt": salt}):
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    svg = buffer.getvalue()
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<metadata>.*?</metadata>\s*", "", svg, flags=re.DOTALL)
+    # Matplotlib numbers its groups from one in every figure; in one page they must differ.
+    svg = re.sub(
+        r' id="((?:figure|axes|patch|line2d|text|legend|matplotlib\.axis|xtick|ytick)_\d+)"',
+        "",
+        svg,
+    )
+    svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", svg, count=1)
+    svg = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", svg, count=1)
+    return svg.replace(INK, "currentColor").replace(GRID, "var(--grid)")

@@ -1,0 +1,75 @@
+"""A site, or one dive alone, as the base in which another dive is looked for."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+from aquaflow.base.errors import InputError
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes.place import KeypointDepths, Place
+from aquaflow.keyframes.places_file import NAME as PLACES
+from aquaflow.keyframes.places_file import PlacesFile
+from aquaflow.survey.site.frames import frame_of
+from aquaflow.survey.site.manifest import check_unchanged, is_site, read_site
+from aquaflow.survey.site.merged_file import MergedSite, merge_of
+from aquaflow.tracking.base.base import Base
+from aquaflow.tracking.base.opening import open_base, prior_of
+
+log = logging.getLogger(__name__)
+
+
+def base_of(folder: Path) -> Base:
+    """The merged site in ``folder``, or the finished dive in it.
+
+    The keyframes of a site are numbered as in its merge, and its components stand for sub-maps. A
+    dive that is gone, or that changed since the merge, is left out.
+
+    Raises:
+        InputError: it is neither, it was not merged, or nothing of it can be read.
+    """
+    if not is_site(folder):
+        return open_base(folder)
+    merged = merge_of(folder)
+    dives = {dive.name: dive.folder(folder) for dive in read_site(folder)}
+    files: dict[int, PlacesFile] = {}
+    for number, (name, before) in enumerate(merged.fingerprints.items()):
+        try:
+            files[number] = _unchanged(dives.get(name, folder / name), before)
+        except InputError as error:
+            log.warning("%s is left out of %s: %s", name, folder, error)
+    places, origins = _places(merged, files)
+    if not places:
+        raise InputError(
+            f"no dive of {folder} is as it was merged; run `aquaflow site merge {folder}` again"
+        )
+
+    def keypoints(number: int) -> KeypointDepths:
+        dive, keyframe = origins[number]
+        return files[dive].keypoints(keyframe)
+
+    frames = {i: frame_of(stated, dives) for i, stated in enumerate(merged.components)}
+    prior = next((p for p in map(prior_of, dives.values()) if p), "")
+    return Base(folder, prior, tuple(places), keypoints, frames)
+
+
+def _unchanged(dive: Path, before: str) -> PlacesFile:
+    check_unchanged(dive, before)
+    return PlacesFile(dive / PLACES)
+
+
+def _places(
+    merged: MergedSite, files: dict[int, PlacesFile]
+) -> tuple[list[Place], dict[int, tuple[int, int]]]:
+    """Keyframes in their component's world, and the dive and number of each there."""
+    places, origins = [], {}
+    for number, row in enumerate(merged.keyframes):
+        dive, keyframe = int(row["dive"]), int(row["number"])
+        known = files[dive].by_number.get(keyframe) if dive in files else None
+        if known is not None:
+            T_sc = Sim3(row["R"].copy(), row["t"].copy(), float(row["scale"]))
+            component = int(row["component"])
+            places.append(replace(known, number=number, sub_map=component, T_mc=T_sc))
+            origins[number] = dive, keyframe
+    return places, origins

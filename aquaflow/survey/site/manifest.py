@@ -1,0 +1,169 @@
+"""``site.json``: the dives of a site, where they lie, and what they were when they were added."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.storage.atomic import write_json
+from aquaflow.keyframes.places_file import NAME as PLACES
+from aquaflow.keyframes.places_file import PlacesFile
+from aquaflow.telemetry.metric_file import NAME as METRIC
+
+NAME = "site.json"
+"""The file by which a folder is known to be a site."""
+FORMAT = 1
+"""Raised whenever an older AquaFlow could no longer read the file."""
+FINGERPRINTED = (PLACES, METRIC, "trajectory.tum", "frames.csv")
+"""Files of a dive that a merge reads; one that is not there counts as such."""
+
+
+@dataclass(frozen=True)
+class SiteDive:
+    """A dive of a site."""
+
+    name: str
+    """Unique in the site: the dive folder's name, with a number where two are alike."""
+    path: str
+    """Of the dive folder: relative to the site where it is on the same file system."""
+    fingerprint: str
+    """Of the files that a merge reads, when the dive was added."""
+
+    def folder(self, site: Path) -> Path:
+        """The dive folder."""
+        return Path(os.path.normpath(site / self.path))
+
+
+def fingerprint(dive: Path) -> str:
+    """SHA-256 of what a merge reads of the folder ``dive``.
+
+    Raises:
+        InputError: a file is there and cannot be read.
+    """
+    found = hashlib.sha256()
+    for name in FINGERPRINTED:
+        path = dive / name
+        try:
+            content = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+        except OSError as error:
+            raise InputError(f"cannot read {path}: {error.strerror}; check the dive") from error
+        found.update(f"{name} {content}\n".encode())
+    return found.hexdigest()
+
+
+def check_unchanged(dive: Path, before: str) -> None:
+    """Compare the folder ``dive`` with the fingerprint that it was merged with.
+
+    Raises:
+        InputError: it is another one now, or cannot be read.
+    """
+    if fingerprint(dive) != before:
+        raise InputError(f"{dive} is not what it was when the site was merged")
+
+
+def is_site(folder: Path) -> bool:
+    """True of a folder with a site's manifest, also a damaged one."""
+    return (folder / NAME).is_file()
+
+
+def read_site(site: Path) -> tuple[SiteDive, ...]:
+    """The dives of the site in the folder ``site``, in the order of adding.
+
+    Raises:
+        InputError: there is none, it is damaged, or of a newer AquaFlow.
+    """
+    path = site / NAME
+    if not is_site(site):
+        raise InputError(f"{site} is no site: {NAME} is missing; make one by `aquaflow site add`")
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        if data["format"] != FORMAT:
+            raise InputError(
+                f"{path} is not in format {FORMAT}, which this AquaFlow reads; update AquaFlow"
+            )
+        dives = tuple(SiteDive(**stated) for stated in data["dives"])
+        if len({dive.name for dive in dives}) != len(dives):
+            raise DamagedError("two dives have one name")
+        if not all(isinstance(part, str) for dive in dives for part in asdict(dive).values()):
+            raise DamagedError("a dive is described by something other than words")
+        return dives
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        what = reason_of(error)
+        raise InputError(f"cannot read {path}: {what}; add the dives to a new site") from error
+
+
+def add_dives(site: Path, folders: Sequence[Path]) -> list[SiteDive]:
+    """Add dive folders to the site, which is made if it is not there; the dives that are new.
+
+    A dive that is in the site already, unchanged, is left as it is; one that was mapped again since
+    keeps its name and gets its new fingerprint, and counts as new. Nothing is written if one of the
+    folders is no finished dive.
+
+    Raises:
+        InputError: a folder is no finished dive, or the site cannot be read or written.
+    """
+    there = list(read_site(site)) if (site / NAME).exists() else []
+    new = []
+    for folder in folders:
+        PlacesFile(folder / PLACES)  # refuses what cannot be recognised again
+        mark = fingerprint(folder)
+        at = next((i for i, dive in enumerate(there) if _same(dive.folder(site), folder)), None)
+        if at is None:
+            names = {dive.name for dive in there}
+            there.append(SiteDive(_free(folder.resolve().name, names), _way(site, folder), mark))
+            new.append(there[-1])
+        elif there[at].fingerprint != mark:
+            there[at] = SiteDive(there[at].name, there[at].path, mark)
+            new.append(there[at])
+    _make(site)
+    write_json(site / NAME, {"format": FORMAT, "dives": [asdict(dive) for dive in there]})
+    return new
+
+
+def state_of(site: Path, dive: SiteDive) -> str:
+    """ "as added", "changed" or "missing".
+
+    Raises:
+        InputError: a file of it is there and cannot be read.
+    """
+    folder = dive.folder(site)
+    if not (folder / PLACES).is_file():
+        return "missing"
+    return "as added" if fingerprint(folder) == dive.fingerprint else "changed"
+
+
+def _same(a: Path, b: Path) -> bool:
+    return a.resolve() == b.resolve()
+
+
+def _free(name: str, taken: set[str]) -> str:
+    """``name``, or the first of ``name_2``, ``name_3``, ... that is not taken."""
+    number, free = 1, name
+    while free in taken:
+        number += 1
+        free = f"{name}_{number}"
+    return free
+
+
+def _way(site: Path, folder: Path) -> str:
+    """Relative, so that site and dives can be moved together, unless only the root is common."""
+    base, target = site.resolve(), folder.resolve()
+    common = os.path.commonpath([base, target])
+    return str(target) if common == base.anchor else os.path.relpath(target, base)
+
+
+def _make(site: Path) -> None:
+    try:
+        site.mkdir(parents=True, exist_ok=True)
+        occupied = any(site.iterdir()) and not (site / NAME).exists()
+    except OSError as error:
+        raise InputError(
+            f"cannot make the site {site}: {error.strerror}; choose another folder"
+        ) from error
+    if occupied:
+        raise InputError(f"{site} holds files that are no site; choose an empty folder")

@@ -1,0 +1,195 @@
+"""``merged.json`` and ``merged.npy``: how the dives of a site lie to each other."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.storage.atomic import atomic_write, write_json
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.survey.site.manifest import SiteDive
+from aquaflow.telemetry.metric_file import read_main
+
+NAME, ARRAYS = "merged.json", "merged.npy"
+"""In a site's folder."""
+FORMAT = 1
+"""Raised whenever an older AquaFlow could no longer read the files."""
+KEYFRAME = np.dtype(
+    [
+        ("dive", "<i4"),
+        ("number", "<i8"),
+        ("sub_map", "<i4"),
+        ("component", "<i4"),
+        ("t_ns", "<i8"),
+        ("R", "<f8", (3, 3)),
+        ("t", "<f8", (3,)),
+        ("scale", "<f8"),
+    ]
+)
+"""A keyframe: index of its dive in ``dives``, and T_sc, camera to its component's world."""
+
+Rows = npt.NDArray[Any]
+
+
+@dataclass(frozen=True)
+class PlacedSubMap:
+    """A sub-map of a dive in its component's world."""
+
+    dive: str
+    """Name."""
+    number: int
+    component: int
+    T_sm: Sim3
+    """From the world of the sub-map's ``map.aqf``."""
+    T_sn: Sim3
+    """From the world of the dive's ``trajectory.tum`` and ``map.ply``."""
+    keyframes: int
+    bent: float
+    """Root mean square distance by which its keyframes differ from that one similarity, in the
+    component's unit: the joint optimisation bends a path that drifted."""
+
+
+@dataclass(frozen=True)
+class MergedSite:
+    """What a merge found."""
+
+    fingerprints: Mapping[str, str]
+    """Of the dives that were merged, by name and in order."""
+    left_out: Mapping[str, str]
+    """Dives that could not take part: name and reason."""
+    components: tuple[dict[str, Any], ...]
+    """By number: what is known of their worlds."""
+    sub_maps: tuple[PlacedSubMap, ...]
+    links: tuple[dict[str, Any], ...]
+    """Every link that was found, its evidence and its verdict."""
+    keyframes: Rows
+    """[N] KEYFRAME"""
+
+    def of_dive(self, name: str) -> tuple[PlacedSubMap, ...]:
+        """The sub-maps of a dive."""
+        return tuple(each for each in self.sub_maps if each.dive == name)
+
+    def chosen(self, component: int | None, site: Path) -> int:
+        """The component that was asked for; None: the one with most keyframes.
+
+        Raises:
+            InputError: there is no such component.
+        """
+        count = len(self.components)
+        if component is None:
+            return int(np.bincount(self.keyframes["component"], minlength=count).argmax())
+        if not 0 <= component < count:
+            raise InputError(
+                f"{site} has components 0 to {count - 1}, not {component}; `aquaflow site list "
+                f"{site}` shows them"
+            )
+        return component
+
+    def main_of(self, dive: SiteDive, site: Path) -> PlacedSubMap | None:
+        """The sub-map of a dive's ``map.ply``; None where the merge has none.
+
+        Raises:
+            InputError: the dive's metric.json is damaged.
+        """
+        main = read_main(dive.folder(site))
+        return next((each for each in self.of_dive(dive.name) if each.number == main), None)
+
+
+def write_merged(site: Path, merged: MergedSite) -> None:
+    """Write both files; the arrays first, so that ``merged.json`` never speaks of others.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
+    with atomic_write(site / ARRAYS) as stream:
+        np.lib.format.write_array(stream, merged.keyframes, allow_pickle=False)
+    sub_maps = [
+        asdict(each) | {"T_sm": _of_sim3(each.T_sm), "T_sn": _of_sim3(each.T_sn)}
+        for each in merged.sub_maps
+    ]
+    write_json(
+        site / NAME,
+        {
+            "format": FORMAT, "dives": dict(merged.fingerprints),
+            "left_out": dict(merged.left_out), "components": list(merged.components),
+            "sub_maps": sub_maps, "links": list(merged.links),
+        },
+    )  # fmt: skip
+
+
+def read_merged(site: Path) -> MergedSite | None:
+    """What the last merge found; None before the first.
+
+    Raises:
+        InputError: a file is damaged, or of a newer AquaFlow.
+    """
+    path = site / NAME
+    if not path.is_file():
+        return None
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        if data["format"] != FORMAT:
+            raise InputError(
+                f"{path} is not in format {FORMAT}, which this AquaFlow reads; update AquaFlow"
+            )
+        return _merged(data, _keyframes(site / ARRAYS))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError) as error:
+        raise InputError(
+            f"cannot read {path}: {reason_of(error)}; run `aquaflow site merge` again"
+        ) from error
+
+
+def merge_of(site: Path) -> MergedSite:
+    """What the last merge found.
+
+    Raises:
+        InputError: there was none, or a file is damaged, or of a newer AquaFlow.
+    """
+    merged = read_merged(site)
+    if merged is None:
+        raise InputError(f"{site} was never merged; run `aquaflow site merge {site}` first")
+    return merged
+
+
+def _keyframes(path: Path) -> Rows:
+    with path.open("rb") as stream:
+        rows = np.lib.format.read_array(stream, allow_pickle=False)
+    if rows.dtype != KEYFRAME or rows.ndim != 1:
+        raise DamagedError(f"{path.name} holds no keyframes")
+    return np.asarray(rows)
+
+
+def _merged(
+    data: dict[str, Any],
+    keyframes: Rows,  # [N] KEYFRAME
+) -> MergedSite:
+    sub_maps = tuple(
+        PlacedSubMap(
+            str(each["dive"]), int(each["number"]), int(each["component"]), _to_sim3(each["T_sm"]),
+            _to_sim3(each["T_sn"]), int(each["keyframes"]), float(each["bent"]),
+        )
+        for each in data["sub_maps"]
+    )  # fmt: skip
+    return MergedSite(
+        dict(data["dives"]), dict(data["left_out"]), tuple(data["components"]), sub_maps,
+        tuple(data["links"]), keyframes,
+    )  # fmt: skip
+
+
+def _of_sim3(T: Sim3) -> dict[str, Any]:
+    return {"scale": float(T.scale), "rotation": T.R.tolist(), "translation": T.t.tolist()}
+
+
+def _to_sim3(stated: dict[str, Any]) -> Sim3:
+    R, t = np.array(stated["rotation"], np.float64), np.array(stated["translation"], np.float64)
+    T = Sim3(R, t, float(stated["scale"]))
+    if R.shape != (3, 3) or t.shape != (3,) or not T.is_finite():
+        raise DamagedError("a transform is not finite")
+    return T

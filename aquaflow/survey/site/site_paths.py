@@ -1,0 +1,77 @@
+"""The dives' paths in the worlds of a merged site, as TUM files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from aquaflow.base.errors import InputError
+from aquaflow.dive.tum import Trajectory, write_tum
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.keyframes.places_file import NAME as PLACES
+from aquaflow.keyframes.places_file import PlacesFile
+from aquaflow.survey.site.merged_file import MergedSite
+from aquaflow.survey.site.paths import FOLDER, moved_path, path_of_sub_map, sub_maps_of_frames
+from aquaflow.telemetry.metric_file import read_metric_file
+from aquaflow.telemetry.metric_frame import MetricFrame
+
+
+def write_paths(site: Path, folders: Mapping[str, Path], merged: MergedSite) -> None:
+    """Write paths/DIVE_COMPONENT.tum for every dive and component; others are removed.
+
+    Raises:
+        InputError: a trajectory cannot be read, or a file cannot be written.
+    """
+    written = set()
+    for index, name in enumerate(merged.fingerprints):
+        for component, path in _paths_of(folders[name], index, name, merged).items():
+            target = site / FOLDER / f"{name}_{component}.tum"
+            _made(target.parent)
+            unit = merged.components[component]["unit"]
+            comment = f"camera to the world of component {component} of the site; unit: {unit}"
+            write_tum(target, path.t_s, path.positions, path.wxyz, comment=comment)
+            written.add(target)
+    for old in (site / FOLDER).glob("*.tum"):
+        if old not in written:
+            old.unlink(missing_ok=True)
+
+
+def _paths_of(folder: Path, index: int, name: str, merged: MergedSite) -> dict[int, Trajectory]:
+    """The path of a dive by component."""
+    file, frames = PlacesFile(folder / PLACES), read_metric_file(folder)
+    sub_maps = sub_maps_of_frames(folder)
+    parts: dict[int, list[Trajectory]] = {}
+    for placed in merged.of_dive(name):
+        path = path_of_sub_map(folder, placed.number, sub_maps)
+        if not len(path):
+            continue
+        frame = frames.get(placed.number, MetricFrame.unknown())
+        places = [place for place in file.places if place.sub_map == placed.number]
+        rows = merged.keyframes[
+            (merged.keyframes["dive"] == index) & (merged.keyframes["sub_map"] == placed.number)
+        ]
+        before = [frame.T_nm @ place.T_mc for place in places]
+        after = [Sim3(row["R"], row["t"], float(row["scale"])) for row in rows]
+        times = 1e-9 * rows["t_ns"]
+        order = np.argsort(times, kind="stable")
+        parts.setdefault(placed.component, []).append(
+            moved_path(path, times[order], [before[i] for i in order], [after[i] for i in order])
+        )
+    return {component: _together(each) for component, each in parts.items()}
+
+
+def _together(parts: list[Trajectory]) -> Trajectory:
+    """In the order of their times."""
+    t_s = np.concatenate([part.t_s for part in parts])
+    positions = np.concatenate([part.positions for part in parts])
+    wxyz = np.concatenate([part.wxyz for part in parts])
+    return Trajectory(t_s, positions, wxyz).select(np.argsort(t_s, kind="stable"))
+
+
+def _made(folder: Path) -> None:
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot make {folder}: {error.strerror}; make room") from error

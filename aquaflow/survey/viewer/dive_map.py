@@ -1,0 +1,61 @@
+"""The Gaussians of a finished dive, with what they are coloured by: seconds for half a million."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.dive.ply import read_ply
+from aquaflow.survey.viewer.dive_coverage import CLASSES, COVERAGE, coverage_of_dive
+from aquaflow.survey.viewer.levels import RANGE, Palette, range_level
+from aquaflow.survey.viewer.splats import Splats, splats
+from aquaflow.telemetry.metric_frame import MetricFrame
+
+
+@dataclass(frozen=True)
+class DiveMap:
+    """What is shown of a map."""
+
+    splats: Splats
+    palettes: dict[str, Palette]
+    total: int
+    """Gaussians of the whole map."""
+
+
+def read_map(
+    folder: Path,
+    ply: Path,
+    cameras: npt.NDArray[np.float64],  # [M, 3] of the path
+    frame: MetricFrame,
+    budget: int,
+) -> DiveMap:
+    """The Gaussians in ``ply``, at most ``budget``, of the dive in ``folder``.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    gaussians = read_ply(ply)
+    levels, palettes = _levels(gaussians.means, cameras, frame.unit)
+    classes = coverage_of_dive(folder, gaussians.means, frame)
+    if classes is not None:
+        levels[COVERAGE], palettes[COVERAGE] = classes, CLASSES
+    shown = splats(
+        np.asarray(gaussians.means, np.float32), np.asarray(gaussians.wxyz, np.float32),
+        np.asarray(gaussians.scales, np.float32), np.asarray(gaussians.opacities, np.float32),
+        np.asarray(gaussians.colours, np.float32), budget, levels,
+    )  # fmt: skip
+    return DiveMap(shown, palettes, len(gaussians.means))
+
+
+def _levels(
+    means: npt.NDArray[np.floating],  # [N, 3]
+    cameras: npt.NDArray[np.float64],  # [M, 3]
+    unit: str,
+) -> tuple[dict[str, npt.NDArray[np.uint8]], dict[str, Palette]]:
+    if not len(cameras) or not len(means):
+        return {}, {}
+    values, palette = range_level(means, cameras, unit)
+    return {RANGE: values}, {RANGE: palette}

@@ -1,0 +1,121 @@
+"""The path of a finished dive as the viewer shows it: poses, how well each is known, and when."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.base.errors import InputError, reason_of
+from aquaflow.geometry.similarity import Sim3, rotation_from_quaternion
+from aquaflow.survey.viewer.dive_moments import moments_of_dive, pictures_of_dive
+from aquaflow.survey.viewer.exhibit import POSE_NUMBERS
+
+LONGEST_PATH = 5000
+"""Most poses that a page gets, as of a live dive: 52 bytes each, on their way before the map."""
+TUM_COLUMNS = 8
+"""t_s tx ty tz qx qy qz qw"""
+
+
+@dataclass(frozen=True)
+class DivePath:
+    """N poses, and the pictures that were kept on the way."""
+
+    t_s: npt.NDArray[np.float64]
+    """[N] as in trajectory.tum."""
+    poses: list[Sim3]
+    """T_nc"""
+    quality: npt.NDArray[np.float64]
+    """[N] inlier share of each pose."""
+    moments: npt.NDArray[np.float32]
+    """[N, 5] of each pose, as :mod:`aquaflow.survey.viewer.moments` has them."""
+    began: datetime | None
+    """UTC of the first pose, if it is known."""
+    pictures: dict[int, Path]
+    """What the camera saw, by the frame's index, where the dive keeps it."""
+
+    @property
+    def places(self) -> npt.NDArray[np.float64]:
+        """[N, 3] of the camera."""
+        return np.array([pose.t for pose in self.poses]).reshape(-1, 3)
+
+    @property
+    def rows(self) -> npt.NDArray[np.float32]:
+        """[N, 8] as :meth:`aquaflow.survey.viewer.page.ViewerPage.show_path` takes them."""
+        rows = [[*T.t, *T.quaternion, q] for T, q in zip(self.poses, self.quality, strict=True)]
+        return np.array(rows, np.float32).reshape(-1, POSE_NUMBERS)
+
+    def thinned(self, most: int = LONGEST_PATH) -> DivePath:
+        """Every n-th pose, so that they are at most ``most``."""
+        step = max(1, -(-len(self.poses) // most))
+        return self.among(range(0, len(self.poses), step))
+
+    def among(self, numbers: Sequence[int]) -> DivePath:
+        """Only the poses with these numbers."""
+        chosen = np.asarray(numbers, np.intp)
+        return replace(
+            self, t_s=self.t_s[chosen], poses=[self.poses[i] for i in chosen],
+            quality=self.quality[chosen], moments=self.moments[chosen],
+        )  # fmt: skip
+
+
+def read_path(folder: Path) -> DivePath:
+    """The path of the finished dive in ``folder``.
+
+    Raises:
+        InputError: a file cannot be read, or holds something else.
+    """
+    poses, t_s = _poses(folder / "trajectory.tum")
+    quality, indices = _of_frames(folder, t_s)
+    pictures = pictures_of_dive(folder)
+    moments, began = moments_of_dive(folder, t_s, indices, pictures)
+    return DivePath(t_s, poses, quality, moments, began, pictures)
+
+
+def _poses(path: Path) -> tuple[list[Sim3], npt.NDArray[np.float64]]:
+    try:
+        rows = np.loadtxt(path, ndmin=2).reshape(-1, TUM_COLUMNS)
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read {path}: {reason_of(error)}; map the dive again") from error
+    if not np.isfinite(rows).all() or (np.linalg.norm(rows[:, 4:8], axis=1) == 0.0).any():
+        raise InputError(f"{path} holds what is no pose; map the dive again")
+    poses = [Sim3(rotation_from_quaternion(np.roll(row[4:8], 1)), row[1:4]) for row in rows]
+    return poses, rows[:, 0]
+
+
+def _of_frames(
+    folder: Path,
+    times: npt.NDArray[np.float64],  # [N] s
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+    """Quality and index of the frame at each time; -1 where there is none."""
+    shown = _shown_by_microsecond(folder / "frames.csv")
+    quality, indices = [], []
+    for t_s in times:
+        inliers, index = shown.get(_microsecond(t_s), (1.0, -1))
+        quality.append(inliers)
+        indices.append(index)
+    return np.array(quality), np.array(indices, np.int64)
+
+
+def _shown_by_microsecond(path: Path) -> dict[int, tuple[float, int]]:
+    """Quality and index of the frame at each time; a damaged line is skipped."""
+    shown: dict[int, tuple[float, int]] = {}
+    try:
+        with path.open(newline="", encoding="utf-8", errors="replace") as stream:
+            for row in csv.DictReader(stream):
+                with contextlib.suppress(KeyError, TypeError, ValueError, OverflowError):
+                    found = float(row["quality"] or 1.0), int(row["index"])
+                    shown[_microsecond(float(row["t_s"]))] = found
+    except (OSError, csv.Error) as error:
+        raise InputError(f"cannot read {path}; map the dive again") from error
+    return shown
+
+
+def _microsecond(t_s: float) -> int:
+    return round(float(t_s) * 1e6)

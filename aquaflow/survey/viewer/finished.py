@@ -1,0 +1,185 @@
+"""A finished dive in the viewer: ``aquaflow view DIVE``."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.config.viewer import ViewerConfig
+from aquaflow.geometry.camera import CameraModel, load_camera
+from aquaflow.survey.viewer.dive_map import DiveMap, read_map
+from aquaflow.survey.viewer.dive_path import DivePath, read_path
+from aquaflow.survey.viewer.levels import Palette
+from aquaflow.survey.viewer.measuring import Asked, Frame
+from aquaflow.survey.viewer.packed_file import PackedFile, key_of, read_packed, write_packed
+from aquaflow.survey.viewer.page import ViewerPage
+from aquaflow.survey.viewer.pinned_notes import PinnedNotes
+from aquaflow.survey.viewer.scale_tool import Mark, marked
+from aquaflow.survey.viewer.seen_water import SeenWater, water_of
+from aquaflow.survey.viewer.splats import Splats
+from aquaflow.survey.viewer.tools import SCALE, Tools
+from aquaflow.telemetry.metric_file import read_frame_of_map
+from aquaflow.telemetry.metric_frame import MetricFrame
+
+log = logging.getLogger(__name__)
+
+WHOLE = ("map.ply", "trajectory.tum", "camera.yaml", "frames.csv")
+"""Files without which a folder is no finished dive."""
+
+
+@dataclass(frozen=True)
+class FinishedDive:
+    """What the viewer shows of a dive folder."""
+
+    folder: Path
+    ply: Path
+    """Of the Gaussians that are shown: without the water where it is known."""
+    map: Callable[[], DiveMap]
+    """Reads the Gaussians when it is first called."""
+    packed: PackedFile | None
+    """Of an earlier look: then a browser needs no :attr:`map` to see them."""
+    key: dict[str, Any]
+    """Of a packed map of this dive as it is now."""
+    water: SeenWater | None
+    path: DivePath
+    camera: CameraModel
+    frame: MetricFrame
+
+    @property
+    def splats(self) -> Splats:
+        """The Gaussians that are shown."""
+        return self.map().splats
+
+    @property
+    def palettes(self) -> dict[str, Palette]:
+        """Of the splats' levels."""
+        return self.map().palettes if self.packed is None else self.packed.palettes
+
+    @property
+    def summary(self) -> str:
+        """For the panel: paragraphs."""
+        if self.packed is None:
+            count, total = len(self.map().splats), self.map().total
+        else:
+            count, total = self.packed.count, self.packed.total
+        of_all = f"{len(self.path.poses)} poses, {count} of {total} Gaussians"
+        return f"{self.folder.name}: {of_all}\n\n{frame_in_words(self.frame)}"
+
+
+def frame_in_words(frame: MetricFrame) -> str:
+    """Unit and axes."""
+    unit = "Lengths are map units"
+    if frame.metric:
+        unit = f"Lengths are metres, \u00b1 {100.0 * frame.scale_sigma:.2g} %"
+    return f"{unit}; x points to {frame.north}, z down" if frame.level else unit
+
+
+def read_dive(folder: Path, budget: int) -> FinishedDive:
+    """The finished dive in ``folder``; its Gaussians are read when they are asked for.
+
+    Raises:
+        InputError: there is none.
+    """
+    for name in WHOLE:
+        if not (folder / name).is_file():
+            raise InputError(f"{folder} holds no finished dive: {name} is missing")
+    path = read_path(folder)
+    frame, camera = read_frame_of_map(folder / "map.aqf"), load_camera(folder / "camera.yaml")
+    water = _water(folder / "medium.json")
+    ply = folder / "map_clear.ply"
+    if water is None or not ply.is_file():  # colours with the water in them are all there is
+        water, ply = None, folder / "map.ply"
+    key = key_of(folder, budget)
+    return FinishedDive(
+        folder, ply, cache(partial(read_map, folder, ply, path.places, frame, budget)),
+        read_packed(folder, key), key, water, path, camera, frame,
+    )  # fmt: skip
+
+
+def show_dive(dive: FinishedDive, config: ViewerConfig, tools: Tools | None = None) -> ViewerPage:
+    """The viewer's page of ``dive``."""
+    page = ViewerPage(config, "AquaFlow", live=False, tools=tools)
+    fill(page, dive)
+    return page
+
+
+def fill(page: ViewerPage, dive: FinishedDive) -> None:
+    """Show ``dive`` on ``page``, in place of what was there."""
+    page.set_frame(
+        Frame.of(dive.frame), up="-z" if dive.frame.level else "-y", north=dive.frame.north
+    )
+    page.show_health(dive.summary)
+    if dive.packed is not None:
+        page.show_packed(dive.packed, lambda: dive.splats, dive.water, dive.palettes)
+    else:
+        page.show_splats(dive.splats, dive.water, dive.palettes)
+    path = dive.path.thinned()
+    page.show_path(path.rows, path.moments, path.began)
+    page.show_pictures(path.pictures)
+    if path.poses:
+        page.show_camera(path.poses[0], dive.camera, None)
+
+
+def open_dive(folder: Path, config: ViewerConfig, mark: Mark | None = None) -> ViewerPage:
+    """The page of the finished dive in ``folder``, with its notes and, by ``mark``, its scale bar.
+
+    Raises:
+        InputError: there is no finished dive, or the address is taken.
+        ConfigError: the token will not do.
+    """
+    tools = Tools(others=PinnedNotes(folder).tools())
+    page: list[ViewerPage] = []
+
+    def scale(given: Asked) -> Asked:
+        said = marked(given, mark) if mark is not None else {}
+        if said.get("rescaled"):
+            fill(page[0], read_dive(folder, config.splats))
+        return said
+
+    if mark is not None:
+        tools.others[SCALE] = scale
+    dive = read_dive(folder, config.splats)
+    page.append(show_dive(dive, config, tools))
+    prepare(folder, dive.key, dive.packed, dive.map, page[0])
+    return page[0]
+
+
+def prepare(
+    folder: Path,
+    key: dict[str, Any],
+    packed: PackedFile | None,
+    whole: Callable[[], DiveMap],
+    page: ViewerPage,
+) -> threading.Thread:
+    """Behind the page: the Gaussians are read, for who points at them, or their packing is kept
+    in ``folder``. ``packed``: of an earlier look, if the page shows that."""
+
+    def work() -> None:
+        try:
+            shown = page.packed
+            if packed is not None:
+                whole()
+            elif shown is not None:
+                write_packed(folder, key, shown, whole().palettes, whole().total)
+        except InputError as error:  # who points is told so
+            log.warning("%s", error)
+
+    thread = threading.Thread(target=work, name="viewer's map", daemon=True)
+    thread.start()
+    return thread
+
+
+def _water(path: Path) -> SeenWater | None:
+    """None for a dive without water, and for a file that does not say it."""
+    try:
+        return water_of(json.loads(path.read_text("utf-8")))
+    except (OSError, ValueError, AttributeError, DamagedError) as error:
+        log.warning("the viewer shows no water: %s: %s", path, reason_of(error))
+        return None

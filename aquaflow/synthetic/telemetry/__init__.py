@@ -1,5 +1,0 @@
-"""The simulated instruments of a dive, and the file of their samples."""
-
-from aquaflow.synthetic.telemetry.table import HEADER, read_telemetry, write_telemetry
-
-__all__ = ["HEADER", "read_telemetry", "write_telemetry"]

@@ -1,0 +1,68 @@
+"""The camera's path in one sub-map, at any moment between two of its poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation, Slerp
+
+from aquaflow.telemetry.interpolation import columns_at
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+LONGEST_GAP_S = 1.5
+"""Between two poses, across which the path is interpolated; a survey camera takes one picture a
+second, and an ROV changes its speed within a few seconds."""
+
+
+SAME_S = 1e-6
+"""A moment so near to a pose is the pose's; sums of seconds round by less."""
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Camera poses of one sub-map in its own world m, map units."""
+
+    t_s: Array
+    """[N] s, strictly increasing."""
+    R_mc: Array
+    """[N, 3, 3] camera to map."""
+    p_m: Array
+    """[N, 3] camera centre."""
+
+    def __len__(self) -> int:
+        return len(self.t_s)
+
+    def covers(
+        self,
+        t_s: Array,  # [M] s
+    ) -> Mask:
+        """[M] moments at which the path is known: those of poses, and those in short gaps."""
+        if len(self) < 2:
+            return np.zeros(len(t_s), dtype=bool)
+        after = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self) - 1)
+        short = (self.t_s[after] - self.t_s[after - 1]) <= LONGEST_GAP_S
+        apart = np.minimum(np.abs(self.t_s[after] - t_s), np.abs(self.t_s[after - 1] - t_s))
+        inside = (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1])
+        return np.asarray((short & inside) | (apart <= SAME_S))
+
+    def at(
+        self,
+        t_s: Array,  # [M] s, covered
+    ) -> tuple[Array, Array]:
+        """Rotations [M, 3, 3] and camera centres [M, 3]; between poses at constant rates."""
+        t_s = np.clip(t_s, self.t_s[0], self.t_s[-1])
+        rotations = Slerp(self.t_s, Rotation.from_matrix(self.R_mc))(t_s).as_matrix()
+        centres = columns_at(t_s, self.t_s, self.p_m)
+        return np.asarray(rotations), centres
+
+    def velocity(
+        self,
+        t_s: Array,  # [M] s, covered
+    ) -> Array:
+        """[M, 3] map units/s."""
+        slope = np.gradient(self.p_m, self.t_s, axis=0)
+        return columns_at(t_s, self.t_s, slope)

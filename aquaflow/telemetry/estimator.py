@@ -1,0 +1,79 @@
+"""The frame of a sub-map from its camera path and the vehicle's telemetry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.config import FusionConfig
+from aquaflow.config.device import MountingConfig
+from aquaflow.telemetry.building import problem_of
+from aquaflow.telemetry.camera_path import CameraPath
+from aquaflow.telemetry.contradictions import contradiction_in
+from aquaflow.telemetry.factors.factor import Factor
+from aquaflow.telemetry.metric_frame import MetricFrame, SourceReport
+from aquaflow.telemetry.problem import Carried, Problem
+from aquaflow.telemetry.solution_frame import frame_of
+from aquaflow.telemetry.solve import Solution, solve
+from aquaflow.telemetry.telemetry import Telemetry
+
+Array = npt.NDArray[np.float64]
+
+LEAST_POSES = 5
+"""Of a sub-map; a shorter one gets no frame of its own."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The frame of a sub-map, and how it came about."""
+
+    frame: MetricFrame
+    problem: Problem | None = None
+    solution: Solution | None = None
+    """None where no telemetry could be used."""
+
+    def reporting(self, sources: Sequence[SourceReport]) -> Estimate:
+        """The same with reports of further sources, which could not be used."""
+        return replace(self, frame=replace(self.frame, sources=(*self.frame.sources, *sources)))
+
+
+def estimate(
+    telemetry: Telemetry,
+    path: CameraPath,
+    config: FusionConfig,
+    mounting: MountingConfig | None,
+    points: Callable[[], Array],
+    extra: Sequence[Factor] = (),
+    carried: Carried | None = None,
+) -> Estimate:
+    """The frame of the sub-map with ``path``.
+
+    Args:
+        mounting: of the camera in the body, as stated; None if nobody stated it.
+        points: makes the map's points [K, 3] m, for the altimeter's beam.
+        extra: factors that do not come from telemetry: known lengths.
+        carried: what an earlier sub-map of the dive has shown.
+
+    Raises:
+        ArithmeticError: the residuals are not finite.
+    """
+    if len(path) < LEAST_POSES:
+        return Estimate(MetricFrame.unknown(f"the sub-map has only {len(path)} poses"))
+    if not telemetry and not extra:
+        return Estimate(MetricFrame.unknown())
+    rejected: dict[tuple[str, str], SourceReport] = {}
+    while True:
+        problem = problem_of(telemetry, path, config, mounting, points, carried, extra, rejected)
+        if not problem.factors:
+            unused = MetricFrame.unknown("no telemetry could be used")
+            return Estimate(replace(unused, sources=tuple(problem.reports)))
+        solution = solve(problem.factors, problem.start, problem.prior)
+        wrong = contradiction_in(problem, solution)
+        if wrong is None:
+            return Estimate(frame_of(problem, solution, path), problem, solution)
+        rejected[wrong.source, wrong.kind] = SourceReport(
+            wrong.source, wrong.kind, rejected=wrong.samples, reason=wrong.reason
+        )

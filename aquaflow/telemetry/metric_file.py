@@ -1,0 +1,155 @@
+"""``metric.json``: how each sub-map of a dive lies in the world, for exports and for reading back.
+
+The file keeps ``T_nm``, from a sub-map's internal world to n, in which all other files of the dive
+are written; ``map.aqf`` and checkpoints keep the internal world.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.storage.atomic import write_json
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.telemetry.metric_frame import MetricFrame, North, Origin, SourceReport
+
+NAME = "metric.json"
+FORMAT = 1
+"""Raised whenever an older AquaFlow could no longer read the file."""
+ROTATION_TOLERANCE = 1e-6
+"""Largest difference of R^T R from the identity: rounding of 17 digits is far below."""
+
+
+def write_metric_file(folder: Path, frames: Mapping[int, MetricFrame], main: int) -> None:
+    """Write the frames by sub-map; ``main`` is the sub-map of ``map.aqf``.
+
+    Raises:
+        InputError: the file cannot be written.
+        ValueError: a number is not finite.
+    """
+    sub_maps = {
+        str(number): {"map": _map_name(number, main), **frame_to_json(frame)}
+        for number, frame in sorted(frames.items())
+    }
+    write_json(folder / NAME, {"format": FORMAT, "main": main, "sub_maps": sub_maps})
+
+
+def read_metric_file(folder: Path) -> dict[int, MetricFrame]:
+    """The frames by sub-map; empty for a dive without the file: of a peer, or an older one.
+
+    Raises:
+        InputError: the file is damaged, or of a newer AquaFlow.
+    """
+    return {number: frame for number, (_, frame) in _read(folder).items()}
+
+
+def read_main(folder: Path) -> int:
+    """The sub-map of ``map.aqf``; 0 for a dive without the file.
+
+    Raises:
+        InputError: the file is damaged, or of a newer AquaFlow.
+    """
+    return next((number for number, (name, _) in _read(folder).items() if name == "map.aqf"), 0)
+
+
+def read_frame_of_map(map_file: Path) -> MetricFrame:
+    """The frame of the sub-map in ``map_file``, ``map.aqf`` or ``map_N.aqf`` of a dive folder.
+
+    Raises:
+        InputError: the dive's ``metric.json`` is damaged, or of a newer AquaFlow.
+    """
+    found = [frame for name, frame in _read(map_file.parent).values() if name == map_file.name]
+    return found[0] if found else MetricFrame.unknown()
+
+
+def _map_name(number: int, main: int) -> str:
+    return "map.aqf" if number == main else f"map_{number}.aqf"
+
+
+def frame_to_json(frame: MetricFrame) -> dict[str, Any]:
+    """The frame as plain values, for this file and for checkpoints."""
+    T, T_bc = frame.T_nm, frame.T_bc
+    return {
+        "unit": frame.unit,
+        "metric": bool(frame.metric),  # a comparison of NumPy's numbers is no JSON
+        "level": bool(frame.level),
+        "north": frame.north,
+        "depth_known": bool(frame.depth_known),
+        "T_nm": _of_sim3(T),
+        "covariance": frame.covariance.tolist(),
+        "T_bc": None if T_bc is None else _of_sim3(T_bc),
+        "origin": None if frame.origin is None else asdict(frame.origin),
+        "scale_source": frame.scale_source,
+        "sources": [asdict(source) for source in frame.sources],
+        **({"site": frame.site} if frame.site else {}),
+    }
+
+
+def _of_sim3(T: Sim3) -> dict[str, Any]:
+    return {"scale": float(T.scale), "rotation": T.R.tolist(), "translation": T.t.tolist()}
+
+
+def _read(folder: Path) -> dict[int, tuple[str, MetricFrame]]:
+    """Map file and frame by sub-map."""
+    path = folder / NAME
+    if not path.is_file():
+        return {}
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(data["format"], int):
+            raise DamagedError("its format is no number")
+        if data["format"] == FORMAT:
+            return {
+                int(number): (str(stated["map"]), frame_of_json(stated))
+                for number, stated in data["sub_maps"].items()
+            }
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        what = f"key {error} is missing" if isinstance(error, KeyError) else reason_of(error)
+        raise InputError(f"cannot read {path}: {what}; map the dive again") from error
+    raise InputError(
+        f"{path} has format {data['format']}, this AquaFlow reads format {FORMAT}; update AquaFlow"
+    )
+
+
+def frame_of_json(stated: dict[str, Any]) -> MetricFrame:
+    """The frame that :func:`frame_to_json` made.
+
+    Raises:
+        DamagedError, KeyError, TypeError, ValueError: it is none.
+    """
+    covariance = np.asarray(stated["covariance"], np.float64)
+    if covariance.shape != (7, 7) or not np.isfinite(covariance).all():
+        raise DamagedError("a covariance is not 7 x 7 finite numbers")
+    if stated["north"] not in get_args(North):
+        raise DamagedError("north is none of the words that the format has")
+    origin, T_bc = stated["origin"], stated["T_bc"]
+    return MetricFrame(
+        T_nm=_to_sim3(stated["T_nm"]),
+        covariance=covariance,
+        metric=bool(stated["metric"]),
+        level=bool(stated["level"]),
+        north=stated["north"],
+        depth_known=bool(stated["depth_known"]),
+        origin=None if origin is None else Origin(**origin),
+        T_bc=None if T_bc is None else _to_sim3(T_bc),
+        scale_source=str(stated["scale_source"]),
+        sources=tuple(SourceReport(**source) for source in stated["sources"]),
+        site=str(stated.get("site", "")),
+    )
+
+
+def _to_sim3(stated: dict[str, Any]) -> Sim3:
+    R = np.asarray(stated["rotation"], np.float64)
+    t = np.asarray(stated["translation"], np.float64)
+    T = Sim3(R, t, float(stated["scale"]))
+    if R.shape != (3, 3) or t.shape != (3,) or not T.is_finite():
+        raise DamagedError("a transform is not finite")
+    if np.abs(R.T @ R - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(R) < 0.0:
+        raise DamagedError("a transform's rotation is none")
+    return T

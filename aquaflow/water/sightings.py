@@ -1,0 +1,167 @@
+"""The same patches of the scene's surface in all pictures that show them.
+
+Detail is lost with range: a far pixel covers more of the scene, and its light scatters more. What
+is lost that way looks like water if points are compared. So patches are, all of one size in the
+world in every view, and so large that the farthest view that shows one still resolves it: on
+rendered dives the contrast of patches changes with range by a hundredth of an optical depth or two,
+on real clips the water that is found does not depend on their size from 1 to 8 pixels.
+
+A patch is a grid of samples on the surface, lifted from the nearest view by the map's range. Each
+sample is looked up in the other views; what is hidden there, or in front of the map's surface, is
+no observation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from aquaflow.water.observations import Observations
+from aquaflow.water.pauses import PICTURES_AT_ONCE
+from aquaflow.water.posed_picture import PosedPicture
+
+Array = npt.NDArray[np.float64]
+Seen = npt.NDArray[np.bool_]
+
+POINTS = 800
+"""Patches looked at."""
+CANDIDATES = 4000
+"""Places on the surface that the patches are drawn from."""
+LEAST_SPAN = 0.1
+"""Added to the log of largest over smallest range, by which patches are drawn: those seen from near
+and far say most, those seen from one range alone something of the scene's colours."""
+MIN_VIEWS, MOST_VIEWS = 3, 8
+"""Views that must see a patch for it to say anything about the water; and how many of them are
+used, from the nearest to the farthest: more say little that is new."""
+SIGMA_PX = 2.0
+"""Of a patch in the farthest of its views, standard deviation of the Gaussian that weighs it."""
+SIDE, REACH = 5, 2.0
+"""Samples along a side of the patch's grid, and how many sigmas it reaches to each side."""
+SEEN_SHARE = 0.85
+"""Of a patch's samples that a view must show."""
+LEAST_TEXTURE = 0.008
+"""Deviation of a patch's samples in the nearest of its views, two grey levels. Where there is less,
+nothing is known of the range: open water, which a map has anywhere."""
+
+
+def sighting(
+    pictures: Sequence[PosedPicture], random: np.random.Generator
+) -> Generator[None, None, Observations]:
+    """Observations of a random choice of the surface that several of the pictures, at least one,
+    show; with pauses."""
+    places, ranges = _drawn(pictures, random)
+    yield
+    samples, sigma = _patches(pictures, places, ranges)
+    yield
+    colour, z, xy = (np.zeros((*ranges.shape, size)) for size in (3, 1, 2))
+    whole_patches = np.asarray(np.isfinite(samples).all(axis=(1, 2)))
+    seen = np.isfinite(ranges) & whole_patches[:, None]
+    for number, picture in enumerate(pictures):
+        own = np.nonzero(seen[:, number])[0]
+        *found, whole = _observed(picture, samples[own], sigma[own])
+        for table, values in zip((colour, z, xy), found, strict=True):
+            table[own, number] = values
+        seen[own, number] = whole
+        if number % PICTURES_AT_ONCE == PICTURES_AT_ONCE - 1:
+            yield
+    seen[seen.sum(axis=1) < MIN_VIEWS] = False
+    place, view = np.nonzero(seen)
+    used, point = np.unique(place, return_inverse=True)
+    return Observations(
+        point, view, colour[place, view], z[place, view, 0], xy[place, view], places[used]
+    )
+
+
+def _drawn(pictures: Sequence[PosedPicture], random: np.random.Generator) -> tuple[Array, Array]:
+    """Places [P, 3] in the world, and their range [P, V] in the views that are used; inf in
+    others."""
+    each = -(-CANDIDATES // max(len(pictures), 1))
+    places = np.concatenate(
+        [np.zeros((0, 3)), *(picture.random_surface(each, random) for picture in pictures)]
+    )
+    ranges = np.full((len(places), len(pictures)), np.inf)
+    for number, picture in enumerate(pictures):
+        _, z, seen = picture.located(places)
+        ranges[seen, number] = z[seen]
+    several = np.isfinite(ranges).sum(axis=1) >= MIN_VIEWS
+    places, ranges = places[several], ranges[several]
+    if len(places) > POINTS:
+        farthest = np.where(np.isfinite(ranges), ranges, 0.0).max(axis=1)
+        weight = LEAST_SPAN + np.log(farthest / ranges.min(axis=1))
+        chosen = random.choice(len(places), POINTS, replace=False, p=weight / weight.sum())
+        places, ranges = places[chosen], ranges[chosen]
+    return places, _over_all_ranges(ranges)
+
+
+def _over_all_ranges(
+    ranges: Array,  # [P, V], inf where not seen
+) -> Array:
+    """[P, V] with at most MOST_VIEWS of each place left: nearest, farthest, and evenly between."""
+    order = np.argsort(ranges, axis=1, kind="stable")
+    count = np.isfinite(ranges).sum(axis=1)
+    wanted = np.linspace(0.0, 1.0, MOST_VIEWS) * (count - 1)[:, None]
+    used = np.take_along_axis(order, np.rint(wanted).astype(np.int64), axis=1)
+    kept = np.full_like(ranges, np.inf)
+    np.put_along_axis(kept, used, np.take_along_axis(ranges, used, axis=1), axis=1)
+    return kept
+
+
+def _patches(
+    pictures: Sequence[PosedPicture],
+    places: Array,  # [P, 3] world
+    ranges: Array,  # [P, V], inf where not used
+) -> tuple[Array, Array]:
+    """Samples of each patch [P, K, 3], NaN where its nearest view does not show all of it; and its
+    sigma [P], map units."""
+    focal = np.array([picture.focal for picture in pictures])
+    sigma = np.where(np.isfinite(ranges), ranges / focal, 0.0).max(axis=1) * SIGMA_PX
+    nearest = ranges.argmin(axis=1) if len(places) else np.zeros(0, np.int64)
+    grid, _ = _grid()
+    samples = np.full((len(places), len(grid), 3), np.nan)
+    for number, picture in enumerate(pictures):
+        own = np.nonzero(nearest == number)[0]
+        pixels, z, _ = picture.located(places[own])
+        pixels = pixels[:, None] + (sigma[own] * picture.focal / z)[:, None, None] * grid
+        lifted = picture.lifted(pixels)
+        whole = picture.located(lifted)[2].all(axis=1)
+        colours = picture.sampled(pixels, _aperture(picture, sigma[own], z))
+        whole &= colours.mean(axis=-1).std(axis=1) > LEAST_TEXTURE
+        samples[own[whole]] = lifted[whole]
+    return samples, sigma
+
+
+def _observed(
+    picture: PosedPicture,
+    samples: Array,  # [N, K, 3] world
+    sigma: Array,  # [N] map units
+) -> tuple[Array, Array, Array, Seen]:
+    """Of each patch colour [N, 3], range [N, 1], place in the picture [N, 2], and whether it is
+    seen [N]."""
+    _, weight = _grid()
+    pixels, z, seen = picture.located(samples)
+    z = z @ weight
+    colours = picture.sampled(pixels, _aperture(picture, sigma, z))
+    colour = np.einsum("k,nkc->nc", weight, colours)
+    size = np.array([picture.camera.width, picture.camera.height])
+    xy = np.einsum("k,nkc->nc", weight, pixels) / (0.5 * size) - 1.0
+    return colour, z[:, None], xy, seen.mean(axis=1) > SEEN_SHARE
+
+
+def _aperture(
+    picture: PosedPicture,
+    sigma: Array,  # [N] of patches, map units
+    z: Array,  # [N] their ranges
+) -> Array:
+    """[N] px that a sample averages: half of what lies between two samples."""
+    spacing = 2.0 * REACH / (SIDE - 1) * sigma * picture.focal / z
+    return 0.5 * spacing
+
+
+def _grid() -> tuple[Array, Array]:
+    """[K, 2] in sigmas, and the weights [K] of a Gaussian."""
+    line = np.linspace(-REACH, REACH, SIDE)
+    grid = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    weight = np.exp(-0.5 * (grid**2).sum(axis=1))
+    return grid, weight / weight.sum()

@@ -1,0 +1,1 @@
+"""The web server under the service's page and the viewer, and who may ask it."""

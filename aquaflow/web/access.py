@@ -1,0 +1,157 @@
+"""Access control: open to this machine; other clients need the token, or a trusted address."""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
+
+from aquaflow.base.errors import ConfigError, InputError, reason_of
+from aquaflow.config.service import ListenConfig, is_loopback
+
+COOKIE = "aquaflow_token"
+"""Name of the cookie in which a browser keeps the token."""
+COOKIE_S = 365 * 24 * 3600
+"""s that a browser keeps the cookie: the token is asked for once a year."""
+SHORTEST_TOKEN = 16
+"""Characters; shorter ones can be guessed."""
+
+
+def read_token(path: Path) -> str:
+    """The token in a file that only its owner may read.
+
+    Raises:
+        InputError: the file cannot be read.
+        ConfigError: others may read it, or the token is short.
+    """
+    try:
+        token = path.read_text(encoding="ascii").strip()
+        mode = path.stat().st_mode
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read the token file {path}: {reason_of(error)}") from error
+    if mode & (stat.S_IRWXO | stat.S_IWGRP):
+        raise ConfigError(f"others may read or change {path}; run: chmod 640 {path}")
+    if len(token) < SHORTEST_TOKEN:
+        raise ConfigError(f"the token in {path} is shorter than {SHORTEST_TOKEN} characters")
+    return token
+
+
+class Access:
+    """The rule of one listening socket."""
+
+    def __init__(self, config: ListenConfig) -> None:
+        """Raises what :func:`read_token` raises."""
+        self.token = None if config.token_file is None else read_token(config.token_file)
+        self._trusted = tuple(config.trusted)
+
+    def allows(self, target: str, headers: Mapping[str, str], peer: str = "") -> bool:
+        """True if a request may be answered.
+
+        Without a token the request must name this machine: else a web page that a name server
+        leads here could read what is only for those on board. So must one from a trusted network
+        name a machine of that network.
+
+        Args:
+            target: path and query, as the client wrote them.
+            headers: by lower-case name.
+            peer: the address that the connection comes from.
+        """
+        name = name_of(headers.get("host", ""))
+        if self.token is None:
+            return is_loopback(name)
+        shown = any(self.is_token(given) for given in _tokens(target, headers))
+        return shown or (_is_local(name) and self._trusts(_client(peer, headers)))
+
+    def may_change(self, headers: Mapping[str, str], peer: str = "") -> bool:
+        """True if a request may change something.
+
+        The token must come in a header or in the cookie, which no other page's request carries: an
+        address may be a link. A browser that names the page which asks must name one of ours.
+        """
+        return self.allows("", headers, peer) and _is_own_page(headers)
+
+    def by_query(self, target: str) -> bool:
+        """True if the address itself carries the token: it belongs into a cookie then."""
+        return any(self.is_token(given) for given in _asked(target))
+
+    def is_token(self, given: str) -> bool:
+        """Compare in constant time."""
+        token = self.token
+        return token is not None and hmac.compare_digest(
+            given.encode(errors="replace"), token.encode()
+        )
+
+    def cookie(self) -> str:
+        """The Set-Cookie header of a browser that showed the token."""
+        return f"{COOKIE}={self.token}; HttpOnly; SameSite=Strict; Path=/; Max-Age={COOKIE_S}"
+
+    def _trusts(self, client: str) -> bool:
+        try:
+            address = ipaddress.ip_address(client)
+        except ValueError:
+            return False
+        mapped = getattr(address, "ipv4_mapped", None)
+        return any((mapped or address) in network for network in self._trusted)
+
+
+def _is_own_page(headers: Mapping[str, str]) -> bool:
+    """False for what a browser sends on behalf of another site's page (Fetch Metadata, Origin)."""
+    if headers.get("sec-fetch-site", "none") not in ("same-origin", "none"):
+        return False
+    origin = headers.get("origin")
+    return origin is None or origin.partition("://")[2] == headers.get("host", "")
+
+
+def name_of(host: str) -> str:
+    """The name in a Host header, without port and brackets."""
+    return host[1:].partition("]")[0] if host.startswith("[") else host.partition(":")[0]
+
+
+def _is_local(name: str) -> bool:
+    """True of an address, and of a name that no name server of the Internet answers."""
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return "." not in name or name.lower().endswith(".local")
+    return True
+
+
+def _client(peer: str, headers: Mapping[str, str]) -> str:
+    """A proxy on this machine, such as BlueOS's, states the address of the client that it serves;
+    from elsewhere that header is only a claim."""
+    stated = headers.get("x-real-ip", "")
+    return stated if stated and is_loopback(peer) else peer
+
+
+def _tokens(target: str, headers: Mapping[str, str]) -> list[str]:
+    """What the request shows as token: header, cookie or query."""
+    given = _asked(target)
+    scheme, _, value = headers.get("authorization", "").partition(" ")
+    if scheme.lower() == "bearer":
+        given.append(value.strip())
+    # Not by http.cookies, which gives up at the first cookie that it does not understand; and a
+    # browser sends those of every service of the vehicle, whatever its port.
+    for pair in headers.get("cookie", "").split(";"):
+        name, _, value = pair.strip().partition("=")
+        if name == COOKIE:
+            given.append(value)
+    return given
+
+
+def path_of(target: str) -> str | None:
+    """The path of a request's target; None if it is no address at all."""
+    try:
+        return urlsplit(target).path
+    except ValueError:
+        return None
+
+
+def _asked(target: str) -> list[str]:
+    """Tokens in the query of a request's target."""
+    try:
+        return parse_qs(urlsplit(target).query).get("token", [])
+    except ValueError:
+        return []

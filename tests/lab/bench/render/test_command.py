@@ -1,0 +1,178 @@
+"""``aquaflow bench render`` as a whole: contenders, peers, failures, files, command line."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+from functools import partial
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from aquaflow.base.errors import InputError
+from aquaflow.cli import app
+from aquaflow.lab.bench.render import benchmark as bm
+from aquaflow.lab.bench.render import peak as peaks
+from aquaflow.lab.bench.render import sizes
+from aquaflow.lab.bench.render.contenders import Timed, contenders_here, thread_counts
+from aquaflow.lab.bench.render.opensplat import NOTE, OpenSplat
+from aquaflow.lab.bench.render.parts import parts_of
+from aquaflow.lab.bench.render.sizes import SIZES
+from aquaflow.lab.bench.render.table import print_result
+from aquaflow.render.example_scene import NAMES, SMALL, Size, height_field
+from aquaflow.render.native.build import supported_isas
+from tests.command_line import refused, run_aquaflow
+from tests.lab.bench.render.pretended_renderer import PEAK, TINY, Pretended, SlowedClock
+
+
+def quiet(stage: str, done: int, total: int | None) -> None:
+    """Progress that nobody looks at."""
+
+
+def test_everything_that_runs_here_is_a_contender() -> None:
+    found, notes = contenders_here()
+    kinds = {(c.name, c.isa, c.threads) for c in found}
+    counts = thread_counts()
+    assert {("cpu", isa, count) for isa in supported_isas() for count in counts} <= kinds
+    assert {("tiles", "torch", count) for count in counts} <= kinds
+    assert ("reference", "torch", 1) in kinds
+    assert any(c.name == "gsplat" for c in found) != any("gsplat" in note for note in notes)
+    largest = max(SIZES, key=lambda size: size.n * size.pixels)
+    assert {c.name for c in found if c.takes(largest)} <= {"cpu", "gsplat"}
+    assert all(c.takes(SMALL) for c in found)
+
+
+def script(folder: Path, ending: str) -> str:
+    """A program as the user would bring it: reads the scene, then does as ``ending`` says."""
+    file = folder / "peer.py"
+    file.write_text(
+        "import json, pathlib, sys\n"
+        "folder = pathlib.Path(sys.argv[1])\n"
+        "scene = json.loads((folder / 'scene.json').read_text())\n"
+        "bytes_of = {n: (folder / f'{n}.f32').stat().st_size for n in scene['arrays']}\n" + ending
+    )
+    return f"{sys.executable} {file}"
+
+
+def test_opensplat_gets_the_scene_and_says_its_times(tmp_path: Path) -> None:
+    ending = (
+        f"assert set(scene['arrays']) == set({[*NAMES, 'K', 'g_image', 'g_alpha']!r})\n"
+        "assert scene['arrays']['colours'] == [scene['n'], 3]\n"
+        "assert scene['arrays']['g_image'] == [scene['height'], scene['width'], 3]\n"
+        "assert bytes_of['means'] == 4 * 3 * scene['n']\n"
+        "print('warming up')\n"
+        "print(json.dumps({'fwd_ms': 7, 'bwd_ms': scene['n'] / 100}))\n"
+    )
+    sample = OpenSplat(script(tmp_path, ending)).sample(height_field(TINY))
+    assert (sample.fwd_ms, sample.bwd_ms, sample.fwd_cpu_ms) == (7.0, 2.0, None)
+    found, notes = contenders_here(script(tmp_path, ending))
+    assert found[-1].name == "opensplat"
+    assert NOTE in notes
+
+
+@pytest.mark.parametrize(
+    ("ending", "said"),
+    [("sys.exit('no such GPU')", "no such GPU"), ("print('done')", "its last line is not")],
+)
+def test_a_peer_that_fails_costs_only_its_own_row(tmp_path: Path, ending: str, said: str) -> None:
+    peer = OpenSplat(script(tmp_path, ending))
+    full = Timed(Pretended(SlowedClock(), fails_after=0))
+    time, notes = SlowedClock(), list[str]()
+    good = Timed(Pretended(time), clock=time.clock())
+    rows = bm.time_sizes([full, peer, good], [TINY], 2, PEAK, notes, quiet)
+    assert [(row["renderer"], row["n"], row["repeats"]) for row in rows] == [("pretended", 200, 2)]
+    assert len(notes) == 2
+    assert notes[0] == "pretended (none) failed at 400, 96 x 72: no room"
+    assert said in notes[1]
+
+
+def test_a_renderer_that_fails_between_its_repeats_has_no_row() -> None:
+    time, notes = SlowedClock(), list[str]()
+    tiring = Timed(Pretended(time, fails_after=3), clock=time.clock())  # two of them uncounted
+    assert bm.time_sizes([tiring], [TINY], 2, PEAK, notes, quiet) == []
+    assert notes == ["pretended (none) failed at 200, 52 x 39: no room"]
+
+
+@pytest.mark.parametrize("command", ["", "no-such-program --fast", "'unclosed"])
+def test_a_peer_that_is_not_there_is_refused(command: str) -> None:
+    with pytest.raises(InputError, match="--opensplat"):
+        OpenSplat(command)
+
+
+@pytest.fixture
+def small_benchmark(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The whole command in seconds."""
+    monkeypatch.setattr(peaks, "STEPS", 20_000)
+    monkeypatch.setattr(sizes, "QUICK_SIZES", (TINY, Size(400, 52, 39)))
+    monkeypatch.setattr(bm, "parts_of", partial(parts_of, pictures=[(32, 24)], rows=[50]))
+
+
+@pytest.mark.usefixtures("small_benchmark")
+@pytest.mark.ci
+def test_the_benchmark_writes_rows_gradients_and_a_picture(tmp_path: Path) -> None:
+    arguments = ["bench", "render", "--quick", "--repeats", "2", "--json", "--out", str(tmp_path)]
+    ran = CliRunner().invoke(app, arguments)
+    assert ran.exit_code == 0, ran.output
+    written = json.loads((tmp_path / bm.JSON_FILE).read_text())
+    assert json.loads(ran.stdout) == written
+    keys = {"renderer", "isa", "threads", "n", "width", "height", "fwd_ms", "bwd_ms", "stage_ms"}
+    assert all(keys <= set(row) for row in written["rows"])
+    fastest = [row for row in written["rows"] if row["isa"] == supported_isas()[0]]
+    assert len(fastest) == 3 * len(thread_counts())  # and the small scene
+    assert all(row["share_of_peak"]["both"] > 0.0 for row in fastest)
+    assert all(row["share_of_blend_limit"]["both"] > 0.0 for row in fastest)
+    assert set(written["machine"]["blend_limit"]) == set(supported_isas())
+    assert set(written["gradient_rel_error"]) == set(NAMES)
+    assert 0.0 < max(written["gradient_rel_error"].values()) <= 5e-5
+    assert {"processor", "load", "peak_gflop_per_s", "peak_method"} <= set(written["machine"])
+    assert (tmp_path / bm.PICTURE_FILE).read_bytes().startswith(b"\x89PNG")
+    page = io.StringIO()
+    print_result(written, Console(file=page, width=200))
+    shown = page.getvalue()
+    for name in (*supported_isas(), "reference", "L1 + SSIM", "GFLOP/s", "means"):
+        assert name in shown
+
+
+# --- the command line -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", [("--suite", "real", "DATA"), ("DATA", "--suite", "real")])
+def test_bench_still_takes_a_suite_and_a_folder_in_any_order(
+    tmp_path: Path, order: tuple[str, ...]
+) -> None:
+    refused(
+        run_aquaflow("bench", *(tmp_path if word == "DATA" else word for word in order)), tmp_path
+    )
+
+
+def test_what_is_neither_a_command_nor_a_suite_is_refused() -> None:
+    refused(run_aquaflow("bench", "rendr"), "rendr", "render")
+    refused(run_aquaflow("bench"), "nothing to run")
+
+
+def test_bench_render_refuses_in_one_sentence(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_text("x")
+    refused(run_aquaflow("bench", "render", "--out", file), file)
+    refused(run_aquaflow("bench", "render", "--opensplat", "no-such-program"), "no-such-program")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "shown"),
+    [(("bench", "--help"), "--suite"), (("bench", "render", "--help"), "--opensplat")],
+)
+def test_both_commands_explain_themselves(arguments: tuple[str, ...], shown: str) -> None:
+    ran = CliRunner().invoke(app, arguments)
+    assert ran.exit_code == 0
+    assert shown in ran.output
+    assert "bench render" in ran.output
+
+
+@pytest.mark.parametrize("option", [("--repeats", "0"), ("--sizes", "3"), ("extra",)])
+def test_wrong_options_of_bench_render_are_usage_errors(option: tuple[str, ...]) -> None:
+    ran = CliRunner().invoke(app, ["bench", "render", *option])
+    assert ran.exit_code == 2
+    assert option[0] in ran.output

@@ -1,0 +1,173 @@
+"""`aquaflow prior train compact`: from nothing to a folder that tracks, and its record."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from typer.testing import CliRunner
+
+from aquaflow import cli
+from aquaflow.lab.training import compact, compact_figures, compact_run, held_out
+from aquaflow.lab.training.compact import CompactSettings
+from aquaflow.lab.training.compact_figures import LEAST_FACTOR, with_honest_range
+from aquaflow.lab.training.compact_recall import tracked_recall
+from aquaflow.lab.training.compact_run import CompactRun, calibration, hardware_of, training_record
+from aquaflow.lab.training.correspondences import overlap
+from aquaflow.lab.training.held_out import SETS, held_out_pairs, turned_pictures
+from aquaflow.lab.training.pair_generator.cameras import TRAINING, Motion
+from aquaflow.lab.training.pair_generator.pool import Pool
+from aquaflow.lab.training.pair_generator.scene import Detail
+from aquaflow.prior.compact import network as compact_network
+from aquaflow.prior.compact.network import CompactPrior, Encoded, NetworkSize
+from aquaflow.prior.folder import read_card
+from tests.lab.training.small_maps import small_dive
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+PLAIN = Detail()
+SMALL = NetworkSize(levels=(8, 8, 12, 16), merged=(16, 12, 8), fine=8, coarse=16, head=4)
+WIDE = SETS["wide"]
+
+
+def small_pool(folder: Path, seed: int, motion: Motion = TRAINING, detail: Detail = PLAIN) -> Pool:
+    """With scenes and pictures of a size that takes seconds."""
+    detail = Detail(terrain=64, texture=128, regular=detail.regular)
+    return Pool(folder, seed, 96, 64, motion, detail)
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scenes, network and held-out set of a size that takes seconds."""
+    monkeypatch.setattr(held_out, "Pool", small_pool)
+    monkeypatch.setattr(compact_run, "Pool", small_pool)
+    monkeypatch.setattr(compact_run, "CompactPrior", partial(CompactPrior, SMALL))
+    monkeypatch.setattr(compact_run, "held_out_pairs", partial(held_out_pairs, count=4))
+
+
+@pytest.mark.usefixtures("small")
+def test_held_out_pairs_overlap_and_are_the_same_again(tmp_path: Path) -> None:
+    one, again = (held_out_pairs(tmp_path / name, WIDE, count=4) for name in ("a", "b"))
+    assert sum(len(pair.a.K) for pair in one) == 4
+    assert all(bool((overlap(pair) >= held_out.LEAST_OVERLAP).all()) for pair in one)
+    assert torch.equal(one[0].a.image, again[0].a.image)
+
+
+@pytest.mark.usefixtures("small")
+def test_flow_from_good_cells_finds_more_than_from_none(tmp_path: Path) -> None:
+    pairs = held_out_pairs(tmp_path, WIDE, count=4)
+    where: dict[int, Tensor] = {}
+    for pair in pairs:  # descriptors that know the place itself
+        for view in (pair.a, pair.b):
+            points = view.points() @ view.T_wc[:, None, :3, :3].mT + view.T_wc[:, None, None, :3, 3]
+            waves = torch.cat([f * points for f in (0.5, 1.0, 2.0)], -1)[:, 4::8, 4::8]
+            D = torch.cat([waves.sin(), waves.cos()], -1)
+            where[id(view.image)] = torch.nn.functional.normalize(D, dim=-1).permute(0, 3, 1, 2)
+
+    def knows(images: Tensor) -> Encoded:
+        return Encoded(where[id(images)], where[id(images)], images)
+
+    known, nothing = tracked_recall(knows, pairs), tracked_recall(None, pairs)
+    assert known["smooth_8px"] > nothing["smooth_8px"]
+    assert known["flow_2px"] > nothing["flow_2px"]
+
+
+def test_the_record_holds_seeds_work_hardware_and_figures() -> None:
+    run = CompactRun(seed=3, steps=10, maps=(Path("dives/reef"),))
+    rows = [{"step": 10.0, "cpu_s": 1.0, "rate": 0.1, "loss_coarse": 2.0, "fine_2px": 0.51239}]
+    record = training_record(run, rows, hardware_of("cpu"))
+    assert (record["seed"], record["steps"], record["pairs"]) == (3, 10, 80)
+    assert record["maps"] == ["reef"]
+    assert record["held_out"] == {"fine_2px": 0.5124}
+    assert "CPU" in record["hardware"]
+
+
+@pytest.mark.usefixtures("small")
+def test_calibration_shows_pictures_that_the_network_takes(tmp_path: Path) -> None:
+    pictures = calibration(small_pool(tmp_path, 1))
+    assert {picture.shape for picture in pictures} == {(1, 3, 64, 96)}
+    assert all(picture.min() >= 0.0 and picture.max() <= 1.0 for picture in pictures)
+
+
+def test_real_pictures_give_held_out_pairs_of_the_tracked_size(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (90, 120, 3), np.uint8)
+    cv2.imwrite(str(tmp_path / "noise.png"), cv2.resize(noise, (480, 360)))
+    one, again = (turned_pictures([tmp_path], count=8) for _ in "ab")
+    assert [pair.a.image.shape for pair in one] == [(8, 3, 240, 320)]
+    assert torch.equal(one[0].b.image, again[0].b.image)
+    assert float(overlap(one[0]).median()) > 0.2
+
+
+def test_windows_grow_when_the_rate_falls() -> None:
+    run = CompactRun(steps=100, warm_up=1)
+    assert run.looks_at(0).width == run.looks_at(69).width == run.looks.width
+    assert run.looks_at(70).width == run.late_looks.width > run.looks.width
+
+
+@pytest.mark.parametrize(("spread", "factor"), [(0.5, LEAST_FACTOR), (1.5, 2.25)])
+def test_a_variance_is_widened_where_errors_are_larger_and_never_narrowed(
+    spread: float, factor: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    errors = torch.tensor([-spread, spread])
+    monkeypatch.setattr(compact_figures, "onnx_encoder", lambda path: None)
+    monkeypatch.setattr(compact_figures, "onnx_comparison", lambda path: None)
+    monkeypatch.setattr(compact_figures, "normalised_errors", lambda *inputs: errors)
+    shipped = Path(compact_network.__file__).parents[2] / "weights" / "compact"
+    folder = Path(shutil.copytree(shipped, tmp_path / "prior"))
+    card = with_honest_range(folder, read_card(folder), [])
+    assert card.range_variance_factor == pytest.approx(factor)
+    assert read_card(folder) == card
+
+
+@pytest.mark.usefixtures("small")
+def test_the_command_stops_when_its_hours_are_over(tmp_path: Path) -> None:
+    options = ["--scenes", "8", "--batch", "2", "--steps", "3", "--out", str(tmp_path)]
+    result = CliRunner().invoke(cli.app, ["prior", "train", "compact", *options, "--hours", "0"])
+    assert result.exit_code == 0, result.output
+    assert "give the same command to go on" in result.stdout
+    assert (tmp_path / "checkpoint.pt").is_file()
+    assert not (tmp_path / compact_run.PRIOR).exists()
+
+
+@pytest.mark.usefixtures("small")
+def test_the_command_takes_maps_of_dives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    dive = small_dive(tmp_path / "dive")
+    out = tmp_path / "out"
+    options = ["--scenes", "8", "--batch", "2", "--steps", "3", "--out", str(out), "--hours", "0"]
+    command = ["prior", "train", "compact", *options, "--maps", str(dive)]
+    monkeypatch.setattr(compact, "CompactSettings", partial(CompactSettings, map_pairs=16))
+    result = CliRunner().invoke(cli.app, command)
+    assert result.exit_code == 0, result.output
+    assert len(list((out / compact_run.POOL).glob("map_*.pt"))) == 2
+    missing = CliRunner().invoke(cli.app, [*command, "--maps", str(tmp_path / "missing")])
+    assert missing.exit_code != 0
+    assert "finished dive" in str(missing.exception or missing.output)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("small")
+def test_the_command_trains_exports_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime", reason="pip install 'aquaflow[prior]'")
+    pytest.importorskip("onnxscript", reason="pip install 'aquaflow[export]'")
+    options = ["--scenes", "16", "--batch", "2", "--out", str(tmp_path), "--json"]
+    command = ["prior", "train", "compact", *options]
+    first = CliRunner().invoke(cli.app, [*command, "--steps", "2"])
+    assert first.exit_code == 0, first.output
+    card = read_card(tmp_path / compact_run.PRIOR)
+    assert card.training is not None
+    assert json.loads(first.stdout) == card.training
+    assert max(card.parity.values()) <= 1e-4
+    assert set(card.training["figures"]) == {"wide", "wider", "hard"}
+    assert card.range_variance_factor >= LEAST_FACTOR
+    again = CliRunner().invoke(cli.app, [*command, "--steps", "3"])
+    assert json.loads(again.stdout)["steps"] == 3
+
+    rows = json.loads((tmp_path / "history.json").read_text())
+    assert [row["step"] for row in rows] == [2.0, 3.0]

@@ -1,0 +1,180 @@
+"""Ranges of known surfaces, fused to triangles: planes, spheres, holes and haze."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aquaflow.base.errors import InputError
+from aquaflow.survey.export.mesh import blocks as blocks_module
+from aquaflow.survey.export.mesh import colouring
+from aquaflow.survey.export.mesh.atlas import lay_out, painted
+from aquaflow.survey.export.mesh.blocks import Blocks, truncation
+from aquaflow.survey.export.mesh.colouring import look_at
+from aquaflow.survey.export.mesh.triangle_mesh import TriangleMesh
+from tests.survey.export.mesh_scenes import (
+    FAR_CAMERA,
+    RADIUS,
+    SIGMA,
+    VOXEL,
+    Array,
+    above_plane,
+    around_sphere,
+    fused_mesh,
+    plane_with_hole,
+    surfaces_of,
+    to_plane,
+    to_sphere,
+)
+
+pytest.importorskip("skimage", reason="scikit-image is not installed")
+trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed")
+
+
+@pytest.fixture(scope="module")
+def sphere(tmp_path_factory: pytest.TempPathFactory) -> TriangleMesh:
+    poses = around_sphere()
+    work = tmp_path_factory.mktemp("sphere")
+    return fused_mesh(surfaces_of(poses, [to_sphere] * len(poses), work, FAR_CAMERA))
+
+
+def read(mesh: TriangleMesh) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+
+
+def test_a_sphere_is_closed_across_chunks_and_as_large_as_it_is(sphere: TriangleMesh) -> None:
+    # 2 / 0.03 voxels: eight chunks at least.
+    assert np.ptp(np.floor(sphere.vertices / (64 * VOXEL)), axis=0).min() >= 1.0
+    found = read(sphere)
+    assert found.is_watertight
+    assert found.is_winding_consistent
+    assert found.euler_number == 2
+    error = np.linalg.norm(sphere.vertices, axis=1) - RADIUS
+    assert np.sqrt(np.mean(error**2)) < 0.05 * VOXEL
+    assert np.abs(error).max() < 0.5 * VOXEL
+    assert found.volume == pytest.approx(4.0 / 3.0 * np.pi * RADIUS**3, rel=0.01)
+    assert sphere.area() == pytest.approx(found.area)
+
+
+def test_normals_point_to_where_the_cameras_are(sphere: TriangleMesh) -> None:
+    outward = sphere.vertices / np.linalg.norm(sphere.vertices, axis=1, keepdims=True)
+    cosine = (sphere.normals() * outward).sum(axis=1)
+    assert cosine.min() > 0.9
+    assert cosine.mean() > 0.999
+
+
+def test_a_plane_is_flat_and_a_hole_in_it_stays_a_hole(tmp_path: Path) -> None:
+    poses = above_plane()
+    whole = fused_mesh(surfaces_of(poses, [to_plane] * 5, tmp_path))
+    holed = fused_mesh(surfaces_of(poses, [plane_with_hole] * 5, tmp_path))
+    for mesh in (whole, holed):
+        assert np.abs(mesh.vertices[:, 2]).max() < 0.02 * VOXEL
+        assert (mesh.normals()[:, 2] > 0.999).all()
+    near = np.hypot(*whole.vertices[:, :2].T) < 0.2
+    assert near.sum() > 100
+    assert not (np.hypot(*holed.vertices[:, :2].T) < 0.2).any()
+    assert read(whole).euler_number == 1
+    assert read(holed).euler_number == 0
+
+
+def test_haze_that_one_view_has_before_the_ground_is_taken_away(tmp_path: Path) -> None:
+    def hazy(centre: Array, rays: Array) -> Array:
+        ranges = to_plane(centre, rays)
+        ranges[40:50, 50:70] *= 0.6
+        return ranges
+
+    mesh = fused_mesh(surfaces_of(above_plane(), [hazy, *[to_plane] * 4], tmp_path))
+    assert np.abs(mesh.vertices[:, 2]).max() < 0.1 * VOXEL
+    shown_by_one = fused_mesh(surfaces_of(above_plane()[:1], [hazy], tmp_path), least_views=1)
+    assert shown_by_one.vertices[:, 2].max() > 0.5
+
+
+def test_what_one_view_alone_shows_is_a_hole(tmp_path: Path) -> None:
+    surfaces = surfaces_of(above_plane()[:1], [to_plane], tmp_path)
+    assert not len(fused_mesh(surfaces).faces)
+    assert len(fused_mesh(surfaces, least_views=1).faces) > 1000
+
+
+def test_errors_of_single_views_are_averaged(tmp_path: Path) -> None:
+    random = np.random.default_rng(5)
+
+    def noisy(centre: Array, rays: Array) -> Array:
+        smooth = to_plane(centre, rays)
+        return smooth + random.normal(0.0, SIGMA, smooth.shape)
+
+    mesh = fused_mesh(surfaces_of(above_plane(), [noisy] * 5, tmp_path))
+    inner = (np.abs(mesh.vertices[:, :2]) < 0.4).all(axis=1)
+    assert 0.0 < np.sqrt(np.mean(mesh.vertices[inner, 2] ** 2)) < 0.75 * SIGMA
+
+
+def test_the_truncation_follows_the_sigma_between_three_and_six_voxels() -> None:
+    sigmas = np.array([0.0, 1.5, 9.0])
+    np.testing.assert_allclose(truncation(sigmas, 1.0), [3.0, 4.5, 6.0])
+
+
+def test_small_pieces_go_and_large_ones_stay() -> None:
+    square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    both = TriangleMesh(np.vstack([square, 0.1 * square + 5.0]), np.vstack([faces, faces + 4]))
+    left = both.without_small_pieces(0.5)
+    np.testing.assert_array_equal(left.vertices, square)
+    np.testing.assert_array_equal(left.faces, faces)
+    assert len(both.without_small_pieces(0.001).faces) == 4
+    assert not len(both.without_small_pieces(2.0).faces)
+
+
+def test_the_sigma_of_a_place_is_what_rays_of_one_pixel_leave_open(tmp_path: Path) -> None:
+    poses = above_plane()
+    surfaces = surfaces_of(poses, [to_plane] * 5, tmp_path)
+    seen = look_at(surfaces, np.array([[0.0, 0.1, 0.0], [9.0, 9.0, 0.0]]), VOXEL)
+    assert not np.isfinite(seen.sigma[1])
+    assert not np.isfinite(seen.nearest[1])
+    # Five rays within 0.3 of each other from 2 above: a pixel is 0.02, the height worse.
+    assert 0.02 < seen.sigma[0] < 0.12
+    np.testing.assert_allclose(seen.radiance[0], [0.5, 0.6, 0.5], atol=0.02)
+    one = look_at(surfaces_of(poses[:1], [to_plane], tmp_path), np.zeros((1, 3)), VOXEL)
+    assert one.sigma[0] > 1e3
+    assert np.isfinite(one.nearest[0])
+
+
+def test_too_many_voxels_are_refused_in_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    surfaces = surfaces_of(above_plane(), [to_plane] * 5, tmp_path)
+    monkeypatch.setattr(blocks_module, "MOST_BLOCKS", 20)
+    with pytest.raises(InputError, match="give a larger --resolution"):
+        Blocks(surfaces, VOXEL)
+    with pytest.raises(InputError, match="too small for a dive of this extent"):
+        Blocks(surfaces, 1e-8)
+
+
+def test_a_texture_has_the_colours_of_its_places_up_to_its_seams(
+    sphere: TriangleMesh, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("xatlas", reason="xatlas is not installed")
+    monkeypatch.setattr(colouring, "BATCH", 1000)
+
+    def colour(places: Array):  # type: ignore[no-untyped-def]  # as in atlas.Colour
+        return np.clip(127.0 * (places + 1.0), 0, 255).astype(np.uint8), places[:, 2] < 0.99
+
+    layout = lay_out(sphere, VOXEL)
+    picture = painted(sphere, layout, colour)
+    assert picture.shape == (layout.height, layout.width, 3)
+    np.testing.assert_array_equal(layout.source[layout.faces], sphere.faces)
+    corners = layout.places[layout.faces].mean(axis=1).astype(int)
+    found = picture[corners[:, 1], corners[:, 0]]
+    expected, _ = colour(sphere.vertices[sphere.faces].mean(axis=1))
+    error = np.abs(found.astype(float) - expected)
+    assert error.mean() < 2.0
+    assert error.max() < 20.0  # in the cap without a colour, 0.15 across
+
+
+def test_a_texture_that_would_be_too_large_is_coarser(
+    sphere: TriangleMesh, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("xatlas", reason="xatlas is not installed")
+    monkeypatch.setattr("aquaflow.survey.export.mesh.atlas.LARGEST_SIDE", 128)
+    layout = lay_out(sphere, 0.001)
+    assert max(layout.width, layout.height) <= 256
