@@ -82,7 +82,7 @@ def read_dive(path: str | os.PathLike[str]) -> Dive:
     """
     folder = Path(path)
     frames = read_rows(folder / "frames.csv")
-    trajectory = read_tum(folder / "trajectory.tum")
+    trajectory = read_tum(folder / "trajectory.tum", inside=True)
     times_s = np.array([row.t_s for row in frames])
     medium, active = None, False
     if (folder / "medium.json").is_file():
@@ -92,7 +92,7 @@ def read_dive(path: str | os.PathLike[str]) -> Dive:
         frames=frames,
         trajectory=trajectory,
         frame_of_pose=rows_of_poses(folder, trajectory, times_s),
-        camera=load_camera(folder / "camera.yaml"),
+        camera=load_camera(folder / "camera.yaml", inside=True),
         medium=medium if active else None,
         metrics=read_metrics(folder),
         metric_frames=read_metric_file(folder),

@@ -160,6 +160,8 @@ def load_map(
     file = Path(path)
     if file.is_dir():
         file /= f"map{SUFFIX}"
+    elif file.is_symlink():  # the user's own
+        file = file.resolve()
     return Map(read_map_file(file, select_renderer(renderer, threads)), read_frame_of_map(file))
 
 

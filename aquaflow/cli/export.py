@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.errors.regular_file import refuse_linked_folders
 from aquaflow.cli.console import Json, progress_bars
 
 
@@ -123,7 +124,7 @@ def export(
         raise InputError(f"--resolution {resolution:g} is no size of a pixel; give a positive one")
     if not (dive / MAP_FILE).exists():
         raise InputError(f"{dive} holds no finished dive: {MAP_FILE} is missing")
-    target = out or dive / NAMES[format]
+    target = out or _own_target(dive / NAMES[format])
     with progress_bars(quiet=as_json) as bars:
 
         def progress(done: int, total: int) -> None:
@@ -148,6 +149,17 @@ def export(
         typer.echo(json.dumps({"out": str(target), **facts}))
     else:
         typer.echo(said)
+
+
+def _own_target(path: Path) -> Path:
+    """``path``, which lies in a dive that others may have made, unless it leads out of it."""
+    try:
+        refuse_linked_folders(path)
+    except OSError as error:
+        raise InputError(
+            f"cannot write to {error.filename}: {error.strerror}; remove it, or give --out"
+        ) from error
+    return path
 
 
 def _refuse_others(format: ExportFormat, given: dict[str, bool]) -> None:

@@ -91,21 +91,22 @@ def parse_config(data: dict[str, Any], origin: str) -> Config:
     return validated(Config, data, origin)
 
 
-def load_config(path: Path) -> Config:
-    """Read a YAML config; keys that are absent keep their defaults.
+def load_config(path: Path, inside: bool = False) -> Config:
+    """Read a YAML config; keys that are absent keep their defaults. ``inside``: of a folder that
+    others may have made.
 
     Raises:
         InputError: the file cannot be read, or is not YAML.
         ConfigError: a key is unknown or a value out of range.
     """
-    return parse_config(read_yaml(path), str(path))
+    return parse_config(read_yaml(path, inside), str(path))
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
+def read_yaml(path: Path, inside: bool = False) -> dict[str, Any]:
     """The mapping that a YAML file holds; empty for an empty file.
 
     Raises:
         InputError: the file cannot be read, or is not YAML.
         ConfigError: it holds something else.
     """
-    return read_mapping(path, "config", "write `key: value` lines; see `aquaflow config`")
+    return read_mapping(path, "config", "write `key: value` lines; see `aquaflow config`", inside)

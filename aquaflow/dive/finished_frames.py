@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.dive.frames_csv import FrameRow, read_rows
 from aquaflow.dive.trajectory_csv import NAME as TRAJECTORY_CSV
 from aquaflow.dive.trajectory_csv import PoseRow, read_trajectory_csv
@@ -40,7 +40,7 @@ def read_finished_frames(dive: Path) -> list[FinishedFrame]:
         InputError: a file is missing or damaged.
     """
     rows, main = read_rows(dive / "frames.csv"), read_main(dive)
-    path = read_tum(dive / "trajectory.tum")
+    path = read_tum(dive / "trajectory.tum", inside=True)
     poses = {
         _ns(float(t)): Sim3(R, position)
         for t, R, position in zip(path.t_s, path.R_wc, path.positions, strict=True)
@@ -72,7 +72,7 @@ def read_facts(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        facts = json.loads(path.read_text(encoding="utf-8"))
+        facts = read_regular_json(path)
         if not isinstance(facts, dict):
             raise DamagedError("it is no JSON object")
     except (OSError, ValueError) as error:

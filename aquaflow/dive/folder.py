@@ -15,7 +15,14 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
-from aquaflow.base.storage.atomic import atomic_write, write_json, write_yaml
+from aquaflow.base.errors.regular_file import refuse_linked_folders
+from aquaflow.base.storage.atomic import (
+    atomic_write,
+    make_subfolder,
+    open_to_append,
+    write_json,
+    write_yaml,
+)
 from aquaflow.base.storage.folder_lock import FolderLock
 from aquaflow.config import Config
 from aquaflow.dive import from_maps
@@ -124,13 +131,19 @@ class DiveFolder:
         dive_s: Callable[[], float | None],
     ) -> None:
         path = self.path
+        try:
+            refuse_linked_folders(path)
+        except OSError as error:
+            raise InputError(
+                f"cannot write to {error.filename}: {error.strerror}; remove it"
+            ) from error
         if resume is None:
             self._claim(overwrite)
         else:
             self._add(resume)
         write_yaml(path / "config.yaml", config.model_dump(mode="json"))
         self._rewrite_frames(self._recorded)
-        self._frames = (path / MARKER).open("ab")
+        self._frames = open_to_append(path / MARKER)
         self._log = JsonLog(path / "log.jsonl", append=resume is not None, dive_s=dive_s)
         self._log.attach()
 
@@ -280,7 +293,7 @@ class DiveFolder:
         """heldout/: what the camera saw, also without its water and how much of that is restored,
         what the map shows, its range."""
         folder = self.path / "heldout"
-        folder.mkdir(exist_ok=True)
+        make_subfolder(folder)
         for example in examples:
             if example.z is not None:
                 with atomic_write(folder / f"{example.frame_index:06d}_range.npz") as stream:

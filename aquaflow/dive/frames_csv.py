@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from aquaflow.base.errors import InputError, reason_of
+from aquaflow.base.errors.regular_file import open_regular_text, read_regular
 
 MOST_LINES = 20
 """Lines of one reason; a library's message has a few."""
@@ -93,7 +94,7 @@ def read_rows(path: Path) -> list[FrameRow]:
         InputError: it cannot be read.
     """
     try:
-        with path.open(newline="", encoding="utf-8") as stream:
+        with open_regular_text(path) as stream:
             next(stream, None)
             return of_text(stream.read())
     except (OSError, ValueError) as error:
@@ -106,7 +107,7 @@ def readable_rows(path: Path) -> tuple[list[FrameRow], int]:
     Raises:
         FileNotFoundError, OSError: there is no such file, or it cannot be read at all.
     """
-    lines = path.read_bytes().splitlines(keepends=True)
+    lines = read_regular(path).splitlines(keepends=True)
     damaged = 0 if lines[:1] == [header().encode("utf-8")] else 1
     rows = []
     for line in _joined(lines[1:]):

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import logging
 from collections import deque
 from collections.abc import Callable
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
+from aquaflow.base.storage.atomic import open_to_append
 from aquaflow.base.storage.lines import is_cut_short
 from aquaflow.dive.log_repeats import Repeats
 
@@ -53,6 +55,12 @@ def _early() -> list[EarlyRecords]:
     return [handler for handler in handlers if isinstance(handler, EarlyRecords)]
 
 
+def _opened(path: Path, append: bool) -> TextIO:
+    if not append:
+        path.unlink(missing_ok=True)
+    return io.TextIOWrapper(open_to_append(path), encoding="utf-8")
+
+
 class JsonLog(logging.Handler):
     """One JSON object a line, flushed at once; a record's ``fields`` become keys of their own.
 
@@ -68,7 +76,7 @@ class JsonLog(logging.Handler):
         """``dive_s``: seconds since the dive's first frame; None before it, and in a replay."""
         super().__init__(logging.INFO)
         cut_short = append and is_cut_short(path)
-        self._stream = path.open("a" if append else "w", encoding="utf-8")
+        self._stream = _opened(path, append)
         if cut_short:  # what follows begins a line of its own
             self._stream.write("\n")
         self._levels_before: dict[str, int] = {}

@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import AquaFlowError, DamagedError, InputError, reason_of
-from aquaflow.base.storage.facts_file import UNREADABLE, read_facts_file, write_facts_file
+from aquaflow.base.storage.archive import UNREADABLE
+from aquaflow.base.storage.facts_file import read_facts_file, write_facts_file
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.state import deserialise, serialise
 from aquaflow.render.contract import Renderer

@@ -7,6 +7,7 @@ wxyz, colour as the zeroth spherical harmonic.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
@@ -15,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.errors.regular_file import open_regular
 from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.geometry.similarity import Sim3
 
@@ -130,9 +132,11 @@ def read_ply(path: Path) -> PlyGaussians:
         InputError: the file is not a binary 3DGS PLY or is cut off.
     """
     try:
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             count, dtype = _read_header(stream, path)
-            body = stream.read(count * dtype.itemsize)
+            there = os.fstat(stream.fileno()).st_size - stream.tell()
+            # A header may claim any number, for which memory would be made.
+            body = stream.read(min(count * dtype.itemsize, there))
     except OSError as error:
         raise InputError(
             f"cannot read the map {path}: {error.strerror}; give a PLY file"
@@ -169,7 +173,7 @@ def _read_header(stream: BinaryIO, path: Path) -> tuple[int, np.dtype[np.void]]:
         if words[:1] == ["element"]:
             if words[1:2] != ["vertex"] or count is not None:
                 break  # elements after the vertices are not read
-            count = int(words[2])
+            count = int(words[2]) if words[2:] and words[2].isdecimal() else 0
         elif words[:1] == ["property"]:
             if len(words) != 3 or words[1] not in PLY_TYPES:
                 raise InputError(f"{path} has a property that no Gaussian map has")

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import io
+import math
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.base.errors import DamagedError
+from aquaflow.base.errors.regular_file import read_regular
 from aquaflow.base.storage.atomic import atomic_write
+
+MOST_PIXELS = 1 << 24
+"""Of a picture in a dive folder: 16 million, more than any is mapped in."""
 
 
 def encoded_png(
@@ -21,6 +28,28 @@ def encoded_png(
         picture = np.asarray(cv2.cvtColor(picture, to_bgr), dtype=np.uint8)
     _, encoded = cv2.imencode(".png", picture)
     return encoded.tobytes()
+
+
+def read_png(
+    path: Path, folders: int = 0
+) -> npt.NDArray[np.uint8]:  # [H, W], [H, W, 3] RGB or [H, W, 4] RGBA
+    """The picture in a file of a folder that others may have made.
+
+    ``folders`` as for :func:`aquaflow.base.errors.regular_file.open_regular`.
+
+    Raises:
+        OSError, ValueError: it cannot be read, is no PNG, or has more pixels than AquaFlow maps.
+    """
+    from PIL import Image
+
+    stream = io.BytesIO(read_regular(path, folders))
+    try:
+        with Image.open(stream, formats=("PNG",)) as picture:
+            if math.prod(picture.size) > MOST_PIXELS:
+                raise DamagedError("it has more pixels than a mapped picture")
+            return np.asarray(picture)
+    except (SyntaxError, Image.DecompressionBombError) as error:
+        raise DamagedError("it is no picture") from error
 
 
 def write_png(

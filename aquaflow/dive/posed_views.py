@@ -60,7 +60,7 @@ def read_mapper(dive: Path) -> Mapper:
         InputError: the dive has no map.
         ConfigError: the dive's settings cannot be read.
     """
-    renderer = select_renderer(load_config(dive / "config.yaml").mapping.renderer)
+    renderer = select_renderer(load_config(dive / "config.yaml", inside=True).mapping.renderer)
     return read_map_file(dive / f"map{SUFFIX}", renderer)
 
 

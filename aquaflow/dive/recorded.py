@@ -57,10 +57,12 @@ def preparation_of(dive: Path, width: int | None = None) -> Preparation:
         InputError, ConfigError: the dive's settings or its calibration cannot be read.
     """
     calibration = dive / "calibration.yaml"
-    source = load_config(dive / "config.yaml").source
+    source = load_config(dive / "config.yaml", inside=True).source
     if width is not None:
         source = source.model_copy(update={"width": width})
-    return Preparation(source, load_camera(calibration) if calibration.is_file() else None)
+    return Preparation(
+        source, load_camera(calibration, inside=True) if calibration.is_file() else None
+    )
 
 
 def _check_size(

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from enum import Enum
 from pathlib import Path
 
+from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.base.storage.atomic import write_json
 from aquaflow.config.device import MountingConfig
 
@@ -57,7 +57,7 @@ class DiveStatus:
 def read_status(dive: Path) -> DiveStatus | None:
     """How the dive in this folder stands; None where nothing readable says so."""
     try:
-        found = json.loads((dive / NAME).read_text(encoding="utf-8"))
+        found = read_regular_json(dive / NAME)
         begun, boot, mounting = (found[name] for name in ("begun_utc", "boot", "mounting"))
         paused = found["paused"] is True
         status = DiveStatus(DiveState(found["state"]), paused, begun, boot, mounting)

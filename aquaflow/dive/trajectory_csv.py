@@ -13,6 +13,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.errors.regular_file import open_regular_text
 from aquaflow.base.storage.atomic import atomic_write
 
 NAME = "trajectory.csv"
@@ -95,7 +96,7 @@ def read_trajectory_csv(path: Path) -> list[PoseRow]:
         InputError: it cannot be read, or holds what is no such row.
     """
     try:
-        with path.open(newline="", encoding="utf-8") as stream:
+        with open_regular_text(path) as stream:
             header, *lines = csv.reader(stream)
         if tuple(header) != COLUMNS:
             raise DamagedError("its columns are others")

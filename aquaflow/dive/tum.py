@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import InputError, reason_of
+from aquaflow.base.errors.regular_file import read_regular
 from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.geometry.similarity import (
     Sim3,
@@ -69,16 +70,20 @@ class Trajectory:
         )
 
 
-def read_tum(path: Path) -> Trajectory:
+def read_tum(path: Path, inside: bool = False) -> Trajectory:
     """Read ``t_s tx ty tz qx qy qz qw`` lines; lines that start with # are comments.
+    ``inside``: of a folder that others may have made.
 
     Raises:
         InputError: the file cannot be read, a line is malformed, or no pose is left.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        data = read_regular(path) if inside else path.read_bytes()
+        lines = data.decode("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read the trajectory {path}; give a TUM text file") from error
+        raise InputError(
+            f"cannot read the trajectory {path}: {reason_of(error)}; give a TUM text file"
+        ) from error
     rows: list[list[float]] = []
     for number, line in enumerate(lines, start=1):
         text = line.partition("#")[0].strip()

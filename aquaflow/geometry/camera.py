@@ -204,15 +204,15 @@ class CameraFile(BaseModel):
         return self
 
 
-def load_camera(path: Path) -> CameraModel:
-    """Read a calibration.
+def load_camera(path: Path, inside: bool = False) -> CameraModel:
+    """Read a calibration; ``inside``: of a folder that others may have made.
 
     Raises:
         InputError: the file is not there or is not YAML.
         ConfigError: a key is unknown, missing, or its value is out of range; or a port is named
             without its measures.
     """
-    data = read_mapping(path, "calibration", "compare it with docs/formats.md")
+    data = read_mapping(path, "calibration", "compare it with docs/formats.md", inside)
     try:
         file = CameraFile.model_validate(data)
     except ValidationError as error:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-import zlib
 from collections.abc import Callable, Iterable
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.storage.archive import UNREADABLE, open_archive, read_array
 from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
@@ -60,11 +60,12 @@ EDGE = np.dtype(
 )
 """A measured relative pose T_ab of two keyframes, given by number; ``information`` is of its right
 tangent, T_ab exp(d), ``trust`` 0 to 1, 0 for a loop that the other edges contradict."""
-UNREADABLE = (
-    OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, SyntaxError,
-    RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error,
-)  # fmt: skip
-"""What damage to the file may raise."""
+MOST_BYTES = 1 << 27
+"""Of one array: a keyframe's keypoints take 0.1 to 2 MB, 100,000 edges 54 MB."""
+MOST_ABOUT_BYTES = 1 << 16
+"""The format and a number."""
+HEADER_BYTES = 1 << 14
+"""More than NumPy allows before the numbers of an array."""
 
 
 def write_places(
@@ -140,11 +141,11 @@ class PlacesFile:
             raise InputError(f"cannot read {self.path}: {what}; map the dive again") from error
 
     def _array(self, name: str) -> Rows:
-        with zipfile.ZipFile(self.path) as archive, archive.open(f"{name}.npy") as stream:
-            array = np.lib.format.read_array(stream, allow_pickle=False)
-            if stream.read(1):  # to the end: only then the checksum is compared
-                raise DamagedError("an array is followed by something")
-            return np.asarray(array)
+        with open_archive(self.path) as archive:
+            limit = MOST_ABOUT_BYTES if name == ABOUT else MOST_BYTES
+            if name == INDEX:
+                limit = HEADER_BYTES + PLACE.itemsize * len(archive.namelist())
+            return read_array(archive, name, limit)
 
     def _index(self) -> tuple[Place, ...]:
         rows = self._array(INDEX)

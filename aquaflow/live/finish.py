@@ -86,7 +86,7 @@ def settings_of(dive: Path, seconds: float | None) -> VehicleConfig:
     Raises:
         InputError, ConfigError: its config.yaml cannot be read.
     """
-    settings = load_config(dive / "config.yaml").model_dump()
+    settings = load_config(dive / "config.yaml", inside=True).model_dump()
     if seconds is not None:
         settings["mapping"]["optimiser"]["refine_seconds"] = max(seconds, LEAST_S)
     service = VehicleConfig().service.model_dump() | {"finish_s": None}
@@ -108,7 +108,7 @@ class NoFeed:
         self.failure: str | None = None
         self.continued = Continued()
         calibration = dive / CALIBRATION
-        self._calibration = load_camera(calibration) if calibration.is_file() else None
+        self._calibration = load_camera(calibration, inside=True) if calibration.is_file() else None
         rows, _ = readable_rows(dive / MARKER)
         self._names = {row.index: row.source for row in rows}
 

@@ -32,7 +32,8 @@ class DiveTelemetry(TelemetryLog):
 
     def samples(self) -> Iterator[TelemetrySample]:
         """Samples in the order of the lines; a damaged line costs itself."""
-        lines, first_ns = TelemetryLines(self.path), None
+        # The user names this file, and may name a link.
+        lines, first_ns = TelemetryLines(self.path.resolve()), None
         for sample in lines.samples():
             first_ns = sample.t_ns if first_ns is None else first_ns
             t_ns = sample.t_ns - first_ns + round(self.starts_s * 1e9)

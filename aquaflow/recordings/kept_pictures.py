@@ -7,6 +7,7 @@ removed and half as many are kept from then on, so that they always span the who
 from __future__ import annotations
 
 import contextlib
+import stat
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.failures import Failures
-from aquaflow.base.storage.atomic import atomic_write
+from aquaflow.base.storage.atomic import atomic_write, make_subfolder
 from aquaflow.sources.newest import Newest
 from aquaflow.types import Frame
 
@@ -64,7 +65,7 @@ class KeptPictures:
         self._next_ns = frame.t_ns + round(1e9 * self._spacing_s)
         data = encoded(frame)
         try:
-            self._folder.mkdir(exist_ok=True)
+            make_subfolder(self._folder)
         except OSError as error:
             raise InputError(f"cannot make {self._folder}: {error.strerror}") from error
         with atomic_write(self._folder / _name(frame.index)) as stream:
@@ -146,7 +147,9 @@ def _sizes(folder: Path) -> dict[int, int]:
     """Bytes by index; what another name has is no picture of ours."""
     found = {}
     with contextlib.suppress(OSError):
-        for path in folder.iterdir():
+        for path in () if folder.is_symlink() else folder.iterdir():
             if path.suffix == ".jpg" and path.stem.isascii() and path.stem.isdecimal():
-                found[int(path.stem)] = path.stat().st_size
+                state = path.lstat()
+                if stat.S_ISREG(state.st_mode):
+                    found[int(path.stem)] = state.st_size
     return found

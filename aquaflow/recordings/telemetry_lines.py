@@ -12,6 +12,8 @@ import logging
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from aquaflow.base.errors.regular_file import open_regular
+from aquaflow.base.storage.atomic import open_to_append
 from aquaflow.base.storage.lines import is_cut_short
 from aquaflow.recordings.telemetry_json import sample_from_values, sample_to_json
 from aquaflow.types import KIND_OF, TelemetrySample
@@ -61,7 +63,7 @@ class TelemetryLines:
             OSError: the file cannot be read.
         """
         self.damaged = 0
-        with self.path.open("rb") as stream:
+        with open_regular(self.path) as stream:
             while line := stream.readline(LONGEST_LINE):
                 try:
                     sample = of_line(line)
@@ -84,7 +86,7 @@ class TelemetryLog:
         self.lost = 0
         """Samples that found no room."""
         cut_short = is_cut_short(path)
-        self._stream = path.open("ab")
+        self._stream = open_to_append(path)
         self._full = False
         if cut_short:  # what follows begins a line of its own
             self._stream.write(b"\n")

@@ -6,7 +6,6 @@ are written; ``map.aqf`` and checkpoints keep the internal world.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any, get_args
 import numpy as np
 
 from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.base.storage.atomic import write_json
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.telemetry.metric_frame import MetricFrame, North, Origin, SourceReport
@@ -101,7 +101,7 @@ def _read(folder: Path) -> dict[int, tuple[str, MetricFrame]]:
     if not path.is_file():
         return {}
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = read_regular_json(path)
         if not isinstance(data["format"], int):
             raise DamagedError("its format is no number")
         if data["format"] == FORMAT:

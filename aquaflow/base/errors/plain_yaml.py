@@ -15,6 +15,7 @@ from typing import Any
 import yaml
 
 from aquaflow.base.errors import ConfigError, InputError, path_of_key, reason_of
+from aquaflow.base.errors.regular_file import open_regular
 
 MOST_BYTES = 1 << 20
 """The longest config that ships has 4 kB; PyYAML reads some 100 kB a second."""
@@ -26,17 +27,18 @@ MOST_INTEGER = 1 << 63
 """Seeds and times in nanoseconds have 64 bits."""
 
 
-def read_mapping(path: Path, what: str, hint: str) -> dict[str, Any]:
+def read_mapping(path: Path, what: str, hint: str, inside: bool = False) -> dict[str, Any]:
     """The mapping that a YAML file holds; empty for an empty file.
 
-    ``what`` it is and a ``hint`` what to give instead stand in the sentences.
+    ``what`` it is and a ``hint`` what to give instead stand in the sentences. ``inside``: the file
+    lies in a folder that others may have made, see :mod:`aquaflow.base.errors.regular_file`.
 
     Raises:
         InputError: the file cannot be read, or is not YAML.
         ConfigError: it holds something else than plain, finite ``key: value`` pairs.
     """
     try:
-        with path.open("rb") as stream:
+        with open_regular(path) if inside else path.open("rb") as stream:
             data = stream.read(MOST_BYTES + 1)
         if len(data) > MOST_BYTES:
             raise ConfigError(f"{path} is longer than {MOST_BYTES >> 20} MB; {hint}")

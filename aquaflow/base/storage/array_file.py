@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,6 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.errors.regular_file import open_regular
+from aquaflow.base.storage.atomic import replacing
 
 Arrays = dict[str, npt.NDArray[Any]]
 
@@ -37,17 +40,12 @@ def write_arrays(
     Raises:
         OSError: the file cannot be written.
     """
-    part = path.with_name(f".{path.name}.part")
     described = {name: [array.dtype.str, array.shape] for name, array in arrays.items()}
     text = json.dumps({"of": of, "arrays": described}).encode("ascii")
-    try:
-        with part.open("wb") as stream:
-            stream.write(b"%08x %s\n" % (_checksum(text, arrays), text))
-            for array in arrays.values():
-                array.tofile(stream)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    with replacing(path) as stream:
+        stream.write(b"%08x %s\n" % (_checksum(text, arrays), text))
+        for array in arrays.values():
+            array.tofile(stream)
 
 
 UNREADABLE = (
@@ -64,8 +62,8 @@ def read_arrays(path: Path, of: str = "") -> Arrays:
         than ``of``.
     """
     try:
-        with path.open("rb") as stream:
-            return _read(stream, of, path.stat().st_size)
+        with open_regular(path, folders=1) as stream:
+            return _read(stream, of, os.fstat(stream.fileno()).st_size)
     except UNREADABLE as error:
         reason = error.strerror if isinstance(error, OSError) else "it is damaged"
         raise InputError(

@@ -1,10 +1,21 @@
-"""Files that are whole or not there: a vehicle may lose its power while one is written."""
+"""Files that are whole or not there: a vehicle may lose its power while one is written.
+
+Nothing is written through a link that someone else left in the folder: what is written gets a new
+file under a name that nobody can foresee, which then takes the name that was meant, also from a
+link. A file of a process that was killed goes when another one writes to the same folder.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import fcntl
+import io
 import json
 import os
+import re
+import secrets
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -12,6 +23,11 @@ from typing import Any, BinaryIO
 import yaml
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.errors.regular_file import LINK, SPECIAL
+
+_PART = re.compile(r"\.[0-9a-f]{32}\.part(\.\w+)?")
+_CLEARED: set[tuple[int, int]] = set()
+"""Device and number of the folders that this process has removed abandoned files from."""
 
 
 @contextlib.contextmanager
@@ -21,32 +37,157 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
     Raises:
         InputError: the file cannot be written.
     """
-    part = path.with_name(f".{path.name}.part")
-    with becoming(path, part), part.open("wb") as stream:
+    with _sentence(path), replacing(path) as stream:
         yield stream
         stream.flush()
         os.fsync(stream.fileno())
 
 
 @contextlib.contextmanager
-def becoming(path: Path, part: Path) -> Iterator[None]:
-    """``part``, which the block writes to the disk, becomes ``path`` when it ends without an
-    exception; else it is removed, and what was at ``path`` stays.
+def fresh_file(path: Path) -> Iterator[Path]:
+    """The name of an empty file, with the ending of ``path``, for a library that opens by name:
+    what it holds becomes ``path`` when the block ends without an exception.
 
     Raises:
         InputError: the file cannot be written.
     """
+    with _sentence(path), _part(path, path.suffix) as (name, _):
+        part = path.with_name(name)
+        yield part
+        with part.open("rb") as stream:
+            os.fsync(stream.fileno())
+
+
+@contextlib.contextmanager
+def scratch_file(path: Path) -> Iterator[Path]:
+    """The name of an empty file beside ``path`` with its ending, for a library that opens by name;
+    it is gone when the block ends.
+
+    Raises:
+        InputError: it cannot be made.
+    """
+    with _sentence(path), _new_part(path, path.suffix) as (_, name, _):
+        yield path.with_name(name)
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """As :func:`atomic_write`, but what is lost with the power may be lost, and an error of the
+    system is raised as it is.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    with _part(path) as (_, descriptor), os.fdopen(os.dup(descriptor), "wb") as stream:
+        yield stream
+        stream.flush()
+
+
+@contextlib.contextmanager
+def _sentence(path: Path) -> Iterator[None]:
     try:
         yield
-        part.replace(path)
     except OSError as error:
         raise InputError(
             f"cannot write {path}: {error.strerror or error}; give a folder with room that can be "
             "written to"
         ) from error
+
+
+@contextlib.contextmanager
+def _part(path: Path, ending: str = "") -> Iterator[tuple[str, int]]:
+    """Name and descriptor of a new file beside ``path``, which takes its name in the end; or else
+    is removed, and what was at ``path`` stays."""
+    with _new_part(path, ending) as (folder, name, descriptor):
+        yield name, descriptor
+        os.replace(name, path.name, src_dir_fd=folder, dst_dir_fd=folder)
+
+
+@contextlib.contextmanager
+def _new_part(path: Path, ending: str) -> Iterator[tuple[int, str, int]]:
+    """Descriptor of the folder of ``path``, name and descriptor of a new file in it, which is
+    removed in the end unless it has another name by then."""
+    folder = os.open(path.parent, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        _remove_abandoned(path.parent, folder)
+        name, descriptor = _new_file(folder, ending)
+        try:
+            yield folder, name, descriptor
+        finally:
+            os.close(descriptor)
+            with contextlib.suppress(OSError):
+                os.unlink(name, dir_fd=folder)
     finally:
+        os.close(folder)
+
+
+def _new_file(folder: int, ending: str) -> tuple[str, int]:
+    """It stays locked as long as its process writes it, which says that it is not abandoned."""
+    while True:
+        name = f".{secrets.token_hex(16)}.part{ending}"
+        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+        descriptor = os.open(name, flags, 0o666, dir_fd=folder)
+        with contextlib.suppress(OSError):  # a file system without locks
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        if os.fstat(descriptor).st_nlink:
+            return name, descriptor
+        os.close(descriptor)  # taken for an abandoned one before it was locked
+
+
+def is_part(path: Path) -> bool:
+    """True of a file that is being written, or was when its process was killed."""
+    return _PART.fullmatch(path.name) is not None
+
+
+def _remove_abandoned(path: Path, folder: int) -> None:
+    found = os.fstat(folder)
+    if (found.st_dev, found.st_ino) in _CLEARED:
+        return
+    _CLEARED.add((found.st_dev, found.st_ino))
+    names: list[str] = []
+    with contextlib.suppress(OSError), os.scandir(path) as entries:
+        names = [entry.name for entry in entries if _PART.fullmatch(entry.name)]
+    for name in names:
+        # An error: it is being written, has its final name by now, or is no file of ours.
         with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
+            flags = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+            descriptor = os.open(name, flags, dir_fd=folder)
+            with os.fdopen(descriptor, "rb", buffering=0):
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                os.unlink(name, dir_fd=folder)
+
+
+def open_to_append(path: Path) -> io.BufferedWriter:
+    """A regular file that is appended to, made where there is none; a link is not followed.
+
+    Raises:
+        OSError: it cannot be opened, or is a link or no regular file.
+    """
+    flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    try:
+        descriptor = os.open(path, flags, 0o666)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise OSError(errno.ELOOP, LINK, str(path)) from error
+        raise
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, SPECIAL, str(path))
+    return os.fdopen(descriptor, "ab")
+
+
+def make_subfolder(path: Path) -> None:
+    """Make the folder ``path`` in a folder that others may have made, unless it is there.
+
+    Raises:
+        OSError: it cannot be made, or is a link.
+    """
+    with contextlib.suppress(FileExistsError):
+        path.mkdir()
+    if path.is_symlink():
+        raise OSError(errno.ELOOP, LINK, str(path))
+    if not path.is_dir():
+        raise OSError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
 
 
 def write_json(path: Path, data: dict[str, Any]) -> None:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from aquaflow.base.errors.regular_file import open_regular
+
 
 def is_cut_short(path: Path) -> bool:
     """True if the file's last line has no end."""
     try:
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             stream.seek(-1, os.SEEK_END)
             return stream.read(1) != b"\n"
     except OSError:  # there is none, or it is empty

@@ -16,7 +16,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Generic, TypeVar
 
+from aquaflow.base.errors.regular_file import read_regular
 from aquaflow.base.storage.array_file import Arrays, read_arrays, write_arrays
+from aquaflow.base.storage.atomic import open_to_append
 
 log = logging.getLogger(__name__)
 
@@ -99,8 +101,8 @@ class Spill(Generic[T]):
 
     def _note_removed(self, number: int) -> None:
         assert self._folder is not None
-        with contextlib.suppress(OSError), (self._folder / REMOVED).open("a") as stream:
-            stream.write(f"{number}\n")
+        with contextlib.suppress(OSError), open_to_append(self._folder / REMOVED) as stream:
+            stream.write(f"{number}\n".encode())
 
     def __contains__(self, number: int) -> bool:
         return number in self._resident or number in self._saved
@@ -153,7 +155,7 @@ class Spill(Generic[T]):
         if self._folder is None:
             return set()
         try:
-            lines = (self._folder / REMOVED).read_bytes().split()
+            lines = read_regular(self._folder / REMOVED, folders=1).split()
         except OSError:
             return set()
         return {int(line) for line in lines if line.isdigit()}

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.errors.regular_file import read_regular
 from aquaflow.base.storage.folder_lock import FolderLock
 from aquaflow.config import Config
 from aquaflow.config.batch import BatchConfig
@@ -74,7 +75,7 @@ def run_batch(
             journal.close()
         if is_url(site):
             with contextlib.suppress(InputError):  # the dives are there; the journal is a record
-                ObjectStore(site).write(JOURNAL, (folder / JOURNAL).read_bytes())
+                ObjectStore(site).write(JOURNAL, read_regular(folder / JOURNAL))
     written = [n for n, outcome in season.outcomes.items() if outcome.state in WRITTEN]
     return Batched(jobs, season, add_members(site, sorted(written)))
 

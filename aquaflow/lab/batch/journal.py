@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.errors.regular_file import read_regular
+from aquaflow.base.storage.atomic import open_to_append
 from aquaflow.base.storage.lines import is_cut_short
 
 JOURNAL = "batch.jsonl"
@@ -28,7 +30,7 @@ class Journal:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             _mend(path)
-            self._stream = path.open("ab", buffering=0)
+            self._stream = open_to_append(path).detach()  # unbuffered
         except OSError as error:
             raise InputError(
                 f"cannot write {path}: {error.strerror}; give another --out"
@@ -53,5 +55,5 @@ class Journal:
 def _mend(path: Path) -> None:
     """Cut off a last line that has no end."""
     if is_cut_short(path):
-        text = path.read_bytes()
+        text = read_regular(path)
         os.truncate(path, text.rfind(b"\n") + 1)

@@ -5,14 +5,16 @@ It is written last: a dive with a manifest is whole.
 
 from __future__ import annotations
 
-import hashlib
 import json
+import os
+import stat
 from pathlib import Path
 from typing import Any
 
 from aquaflow import __version__
 from aquaflow.base.errors import InputError
-from aquaflow.base.storage.atomic import write_json
+from aquaflow.base.errors.regular_file import sha256_regular
+from aquaflow.base.storage.atomic import is_part, write_json
 from aquaflow.lab.batch.job import Job, Outcome
 
 MANIFEST = "manifest.json"
@@ -24,11 +26,11 @@ def write_manifest(dive: Path, job: Job, outcome: Outcome) -> None:
     Raises:
         InputError: it cannot be written.
     """
-    files = sorted(path for path in dive.rglob("*") if path.is_file() and path.name != MANIFEST)
+    files = [path for path in files_of(dive) if path.name != MANIFEST]
     listed = {
         path.relative_to(dive).as_posix(): {
             "bytes": path.stat().st_size,
-            "sha256": _sha256(path),
+            "sha256": sha256_regular(path),
         }
         for path in files
     }
@@ -41,6 +43,16 @@ def write_manifest(dive: Path, job: Job, outcome: Outcome) -> None:
             "outcome": outcome.to_json(),
             "files": listed,
         },
+    )
+
+
+def files_of(dive: Path) -> list[Path]:
+    """The regular files of a dive; where others left a link, it is none, and not followed."""
+    return sorted(
+        Path(folder) / name
+        for folder, _, names in os.walk(dive)
+        for name in names
+        if stat.S_ISREG((Path(folder) / name).lstat().st_mode) and not is_part(Path(name))
     )
 
 
@@ -74,11 +86,3 @@ def read_manifest(text: bytes, where: str) -> dict[str, Any]:
     except ValueError as error:
         raise InputError(f"{where}/{MANIFEST} is damaged; remove that dive") from error
     return content if isinstance(content, dict) else {}
-
-
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as stream:
-        while block := stream.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()

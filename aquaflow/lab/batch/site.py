@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Protocol
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.errors.regular_file import read_regular
 from aquaflow.base.storage.folder_lock import FolderLock, is_held
 from aquaflow.lab.batch.job import Job, Outcome
-from aquaflow.lab.batch.manifest import MANIFEST, earlier_outcome, read_manifest
+from aquaflow.lab.batch.manifest import MANIFEST, earlier_outcome, files_of, read_manifest
 from aquaflow.lab.batch.object_store import ObjectStore, is_url
 
 DIVES = "dives"
@@ -60,7 +61,7 @@ class FolderSite:
         if not dive.exists():
             return None
         try:
-            text = (dive / MANIFEST).read_bytes()
+            text = read_regular(dive / MANIFEST)
         except OSError as error:
             raise InputError(
                 f"{dive} is not of a batch; remove it, or give another --out"
@@ -99,8 +100,7 @@ class StoreSite:
             return
         to = f"{DIVES}/{job.name}"
         self.store.remove(to)  # of an attempt that was cut off
-        files = sorted(path for path in dive.rglob("*") if path.is_file())
-        for path in sorted(files, key=lambda path: path.name == MANIFEST):
+        for path in sorted(files_of(dive), key=lambda path: path.name == MANIFEST):
             self.store.put(path, f"{to}/{path.relative_to(dive).as_posix()}")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.lab.evaluation.trajectory import Trajectory, associate, read_tum
 
 ROW_TOLERANCE_S = 1e-3
@@ -125,7 +125,7 @@ def read_metrics(dive: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = read_regular_json(path)
     except (OSError, ValueError) as error:
         raise InputError(f"{path} is not JSON; run 'aquaflow map' again") from error
     if not isinstance(data, dict):

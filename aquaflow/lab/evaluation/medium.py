@@ -7,7 +7,6 @@ takes them to rates per metre.
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.lab.synthetic.water import WATER_TYPES, Medium
 
 BACKSCATTER_SPAN_M = (0.5, 8.0)
@@ -78,7 +78,7 @@ def read_recovered(path: Path, metres_per_unit: float) -> tuple[Medium, bool]:
         InputError: the file is not a dive's medium.
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = read_regular_json(path)
         if not data["active"]:
             return WATER_TYPES["clear"], False
         per_metre = 1.0 if data["attenuation_unit"] == "1/m" else 1.0 / metres_per_unit

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from aquaflow.base.errors import InputError, reason_of
+from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.lab.training.curve import draw_curve
 from aquaflow.lab.training.distributed import TrainingProcess
 from aquaflow.lab.training.schedule import Schedule
@@ -111,7 +112,8 @@ def train(
             run.cpu_s = time.process_time() - began
             run.history.append(_row(task, plan, run, sums))
             sums = {}
-            (out / HISTORY).write_text(json.dumps(run.history, indent=1) + "\n")
+            with atomic_write(out / HISTORY) as stream:
+                stream.write(json.dumps(run.history, indent=1).encode() + b"\n")
             draw_curve(run.history, out / CURVE)
             log.info("%s", json.dumps(run.history[-1]))
         if process.leads and (last or over or run.step % plan.save_every == 0):
@@ -172,9 +174,8 @@ def _save(network: nn.Module, optimiser: torch.optim.Optimizer, run: _Run, path:
         "network": network.state_dict(),
         "optimiser": optimiser.state_dict(),
     }
-    part = path.with_suffix(".part")
-    torch.save(state, part)
-    part.replace(path)
+    with atomic_write(path) as stream:
+        torch.save(state, stream)
 
 
 def _resumed(network: nn.Module, optimiser: torch.optim.Optimizer, path: Path) -> _Run:

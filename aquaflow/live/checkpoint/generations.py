@@ -7,7 +7,6 @@ whole and hold no pickle. The CRC-32 of every entry is verified before it is use
 from __future__ import annotations
 
 import os
-import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,9 @@ from typing import Any
 
 from aquaflow.base.clocks.device import Learned
 from aquaflow.base.errors import InputError
-from aquaflow.base.storage.facts_file import UNREADABLE, read_facts_file, write_facts_file
+from aquaflow.base.storage.archive import UNREADABLE, open_archive
+from aquaflow.base.storage.atomic import make_subfolder
+from aquaflow.base.storage.facts_file import read_facts_file, write_facts_file
 from aquaflow.dive.folder import CHECKPOINT
 from aquaflow.geometry.arrays import Arrays
 from aquaflow.live.moment import Moment
@@ -86,7 +87,7 @@ def write_state(
         InputError, OSError: it cannot be written; those that there are stay.
     """
     path = state_file(dive)
-    path.parent.mkdir(exist_ok=True)
+    make_subfolder(path.parent)
     fresh = path.with_name("fresh.npz")
     try:
         write_facts_file(fresh, facts, arrays, allow_nan=False)
@@ -104,7 +105,7 @@ def _rename_or_link(path: Path, name: Path) -> None:
     link = path.with_name("link.npz")
     link.unlink(missing_ok=True)
     try:
-        os.link(path, link)
+        os.link(path, link, follow_symlinks=False)
         link.replace(name)
     except OSError:
         path.replace(name)
@@ -120,11 +121,11 @@ def read_state(path: Path) -> Checkpoint:
         InputError: it is not there, or is damaged.
     """
     try:
-        with zipfile.ZipFile(path) as file:
+        with open_archive(path, stored=True, folders=1) as file:
             damaged = file.testzip()
         if damaged is not None:
             raise InputError(f"{path} is damaged: {damaged} differs from its checksum")
-        facts, arrays = read_facts_file(path)
+        facts, arrays = read_facts_file(path, folders=1)
         checkpoint = Checkpoint(path, facts, arrays)
         known = facts["format"] == FORMAT
         if known:
@@ -146,7 +147,7 @@ def bring_to_disk(paths: Iterable[Path]) -> None:
     """fsync files that must survive a power cut; missing files are ignored."""
     for path in paths:
         try:
-            descriptor = os.open(path, os.O_RDONLY)
+            descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         except FileNotFoundError:
             continue
         try:

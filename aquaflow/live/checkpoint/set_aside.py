@@ -10,6 +10,8 @@ import shutil
 from pathlib import Path
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.errors.regular_file import open_regular
+from aquaflow.base.storage.atomic import atomic_write, open_to_append
 
 WHY = "why.txt"
 """The file with the reason for each file set aside."""
@@ -42,7 +44,9 @@ class SetAside:
         if not path.is_file():
             return
         try:
-            shutil.copy2(path, self._place(path, why))
+            depth = len(path.relative_to(self._dive).parts) - 1
+            with open_regular(path, depth) as stream, atomic_write(self._place(path, why)) as copy:
+                shutil.copyfileobj(stream, copy)
         except OSError as error:
             raise _refused(path, error) from error
 
@@ -55,8 +59,8 @@ class SetAside:
         name = path.relative_to(self._dive)
         place = self._folder / name
         place.parent.mkdir(parents=True, exist_ok=True)
-        with (self._folder / WHY).open("a", encoding="utf-8") as stream:
-            stream.write(f"{name}: {why}\n")
+        with open_to_append(self._folder / WHY) as stream:
+            stream.write(f"{name}: {why}\n".encode())
         return place
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 
 from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.dive.georeference import to_geodetic
 from aquaflow.dive.map_file import SUFFIX
 from aquaflow.geometry.earth import north_east
@@ -89,7 +89,7 @@ def read_transform(path: Path) -> Sim3:
         InputError: the file cannot be read, or holds none.
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = read_regular_json(path)
         R, t = (np.asarray(data[key], np.float64) for key in ("rotation", "translation"))
         T = Sim3(R, t, float(data.get("scale", 1.0)))
         if R.shape != (3, 3) or t.shape != (3,) or not T.is_finite() or T.scale <= 0.0:

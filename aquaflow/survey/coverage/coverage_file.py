@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -12,7 +11,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.errors.regular_file import LARGEST_JSON_BYTES
+from aquaflow.base.storage.archive import UNREADABLE, read_arrays_of
 from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.survey.coverage.classes import Seen
 from aquaflow.survey.coverage.next_line import LineState, Suggestion
@@ -23,6 +24,8 @@ from aquaflow.survey.coverage.survey_lines import Line
 
 NAME = "coverage.npz"
 """In a dive's folder (docs/formats.md#coverage)."""
+MOST_BYTES = 1 << 27
+"""Of all arrays together: a sub-map's plan views take at most 14 MB, most of them far less."""
 VALUES = "values"
 """The array that holds what is no array, as JSON."""
 
@@ -67,14 +70,19 @@ def read_coverage_file(path: Path) -> dict[int, PageView]:
         InputError: the file is missing, damaged or of something else.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        values = json.loads(arrays.pop(VALUES).tobytes())
+        arrays = read_arrays_of(path, most_bytes=MOST_BYTES)
+        text = arrays.pop(VALUES).tobytes()
+        if len(text) > LARGEST_JSON_BYTES:
+            raise DamagedError("its values are longer than a dive's can be")
+        values = json.loads(text)
         return {int(number): _view(int(number), each, arrays) for number, each in values.items()}
     except FileNotFoundError as error:
         raise InputError(f"{path} is missing; map the dive again for its coverage") from error
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path} is no coverage of a dive, or damaged; map it again") from error
+    except (*UNREADABLE, AttributeError) as error:
+        said = f" ({reason_of(error)})" if isinstance(error, (OSError, DamagedError)) else ""
+        raise InputError(
+            f"{path} is no coverage of a dive, or damaged{said}; map it again"
+        ) from error
 
 
 def _view(

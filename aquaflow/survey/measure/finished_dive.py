@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 
 from aquaflow.base.errors import InputError, reason_of
+from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.dive.trajectory_csv import NAME as TRAJECTORY
 from aquaflow.dive.trajectory_csv import read_trajectory_csv
 from aquaflow.survey.export.ortho.ground import Ground, ground_of
@@ -46,7 +46,7 @@ def numbers_of_dive(
 
 def _water(path: Path) -> Water | None:
     try:
-        data = json.loads(path.read_text("utf-8"))
+        data = read_regular_json(path)
         if not data["active"]:
             return None
         rates = [float(each) for each in data["attenuation_per_unit"]]

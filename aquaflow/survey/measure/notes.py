@@ -9,7 +9,6 @@ somewhere else on the earth.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.base.storage.atomic import write_json
 from aquaflow.geometry.earth import from_geodetic, geodetic
 from aquaflow.telemetry.metric_frame import MetricFrame
@@ -88,9 +88,7 @@ def read_notes(dive: Path, frame: MetricFrame) -> list[Note]:
     """
     path = dive / NAME
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise DamagedError("it is too large")
-        data = json.loads(path.read_text("utf-8"))
+        data = read_regular_json(path, most_bytes=MOST_BYTES)
         features = data["features"]
         if not isinstance(features, list) or len(features) > MOST_NOTES:
             raise DamagedError(f"its features are no list of at most {MOST_NOTES}")

@@ -7,7 +7,6 @@ its scale came from many measurements, and its origin and depth hang on it.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError, reason_of
+from aquaflow.base.errors.regular_file import open_regular_text, read_regular_json
+from aquaflow.base.storage.archive import read_arrays_of
 from aquaflow.base.storage.atomic import atomic_write, write_json
 from aquaflow.dive import trajectory_csv
 from aquaflow.dive.metric_outputs import frame_numbers, worlds_in_words
@@ -157,10 +158,13 @@ def _medium(data: dict[str, Any], frame: MetricFrame, times: float) -> dict[str,
     return data
 
 
+MOST_RANGE_BYTES = 1 << 26
+"""Of a range in 4 bytes, for 16 million pixels."""
+
+
 def _scale_ranges(folder: Path, times: float) -> None:
     for path in sorted(folder.glob("*_range.npz")):
-        with np.load(path) as stored:
-            z = stored["z"]
+        z = read_arrays_of(path, folders=1, most_bytes=MOST_RANGE_BYTES)["z"]
         with atomic_write(path) as stream:
             np.savez_compressed(stream, z=(times * z.astype(np.float64)).astype(np.float32))
 
@@ -168,14 +172,15 @@ def _scale_ranges(folder: Path, times: float) -> None:
 def _poses(path: Path) -> Array:
     """[N, 8] of trajectory.tum."""
     try:
-        return np.loadtxt(path, np.float64, ndmin=2).reshape(-1, 8)
+        with open_regular_text(path) as stream:
+            return np.loadtxt(stream, np.float64, ndmin=2).reshape(-1, 8)
     except (OSError, ValueError) as error:
         raise InputError(f"cannot read {path}: {reason_of(error)}; map the dive again") from error
 
 
 def _json(path: Path) -> dict[str, Any]:
     try:
-        data = json.loads(path.read_text("utf-8"))
+        data = read_regular_json(path)
         return dict(data)
     except (OSError, ValueError, TypeError) as error:
         raise InputError(f"cannot read {path}: {reason_of(error)}; map the dive again") from error

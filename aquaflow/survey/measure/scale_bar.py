@@ -95,7 +95,7 @@ def _mapped(dive: Path, frame: int) -> tuple[Mapper, View, int]:
     if frame not in sub_maps:
         raise InputError(f"frame {frame} of {dive} has no pose; choose another --frame")
     number, largest = sub_maps[frame], _largest(sub_maps)
-    renderer = select_renderer(load_config(dive / "config.yaml").mapping.renderer)
+    renderer = select_renderer(load_config(dive / "config.yaml", inside=True).mapping.renderer)
     name = "map" if number == largest else f"map_{number}"
     mapper = read_map_file(dive / f"{name}{SUFFIX}", renderer)
     return mapper, view_of_frame(mapper, frame, dive), number

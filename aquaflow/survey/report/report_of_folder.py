@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from aquaflow.base.errors import InputError, reason_of
+from aquaflow.base.errors.regular_file import open_regular_text, read_regular, read_regular_json
 from aquaflow.dive.folder import CALIBRATION, MARKER
 from aquaflow.dive.frames_csv import FrameRow, read_rows
 from aquaflow.dive.from_maps import OVERVIEW
+from aquaflow.dive.png import read_png
 from aquaflow.dive.trajectory_csv import NAME as PATH_TABLE
 from aquaflow.dive.trajectory_csv import PoseRow, read_trajectory_csv
 from aquaflow.geometry.camera import load_camera
@@ -42,7 +43,7 @@ def report_of_folder(dive: Path) -> ReportData:
     frames, main = read_metric_file(dive), read_main(dive)
     frame = frames.get(main, MetricFrame.unknown())
     path, medium = _path(poses, rows, frames, frame), _medium(dive, frame)
-    camera = load_camera(dive / "camera.yaml")
+    camera = load_camera(dive / "camera.yaml", inside=True)
     return ReportData(
         name=dive.resolve().name,
         camera=camera_summary(camera, _calibrated(dive)),
@@ -65,7 +66,7 @@ def report_of_folder(dive: Path) -> ReportData:
 
 def _json(path: Path) -> dict[str, Any]:
     try:
-        content = json.loads(path.read_bytes())
+        content = read_regular_json(path)
     except (OSError, ValueError) as error:
         raise InputError(f"cannot read {path}: {reason_of(error)}; map the dive again") from error
     if not isinstance(content, dict):
@@ -142,12 +143,12 @@ def _coverage(dive: Path, main: int) -> PageView | None:
 
 
 def _bytes(path: Path) -> bytes | None:
-    return path.read_bytes() if path.is_file() else None
+    return read_regular(path) if path.is_file() else None
 
 
 def _calibrated(dive: Path) -> bool:
     try:
-        with (dive / CALIBRATION).open(encoding="utf-8") as stream:
+        with open_regular_text(dive / CALIBRATION) as stream:
             return FOUND not in stream.readline()
     except (OSError, ValueError):
         return False
@@ -155,8 +156,6 @@ def _calibrated(dive: Path) -> bool:
 
 def _examples(dive: Path) -> list[HeldOutExample]:
     """Some held-out views, spread over the dive; one whose pictures are damaged is left out."""
-    from PIL import Image, UnidentifiedImageError
-
     real = sorted((dive / "heldout").glob("*_real.png"))
     chosen = np.linspace(0, len(real) - 1, min(len(real), MAX_EXAMPLES)).round().astype(int)
     examples = []
@@ -165,9 +164,9 @@ def _examples(dive: Path) -> list[HeldOutExample]:
         others = [path.with_name(f"{stem}_{name}.png") for name in ("rendered", "restored")]
         try:
             pictures = [
-                np.asarray(Image.open(each)) if each.exists() else None for each in (path, *others)
+                read_png(each, folders=1) if each.exists() else None for each in (path, *others)
             ]
-        except (OSError, UnidentifiedImageError):
+        except (OSError, ValueError):
             continue
         first, rendered, restored = pictures
         if first is not None and rendered is not None:

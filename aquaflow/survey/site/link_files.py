@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from aquaflow.base.errors import InputError
-from aquaflow.base.storage.atomic import write_json
+from aquaflow.base.errors.regular_file import read_regular_json
+from aquaflow.base.storage.atomic import make_subfolder, write_json
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.site.links import CrossLink
 from aquaflow.survey.site.manifest import SiteDive
@@ -32,7 +32,7 @@ def write_links(path: Path, a: SiteDive, b: SiteDive, links: list[CrossLink]) ->
         InputError: the file cannot be written.
     """
     try:
-        path.parent.mkdir(exist_ok=True)
+        make_subfolder(path.parent)
     except OSError as error:
         raise InputError(f"cannot make {path.parent}: {error.strerror}; make room") from error
     write_json(path, {"of": _of(a, b), "links": [_to_json(link) for link in links]})
@@ -41,7 +41,7 @@ def write_links(path: Path, a: SiteDive, b: SiteDive, links: list[CrossLink]) ->
 def read_links(path: Path, a: SiteDive, b: SiteDive) -> list[CrossLink] | None:
     """The links between two dives as they are now; None where they are to be looked for."""
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = read_regular_json(path, folders=1)
         if data["of"] != _of(a, b):
             return None
         return [_of_json(stated) for stated in data["links"]]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.errors.regular_file import read_regular_json, sha256_regular
 from aquaflow.base.storage.atomic import write_json
 from aquaflow.keyframes.places_file import NAME as PLACES
 from aquaflow.keyframes.places_file import PlacesFile
@@ -49,7 +49,7 @@ def fingerprint(dive: Path) -> str:
     for name in FINGERPRINTED:
         path = dive / name
         try:
-            content = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+            content = sha256_regular(path) if path.is_file() else ""
         except OSError as error:
             raise InputError(f"cannot read {path}: {error.strerror}; check the dive") from error
         found.update(f"{name} {content}\n".encode())
@@ -81,7 +81,7 @@ def read_site(site: Path) -> tuple[SiteDive, ...]:
     if not is_site(site):
         raise InputError(f"{site} is no site: {NAME} is missing; make one by `aquaflow site add`")
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = read_regular_json(path)
         if data["format"] != FORMAT:
             raise InputError(
                 f"{path} is not in format {FORMAT}, which this AquaFlow reads; update AquaFlow"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,6 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.errors.regular_file import read_regular_json
+from aquaflow.base.storage.archive import read_array_file
 from aquaflow.base.storage.atomic import atomic_write, write_json
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.site.manifest import SiteDive
@@ -134,7 +135,7 @@ def read_merged(site: Path) -> MergedSite | None:
     if not path.is_file():
         return None
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = read_regular_json(path)
         if data["format"] != FORMAT:
             raise InputError(
                 f"{path} is not in format {FORMAT}, which this AquaFlow reads; update AquaFlow"
@@ -159,8 +160,7 @@ def merge_of(site: Path) -> MergedSite:
 
 
 def _keyframes(path: Path) -> Rows:
-    with path.open("rb") as stream:
-        rows = np.lib.format.read_array(stream, allow_pickle=False)
+    rows = read_array_file(path)
     if rows.dtype != KEYFRAME or rows.ndim != 1:
         raise DamagedError(f"{path.name} holds no keyframes")
     return np.asarray(rows)

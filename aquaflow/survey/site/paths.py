@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError, reason_of
+from aquaflow.base.errors.regular_file import open_regular_text
 from aquaflow.dive.tum import Trajectory, read_tum
 from aquaflow.geometry.similarity import Sim3, quaternion_from_rotation
 from aquaflow.geometry.similarity_batch import Sim3Batch
@@ -28,7 +29,7 @@ def sub_maps_of_frames(dive: Path) -> dict[int, int]:
     """
     path = dive / "frames.csv"
     try:
-        with path.open(newline="", encoding="utf-8") as stream:
+        with open_regular_text(path) as stream:
             return {
                 _microsecond(float(row["t_s"])): int(row["sub_map"])
                 for row in csv.DictReader(stream)
@@ -67,7 +68,7 @@ def path_of_sub_map(dive: Path, sub_map: int, sub_maps: dict[int, int]) -> Traje
     Raises:
         InputError: it cannot be read.
     """
-    path = read_tum(dive / "trajectory.tum")
+    path = read_tum(dive / "trajectory.tum", inside=True)
     there = [sub_maps.get(_microsecond(float(t))) == sub_map for t in path.t_s]
     return path.select(np.array(there, dtype=bool))
 

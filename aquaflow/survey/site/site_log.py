@@ -7,6 +7,8 @@ import logging
 from datetime import datetime, timezone
 from pathlib import Path
 
+from aquaflow.base.storage.atomic import open_to_append
+
 log = logging.getLogger(__name__)
 
 NAME = "log.jsonl"
@@ -18,7 +20,7 @@ def say(site: Path, event: str, **facts: str | int) -> None:
     now = datetime.now(timezone.utc).isoformat(timespec="milliseconds").replace("+00:00", "Z")
     line = json.dumps({"utc": now, "event": event, **facts}) + "\n"
     try:
-        with (site / NAME).open("a", encoding="utf-8") as stream:
-            stream.write(line)
+        with open_to_append(site / NAME) as stream:
+            stream.write(line.encode())
     except OSError as error:
         log.warning("%s takes no more: %s", site / NAME, error.strerror)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from aquaflow.base.errors import InputError, reason_of
+from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.base.storage.atomic import write_json
 from aquaflow.dive.ply import PlyGaussians, read_ply, write_ply
 from aquaflow.geometry.similarity import Sim3
@@ -76,7 +76,7 @@ def parts_of(
     if not about.is_file():
         return None
     try:
-        data = json.loads(about.read_text(encoding="utf-8"))
+        data = read_regular_json(about)
         if data["format"] != FORMAT:
             raise InputError(
                 f"{about} is not in format {FORMAT}, which this AquaFlow reads; update AquaFlow"

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.storage.atomic import make_subfolder
 from aquaflow.dive.tum import Trajectory, write_tum
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes.places_file import NAME as PLACES
@@ -72,6 +73,6 @@ def _together(parts: list[Trajectory]) -> Trajectory:
 
 def _made(folder: Path) -> None:
     try:
-        folder.mkdir(exist_ok=True)
+        make_subfolder(folder)
     except OSError as error:
         raise InputError(f"cannot make {folder}: {error.strerror}; make room") from error

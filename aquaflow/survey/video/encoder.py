@@ -8,7 +8,6 @@ write no sound.
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
-from aquaflow.base.storage.atomic import becoming
+from aquaflow.base.storage.atomic import fresh_file
 
 SUFFIX, CODEC = ".mp4", "vp09"
 """Of the files; the codec by its FourCC."""
@@ -108,17 +107,11 @@ def video_file(path: Path, fps: float) -> Iterator[VideoFile]:
         InputError: the name has another ending, or the file cannot be written.
     """
     check_name(path)
-    # FFmpeg takes the container from the ending.
-    part = path.with_name(f".{path.stem}.part{SUFFIX}")
-    file = VideoFile(part, min(fps, MOST_FPS))
-    with becoming(path, part):
-        with part.open("wb"):  # what cannot be written is known before pictures are made
-            pass
+    with fresh_file(path) as part:  # FFmpeg takes the container from the ending
+        file = VideoFile(part, min(fps, MOST_FPS))
         try:
             yield file
             file.finish()
         except BaseException:
             file.abandon()
             raise
-        with part.open("rb") as stream:
-            os.fsync(stream.fileno())

@@ -24,6 +24,8 @@ def pictures_of_dive(folder: Path) -> dict[int, Path]:
     found = kept_pictures(folder)
     for path in (folder / "heldout").glob("*_real.png"):
         number = path.name.removesuffix("_real.png")
+        if path.is_symlink() or path.parent.is_symlink():
+            continue
         if number.isascii() and number.isdecimal():
             found[int(number)] = path
     return found

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError, reason_of
+from aquaflow.base.errors.regular_file import open_regular_text
 from aquaflow.geometry.similarity import Sim3, rotation_from_quaternion
 from aquaflow.survey.viewer.dive_moments import moments_of_dive, pictures_of_dive
 from aquaflow.survey.viewer.exhibit import POSE_NUMBERS
@@ -80,7 +81,8 @@ def read_path(folder: Path) -> DivePath:
 
 def _poses(path: Path) -> tuple[list[Sim3], npt.NDArray[np.float64]]:
     try:
-        rows = np.loadtxt(path, ndmin=2).reshape(-1, TUM_COLUMNS)
+        with open_regular_text(path) as stream:
+            rows = np.loadtxt(stream, ndmin=2).reshape(-1, TUM_COLUMNS)
     except (OSError, ValueError) as error:
         raise InputError(f"cannot read {path}: {reason_of(error)}; map the dive again") from error
     if not np.isfinite(rows).all() or (np.linalg.norm(rows[:, 4:8], axis=1) == 0.0).any():
@@ -107,7 +109,7 @@ def _shown_by_microsecond(path: Path) -> dict[int, tuple[float, int]]:
     """Quality and index of the frame at each time; a damaged line is skipped."""
     shown: dict[int, tuple[float, int]] = {}
     try:
-        with path.open(newline="", encoding="utf-8", errors="replace") as stream:
+        with open_regular_text(path, errors="replace") as stream:
             for row in csv.DictReader(stream):
                 with contextlib.suppress(KeyError, TypeError, ValueError, OverflowError):
                     found = float(row["quality"] or 1.0), int(row["index"])

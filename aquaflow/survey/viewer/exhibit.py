@@ -6,7 +6,7 @@ asks. Where no browser asks, nothing is packed.
 
 from __future__ import annotations
 
-import contextlib
+import logging
 import math
 import threading
 import time
@@ -19,6 +19,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.base.errors import reason_of
+from aquaflow.base.errors.regular_file import read_regular
+from aquaflow.dive.png import read_png
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.viewer.levels import Palette
 from aquaflow.survey.viewer.moments import MOMENT_NUMBERS
@@ -29,6 +32,8 @@ from aquaflow.survey.viewer.splats import Splats
 from aquaflow.types import CameraModel
 
 Float = npt.NDArray[np.floating[Any]]
+
+log = logging.getLogger(__name__)
 
 JPEG_QUALITY = 80
 POSE_NUMBERS = 8
@@ -148,13 +153,16 @@ class Exhibit:
         path = self.pictures.get(index)
         if path is None:
             return None
-        if path.suffix == ".jpg":
-            with contextlib.suppress(OSError):  # thinned meanwhile
-                return path.read_bytes()
+        try:
+            if path.suffix == ".jpg":
+                return read_regular(path, folders=1)
+            shown = read_png(path, folders=1)
+            return _jpeg(shown if shown.ndim == 2 else shown[..., 2::-1])
+        except FileNotFoundError:  # thinned meanwhile
             return None
-        import cv2
-
-        return _jpeg(cv2.imread(str(path)))
+        except (OSError, ValueError, IndexError) as error:
+            log.warning("%s is not shown: %s", path, reason_of(error))
+            return None
 
     def newest_picture(self) -> bytes | None:
         """JPEG of what the camera sees; encoded once for all browsers."""

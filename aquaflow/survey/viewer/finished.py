@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import threading
 from collections.abc import Callable
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.survey.viewer.dive_map import DiveMap, read_map
@@ -91,7 +91,10 @@ def read_dive(folder: Path, budget: int) -> FinishedDive:
         if not (folder / name).is_file():
             raise InputError(f"{folder} holds no finished dive: {name} is missing")
     path = read_path(folder)
-    frame, camera = read_frame_of_map(folder / "map.aqf"), load_camera(folder / "camera.yaml")
+    frame, camera = (
+        read_frame_of_map(folder / "map.aqf"),
+        load_camera(folder / "camera.yaml", inside=True),
+    )
     water = _water(folder / "medium.json")
     ply = folder / "map_clear.ply"
     if water is None or not ply.is_file():  # colours with the water in them are all there is
@@ -179,7 +182,7 @@ def prepare(
 def _water(path: Path) -> SeenWater | None:
     """None for a dive without water, and for a file that does not say it."""
     try:
-        return water_of(json.loads(path.read_text("utf-8")))
+        return water_of(read_regular_json(path))
     except (OSError, ValueError, AttributeError, DamagedError) as error:
         log.warning("the viewer shows no water: %s: %s", path, reason_of(error))
         return None

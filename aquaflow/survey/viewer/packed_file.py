@@ -9,15 +9,17 @@ from __future__ import annotations
 import json
 import logging
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from aquaflow import __version__
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.storage.archive import UNREADABLE, open_archive, read_member
 from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.survey.viewer.levels import Palette
-from aquaflow.survey.viewer.packing import Packed
+from aquaflow.survey.viewer.packing import Packed, bytes_of_each, chunk_ends
 
 log = logging.getLogger(__name__)
 
@@ -29,6 +31,14 @@ SOURCES = (
 """Files of a dive that the packed map depends on."""
 ABOUT = "about.json"
 """Member beside the chunks, which have numbers as names."""
+MOST_ABOUT_BYTES = 1 << 20
+"""It has some kB: palettes and 10 to 20 chunks' ends."""
+MOST_GAUSSIANS = 1 << 22
+"""More are packed at every look: a browser shows some 500,000."""
+MOST_LEVELS = 16
+"""Of a Gaussian; a dive has at most 4."""
+GZIP_BYTES, BLOCK_BYTES = 1024, 1 << 16
+"""A header and an end take 18; unpacked at once."""
 
 
 @dataclass(frozen=True)
@@ -60,13 +70,29 @@ class PackedFile:
         if not 0 <= number < len(self.about["ends"]):
             return None
         try:
-            with zipfile.ZipFile(self.path) as file:
-                if json.loads(file.read(ABOUT))["map"]["version"] != self.version:
+            with open_archive(self.path, stored=True) as file:
+                if _about(file)["map"]["version"] != self.version:
                     return None
-                return file.read(str(number))
-        except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+                return self._chunk(file, number)
+        except UNREADABLE as error:
             log.warning("%s was removed or damaged while it was shown: %s", self.path, error)
             return None
+
+    def _chunk(self, file: zipfile.ZipFile, number: int) -> bytes:
+        """Of the length that its Gaussians have, also in a browser, which unpacks it."""
+        ends = (0, *self.about["ends"])
+        size = (ends[number + 1] - ends[number]) * bytes_of_each(len(self.about["levels"]))
+        packed = read_member(file, str(number), most_bytes=size + size // 64 + GZIP_BYTES)
+        unpacking, waiting, there = zlib.decompressobj(zlib.MAX_WBITS | 16), packed, 0
+        while not unpacking.eof and there <= size:
+            block = unpacking.decompress(waiting, BLOCK_BYTES)
+            waiting = unpacking.unconsumed_tail
+            if not block and not waiting:  # it is cut short
+                break
+            there += len(block)
+        if there != size or not unpacking.eof or unpacking.unused_data:
+            raise DamagedError("a chunk is longer or shorter than its Gaussians")
+        return packed
 
 
 def key_of(dive: Path, budget: int) -> dict[str, Any]:
@@ -74,7 +100,7 @@ def key_of(dive: Path, budget: int) -> dict[str, Any]:
     found: dict[str, Any] = {"aquaflow": __version__, "budget": budget}
     for name in SOURCES:
         try:
-            stat = (dive / name).stat()
+            stat = (dive / name).lstat()
         except OSError:
             found[name] = None
         else:
@@ -86,19 +112,24 @@ def read_packed(dive: Path, key: dict[str, Any]) -> PackedFile | None:
     """The packed map that was made with that ``key``; None where there is none, or no whole one."""
     path = dive / NAME
     try:
-        with zipfile.ZipFile(path) as file:
-            said = json.loads(file.read(ABOUT))
+        with open_archive(path, stored=True) as file:
+            said = _about(file)
             if said["key"] != key:
                 return None
             names, chunks = set(file.namelist()), range(len(said["map"]["ends"]))
+            count = int(said["map"]["count"])
+            if count > MOST_GAUSSIANS or said["map"]["ends"] != chunk_ends(count):
+                raise DamagedError("its chunks are no chunks of its Gaussians, or too many")
+            if len(said["map"]["levels"]) > MOST_LEVELS:
+                raise DamagedError("its Gaussians have too many levels")
             if not {str(number) for number in chunks} <= names:
                 return None
         palettes = {name: _palette(each) for name, each in said["palettes"].items()}
         return PackedFile(said["map"], palettes, int(said["total"]), path)
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        log.warning("%s is damaged and made anew: %s", path, error)
+    except UNREADABLE as error:
+        log.warning("%s is damaged and made anew: %s", path, reason_of(error))
         return None
 
 
@@ -119,6 +150,10 @@ def write_packed(
                 file.writestr(str(number), chunk)
     except InputError as error:
         log.info("the packed map is not kept: %s", error)
+
+
+def _about(file: zipfile.ZipFile) -> Any:
+    return json.loads(read_member(file, ABOUT, MOST_ABOUT_BYTES))
 
 
 def _palette(said: dict[str, Any]) -> Palette:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from aquaflow.base.errors import InputError, reason_of
+from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.base.storage.atomic import write_json
 from aquaflow.telemetry.known_lengths.known_length import KnownLength, scale_of
 
@@ -25,7 +25,7 @@ def read_known_lengths(dive: Path) -> list[KnownLength]:
     """
     path = dive / FILE
     try:
-        listed = json.loads(path.read_text("utf-8"))["lengths"]
+        listed = read_regular_json(path)["lengths"]
         return [_length(each) for each in listed]
     except FileNotFoundError:
         return []

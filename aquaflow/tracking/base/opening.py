@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.keyframes.places_file import NAME, PlacesFile
 from aquaflow.telemetry.metric_file import read_metric_file
 from aquaflow.tracking.base.base import Base
@@ -37,7 +37,7 @@ def prior_of(folder: Path) -> str:
     """The prior of a dive; empty where metrics.json is missing or damaged, which costs only the
     check that both dives have the same."""
     try:
-        stated = json.loads((folder / METRICS).read_text(encoding="utf-8"))
+        stated = read_regular_json(folder / METRICS)
         return str(stated.get("prior") or "")
     except (OSError, ValueError, AttributeError):
         return ""

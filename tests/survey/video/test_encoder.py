@@ -76,7 +76,8 @@ def test_what_is_interrupted_leaves_no_file(tmp_path: Path, raised: type[BaseExc
     def interrupted() -> None:
         with video_file(tmp_path / "a.mp4", 25.0) as file:
             file.add(grey(1))
-            assert leftovers(tmp_path) == [".a.part.mp4"]
+            (part,) = leftovers(tmp_path)
+            assert part.endswith(".part.mp4")
             raise raised
 
     with pytest.raises(raised):

@@ -6,7 +6,6 @@ one that trains, and a folder that was cut short is continued.
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.lab.training.pair_generator.render import BRIGHTEST
 from aquaflow.lab.training.pairs import Pair, ViewBatch
 
@@ -60,9 +60,8 @@ class StoredPairs(ABC):
         self.folder.mkdir(parents=True, exist_ok=True)
         with torch.no_grad():
             pair = self.rendered(shard)
-        part = path.with_suffix(f".{os.getpid()}.part")
-        torch.save(_packed(pair.a, "a") | _packed(pair.b, "b"), part)
-        part.replace(path)
+        with atomic_write(path) as stream:
+            torch.save(_packed(pair.a, "a") | _packed(pair.b, "b"), stream)
         return True
 
     def _shard(self, shard: int) -> dict[str, Tensor]:

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import InputError, first_line
 from aquaflow.base.errors.extra import load
+from aquaflow.base.storage.atomic import fresh_file, scratch_file
 from aquaflow.survey.export.ortho.grid import TILE_PX, Grid, Tile
 from aquaflow.survey.export.ortho.ground import Ground
 from aquaflow.survey.export.ortho.layers import NODATA, RasterFile
@@ -65,23 +66,22 @@ def writing_raster(
     """
     rasterio = require_rasterio()
     path = folder / layer.name
-    tiled, part = (folder / f".{layer.name}.{word}" for word in ("tiles", "part"))
     try:
-        with rasterio.Env(GDAL_CACHEMAX=CACHE_MB, GDAL_PAM_ENABLED=False):
+        with (
+            rasterio.Env(GDAL_CACHEMAX=CACHE_MB, GDAL_PAM_ENABLED=False),
+            scratch_file(path) as tiled,
+            fresh_file(path) as part,
+        ):
             with rasterio.open(tiled, "w", **_profile(layer, grid, ground)) as dataset:
                 dataset.descriptions = tuple(band.format(unit=ground.unit) for band in layer.bands)
                 dataset.update_tags(**tags)
                 yield Raster(dataset)
             _optimise(tiled, part, layer)
-        part.replace(path)
     except (OSError, rasterio.errors.RasterioError) as error:
         raise InputError(
             f"cannot write {path}: {first_line(error)}; give a folder with room that can be "
             "written to"
         ) from error
-    finally:
-        tiled.unlink(missing_ok=True)
-        part.unlink(missing_ok=True)
 
 
 def _profile(layer: RasterFile, grid: Grid, ground: Ground) -> dict[str, Any]:
