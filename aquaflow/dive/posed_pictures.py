@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.storage.whole_folder import whole_folder
 from aquaflow.dive.png import write_png
 from aquaflow.dive.point_cloud import PointCloud, read_splats
 from aquaflow.dive.posed_views import PosedView, read_mapper, read_posed_views
@@ -56,12 +57,13 @@ def export_posed_pictures(
     pictures = (
         _without_water(dive, mapper, recording) if restored else _seen(dive, mapper, recording)
     )
-    (out / IMAGES).mkdir(parents=True, exist_ok=True)
-    for done, (index, picture) in enumerate(pictures, start=1):
-        write_png(out / IMAGES / picture_name(index), picture)
-        if progress is not None:
-            progress(done, len(views))
-    write_model(out, views, cloud)
+    with whole_folder(out) as made:
+        (made / IMAGES).mkdir()
+        for done, (index, picture) in enumerate(pictures, start=1):
+            write_png(made / IMAGES / picture_name(index), picture)
+            if progress is not None:
+                progress(done, len(views))
+        write_model(made, views, cloud)
     return len(views)
 
 

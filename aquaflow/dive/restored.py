@@ -11,6 +11,7 @@ import numpy.typing as npt
 import torch
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.storage.whole_folder import whole_folder
 from aquaflow.dive.png import write_png
 from aquaflow.dive.posed_views import read_mapper
 from aquaflow.dive.recorded import recorded_pictures
@@ -45,14 +46,14 @@ def export_restored(
     """
     mapper = read_mapper(dive)
     exposure, count = exposure_without_water(dive, mapper), 0
-    out.mkdir(parents=True, exist_ok=True)
-    for index, picture in restored_frames(dive, mapper, recording):
-        write_png(out / f"{index:06d}.png", picture.picture_bytes(exposure))
-        if recording is not None:
-            write_png(out / f"{index:06d}_confidence.png", picture.confidence_bytes())
-        count += 1
-        if progress is not None:
-            progress(count, len(mapper.views))
+    with whole_folder(out) as made:
+        for index, picture in restored_frames(dive, mapper, recording):
+            write_png(made / f"{index:06d}.png", picture.picture_bytes(exposure))
+            if recording is not None:
+                write_png(made / f"{index:06d}_confidence.png", picture.confidence_bytes())
+            count += 1
+            if progress is not None:
+                progress(count, len(mapper.views))
     return count
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import read_regular
 from aquaflow.base.storage.folder_lock import FolderLock
+from aquaflow.base.storage.whole_folder import remove_abandoned
 from aquaflow.config import Config
 from aquaflow.config.batch import BatchConfig
 from aquaflow.lab.batch.estimate import memory_mb
@@ -24,7 +25,7 @@ from aquaflow.lab.batch.object_store import ObjectStore, is_url
 from aquaflow.lab.batch.ray_workers import RayWorkers
 from aquaflow.lab.batch.recordings import Recording, find_recordings
 from aquaflow.lab.batch.season import Season, run_season
-from aquaflow.lab.batch.site import DIVES, remove_abandoned
+from aquaflow.lab.batch.site import DIVES
 from aquaflow.lab.batch.workers import LocalWorkers, Workers
 
 Progress = Callable[[str, int, int | None], None]

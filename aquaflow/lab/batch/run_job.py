@@ -15,11 +15,12 @@ from typing import Any
 
 from aquaflow import __version__
 from aquaflow.base.errors import InputError
+from aquaflow.base.storage.whole_folder import working_folder
 from aquaflow.lab.batch.job import WRITTEN, Job, Outcome
 from aquaflow.lab.batch.manifest import write_manifest
 from aquaflow.lab.batch.mapping_process import outcome_of_failure
 from aquaflow.lab.batch.object_store import ObjectStore, StoreError, is_url
-from aquaflow.lab.batch.site import Site, open_site, working_folder
+from aquaflow.lab.batch.site import Site, open_site
 from aquaflow.lab.batch.started import Started
 
 PROGRAM = "aquaflow.lab.batch.mapping_process"

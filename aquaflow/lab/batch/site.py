@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
-import shutil
-import uuid
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Protocol
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import read_regular
-from aquaflow.base.storage.folder_lock import FolderLock, is_held
 from aquaflow.lab.batch.job import Job, Outcome
 from aquaflow.lab.batch.manifest import MANIFEST, earlier_outcome, files_of, read_manifest
 from aquaflow.lab.batch.object_store import ObjectStore, is_url
 
 DIVES = "dives"
-WORK = ".work"
-"""Suffix of the hidden folder that a dive is made in."""
 
 
 class Site(Protocol):
@@ -102,30 +95,3 @@ class StoreSite:
         self.store.remove(to)  # of an attempt that was cut off
         for path in sorted(files_of(dive), key=lambda path: path.name == MANIFEST):
             self.store.put(path, f"{to}/{path.relative_to(dive).as_posix()}")
-
-
-@contextlib.contextmanager
-def working_folder(parent: Path, name: str) -> Iterator[Path]:
-    """A new hidden folder that no other attempt uses; it is gone afterwards.
-
-    Raises:
-        InputError: it cannot be made.
-    """
-    folder = parent / f".{name}.{uuid.uuid4().hex[:8]}{WORK}"
-    try:
-        folder.mkdir(parents=True)
-    except OSError as error:
-        raise InputError(f"cannot make {folder}: {error.strerror}; give another --out") from error
-    lock = FolderLock(folder)
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-        lock.release()
-
-
-def remove_abandoned(parent: Path) -> None:
-    """Remove working folders whose process was killed; those of running ones stay."""
-    for folder in parent.glob(f".*{WORK}"):
-        if folder.is_dir() and not is_held(folder):
-            shutil.rmtree(folder, ignore_errors=True)

@@ -110,8 +110,8 @@ def export_mcap(
             _write_frame(file, source, frame)
             shown += seen.write(file, frame)
         count = file.count
-    beside = path.with_suffix(".layout.json")
-    write_json(beside, layout(*pictures(recording is not None, source.has_water)))
+        beside = path.with_suffix(".layout.json")  # first: where the messages are, all is
+        write_json(beside, layout(*pictures(recording is not None, source.has_water)))
     return McapExport(beside, count, len(source.posed), shown, source.times, source.where)
 
 

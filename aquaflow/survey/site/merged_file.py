@@ -103,8 +103,20 @@ class MergedSite:
         return next((each for each in self.of_dive(dive.name) if each.number == main), None)
 
 
+def remove_merged(site: Path) -> None:
+    """Remove what says that the site was merged, before any other file of the merge is written.
+
+    Raises:
+        InputError: it cannot be removed.
+    """
+    try:
+        (site / NAME).unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot remove {site / NAME}: {error.strerror}") from error
+
+
 def write_merged(site: Path, merged: MergedSite) -> None:
-    """Write both files; the arrays first, so that ``merged.json`` never speaks of others.
+    """Write both files; ``merged.json``, after :func:`remove_merged`, last: where it is, all is.
 
     Raises:
         InputError: a file cannot be written.
@@ -155,7 +167,9 @@ def merge_of(site: Path) -> MergedSite:
     """
     merged = read_merged(site)
     if merged is None:
-        raise InputError(f"{site} was never merged; run `aquaflow site merge {site}` first")
+        raise InputError(
+            f"{site} was never merged, or that was cut off; run `aquaflow site merge {site}` first"
+        )
     return merged
 
 

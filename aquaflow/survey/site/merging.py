@@ -21,7 +21,7 @@ from aquaflow.survey.site.joint_graph import JointGraph, by_knowledge, sub_maps_
 from aquaflow.survey.site.link_files import link_file, read_links, write_links
 from aquaflow.survey.site.links import CrossLink, find_links
 from aquaflow.survey.site.manifest import SiteDive, read_site, state_of
-from aquaflow.survey.site.merged_file import MergedSite, write_merged
+from aquaflow.survey.site.merged_file import MergedSite, remove_merged, write_merged
 from aquaflow.survey.site.placing import placed
 from aquaflow.survey.site.site_log import say
 from aquaflow.survey.site.site_paths import write_paths
@@ -56,6 +56,7 @@ def merge(site: Path, progress: Progress = lambda *_: None) -> MergedSite:
         taking, left_out = _taking(site, dives)
         found = _links(site, taking, progress)
         merged = _merged(taking, left_out, found)
+        remove_merged(site)
         write_paths(site, {each.dive.name: each.folder for each in taking}, merged)
         write_merged(site, merged)
         say(site, "merged", dives=len(taking), components=len(merged.components))

@@ -44,6 +44,9 @@ def write_obj(path: Path, mesh: PlacedMesh, texture: Texture) -> list[Path]:
         )
         for text in _lines(mesh, texture, material.name):
             obj.write(text.encode())
+        for stream in (obj, mtl, image):
+            stream.flush()
+        path.unlink(missing_ok=True)  # an earlier mesh has another texture
     return [path, material, picture]
 
 

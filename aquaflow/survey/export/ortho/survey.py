@@ -13,6 +13,7 @@ import numpy as np
 
 from aquaflow import __version__
 from aquaflow.base.errors import InputError
+from aquaflow.base.storage.whole_folder import whole_folder
 from aquaflow.dive.map_file import SUFFIX
 from aquaflow.dive.posed_views import read_mapper
 from aquaflow.mapping.mapper import Mapper
@@ -88,7 +89,7 @@ def export_survey(
     require_rasterio()
     mapper, frame = read_map(dive)
     ground = ground_of(frame, mapper.views)
-    ranges = ViewRanges(mapper, ground, out, progress and partial(progress, "views"))
+    ranges = ViewRanges(mapper, ground, out.parent, progress and partial(progress, "views"))
     side = resolution or rounded(ranges.footprint)
     start = -np.array(ground.origin) / ground.grid_scale
     grid = Grid.around(ranges.low, ranges.high, side / ground.grid_scale, start)
@@ -97,9 +98,9 @@ def export_survey(
     looked = _Tiles(grid, Splats(mapper, ground), ranges, colours)
     tags = _tags(dive, frame, ground, side, through, colours is not None)
     covered = 0
-    with ExitStack() as files:
+    with whole_folder(out) as made, ExitStack() as files:
         rasters = [
-            files.enter_context(writing_raster(out, layer, grid, ground, tags))
+            files.enter_context(writing_raster(made, layer, grid, ground, tags))
             for layer in LAYERS[kind]
         ]
         for done, tile in enumerate(grid.tiles()):

@@ -1,0 +1,99 @@
+"""Folders that are whole or not there: their files are made in a hidden folder beside them."""
+
+from __future__ import annotations
+
+import errno
+import shutil
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from aquaflow.base.errors import InputError
+from aquaflow.base.storage.atomic import atomic_write, make_subfolder
+from aquaflow.base.storage.folder_lock import FolderLock, is_held
+
+WORK = ".work"
+"""Suffix of the hidden folder that a folder is made in."""
+MARK = "UNFINISHED.txt"
+"""In a folder that holds other files too, while ours are moved into it."""
+MARKED = (
+    "aquaflow was cut off while it moved files into this folder: some of them may be missing, or "
+    "of an earlier time. Give the same command again; this file goes when all of them are there.\n"
+)
+
+
+@contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """An empty folder whose files are in ``path`` when the block ends without an exception, all of
+    them: an earlier ``path`` stays as it was until then. What a killed process left is removed.
+
+    A ``path`` that holds files keeps those that have other names. While ours are moved into it,
+    which is the only time in which it could be cut off, ``UNFINISHED.txt`` stands there.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    path = path.resolve()
+    if path.exists() and not path.is_dir():
+        raise InputError(f"{path} is no folder; give a folder to write to")
+    remove_abandoned(path.parent, path.name)
+    with working_folder(path.parent, path.name) as work:
+        made = work / path.name
+        try:
+            made.mkdir()
+            yield made
+            _publish(made, path)
+        except OSError as error:
+            raise InputError(
+                f"cannot write {path}: {error.strerror or error}; give a folder with room that can "
+                "be written to"
+            ) from error
+
+
+def _publish(made: Path, path: Path) -> None:
+    try:
+        made.rename(path)  # to where there is nothing, or an empty folder
+    except OSError as error:
+        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+            raise
+        with atomic_write(path / MARK) as stream:
+            stream.write(MARKED.encode("utf-8"))
+        for file in sorted(made.rglob("*")):
+            target = path / file.relative_to(made)
+            if file.is_dir():
+                make_subfolder(target)
+            else:
+                file.replace(target)
+        (path / MARK).unlink()
+
+
+@contextmanager
+def working_folder(parent: Path, name: str) -> Iterator[Path]:
+    """A new hidden folder that no other process uses; it is gone afterwards.
+
+    Raises:
+        InputError: it cannot be made.
+    """
+    folder = parent / f".{name}.{uuid.uuid4().hex[:8]}{WORK}"
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise InputError(
+            f"cannot make {folder}: {error.strerror}; give a folder that can be written to as --out"
+        ) from error
+    lock = FolderLock(folder)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        lock.release()
+
+
+def remove_abandoned(parent: Path, name: str = "") -> None:
+    """Remove the working folders of ``name``, or of all names, whose process was killed; those of
+    running ones stay."""
+    for folder in parent.glob(f".*{WORK}"):
+        of_name = not name or folder.name.rpartition(".")[0].rpartition(".")[0] == f".{name}"
+        if of_name and folder.is_dir() and not is_held(folder):
+            shutil.rmtree(folder, ignore_errors=True)
