@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.dive.frames_csv import FrameRow, read_rows
+from aquaflow.dive.status import refuse_unfinished
 from aquaflow.dive.trajectory_csv import NAME as TRAJECTORY_CSV
 from aquaflow.dive.trajectory_csv import PoseRow, read_trajectory_csv
 from aquaflow.geometry.camera import CameraModel, load_camera
@@ -77,10 +78,12 @@ def read_dive(path: str | os.PathLike[str]) -> Dive:
     """Read the finished dive in the folder ``path``.
 
     Raises:
-        InputError: a file is missing or malformed, or does not match another.
+        InputError: the dive is not finished, or a file is missing or malformed, or does not match
+            another.
         ConfigError: ``camera.yaml`` is malformed.
     """
     folder = Path(path)
+    refuse_unfinished(folder)
     frames = read_rows(folder / "frames.csv")
     trajectory = read_tum(folder / "trajectory.tum", inside=True)
     times_s = np.array([row.t_s for row in frames])

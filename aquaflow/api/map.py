@@ -14,6 +14,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.dive.map_file import SUFFIX, read_map_file
 from aquaflow.dive.map_splats import splats_of
 from aquaflow.dive.ply import PlyGaussians
+from aquaflow.dive.status import refuse_unfinished
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.lab.synthetic.water import Medium, Rgb
@@ -153,8 +154,8 @@ def load_map(
         threads: of the CPU kernels; as many as torch has if None.
 
     Raises:
-        InputError: the file, or the dive's metric.json, is damaged or of a newer AquaFlow; or the
-            file is not there.
+        InputError: the dive is not finished; or the file, or the dive's metric.json, is damaged or
+            of a newer AquaFlow; or the file is not there.
         AquaFlowError: a renderer asked for by name cannot run here.
     """
     file = Path(path)
@@ -162,6 +163,7 @@ def load_map(
         file /= f"map{SUFFIX}"
     elif file.is_symlink():  # the user's own
         file = file.resolve()
+    refuse_unfinished(file.parent)
     return Map(read_map_file(file, select_renderer(renderer, threads)), read_frame_of_map(file))
 
 

@@ -11,12 +11,13 @@ ASKED = (signal.SIGINT, signal.SIGTERM)
 
 
 @contextlib.contextmanager
-def stop_on_signals(stopping: Event, once: bool = False) -> Iterator[None]:
-    """Either signal sets ``stopping``; with ``once``, the next one ends the process as it stands.
-    The previous handlers are restored at the end."""
+def stop_on_signals(*stopping: Event, once: bool = False) -> Iterator[None]:
+    """Either signal sets all of ``stopping``; with ``once``, the next one ends the process as it
+    stands. The previous handlers are restored at the end."""
 
     def stop(*_: object) -> None:
-        stopping.set()
+        for event in stopping:
+            event.set()
         for each in ASKED if once else ():
             signal.signal(each, signal.SIG_DFL)
 

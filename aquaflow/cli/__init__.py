@@ -225,12 +225,14 @@ def evaluate(
 ) -> None:
     """Measure a dive: colours of restored views, and what the truth allows to compare."""
     from aquaflow.base.errors import InputError
+    from aquaflow.dive.status import refuse_unfinished
     from aquaflow.lab.evaluation.epipolar_error import evaluate_epipolar
     from aquaflow.lab.evaluation.naturalness import evaluate_naturalness
     from aquaflow.lab.evaluation.protocol import evaluate_dive
     from aquaflow.lab.evaluation.restoration import evaluate_restoration
     from aquaflow.lab.evaluation.summary import in_words
 
+    refuse_unfinished(dive)
     natural = evaluate_naturalness(dive)
     if truth is None and clean is None and recording is None and natural is None:
         raise InputError(

@@ -16,8 +16,6 @@ from aquaflow.cli.console import Json, progress_bars
 if TYPE_CHECKING:
     from aquaflow.survey.change.find_changes import Changes
 
-MAP_FILE = "map.aqf"
-"""What every finished dive with a map has."""
 MOST_RATE = 0.5
 """Largest --false: more than half of what is found would be nothing."""
 
@@ -57,9 +55,10 @@ def change(
     if site is not None and transform is not None:
         raise InputError("a site knows how its dives lie; leave out --transform, or the site")
     if site is None:
+        from aquaflow.dive.status import refuse_without_map
+
         for name in (first, second):
-            if not (Path(name) / MAP_FILE).exists():
-                raise InputError(f"{name} holds no finished dive: {MAP_FILE} is missing")
+            refuse_without_map(Path(name))
     names = f"{Path(first).resolve().name}_{Path(second).resolve().name}"
     target = out or (site or Path("out")) / f"change_{names}"
     from aquaflow.survey.change.find_changes import Asked, find_changes, refuse_taken, write_changes

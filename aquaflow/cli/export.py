@@ -70,8 +70,6 @@ MESHES: dict[ExportFormat, Literal["ply", "obj", "glb"]] = {
 }
 """Formats that are triangles."""
 
-MAP_FILE = "map.aqf"
-"""What every finished dive with a map has."""
 
 Progress = Callable[[int, int], None]
 
@@ -122,8 +120,9 @@ def export(
     _refuse_others(format, given)
     if resolution is not None and not (math.isfinite(resolution) and resolution > 0.0):
         raise InputError(f"--resolution {resolution:g} is no size of a pixel; give a positive one")
-    if not (dive / MAP_FILE).exists():
-        raise InputError(f"{dive} holds no finished dive: {MAP_FILE} is missing")
+    from aquaflow.dive.status import refuse_without_map
+
+    refuse_without_map(dive)
     target = out or _own_target(dive / NAMES[format])
     with progress_bars(quiet=as_json) as bars:
 

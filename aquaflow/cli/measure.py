@@ -35,10 +35,6 @@ class Units(str, Enum):
     feet = "feet"
 
 
-MAP_FILE = "map.aqf"
-"""What every finished dive with a map has."""
-
-
 def register(app: typer.Typer) -> None:
     """Add the command to ``app``."""
     app.command("measure")(measure)
@@ -77,10 +73,13 @@ def measure(
     as_json: Json = False,
 ) -> None:
     """Measure in a finished dive: the ground in numbers, or between points; or tend its notes."""
+    from aquaflow.dive.status import refuse_without_map
+
     if notes or delete:
         if point or any(each is not None for each in (shape, cell, note, csv)):
             raise InputError("--notes and --delete measure nothing; give no other options")
-        _tend_notes(_with_map(dive), delete or [], as_json)
+        refuse_without_map(dive)
+        _tend_notes(dive, delete or [], as_json)
         return
     if cell is not None and not (math.isfinite(cell) and cell > 0.0):
         raise InputError(f"--cell {cell:g} is no size of a cell; give a positive one")
@@ -88,7 +87,7 @@ def measure(
         raise InputError(f"{csv} does not end in .csv; give the table a file of its own")
     if not point and (shape is not None or note is not None):
         raise InputError("--as and --note need points; give --point for each")
-    _with_map(dive)
+    refuse_without_map(dive)
     from aquaflow.survey.measure.finished_dive import numbers_of_dive
     from aquaflow.survey.measure.reef_files import write_csv
 
@@ -106,18 +105,13 @@ def measure(
     typer.echo(json.dumps(found.to_json()) if as_json else _in_words(found, unit))
 
 
-def _with_map(dive: Path) -> Path:
-    if not (dive / MAP_FILE).exists():
-        raise InputError(f"{dive} holds no finished dive: {MAP_FILE} is missing")
-    return dive
-
-
 def _tend_notes(dive: Path, delete: list[str], as_json: bool) -> None:
     """Remove the notes with these keys, and list what is left."""
+    from aquaflow.dive.map_file import SUFFIX
     from aquaflow.survey.measure.notes import listed, read_notes, without, write_notes
     from aquaflow.telemetry.metric_file import read_frame_of_map
 
-    frame = read_frame_of_map(dive / MAP_FILE)
+    frame = read_frame_of_map(dive / f"map{SUFFIX}")
     notes = read_notes(dive, frame)
     if delete:
         notes = without(notes, delete)

@@ -135,7 +135,7 @@ def view(
     from aquaflow.config.stage import validated
     from aquaflow.config.viewer import ViewerConfig
     from aquaflow.survey.site.manifest import is_site
-    from aquaflow.survey.viewer.finished import open_dive
+    from aquaflow.survey.viewer.finished import note_unfinished, open_dive
     from aquaflow.survey.viewer.site_page import open_site
 
     asked = {"enabled": True, "host": host, "port": port, "token_file": token_file}
@@ -144,6 +144,8 @@ def view(
         window = open_site(dive, config, component)
     elif component is None:
         window = open_dive(dive, config, partial(_mark, dive))
+        if said := note_unfinished(dive):
+            typer.echo(f"Warning: {said}.", err=True)
     else:
         raise InputError(f"{dive} is no site: only a site has components; leave --component out")
     typer.echo(f"Open {window.address} in a browser; Ctrl-C ends it.")

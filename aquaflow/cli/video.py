@@ -33,8 +33,6 @@ FLIGHT_S = 20.0
 LONGEST_FLIGHT_S = 3600.0
 WIDTHS = (64, 8192)
 """px; as of the pictures that are mapped."""
-MAP_FILE = "map.aqf"
-"""What every finished dive with a map has."""
 
 
 def register(app: typer.Typer) -> None:
@@ -67,8 +65,9 @@ def video(
         "--width": width is not None,
     }  # fmt: skip
     _refuse(kind, given, seconds, width)
-    if not (dive / MAP_FILE).exists():
-        raise InputError(f"{dive} holds no finished dive: {MAP_FILE} is missing")
+    from aquaflow.dive.status import refuse_without_map
+
+    refuse_without_map(dive)
     with progress_bars(quiet=as_json) as bars:
 
         def progress(done: int, total: int) -> None:

@@ -210,8 +210,13 @@ class ServiceConfig(Stage):
         100.0,
         gt=0,
         description="s; for all that ends a dive: frames that wait, refining, evaluation, files. "
-        "Evaluation and refining are cut short; keep it 30 s below systemd's TimeoutStopSec "
-        "(None: as long as it takes)",
+        "Evaluation and refining are cut short (None: as long as it takes)",
+    )
+    stop_s: float = Field(
+        15.0,
+        gt=0,
+        description="s; for the same from the moment on at which SIGTERM or Ctrl-C comes: the dive "
+        "may go on, or be finished, later. Keep it 45 s below systemd's TimeoutStopSec",
     )
     health: ListenConfig = ListenConfig(port=8230)
     foxglove: FoxgloveConfig = FoxgloveConfig()

@@ -18,6 +18,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import refuse_linked_folders
 from aquaflow.base.storage.atomic import (
     atomic_write,
+    is_part,
     make_subfolder,
     open_to_append,
     write_json,
@@ -31,6 +32,7 @@ from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.dive.log import JsonLog
 from aquaflow.dive.png import write_png
 from aquaflow.dive.results import WaterSummary
+from aquaflow.dive.status import CHECKPOINT, FRAMES, DiveState, DiveStatus
 from aquaflow.dive.status import NAME as STATUS
 from aquaflow.dive.trajectory_csv import NAME as PATH_TABLE
 from aquaflow.dive.trajectory_csv import PoseRow, write_trajectory_csv
@@ -49,7 +51,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MARKER = "frames.csv"
+MARKER = FRAMES
 """The file by which a folder is known to be a dive."""
 
 TRACE = "trace.json"
@@ -64,31 +66,30 @@ SUGGESTED = "found_camera.yaml"
 IN_SITE = "in_site.json"
 """Where a dive lies in an earlier one that it was looked for in."""
 
-RESULTS = (
-    *("trajectory.tum", "camera.yaml", "map*.ply", "map*.aqf", "medium.json"),
-    *(CALIBRATION, SUGGESTED),
+DELIVERABLES = (
+    *("trajectory.tum", "camera.yaml", "map*.ply", "map*.aqf", "medium.json", SUGGESTED, IN_SITE),
     *("metrics.json", "report.html", "heldout/*.png", "heldout/*.npz", TRACE),
-    KNOWN_LENGTHS,
-    TELEMETRY,
-    *("pictures/*.jpg", "view.zip"),
-    *("coverage.npz", "coverage.json", "coverage.png", "overview.png", "report.pdf"),
-    IN_SITE,
-    *("metric.json", "trajectory.csv", "georeference.json", "places.npz", STATUS),
-    *(
-        "restored/*.png",
-        "points.laz",
-        "points.e57",
-        "map.spz",
-        "colmap/images/*.png",
-        "colmap/sparse/0/*.bin",
-    ),
-    *("nerfstudio/images/*.png", "nerfstudio/points.ply", "nerfstudio/transforms.json"),
+    *("coverage.npz", "coverage.json", "coverage.png", "overview.png"),
+    *("metric.json", "trajectory.csv", "georeference.json", "places.npz"),
+    *("reef_numbers.csv", "reef_numbers.json"),
 )
-"""What a run writes, mostly at its end; of an earlier run in the same folder nothing must
-remain."""
+"""What is written at the end of a run, and of a live dive partly while it goes on."""
+EARLIER = ".earlier"
+"""Before the suffix of a deliverable that was not written again at the dive's end."""
 
-CHECKPOINT = "checkpoint"
-"""Folder of the checkpoints of a live run."""
+RESULTS = (
+    *DELIVERABLES,
+    f"*{EARLIER}.*",
+    *(CALIBRATION, KNOWN_LENGTHS, TELEMETRY),
+    *("pictures/*.jpg", "view.zip", "report.pdf"),
+    *("restored/*.png", "points.laz", "points.e57", "map.spz"),
+    *("colmap/images/*.png", "colmap/sparse/0/*.bin"),
+    *("nerfstudio/images/*.png", "nerfstudio/points.ply", "nerfstudio/transforms.json"),
+    *("mesh.ply", "mesh.obj", "mesh.mtl", "mesh.png", "mesh.glb", "ortho/*.tif", "dem/*.tif"),
+    *("dive.mcap", "dive.layout.json"),
+)
+"""What a run writes, and what is made of it; of an earlier run in the same folder nothing must
+remain."""
 
 WORK = "work"
 """Folder of data that does not fit into memory; removed at the end of the run."""
@@ -156,10 +157,10 @@ class DiveFolder:
 
     def _claim(self, overwrite: bool) -> None:
         try:
-            occupied = any(self.path.iterdir())
+            occupied = any(not is_part(each) for each in self.path.iterdir())
         except OSError as error:
             raise _unmade(self.path, error) from error
-        if occupied and not (self.path / MARKER).exists():
+        if occupied and not any((self.path / name).exists() for name in (MARKER, STATUS)):
             raise InputError(
                 f"{self.path} holds files that are not a dive; choose an empty folder as --out"
             )
@@ -167,6 +168,8 @@ class DiveFolder:
             raise InputError(
                 f"{self.path} already holds a dive; choose another --out or add --overwrite"
             )
+        # Before anything of an earlier dive goes, and before any file of this one.
+        DiveStatus(DiveState.OPEN).write(self.path)
         for pattern in RESULTS:
             for old in self.path.glob(pattern):
                 old.unlink()
@@ -207,7 +210,33 @@ class DiveFolder:
         self._recorded += lines
         return lines
 
+    def set_finished(self) -> None:
+        """Nothing comes any more, and every file is there that there will be.
+
+        Raises:
+            InputError: dive.json cannot be written.
+        """
+        DiveStatus(DiveState.FINISHED).write(self.path)
+
     # --- at its end ---------------------------------------------------------------------------
+
+    def deliverables(self) -> dict[Path, int]:
+        """Those that are there, and the inode of each: a file that is written has another one."""
+        found = (path for pattern in DELIVERABLES for path in self.path.glob(pattern))
+        return {path: path.stat().st_ino for path in found if EARLIER not in path.suffixes}
+
+    def set_aside(self, before: Mapping[Path, int]) -> None:
+        """Rename deliverables that were there ``before`` and were not written since, ``map.ply`` to
+        ``map.earlier.ply``: they are of another moment than the rest. Those of which the rest has
+        a newer one are removed."""
+        now = self.deliverables()
+        for path, inode in before.items():
+            if now.get(path) == inode:
+                path.replace(path.with_suffix(EARLIER + path.suffix))
+                log.warning("%s was not written again: it is of an earlier moment", path.name)
+        for old in [*self.path.glob(f"*{EARLIER}.*"), *self.path.glob(f"heldout/*{EARLIER}.*")]:
+            if old.with_name(old.name.replace(EARLIER, "")).exists():
+                old.unlink()
 
     def write_frames(self, sub_maps: Mapping[int, int]) -> None:
         """frames.csv once more: in the order of the recording, each posed frame in the sub-map that

@@ -13,6 +13,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.config import load_config
 from aquaflow.dive.map_file import SUFFIX, read_map_file
 from aquaflow.dive.placement import Placement, placement
+from aquaflow.dive.status import refuse_without_map
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
@@ -57,9 +58,10 @@ def read_mapper(dive: Path) -> Mapper:
     """The largest sub-map of the dive.
 
     Raises:
-        InputError: the dive has no map.
+        InputError: the dive is not finished, or has no map.
         ConfigError: the dive's settings cannot be read.
     """
+    refuse_without_map(dive)
     renderer = select_renderer(load_config(dive / "config.yaml", inside=True).mapping.renderer)
     return read_map_file(dive / f"map{SUFFIX}", renderer)
 

@@ -74,7 +74,9 @@ def map_recording(
             shown = progress or (lambda stage, done, total: None)
             if calibration is None:
                 _find_camera(run, recording, shown)
-            return _replay(run, recording, given, playback, config, shown)
+            finished = _replay(run, recording, given, playback, config, shown)
+            folder.set_finished()
+            return finished
         finally:
             with failures.contain("closing"):
                 slam.close()

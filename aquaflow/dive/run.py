@@ -309,6 +309,7 @@ class DiveRun:
     def _write(
         self, results: list[Tracked], outputs: MetricOutputs, limits: FinishTime
     ) -> Finished:
+        before = self.folder.deliverables()
         made = Deliverables(
             self.name, self.folder, self.slam, results, self.calibration, outputs, self.found,
             self.coverage,
@@ -336,13 +337,26 @@ class DiveRun:
         attempt("writing metrics.json", partial(write, "metrics.json", numbers))
         if self._trace:
             attempt(f"writing {TRACE}", lambda: write(TRACE, self.profiler.chrome_trace()))
-        if self.slam.failures.disk_was_full:
-            raise InputError(
-                f"the disk is full: {self.folder.path} lacks some of its files, log.jsonl says "
-                "which; make room and map again"
-            )
+        self._settle(before)
         notes = self.notes + self.slam.failures.notes()
         return Finished(self.folder.path, numbers, notes, self.warnings)
+
+    def _settle(self, before: dict[Path, int]) -> None:
+        """The files of the dive are of one moment: what was there ``before`` and was not written
+        anew, for want of room or because it failed, is set aside.
+
+        Raises:
+            InputError: some did not.
+        """
+        with self.slam.failures.contain("setting files aside", full_disk=True):
+            self.folder.set_aside(before)
+        if self.slam.failures.disk_was_full:
+            dive = self.folder.path
+            again = "map again" if self.live is None else f"run `aquaflow dive finish {dive}`"
+            raise InputError(
+                f"the disk is full: {dive} lacks some of its files, log.jsonl says which; make "
+                f"room and {again}"
+            )
 
     def _check_calibration(self) -> None:
         if self.calibration is None:

@@ -1,25 +1,35 @@
-"""dive.json: how a live dive stands, for the process that comes next."""
+"""dive.json: how a dive stands, for the process that comes next and for everyone who reads it."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
 from enum import Enum
 from pathlib import Path
 
+from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.base.storage.atomic import write_json
+from aquaflow.base.storage.folder_lock import is_held
 from aquaflow.config.device import MountingConfig
 
 NAME = "dive.json"
+FRAMES, METRICS, MAP = "frames.csv", "metrics.json", "map.aqf"
+"""Files that every dive has, every finished one, and every finished one with a map."""
+CHECKPOINT = "checkpoint"
+"""Folder of the checkpoints of a live run."""
 
 
 class DiveState(str, Enum):
     """What became of a dive."""
 
     OPEN = "open"
-    """It is being mapped, or was when its process was killed."""
+    """It is being mapped, or was when that failed or its process was killed."""
     FINISHING = "finishing"
     """The pilot wants it finished; a process that ends now has left that undone."""
+    RESCALING = "rescaling"
+    """Its files are being brought to metres; a process that ends now leaves two units in them."""
     STOPPED = "stopped"
     """The service was told to end: the deliverables are there, and the dive may go on."""
     FINISHED = "finished"
@@ -36,14 +46,19 @@ class DiveStatus:
     """The content of dive.json."""
 
     state: DiveState
-    paused: bool
+    paused: bool = False
     """The pilot wants nothing mapped, until he asks for it."""
-    begun_utc: str | None
-    """By the computer's clock; None while that had never been set."""
-    boot: str
-    """Of the kernel under which the dive last ran; its monotonic clock counts from there."""
-    mounting: dict[str, object] | None
-    """Of the camera in the body, as the config or the camera stated it."""
+    begun_utc: str | None = None
+    """Of a live dive, by the computer's clock; None while that had never been set."""
+    boot: str = ""
+    """Of the kernel under which a live dive last ran; its monotonic clock counts from there."""
+    mounting: dict[str, object] | None = None
+    """Of a live dive's camera in the body, as the config or the camera stated it."""
+
+    @property
+    def is_live(self) -> bool:
+        """True of a live dive; a replay is of no boot."""
+        return bool(self.boot)
 
     def write(self, dive: Path) -> None:
         """Raises InputError if it cannot be written."""
@@ -67,3 +82,92 @@ def read_status(dive: Path) -> DiveStatus | None:
     if not isinstance(begun, str | None) or not isinstance(boot, str):
         return None
     return status
+
+
+def unfinished(dive: Path) -> str | None:
+    """What keeps a dive's files from being those of a finished dive, and what to do about it, in a
+    sentence; None of a finished dive, and of a folder that is no dive.
+
+    Without a readable dive.json, as in dives of an older AquaFlow, metrics.json tells: it was the
+    last file of a dive, and those that were written while a live dive went on say so.
+    """
+    status = read_status(dive)
+    there = (dive / FRAMES).is_file()
+    if status is None:
+        return _why_cut_off(dive, live=False) if there and not _has_metrics(dive) else None
+    if status.state is DiveState.RESCALING:
+        return (
+            f"`aquaflow scale` was cut off in {dive}, whose files have two units of length now; "
+            f"map its recording again: `aquaflow map RECORDING --out {dive} --overwrite`"
+        )
+    if not status.state.is_complete:
+        return _why_cut_off(dive, status.is_live)
+    if there and not (dive / METRICS).is_file():
+        return f"nothing of {dive} could be mapped; its {FRAMES} says why, for each frame"
+    return None
+
+
+def _why_cut_off(dive: Path, live: bool) -> str:
+    if is_held(dive):
+        return f"{dive} is being written by a running aquaflow; wait for its end, or stop it"
+    if any((dive / CHECKPOINT).glob("*.npz")):
+        return (
+            f"{dive} is not finished: its process was cut off, or the disk was full; "
+            f"`aquaflow dive finish {dive}` does the rest"
+        )
+    if live:
+        return (
+            f"{dive} is not finished: its process was cut off before its first checkpoint, so that "
+            "nothing can be added to what was written until then"
+        )
+    return (
+        f"{dive} is not finished: mapping it was cut off, or failed; map its recording again: "
+        f"`aquaflow map RECORDING --out {dive} --overwrite`"
+    )
+
+
+def refuse_unfinished(dive: Path) -> None:
+    """For whoever takes a dive's files as those of a finished one.
+
+    Raises:
+        InputError: they are not; what happened, and what to do.
+    """
+    said = unfinished(dive)
+    if said is not None:
+        raise InputError(said)
+
+
+def refuse_without_map(dive: Path) -> None:
+    """For whoever needs the map of a finished dive.
+
+    Raises:
+        InputError: it is not finished, or has no map.
+    """
+    refuse_unfinished(dive)
+    if not (dive / MAP).exists():
+        raise InputError(f"{dive} holds no finished dive: {MAP} is missing")
+
+
+@contextmanager
+def rescaling(dive: Path) -> Iterator[None]:
+    """The block changes the unit of a finished dive's files; if it does not come to its end, every
+    reader says so.
+
+    Raises:
+        InputError: dive.json cannot be written.
+    """
+    before = read_status(dive) or DiveStatus(DiveState.FINISHED)
+    replace(before, state=DiveState.RESCALING).write(dive)
+    yield
+    before.write(dive)
+
+
+def _has_metrics(dive: Path) -> bool:
+    """True if metrics.json is there and does not say that it is of a dive that went on."""
+    try:
+        found = read_regular_json(dive / METRICS)
+    except FileNotFoundError:
+        return False
+    except (OSError, ValueError, RecursionError):  # who reads it says what is wrong with it
+        return True
+    return not isinstance(found, dict) or found.get("complete") is not False

@@ -66,6 +66,8 @@ class Control:
         self.stopping = threading.Event()
         """Set: the service ends, and leaves a dive that can be gone on with. For any thread, and
         for signal handlers."""
+        self.told = threading.Event()
+        """Set: by a signal, whose sender kills the process after a while."""
         self._lock, self._asked = threading.Lock(), threading.Event()
         self._phase = Phase.IDLE
         self._another = False

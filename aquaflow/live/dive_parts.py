@@ -76,7 +76,8 @@ def assembled(
         ConfigError: the prior cannot give what the config asks tracking for.
     """
     config, service, failures = plain(vehicle), vehicle.service, feed.failures
-    profiler, before = Profiler(), read_status(folder.path)
+    profiler = Profiler()
+    before = None if choice.checkpoint is None else read_status(folder.path)
     # A core is left for tracking, where there is more than one.
     threads = config.threads or max(1, core_count() - 1)
     # A dive whose map was made before mapping was switched off keeps it.

@@ -13,10 +13,10 @@ from aquaflow.base.storage.folder_lock import refuse_held
 from aquaflow.config import load_config
 from aquaflow.config.device import MountingConfig
 from aquaflow.config.vehicle import VehicleConfig
-from aquaflow.dive.folder import CALIBRATION, CHECKPOINT, MARKER, WORK
+from aquaflow.dive.folder import CALIBRATION, MARKER, WORK
 from aquaflow.dive.frames_csv import readable_rows
 from aquaflow.dive.run import Finished
-from aquaflow.dive.status import DiveState, read_status
+from aquaflow.dive.status import CHECKPOINT, DiveState, read_status, refuse_unfinished
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.live.checkpoint.generations import generations
 from aquaflow.live.checkpoint.resume import Choice, newest_usable
@@ -67,7 +67,7 @@ def refuse_unfit(dive: Path) -> None:
 
     Raises:
         FinishedAlreadyError: it is; what its last process had no time to remove is removed.
-        InputError: it is no dive, or a running service writes to it.
+        InputError: it is no dive, a running service writes to it, or it is a replay.
     """
     if not (dive / MARKER).is_file():
         raise InputError(f"{dive} is no dive: it has no {MARKER}; give the folder of a dive")
@@ -78,6 +78,8 @@ def refuse_unfit(dive: Path) -> None:
         for name in (CHECKPOINT, WORK):
             shutil.rmtree(dive / name, ignore_errors=True)
         raise FinishedAlreadyError(f"{dive} is finished already")
+    if status is not None and not status.is_live and not generations(dive):
+        refuse_unfinished(dive)
 
 
 def settings_of(dive: Path, seconds: float | None) -> VehicleConfig:

@@ -10,10 +10,10 @@ from functools import partial
 from aquaflow.base.cores import usable_threads
 from aquaflow.base.errors import NotMappedError
 from aquaflow.config.vehicle import VehicleConfig
-from aquaflow.dive.folder import CHECKPOINT, DiveFolder
+from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.replay import fix_threads
 from aquaflow.dive.run import Finished
-from aquaflow.dive.status import DiveState
+from aquaflow.dive.status import CHECKPOINT, DiveState
 from aquaflow.live.checkpoint.resume import Choice
 from aquaflow.live.checkpoint.salvage import salvaged_from
 from aquaflow.live.control import Control
@@ -34,7 +34,12 @@ STAGE = "finishing"
 """Name of a dive's end among the heartbeats; it is hung where it takes ``service.hang_s`` longer
 than ``service.finish_s``."""
 FINISH_MARGIN_S = 30.0
-"""Requested from systemd on top of ``service.finish_s``: what cannot be cut short, and closing."""
+"""Requested from systemd on top of ``service.finish_s`` or ``service.stop_s``: what cannot be cut
+short, and closing."""
+CUT_SHORT = (
+    "the service was told to stop, and the end of the dive was kept short (service.stop_s); "
+    "`aquaflow dive finish` refines the map and evaluates more"
+)
 
 
 class LiveDive:
@@ -67,7 +72,7 @@ class LiveDive:
         self.feed, self.control = feed, control or Control()
         self.vitals = vitals or Vitals(config.service)
         self._own_vitals = vitals is None
-        self._finish_s = config.service.finish_s
+        self._finish_s, self._stop_s = config.service.finish_s, config.service.stop_s
         self._finished = False
         losses = [] if salvaged is None else salvaged.losses
         try:
@@ -94,13 +99,15 @@ class LiveDive:
         self.parts.loop.end()
 
     def finish(self, progress: Progress | None = None) -> Finished | None:
-        """Refine and write, within ``service.finish_s``; None where nothing could be mapped. A dive
-        whose service was told to stop can be gone on with; every other one is finished.
+        """Refine and write, within ``service.finish_s``, and within ``service.stop_s`` once a
+        signal came; None where nothing could be mapped. A dive whose service was told to stop can
+        be gone on with; every other one is finished.
 
         Raises:
             InputError: the disk is full.
         """
-        limits, parts, heartbeats = FinishTime(self._finish_s), self.parts, self.vitals.heartbeats
+        parts, heartbeats, told = self.parts, self.vitals.heartbeats, self.control.told.is_set
+        limits = FinishTime(self._finish_s, stopped=told, stop_s=self._stop_s)
         parts.refresher.end()
         if self._finish_s is not None:
             heartbeats.beat(STAGE, ahead_s=self._finish_s)
@@ -120,7 +127,8 @@ class LiveDive:
         with contain("service counters"):
             parts.run.live = parts.loop.status()
         try:
-            finished = parts.run.finish(self.feed.notes, progress, limits)
+            notes = [*self.feed.notes, *([CUT_SHORT] if told() else [])]
+            finished = parts.run.finish(notes, progress, limits)
         except NotMappedError as error:
             log.warning("%s", error)
             finished = None
@@ -133,7 +141,8 @@ class LiveDive:
         """What happens now: the service ends with this dive, or waits for the next."""
         if stopped or self.feed.newest.ended:
             reason = "stop requested" if stopped else "the recording ended"
-            self.vitals.stop(reason, (self._finish_s or 0.0) + FINISH_MARGIN_S)
+            most_s = self._stop_s if self.control.told.is_set() else self._finish_s or 0.0
+            self.vitals.stop(reason, most_s + FINISH_MARGIN_S)
         else:
             self.vitals.health.set(State.FINISHING, FINISHING)
         self.parts.loop.tell_watchers()  # the pilot hears it while the feed is open

@@ -78,7 +78,7 @@ def map_live(
         vitals = around.enter_context(Vitals(vehicle.service))
         station = around.enter_context(Station(feed, vehicle, control, vitals))
         around.callback(_stop_after(seconds, control).cancel)
-        around.enter_context(stop_on_signals(control.stopping, once=True))
+        around.enter_context(stop_on_signals(control.told, control.stopping, once=True))
         onboard = Onboard(feed, vehicle, control, station, progress)
         return onboard.serve(Asked(out, new, overwrite))
 

@@ -116,3 +116,19 @@ def test_every_beginning_of_the_order_is_spread_over_the_dive(count: int) -> Non
     for some in range(3, count + 1):
         gaps = np.diff(sorted([-1, *order[:some], count]))
         assert gaps.max() <= 4.0 * count / some
+
+
+def test_once_the_service_is_told_to_stop_every_phase_ends_so_much_later_at_most() -> None:
+    now, told = [0.0], [False]
+    limits = FinishTime(100.0, lambda: now[0], lambda: told[0], stop_s=10.0)
+    part = limits.refining.share(0.5)
+    assert limits.settling.left_s == pytest.approx(25.0)
+    now[0], told[0] = 20.0, True
+    assert limits.settling.left_s == pytest.approx(SETTLED * 10.0)
+    assert limits.evaluating.left_s == pytest.approx(EVALUATED * 10.0)
+    assert part.left_s == pytest.approx(REFINED * 10.0)  # also what was derived before
+    now[0] = 26.0
+    assert limits.refining.over
+    assert not limits.evaluating.over
+    now[0] = 30.0
+    assert limits.whole.over

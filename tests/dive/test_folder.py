@@ -17,6 +17,7 @@ from aquaflow.config import Config, load_config
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.frames_csv import FrameRow
 from aquaflow.dive.ply import read_ply
+from aquaflow.dive.status import DiveState, read_status, unfinished
 from aquaflow.geometry.camera import load_camera
 from aquaflow.lab.evaluation.trajectory import read_tum
 from tests.small_recording import FRAMES, HEIGHT, WIDTH
@@ -172,3 +173,58 @@ def test_overwriting_removes_results_and_keeps_what_is_not_a_runs(tmp_path: Path
     with opened(dive, overwrite=True):
         assert not (dive / "map_1.ply").exists()
         assert (dive / "my notes.txt").exists()
+
+
+def test_a_folder_is_open_before_anything_in_it_is_touched_and_finished_when_that_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dive, unlink = tmp_path / "dive", Path.unlink
+    with opened(dive) as folder:
+        assert "is being written" in (unfinished(dive) or "")
+        (dive / "map.ply").touch()
+        (dive / "metrics.json").write_text("{}")
+        folder.set_finished()
+    assert unfinished(dive) is None
+    states = []
+
+    def seen(self: Path, missing_ok: bool = False) -> None:
+        if self.name == "map.ply":
+            status = read_status(dive)
+            states.append(None if status is None else status.state)
+        unlink(self, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", seen)
+    with opened(dive, overwrite=True):
+        pass
+    assert states == [DiveState.OPEN]
+    assert "mapping it was cut off, or failed" in (unfinished(dive) or "")
+
+
+def test_a_folder_that_was_cut_off_before_its_table_can_be_mapped_into_again(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / ".dive.json.part").touch()
+    with opened(tmp_path):
+        pass
+    (tmp_path / "frames.csv").unlink()
+    with opened(tmp_path, overwrite=True):
+        assert (tmp_path / "frames.csv").exists()
+
+
+def test_deliverables_that_were_not_written_again_are_set_aside_until_they_are(
+    tmp_path: Path,
+) -> None:
+    with opened(tmp_path / "dive") as folder:
+        for name in ("map.ply", "report.html"):
+            folder.write_bytes(name, b"old")
+        before = folder.deliverables()
+        folder.write_bytes("report.html", b"new")
+        folder.set_aside(before)
+        assert not (folder.path / "map.ply").exists()
+        assert (folder.path / "map.earlier.ply").read_bytes() == b"old"
+        assert (folder.path / "report.html").read_bytes() == b"new"
+        before = folder.deliverables()
+        for name in ("map.ply", "report.html"):
+            folder.write_bytes(name, b"newer")
+        folder.set_aside(before)
+        assert list(folder.path.glob("*.earlier.*")) == []

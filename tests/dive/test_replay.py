@@ -14,6 +14,7 @@ import pytest
 from aquaflow.base.errors import InputError, NotMappedError
 from aquaflow.config import Config, SourceConfig
 from aquaflow.dive.replay import map_recording
+from aquaflow.dive.status import refuse_unfinished
 from aquaflow.recordings.synthetic import SyntheticDive
 from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
@@ -137,6 +138,8 @@ def test_a_still_camera_gives_no_map_and_says_what_is_needed(
     with pytest.raises(NotMappedError, match="move sideways"):
         map_recording(open_recording(source), "still", tmp_path / "dive", TRACKING_ONLY)
     assert all(row["reason"] for row in rows(tmp_path / "dive"))
+    with pytest.raises(InputError, match="is not finished: mapping it was cut off, or failed"):
+        refuse_unfinished(tmp_path / "dive")
 
 
 def test_a_real_reef_is_tracked_from_small_pictures(

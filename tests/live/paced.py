@@ -4,7 +4,8 @@ A live dive takes the newest picture, so that what it maps depends on how fast t
 this one every picture is taken, at the machine's own pace. As a program:
 ``paced.py [--full-disk-at INDEX | --killed-at INDEX] run ...``: at that picture of the recording,
 once a checkpoint that is newer than it was written, files cannot grow any more, or the process is
-killed; with ``--killed-with-a-report-at``, once a report was written, too.
+killed; with ``--killed-with-a-report-at``, once a report was written, too, and with
+``--little-room-with-a-report-at`` files can only stay small from there on.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from aquaflow.types import Dropped, Frame
 
 ROOM_BYTES = 64
 """No file can become larger: nothing new can be written, what is there stays."""
+LITTLE_BYTES = 16_384
 FAST = "1000"
 """Times as fast as the recording: pictures are always there when they are asked for."""
 LOOK_S = 0.02
@@ -35,11 +37,17 @@ def fill_the_disk() -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (ROOM_BYTES, resource.RLIM_INFINITY))
 
 
+def leave_little_room() -> None:
+    """A path finds room, a map does not."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (LITTLE_BYTES, resource.RLIM_INFINITY))
+
+
 def kill() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
 HAPPENINGS: dict[str, Callable[[], None]] = {
+    "--little-room-with-a-report-at": leave_little_room,
     "--full-disk-at": fill_the_disk, "--killed-at": kill, "--killed-with-a-report-at": kill,
 }  # fmt: skip
 

@@ -8,11 +8,15 @@ from pathlib import Path
 import pytest
 
 from aquaflow.dive.frames_csv import read_rows
+from aquaflow.lab.evaluation.trajectory import read_tum
 from aquaflow.live.checkpoint.generations import read_state, state_file
+from tests.command_line import Cli
 from tests.live.killed_dives import CONFIG
 from tests.live.paced import paced_run
 from tests.small_recording import FRAMES
 
+FPS = 10.0
+FULL_WITH_A_MAP_AT = 18
 FULL_AT = 12
 """The picture at which the disk is full, once there is a checkpoint of those before it."""
 
@@ -64,3 +68,30 @@ def test_with_room_again_the_dive_is_taken_up_and_finished(
     ]
     assert posed[-1] == FRAMES - 1
     assert (folder / "dive" / "map.ply").stat().st_size > 1000
+
+
+def test_deliverables_of_an_earlier_moment_are_set_aside_and_the_dive_is_finished_with_room_again(
+    aquaflow: Cli, small_recording: Path, tmp_path: Path
+) -> None:
+    dive, config = tmp_path / "dive", tmp_path / "vehicle.yaml"
+    config.write_text(CONFIG.replace("{every_s: 1.0}", "{every_s: 0.01, deliverables_s: 0.01}"))
+    at = ("--little-room-with-a-report-at", str(FULL_WITH_A_MAP_AT))
+    done = paced_run(small_recording, config, dive, *at)
+    assert done.returncode == 1
+    assert f"make room and run `aquaflow dive finish {dive}`" in done.stderr
+    last_s = read_tum(dive / "trajectory.tum").t_s[-1]
+    assert last_s == pytest.approx((FRAMES - 1) / FPS)  # it is of the end
+    for name in ("map.ply", "map_clear.ply", "report.html"):
+        assert not (dive / name).exists()
+    earlier = (dive / "report.earlier.html").read_text()
+    assert "written while the dive went on" in earlier
+    assert (dive / "map.earlier.ply").is_file()
+    ran = aquaflow("export", dive, "--format", "spz")
+    assert (ran.code, ran.out) == (1, "")
+    assert f"the disk was full; `aquaflow dive finish {dive}` does the rest" in ran.err
+    ran = aquaflow("dive", "finish", dive)
+    assert ran.code in (0, 3), ran.err
+    assert list(dive.rglob("*.earlier.*")) == []
+    for name in ("map.aqf", "map.ply", "report.html", "metrics.json"):
+        assert (dive / name).is_file()
+    assert aquaflow("export", dive, "--format", "spz").code == 0

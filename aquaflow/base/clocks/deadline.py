@@ -13,9 +13,19 @@ Now = Callable[[], float]
 class Deadline:
     """Work may go on until ``seconds`` have passed; None: for ever."""
 
-    def __init__(self, seconds: float | None = None, now_s: Now = time.monotonic) -> None:
-        self._now_s, self._seconds = now_s, seconds
-        self._end_s = math.inf if seconds is None else now_s() + seconds
+    def __init__(
+        self,
+        seconds: float | None = None,
+        now_s: Now = time.monotonic,
+        cut_s: Now = lambda: math.inf,
+    ) -> None:
+        """``cut_s``: the moment at which it ends at the latest, which may come nearer later."""
+        self._now_s, self._cut_s, self._seconds = now_s, cut_s, seconds
+        self._asked_s = math.inf if seconds is None else now_s() + seconds
+
+    @property
+    def _end_s(self) -> float:
+        return min(self._asked_s, self._cut_s())
 
     @property
     def left_s(self) -> float:
@@ -43,7 +53,7 @@ class Deadline:
         """The earlier of this one and ``most_s`` from now; None: this one."""
         limits = [] if most_s is None else [most_s]
         limits += [self.left_s] if self.limited else []
-        return Deadline(min(limits, default=None), self._now_s)
+        return Deadline(min(limits, default=None), self._now_s, self._cut_s)
 
     def share(self, part: float) -> Deadline:
         """One after ``part`` of the time that is left."""

@@ -17,10 +17,10 @@ from aquaflow.base.clocks.computer import clock_is_set
 from aquaflow.base.errors import InputError
 from aquaflow.base.storage.folder_lock import is_held
 from aquaflow.config.service import CheckpointConfig
-from aquaflow.dive.folder import CHECKPOINT, MARKER, WORK
+from aquaflow.dive.folder import MARKER, WORK
 from aquaflow.dive.frames_csv import header
+from aquaflow.dive.status import CHECKPOINT, DiveState, read_status
 from aquaflow.dive.status import NAME as STATUS
-from aquaflow.dive.status import DiveState, read_status
 from aquaflow.live.checkpoint.age import age_of
 from aquaflow.live.checkpoint.generations import Checkpoint, generations, read_state
 from aquaflow.live.moment import Moment
@@ -84,7 +84,8 @@ def resumed(folder: Path, new: bool) -> Choice:
 
 def is_begun(folder: Path) -> bool:
     """True for a dive that was interrupted before its first row: it may be restarted."""
-    return (folder / MARKER).is_file() and not holds_rows(folder)
+    begun = any((folder / name).is_file() for name in (MARKER, STATUS))
+    return begun and not holds_rows(folder)
 
 
 def holds_rows(folder: Path) -> bool:

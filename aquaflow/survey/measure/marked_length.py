@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from aquaflow.base.errors import InputError
+from aquaflow.dive.status import refuse_unfinished
 from aquaflow.survey.measure.reef_files import CSV, JSON, write_reef_numbers
 from aquaflow.survey.measure.rescaling import rescale, why_not
 from aquaflow.telemetry.known_lengths.known_length import KnownLength, LengthScale, scale_of
@@ -49,8 +50,9 @@ def keep_length(dive: Path, known: KnownLength, progress: Progress | None = None
     The ground is measured anew then: on cells of so many centimetres, as other dives are.
 
     Raises:
-        InputError: a file of the dive cannot be read or written.
+        InputError: the dive is not finished, or a file of it cannot be read or written.
     """
+    refuse_unfinished(dive)
     lengths = with_length(read_known_lengths(dive), known)
     write_known_lengths(dive, lengths)
     members = [each for each in lengths if each.sub_map == known.sub_map]

@@ -23,6 +23,7 @@ from aquaflow.dive import trajectory_csv
 from aquaflow.dive.metric_outputs import frame_numbers, worlds_in_words
 from aquaflow.dive.path_rows import position_sigma, speeds_of
 from aquaflow.dive.ply import PlyGaussians, read_ply, write_ply
+from aquaflow.dive.status import rescaling
 from aquaflow.dive.trajectory_csv import PoseRow, read_trajectory_csv, write_trajectory_csv
 from aquaflow.dive.tum import write_tum
 from aquaflow.geometry.similarity import Sim3
@@ -81,23 +82,25 @@ def rescale(dive: Path, sub_map: int, lengths: Sequence[KnownLength], scale: Len
         texts["metrics.json"] = _json(dive / "metrics.json") | frame_numbers(frames[main])
         if (dive / "medium.json").is_file():
             texts["medium.json"] = _medium(_json(dive / "medium.json"), frames[main], times)
-    for path, each in splats.items():
-        write_ply(path, _scaled(each, times))
-    write_trajectory_csv(dive / trajectory_csv.NAME, _rows(rows, sub_map, frames[sub_map], times))
-    write_tum(
-        dive / "trajectory.tum", poses[:, 0], poses[:, 1:4], poses[:, [7, 4, 5, 6]],
-        worlds_in_words(frames),
-    )  # fmt: skip
-    for name, content in texts.items():
-        write_json(dive / name, content)
-    if sub_map == main:
-        _scale_ranges(dive / "heldout", times)
-        if notes:
-            write_notes(dive, notes, frames[main])
-    if sub_map in seen:
-        seen[sub_map] = seen[sub_map].rescaled(times, frames[sub_map].unit)
-        write_coverage(dive, seen, main)
-    write_metric_file(dive, frames, main)
+    with rescaling(dive):
+        for path, each in splats.items():
+            write_ply(path, _scaled(each, times))
+        table = _rows(rows, sub_map, frames[sub_map], times)
+        write_trajectory_csv(dive / trajectory_csv.NAME, table)
+        write_tum(
+            dive / "trajectory.tum", poses[:, 0], poses[:, 1:4], poses[:, [7, 4, 5, 6]],
+            worlds_in_words(frames),
+        )  # fmt: skip
+        for name, content in texts.items():
+            write_json(dive / name, content)
+        if sub_map == main:
+            _scale_ranges(dive / "heldout", times)
+            if notes:
+                write_notes(dive, notes, frames[main])
+        if sub_map in seen:
+            seen[sub_map] = seen[sub_map].rescaled(times, frames[sub_map].unit)
+            write_coverage(dive, seen, main)
+        write_metric_file(dive, frames, main)
 
 
 def _metric(frame: MetricFrame, lengths: Sequence[KnownLength], scale: LengthScale) -> MetricFrame:

@@ -15,6 +15,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.config import load_config
 from aquaflow.dive.frames_csv import read_rows
 from aquaflow.dive.map_file import SUFFIX, read_map_file
+from aquaflow.dive.status import refuse_unfinished
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render import select_renderer
 from aquaflow.render.views import View
@@ -97,6 +98,7 @@ def _mapped(dive: Path, frame: int) -> tuple[Mapper, View, int]:
     number, largest = sub_maps[frame], _largest(sub_maps)
     renderer = select_renderer(load_config(dive / "config.yaml", inside=True).mapping.renderer)
     name = "map" if number == largest else f"map_{number}"
+    refuse_unfinished(dive)
     mapper = read_map_file(dive / f"{name}{SUFFIX}", renderer)
     return mapper, view_of_frame(mapper, frame, dive), number
 

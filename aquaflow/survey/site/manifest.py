@@ -11,6 +11,7 @@ from pathlib import Path
 from aquaflow.base.errors import DamagedError, InputError, reason_of
 from aquaflow.base.errors.regular_file import read_regular_json, sha256_regular
 from aquaflow.base.storage.atomic import write_json
+from aquaflow.dive.status import refuse_unfinished
 from aquaflow.keyframes.places_file import NAME as PLACES
 from aquaflow.keyframes.places_file import PlacesFile
 from aquaflow.telemetry.metric_file import NAME as METRIC
@@ -110,6 +111,7 @@ def add_dives(site: Path, folders: Sequence[Path]) -> list[SiteDive]:
     there = list(read_site(site)) if (site / NAME).exists() else []
     new = []
     for folder in folders:
+        refuse_unfinished(folder)
         PlacesFile(folder / PLACES)  # refuses what cannot be recognised again
         mark = fingerprint(folder)
         at = next((i for i, dive in enumerate(there) if _same(dive.folder(site), folder)), None)

@@ -13,6 +13,7 @@ from typing import Any
 from aquaflow.base.errors import DamagedError, InputError, reason_of
 from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.config.viewer import ViewerConfig
+from aquaflow.dive.status import unfinished
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.survey.viewer.dive_map import DiveMap, read_map
 from aquaflow.survey.viewer.dive_path import DivePath, read_path
@@ -70,7 +71,8 @@ class FinishedDive:
         else:
             count, total = self.packed.count, self.packed.total
         of_all = f"{len(self.path.poses)} poses, {count} of {total} Gaussians"
-        return f"{self.folder.name}: {of_all}\n\n{frame_in_words(self.frame)}"
+        said = f"{self.folder.name}: {of_all}\n\n{frame_in_words(self.frame)}"
+        return "\n\n".join(filter(None, (said, note_unfinished(self.folder))))
 
 
 def frame_in_words(frame: MetricFrame) -> str:
@@ -87,7 +89,10 @@ def read_dive(folder: Path, budget: int) -> FinishedDive:
     Raises:
         InputError: there is none.
     """
+    said = unfinished(folder)
     for name in WHOLE:
+        if said is not None and not (folder / name).is_file():
+            raise InputError(said)
         if not (folder / name).is_file():
             raise InputError(f"{folder} holds no finished dive: {name} is missing")
     path = read_path(folder)
@@ -104,6 +109,12 @@ def read_dive(folder: Path, budget: int) -> FinishedDive:
         folder, ply, cache(partial(read_map, folder, ply, path.places, frame, budget)),
         read_packed(folder, key), key, water, path, camera, frame,
     )  # fmt: skip
+
+
+def note_unfinished(folder: Path) -> str:
+    """What the viewer says of a dive that is shown as far as it came; empty of a finished one."""
+    said = unfinished(folder)
+    return "" if said is None else f"What is shown may be of several moments: {said}"
 
 
 def show_dive(dive: FinishedDive, config: ViewerConfig, tools: Tools | None = None) -> ViewerPage:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import read_regular_json
+from aquaflow.dive.status import refuse_unfinished
 from aquaflow.keyframes.places_file import NAME, PlacesFile
 from aquaflow.telemetry.metric_file import read_metric_file
 from aquaflow.tracking.base.base import Base
@@ -22,6 +23,7 @@ def open_base(folder: Path) -> Base:
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is no folder; give that of a finished dive to --in")
+    refuse_unfinished(folder)
     if not (folder / NAME).is_file():
         raise InputError(
             f"{folder} has no {NAME}, by which places are found again; give a finished dive to "

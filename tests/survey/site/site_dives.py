@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from aquaflow.dive.status import DiveState, DiveStatus
 from aquaflow.dive.tum import write_tum
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
@@ -84,4 +85,6 @@ def stated_dive(
     rows = [f"{i},x,{float(i):.9f},keyframe,{numbers[i]},{i},1.000," for i in range(count)]
     header = "index,source,t_s,class,sub_map,keyframe,quality,reason"
     (folder / "frames.csv").write_text("\n".join([header, *rows]) + "\n")
+    DiveStatus(DiveState.FINISHED).write(folder)
+    (folder / "metrics.json").write_text("{}")
     return folder

@@ -39,6 +39,7 @@ def perform(job: GrowthJob) -> dict[str, Any]:
         try:
             run = DiveRun("survey", folder, config, slam, survey.camera, survey.name_of)
             row = _dived(run, survey, job.frames) | _finished(run)
+            folder.set_finished()
         finally:
             slam.close()
     finally:
