@@ -36,8 +36,13 @@ class Ran:
 Cli = Callable[..., Ran]
 
 
-def run_aquaflow(*arguments: object, timeout_s: float = TIMEOUT_S) -> Ran:
-    """Run ``aquaflow`` with ``arguments``; one that runs longer than ``timeout_s`` is killed."""
+def run_aquaflow(
+    *arguments: object,
+    timeout_s: float = TIMEOUT_S,
+    meanwhile: Callable[[int], None] = lambda _: None,
+) -> Ran:
+    """Run ``aquaflow`` with ``arguments``; one that runs longer than ``timeout_s`` is killed.
+    ``meanwhile`` is called with its process id, and may kill it."""
     with tempfile.TemporaryDirectory(prefix="aquaflow-command-") as folder:
         out, err = Path(folder) / "out", Path(folder) / "err"
         command = {
@@ -47,7 +52,7 @@ def run_aquaflow(*arguments: object, timeout_s: float = TIMEOUT_S) -> Ran:
             "out": str(out),
             "err": str(err),
         }
-        code = _answer(json.dumps(command), timeout_s)
+        code = _answer(json.dumps(command), timeout_s, meanwhile)
         return Ran(code, _text(out), _text(err))
 
 
@@ -62,7 +67,7 @@ def refused(ran: Ran, *named: object) -> None:
         assert str(name) in line
 
 
-def _answer(line: str, timeout_s: float) -> int:
+def _answer(line: str, timeout_s: float, meanwhile: Callable[[int], None]) -> int:
     """The exit status of one command; as with subprocess, minus the signal that ended it."""
     server = _server()
     assert server.stdin is not None
@@ -73,6 +78,7 @@ def _answer(line: str, timeout_s: float) -> int:
     alarm = threading.Timer(timeout_s, os.kill, (process_id, signal.SIGKILL))
     alarm.start()
     try:
+        meanwhile(process_id)
         return int(server.stdout.readline())
     finally:
         alarm.cancel()
