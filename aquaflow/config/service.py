@@ -6,7 +6,7 @@ import ipaddress
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field, IPvAnyNetwork, field_validator, model_validator
+from pydantic import Field, IPvAnyNetwork, model_validator
 
 from aquaflow.config.device import MountingConfig
 from aquaflow.config.link import Port
@@ -36,6 +36,10 @@ class ListenConfig(Stage):
         [], description="networks whose computers need no token, such as 192.168.2.0/24: everybody "
         "there may watch and control the dive",
     )  # fmt: skip
+    proxies: list[IPvAnyNetwork] = Field(
+        [], description="addresses of proxies whose X-Real-IP names the client, such as 127.0.0.1 "
+        "for BlueOS's: every program at such an address can claim to be any client",
+    )  # fmt: skip
 
     @model_validator(mode="after")
     def _others_need_a_token(self) -> ListenConfig:
@@ -44,31 +48,21 @@ class ListenConfig(Stage):
         return self
 
 
-class FoxgloveConfig(Stage):
+class FoxgloveConfig(ListenConfig):
     """A running dive as ROS 2 messages over Foxglove's websocket; off unless asked for."""
 
     enabled: bool = False
-    host: str = Field(
-        "127.0.0.1",
-        description="loopback only: the protocol has no token; from another computer, "
-        "ssh -L 8765:127.0.0.1:8765",
-    )
     port: int = Field(8765, ge=0, le=65535, description="Foxglove's default; 0: any that is free")
+    origins: list[str] = Field(
+        ["https://app.foxglove.dev"],
+        description="pages that may connect without being told the token, as a browser names them "
+        "in Origin; file:// lets desktop apps in, and every page that is opened from the disk",
+    )
     pose_hz: float = Field(10.0, gt=0, le=60, description="tf, pose, camera picture, diagnostics")
     refresh_s: float = Field(
         3.0, gt=0, description="s between points and rendered pictures of the map, as the viewer's"
     )
     points: int = Field(60_000, ge=100, description="of the map at most; 20 bytes each")
-
-    @field_validator("host")
-    @classmethod
-    def _is_loopback(cls, host: str) -> str:
-        if not is_loopback(host):
-            raise ValueError(
-                f"{host} can be reached from outside, and Foxglove's protocol has no token: leave "
-                "it at 127.0.0.1 and use ssh -L"
-            )
-        return host
 
 
 class LiveMappingConfig(Stage):

@@ -33,7 +33,7 @@ PACKAGES = (
         "pictures in recordings, for Foxglove and Lichtblick",
     ),
     Package("rosbags", "rosbags", "recording", "ROS 1 and 2 bags; a dive as ROS 2 messages"),
-    Package("foxglove-sdk", "foxglove", "foxglove", "a running dive in Foxglove"),
+    Package("websockets", "websockets", "foxglove", "a running dive in Foxglove"),
     Package("ray", "ray", "cluster", "batches of dives on several machines"),
     Package("s3fs", "s3fs", "s3", "batches of dives from and to S3"),
     Package("laspy", "laspy", "survey", "points of a dive as LAZ"),

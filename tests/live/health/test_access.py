@@ -9,11 +9,15 @@ import pytest
 from aquaflow.base.errors import ConfigError
 from aquaflow.config.service import ListenConfig
 from aquaflow.config.stage import validated
-from aquaflow.web.access import Access
+from aquaflow.web.access import MOST_ADDRESSES, Access
 
 TOKEN = "correct-horse-battery"
 SURFACE = "192.168.2.1"
 BEARER = {"authorization": f"Bearer {TOKEN}"}
+
+
+def bearer(token: str) -> dict[str, str]:
+    return {"authorization": f"Bearer {token}"}
 
 
 @pytest.fixture
@@ -56,11 +60,19 @@ def test_a_name_of_the_internet_that_leads_here_is_no_trusted_request(trusting: 
     assert not trusting.allows("/health", {"host": "evil.example"}, SURFACE)
 
 
-def test_a_proxy_on_this_machine_states_its_clients_and_nobody_else_does(trusting: Access) -> None:
+def test_only_a_proxy_of_the_config_states_its_clients(trusting: Access, token_file: Path) -> None:
     stated = {"host": "blueos.local", "x-real-ip": SURFACE}
-    assert trusting.allows("/health", stated, "127.0.0.1")
-    assert not trusting.allows("/health", stated, "10.0.0.5")
-    assert not trusting.allows("/health", stated | {"x-real-ip": "10.0.0.5"}, "127.0.0.1")
+    for peer in ("127.0.0.1", "::1", "10.0.0.5"):
+        assert not trusting.allows("/health", stated, peer)
+    config = {
+        "host": "0.0.0.0", "port": 8230, "token_file": token_file,
+        "trusted": ["192.168.2.0/24"], "proxies": ["127.0.0.1"],
+    }  # fmt: skip
+    behind = Access(validated(ListenConfig, config, "test"))
+    assert behind.allows("/health", stated, "127.0.0.1")
+    assert not behind.allows("/health", stated, "127.0.0.2")
+    assert not behind.allows("/health", stated | {"x-real-ip": "10.0.0.5"}, "127.0.0.1")
+    assert not behind.allows("/health", stated | {"x-real-ip": f"{SURFACE}, x"}, "127.0.0.1")
 
 
 def test_a_trusted_network_still_asks_for_a_token_file_and_a_real_network() -> None:
@@ -74,3 +86,43 @@ def test_cookies_of_other_services_of_the_vehicle_hide_ours_in_no_way(careful: A
     cookies = f'settings={{"a": "b, c"}}; aquaflow_token={TOKEN}; x=y=z; é'
     assert careful.allows("/health", {"host": "vehicle", "cookie": cookies})
     assert not careful.allows("/health", {"host": "vehicle", "cookie": f"other={TOKEN}"})
+
+
+@pytest.mark.parametrize("by", ["form", "header", "cookie", "address"])
+def test_after_ten_wrong_tokens_an_address_waits_a_minute(token_file: Path, by: str) -> None:
+    now = [0.0]
+    config = ListenConfig(host="0.0.0.0", port=8230, token_file=token_file)
+    access = Access(config, clock=lambda: now[0])
+
+    def shows(token: str, peer: str) -> bool:
+        if by == "form":
+            return access.logs_in(token, {}, peer)
+        if by == "address":
+            return access.allows(f"/?token={token}", {}, peer)
+        cookie = {"cookie": f"aquaflow_token={token}"}
+        return access.allows("/", bearer(token) if by == "header" else cookie, peer)
+
+    for _ in range(10):
+        assert not access.must_wait({}, SURFACE)
+        assert not shows("wrong", SURFACE)
+    assert access.must_wait({}, SURFACE)
+    assert not shows(TOKEN, SURFACE)
+    assert not access.by_query(f"/?token={TOKEN}", {}, SURFACE)
+    assert shows(TOKEN, "192.168.2.7")
+    now[0] = 61.0
+    assert shows(TOKEN, SURFACE)
+
+
+def test_who_has_shown_the_token_is_not_locked_out_by_another_at_its_address(
+    careful: Access,
+) -> None:
+    assert careful.allows("/", BEARER, SURFACE)
+    for _ in range(50):
+        assert not careful.allows("/", bearer("wrong"), SURFACE)
+    assert careful.allows("/", BEARER, SURFACE)
+
+
+def test_the_addresses_whose_guesses_are_counted_are_bounded(careful: Access) -> None:
+    for number in range(3000):
+        careful.logs_in("wrong", {}, f"10.0.{number // 256}.{number % 256}")
+    assert len(careful._guesses._wrong) == MOST_ADDRESSES

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import http.client
 import json
 import logging
 import re
 import socket
-import socketserver
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,11 +16,10 @@ import pytest
 from aquaflow.base.errors import ConfigError
 from aquaflow.config.service import ListenConfig, ServiceConfig
 from aquaflow.config.stage import validated
-from aquaflow.live.health.http import MOST_CLIENTS, HealthServer
+from aquaflow.live.health.http import HealthServer
 from aquaflow.web.access import Access, read_token
 from tests.command_line import Cli
 from tests.live.health.reports import REPORT
-from tests.small_recording import GIVE_UP_S
 
 TOKEN = "correct-horse-battery"
 
@@ -144,7 +140,7 @@ def test_a_form_that_is_too_long_is_not_read_and_other_forms_are_nothing(
     locked: HealthServer,
 ) -> None:
     assert ask("POST", locked.port, "/login", f"token={TOKEN}&x={'x' * 5000}")[0] == 413
-    assert ask("POST", locked.port, "/login", None, **{"Content-Length": "-1"})[0] == 413
+    assert ask("POST", locked.port, "/login", None, **{"Content-Length": "-1"})[0] == 400
     assert ask("POST", locked.port, "/health", f"token={TOKEN}")[0] == 404
 
 
@@ -153,19 +149,6 @@ def test_clients_that_hang_keep_nobody_else_out(server: HealthServer) -> None:
     for client in hanging:
         client.sendall(b"GET /health HTTP/1.1\r\n")  # and never another byte
     assert get(server.port, "/health")[0] == 200
-    for client in hanging:
-        client.close()
-
-
-def test_more_clients_than_there_is_room_for_are_turned_away(server: HealthServer) -> None:
-    hanging = [
-        socket.create_connection(("127.0.0.1", server.port)) for _ in range(MOST_CLIENTS + 4)
-    ]
-    last = hanging[-1]
-    last.settimeout(20.0)
-    last.sendall(b"GET")
-    with contextlib.suppress(ConnectionError):  # turned away before it was heard
-        assert last.recv(1) == b""
     for client in hanging:
         client.close()
 
@@ -199,18 +182,14 @@ def test_status_prints_the_report_and_its_exit_code_says_if_all_is_well(
     assert "no service answers" in asked.err
 
 
-def test_a_request_whose_thread_fails_is_logged_and_the_next_is_answered(
+def test_a_request_that_fails_is_logged_and_the_next_is_answered(
     server: HealthServer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def failing(*_: object) -> None:
         raise OSError(errno.EIO, "planted")
 
-    with monkeypatch.context() as broken, caplog.at_level(logging.WARNING):
-        broken.setattr(socketserver.ThreadingMixIn, "process_request_thread", failing)
-        with socket.create_connection(("127.0.0.1", server.port), timeout=20) as client:
-            client.sendall(b"GET /health HTTP/1.0\r\n\r\n")
-            waited = time.monotonic()
-            while "planted" not in caplog.text and time.monotonic() - waited < GIVE_UP_S:
-                time.sleep(0.01)
-    assert "a request was not answered" in caplog.text
+    with monkeypatch.context() as broken, caplog.at_level(logging.ERROR):
+        broken.setattr("aquaflow.live.health.http.path_of", failing)
+        assert get(server.port, "/health")[0] == 500
+    assert "a request could not be answered" in caplog.text
     assert get(server.port, "/health")[0] == 200

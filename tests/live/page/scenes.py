@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 from aquaflow.live.live_coverage import described
 from aquaflow.survey.coverage import PageView
 from aquaflow.survey.coverage.picture import cells_png, coverage_png
+from aquaflow.web import Answer, Request
 from tests.live.health.reports import REPORT
 from tests.survey.coverage.surveys import survey_of
 
@@ -126,37 +126,21 @@ def change(ago_s: float, before: str, after: str, reason: str) -> dict[str, Any]
     return {"ago_s": ago_s, "before": before, "after": after, "reason": reason}
 
 
-def with_buttons(
-    handler: type[BaseHTTPRequestHandler], dive: SimulatedDive
-) -> type[BaseHTTPRequestHandler]:
-    """The server's handler with the requests that control a dive, and its newest picture."""
+def with_buttons(answers: type[Any], dive: SimulatedDive) -> type[Any]:
+    """The server's answers with the requests that control a dive, and its newest picture."""
 
-    class Controlled(handler):  # type: ignore[misc, valid-type]
-        def do_GET(self) -> None:
-            if not self.path.startswith("/picture.jpg"):
-                super().do_GET()
-            elif self.allowed():
-                self.reply(200, "image/jpeg", dive.picture())
+    class Controlled(answers):  # type: ignore[misc]
+        def data(self, path: str) -> Answer:
+            if path == "/picture.jpg":
+                return Answer(200, "image/jpeg", dive.picture())
+            return super().data(path)
 
-        def do_POST(self) -> None:
-            if not self.path.startswith("/dive/"):
-                super().do_POST()
-            elif self.allowed():
-                code, said = dive.act(self.path.rpartition("/")[2])
-                self.reply(code, "application/json", json.dumps(said).encode())
-
-        def allowed(self) -> bool:
-            headers = {name.lower(): value for name, value in self.headers.items()}
-            if self._access.allows(self.path, headers):
-                return True
-            self.reply(403, "application/json", b'{"error": "give the token"}')
-            return False
-
-        def reply(self, code: int, kind: str, data: bytes) -> None:
-            self.send_response(code)
-            self.send_header("Content-Type", kind)
-            self.send_header("Content-Length", str(len(data)))
-            self.end_headers()
-            self.wfile.write(data)
+        def posted(self, request: Request) -> Answer:
+            if not request.target.startswith("/dive/"):
+                return super().posted(request)
+            if not self.access.allows(request.target, request.headers, request.peer):
+                return Answer(403, "application/json", b'{"error": "give the token"}')
+            code, said = dive.act(request.target.rpartition("/")[2])
+            return Answer(code, "application/json", json.dumps(said).encode())
 
     return Controlled

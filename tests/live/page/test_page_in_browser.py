@@ -45,7 +45,7 @@ def address(dive: SimulatedDive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     token = tmp_path / "token"
     token.write_text(TOKEN)
     token.chmod(0o600)
-    monkeypatch.setattr(http, "_Handler", with_buttons(http._Handler, dive))
+    monkeypatch.setattr(http, "_Answers", with_buttons(http._Answers, dive))
     config = ListenConfig.model_construct(host="127.0.0.1", port=0, token_file=token)
     server = http.HealthServer(config, dive.report, dive.path, coverage=dive)
     yield f"http://127.0.0.1:{server.port}/"

@@ -81,6 +81,7 @@ def test_on_this_machine_everybody_may_look(page: ViewerPage) -> None:
     assert status == 200
     assert b"AquaFlow" in gzip.decompress(data)
     assert "script-src 'self'" in headers["Content-Security-Policy"]
+    assert "frame-ancestors 'none'" in headers["Content-Security-Policy"]
 
 
 @pytest.mark.parametrize("target", ["/", "/scene.json", "/client/main.js", "/path/1"])
