@@ -13,7 +13,7 @@ from datetime import datetime, timezone
 import numpy as np
 
 from aquaflow.config import FusionConfig
-from aquaflow.telemetry.telemetry import Telemetry
+from aquaflow.telemetry.telemetry import Telemetry, device_of
 from aquaflow.telemetry.utc import fit_utc
 from aquaflow.types import Attitude, Position
 
@@ -34,7 +34,7 @@ def declination_of(telemetry: Telemetry, config: FusionConfig) -> float | None:
     compasses, places = telemetry.of(Attitude), telemetry.of(Position)
     if not compasses or not places:
         return None
-    if _device(compasses[0].source) in {_device(each.source) for each in places}:
+    if device_of(compasses[0].source) in {device_of(each.source) for each in places}:
         return 0.0
     clock = fit_utc(telemetry.utc)
     if clock is None:
@@ -42,11 +42,6 @@ def declination_of(telemetry: Telemetry, config: FusionConfig) -> float | None:
     place = np.median(places[0].values[:, :2], axis=0)
     date = clock.utc_of(round(1e9 * float(places[0].t_s[0])))
     return _by_model(float(place[0]), float(place[1]), date)
-
-
-def _device(source: str) -> str:
-    """A driver names its sources ``device/message``."""
-    return source.partition("/")[0]
 
 
 def _by_model(latitude_deg: float, longitude_deg: float, date: datetime) -> float | None:

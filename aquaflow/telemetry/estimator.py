@@ -12,12 +12,15 @@ from aquaflow.config import FusionConfig
 from aquaflow.config.device import MountingConfig
 from aquaflow.telemetry.building import problem_of
 from aquaflow.telemetry.camera_path import CameraPath
+from aquaflow.telemetry.confirmation import confirmation_of
 from aquaflow.telemetry.contradictions import contradiction_in
+from aquaflow.telemetry.device_clocks import DeviceClocks
 from aquaflow.telemetry.factors.factor import Factor
 from aquaflow.telemetry.metric_frame import MetricFrame, SourceReport
 from aquaflow.telemetry.problem import Carried, Problem
 from aquaflow.telemetry.solution_frame import frame_of
 from aquaflow.telemetry.solve import Solution, solve
+from aquaflow.telemetry.start import camera_in_body
 from aquaflow.telemetry.telemetry import Telemetry
 
 Array = npt.NDArray[np.float64]
@@ -64,16 +67,30 @@ def estimate(
         return Estimate(MetricFrame.unknown(f"the sub-map has only {len(path)} poses"))
     if not telemetry and not extra:
         return Estimate(MetricFrame.unknown())
-    rejected: dict[tuple[str, str], SourceReport] = {}
+    R_cb = None if mounting is None else camera_in_body(mounting).R.T
+    clocks = DeviceClocks.of(telemetry, path, R_cb)
+    telemetry = clocks.corrected(telemetry)
+    rejected = clocks.unlike(telemetry)
+
+    def problem_along(path: CameraPath, points: Callable[[], Array]) -> Problem:
+        return problem_of(telemetry, path, config, mounting, points, carried, extra, rejected)
+
     while True:
-        problem = problem_of(telemetry, path, config, mounting, points, carried, extra, rejected)
+        problem = problem_along(path, points)
         if not problem.factors:
             unused = MetricFrame.unknown("no telemetry could be used")
             return Estimate(replace(unused, sources=tuple(problem.reports)))
         solution = solve(problem.factors, problem.start, problem.prior)
         wrong = contradiction_in(problem, solution)
         if wrong is None:
-            return Estimate(frame_of(problem, solution, path), problem, solution)
+            break
         rejected[wrong.source, wrong.kind] = SourceReport(
             wrong.source, wrong.kind, rejected=wrong.samples, reason=wrong.reason
         )
+    if clocks.leave_open(problem):
+        ground = points()
+        confirmation = confirmation_of(path, lambda part: problem_along(part, lambda: ground))
+        if confirmation.refuted or not clocks.known:
+            solution = confirmation.applied(solution)
+            problem.doubt = f"{confirmation.in_words()}, and {clocks.why_open}"
+    return Estimate(clocks.stated(frame_of(problem, solution, path)), problem, solution)

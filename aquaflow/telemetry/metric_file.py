@@ -87,6 +87,7 @@ def frame_to_json(frame: MetricFrame) -> dict[str, Any]:
         "origin": None if frame.origin is None else asdict(frame.origin),
         "scale_source": frame.scale_source,
         "sources": [asdict(source) for source in frame.sources],
+        **({"clock_offset_s": frame.clock_offset_s} if frame.clock_offset_s else {}),
         **({"site": frame.site} if frame.site else {}),
     }
 
@@ -140,6 +141,7 @@ def frame_of_json(stated: dict[str, Any]) -> MetricFrame:
         T_bc=None if T_bc is None else _to_sim3(T_bc),
         scale_source=str(stated["scale_source"]),
         sources=tuple(SourceReport(**source) for source in stated["sources"]),
+        clock_offset_s=float(stated.get("clock_offset_s", 0.0)),
         site=str(stated.get("site", "")),
     )
 

@@ -79,6 +79,9 @@ class MetricFrame:
     scale_source: str = ""
     """Devices that the scale comes from, or why there is none."""
     sources: tuple[SourceReport, ...] = ()
+    clock_offset_s: float = 0.0
+    """Pictures' time less that of telemetry's stamps, as rotations show it now and as it was
+    corrected; 0 where none was found."""
     site: str = ""
     """The earlier dive whose frame n is, where this one was recognised in it; empty otherwise."""
 

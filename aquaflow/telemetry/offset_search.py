@@ -101,6 +101,14 @@ def peaks(camera: Cells, body: Cells, R_cb: Array | None) -> list[Peak]:  # [3, 
     ]
 
 
+def peak_at(camera: Cells, body: Cells, R_cb: Array | None, offset_s: float) -> Peak:  # [3, 3]
+    """One offset, however much it explains."""
+    explained, H, offsets_s = explained_at_all_offsets(camera, body, R_cb)
+    near = int(np.argmin(np.abs(offsets_s - offset_s)))
+    R = nearest_rotation(H[near]) if R_cb is None else R_cb
+    return Peak(offset_s, R, float(explained[near]))
+
+
 def explained_at_all_offsets(
     camera: Cells,
     body: Cells,

@@ -53,3 +53,5 @@ class Problem:
     mounted: bool = True
     """False if nothing is known of the camera's mounting."""
     origin: Origin | None = None
+    doubt: str = ""
+    """Why the scale is less sure than the factors say; empty where it is not."""

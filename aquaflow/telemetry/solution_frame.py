@@ -113,6 +113,8 @@ def _scale_source(
         return f"none: no telemetry measures a length; {MAP_UNIT}"
     rise = float(np.ptp(path.p_m @ solution.state.R_nm[2]))
     best = min(alone.values())
+    if problem.doubt and best <= LARGEST_SCALE_SIGMA:
+        return f"none: {problem.doubt}; {MAP_UNIT}"
     said = f"none: {', '.join(sorted({SCALING[factor.kind] for factor in alone}))} give the scale "
     said += f"to {100.0 * min(best, 9.99):.0f} % only"
     if {factor.kind for factor in alone} == {"depth"}:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,6 +37,11 @@ class Series:
         """At most so many samples, evenly chosen."""
         step = max(1, -(-len(self) // most))
         return Series(self.source, self.t_s[::step], self.values[::step])
+
+
+def device_of(source: str) -> str:
+    """Name of the device that a source belongs to; its sources have one clock."""
+    return source.split("/", 1)[0]
 
 
 CHUNK = 1024
@@ -106,6 +111,12 @@ class Telemetry:
         other = Telemetry()
         other._tables = {key: table.copy() for key, table in self._tables.items()}
         other.utc = list(self.utc)
+        return other
+
+    def retimed(self, change: Callable[[Series], Series]) -> Telemetry:
+        """The same with every series as ``change`` gives it."""
+        other = self.copy()
+        other._series = {key: change(self._of(key)) for key in self._tables}
         return other
 
     def of(self, kind: type) -> list[Series]:

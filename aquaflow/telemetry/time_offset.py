@@ -6,7 +6,7 @@ all counts only if it explains the camera's rotations, and does so better than e
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,7 +24,7 @@ from aquaflow.telemetry.offset_refinement import (
     Fit,
     Refinement,
 )
-from aquaflow.telemetry.offset_search import SHORTEST_OVERLAP_S, Cells, peaks
+from aquaflow.telemetry.offset_search import SHORTEST_OVERLAP_S, Cells, peak_at, peaks
 from aquaflow.telemetry.turns import Turns, turns_of_telemetry
 from aquaflow.types import TelemetrySample
 
@@ -48,12 +48,20 @@ CHANCE_OF_NOTHING = 1e-4
 unrelated pairs of simulated random motion none passes, of as many related ones all."""
 CHANCE_OF_RIVAL = 1e-3
 """Chance that another offset is as good, up to which it is not."""
+CHANCE_AS_EXPECTED = 1e-3
+"""As ``CHANCE_OF_NOTHING``, of the one offset that was expected: a search has hundreds of tries."""
+NEAR_EXPECTED_S = 1.0
+"""An offset that a fit finds from the expected one is still that: a quarter of an ROV's sway."""
 KNOWN_DRIFT = 0.5
 """Share of the prior's sigma below which the overlap has shown the clock's rate."""
 
 
 class NotSynchronisedError(InputError):
     """The offset between a video and a log cannot be found from their rotations."""
+
+
+class UnlikeError(NotSynchronisedError):
+    """Both turned, and unlike each other at every offset."""
 
 
 @dataclass(frozen=True)
@@ -104,15 +112,17 @@ def estimate_time_offset(
     camera: Turns,
     body: Turns,
     R_cb: Array | None = None,  # [3, 3]
+    expected_s: float | None = None,
 ) -> TimeOffset:
     """The offset of a log, from the turns of a camera and of the vehicle that carries it.
 
     ``R_cb`` is the rotation from body to camera axes where it is known, to some degrees: it
-    excludes offsets that need another. Either way it is found too.
+    excludes offsets that need another. Either way it is found too. Of offsets that explain the
+    rotations equally well, the one near ``expected_s`` counts, where one is expected.
 
     Raises:
-        NotSynchronisedError: too little was measured or moved, nothing correlates, or several
-            offsets are as good.
+        NotSynchronisedError: too little was measured or moved, nothing correlates
+            (:class:`UnlikeError`), or several offsets are as good.
     """
     for turns, whose in ((camera, "the video's poses"), (body, "the log's rotations")):
         if turns.covered_s < SHORTEST_OVERLAP_S:
@@ -130,21 +140,49 @@ def estimate_time_offset(
             )
     refinement = Refinement(camera, body, sigma_s, mounting_known=R_cb is not None)
     fits = [fit for peak in peaks(*cells, R_cb) if (fit := refinement.fit(peak)) is not None]
+    if expected_s is not None:
+        found = _as_expected(cells, R_cb, expected_s, refinement, fits, sigma_s)
+        if found is not None:
+            return found
     if not fits:
-        raise NotSynchronisedError("the log's rotations resemble the video's at no offset")
+        raise UnlikeError("the log's rotations resemble the video's at no offset")
     best = max(fits, key=lambda fit: fit.gain)
     rivals = [fit for fit in fits if abs(fit.x[OFFSET] - best.x[OFFSET]) > sigma_s]
     return _judged(best, rivals, sigma_s)
 
 
-def _judged(best: Fit, rivals: list[Fit], step_s: float) -> TimeOffset:
+def _as_expected(
+    cells: tuple[Cells, Cells],
+    R_cb: Array | None,  # [3, 3]
+    expected_s: float,
+    refinement: Refinement,
+    fits: Sequence[Fit],
+    step_s: float,
+) -> TimeOffset | None:
+    """The offset near the expected one; None where it explains nothing, or another one more."""
+    fit = refinement.fit(peak_at(*cells, R_cb, expected_s))
+    if fit is None or abs(fit.x[OFFSET] - expected_s) > NEAR_EXPECTED_S:
+        return None
+    for rival in fits:
+        both = fit.used & rival.used
+        if rival.gain > fit.gain and _chance(fit.residual, rival, both, step_s) < CHANCE_OF_RIVAL:
+            return None
+    try:
+        return _judged(fit, [], step_s, CHANCE_AS_EXPECTED)
+    except NotSynchronisedError:
+        return None
+
+
+def _judged(
+    best: Fit, rivals: list[Fit], step_s: float, chance: float = CHANCE_OF_NOTHING
+) -> TimeOffset:
     """The best fit as a result.
 
     Raises:
         NotSynchronisedError: it is not significant, not the only one, or not sharp.
     """
-    if _chance(_unexplained(best), best, best.used, step_s) > CHANCE_OF_NOTHING:
-        raise NotSynchronisedError(
+    if _chance(_unexplained(best), best, best.used, step_s) > chance:
+        raise UnlikeError(
             f"the log's rotations do not explain the video's (correlation {best.correlation:.2f} "
             f"at the best offset, {best.x[OFFSET]:+.1f} s)"
         )

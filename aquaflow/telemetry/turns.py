@@ -16,7 +16,8 @@ import numpy.typing as npt
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
-from aquaflow.types import AngularRate, Attitude, TelemetrySample
+from aquaflow.telemetry.telemetry import Series
+from aquaflow.types import AngularRate, Attitude, TelemetrySample, values_of
 
 Array = npt.NDArray[np.float64]
 
@@ -26,6 +27,7 @@ tracking or of the link does not."""
 FEW_RATES_HZ = 5.0
 """A gyro that is logged more slowly misses the sway of a small ROV (2 s and longer) between two of
 its samples; attitudes miss nothing."""
+NO_SERIES = Series("", np.empty(0), np.empty((0, 4)))
 
 
 @dataclass(frozen=True)
@@ -121,11 +123,7 @@ def smoothing(
 
 
 def turns_of_telemetry(samples: Iterable[TelemetrySample]) -> tuple[str, Turns] | None:
-    """The best source of rotations among ``samples``, with its name; None where there is none.
-
-    A gyro counts before attitudes, unless it was logged more slowly than they were, or too slowly
-    to be integrated; of equals, the source with more samples.
-    """
+    """The best source of rotations among ``samples``, with its name; None where there is none."""
     rates: dict[str, list[AngularRate]] = {}
     attitudes: dict[str, list[Attitude]] = {}
     for sample in samples:
@@ -133,29 +131,35 @@ def turns_of_telemetry(samples: Iterable[TelemetrySample]) -> tuple[str, Turns] 
             rates.setdefault(sample.source, []).append(sample)
         elif isinstance(sample, Attitude):
             attitudes.setdefault(sample.source, []).append(sample)
-    gyro = max(rates.values(), key=len, default=[])
-    ahrs = max(attitudes.values(), key=len, default=[])
+    return best_turns(
+        [_in_order(source, found) for source, found in rates.items()],
+        [_in_order(source, found) for source, found in attitudes.items()],
+    )
+
+
+def best_turns(rates: Sequence[Series], attitudes: Sequence[Series]) -> tuple[str, Turns] | None:
+    """The best source of rotations, with its name; None where there is none.
+
+    A gyro counts before attitudes, unless it was logged more slowly than they were, or too slowly
+    to be integrated; of equals, the source with more samples.
+    """
+    gyro = max(rates, key=len, default=NO_SERIES)
+    ahrs = max(attitudes, key=len, default=NO_SERIES)
     if len(gyro) >= len(ahrs) or _frequency_hz(gyro) >= FEW_RATES_HZ:
-        if len(gyro) < 2:
-            return None
-        times, rate = _in_order(gyro, [sample.rate_rad_s for sample in gyro])
-        return gyro[0].source, Turns.of_rates(times, rate)
-    times, wxyz = _in_order(ahrs, [sample.wxyz for sample in ahrs])
-    R_nb = Rotation.from_quat(np.roll(wxyz, -1, axis=1)).as_matrix()
-    return ahrs[0].source, Turns.of_orientations(times, R_nb)
+        return (gyro.source, Turns.of_rates(gyro.t_s, gyro.values)) if len(gyro) >= 2 else None
+    R_nb = Rotation.from_quat(np.roll(ahrs.values, -1, axis=1)).as_matrix()
+    return ahrs.source, Turns.of_orientations(ahrs.t_s, R_nb)
 
 
-def _frequency_hz(samples: Sequence[AngularRate]) -> float:
-    if len(samples) < 2:
+def _frequency_hz(series: Series) -> float:
+    if len(series) < 2:
         return 0.0
-    steps = np.diff(np.sort([sample.t_ns for sample in samples])) * 1e-9
-    return float(1.0 / max(np.median(steps), 1e-9))
+    return float(1.0 / max(np.median(np.diff(series.t_s)), 1e-9))
 
 
-def _in_order(
-    samples: Sequence[AngularRate | Attitude], values: Sequence[tuple[float, ...]]
-) -> tuple[Array, Array]:
-    """Times [M] in s and values [M, D], by time."""
+def _in_order(source: str, samples: Sequence[AngularRate | Attitude]) -> Series:
+    """The samples by time."""
     times = np.array([sample.t_ns for sample in samples]) * 1e-9
     order = np.argsort(times, kind="stable")
-    return times[order], np.asarray(values, dtype=float)[order]
+    values = np.asarray([values_of(sample) for sample in samples], dtype=float)
+    return Series(source, times[order], values[order])

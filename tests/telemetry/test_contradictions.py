@@ -98,8 +98,8 @@ def test_a_source_in_wrong_units_is_left_out(
 
 def test_an_attitude_of_another_vehicle_is_left_out(dive: Swum, floor: np.ndarray) -> None:
     estimate = what_comes_of(dive, floor, of_another_vehicle)
-    assert set(left_out(estimate)) == {"heading", "attitude"}
-    assert "degrees" in left_out(estimate)["attitude"].reason
+    assert set(left_out(estimate)) == {"attitude"}
+    assert "the log's rotations" in left_out(estimate)["attitude"].reason
     assert estimate.frame.metric
     assert estimate.frame.north == "initial heading"
 

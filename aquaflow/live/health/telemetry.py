@@ -66,6 +66,7 @@ def metric_frame_numbers(frame: MetricFrame) -> dict[str, Any]:
         "metres_per_map_unit": round(frame.T_nm.scale, 5) if frame.metric else None,
         "scale_sigma": round(frame.scale_sigma, 5) if frame.metric else None,
         "scale_source": frame.scale_source,
+        "clock_offset_s": round(frame.clock_offset_s, DIGITS),
         "level": frame.level,
         "gravity_sigma_deg": (
             round(float(np.degrees(frame.tilt_sigma_rad)), DIGITS) if frame.level else None

@@ -1,9 +1,9 @@
 """The vehicle's pose back to its autopilot: only in metres, with how well it is known.
 
 The scale comes from telemetry and grows more certain during a dive; until it and the direction of
-gravity are known well enough, nothing is sent. The autopilot's filter wants at least four poses a
-second; where tracking gives fewer, nothing is sent, because a filter that starves is worse than one
-that knows it has no vision.
+gravity are known well enough, and while pictures and telemetry are out of step, nothing is sent.
+The autopilot's filter wants at least four poses a second; where tracking gives fewer, nothing is
+sent, because a filter that starves is worse than one that knows it has no vision.
 """
 
 from __future__ import annotations
@@ -41,6 +41,9 @@ SIGMA_SHARE = 0.02
 """Growth of the position's sigma with the way since the last loop: drift of 2 % (judgement)."""
 LEAST_QUALITY = 0.05
 """The share of inliers below which sigmas grow no further."""
+LARGEST_OFFSET_S = 0.25
+"""Between pictures and telemetry, of which the autopilot's is one: its filter looks back no further
+(ArduPilot, VISO_DELAY_MS: 0 to 250)."""
 NORTH = ("true north", "magnetic north")
 """What x must point to for a frame that is named after north."""
 
@@ -50,6 +53,7 @@ class Withheld(str, Enum):
 
     NO_SCALE = "the map's scale in metres is not known"
     VAGUE_SCALE = "the map's scale is not known to service.pose.max_scale_sigma"
+    OUT_OF_STEP = "pictures and telemetry are out of step, see metric_frame.clock_offset_s"
     NOT_LEVEL = "the direction of gravity is not known"
     NO_MOUNTING = "the camera's mounting is not known; set fusion.camera or service.pose.mounting"
     VAGUE_POSITION = "the position is not known to service.pose.max_position_sigma_m"
@@ -133,6 +137,8 @@ class PoseOutput:
             return Withheld.NO_SCALE
         if not frame.scale_sigma <= self._config.max_scale_sigma:
             return Withheld.VAGUE_SCALE
+        if not abs(frame.clock_offset_s) <= LARGEST_OFFSET_S:
+            return Withheld.OUT_OF_STEP
         if self._config.message == "odometry" and not frame.level:
             return Withheld.NOT_LEVEL
         return None

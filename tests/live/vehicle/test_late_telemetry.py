@@ -1,0 +1,43 @@
+"""No pose with a wrong scale goes out, whatever is wrong with the times of telemetry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from aquaflow.live.vehicle.pose_output import Withheld
+from tests.live.vehicle.late_telemetry import Case, outcome_of
+
+SIGMAS = 3.0
+FAILED_BEFORE = (2, 9)
+"""Clocks that drift under a calm vehicle; 15.7 s with depth and DVL and nothing that turns."""
+CORRECTED = 1
+"""2.6 s with attitude, depth and altimeter."""
+DIVES = [*FAILED_BEFORE, *(
+    pytest.param(seed, marks=pytest.mark.slow) for seed in range(100) if seed not in FAILED_BEFORE
+)]  # fmt: skip
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("seed", DIVES)
+def test_no_pose_whose_scale_is_wrong_is_sent_nor_stated(seed: int) -> None:
+    found = outcome_of(Case.drawn(seed))
+    assert found.worst_sigmas <= SIGMAS
+    assert found.stated_sigmas <= SIGMAS
+
+
+@pytest.mark.timeout(600)
+def test_an_offset_is_found_and_corrected_and_no_pose_is_sent_meanwhile() -> None:
+    found = outcome_of(Case.drawn(CORRECTED))
+    assert found.sent == 0
+    assert found.said.startswith(Withheld.OUT_OF_STEP.value)
+    assert "2.6" in found.said
+    assert found.said.endswith("corrected")
+    assert 0.0 < found.stated_sigmas <= SIGMAS
+
+
+@pytest.mark.timeout(600)
+def test_poses_flow_where_clocks_are_right() -> None:
+    found = outcome_of(Case.drawn(0, right=True), until_sent=True)
+    assert np.isfinite(found.first_s)
+    assert found.worst_sigmas <= SIGMAS
