@@ -79,11 +79,47 @@ def allowed_groups() -> list[str]:
 def test_every_serial_port_that_is_listed_may_be_opened_by_the_service(pattern: str) -> None:
     name = pattern.removesuffix("*")
     assert any(fnmatchcase(name, group) for group in allowed_groups())
-    rules = (DEPLOY / "99-aquaflow.rules").read_text()
-    kernels = re.findall(r'SUBSYSTEM=="tty", KERNEL=="([^"]+)", GROUP="(\w+)", MODE="0660"', rules)
-    groups = [group for kernel, group in kernels if f"{name}[0-9]*" in kernel.split("|")]
-    assert groups in (["aquaflow"], ["dialout"])
-    assert "dialout" in (DEPLOY / "install.sh").read_text()
+
+
+def udev_rules() -> list[dict[str, str]]:
+    """Of each rule, the value of every key with its operator, such as ``GROUP=`` (udev(7))."""
+    lines = (DEPLOY / "99-aquaflow.rules").read_text().splitlines()
+    rules = [line for line in lines if line and not line.startswith("#")]
+    token = re.compile(r'([A-Z_]+(?:\{\w+\})?)(==|!=|\+=|-=|:=|=)"([^"]*)"')
+    for rule in rules:
+        assert re.fullmatch(rf"{token.pattern}(, {token.pattern})*", rule), rule
+    return [{key + sign: value for key, sign, value in token.findall(rule)} for rule in rules]
+
+
+def test_no_rule_takes_a_device_from_who_has_it() -> None:
+    for rule in udev_rules():
+        assert not {"GROUP=", "GROUP:=", "OWNER=", "OWNER:=", "MODE:="} & set(rule)
+        assert rule.get("MODE=", "0666") == "0666"
+
+
+def test_only_autopilots_are_kept_from_modemmanager() -> None:
+    ignored = [rule for rule in udev_rules() if "ENV{ID_MM_DEVICE_IGNORE}=" in rule]
+    assert ignored
+    assert all("ATTRS{idVendor}==" in rule for rule in ignored)
+
+
+def test_the_services_user_is_in_the_groups_that_udev_gives_devices_to() -> None:
+    text = (DEPLOY / "install.sh").read_text()
+    groups = re.search(r"for group in ([\w ]+); do", text)
+    assert groups is not None
+    # Those of systemd's 50-udev-default.rules for video4linux and media, drm and serial ports.
+    assert {"video", "render", "dialout"} <= set(groups[1].split())
+
+
+def test_udev_has_nothing_to_say_about_the_rules() -> None:
+    udevadm = shutil.which("udevadm")
+    if udevadm is None:
+        pytest.skip("udevadm is not installed")
+    command = [udevadm, "verify", str(DEPLOY / "99-aquaflow.rules")]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False)
+    if "Unknown command" in ran.stderr:
+        pytest.skip("this udevadm is older than 254 and verifies nothing")
+    assert ran.returncode == 0, ran.stdout + ran.stderr
 
 
 @pytest.mark.parametrize("listed", PROC_DEVICES.values(), ids=PROC_DEVICES)

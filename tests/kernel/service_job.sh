@@ -67,7 +67,7 @@ printf '%s\n' '[Service]' TimeoutStartSec=600 WatchdogSec=60 TimeoutAbortSec=10 
 until_true 600 is ActiveState active && result ready "$(property StatusText)"
 result user "$(ps -o user= -p "$(property MainPID)")" dives "$(folders)"
 # What udev would have done: there is none in the guest.
-chown root:aquaflow /dev/video0 && chmod 0660 /dev/video0
+chown root:video /dev/video0 && chmod 0660 /dev/video0
 until_true 200 says initialising && result camera "$(property StatusText)"
 until_true 60 is_device autopilot connected
 result devices "front $(device front) autopilot $(device autopilot)"
