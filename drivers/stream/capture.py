@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from functools import partial
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,11 +12,14 @@ import numpy.typing as npt
 from aquaflow.config.cameras import StreamConfig
 from aquaflow.drivers.capture import RawPicture
 from aquaflow.drivers.ffmpeg import rgb_of
+from aquaflow.drivers.jpeg import jpeg_to_rgb
 from aquaflow.drivers.stream.address import for_logs, is_at_a_port
 from aquaflow.drivers.stream.ages import Ages
 from aquaflow.drivers.stream.ffmpeg import OPEN_TIMEOUT_S, format_of, opened
-from aquaflow.types import CameraModel
+from aquaflow.types import CameraModel, EncodedPicture
 
+MOTION_JPEG = "MJPG"
+"""FFmpeg's name of a stream whose pictures are JPEG files."""
 MAX_DAMAGED = 30
 """Pictures in a row that fail to decode before the stream counts as broken: 1 s."""
 
@@ -43,6 +48,8 @@ class StreamCapture:
             self.close()
             raise ConnectionError(f"no video from {for_logs(config.url)}{_advice(config)}")
         self.format = format_of(self._capture)
+        self._width, self._height = _size(self._capture)
+        self._sends_jpeg = self.format.endswith(f" {MOTION_JPEG}") and _hands_over(self._capture)
 
     def read(self, timeout_s: float) -> RawPicture | None:
         """The next picture; FFmpeg waits up to the configured stall time."""
@@ -54,11 +61,15 @@ class StreamCapture:
             return RawPicture(arrival_ns, rgb_of(None), stale=self._stale)
         self._grabbed = False
         exposed_ns, self._stale = self._ages.judged(self._stream_ns(), arrival_ns)
+        shown = None if self._stale else self._retrieved()
+        if shown is None or not self._sends_jpeg:
+            return RawPicture(arrival_ns, rgb_of(shown), exposed_ns, stale=self._stale)
+        jpeg = shown.reshape(-1)
         return RawPicture(
-            arrival_ns=arrival_ns,
-            decode=rgb_of(None if self._stale else self._retrieved()),
-            exposed_ns=exposed_ns,
-            stale=self._stale,
+            arrival_ns,
+            partial(jpeg_to_rgb, jpeg, self._width, self._height),
+            exposed_ns,
+            received=lambda: EncodedPicture("jpeg", jpeg.tobytes()),
         )
 
     def close(self) -> None:
@@ -89,9 +100,25 @@ class StreamCapture:
         return round(1e6 * float(self._capture.get(cv2.CAP_PROP_POS_MSEC)))
 
     def _retrieved(self) -> npt.NDArray[np.uint8] | None:
-        """[H, W, 3] BGR; must be fetched before the next picture is grabbed, used or not."""
+        """[H, W, 3] BGR, or the bytes of a JPEG file; must be fetched before the next picture is
+        grabbed, used or not."""
         decoded, bgr = self._capture.retrieve()
         return bgr if decoded else None
+
+
+def _size(capture: Any) -> tuple[int, int]:
+    """Width and height, px."""
+    import cv2
+
+    width, height = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT
+    return int(capture.get(width)), int(capture.get(height))
+
+
+def _hands_over(capture: Any) -> bool:
+    """Let FFmpeg pass on the pictures' files as they came; False if it cannot."""
+    import cv2
+
+    return bool(capture.set(cv2.CAP_PROP_FORMAT, -1))
 
 
 def _advice(config: StreamConfig) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.drivers.capture import UnusablePictureError
+from aquaflow.drivers.jpeg import jpeg_to_rgb
 from aquaflow.drivers.v4l2.planes import PictureFormat
 
 PACKED = {"YUYV": "COLOR_YUV2RGB_YUYV", "UYVY": "COLOR_YUV2RGB_UYVY"}
@@ -19,8 +20,6 @@ STREAMED = "H264"
 
 JPEG_PIXELS = frozenset({"MJPG", "JPEG"})
 """V4L2's two names of a picture that is a JPEG file."""
-JPEG_START = b"\xff\xd8"
-"""SOI, the marker that a JPEG file begins with."""
 
 Bytes = npt.NDArray[np.uint8]
 
@@ -37,7 +36,7 @@ def to_rgb(
     import cv2
 
     if form.pixels in JPEG_PIXELS:
-        return _jpeg_to_rgb(data[0], form.width, form.height)
+        return jpeg_to_rgb(data[0], form.width, form.height)
     if form.pixels == "GREY":
         return np.repeat(_rows(data[0], form, 0, form.height, form.width)[:, :, None], 3, axis=2)
     if form.pixels in PACKED:
@@ -76,27 +75,3 @@ def _rows(
     if data.size < stride * count:
         raise UnusablePictureError(f"is cut off after {data.size} of {stride * count} bytes")
     return data[: stride * count].reshape(count, stride)[:, :wide]
-
-
-def _jpeg_to_rgb(
-    data: npt.NDArray[np.uint8],  # [bytes used]
-    width: int,
-    height: int,
-) -> npt.NDArray[np.uint8]:
-    import cv2
-
-    # Without its start OpenCV would search for other formats, and write to stderr about it.
-    if data[:2].tobytes() != JPEG_START:
-        raise UnusablePictureError("is no JPEG picture")
-    try:
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB)
-    except cv2.error as error:
-        raise UnusablePictureError("is a damaged JPEG picture") from error
-    if image is None:
-        raise UnusablePictureError("is a damaged JPEG picture")
-    if image.shape != (height, width, 3):
-        raise UnusablePictureError(
-            f"is {image.shape[1]} x {image.shape[0]} px where the camera announced "
-            f"{width} x {height}"
-        )
-    return np.asarray(image, np.uint8)

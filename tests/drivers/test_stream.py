@@ -8,6 +8,7 @@ import socket
 import threading
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -16,7 +17,8 @@ from aquaflow.drivers import ffmpeg
 from aquaflow.drivers.camera_state import CameraState
 from aquaflow.drivers.stream.address import for_logs
 from aquaflow.recordings.transport_stream import UdpCamera
-from aquaflow.sim_drivers.camera_feed import CameraFeed, first_images
+from aquaflow.sim_drivers import mjpeg_server
+from aquaflow.sim_drivers.camera_feed import CameraFeed, Shot, first_images
 from aquaflow.sim_drivers.mjpeg_server import MjpegServer
 from aquaflow.sim_drivers.rtp_camera import RtspCamera
 from aquaflow.types import Frame
@@ -147,3 +149,23 @@ def test_nothing_is_written_to_stderr(
     assert capfd.readouterr().err == ""
     assert "camera 'front' is lost" in caplog.text
     assert np.all([record.levelno == logging.WARNING for record in caplog.records])
+
+
+def test_a_motion_jpeg_picture_is_kept_byte_by_byte(monkeypatch: pytest.MonkeyPatch) -> None:
+    sent: set[bytes] = set()
+    made = mjpeg_server._jpeg
+
+    def remembered(shot: Shot) -> bytes:
+        jpeg = made(shot)
+        sent.add(jpeg)
+        return jpeg
+
+    monkeypatch.setattr(mjpeg_server, "_jpeg", remembered)
+    with MjpegServer(feed()) as server, closing(stream(server.url)) as camera:
+        seen = [frame for frame in until(camera, 5) if isinstance(frame, Frame)]
+    assert seen
+    for frame in seen:
+        assert frame.encoded is not None
+        assert frame.encoded.data in sent
+        decoded = cv2.imdecode(np.frombuffer(frame.encoded.data, np.uint8), cv2.IMREAD_COLOR_RGB)
+        assert np.array_equal(frame.image, decoded)
