@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from aquaflow import __version__
+from aquaflow.base.errors import printable
 from aquaflow.base.errors.crash_report import one_sentence, print_anything, refuse_unreadable
 from aquaflow.cli.batch import register as register_batch
 from aquaflow.cli.bench import register as register_bench
@@ -25,6 +26,7 @@ from aquaflow.cli.console import (
     Json,
     checked_site,
     progress_bars,
+    table_console,
     unit_in_words,
 )
 from aquaflow.cli.devices import register as register_devices
@@ -253,30 +255,52 @@ def evaluate(
 
 
 @app.command()
-def doctor(as_json: Json = False) -> None:
+def doctor(
+    config: Annotated[
+        Path | None, typer.Option(help="Check this YAML, and only what a run with it would open.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
     """Report what this machine has, what AquaFlow will use, and what is missing."""
-    from rich.console import Console
-
     from aquaflow.doctor import examine, print_findings, to_json
 
-    findings = examine()
+    if config is None:
+        findings = examine()
+    else:
+        from aquaflow.config.vehicle import load_any
+        from aquaflow.doctor.opened import opened
+
+        findings = opened(load_any(config))
     if as_json:
         typer.echo(json.dumps(to_json(findings)))
     else:
-        print_findings(findings, Console())
+        print_findings(findings, table_console())
 
 
 @app.command("config")
 def config_command(
-    file: Annotated[Path | None, typer.Argument(help="A config to check and complete.")] = None,
+    file: Annotated[
+        Path | None, typer.Argument(help="A config to check and complete, also a vehicle's.")
+    ] = None,
+    as_json: Json = False,
 ) -> None:
-    """Print the effective configuration as YAML: every key and its value."""
+    """Print the effective configuration as YAML: every key and its value, and what it opens."""
     import yaml
 
-    from aquaflow.config import Config, load_config
+    from aquaflow.config import Config
+    from aquaflow.config.vehicle import load_any
+    from aquaflow.doctor import to_json
+    from aquaflow.doctor.opened import opened
 
-    settings = Config() if file is None else load_config(file)
-    typer.echo(yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
+    settings = Config() if file is None else load_any(file)
+    values, findings = settings.model_dump(mode="json"), opened(settings)
+    if as_json:
+        typer.echo(json.dumps({"config": values, "opens": to_json(findings)["findings"]}))
+        return
+    typer.echo(yaml.safe_dump(values, sort_keys=False), nl=False)
+    for each in findings:
+        advice = f" ({each.advice})" if each.advice else ""
+        typer.echo(printable(f"# {each.name}: {each.used_for}: {each.found}{advice}"))
 
 
 def _print_summary(finished: Finished) -> None:

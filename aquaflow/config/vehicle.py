@@ -38,6 +38,19 @@ def load_vehicle(path: Path | None, preset_name: str | None = None) -> VehicleCo
     return validated(VehicleConfig, merged(written, changed), str(path or preset_name))
 
 
+def load_any(path: Path) -> Config:
+    """Read a YAML config of either kind: a vehicle's if it has a key that only those have.
+
+    Raises:
+        InputError: the file cannot be read, or is not YAML.
+        ConfigError: a key is unknown or a value out of range.
+    """
+    written = read_yaml(path)
+    only_vehicles = VehicleConfig.model_fields.keys() - Config.model_fields.keys()
+    model = VehicleConfig if only_vehicles & written.keys() else Config
+    return validated(model, written, str(path))
+
+
 def looking_in(vehicle: VehicleConfig, site: Path) -> VehicleConfig:
     """The same vehicle, whose dives are looked for in the earlier one in the folder ``site``."""
     dive = vehicle.service.dive.model_copy(update={"site": site})

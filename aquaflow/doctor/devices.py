@@ -51,7 +51,7 @@ def cameras(machine: MachineProbes) -> Finding:
         f"/dev/{node.name} ({name or 'no name'})" for node, name in zip(nodes, names, strict=True)
     )
     used = "read live, driver v4l2; `aquaflow devices` prints its id"
-    return Finding("USB and CSI cameras", found, used, _access(nodes, "video"))
+    return Finding("USB and CSI cameras", found, used, no_access(nodes, "video"))
 
 
 def oak(machine: MachineProbes) -> Finding:
@@ -78,10 +78,10 @@ def serial(machine: MachineProbes) -> Finding:
         return Finding("serial ports", "none", "no telemetry over serial")
     found = ", ".join("/" + str(port.relative_to(machine.root)) for port in ports)
     used = "can carry MAVLink, NMEA or a DVL, which give the map its scale"
-    return Finding("serial ports", found, used, _access(ports, "dialout"))
+    return Finding("serial ports", found, used, no_access(ports, "dialout"))
 
 
-def _access(nodes: list[Path], group: str) -> str:
+def no_access(nodes: list[Path], group: str) -> str:
     """What to do if a device exists but this user may not open it."""
     barred = [node for node in nodes if not os.access(node, os.R_OK | os.W_OK)]
     if not barred:
