@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import InputError, printable_text
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -114,7 +114,7 @@ class _Sentence(logging.Formatter):
     """The message alone; a traceback is in the dive's log."""
 
     def format(self, record: logging.LogRecord) -> str:
-        return record.getMessage()
+        return printable_text(record.getMessage())
 
 
 def devices_on_stderr() -> None:

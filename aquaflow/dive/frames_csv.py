@@ -10,6 +10,7 @@ from pathlib import Path
 
 from aquaflow.base.errors import InputError, reason_of
 from aquaflow.base.errors.regular_file import open_regular_text, read_regular
+from aquaflow.base.storage.table import csv_text, text_of_cell
 
 MOST_LINES = 20
 """Lines of one reason; a library's message has a few."""
@@ -41,8 +42,10 @@ class FrameRow:
 
     @staticmethod
     def of_cells(cells: Sequence[str]) -> FrameRow:
-        """The row that :meth:`cells` wrote."""
-        index, source, t_s, frame_class, sub_map, keyframe, quality, reason = cells
+        """The row of a line of the file."""
+        index, source, t_s, frame_class, sub_map, keyframe, quality, reason = map(
+            text_of_cell, cells
+        )
         return FrameRow(
             int(index), source, float(t_s), frame_class,
             int(sub_map) if sub_map else None,
@@ -63,18 +66,12 @@ class FrameRow:
 
 def to_text(rows: Iterable[FrameRow]) -> str:
     """Their lines of frames.csv."""
-    return _csv(row.cells() for row in rows)
+    return csv_text(row.cells() for row in rows)
 
 
 def header() -> str:
     """The first line of frames.csv."""
-    return _csv([FRAME_COLUMNS])
-
-
-def _csv(lines: Iterable[Sequence[str]]) -> str:
-    text = io.StringIO(newline="")
-    csv.writer(text, lineterminator="\n").writerows(lines)
-    return text.getvalue()
+    return csv_text([FRAME_COLUMNS])
 
 
 def of_text(text: str) -> list[FrameRow]:

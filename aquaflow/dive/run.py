@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from aquaflow.base.errors import InputError, NotMappedError
+from aquaflow.base.errors import InputError, NotMappedError, printable
 from aquaflow.base.profiler import pace
 from aquaflow.config import Config
 from aquaflow.dive import calibration_findings
@@ -69,7 +69,7 @@ class DiveRun:
         trace: bool = False,
     ) -> None:
         """``name_of`` a frame's index: its file, or where it is in the film."""
-        self.name, self.folder, self.slam = name, folder, slam
+        self.name, self.folder, self.slam = printable(name), folder, slam
         self.calibration = calibration
         self.preparation = Preparation(config.source, calibration)
         self.profiler = slam.profiler

@@ -6,7 +6,6 @@ What is unknown is an empty cell. Positions are those of ``trajectory.tum``.
 from __future__ import annotations
 
 import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from datetime import datetime, timezone
@@ -15,6 +14,7 @@ from pathlib import Path
 from aquaflow.base.errors import DamagedError, InputError, reason_of
 from aquaflow.base.errors.regular_file import open_regular_text
 from aquaflow.base.storage.atomic import atomic_write
+from aquaflow.base.storage.table import csv_text
 
 NAME = "trajectory.csv"
 DECIMALS = {"t_s": 9, "latitude_deg": 9, "longitude_deg": 9, "x": 6, "y": 6, "z": 6}
@@ -83,10 +83,8 @@ def write_trajectory_csv(path: Path, rows: Sequence[PoseRow]) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    text = io.StringIO(newline="")
-    csv.writer(text, lineterminator="\n").writerows([COLUMNS, *(row.cells() for row in rows)])
     with atomic_write(path) as stream:
-        stream.write(text.getvalue().encode("utf-8"))
+        stream.write(csv_text([COLUMNS, *(row.cells() for row in rows)]).encode("utf-8"))
 
 
 def read_trajectory_csv(path: Path) -> list[PoseRow]:

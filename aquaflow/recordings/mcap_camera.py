@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import InputError, printable
 from aquaflow.config.device import MountingConfig
 from aquaflow.geometry.camera import (
     CameraModel,
@@ -93,7 +93,7 @@ class McapCamera:
 
     def name_of(self, index: int) -> str:
         """The recording's name and the picture's number, ``dive.mcap#12``."""
-        return f"{self.path.name}#{index}"
+        return f"{printable(self.path.name)}#{index}"
 
     def frames(
         self, every: int = 1, start: int = 0, stop: int | None = None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import InputError, printable
 from aquaflow.geometry.camera import CameraModel, DistortionModel, guess_camera
 from aquaflow.recordings.picture import UnreadablePictureError, received_as
 from aquaflow.recordings.picture_message import compressed_picture, raw_picture
@@ -76,7 +76,7 @@ class RosbagCamera:
 
     def name_of(self, index: int) -> str:
         """The bag's name and the picture's number, ``dive.bag#12``."""
-        return f"{self.path.name}#{index}"
+        return f"{printable(self.path.name)}#{index}"
 
     def frames(
         self, every: int = 1, start: int = 0, stop: int | None = None

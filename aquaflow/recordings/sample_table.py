@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from aquaflow.base.errors import InputError, reason_of
+from aquaflow.base.storage.table import csv_text
 from aquaflow.types import KIND_OF, KINDS, LENGTHS, VALUES, TelemetrySample, values_of
 
 __all__ = ["HEADER", "read_telemetry", "sample_of", "write_telemetry"]
@@ -40,12 +41,12 @@ EXACT = frozenset({"position", "utc_time"})
 
 def write_telemetry(path: Path, samples: Iterable[TelemetrySample]) -> None:
     """Write samples in the order given; their times must count from the first picture."""
+    rows: list[Sequence[str]] = [HEADER]
+    for sample in samples:
+        stamps = (f"{ns * 1e-9:.9f}" for ns in (sample.t_ns, sample.arrival_ns))
+        rows.append([*stamps, *_cells(sample)])
     with path.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(HEADER)
-        for sample in samples:
-            stamps = (f"{ns * 1e-9:.9f}" for ns in (sample.t_ns, sample.arrival_ns))
-            writer.writerow([*stamps, *_cells(sample)])
+        file.write(csv_text(rows))
 
 
 def read_telemetry(path: Path) -> Iterator[TelemetrySample]:

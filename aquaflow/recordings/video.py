@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import InputError, printable
 from aquaflow.geometry.camera import ASPECT_TOLERANCE, guess_camera, load_camera
 from aquaflow.recordings.images import CALIBRATION, DEFAULT_FPS, NS_PER_S
 from aquaflow.sources import is_asked
@@ -71,7 +71,7 @@ class VideoFile:
 
     def name_of(self, index: int) -> str:
         """The video's name and the frame's number, ``clip.mp4#12``."""
-        return f"{self.path.name}#{index}"
+        return f"{printable(self.path.name)}#{index}"
 
     def frames(
         self, every: int = 1, start: int = 0, stop: int | None = None

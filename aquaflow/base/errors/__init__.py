@@ -114,6 +114,12 @@ _POSITION = re.compile(r"\bline:? (\d+)(?:[ ,(]*col(?:umn)?:? (\d+))?", re.IGNOR
 """Where a parser's message says that it stopped."""
 
 
+_COMMANDS = re.compile(
+    "[\\x00-\\x08\\x0b-\\x1f\\x7f-\\x9f\\u061c\\u200e\\u200f\\u202a-\\u202e\\u2066-\\u2069]"
+)
+"""Control characters but tab and line feed (ECMA-48), and those of bidirectional text (Unicode)."""
+
+
 def reason_of(error: BaseException) -> str:
     """Why another library could not use a file, without a word of what the file holds.
 
@@ -147,6 +153,12 @@ def printable(name: str) -> str:
     except UnicodeEncodeError:  # half a character from a file's text, which no name on disk has
         raw = name.encode("utf-8", "backslashreplace").decode("utf-8")
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in raw)
+
+
+def printable_text(text: str) -> str:
+    r"""A text of several lines to show: other control characters, which a terminal obeys, and marks
+    that turn the direction of writing as ``\x1b`` and ``\u202e``."""
+    return _COMMANDS.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 def words_of(message: str) -> str:

@@ -16,7 +16,13 @@ from pathlib import Path
 from typing import TextIO
 
 from aquaflow import __version__
-from aquaflow.base.errors import AquaFlowError, InputError, is_out_of_memory, printable
+from aquaflow.base.errors import (
+    AquaFlowError,
+    InputError,
+    is_out_of_memory,
+    printable,
+    printable_text,
+)
 
 DEBUG = "AQUAFLOW_DEBUG"
 """Environment variable: set to anything, tracebacks go to stderr."""
@@ -97,15 +103,16 @@ def _kept(error: Exception) -> str:
 
 
 def _end(sentence: str, code: int) -> None:
-    print(f"aquaflow: {' '.join(sentence.split())}", file=sys.stderr)
+    print(f"aquaflow: {printable(' '.join(sentence.split()))}", file=sys.stderr)
     sys.exit(code)
 
 
 def refuse_unreadable(arguments: Sequence[str]) -> None:
-    """Names on the command line must be text: neither OpenCV nor a report can take others.
+    """Names on the command line must be text: neither OpenCV nor a report can take others, and a
+    terminal obeys control characters.
 
     Raises:
-        InputError: an argument is not in the encoding of the system.
+        InputError: an argument is not in the encoding of the system, or holds what is no text.
     """
     for argument in arguments:
         try:
@@ -114,6 +121,11 @@ def refuse_unreadable(arguments: Sequence[str]) -> None:
             raise InputError(
                 f"the name '{printable(argument)}' is not UTF-8; rename the file or folder"
             ) from error
+        if printable_text(argument) != argument:
+            raise InputError(
+                f"the name '{printable(argument)}' holds control characters; rename the file or "
+                "folder"
+            )
 
 
 def print_anything(streams: Sequence[TextIO]) -> None:

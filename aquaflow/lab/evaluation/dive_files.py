@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import read_regular_json
+from aquaflow.base.storage.table import text_of_cell
 from aquaflow.lab.evaluation.trajectory import Trajectory, associate, read_tum
 
 ROW_TOLERANCE_S = 1e-3
@@ -109,7 +110,7 @@ def _read_frames(path: Path) -> tuple[list[float], list[str], list[int]]:
                     raise InputError(
                         f"{path} line {reader.line_num}: t_s and sub_map must be numbers"
                     ) from error
-                sources.append(row["source"])
+                sources.append(text_of_cell(row["source"]))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"cannot read the frames {path}; run 'aquaflow map' again") from error
     return times, sources, sub_maps

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.base.storage.table import csv_text
 from aquaflow.survey.change.patches import NAMES, Patch
 from aquaflow.survey.export.ortho.ground import Ground
 
@@ -44,12 +43,8 @@ def row_of(number: int, patch: Patch, ground: Ground) -> dict[str, Any]:
 
 def csv_of(rows: list[dict[str, Any]]) -> bytes:
     """The table with its head."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for row in rows:
-        writer.writerow([_text(row[column]) for column in COLUMNS])
-    return text.getvalue().encode("utf-8")
+    cells = ([_text(row[column]) for column in COLUMNS] for row in rows)
+    return csv_text([COLUMNS, *cells]).encode("utf-8")
 
 
 def _text(value: Any) -> str:

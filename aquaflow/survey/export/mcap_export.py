@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from aquaflow import __version__
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import InputError, printable
 from aquaflow.base.storage.atomic import write_json
 from aquaflow.dive.finished_frames import (
     FinishedFrame,
@@ -119,7 +119,7 @@ def _facts(source: _Dive) -> dict[str, str]:
     """The metadata record of the file."""
     return {
         "version": __version__,
-        "dive": source.path.name,
+        "dive": printable(source.path.name),
         "unit": source.where.unit,
         "map": source.where.in_words() if source.where.epsg is None else source.where.axes,
         "times": source.times,

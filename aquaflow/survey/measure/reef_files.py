@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from pathlib import Path
 
 from aquaflow.base.storage.atomic import atomic_write, write_json
+from aquaflow.base.storage.table import csv_text
 from aquaflow.survey.measure.reef_numbers import ReefNumbers
 
 JSON, CSV = "reef_numbers.json", "reef_numbers.csv"
@@ -29,7 +28,5 @@ def write_csv(path: Path, rows: list[list[str]]) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
     with atomic_write(path) as stream:
-        stream.write(text.getvalue().encode("utf-8"))
+        stream.write(csv_text(rows).encode("utf-8"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 from pathlib import Path
 
+from aquaflow.base.errors import printable_text
 from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.survey.report import measures, sections, survey_sections
 from aquaflow.survey.report.data import ReportData
@@ -45,7 +46,7 @@ def render_report(data: ReportData) -> str:
     name = html.escape(data.name)
     version = html.escape(str(data.metrics.get("version", "")))
     written = f" on {html.escape(data.written)}" if data.written else ""
-    return (
+    return printable_text(
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{name}: AquaFlow dive report</title><style>{STYLE_SHEET}</style></head>"

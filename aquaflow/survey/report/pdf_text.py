@@ -101,7 +101,9 @@ class Pages:
 
         figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), layout="constrained")
         top = 1.0 - 0.45 / HEIGHT_IN
-        figure.text(MARGIN_IN / WIDTH_IN, top, self._header, fontsize=8.0, color="#56707a")
+        figure.text(
+            MARGIN_IN / WIDTH_IN, top, self._header, fontsize=8.0, color="#56707a", parse_math=False
+        )
         return figure
 
     def _room(self, inches: float) -> None:

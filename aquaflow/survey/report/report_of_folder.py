@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from aquaflow.base.errors import InputError, reason_of
+from aquaflow.base.errors import InputError, printable, reason_of
 from aquaflow.base.errors.regular_file import open_regular_text, read_regular, read_regular_json
 from aquaflow.dive.folder import CALIBRATION, MARKER
 from aquaflow.dive.frames_csv import FrameRow, read_rows
@@ -45,7 +45,7 @@ def report_of_folder(dive: Path) -> ReportData:
     path, medium = _path(poses, rows, frames, frame), _medium(dive, frame)
     camera = load_camera(dive / "camera.yaml", inside=True)
     return ReportData(
-        name=dive.resolve().name,
+        name=printable(dive.resolve().name),
         camera=camera_summary(camera, _calibrated(dive)),
         metrics=metrics,
         path=path,

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.errors import DamagedError, InputError, printable, reason_of
 from aquaflow.base.errors.regular_file import read_regular_json, sha256_regular
 from aquaflow.base.storage.atomic import write_json
 from aquaflow.dive.status import refuse_unfinished
@@ -117,7 +117,9 @@ def add_dives(site: Path, folders: Sequence[Path]) -> list[SiteDive]:
         at = next((i for i, dive in enumerate(there) if _same(dive.folder(site), folder)), None)
         if at is None:
             names = {dive.name for dive in there}
-            there.append(SiteDive(_free(folder.resolve().name, names), _way(site, folder), mark))
+            there.append(
+                SiteDive(_free(printable(folder.resolve().name), names), _way(site, folder), mark)
+            )
             new.append(there[-1])
         elif there[at].fingerprint != mark:
             there[at] = SiteDive(there[at].name, there[at].path, mark)

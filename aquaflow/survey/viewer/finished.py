@@ -10,7 +10,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.errors import DamagedError, InputError, printable, reason_of
 from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.dive.status import unfinished
@@ -71,7 +71,7 @@ class FinishedDive:
         else:
             count, total = self.packed.count, self.packed.total
         of_all = f"{len(self.path.poses)} poses, {count} of {total} Gaussians"
-        said = f"{self.folder.name}: {of_all}\n\n{frame_in_words(self.frame)}"
+        said = f"{printable(self.folder.name)}: {of_all}\n\n{frame_in_words(self.frame)}"
         return "\n\n".join(filter(None, (said, note_unfinished(self.folder))))
 
 

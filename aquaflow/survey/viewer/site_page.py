@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from aquaflow.base.errors import InputError
+from aquaflow.base.errors import InputError, printable
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.dive.ply import PlyGaussians, read_ply
 from aquaflow.geometry.similarity import Sim3
@@ -157,8 +157,8 @@ def _in_words(shown: ShownSite, count: int, total: int) -> str:
     poses = sum(len(placed.path.poses) for placed in shown.dives)
     dives = len(shown.dives)
     words = [
-        f"{shown.folder.name}: {dives} {'dive' if dives == 1 else 'dives'}, {poses} poses, "
-        f"{count} of {total} Gaussians"
+        f"{printable(shown.folder.name)}: {dives} {'dive' if dives == 1 else 'dives'}, "
+        f"{poses} poses, {count} of {total} Gaussians"
         + ("" if shown.one_map is None else " of the one map of all of them"),
         frame_in_words(shown.frame),
     ]

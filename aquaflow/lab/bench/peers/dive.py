@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 
 from aquaflow.base.errors import NotMappedError
 from aquaflow.base.profiler import pace
+from aquaflow.base.storage.table import csv_text
 from aquaflow.config import Config
 from aquaflow.dive.tum import write_tum
 from aquaflow.geometry.camera import load_camera
@@ -82,13 +82,11 @@ def write_dive(out: Path, recording: Prepared, result: PeerResult) -> dict[str, 
         np.stack([result.poses[i].t for i in placed]),
         np.stack([result.poses[i].quaternion for i in placed]),
     )
-    with (out / "frames.csv").open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(FRAME_COLUMNS)
-        for i, (frame, name) in enumerate(zip(frames, recording.names, strict=True)):
-            posed = i in result.poses
-            state = ("common", 0) if posed else ("lost", "")
-            writer.writerow([frame.index, name, f"{frame.t_ns * 1e-9:.9f}", *state])
+    rows: list[tuple[object, ...]] = [FRAME_COLUMNS]
+    for i, (frame, name) in enumerate(zip(frames, recording.names, strict=True)):
+        state = ("common", 0) if i in result.poses else ("lost", "")
+        rows.append((frame.index, name, f"{frame.t_ns * 1e-9:.9f}", *state))
+    (out / "frames.csv").write_text(csv_text(rows), encoding="utf-8", newline="")
     metrics = _metrics(len(frames), result)
     (out / "metrics.json").write_text(json.dumps(metrics), encoding="utf-8")
     return metrics
