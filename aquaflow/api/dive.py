@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.base.storage.dive_status import refuse_unfinished
 from aquaflow.dive.frames_csv import FrameRow, read_rows
-from aquaflow.dive.status import refuse_unfinished
 from aquaflow.dive.trajectory_csv import NAME as TRAJECTORY_CSV
 from aquaflow.dive.trajectory_csv import PoseRow, read_trajectory_csv
 from aquaflow.geometry.camera import CameraModel, load_camera

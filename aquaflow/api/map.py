@@ -11,10 +11,10 @@ import numpy.typing as npt
 import torch
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.storage.dive_status import refuse_unfinished
 from aquaflow.dive.map_file import SUFFIX, read_map_file
 from aquaflow.dive.map_splats import splats_of
 from aquaflow.dive.ply import PlyGaussians
-from aquaflow.dive.status import refuse_unfinished
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.lab.synthetic.water import Medium, Rgb

@@ -227,7 +227,7 @@ def evaluate(
 ) -> None:
     """Measure a dive: colours of restored views, and what the truth allows to compare."""
     from aquaflow.base.errors import InputError
-    from aquaflow.dive.status import refuse_unfinished
+    from aquaflow.base.storage.dive_status import refuse_unfinished
     from aquaflow.lab.evaluation.epipolar_error import evaluate_epipolar
     from aquaflow.lab.evaluation.naturalness import evaluate_naturalness
     from aquaflow.lab.evaluation.protocol import evaluate_dive

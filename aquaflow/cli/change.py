@@ -55,7 +55,7 @@ def change(
     if site is not None and transform is not None:
         raise InputError("a site knows how its dives lie; leave out --transform, or the site")
     if site is None:
-        from aquaflow.dive.status import refuse_without_map
+        from aquaflow.base.storage.dive_status import refuse_without_map
 
         for name in (first, second):
             refuse_without_map(Path(name))

@@ -120,7 +120,7 @@ def export(
     _refuse_others(format, given)
     if resolution is not None and not (math.isfinite(resolution) and resolution > 0.0):
         raise InputError(f"--resolution {resolution:g} is no size of a pixel; give a positive one")
-    from aquaflow.dive.status import refuse_without_map
+    from aquaflow.base.storage.dive_status import refuse_without_map
 
     refuse_without_map(dive)
     target = out or _own_target(dive / NAMES[format])

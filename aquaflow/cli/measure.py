@@ -73,7 +73,7 @@ def measure(
     as_json: Json = False,
 ) -> None:
     """Measure in a finished dive: the ground in numbers, or between points; or tend its notes."""
-    from aquaflow.dive.status import refuse_without_map
+    from aquaflow.base.storage.dive_status import refuse_without_map
 
     if notes or delete:
         if point or any(each is not None for each in (shape, cell, note, csv)):

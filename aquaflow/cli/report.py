@@ -28,7 +28,7 @@ def report(
     """Write the report of a finished dive as one PDF, to print or to send."""
     if pdf is not None and pdf.suffix.lower() != ".pdf":
         raise InputError(f"{pdf} does not end in .pdf; give the report a file of its own")
-    from aquaflow.dive.status import refuse_unfinished
+    from aquaflow.base.storage.dive_status import refuse_unfinished
     from aquaflow.survey.report.pdf import write_pdf
     from aquaflow.survey.report.report_of_folder import report_of_folder
 

@@ -65,7 +65,7 @@ def video(
         "--width": width is not None,
     }  # fmt: skip
     _refuse(kind, given, seconds, width)
-    from aquaflow.dive.status import refuse_without_map
+    from aquaflow.base.storage.dive_status import refuse_without_map
 
     refuse_without_map(dive)
     with progress_bars(quiet=as_json) as bars:

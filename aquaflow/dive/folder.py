@@ -24,6 +24,8 @@ from aquaflow.base.storage.atomic import (
     write_json,
     write_yaml,
 )
+from aquaflow.base.storage.dive_status import CHECKPOINT, FRAMES, DiveState, DiveStatus
+from aquaflow.base.storage.dive_status import NAME as STATUS
 from aquaflow.base.storage.folder_lock import FolderLock
 from aquaflow.config import Config
 from aquaflow.dive import from_maps
@@ -32,8 +34,6 @@ from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.dive.log import JsonLog
 from aquaflow.dive.png import write_png
 from aquaflow.dive.results import WaterSummary
-from aquaflow.dive.status import CHECKPOINT, FRAMES, DiveState, DiveStatus
-from aquaflow.dive.status import NAME as STATUS
 from aquaflow.dive.trajectory_csv import NAME as PATH_TABLE
 from aquaflow.dive.trajectory_csv import PoseRow, write_trajectory_csv
 from aquaflow.dive.tum import write_tum

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.storage.dive_status import refuse_without_map
 from aquaflow.config import load_config
 from aquaflow.dive.map_file import SUFFIX, read_map_file
 from aquaflow.dive.placement import Placement, placement
-from aquaflow.dive.status import refuse_without_map
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper

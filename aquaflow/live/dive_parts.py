@@ -9,11 +9,12 @@ from functools import partial
 from aquaflow.base.cores import core_count
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.base.profiler import Profiler
+from aquaflow.base.storage.dive_status import DiveStatus, read_status
 from aquaflow.config import Config, parse_config
+from aquaflow.config.device import MountingConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import DiveRun
-from aquaflow.dive.status import read_status
 from aquaflow.live.checkpoint.base import look_in_base
 from aquaflow.live.checkpoint.checkpoint import Checkpointer, restore
 from aquaflow.live.checkpoint.generations import Checkpoint
@@ -90,7 +91,7 @@ def assembled(
     said = look_in_base(slam, service.dive.site, choice.checkpoint)
     with failures.contain("camera mounting"):
         stated = camera_mounting(config, service, feed)
-        slam.metric.mounting = stated or (before.stated_mounting() if before else None)
+        slam.metric.mounting = stated or _mounting_of(before)
     run = DiveRun(name, folder, config, slam, feed.calibration, feed.name_of)
     continued = Continued()
     if choice.checkpoint is not None:
@@ -133,6 +134,12 @@ def assembled(
     return Parts(
         loop, slam, run, thread, checkpointer, refresher, choice, standing, errors, frames_before
     )  # fmt: skip
+
+
+def _mounting_of(before: DiveStatus | None) -> MountingConfig | None:
+    """Of the camera in the body, as an earlier run of the dive was told; None where it was not."""
+    stated = None if before is None else before.mounting
+    return None if stated is None else MountingConfig.model_validate(stated)
 
 
 def _has_maps(known: Checkpoint | None) -> bool:

@@ -9,6 +9,7 @@ from pathlib import Path
 from aquaflow.base.clocks.device import Learned
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.failures import Failures
+from aquaflow.base.storage.dive_status import CHECKPOINT, DiveState, read_status, refuse_unfinished
 from aquaflow.base.storage.folder_lock import refuse_held
 from aquaflow.config import load_config
 from aquaflow.config.device import MountingConfig
@@ -16,7 +17,6 @@ from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.folder import CALIBRATION, MARKER, WORK
 from aquaflow.dive.frames_csv import readable_rows
 from aquaflow.dive.run import Finished
-from aquaflow.dive.status import CHECKPOINT, DiveState, read_status, refuse_unfinished
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.live.checkpoint.generations import generations
 from aquaflow.live.checkpoint.resume import Choice, newest_usable

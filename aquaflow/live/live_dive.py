@@ -9,11 +9,11 @@ from functools import partial
 
 from aquaflow.base.cores import usable_threads
 from aquaflow.base.errors import NotMappedError
+from aquaflow.base.storage.dive_status import CHECKPOINT, DiveState
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.replay import fix_threads
 from aquaflow.dive.run import Finished
-from aquaflow.dive.status import CHECKPOINT, DiveState
 from aquaflow.live.checkpoint.resume import Choice
 from aquaflow.live.checkpoint.salvage import salvaged_from
 from aquaflow.live.control import Control

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.base.signals import stop_on_signals
+from aquaflow.base.storage.dive_status import DiveState, read_status
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.run import Finished
-from aquaflow.dive.status import DiveState, read_status
 from aquaflow.live.checkpoint.checkpoint import UnusableStateError
 from aquaflow.live.checkpoint.resume import Choice, choose, is_begun, resumed, tidy
 from aquaflow.live.checkpoint.set_aside import SetAside

@@ -9,8 +9,8 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from aquaflow.base.errors.failures import Failures
+from aquaflow.base.storage.dive_status import DiveState, DiveStatus
 from aquaflow.config.device import MountingConfig
-from aquaflow.dive.status import DiveState, DiveStatus
 from aquaflow.live.loop import LiveLoop
 from aquaflow.live.moment import Moment
 from aquaflow.sources.wall_clock import OLDEST_NS

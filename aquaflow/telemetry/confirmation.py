@@ -46,6 +46,12 @@ class Confirmation:
         """True if the estimates contradict each other."""
         return self.chance < CHANCE_OF_SCATTER
 
+    @property
+    def vague(self) -> bool:
+        """True if there are too few estimates to see whether they agree: an autopilot is told
+        nothing before (an altimeter alone, 1.85 s late, was 5.6 sigma wrong after 5 s)."""
+        return self.estimates < LEAST_ESTIMATES
+
     def applied(self, solution: Solution) -> Solution:
         """The solution with a scale that is no surer than this."""
         covariance = solution.covariance.copy()
@@ -55,7 +61,7 @@ class Confirmation:
 
     def in_words(self) -> str:
         """What is missing, where the scale is not confirmed."""
-        if self.estimates < LEAST_ESTIMATES:
+        if self.vague:
             return "too little of the path has a scale of its own"
         return f"parts of the path and kinds of source agree on the scale to {self.sigma:.0%} only"
 

@@ -90,7 +90,7 @@ def estimate(
     if clocks.leave_open(problem):
         ground = points()
         confirmation = confirmation_of(path, lambda part: problem_along(part, lambda: ground))
-        if confirmation.refuted or not clocks.known:
+        if confirmation.refuted or confirmation.vague or not clocks.known:
             solution = confirmation.applied(solution)
             problem.doubt = f"{confirmation.in_words()}, and {clocks.why_open}"
     return Estimate(clocks.stated(frame_of(problem, solution, path)), problem, solution)

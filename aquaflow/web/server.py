@@ -121,11 +121,12 @@ class WebServer:
         from aquaflow.web.connection import Connection, Connections
 
         self._threads, self._connections = asyncio.Semaphore(MOST_THREADS), Connections()
+        limited: Any = partial(Connection, self._connections)  # uvicorn calls it, as a class
         return uvicorn.Server(
             uvicorn.Config(
                 self._serve,
-                http=partial(Connection, self._connections),
-                lifespan="off",  # type: ignore[arg-type]
+                http=limited,
+                lifespan="off",
                 ws="none" if self._watcher is None else "websockets-sansio",
                 ws_max_size=LARGEST_MESSAGE,
                 ws_per_message_deflate=False,

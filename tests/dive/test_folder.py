@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.storage.dive_status import DiveState, read_status, unfinished
 from aquaflow.config import Config, load_config
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.frames_csv import FrameRow
 from aquaflow.dive.ply import read_ply
-from aquaflow.dive.status import DiveState, read_status, unfinished
 from aquaflow.geometry.camera import load_camera
 from aquaflow.lab.evaluation.trajectory import read_tum
 from tests.small_recording import FRAMES, HEIGHT, WIDTH

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError, NotMappedError
+from aquaflow.base.storage.dive_status import refuse_unfinished
 from aquaflow.config import Config, SourceConfig
 from aquaflow.dive.replay import map_recording
-from aquaflow.dive.status import refuse_unfinished
 from aquaflow.recordings.synthetic import SyntheticDive
 from aquaflow.slam import Slam
 from aquaflow.sources import open_recording

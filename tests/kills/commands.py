@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+from aquaflow.base.storage.dive_status import CHECKPOINT, FRAMES, DiveState, read_status
+from aquaflow.base.storage.dive_status import NAME as STATUS
 from aquaflow.base.storage.whole_folder import MARK, WORK
-from aquaflow.dive.status import CHECKPOINT, FRAMES, DiveState, read_status
-from aquaflow.dive.status import NAME as STATUS
 from aquaflow.survey.site.merged_file import read_merged
 from tests.command_line import Ran, run_aquaflow
 from tests.lab.batch.seasons import contents, season

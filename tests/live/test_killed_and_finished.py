@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from aquaflow.base.storage.dive_status import DiveState, DiveStatus, read_status
 from aquaflow.base.storage.folder_lock import FolderLock
 from aquaflow.dive.frames_csv import read_rows
 from aquaflow.dive.ply import read_ply
-from aquaflow.dive.status import DiveState, DiveStatus, read_status
 from aquaflow.lab.evaluation.trajectory import read_tum
 from aquaflow.live.checkpoint.generations import read_state, state_file
 from tests.command_line import Cli

@@ -14,8 +14,8 @@ import pytest
 
 from aquaflow.base.errors import AquaFlowError, InputError
 from aquaflow.base.signals import stop_on_signals
+from aquaflow.base.storage.dive_status import DiveState, DiveStatus
 from aquaflow.config.vehicle import VehicleConfig
-from aquaflow.dive.status import DiveState, DiveStatus
 from aquaflow.live import onboard as module
 from aquaflow.live.control import Control, Phase, Request
 from aquaflow.live.live_dive import STAGE

@@ -21,12 +21,12 @@ import cv2
 import numpy as np
 import pytest
 
+from aquaflow.base.storage.dive_status import DiveState, read_status
 from aquaflow.config import SourceConfig
 from aquaflow.config.cameras import V4l2Config
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.frames_csv import read_rows
 from aquaflow.dive.ply import read_ply
-from aquaflow.dive.status import DiveState, read_status
 from aquaflow.drivers.v4l2 import V4l2Camera
 from aquaflow.lab.evaluation.trajectory import read_tum
 from aquaflow.live.checkpoint.generations import state_file

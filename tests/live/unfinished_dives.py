@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from aquaflow.dive.status import DiveState, DiveStatus
+from aquaflow.base.storage.dive_status import DiveState, DiveStatus
 from aquaflow.geometry.arrays import of_camera
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.live.checkpoint.generations import FORMAT, state_file, write_state

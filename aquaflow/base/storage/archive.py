@@ -22,7 +22,7 @@ import numpy as np
 
 from aquaflow.base.errors import DamagedError
 from aquaflow.base.errors.regular_file import open_regular
-from aquaflow.geometry.arrays import Array
+from aquaflow.base.storage.array_file import Array
 
 UNREADABLE = (
     *(OSError, zipfile.BadZipFile, zlib.error, ValueError, KeyError, TypeError, EOFError),

@@ -22,7 +22,8 @@ from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import open_regular
 from aquaflow.base.storage.atomic import replacing
 
-Arrays = dict[str, npt.NDArray[Any]]
+Array = npt.NDArray[Any]
+Arrays = dict[str, Array]
 
 LONGEST_LINE = 1 << 16
 """Bytes; a line is some hundreds. A damaged file may have no end of line."""

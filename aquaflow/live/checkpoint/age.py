@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from aquaflow.base.clocks.computer import clock_is_set
+from aquaflow.base.storage.dive_status import CHECKPOINT
 from aquaflow.dive.folder import MARKER
-from aquaflow.dive.status import CHECKPOINT
 from aquaflow.live.moment import Moment
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
 

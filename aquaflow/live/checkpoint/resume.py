@@ -15,12 +15,12 @@ from pathlib import Path
 
 from aquaflow.base.clocks.computer import clock_is_set
 from aquaflow.base.errors import InputError
+from aquaflow.base.storage.dive_status import CHECKPOINT, DiveState, read_status
+from aquaflow.base.storage.dive_status import NAME as STATUS
 from aquaflow.base.storage.folder_lock import is_held
 from aquaflow.config.service import CheckpointConfig
 from aquaflow.dive.folder import MARKER, WORK
 from aquaflow.dive.frames_csv import header
-from aquaflow.dive.status import CHECKPOINT, DiveState, read_status
-from aquaflow.dive.status import NAME as STATUS
 from aquaflow.live.checkpoint.age import age_of
 from aquaflow.live.checkpoint.generations import Checkpoint, generations, read_state
 from aquaflow.live.moment import Moment

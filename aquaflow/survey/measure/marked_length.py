@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from aquaflow.base.errors import InputError
-from aquaflow.dive.status import refuse_unfinished
+from aquaflow.base.storage.dive_status import refuse_unfinished
 from aquaflow.survey.measure.reef_files import CSV, JSON, write_reef_numbers
 from aquaflow.survey.measure.rescaling import rescale, why_not
 from aquaflow.telemetry.known_lengths.known_length import KnownLength, LengthScale, scale_of

@@ -19,11 +19,11 @@ from aquaflow.base.errors import InputError, reason_of
 from aquaflow.base.errors.regular_file import open_regular_text, read_regular_json
 from aquaflow.base.storage.archive import read_arrays_of
 from aquaflow.base.storage.atomic import atomic_write, write_json
+from aquaflow.base.storage.dive_status import rescaling
 from aquaflow.dive import trajectory_csv
 from aquaflow.dive.metric_outputs import frame_numbers, worlds_in_words
 from aquaflow.dive.path_rows import position_sigma, speeds_of
 from aquaflow.dive.ply import PlyGaussians, read_ply, write_ply
-from aquaflow.dive.status import rescaling
 from aquaflow.dive.trajectory_csv import PoseRow, read_trajectory_csv, write_trajectory_csv
 from aquaflow.dive.tum import write_tum
 from aquaflow.geometry.similarity import Sim3

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.storage.dive_status import refuse_unfinished
 from aquaflow.config import load_config
 from aquaflow.dive.frames_csv import read_rows
 from aquaflow.dive.map_file import SUFFIX, read_map_file
-from aquaflow.dive.status import refuse_unfinished
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render import select_renderer
 from aquaflow.render.views import View

@@ -11,7 +11,7 @@ from pathlib import Path
 from aquaflow.base.errors import DamagedError, InputError, printable, reason_of
 from aquaflow.base.errors.regular_file import read_regular_json, sha256_regular
 from aquaflow.base.storage.atomic import write_json
-from aquaflow.dive.status import refuse_unfinished
+from aquaflow.base.storage.dive_status import refuse_unfinished
 from aquaflow.keyframes.places_file import NAME as PLACES
 from aquaflow.keyframes.places_file import PlacesFile
 from aquaflow.telemetry.metric_file import NAME as METRIC

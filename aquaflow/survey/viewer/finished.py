@@ -12,8 +12,8 @@ from typing import Any
 
 from aquaflow.base.errors import DamagedError, InputError, printable, reason_of
 from aquaflow.base.errors.regular_file import read_regular_json
+from aquaflow.base.storage.dive_status import unfinished
 from aquaflow.config.viewer import ViewerConfig
-from aquaflow.dive.status import unfinished
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.survey.viewer.dive_map import DiveMap, read_map
 from aquaflow.survey.viewer.dive_path import DivePath, read_path

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import read_regular_json
-from aquaflow.dive.status import refuse_unfinished
+from aquaflow.base.storage.dive_status import refuse_unfinished
 from aquaflow.keyframes.places_file import NAME, PlacesFile
 from aquaflow.telemetry.metric_file import read_metric_file
 from aquaflow.tracking.base.base import Base

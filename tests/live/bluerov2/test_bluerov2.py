@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
+from aquaflow.base.storage.dive_status import DiveState, read_status
 from aquaflow.dive.ply import read_ply
-from aquaflow.dive.status import DiveState, read_status
 from aquaflow.drivers.protocol.mavlink import OUR_COMPONENT
 from aquaflow.drivers.protocol.mavlink_commands import ACCEPTED, FIRST_COMMAND, REFUSED_NOW
 from aquaflow.lab.evaluation.trajectory import read_tum

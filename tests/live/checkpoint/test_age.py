@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from aquaflow.base.storage.dive_status import DiveState
 from aquaflow.base.storage.folder_lock import FolderLock
 from aquaflow.config.service import CheckpointConfig
-from aquaflow.dive.status import DiveState
 from aquaflow.live.checkpoint.age import age_of
 from aquaflow.live.checkpoint.resume import Choice, choose
 from aquaflow.live.moment import Moment

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError
+from aquaflow.base.storage.dive_status import DiveState, DiveStatus
 from aquaflow.config.service import CheckpointConfig
-from aquaflow.dive.status import DiveState, DiveStatus
 from aquaflow.geometry.arrays import of_camera
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.live.checkpoint.generations import (

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from aquaflow.dive.status import DiveState, DiveStatus
+from aquaflow.base.storage.dive_status import DiveState, DiveStatus
 from aquaflow.dive.tum import write_tum
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from aquaflow.base.errors import InputError
-from aquaflow.base.storage.folder_lock import FolderLock
-from aquaflow.dive.status import (
+from aquaflow.base.storage.dive_status import (
     DiveState,
     DiveStatus,
     read_status,
@@ -17,6 +16,7 @@ from aquaflow.dive.status import (
     rescaling,
     unfinished,
 )
+from aquaflow.base.storage.folder_lock import FolderLock
 
 LIVE = DiveStatus(DiveState.OPEN, boot="boot")
 

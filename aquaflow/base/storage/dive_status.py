@@ -12,7 +12,6 @@ from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.base.storage.atomic import write_json
 from aquaflow.base.storage.folder_lock import is_held
-from aquaflow.config.device import MountingConfig
 
 NAME = "dive.json"
 FRAMES, METRICS, MAP = "frames.csv", "metrics.json", "map.aqf"
@@ -64,10 +63,6 @@ class DiveStatus:
         """Raises InputError if it cannot be written."""
         write_json(dive / NAME, asdict(self))
 
-    def stated_mounting(self) -> MountingConfig | None:
-        """The mounting again; None where none was stated."""
-        return None if self.mounting is None else MountingConfig.model_validate(self.mounting)
-
 
 def read_status(dive: Path) -> DiveStatus | None:
     """How the dive in this folder stands; None where nothing readable says so."""
@@ -76,10 +71,11 @@ def read_status(dive: Path) -> DiveStatus | None:
         begun, boot, mounting = (found[name] for name in ("begun_utc", "boot", "mounting"))
         paused = found["paused"] is True
         status = DiveStatus(DiveState(found["state"]), paused, begun, boot, mounting)
-        status.stated_mounting()
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
     if not isinstance(begun, str | None) or not isinstance(boot, str):
+        return None
+    if not isinstance(mounting, dict | None):
         return None
     return status
 
