@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,11 +18,14 @@ from aquaflow.mapping.work import OwnedMaps
 from aquaflow.sources.newest import Newest
 from aquaflow.survey.coverage.plan import CoveragePlan
 from aquaflow.survey.measure.scale import Scale
-from aquaflow.survey.viewer.copies import MapCopy, Pose, shown
+from aquaflow.survey.viewer.copies import Pose, shown
 from aquaflow.survey.viewer.measuring import Frame
 from aquaflow.survey.viewer.page import ViewerPage
 from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.tracking.frames import Tracked
+
+if TYPE_CHECKING:
+    from aquaflow.mapping.map_copy import MapCopy
 
 
 class LiveViewer:
@@ -92,7 +95,7 @@ class LiveViewer:
         self._asked = False
         mapper = maps.mappers.get(sub_map)
         if mapper is not None and mapper.views and len(mapper.gaussians):
-            from aquaflow.survey.viewer.snapshot import copied  # torch, which has made the map
+            from aquaflow.mapping.map_copy import copied  # torch, which has made the map
 
             self._copies.put((sub_map, copied(mapper)))
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.dive.page_axes import names_of, page_axes
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.live.dive_parts import Parts
 from aquaflow.live.live_coverage import LiveCoverage
-from aquaflow.survey.coverage.page_axes import names_of, page_axes
 from aquaflow.telemetry.metric_frame import MetricFrame
 
 Array = npt.NDArray[np.float64]
