@@ -11,8 +11,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from aquaflow.live.live_coverage import described
 from aquaflow.survey.coverage import PageView
+from aquaflow.survey.coverage.live_coverage import described
 from aquaflow.survey.coverage.picture import cells_png, coverage_png
 from tests.live.health.reports import REPORT
 from tests.survey.coverage.surveys import survey_of
