@@ -30,7 +30,7 @@ APART = (({"tracking"}, {"mapping", "water"}),)
 USERS_OF_DRIVERS = {"cli", "sim_drivers", "recordings"}
 """Logs on disk hold the bytes that devices sent, and are decoded as those are."""
 
-NOT_YET = {("dive", "survey"), ("live", "survey"), ("lab", "survey")}
+NOT_YET = {("live", "survey"), ("lab", "survey")}
 """Imports that are to go through entry points; nothing may be added."""
 
 LOOSE_MODULES = {"types"}

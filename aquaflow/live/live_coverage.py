@@ -26,6 +26,7 @@ from aquaflow.survey.coverage.hints import Hint, Hints, Measured, Place, forward
 from aquaflow.survey.coverage.picture import cells_affine, cells_png, coverage_png
 from aquaflow.survey.coverage.plan import CoveragePlan
 from aquaflow.survey.coverage.swath import MOST_SIGHTS, extent
+from aquaflow.survey.deliverables import CoverageFiles
 
 log = logging.getLogger(__name__)
 
@@ -71,8 +72,8 @@ class LiveCoverage:
     def show(self, parts: Parts) -> None:
         """From here on, this dive."""
         self.hide()
-        if parts.run.coverage is not None:
-            self._hints = Hints(parts.run.coverage.config)
+        if (coverage := coverage_of(parts)) is not None:
+            self._hints = Hints(coverage.config)
             self._parts = parts
 
     def hide(self) -> None:
@@ -147,10 +148,11 @@ class LiveCoverage:
     def turn(self) -> None:
         """Take in what is new, and show it."""
         parts, hints = self._parts, self._hints
-        if parts is None or hints is None or parts.run.coverage is None:
+        coverage = None if parts is None else coverage_of(parts)
+        if parts is None or hints is None or coverage is None:
             return
         self._ask_for_the_water(parts)
-        coverage, slam = parts.run.coverage, parts.slam
+        slam = parts.slam
         coverage.look(slam.keyframes, slam.metric_frame)
         coverage.update()
         views = coverage.views(slam.keyframes, slam.metric_frame, self._limits)
@@ -195,6 +197,12 @@ class LiveCoverage:
                 self._limits[number] = mapping_range(attenuation, config.least_contrast)
 
         parts.maps.inspect("water for the coverage", read)
+
+
+def coverage_of(parts: Parts) -> DiveCoverage | None:
+    """What the camera has seen in the dive; None where that is switched off."""
+    made = parts.run.deliverables.get("coverage")
+    return made.coverage if isinstance(made, CoverageFiles) else None
 
 
 def described(view: PageView) -> dict[str, Any]:

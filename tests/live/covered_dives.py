@@ -12,7 +12,7 @@ from aquaflow.base.errors.failures import Failures
 from aquaflow.config.coverage import CoverageConfig
 from aquaflow.keyframes import Pointmap
 from aquaflow.live.live_coverage import LiveCoverage
-from aquaflow.survey.coverage import DiveCoverage
+from aquaflow.survey.deliverables import CoverageFiles
 from tests.survey.coverage.surveys import ALTITUDE, CAMERA, above, metric
 
 
@@ -23,7 +23,9 @@ class CoveredDive:
         self.keyframes: list[Any] = []
         self.attenuation = attenuation
         self.config = SimpleNamespace(coverage=CoverageConfig())
-        run = SimpleNamespace(coverage=DiveCoverage(CoverageConfig()), config=self.config)
+        slam_to_be: Any = SimpleNamespace(config=self.config)
+        made = {"coverage": CoverageFiles(slam_to_be)}
+        run = SimpleNamespace(deliverables=made, config=self.config)
         store = SimpleNamespace(keyframes=self.keyframes)
         slam = SimpleNamespace(keyframes=store, metric_frame=lambda _: metric())
         self.loop: Any = SimpleNamespace(latest=None)

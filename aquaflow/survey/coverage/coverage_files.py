@@ -7,42 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from aquaflow.base.storage.atomic import atomic_write, write_json
-from aquaflow.dive.metric_outputs import MetricOutputs
-from aquaflow.dive.results import WaterSummary
-from aquaflow.slam import Slam
-from aquaflow.survey.coverage import DiveCoverage, PageView, Seen, mapping_range
+from aquaflow.survey.coverage import PageView, Seen
 from aquaflow.survey.coverage.coverage_file import NAME, write_coverage_file
 from aquaflow.survey.coverage.picture import coverage_png
 
 NUMBERS, PICTURE = "coverage.json", "coverage.png"
 """In the dive's folder, beside NAME."""
-
-
-def final_views(
-    coverage: DiveCoverage,
-    slam: Slam,
-    outputs: MetricOutputs,
-    waters: Mapping[int, WaterSummary | None],
-) -> dict[int, PageView]:
-    """What is shown of each sub-map once all keyframes are where they stay."""
-    coverage.look(slam.keyframes, outputs.frame, everything=True)
-    coverage.settle()
-    return current_views(coverage, slam, outputs, waters)
-
-
-def current_views(
-    coverage: DiveCoverage,
-    slam: Slam,
-    outputs: MetricOutputs,
-    waters: Mapping[int, WaterSummary | None],
-) -> dict[int, PageView]:
-    """What is shown of each sub-map at the moment; ``waters`` in map units."""
-    least = coverage.config.least_contrast
-    limits = {
-        number: None if water is None else mapping_range(water.beta_a, least)
-        for number, water in waters.items()
-    }
-    return coverage.views(slam.keyframes, outputs.frame, limits)
 
 
 def write_coverage(dive: Path, views: Mapping[int, PageView], main: int) -> None:
