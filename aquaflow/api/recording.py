@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from aquaflow.api.dive import Dive, read_dive
 from aquaflow.config.presets import configured
+from aquaflow.dive.dive import Dive, read_dive
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.sources import RecordedCamera, open_recording
 from aquaflow.sources.telemetry_input import open_telemetry

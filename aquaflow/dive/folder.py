@@ -19,6 +19,7 @@ from aquaflow.base.storage.atomic import atomic_write, write_json, write_yaml
 from aquaflow.base.storage.folder_lock import FolderLock
 from aquaflow.config import Config
 from aquaflow.dive import from_maps
+from aquaflow.dive.dive import CALIBRATION, FRAMES
 from aquaflow.dive.frames_csv import FrameRow, header, of_text, to_text
 from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.dive.log import JsonLog
@@ -32,7 +33,6 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.camera_file import save_camera
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
-from aquaflow.survey.report import ReportData, write_report
 from aquaflow.telemetry.known_lengths.known_lengths_file import FILE as KNOWN_LENGTHS
 from aquaflow.telemetry.metric_file import write_metric_file
 from aquaflow.telemetry.metric_frame import MetricFrame
@@ -42,14 +42,11 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MARKER = "frames.csv"
+MARKER = FRAMES
 """The file by which a folder is known to be a dive."""
 
 TRACE = "trace.json"
 """Every run of every stage, in Chrome's trace event format; written when asked for."""
-
-CALIBRATION = "calibration.yaml"
-"""The camera that the pictures are undistorted with."""
 
 SUGGESTED = "found_camera.yaml"
 """Calibration that a dive without one found too late to use it."""
@@ -76,6 +73,7 @@ RESULTS = (
         "colmap/sparse/0/*.bin",
     ),
     *("nerfstudio/images/*.png", "nerfstudio/points.ply", "nerfstudio/transforms.json"),
+    "reef_numbers.*",
 )
 """What a run writes, mostly at its end; of an earlier run in the same folder nothing must
 remain."""
@@ -305,10 +303,6 @@ class DiveFolder:
     def write_json(self, name: str, data: dict[str, Any]) -> None:
         """A JSON file of the dive; a number that is not finite is unknown, null."""
         write_json(self.path / name, _finite(data))
-
-    def write_report(self, data: ReportData) -> None:
-        """report.html."""
-        write_report(self.path / "report.html", data)
 
 
 def _unmade(path: Path, error: OSError) -> InputError:

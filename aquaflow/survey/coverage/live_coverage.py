@@ -21,6 +21,7 @@ from aquaflow.dive.from_maps import attenuations
 from aquaflow.dive.views import CoverageView, RunningDive
 from aquaflow.mapping.work import OwnedMaps
 from aquaflow.survey.coverage import DiveCoverage, PageView, mapping_range
+from aquaflow.survey.coverage.coverage_files import CoverageFiles
 from aquaflow.survey.coverage.hints import (
     SENTENCES,
     Hint,
@@ -77,7 +78,7 @@ class LiveCoverage(CoverageView):
     def show(self, dive: RunningDive) -> None:
         """From here on, this dive."""
         self.hide()
-        coverage = dive.dive_run.coverage
+        coverage = coverage_of(dive)
         if coverage is not None:
             self._hints = Hints(coverage.config)
             self._dive = dive
@@ -158,7 +159,7 @@ class LiveCoverage(CoverageView):
     def turn(self) -> None:
         """Take in what is new, and show it."""
         dive, hints = self._dive, self._hints
-        coverage = None if dive is None else dive.dive_run.coverage
+        coverage = None if dive is None else coverage_of(dive)
         if dive is None or hints is None or coverage is None:
             return
         self._ask_for_the_water(dive)
@@ -207,6 +208,12 @@ class LiveCoverage(CoverageView):
                 self._limits[number] = mapping_range(attenuation, config.least_contrast)
 
         dive.maps.inspect("water for the coverage", read)
+
+
+def coverage_of(dive: RunningDive) -> DiveCoverage | None:
+    """What the camera has seen in the dive; None where that is switched off."""
+    made = dive.dive_run.deliverables.get("coverage")
+    return made.coverage if isinstance(made, CoverageFiles) else None
 
 
 def described(view: PageView) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 from aquaflow.base.errors.failures import Failures
 from aquaflow.config.coverage import CoverageConfig
 from aquaflow.keyframes import Pointmap
-from aquaflow.survey.coverage import DiveCoverage
+from aquaflow.survey.coverage.coverage_files import CoverageFiles
 from aquaflow.survey.coverage.live_coverage import LiveCoverage
 from tests.survey.coverage.surveys import ALTITUDE, CAMERA, above, metric
 
@@ -25,8 +25,9 @@ class CoveredDive:
         self.config = SimpleNamespace(coverage=CoverageConfig())
         store = SimpleNamespace(keyframes=self.keyframes)
         slam = SimpleNamespace(keyframes=store, metric_frame=lambda _: metric())
-        coverage, maps = DiveCoverage(CoverageConfig()), SimpleNamespace(inspect=self._inspect)
-        run = SimpleNamespace(coverage=coverage, config=self.config, slam=slam)
+        slam_to_be: Any = SimpleNamespace(config=self.config)
+        made, maps = {"coverage": CoverageFiles(slam_to_be)}, SimpleNamespace(inspect=self._inspect)
+        run = SimpleNamespace(deliverables=made, config=self.config, slam=slam)
         self.loop: Any = SimpleNamespace(latest=None, dive_run=run, maps=maps)
         self.parts: Any = SimpleNamespace(slam=slam, loop=self.loop)
         self.live = LiveCoverage(Failures(), cpu_s=lambda: 0.0)
