@@ -12,6 +12,8 @@ WORKERS ?= 2
 TESTS := $(BIN)/pytest -n $(WORKERS) --dist loadfile --max-worker-restart 0 --timeout 900
 MKDOCS := NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 QUICK := -m 'not slow and not kernel and not ci'
+EMPTY_TREE := 4b825dc642cb6eb9a060e54bf8d69288fbee4904
+NO_SPACES := core.whitespace=-trailing-space,-space-before-tab,-blank-at-eof,-tab-in-indent
 KERNELS := $(wildcard aquaflow/render/native/*.cpp aquaflow/render/native/*.h)
 
 OUT ?= out/dive
@@ -25,7 +27,8 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export XDG_CACHE_HOME := $(CURDIR)/$(VENV)/cache
 export MPLCONFIGDIR := $(CURDIR)/$(VENV)/cache/matplotlib
 
-.PHONY: help setup run test test-ci test-injection test-all test-kernel fuzz coverage check docs clean
+.PHONY: help setup run test test-ci test-injection test-all test-kernel fuzz coverage check markers \
+  docs clean
 
 help: ## Show this list.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -73,7 +76,10 @@ fuzz: setup ## Feed every command what nothing sane would, for FUZZ_SECONDS=120.
 coverage: setup ## Run the tests of `make test` and show how much of each file they reach.
 	$(TESTS) $(QUICK) --cov --cov-report=term --cov-report=html:out/coverage
 
-check: setup ## Lint, formatting, unused code, links of the documentation, types.
+markers: # Of a merge that is not finished; git names file and line.
+	git -c $(NO_SPACES) diff --check $(EMPTY_TREE)
+
+check: setup markers ## Lint, formatting, unused code, links of the documentation, types.
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/clang-format --dry-run --Werror $(KERNELS) $(wildcard tests/render/native/*.cpp)

@@ -16,10 +16,10 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from aquaflow.api.dive import Dive, read_dive
     from aquaflow.api.map import Map, load_map
     from aquaflow.api.recording import map_recording
     from aquaflow.base.errors import AquaFlowError
+    from aquaflow.dive.dive import Dive, read_dive
 
 try:
     __version__ = version("aquaflow")
@@ -38,11 +38,11 @@ __all__ = [
 
 _HOMES = {
     "AquaFlowError": "aquaflow.base.errors",
-    "Dive": "aquaflow.api.dive",
+    "Dive": "aquaflow.dive.dive",
     "Map": "aquaflow.api.map",
     "load_map": "aquaflow.api.map",
     "map_recording": "aquaflow.api.recording",
-    "read_dive": "aquaflow.api.dive",
+    "read_dive": "aquaflow.dive.dive",
 }
 """The module of each public name; it is imported when the name is first used."""
 

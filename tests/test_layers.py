@@ -30,9 +30,6 @@ APART = (({"tracking"}, {"mapping", "water"}),)
 USERS_OF_DRIVERS = {"cli", "sim_drivers", "recordings"}
 """Logs on disk hold the bytes that devices sent, and are decoded as those are."""
 
-NOT_YET = {("dive", "survey"), ("live", "survey"), ("lab", "survey")}
-"""Imports that are to go through entry points; nothing may be added."""
-
 LOOSE_MODULES = {"types"}
 """Modules right under ``aquaflow``; everything else lies in a folder."""
 
@@ -92,7 +89,7 @@ def violations(source: str, path: Path) -> list[str]:
     problems = []
     for module in sorted(imported(source, path)):
         theirs = family(module)
-        if theirs == mine or module == PACKAGE or (mine, theirs) in NOT_YET:
+        if theirs == mine or module == PACKAGE:
             continue
         if theirs not in HEIGHT:
             problems.append(f"{mine} imports {'.'.join(module)}, which has no floor")
@@ -134,8 +131,6 @@ def folded(graph: Graph, folder: Module) -> Graph:
             mine = module[: depth + 1]
             inside = {other[: depth + 1] for other in others if other[:depth] == folder}
             between.setdefault(mine, set()).update(inside - {mine})
-    for importer, imported_later in NOT_YET:
-        between.get((*PACKAGE, importer), set()).discard((*PACKAGE, imported_later))
     return between
 
 

@@ -14,10 +14,10 @@ from aquaflow.base.errors import InputError
 from aquaflow.base.storage.dive_status import refuse_unfinished
 from aquaflow.dive.map_file import SUFFIX, read_map_file
 from aquaflow.dive.map_splats import splats_of
+from aquaflow.dive.medium import Medium, Rgb
 from aquaflow.dive.ply import PlyGaussians
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.lab.synthetic.water import Medium, Rgb
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.state import NO_PIXELS
 from aquaflow.render import RendererName, select_renderer

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from aquaflow.api.dive import Dive, read_dive
 from aquaflow.config.presets import configured
+from aquaflow.dive.dive import Dive, read_dive
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.sources import RecordedCamera, open_recording
 from aquaflow.sources.telemetry_input import open_telemetry
@@ -69,7 +69,7 @@ def map_recording(
         recording, name = source, type(source).__name__
     path = Path(source) if isinstance(source, (str, os.PathLike)) else None
     given = open_telemetry(path, [Path(log) for log in telemetry], telemetry_offset_s)
-    from aquaflow.survey.site.base import base_of
+    from aquaflow.tracking.base.opening import base_of
 
     base = None if in_site is None else base_of(Path(in_site))
     from aquaflow.dive import replay  # loads torch: after what can be refused without it

@@ -71,9 +71,14 @@ def batch(
         "command line",
     )  # fmt: skip
     from aquaflow.lab.batch.batch import run_batch
+    from aquaflow.lab.batch.membership import Sites
+    from aquaflow.survey.site.adding import add_to_site
+    from aquaflow.survey.site.manifest import is_site
 
     with progress_bars(quiet=as_json) as progress:
-        batched = run_batch(dives, out, settings, _content(calib), asked, progress)
+        batched = run_batch(
+            dives, out, settings, _content(calib), asked, progress, Sites(is_site, add_to_site)
+        )
     if as_json:
         typer.echo(json.dumps(_as_json(batched, out)))
     else:

@@ -88,6 +88,7 @@ def measure(
     if not point and (shape is not None or note is not None):
         raise InputError("--as and --note need points; give --point for each")
     refuse_without_map(dive)
+    from aquaflow.dive.dive import Dive
     from aquaflow.survey.measure.finished_dive import numbers_of_dive
     from aquaflow.survey.measure.reef_files import write_csv
 
@@ -96,7 +97,7 @@ def measure(
         if point:
             found = _between(dive, point, shape, cell, Path(work), bars)
         else:
-            found = numbers_of_dive(dive, Path(work), cell, bars)
+            found = numbers_of_dive(Dive(dive), Path(work), cell, bars)
     if note is not None:
         _pin(dive, note, found)
     if csv is not None:

@@ -29,12 +29,14 @@ def report(
     if pdf is not None and pdf.suffix.lower() != ".pdf":
         raise InputError(f"{pdf} does not end in .pdf; give the report a file of its own")
     from aquaflow.base.storage.dive_status import refuse_unfinished
+    from aquaflow.dive.dive import FRAMES, METRICS, Dive
     from aquaflow.survey.report.pdf import write_pdf
-    from aquaflow.survey.report.report_of_folder import report_of_folder
+    from aquaflow.survey.report.report_of import report_of
 
     refuse_unfinished(dive)
-    out = pdf or dive / NAME
-    pages = write_pdf(out, report_of_folder(dive))
+    out, of = pdf or dive / NAME, Dive(dive)
+    of.require(FRAMES, METRICS)
+    pages = write_pdf(out, report_of(of))
     if as_json:
         typer.echo(json.dumps({"pdf": str(out), "pages": pages}))
         return

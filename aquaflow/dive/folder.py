@@ -29,6 +29,7 @@ from aquaflow.base.storage.dive_status import NAME as STATUS
 from aquaflow.base.storage.folder_lock import FolderLock
 from aquaflow.config import Config
 from aquaflow.dive import from_maps
+from aquaflow.dive.dive import CALIBRATION, FRAMES
 from aquaflow.dive.frames_csv import FrameRow, header, of_text, to_text
 from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.dive.log import JsonLog
@@ -41,7 +42,6 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.camera_file import save_camera
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
-from aquaflow.survey.report import ReportData, write_report
 from aquaflow.telemetry.known_lengths.known_lengths_file import FILE as KNOWN_LENGTHS
 from aquaflow.telemetry.metric_file import write_metric_file
 from aquaflow.telemetry.metric_frame import MetricFrame
@@ -56,9 +56,6 @@ MARKER = FRAMES
 
 TRACE = "trace.json"
 """Every run of every stage, in Chrome's trace event format; written when asked for."""
-
-CALIBRATION = "calibration.yaml"
-"""The camera that the pictures are undistorted with."""
 
 SUGGESTED = "found_camera.yaml"
 """Calibration that a dive without one found too late to use it."""
@@ -347,10 +344,6 @@ class DiveFolder:
     def write_json(self, name: str, data: dict[str, Any]) -> None:
         """A JSON file of the dive; a number that is not finite is unknown, null."""
         write_json(self.path / name, _finite(data))
-
-    def write_report(self, data: ReportData) -> None:
-        """report.html."""
-        write_report(self.path / "report.html", data)
 
 
 def _unmade(path: Path, error: OSError) -> InputError:

@@ -6,23 +6,18 @@ map never does.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.dive.results import WaterSummary
-from aquaflow.survey.export.ortho.ground import Ground, ground_of
-from aquaflow.survey.measure.height_field import HeightField
 from aquaflow.telemetry.metric_frame import MetricFrame
 
 if TYPE_CHECKING:
     from aquaflow.mapping.mapper import Mapper
     from aquaflow.slam import Slam
-
-OVERVIEW = "overview.png"
-"""The map from straight above, in a dive's folder."""
 
 
 def water_in_numbers(mapper: Mapper, most_views: int | None = None) -> WaterSummary | None:
@@ -64,20 +59,3 @@ def attenuations(mappers: Mapping[int, Mapper]) -> dict[int, list[float]]:
     from aquaflow.dive import water_summary
 
     return water_summary.attenuations(mappers)
-
-
-def overview(mapper: Mapper, frame: MetricFrame) -> bytes:
-    """See :func:`aquaflow.survey.export.ortho.overview.overview_png`."""
-    from aquaflow.survey.export.ortho.overview import overview_png
-
-    return overview_png(mapper, frame)
-
-
-def drawn_ground(
-    mapper: Mapper, frame: MetricFrame, work: Path, progress: Callable[[str, int, int], None]
-) -> tuple[HeightField, Ground]:
-    """See :func:`aquaflow.survey.measure.drawn_heights.draw_heights`."""
-    from aquaflow.survey.measure.drawn_heights import draw_heights
-
-    ground = ground_of(frame, mapper.views)
-    return draw_heights(mapper, ground, work, progress=progress), ground

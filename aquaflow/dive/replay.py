@@ -113,7 +113,7 @@ def _replay(
         else:
             decided = run.frame(event)
             if any(tracked.frame_class is FrameClass.KEYFRAME for tracked in decided):
-                run.cover()
+                run.look()
         with run.profiler.stage("progress"), contain("progress"):
             progress("map", done, total)
     if done == 0:

@@ -15,6 +15,8 @@ from aquaflow.base.errors import InputError, NotMappedError, printable
 from aquaflow.base.profiler import pace
 from aquaflow.config import Config
 from aquaflow.dive import calibration_findings
+from aquaflow.dive.deliverable import Phase, deliverables_of
+from aquaflow.dive.deliverables import Deliverables
 from aquaflow.dive.folder import SUGGESTED, TRACE, DiveFolder
 from aquaflow.dive.found_camera import FoundCamera, from_keyframes, in_words
 from aquaflow.dive.frames_csv import FrameRow
@@ -35,8 +37,6 @@ from aquaflow.recordings.telemetry_lines import TelemetryLog
 from aquaflow.slam import Slam
 from aquaflow.slam.finish_time import FinishTime
 from aquaflow.sources.preprocessing import Preparation
-from aquaflow.survey.coverage import DiveCoverage
-from aquaflow.survey.deliverables import Deliverables
 from aquaflow.tracking.calibration_check import LensError, lens_error
 from aquaflow.tracking.frames import Tracked
 from aquaflow.types import CameraModel, Dropped, Frame, TelemetrySample
@@ -85,8 +85,8 @@ class DiveRun:
         """Counters of a live run for metrics.json."""
         self.telemetry_log: TelemetryLog | None = None
         """Of a live run: a replay's telemetry is in files already."""
-        self.coverage = DiveCoverage(config.coverage) if config.coverage.enabled else None
-        """What the camera has seen; brought up to date by whoever runs the dive."""
+        self.deliverables = deliverables_of(slam)
+        """By name: what is made of the dive beside the files of the core."""
         self.pictures: KeptPictures | None = None
         if config.pictures.enabled:
             self.pictures = KeptPictures(folder.path, 1e6 * config.pictures.most_mb)
@@ -164,12 +164,11 @@ class DiveRun:
         self.decide(decided)
         return decided
 
-    def cover(self) -> None:
-        """Bring the coverage up to date; it never costs a frame."""
-        if self.coverage is not None:
-            with self.profiler.stage("coverage"), self.slam.failures.contain("coverage"):
-                self.coverage.look(self.slam.keyframes, self.slam.metric_frame)
-                self.coverage.update()
+    def look(self) -> None:
+        """Let the deliverables take in what is new; it never costs a frame."""
+        for name, each in self.deliverables.items():
+            with self.slam.failures.contain(name):
+                each.look()
 
     def _time_frame(self, begun: float, decided: list[Tracked]) -> None:
         now = time.monotonic()
@@ -312,27 +311,25 @@ class DiveRun:
         before = self.folder.deliverables()
         made = Deliverables(
             self.name, self.folder, self.slam, results, self.calibration, outputs, self.found,
-            self.coverage,
+            self.deliverables,
         )  # fmt: skip
         with self.profiler.stage("evaluate"):
             made.summarise()
         with self.profiler.stage("write"):
             made.write()
+            made.make(Phase.WRITE)
         with self.profiler.stage("evaluate"):
             made.evaluate(limits.evaluating)
         with self.profiler.stage("measure"):
-            made.measure(limits.evaluating)
+            made.make(Phase.MEASURE, limits.evaluating)
             self.notes += made.notes
         with self.profiler.stage("write"):
             made.write_evaluation()
         self._check_calibration()
         with self.profiler.stage("report"):
             self.warnings = self._shortcomings()
-            numbers = self._numbers(results, made)
-            notes = self.notes + self.slam.failures.notes()
-            made.write_report(self.dropped, numbers, notes)
+            made.make(Phase.REPORT, limits.whole, self._numbers(results, made))
         numbers = self._numbers(results, made)  # the report's own time included
-        numbers["notes"] = self.notes + self.slam.failures.notes()
         attempt, write = self.slam.failures.attempt, self.folder.write_json
         attempt("writing metrics.json", partial(write, "metrics.json", numbers))
         if self._trace:
@@ -391,4 +388,5 @@ class DiveRun:
         numbers["cpu_s"] = round(time.process_time() - self._cpu_before_s, 3)  # of all threads
         if self.live is not None:
             numbers["live"] = self.live
-        return numbers | pace(self.frame_ms, len(self.frame_ms), self.first_pose_s, wall_s)
+        numbers |= pace(self.frame_ms, len(self.frame_ms), self.first_pose_s, wall_s)
+        return numbers | {"notes": self.notes + self.slam.failures.notes()}

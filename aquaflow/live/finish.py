@@ -14,7 +14,8 @@ from aquaflow.base.storage.folder_lock import refuse_held
 from aquaflow.config import load_config
 from aquaflow.config.device import MountingConfig
 from aquaflow.config.vehicle import VehicleConfig
-from aquaflow.dive.folder import CALIBRATION, MARKER, WORK
+from aquaflow.dive.dive import CALIBRATION
+from aquaflow.dive.folder import MARKER, WORK
 from aquaflow.dive.frames_csv import readable_rows
 from aquaflow.dive.run import Finished
 from aquaflow.geometry.camera import CameraModel, load_camera

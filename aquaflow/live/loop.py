@@ -58,7 +58,7 @@ class LiveLoop:
         pressure: Callable[[], Pressure],
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.run_, self.feed, self.maps, self.config = run, feed, maps, config
+        self.dive_run, self.feed, self.maps, self.config = run, feed, maps, config
         self.vitals, self.control = vitals, control
         self.health, self.heartbeats = vitals.health, vitals.heartbeats
         self.degradation, self.counters = vitals.degradation, Counters(run.profiler, now_s)
@@ -94,14 +94,14 @@ class LiveLoop:
 
     def take(self, frame: Frame | Dropped | None) -> None:
         """One turn: a frame, the note that one is missing, or an idle moment."""
-        self.run_.samples(self.feed.latest_samples.taken())
+        self.dive_run.samples(self.feed.latest_samples.taken())
         if frame is not None:
             self._frame_s, self._pictured = self._now_s(), True
         if self.control.paused:
             self.picture = frame if isinstance(frame, Frame) else self.picture
             frame = None
         if isinstance(frame, Dropped):
-            self.run_.drop(frame)
+            self.dive_run.drop(frame)
         elif frame is not None:
             self._frame(frame)
         elif self._past is not None:
@@ -112,11 +112,11 @@ class LiveLoop:
         """Poses of the frames that wait for idle moments, as many as there is time for."""
         while self._past is not None and not until.over:
             self._catch_up(self._past)
-            self.run_.slam.side_work.settle(wait=True)
+            self.dive_run.slam.side_work.settle(wait=True)
 
     def end(self) -> None:
         """After the last turn: telemetry of after the last frame is taken."""
-        self.run_.samples(self.feed.latest_samples.taken())
+        self.dive_run.samples(self.feed.latest_samples.taken())
         self.heartbeats.retire(STAGE)
 
     def status(self) -> dict[str, Any]:
@@ -133,7 +133,7 @@ class LiveLoop:
             "mapping_failures": self.maps.failures,
             "mapping_waits": self.maps.waiting,
             "mapping_rests": self.maps.rests,
-            "stage_failures": self.run_.slam.failures.to_json(),
+            "stage_failures": self.dive_run.slam.failures.to_json(),
         }
 
     # --- one frame ------------------------------------------------------------------------------
@@ -141,7 +141,7 @@ class LiveLoop:
     def _frame(self, frame: Frame) -> None:
         self.picture = frame
         if self.degradation.level is DegradationLevel.RECORDING_ONLY:
-            self.run_.drop(
+            self.dive_run.drop(
                 Dropped(frame.index, frame.t_ns, f"recording only: {self.degradation.reason}")
             )
         else:
@@ -150,7 +150,7 @@ class LiveLoop:
 
     def _track(self, frame: Frame) -> None:
         try:
-            decided = self.run_.frame(frame)
+            decided = self.dive_run.frame(frame)
         # A bad frame never ends the dive (docs/architecture.md#numbers-stay-finite).
         except Exception as error:
             self._failed(frame, error)
@@ -163,11 +163,11 @@ class LiveLoop:
     @property
     def _past(self) -> Frame | None:
         """An earlier frame that waits for its pose until there is time."""
-        return self.run_.slam.tracker.past
+        return self.dive_run.slam.tracker.past
 
     def _catch_up(self, past: Frame) -> None:
         try:
-            decided = self.run_.catch_up()
+            decided = self.dive_run.catch_up()
         except Exception as error:  # costs that frame
             self._failed(past, error)
             return
@@ -185,7 +185,7 @@ class LiveLoop:
         self.counters.failures += 1
         self._failed_in_a_row += 1
         log.exception("frame %d failed", frame.index)
-        self.run_.drop(Dropped(frame.index, frame.t_ns, f"failed: {error}"))
+        self.dive_run.drop(Dropped(frame.index, frame.t_ns, f"failed: {error}"))
         if self._failed_in_a_row >= MOST_FAILURES:
             raise AquaFlowError(
                 f"{MOST_FAILURES} frames in a row failed, the last with: {error}; see log.jsonl"
@@ -195,7 +195,7 @@ class LiveLoop:
 
     def _tend(self) -> None:
         self.heartbeats.beat(STAGE)
-        contain = self.run_.slam.failures.contain
+        contain = self.dive_run.slam.failures.contain
         with contain("resource check"):
             self._give_way_to_mapping()
             self.degradation.update(self._need)
@@ -209,14 +209,14 @@ class LiveLoop:
 
     def tell_watchers(self) -> None:
         """Let those who look on see the service as it is now."""
-        contain = self.run_.slam.failures.contain
+        contain = self.dive_run.slam.failures.contain
         for watch in self.watchers:
             with contain(f"service: {getattr(watch, '__qualname__', type(watch).__name__)}"):
                 watch(self)
 
     def _give_way_to_mapping(self) -> None:
         """What found no memory on the GPU was left out; less is asked for from now on."""
-        full = self.run_.slam.failures.device_full
+        full = self.dive_run.slam.failures.device_full
         if full > self._gpu_full:
             self.degradation.give_way(Need(Shortage.GPU_MEMORY, "the GPU's memory was full"))
         self._gpu_full = full
@@ -226,7 +226,7 @@ class LiveLoop:
         return self.pressure.need(self.config.limits)
 
     def _facts(self) -> Facts:
-        devices, slam = self.feed.describe(), self.run_.slam
+        devices, slam = self.feed.describe(), self.dive_run.slam
         return Facts(
             self._now_s() - self._frame_s,
             PATIENCE_S,

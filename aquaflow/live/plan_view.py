@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.dive.page_axes import names_of, page_axes
+from aquaflow.dive.views import CoverageView
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.live.dive_parts import Parts
-from aquaflow.live.live_coverage import LiveCoverage
-from aquaflow.survey.coverage.page_axes import names_of, page_axes
 from aquaflow.telemetry.metric_frame import MetricFrame
 
 Array = npt.NDArray[np.float64]
@@ -37,7 +37,7 @@ class PlanView:
         self,
         parts: Callable[[], Parts | None],
         now_s: Callable[[], float] = time.monotonic,
-        coverage: LiveCoverage | None = None,
+        coverage: CoverageView | None = None,
     ) -> None:
         """``parts``: of the dive that runs; None: there is none."""
         self._parts, self._now_s, self._coverage = parts, now_s, coverage

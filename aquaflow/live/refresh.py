@@ -13,10 +13,10 @@ from typing import Any
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.failures import Failures
+from aquaflow.dive.interim import Interim
 from aquaflow.dive.run import DiveRun
 from aquaflow.live.map_thread import Job, MapThread
 from aquaflow.mapping.work import MIN_VIEWS, OwnedMaps
-from aquaflow.survey.interim import Interim
 
 log = logging.getLogger(__name__)
 

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from aquaflow.config.vehicle import VehicleConfig
+from aquaflow.dive.views import DiveView, open_coverage, open_viewer
 from aquaflow.live.control import Control
 from aquaflow.live.dive_parts import Parts
 from aquaflow.live.feed import Feed
 from aquaflow.live.health.http import HealthServer
-from aquaflow.live.live_coverage import LiveCoverage
 from aquaflow.live.live_dive import LiveDive
-from aquaflow.live.live_viewer import LiveViewer
 from aquaflow.live.picture import NewestPicture
 from aquaflow.live.plan_view import PlanView
 from aquaflow.live.report import report, report_between_dives, viewer_facts
@@ -23,10 +22,6 @@ from aquaflow.live.vehicle.pilot_messages import PilotMessages
 from aquaflow.live.vehicle.pose_output import PoseOutput
 from aquaflow.live.vitals import Vitals
 from aquaflow.live.watched import Watched
-from aquaflow.survey.coverage.hints import Hint
-
-if TYPE_CHECKING:
-    from aquaflow.live.foxglove.live import LiveFoxglove
 
 
 class Station:
@@ -47,14 +42,13 @@ class Station:
         self._shown: tuple[Parts, PoseOutput | None] | None = None
         self._closing = contextlib.ExitStack()
         self.picture = NewestPicture()
-        self._coverage = LiveCoverage(feed.failures) if vehicle.coverage.enabled else None
+        self._coverage = open_coverage(feed.failures) if vehicle.coverage.enabled else None
         messages = PilotMessages(service.report, feed, self._hints)
         self._watchers: list[Callable[[Watched], None]] = [self.picture.update, messages.update]
         if feed.pilot is not None:
             self._watchers.append(Arming(service.dive, control, feed.pilot).update)
         self.standby.watchers += self._watchers
-        self._viewer: LiveViewer | None = None
-        self._foxglove: LiveFoxglove | None = None
+        self._views: list[DiveView] = [] if self._coverage is None else [self._coverage]
         self._viewer_config = vehicle.viewer
         with contextlib.ExitStack() as opened:
             if self._coverage is not None:
@@ -67,14 +61,13 @@ class Station:
                 )  # fmt: skip
                 opened.callback(self._contained, server.close)
             if vehicle.viewer.enabled:
-                plan_of = (lambda number: None) if self._coverage is None else self._coverage.plan
-                self._viewer = LiveViewer(vehicle.viewer, self.report, plan_of)
-                opened.callback(self._contained, self._viewer.close)
+                self._views.append(open_viewer(vehicle.viewer, self.report, self._coverage))
+                opened.callback(self._contained, self._views[-1].close)
             if service.foxglove.enabled:
                 from aquaflow.live.foxglove.live import LiveFoxglove  # it loads torch
 
-                self._foxglove = LiveFoxglove(service.foxglove, self.report)
-                opened.callback(self._contained, self._foxglove.close)
+                self._views.append(LiveFoxglove(service.foxglove, self.report))
+                opened.callback(self._contained, self._views[-1].close)
             self._closing = opened.pop_all()
 
     def report(self) -> dict[str, Any]:
@@ -97,15 +90,9 @@ class Station:
         parts.loop.watchers += self._watchers
         if poses is not None:
             parts.loop.watchers.append(poses.update)
-        if self._viewer is not None:
-            self._viewer.begin()
-            parts.loop.watchers.append(self._viewer.update)
-        if self._coverage is not None:
-            self._coverage.show(parts)
-            parts.loop.watchers.append(self._coverage.update)
-        if self._foxglove is not None:
-            self._foxglove.begin()
-            parts.loop.watchers.append(self._foxglove.update)
+        for view in self._views:
+            view.show(parts.loop)
+            parts.loop.watchers.append(view.update)
         self._shown = parts, poses
 
     def hide(self) -> None:
@@ -117,8 +104,8 @@ class Station:
     def _dive_shown(self) -> Parts | None:
         return None if self._shown is None else self._shown[0]
 
-    def _hints(self) -> tuple[Hint, ...]:
-        return () if self._coverage is None else self._coverage.hints
+    def _hints(self) -> tuple[str, ...]:
+        return () if self._coverage is None else self._coverage.sentences()
 
     def close(self) -> None:
         """Stop listening."""

@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 
 from aquaflow.config import Config
+from aquaflow.dive.deliverables import Deliverables
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.map_file import read_map_file
 from aquaflow.mapping.maps import Maps
 from aquaflow.render.contract import CPU
 from aquaflow.render.reference import ReferenceRenderer
-from aquaflow.survey.deliverables import Deliverables
 from aquaflow.tracking.frames import FrameClass, Tracked
 from tests.device.device_scenes import assert_alike, on_host
 from tests.device.failing_dives import copy_of, dive, growth

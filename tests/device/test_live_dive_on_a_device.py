@@ -17,9 +17,9 @@ from aquaflow.live.checkpoint.generations import read_state, state_file
 from aquaflow.live.checkpoint.resume import resumed
 from aquaflow.live.health.degradation import DegradationLevel
 from aquaflow.live.live_dive import LiveDive
-from aquaflow.live.live_viewer import LiveViewer
 from aquaflow.live.report import report
 from aquaflow.sources import open_recording
+from aquaflow.survey.viewer.live_viewer import LiveViewer
 from aquaflow.types import Frame
 from tests.device.device_scenes import on_host
 from tests.device.gsplats_place import machine_with

@@ -12,11 +12,10 @@ from aquaflow.config.service import LiveMappingConfig
 from aquaflow.live.health.degradation import DegradationLevel
 from aquaflow.live.health.heartbeats import Heartbeats
 from aquaflow.live.map_thread import MapThread
+from aquaflow.mapping.map_copy import MapCopy, copied
 from aquaflow.mapping.maps import Maps
 from aquaflow.mapping.work import Growth
 from aquaflow.render.contract import CPU
-from aquaflow.survey.viewer.copies import MapCopy
-from aquaflow.survey.viewer.snapshot import copied
 from tests.device.device_scenes import SMALL, SinglePrecision, everything
 from tests.mapping.mapping_scenes import flat_pointmap, floor, path, picture, view_of
 from tests.pretended_allocator import DEFAULT_BYTES

@@ -11,11 +11,11 @@ import torch
 from aquaflow.api.map import Map
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.mapping import state
+from aquaflow.mapping.map_copy import copied
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.contract import CPU
 from aquaflow.render.cpu import CpuRenderer
 from aquaflow.survey.viewer.copies import shown
-from aquaflow.survey.viewer.snapshot import copied
 from tests.device.device_scenes import (
     SMALL,
     WHERE,

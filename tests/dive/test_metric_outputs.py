@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 
 import aquaflow
 from aquaflow.config import Config, load_config
+from aquaflow.dive.deliverable import Phase, deliverables_of
+from aquaflow.dive.deliverables import Deliverables
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.metric_outputs import (
     MetricOutputs,
@@ -26,7 +28,6 @@ from aquaflow.lab.evaluation.trajectory import read_tum
 from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation
-from aquaflow.survey.deliverables import Deliverables
 from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.telemetry.telemetry import Telemetry
 from aquaflow.types import Frame, UtcTime
@@ -57,12 +58,14 @@ def slam(small_recording: Path) -> Slam:
 
 def written(slam: Slam, path: Path, outputs: MetricOutputs | None) -> Path:
     folder = DiveFolder(path, slam.config)
-    made = Deliverables("dive", folder, slam, slam.results(), None, outputs)
+    others = deliverables_of(slam)
+    made = Deliverables("dive", folder, slam, slam.results(), None, outputs, others=others)
     made.summarise()
     made.write()
+    made.make(Phase.WRITE)
     made.evaluate()
     made.write_evaluation()
-    made.write_report([], NUMBERS, [])
+    made.make(Phase.REPORT, metrics=NUMBERS)
     folder.close()
     return path
 

@@ -74,7 +74,7 @@ def test_a_silent_link_degrades_with_its_name_and_comes_back(told: Told) -> None
 
 def test_a_finding_of_the_monitor_is_a_state_with_its_reason_and_ends(told: Told) -> None:
     told.frames("pp")
-    monitor = told.loop.run_.slam.tracker.monitor
+    monitor = told.loop.dive_run.slam.tracker.monitor
     monitor.counts.add(Finding(1, 0, Cause.POSE, 1.2))
     monitor._frames_since = 0
     told.frames("p", first=5)

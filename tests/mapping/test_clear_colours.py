@@ -13,10 +13,10 @@ from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.ply import read_ply
 from aquaflow.dive.water_summary import summarise_water
 from aquaflow.mapping.clear_colours import mean_water, restored_gaussians, restored_radiance
+from aquaflow.mapping.map_copy import copied
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import drawn_without_water
 from aquaflow.render.activation import radiance
-from aquaflow.survey.viewer.snapshot import copied
 from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.water.white_balance import WhiteBalance
 from tests.mapping.mapping_scenes import CAMERA, floor, pose, renderer, view_of

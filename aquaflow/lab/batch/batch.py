@@ -20,7 +20,7 @@ from aquaflow.lab.batch.examine import Examiner
 from aquaflow.lab.batch.job import WRITTEN, Job
 from aquaflow.lab.batch.journal import JOURNAL, Journal
 from aquaflow.lab.batch.machine import core_count, memory_for_dives_mb
-from aquaflow.lab.batch.membership import add_members, make_site
+from aquaflow.lab.batch.membership import Sites, add_members, make_site
 from aquaflow.lab.batch.object_store import ObjectStore, is_url
 from aquaflow.lab.batch.ray_workers import RayWorkers
 from aquaflow.lab.batch.recordings import Recording, find_recordings
@@ -50,6 +50,7 @@ def run_batch(
     calibration: str | None,
     batch: BatchConfig,
     progress: Progress,
+    sites: Sites,
 ) -> Batched:
     """Make a dive in ``site`` of every recording in ``dives``; those that are there stay.
 
@@ -61,7 +62,7 @@ def run_batch(
     """
     cache = batch.cache or _cache_for(site)
     recordings = find_recordings(dives)
-    make_site(site)
+    make_site(site, sites)
     with _held(site, cache) as folder:
         jobs = _jobs(recordings, site, settings, calibration, str(cache), progress)
         journal = Journal(folder / JOURNAL)
@@ -78,7 +79,7 @@ def run_batch(
             with contextlib.suppress(InputError):  # the dives are there; the journal is a record
                 ObjectStore(site).write(JOURNAL, read_regular(folder / JOURNAL))
     written = [n for n, outcome in season.outcomes.items() if outcome.state in WRITTEN]
-    return Batched(jobs, season, add_members(site, sorted(written)))
+    return Batched(jobs, season, add_members(site, sorted(written), sites))
 
 
 @contextlib.contextmanager

@@ -20,11 +20,12 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
 from aquaflow.config import load_config
+from aquaflow.dive.dive import Dive
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.geometry.epipolar import epipolar_distances
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.two_view import MIN_MATCHES, relative_pose
-from aquaflow.lab.evaluation.dive_files import read_dive
+from aquaflow.lab.evaluation.dive_files import evaluated_dive
 from aquaflow.lab.evaluation.trajectory import ASSOCIATION_TOLERANCE_S, Trajectory, associate
 from aquaflow.lab.evaluation.truth import read_truth
 from aquaflow.prior.contract import Keypoints
@@ -92,7 +93,7 @@ def evaluate_epipolar(dive: Path, recording: Path, truth: Path | None) -> Epipol
         InputError: a file is missing or malformed, or the pictures do not match each other.
         ConfigError: the dive's crop or calibration does not fit the recording.
     """
-    estimate = read_dive(dive).trajectory
+    estimate = evaluated_dive(Dive(dive)).trajectory
     true = None if truth is None else read_truth(truth).trajectory
     if true is not None:
         ours, theirs = associate(estimate.t_s, true.t_s, ASSOCIATION_TOLERANCE_S)

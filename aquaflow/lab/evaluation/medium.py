@@ -7,15 +7,14 @@ takes them to rates per metre.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from aquaflow.base.errors import DamagedError, InputError, reason_of
-from aquaflow.base.errors.regular_file import read_regular_json
-from aquaflow.lab.synthetic.water import WATER_TYPES, Medium
+from aquaflow.dive.dive import Dive
+from aquaflow.dive.medium import Medium, Rgb
+from aquaflow.lab.synthetic.water import WATER_TYPES
 
 BACKSCATTER_SPAN_M = (0.5, 8.0)
 """Ranges over which the two backscatter curves are compared: a hand's width to turbid distance."""
@@ -67,39 +66,26 @@ def compare_medium(recovered: Medium, truth: Medium, *, active: bool) -> MediumE
     )
 
 
-def read_recovered(path: Path, metres_per_unit: float) -> tuple[Medium, bool]:
-    """A dive's ``medium.json`` with rates per metre, and whether the medium was active.
+def recovered_water(dive: Dive, metres_per_unit: float) -> tuple[Medium, bool]:
+    """The water of a dive with rates per metre, and whether one was modelled; without, clear water.
 
     Args:
-        path: the file; ``attenuation_unit`` names the unit of all its rates.
+        dive: ``attenuation_unit`` of its medium.json names the unit of all its rates.
         metres_per_unit: scale of the alignment; not used if the dive's rates are per metre already.
 
     Raises:
         InputError: the file is not a dive's medium.
     """
-    try:
-        data = read_regular_json(path)
-        if not data["active"]:
-            return WATER_TYPES["clear"], False
-        per_metre = 1.0 if data["attenuation_unit"] == "1/m" else 1.0 / metres_per_unit
-        scatter = data["backscatter"]
-        medium = Medium(
-            beta_a=_rgb(data["attenuation_per_unit"], per_metre),
-            b=_rgb(scatter["b"], per_metre),
-            B_inf=_rgb(scatter["B_inf"]),
-            B_res=_rgb(scatter["B_res"]),
-            d=_rgb(scatter["d"], per_metre),
-        )
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        what = f"key {error} is missing" if isinstance(error, KeyError) else reason_of(error)
-        raise InputError(f"cannot read the medium {path}: {what}; map the dive again") from error
-    return medium, True
+    found = dive.medium
+    if found is None:
+        return WATER_TYPES["clear"], False
+    if dive.medium_facts.get("attenuation_unit") == "1/m":
+        return found, True
+    per_metre = 1.0 / metres_per_unit
+    rates = {name: _times(getattr(found, name), per_metre) for name in ("beta_a", "b", "d")}
+    return replace(found, **rates), True
 
 
-def _rgb(value: object, factor: float = 1.0) -> tuple[float, float, float]:
-    """Three finite, non-negative numbers times ``factor``."""
-    channels = np.asarray(value, dtype=np.float64)
-    if channels.shape != (3,) or not np.isfinite(channels).all() or (channels < 0.0).any():
-        raise DamagedError("a colour is not three numbers of at least 0")
-    red, green, blue = (channels * factor).tolist()
+def _times(colour: Rgb, factor: float) -> Rgb:
+    red, green, blue = (factor * each for each in colour)
     return red, green, blue

@@ -12,9 +12,10 @@ import numpy.typing as npt
 from aquaflow.base.errors import InputError
 from aquaflow.config import load_config
 from aquaflow.config.source import SourceConfig
+from aquaflow.dive.dive import Dive
 from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.lab.evaluation.dive_files import read_dive
+from aquaflow.lab.evaluation.dive_files import evaluated_dive
 from aquaflow.prior.oracle import TrueView, write_oracle
 from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation
@@ -71,7 +72,7 @@ def _mapped(recording: Path, dive: Path) -> Iterator[tuple[TrueView, CameraModel
 
     file = dive / f"map{SUFFIX}"
     mapper, T_nm = read_map_file(file, select_renderer("auto", None)), read_frame_of_map(file).T_nm
-    found, calibration = read_dive(dive).trajectory, dive / "calibration.yaml"
+    found, calibration = evaluated_dive(Dive(dive)).trajectory, dive / "calibration.yaml"
     placed = zip(found.R_wc, found.positions, strict=True)
     poses = dict(zip(np.round(1e6 * found.t_s), placed, strict=True))
     camera = load_camera(calibration) if calibration.is_file() else None

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from aquaflow.base.errors import InputError
+from aquaflow.dive.dive import Dive
 from aquaflow.lab.evaluation import medium as water
-from aquaflow.lab.evaluation.dive_files import EvaluatedDive, read_dive, read_metrics
+from aquaflow.lab.evaluation.dive_files import EvaluatedDive, evaluated_dive
 from aquaflow.lab.evaluation.metric_error import MetricError, metric_error
 from aquaflow.lab.evaluation.trajectory import ASSOCIATION_TOLERANCE_S, Trajectory, associate
 from aquaflow.lab.evaluation.trajectory_error import (
@@ -25,8 +26,6 @@ from aquaflow.lab.evaluation.trajectory_error import (
 )
 from aquaflow.lab.evaluation.truth import PositionTable, read_truth
 from aquaflow.lab.synthetic.water import load_medium
-from aquaflow.telemetry.metric_file import read_metric_file
-from aquaflow.telemetry.metric_frame import MetricFrame
 
 COPIED_METRICS = (
     "psnr", "ssim", "psnr_as_tracked", "ssim_as_tracked", "lpips", "lpips_reason",
@@ -95,7 +94,8 @@ def evaluate_dive(
     Raises:
         InputError: a file is missing or malformed, or too few poses have a truth.
     """
-    estimate = read_dive(dive)
+    read = Dive(dive)
+    estimate = evaluated_dive(read)
     known = read_truth(truth)
     notes = _notes_on(estimate)
     estimated, true = estimate.trajectory, None
@@ -106,7 +106,7 @@ def evaluate_dive(
         assert known.positions is not None
         error, said = _with_positions(estimate, known.positions, truth)
         notes += said
-    frame = read_metric_file(dive).get(estimate.sub_map, MetricFrame.unknown())
+    frame = read.frame_of(estimate.sub_map)
     scale = error.sim3.alignment.T_target_source.scale
     level = (estimated, true) if known.z_down and true is not None else None
     metric = metric_error(frame, scale, error.se3.rmse, level)
@@ -118,10 +118,10 @@ def evaluate_dive(
             "are not compared"
         )
     compared = None
-    if known.medium is not None and (dive / "medium.json").is_file():
-        found, active = water.read_recovered(dive / "medium.json", scale)
+    if known.medium is not None and read.medium_facts:
+        found, active = water.recovered_water(read, scale)
         compared = water.compare_medium(found, load_medium(known.medium), active=active)
-    return Evaluation(estimate, error, compared, metric, read_metrics(dive), notes)
+    return Evaluation(estimate, error, compared, metric, read.metrics, notes)
 
 
 def _notes_on(dive: EvaluatedDive) -> list[str]:

@@ -9,7 +9,7 @@ from aquaflow.lab.evaluation.water_peers.contract import NAMES
 
 Values = Mapping[str, Any]
 
-LABEL_WIDTH = 26
+LABEL_WIDTH = 32
 """Characters of the first column."""
 
 
@@ -32,7 +32,7 @@ def in_words(result: Values) -> list[str]:
 
 
 def _row(label: str, text: str) -> str:
-    return f"  {label:<{LABEL_WIDTH}}{text}"
+    return f"  {label:<{LABEL_WIDTH - 2}}  {text}"
 
 
 def _trajectory(result: Values) -> list[str]:

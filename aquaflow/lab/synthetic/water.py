@@ -13,85 +13,21 @@ chosen: the colour of the open water follows the channel that travels furthest.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 import yaml
 
 from aquaflow.base.errors import InputError, reason_of
 from aquaflow.base.errors.plain_yaml import read_mapping
+from aquaflow.dive.medium import Medium, Rgb
 from aquaflow.lab.synthetic.config import WaterType
 
-__all__ = ["WATER_TYPES", "Medium", "load_medium", "save_medium"]
-
-Rgb: TypeAlias = tuple[float, float, float]
-FloatArray: TypeAlias = npt.NDArray[np.floating]
+__all__ = ["WATER_TYPES", "Medium", "Rgb", "load_medium", "save_medium"]
 
 BEAM_OVER_DIFFUSE = 2.2
 """Beam attenuation over diffuse attenuation (see the module's text)."""
-
-
-@dataclass(frozen=True)
-class Medium:
-    """Parameters of the image formation, RGB.
-
-    Lengths are in metres in the truth of a synthetic dive, and in its own unit in a mapped dive.
-    """
-
-    beta_a: Rgb
-    """Attenuation, 1/m."""
-    b: Rgb
-    """Growth of the backscatter, 1/m."""
-    B_inf: Rgb
-    """Colour of infinitely deep water, radiance in [0, 1]."""
-    B_res: Rgb
-    """Near residual of the backscatter, radiance in [0, 1]."""
-    d: Rgb
-    """Decay of the near residual, 1/m."""
-
-    def looking(
-        self,
-        axis: FloatArray,  # [3] unit, the optical axis in the world (x north, z down)
-        change: float,
-    ) -> Medium:
-        """The water of a camera that looks along ``axis``; ``change`` is config's
-        ``directional_attenuation``."""
-        if change == 0.0:
-            return self
-        factor = 1.0 + change * float(axis[0])
-        red, green, blue = self.beta_a
-        return replace(self, beta_a=(factor * red, factor * green, factor * blue))
-
-    def transmission(
-        self,
-        z: FloatArray,  # [...]
-    ) -> FloatArray:
-        """exp(-beta_a z), [..., 3], for ranges z [...] in the unit of length."""
-        return np.asarray(np.exp(-np.asarray(self.beta_a, z.dtype) * z[..., None]))
-
-    def backscatter(
-        self,
-        z: FloatArray,  # [...]
-    ) -> FloatArray:
-        """B(z), [..., 3], for ranges z [...] in the unit of length; infinite z gives B_inf."""
-        kind = z.dtype
-        grown = np.asarray(self.B_inf, kind) * (
-            1 - np.exp(-np.asarray(self.b, kind) * z[..., None])
-        )
-        return np.asarray(
-            grown + np.asarray(self.B_res, kind) * np.exp(-np.asarray(self.d, kind) * z[..., None])
-        )
-
-    def compose(
-        self,
-        clean: FloatArray,  # [..., 3] radiance J
-        z: FloatArray,  # [...] m, inf where nothing is hit
-    ) -> FloatArray:
-        """The colour I [..., 3] that reaches the camera."""
-        return np.asarray(clean * self.transmission(z) + self.backscatter(z))
 
 
 def _jerlov(transmission: Rgb, B_inf: Rgb, b_over_beta: float, B_res: Rgb) -> Medium:

@@ -12,12 +12,11 @@ from aquaflow.dive.path_rows import attitude_of
 from aquaflow.dive.placement import placement
 from aquaflow.dive.ros import messages, topics
 from aquaflow.dive.ros.frames import MAP, OPTICAL, FrameTree
+from aquaflow.dive.views import LOOK_S, DiveView, RunningDive, Showing
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.live.foxglove.map_moment import MapMoment, cloud_of, taken, water_status
 from aquaflow.live.foxglove.server import FoxgloveServer
-from aquaflow.live.loop import LiveLoop
 from aquaflow.live.report import GOOD
-from aquaflow.live.showing import LOOK_S, Showing
 from aquaflow.mapping.work import OwnedMaps
 from aquaflow.sources.newest import Newest
 from aquaflow.sources.preprocessing import Preparation
@@ -49,7 +48,7 @@ class _Moment:
     preparation: Preparation
 
 
-class LiveFoxglove:
+class LiveFoxglove(DiveView):
     """Takes new data from the loop and the maps, and sends them from its own thread."""
 
     def __init__(self, config: FoxgloveConfig, report: Callable[[], dict[str, Any]]) -> None:
@@ -71,30 +70,30 @@ class LiveFoxglove:
         self._asked = False
         self._water: Any = None
 
-    def begin(self) -> None:
+    def show(self, dive: RunningDive) -> None:
         """A dive begins: its path is shown, and no other's."""
         self._forget()
 
-    def update(self, loop: LiveLoop) -> None:
+    def update(self, dive: RunningDive) -> None:
         """Called after every turn of the loop; queues what is new, never waits."""
-        now, latest = time.monotonic(), loop.latest
+        now, latest = time.monotonic(), dive.latest
         if latest is None or latest.T_wc is None:
             return
         t_ns = _stamp_ns(latest.frame)
         self._stamps[latest.frame.index] = t_ns
         while len(self._stamps) > KEPT_STAMPS:
             del self._stamps[next(iter(self._stamps))]
-        frame = loop.run_.slam.metric_frame(latest.sub_map)
+        frame = dive.dive_run.slam.metric_frame(latest.sub_map)
         if latest.frame.index != self._last and now - self._pose_s >= 1.0 / self._config.pose_hz:
             self._pose_s, self._last = now, latest.frame.index
-            self._hand_over(loop, latest, t_ns, frame)
+            self._hand_over(dive, latest, t_ns, frame)
         if now - self._map_s >= self._config.refresh_s and not self._asked:
             points = self._server.wanted(topics.POINTS)
             drawn = any(map(self._server.wanted, PICTURES))
             if points or drawn or self._server.wanted(topics.DIAGNOSTICS):
                 self._map_s, self._asked = now, True
                 sub_map = latest.sub_map
-                loop.maps.inspect(
+                dive.maps.inspect(
                     "show Foxglove the map",
                     lambda maps, _: self._take(maps, sub_map, frame, points, drawn),
                 )
@@ -104,11 +103,11 @@ class LiveFoxglove:
         self._showing.close()
         self._server.close()
 
-    def _hand_over(self, loop: LiveLoop, latest: Tracked, t_ns: int, frame: MetricFrame) -> None:
-        run = loop.run_
+    def _hand_over(self, dive: RunningDive, latest: Tracked, t_ns: int, frame: MetricFrame) -> None:
+        run = dive.dive_run
         if self._preparation is None:  # of its own: the loop's prepares the next frame meanwhile
             self._preparation = Preparation(run.config.source, run.preparation.calibration)
-        picture = loop.picture
+        picture = dive.picture
         same = picture is not None and picture.index == latest.frame.index
         moment = _Moment(t_ns, latest, picture if same else None, frame, self._preparation)
         self._moments.put(moment)

@@ -15,11 +15,10 @@ from aquaflow.dive.point_cloud import PointCloud
 from aquaflow.dive.posed_views import PosedView, posed_views
 from aquaflow.dive.restored import SeenFrame, without_water
 from aquaflow.dive.ros import messages
+from aquaflow.mapping.map_copy import MapCopy, copied
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import common_exposure, drawn_without_water, to_bytes
 from aquaflow.render.transfers import picture_out
-from aquaflow.survey.viewer.copies import MapCopy
-from aquaflow.survey.viewer.snapshot import copied
 from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.water.image_formation import Water
 

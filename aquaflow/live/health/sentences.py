@@ -10,7 +10,6 @@ from aquaflow.live.health.degradation import DegradationLevel
 from aquaflow.live.health.pressure import Shortage
 from aquaflow.live.health.state import State
 from aquaflow.sources.outbound import LONGEST_TEXT
-from aquaflow.survey.coverage.hints import Hint
 from aquaflow.tracking.consistency import Cause
 
 OF_STATE = {
@@ -46,12 +45,6 @@ OF_LEVEL = {
     DegradationLevel.RECORDING_ONLY: "it only records",
 }
 """What the service still does."""
-OF_HINT = {
-    Hint.TOO_HIGH: "AquaFlow: too high for this water.",
-    Hint.TOO_FAST: "AquaFlow: too fast for the wanted overlap.",
-    Hint.TOO_FAR_ASIDE: "AquaFlow: too far from the last line.",
-}
-"""What a pilot could do better."""
 DISK_FULL = "AquaFlow: the disk is full, nothing is kept."
 MAPPING_FAILS = "AquaFlow: the map cannot grow, tracking goes on."
 STAGE_FAILS = "AquaFlow: a stage fails again and again."

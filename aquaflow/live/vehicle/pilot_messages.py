@@ -8,11 +8,10 @@ from typing import Literal
 
 from aquaflow.config.service import VehicleReportConfig
 from aquaflow.live.feed import Feed
-from aquaflow.live.health.sentences import OF_HINT, OF_STATE
+from aquaflow.live.health.sentences import OF_STATE
 from aquaflow.live.health.state import Health, State
 from aquaflow.live.watched import Watched
 from aquaflow.sources.outbound import NamedValue, StatusText
-from aquaflow.survey.coverage.hints import Hint
 
 EVERY_S = 1.0
 """Period of the numbers that the autopilot logs."""
@@ -43,9 +42,9 @@ class PilotMessages:
         self,
         config: VehicleReportConfig,
         feed: Feed,
-        hints: Callable[[], Sequence[Hint]] = tuple,
+        hints: Callable[[], Sequence[str]] = tuple,
     ) -> None:
-        """``hints``: those of the coverage that hold now."""
+        """``hints``: what the pilot could do better now, in sentences."""
         self._config, self._feed, self._hints = config, feed, hints
         self._standing: set[str] = set()
         """Sentences that were said and still hold."""
@@ -73,7 +72,7 @@ class PilotMessages:
         """The first sentence that holds now and was not said since it began to."""
         hints = self._hints() if self._config.hints and health.state in HINTED_IN else ()
         own = health.sentences or (OF_STATE[health.state],)
-        holding = (*own, *(OF_HINT[hint] for hint in hints))
+        holding = (*own, *hints)
         self._standing &= set(holding)
         soon = now - max(self._said_s.values(), default=-SPACING_S) < SPACING_S
         if soon and health.state is not State.STOPPING:  # which has no later

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.storage.atomic import atomic_write, write_json
-from aquaflow.dive.metric_outputs import MetricOutputs
-from aquaflow.dive.results import WaterSummary
+from aquaflow.dive.deliverable import Deliverable
+from aquaflow.dive.dive import Dive
 from aquaflow.slam import Slam
 from aquaflow.survey.coverage import DiveCoverage, PageView, Seen, mapping_range
 from aquaflow.survey.coverage.coverage_file import NAME, write_coverage_file
@@ -18,31 +19,40 @@ NUMBERS, PICTURE = "coverage.json", "coverage.png"
 """In the dive's folder, beside NAME."""
 
 
-def final_views(
-    coverage: DiveCoverage,
-    slam: Slam,
-    outputs: MetricOutputs,
-    waters: Mapping[int, WaterSummary | None],
-) -> dict[int, PageView]:
-    """What is shown of each sub-map once all keyframes are where they stay."""
-    coverage.look(slam.keyframes, outputs.frame, everything=True)
-    coverage.settle()
-    return current_views(coverage, slam, outputs, waters)
+class CoverageFiles(Deliverable):
+    """coverage.npz, coverage.json and coverage.png: what the camera has seen."""
 
+    stage = "writing the coverage"
 
-def current_views(
-    coverage: DiveCoverage,
-    slam: Slam,
-    outputs: MetricOutputs,
-    waters: Mapping[int, WaterSummary | None],
-) -> dict[int, PageView]:
-    """What is shown of each sub-map at the moment; ``waters`` in map units."""
-    least = coverage.config.least_contrast
-    limits = {
-        number: None if water is None else mapping_range(water.beta_a, least)
-        for number, water in waters.items()
-    }
-    return coverage.views(slam.keyframes, outputs.frame, limits)
+    def __init__(self, slam: Slam) -> None:
+        super().__init__(slam)
+        config = slam.config.coverage
+        self.coverage = DiveCoverage(config) if config.enabled else None
+        """Of the running dive; any thread may look at it."""
+
+    def look(self) -> None:
+        """Take in new and moved keyframes."""
+        if self.coverage is not None:
+            with self.slam.profiler.stage("coverage"):
+                self.coverage.look(self.slam.keyframes, self.slam.metric_frame)
+                self.coverage.update()
+
+    def refresh(self, dive: Dive) -> None:
+        """As it is at the moment."""
+        if self.coverage is not None:
+            write_coverage(dive.path, self._views(self.coverage, dive), dive.main)
+
+    def make(self, dive: Dive, until: Deadline) -> None:
+        """Once all keyframes are where they stay."""
+        if self.coverage is not None:
+            self.coverage.look(self.slam.keyframes, dive.frame_of, everything=True)
+            self.coverage.settle()
+            self.refresh(dive)
+
+    def _views(self, coverage: DiveCoverage, dive: Dive) -> dict[int, PageView]:
+        least = coverage.config.least_contrast
+        limits = {n: mapping_range(list(rates), least) for n, rates in dive.attenuations.items()}
+        return coverage.views(self.slam.keyframes, dive.frame_of, limits)
 
 
 def write_coverage(dive: Path, views: Mapping[int, PageView], main: int) -> None:

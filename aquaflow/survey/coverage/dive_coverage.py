@@ -11,10 +11,10 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
 from aquaflow.config.coverage import CoverageConfig
+from aquaflow.dive.page_axes import page_axes, page_rotation
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore
 from aquaflow.survey.coverage.footprint import Footprint
-from aquaflow.survey.coverage.page_axes import page_axes, page_rotation
 from aquaflow.survey.coverage.page_view import PageView, page_view
 from aquaflow.survey.coverage.sub_map_coverage import REDRAWN, SubMapCoverage
 from aquaflow.telemetry.metric_frame import MetricFrame

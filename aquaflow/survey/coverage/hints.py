@@ -31,6 +31,10 @@ class Hint(str, Enum):
     TOO_FAR_ASIDE = "too far from the last line"
 
 
+SENTENCES = {hint: f"AquaFlow: {hint.value}." for hint in Hint}
+"""As a ground station speaks them: whole, without numbers, and fit for one STATUSTEXT."""
+
+
 @dataclass(frozen=True)
 class Place:
     """Where the camera was when a picture was tracked."""

@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.coverage import CoverageConfig
+from aquaflow.dive.page_axes import names_of, page_axes
 from aquaflow.survey.coverage.classes import Seen
 from aquaflow.survey.coverage.next_line import LineState, line_state
-from aquaflow.survey.coverage.page_axes import names_of, page_axes
 from aquaflow.survey.coverage.plan import CoveragePlan, plan_of
 from aquaflow.survey.coverage.sub_map_coverage import SubMapCoverage
 from aquaflow.survey.coverage.survey_lines import survey_lines

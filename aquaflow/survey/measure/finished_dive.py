@@ -1,26 +1,29 @@
-"""The reef numbers of a finished dive, from the files in its folder."""
+"""The reef numbers of a dive: of a finished one, or of one whose maps are still in memory."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
+from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.errors import InputError, reason_of
-from aquaflow.base.errors.regular_file import read_regular_json
-from aquaflow.dive.trajectory_csv import NAME as TRAJECTORY
-from aquaflow.dive.trajectory_csv import read_trajectory_csv
+from aquaflow.dive.dive import Dive
+from aquaflow.dive.medium import NAME as MEDIUM
 from aquaflow.survey.export.ortho.ground import Ground, ground_of
-from aquaflow.survey.export.ortho.survey import read_map
-from aquaflow.survey.measure.drawn_heights import Progress, draw_heights
 from aquaflow.survey.measure.height_field import HeightField
 from aquaflow.survey.measure.reef_numbers import ReefNumbers, Water, reef_numbers
 from aquaflow.survey.measure.scale import scale_of
-from aquaflow.telemetry.metric_file import read_main
+
+if TYPE_CHECKING:
+    from aquaflow.mapping.mapper import Mapper
+    from aquaflow.survey.measure.drawn_heights import Progress
 
 
 def numbers_of_dive(
-    dive: Path, work: Path, cell: float | None = None, progress: Progress | None = None
+    dive: Dive, work: Path, cell: float | None = None, progress: Progress | None = None
 ) -> ReefNumbers:
     """The numbers of a finished dive's largest sub-map.
 
@@ -32,25 +35,58 @@ def numbers_of_dive(
         InputError: the dive has no map, or a file of it is damaged.
         ConfigError: the dive's settings cannot be read.
     """
-    mapper, frame = read_map(dive)
-    main = read_main(dive)
+    mapper = dive.filled_map()
+    dive.require(MEDIUM)
 
     def draw() -> tuple[HeightField, Ground]:
-        ground = ground_of(frame, mapper.views)
-        return draw_heights(mapper, ground, work, cell, progress), ground
+        return _drawn(dive, mapper, work, cell, progress)
 
-    rows = [row for row in read_trajectory_csv(dive / TRAJECTORY) if row.sub_map == main]
-    places = np.array([(row.x, row.y, row.z) for row in rows]).reshape(-1, 3)
-    return reef_numbers(draw, places, _water(dive / "medium.json"), scale_of(frame))
+    return reef_numbers(draw, _places(dive), _water(dive), scale_of(dive.frame))
 
 
-def _water(path: Path) -> Water | None:
+def numbers_at_the_end(dive: Dive, until: Deadline) -> ReefNumbers:
+    """The numbers of the largest sub-map of a dive that ends, with what is in memory; after
+    ``until`` the ground is left out."""
+
+    def in_time(stage: str, done: int, total: int) -> None:
+        if until.over:
+            raise InputError(
+                f"the dive's end had no more time after {done} of {total} {stage} "
+                "(service.finish_s); aquaflow measure does it"
+            )
+
+    def draw() -> tuple[HeightField, Ground]:
+        mapper = dive.maps.get(dive.main)
+        if mapper is None or not mapper.views or len(mapper.gaussians) == 0:
+            raise InputError("the map is empty; map a recording that shows more")
+        return _drawn(dive, mapper, dive.path, None, in_time)
+
+    return reef_numbers(draw, _places(dive), _water(dive), scale_of(dive.frame))
+
+
+def _drawn(
+    dive: Dive, mapper: Mapper, work: Path, cell: float | None, progress: Progress | None
+) -> tuple[HeightField, Ground]:
+    from aquaflow.survey.measure.drawn_heights import draw_heights  # loads torch
+
+    ground = ground_of(dive.frame, mapper.views)
+    return draw_heights(mapper, ground, work, cell, progress), ground
+
+
+def _places(dive: Dive) -> npt.NDArray[np.float64]:
+    """[N, 3] camera centres in n, in order of time."""
+    rows = [row for row in dive.poses if row.sub_map == dive.main]
+    return np.array([(row.x, row.y, row.z) for row in rows]).reshape(-1, 3)
+
+
+def _water(dive: Dive) -> Water | None:
+    facts = dive.medium_facts
     try:
-        data = read_regular_json(path)
-        if not data["active"]:
+        if not facts or not facts["active"]:
             return None
-        rates = [float(each) for each in data["attenuation_per_unit"]]
-        sigma = data["attenuation_relative_sigma"]
+        rates = [float(each) for each in facts["attenuation_per_unit"]]
+        sigma = facts["attenuation_relative_sigma"]
         return Water(rates, None if sigma is None else [float(each) for each in sigma])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError) as error:
+        path = dive.file(MEDIUM)
         raise InputError(f"cannot read {path}: {reason_of(error)}; map the dive again") from error

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.storage.dive_status import refuse_unfinished
+from aquaflow.dive.dive import Dive
 from aquaflow.survey.measure.reef_files import CSV, JSON, write_reef_numbers
 from aquaflow.survey.measure.rescaling import rescale, why_not
 from aquaflow.telemetry.known_lengths.known_length import KnownLength, LengthScale, scale_of
@@ -70,14 +71,14 @@ def _measure_anew(dive: Path, progress: Progress | None) -> None:
     """The dive's reef numbers in its new unit; none where it had none, or cannot be measured."""
     if not (dive / JSON).is_file():
         return
-    from aquaflow.survey.measure.finished_dive import numbers_of_dive  # loads torch
+    from aquaflow.survey.measure.finished_dive import numbers_of_dive
 
     # Those in another unit would contradict the rest of the folder.
     for name in (JSON, CSV):
         (dive / name).unlink(missing_ok=True)
     try:
         with tempfile.TemporaryDirectory() as work:
-            write_reef_numbers(dive, numbers_of_dive(dive, Path(work), progress=progress))
+            write_reef_numbers(dive, numbers_of_dive(Dive(dive), Path(work), progress=progress))
     except InputError:
         return  # aquaflow measure says why
 

@@ -5,13 +5,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.dive.results import WaterSummary
-from aquaflow.survey.measure.reef_numbers import ReefNumbers
-from aquaflow.survey.report import Measures, PathPlot, ReefRow
+from aquaflow.survey.report import Measures, MediumCurves, PathPlot
 from aquaflow.telemetry.metric_frame import MetricFrame
 
 
-def measures(path: PathPlot, frame: MetricFrame, water: WaterSummary | None) -> Measures:
+def measures(path: PathPlot, frame: MetricFrame, water: MediumCurves | None) -> Measures:
     """Of the path in n, the largest sub-map's ``frame``, and the water in its unit."""
     rows = [
         ("unit of length", _unit(frame)),
@@ -25,18 +23,6 @@ def measures(path: PathPlot, frame: MetricFrame, water: WaterSummary | None) -> 
         seen = f"{water.range_p5:.3g} to {water.range_p95:.3g} {frame.unit}"
         rows.append(("distances seen", f"{seen} (5 % and 95 %)"))
     return Measures(rows, frame.sources)
-
-
-def reef_rows(found: ReefNumbers | None) -> list[ReefRow]:
-    """The reef numbers in words; empty where there are none."""
-    if found is None:
-        return []
-    rows = []
-    for each in found.numbers:
-        q = each.quantity
-        interval = f"{q.low:.4g} to {q.high:.4g}"
-        rows.append(ReefRow(each.label, q.in_words(), interval, each.meaning))
-    return rows + [ReefRow(what, "unknown", "", why) for what, why in found.missing.items()]
 
 
 def _unit(frame: MetricFrame) -> str:

@@ -155,7 +155,7 @@ def _example(example: HeldOutExample) -> str:
     )
     return (
         f'<p class="shot">{html.escape(example.caption)}<small>{", ".join(scores)}</small></p>'
-        f'<div class="views">{views}</div>'
+        f'<div class="views of{len(pictures)}">{views}</div>'
     )
 
 

@@ -43,8 +43,11 @@ svg { width: 100%; height: auto; display: block; font-family: inherit; }
   list-style: none; font-size: .9rem; color: var(--soft); }
 .key i { display: inline-block; width: .8em; height: .8em; border-radius: 3px;
   margin-right: .45em; vertical-align: -.05em; }
-.views { display: grid; grid-template-columns: repeat(auto-fit, minmax(15rem, 1fr)); gap: .7rem;
-  margin: 0 0 .4rem; }
+.views { display: grid; gap: .7rem; margin: 0 0 .4rem; }
+@media (min-width: 34rem) {
+  .of2, .of4 { grid-template-columns: 1fr 1fr; }
+  .of3 { grid-template-columns: 1fr 1fr 1fr; }
+}
 figure { margin: 0; }
 figcaption { font-size: .84rem; color: var(--soft); margin-top: .25rem; }
 .views img { width: 100%; border-radius: 8px; display: block; }

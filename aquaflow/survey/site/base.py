@@ -1,4 +1,4 @@
-"""A site, or one dive alone, as the base in which another dive is looked for."""
+"""A merged site as the base in which another dive is looked for."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from aquaflow.survey.site.frames import frame_of
 from aquaflow.survey.site.manifest import check_unchanged, is_site, read_site
 from aquaflow.survey.site.merged_file import MergedSite, merge_of
 from aquaflow.tracking.base.base import Base
-from aquaflow.tracking.base.opening import open_base, prior_of
+from aquaflow.tracking.base.opening import prior_of
 
 log = logging.getLogger(__name__)
 
 
-def base_of(folder: Path) -> Base:
-    """The merged site in ``folder``, or the finished dive in it.
+def site_as_base(folder: Path) -> Base | None:
+    """The merged site in ``folder``; None where it is no site. Behind ``aquaflow.bases``.
 
     The keyframes of a site are numbered as in its merge, and its components stand for sub-maps. A
     dive that is gone, or that changed since the merge, is left out.
 
     Raises:
-        InputError: it is neither, it was not merged, or nothing of it can be read.
+        InputError: it was not merged, or nothing of it can be read.
     """
     if not is_site(folder):
-        return open_base(folder)
+        return None
     merged = merge_of(folder)
     dives = {dive.name: dive.folder(folder) for dive in read_site(folder)}
     files: dict[int, PlacesFile] = {}

@@ -7,6 +7,7 @@ it from there, computes what a browser needs, and hands it to the server.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +21,9 @@ from aquaflow.survey.viewer.seen_water import SeenWater, seen_water
 from aquaflow.survey.viewer.splats import Splats, splats
 from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.types import CameraModel
+
+if TYPE_CHECKING:
+    from aquaflow.mapping.map_copy import MapCopy  # it loads torch
 
 SEEN = "seen"
 """Name of the level that says how often a Gaussian was seen."""
@@ -35,21 +39,6 @@ class Pose:
     camera: CameraModel
     picture: npt.NDArray[np.uint8]
     """[H, W, 3] RGB"""
-
-
-@dataclass(frozen=True)
-class MapCopy:
-    """Copies of the shown parts of a map, which mapping changes meanwhile."""
-
-    parameters: dict[str, npt.NDArray[np.float32]]
-    steps: npt.NDArray[np.int32]
-    """[N] optimiser steps of each Gaussian."""
-    clear: npt.NDArray[np.float32]
-    """[N, 3] without water."""
-    water: npt.NDArray[np.float32] | None
-    """[6, 3] beta, B_inf, b, B_res, d as the last camera sees it, and the gain of ``clear``."""
-    views: list[Sim3]
-    """T_wc of the mapped views; the last one is the newest."""
 
 
 def shown(

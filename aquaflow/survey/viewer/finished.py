@@ -124,6 +124,17 @@ def show_dive(dive: FinishedDive, config: ViewerConfig, tools: Tools | None = No
     return page
 
 
+def show_folder(folder: Path, config: ViewerConfig) -> ViewerPage:
+    """The viewer's page of the finished dive in ``folder``, without tools; behind
+    ``aquaflow.views``.
+
+    Raises:
+        InputError: there is no finished dive, or the address is taken.
+        ConfigError: the token will not do.
+    """
+    return show_dive(read_dive(folder, config.splats), config)
+
+
 def fill(page: ViewerPage, dive: FinishedDive) -> None:
     """Show ``dive`` on ``page``, in place of what was there."""
     page.set_frame(

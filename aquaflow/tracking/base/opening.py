@@ -1,7 +1,9 @@
-"""Opens an earlier dive as the base of another."""
+"""Opens an earlier dive, or several in one frame, as the base of another dive."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from importlib.metadata import entry_points
 from pathlib import Path
 
 from aquaflow.base.errors import InputError
@@ -13,6 +15,23 @@ from aquaflow.tracking.base.base import Base
 
 METRICS = "metrics.json"
 """Says which prior the dive was tracked with."""
+BASES = "aquaflow.bases"
+"""Group of entry points: functions that open a folder of several dives, and return None for a
+folder of another kind."""
+
+
+def base_of(folder: Path) -> Base:
+    """What an entry point of :data:`BASES` recognises in ``folder``, or the finished dive there.
+
+    Raises:
+        InputError: it is neither, or cannot be used.
+    """
+    for entry in entry_points(group=BASES):
+        opened: Callable[[Path], Base | None] = entry.load()
+        base = opened(folder)
+        if base is not None:
+            return base
+    return open_base(folder)
 
 
 def open_base(folder: Path) -> Base:

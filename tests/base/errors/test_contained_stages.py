@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -16,6 +15,8 @@ from aquaflow.base.errors import InputError
 from aquaflow.base.errors.failures import Failures
 from aquaflow.config import Config
 from aquaflow.dive import replay
+from aquaflow.dive.deliverable import Phase, deliverables_of
+from aquaflow.dive.deliverables import Deliverables
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import Finished
 from aquaflow.mapping import water_fitting
@@ -25,7 +26,6 @@ from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.slam import Slam
 from aquaflow.sources import RecordedCamera, open_recording
 from aquaflow.sources.preprocessing import Preparation
-from aquaflow.survey.deliverables import Deliverables
 from aquaflow.tracking.current_keyframe import KeyframeTracker
 from aquaflow.tracking.gate.gate import FrameGate
 from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph
@@ -191,7 +191,10 @@ WRITERS = {
     "write_splats": ("writing map.ply", "map.ply"),
     "write_held_out": ("writing held-out views", "heldout"),
     "write_medium": ("writing medium.json", "medium.json"),
-    "write_report": ("report", "report.html"),
+    "coverage": ("writing the coverage", "coverage.npz"),
+    "overview": ("drawing the overview", "overview.png"),
+    "reef_numbers": ("reef numbers", "reef_numbers.json"),
+    "report": ("report", "report.html"),
 }
 
 
@@ -217,13 +220,19 @@ def test_a_file_that_cannot_be_written_leaves_the_others(
 
     slam, folder = finished_slam, DiveFolder(tmp_path / "dive", SETTINGS)
     monkeypatch.setattr(slam, "failures", Failures(strict=False))
-    monkeypatch.setattr(folder, broken, partial(fail))
-    made = Deliverables("planted", folder, slam, slam.results(), None)
+    others = deliverables_of(slam)
+    if broken in others:
+        monkeypatch.setattr(others[broken], "make", fail)
+    else:
+        monkeypatch.setattr(folder, broken, fail)
+    made = Deliverables("planted", folder, slam, slam.results(), None, others=others)
     made.summarise()
     made.write()
+    made.make(Phase.WRITE)
     made.evaluate()
+    made.make(Phase.MEASURE)
     made.write_evaluation()
-    made.write_report([], {"stage_ms": {}, "warnings": []}, slam.failures.notes())
+    made.make(Phase.REPORT, metrics={"stage_ms": {}, "warnings": []})
     folder.close()
     stage, missing = WRITERS[broken]
     assert [kind.stage for kind in slam.failures.kinds] == [stage]

@@ -20,8 +20,8 @@ from PIL import Image
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
-from aquaflow.api.dive import read_dive
 from aquaflow.base.errors import InputError
+from aquaflow.dive.dive import read_dive
 from aquaflow.dive.point_cloud import read_point_cloud
 from aquaflow.dive.posed_views import read_mapper, read_posed_views
 from aquaflow.dive.restored import exposure_without_water, restored_frames

@@ -24,10 +24,10 @@ from aquaflow.live.checkpoint.resume import choose, is_begun, resumed
 from aquaflow.live.dive_clock import Continued
 from aquaflow.live.health.prometheus import exposition
 from aquaflow.live.live_dive import LiveDive
-from aquaflow.live.live_viewer import LiveViewer, in_words
 from aquaflow.live.moment import Moment
 from aquaflow.live.report import report
 from aquaflow.sources import open_recording
+from aquaflow.survey.viewer.live_viewer import LiveViewer, in_words
 from aquaflow.tracking.graph.keyframe_graph import LOOP_SEARCH
 from aquaflow.types import Frame
 from tests.live.live_scenes import VEHICLE, ToldFeed, caught_up

@@ -300,8 +300,8 @@ def test_a_service_shows_its_dives_where_it_is_asked_to_and_stops_listening(
 
     monkeypatch.setattr(FoxgloveServer, "__init__", noted)
     changed = VEHICLE.service.model_copy(update={"foxglove": LOOPBACK})
-    loop, run = SimpleNamespace(watchers=[]), SimpleNamespace(coverage=None)
-    dive: Any = SimpleNamespace(parts=SimpleNamespace(loop=loop, run=run))
+    loop = SimpleNamespace(watchers=[], dive_run=SimpleNamespace(deliverables={}))
+    dive: Any = SimpleNamespace(parts=SimpleNamespace(loop=loop))
     for service, count in ((VEHICLE.service, 0), (changed, 1)):
         vehicle = VEHICLE.model_copy(update={"service": service})
         with Vitals(service) as vitals, Station(ToldFeed(), vehicle, Control(), vitals) as station:

@@ -10,8 +10,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from aquaflow.live.live_coverage import described
 from aquaflow.survey.coverage import PageView
+from aquaflow.survey.coverage.live_coverage import described
 from aquaflow.survey.coverage.picture import cells_png, coverage_png
 from aquaflow.web import Answer, Request
 from tests.live.health.reports import REPORT

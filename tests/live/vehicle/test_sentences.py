@@ -17,7 +17,7 @@ from aquaflow.live.health.pressure import Shortage
 from aquaflow.live.health.state import State
 from aquaflow.live.vehicle.pilot_messages import REPEAT_S, SEVERITY, SPACING_S, PilotMessages
 from aquaflow.sources.outbound import LONGEST_TEXT, StatusText
-from aquaflow.survey.coverage.hints import Hint
+from aquaflow.survey.coverage.hints import SENTENCES
 from aquaflow.tracking.consistency import Cause, Finding
 from tests.live.live_scenes import CALM, Told
 
@@ -28,7 +28,7 @@ LEVELS = [level for level in DegradationLevel if level is not DegradationLevel.F
 EVERY_SENTENCE = {
     *sentences.OF_STATE.values(),
     *sentences.OF_CAUSE.values(),
-    *sentences.OF_HINT.values(),
+    *SENTENCES.values(),
     *(sentences.doing_less(level, short) for level in LEVELS for short in Shortage),
     *(sentences.no_picture(name) for name in NAMES),
     *(sentences.silent_link(name, heard) for name in NAMES for heard in (False, True)),
@@ -48,7 +48,6 @@ def told(tmp_path: Path) -> Iterator[Told]:
 def test_every_state_and_every_cause_has_its_sentence() -> None:
     assert set(sentences.OF_STATE) == set(State)
     assert set(sentences.OF_CAUSE) == set(Cause)
-    assert set(sentences.OF_HINT) == set(Hint)
     assert set(sentences.OF_LEVEL) == set(LEVELS)
     assert set(sentences.OF_SHORTAGE) == set(Shortage)
 

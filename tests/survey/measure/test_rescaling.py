@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.ply import read_ply
 from aquaflow.dive.trajectory_csv import read_trajectory_csv
 from aquaflow.survey.coverage.coverage_file import read_coverage_file
 from aquaflow.survey.measure import finished_dive
 from aquaflow.survey.measure.marked_length import keep_length
 from aquaflow.survey.measure.notes import Note, read_notes, write_notes
-from aquaflow.survey.report.report_of_folder import report_of_folder
+from aquaflow.survey.report.report_of import report_of
 from aquaflow.telemetry.known_lengths.known_length import KnownLength
 from aquaflow.telemetry.metric_file import read_metric_file, write_metric_file
 from aquaflow.telemetry.metric_frame import MetricFrame
@@ -106,7 +107,7 @@ def test_the_ground_is_measured_anew_in_metres_and_in_the_report(dive: Path, com
     scale_sigma = read_metric_file(dive)[0].scale_sigma
     assert path["high_95"] - path["value"] == pytest.approx(1.96 * scale_sigma * way, rel=0.01)
     assert "m\u00b2" in (dive / "reef_numbers.csv").read_text()
-    shown = {row.label: row.value for row in report_of_folder(dive).reef}
+    shown = {row.label: row.value for row in report_of(Dive(dive)).reef}
     assert shown["length of the path"].endswith(" m")
     assert shown["surveyed area"].endswith(" m\u00b2")
 
@@ -121,7 +122,7 @@ def test_numbers_of_the_ground_that_cannot_be_measured_anew_are_taken_away(
     known = KnownLength(-1, "ruler", 0.5, 0.005, 1.5, 0.001, 0)
     assert keep_length(dive, known).unchanged is None
     assert not list(dive.glob("reef_numbers.*"))
-    assert report_of_folder(dive).reef == []
+    assert report_of(Dive(dive)).reef == []
 
 
 def test_notes_stay_where_they_are_in_the_map(dive: Path, command: Cli) -> None:

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from aquaflow.dive.dive import Dive
 from aquaflow.survey.coverage.coverage_file import read_coverage_file
-from aquaflow.survey.report.report_of_folder import report_of_folder
+from aquaflow.survey.report.report_of import report_of
 from tests.command_line import Cli, refused
 
 
@@ -32,7 +33,7 @@ def test_a_finished_dive_has_its_coverage_and_a_map_from_above(small_dive: Path)
 
 
 def test_the_folder_gives_back_what_the_report_showed(small_dive: Path) -> None:
-    data = report_of_folder(small_dive)
+    data = report_of(Dive(small_dive))
     page = (small_dive / "report.html").read_text()
     assert data.coverage is not None
     assert data.path is not None
@@ -45,7 +46,7 @@ def test_the_folder_gives_back_what_the_report_showed(small_dive: Path) -> None:
 
 
 def test_the_ground_in_numbers_is_that_of_the_page_until_its_unit_changes(dive: Path) -> None:
-    page, rows = (dive / "report.html").read_text(), report_of_folder(dive).reef
+    page, rows = (dive / "report.html").read_text(), report_of(Dive(dive)).reef
     assert len(rows) > 5
     for row in rows:
         assert html.escape(row.label) in page
@@ -54,7 +55,7 @@ def test_the_ground_in_numbers_is_that_of_the_page_until_its_unit_changes(dive: 
     numbers = dive / "reef_numbers.json"
     content = json.loads(numbers.read_text())
     numbers.write_text(json.dumps(content | {"unit": "furlongs"}))
-    assert report_of_folder(dive).reef == []
+    assert report_of(Dive(dive)).reef == []
 
 
 def test_a_report_is_never_written_over_what_is_no_pdf(dive: Path, command: Cli) -> None:

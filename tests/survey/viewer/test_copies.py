@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.survey.viewer.copies import MapCopy, shown
+from aquaflow.mapping.map_copy import MapCopy
+from aquaflow.survey.viewer.copies import shown
 from aquaflow.survey.viewer.dive_coverage import CLASSES, COVERAGE
 
 

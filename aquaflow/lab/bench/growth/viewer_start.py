@@ -8,7 +8,7 @@ from pathlib import Path
 from urllib.request import urlopen
 
 from aquaflow.config.viewer import ViewerConfig
-from aquaflow.survey.viewer.finished import read_dive, show_dive
+from aquaflow.dive.views import open_finished
 
 PATIENCE_S = 60.0
 """After which a viewer that does not answer has failed."""
@@ -23,8 +23,7 @@ def viewer_start(dive: Path) -> dict[str, float]:
         OSError: the viewer does not answer.
     """
     began = time.perf_counter()
-    config = ViewerConfig(port=0)
-    page = show_dive(read_dive(dive, config.splats), config)
+    page = open_finished(dive, ViewerConfig(port=0))
     try:
         _get(page.address)
         page_s = time.perf_counter() - began

@@ -18,11 +18,18 @@ import numpy as np
 
 from aquaflow.base.errors.failures import Failures
 from aquaflow.dive.from_maps import attenuations
-from aquaflow.live.dive_parts import Parts
-from aquaflow.live.loop import LiveLoop
+from aquaflow.dive.views import CoverageView, RunningDive
 from aquaflow.mapping.work import OwnedMaps
 from aquaflow.survey.coverage import DiveCoverage, PageView, mapping_range
-from aquaflow.survey.coverage.hints import Hint, Hints, Measured, Place, forward_steps
+from aquaflow.survey.coverage.coverage_files import CoverageFiles
+from aquaflow.survey.coverage.hints import (
+    SENTENCES,
+    Hint,
+    Hints,
+    Measured,
+    Place,
+    forward_steps,
+)
 from aquaflow.survey.coverage.picture import cells_affine, cells_png, coverage_png
 from aquaflow.survey.coverage.plan import CoveragePlan
 from aquaflow.survey.coverage.swath import MOST_SIGHTS, extent
@@ -40,7 +47,7 @@ PLACES = 200
 NO_VIEWS: Mapping[int, PageView] = MappingProxyType({})
 
 
-class LiveCoverage:
+class LiveCoverage(CoverageView):
     """Construct once; :meth:`show` and :meth:`hide` a dive; asked from any thread."""
 
     def __init__(
@@ -55,7 +62,7 @@ class LiveCoverage:
         self.turns, self.took_s = 0, 0.0
         """Turns so far, and the CPU time that they took."""
         self._failures, self._now_s, self._cpu_s = failures, now_s, cpu_s
-        self._parts: Parts | None = None
+        self._dive: RunningDive | None = None
         self._views: Mapping[int, PageView] = NO_VIEWS
         self._hints: Hints | None = None
         self._measured = Measured()
@@ -68,22 +75,23 @@ class LiveCoverage:
 
     # --- in the service's threads ---------------------------------------------------------------
 
-    def show(self, parts: Parts) -> None:
+    def show(self, dive: RunningDive) -> None:
         """From here on, this dive."""
         self.hide()
-        if parts.run.coverage is not None:
-            self._hints = Hints(parts.run.coverage.config)
-            self._parts = parts
+        coverage = coverage_of(dive)
+        if coverage is not None:
+            self._hints = Hints(coverage.config)
+            self._dive = dive
 
     def hide(self) -> None:
         """From here on, none."""
-        self._parts, self._hints, self._views, self.hints = None, None, NO_VIEWS, ()
+        self._dive, self._hints, self._views, self.hints = None, None, NO_VIEWS, ()
         self._measured, self._limits, self._water_s = Measured(), {}, -WATER_S
         self._places.clear()
 
-    def update(self, loop: LiveLoop) -> None:
-        """A watcher of the loop, in tracking's thread: notes where the newest picture was taken."""
-        latest = loop.latest
+    def update(self, dive: RunningDive) -> None:
+        """In tracking's thread: notes where the newest picture was taken."""
+        latest = dive.latest
         if latest is None or latest.T_wc is None:
             return
         t_s = latest.frame.t_ns * 1e-9
@@ -95,7 +103,11 @@ class LiveCoverage:
         self._closing.set()
         self._thread.join(5.0)
 
-    # --- what the page asks for -----------------------------------------------------------------
+    # --- what the pilot is told, and what the page asks for -------------------------------------
+
+    def sentences(self) -> tuple[str, ...]:
+        """The hints that hold, each fit for one STATUSTEXT."""
+        return tuple(SENTENCES[hint] for hint in self.hints)
 
     def to_json(self) -> dict[int, dict[str, Any]]:
         """By sub-map: the picture of the cells and how it lies on the page, lines and areas."""
@@ -146,16 +158,17 @@ class LiveCoverage:
 
     def turn(self) -> None:
         """Take in what is new, and show it."""
-        parts, hints = self._parts, self._hints
-        if parts is None or hints is None or parts.run.coverage is None:
+        dive, hints = self._dive, self._hints
+        coverage = None if dive is None else coverage_of(dive)
+        if dive is None or hints is None or coverage is None:
             return
-        self._ask_for_the_water(parts)
-        coverage, slam = parts.run.coverage, parts.slam
+        self._ask_for_the_water(dive)
+        slam = dive.dive_run.slam
         coverage.look(slam.keyframes, slam.metric_frame)
         coverage.update()
         views = coverage.views(slam.keyframes, slam.metric_frame, self._limits)
         measured = self._judged(coverage, views)
-        if self._parts is parts:  # else the dive ended meanwhile
+        if self._dive is dive:  # else the dive ended meanwhile
             self.turns += 1
             self._views, self._measured = views, measured
             self.hints = hints.judge(measured)
@@ -183,18 +196,24 @@ class LiveCoverage:
                 measured.forward_overlap = 1.0 - float(np.median(steps)) / length
         return measured
 
-    def _ask_for_the_water(self, parts: Parts) -> None:
+    def _ask_for_the_water(self, dive: RunningDive) -> None:
         """The mapping thread answers when it finds time; it is not waited for."""
         now = self._now_s()
         if now - self._water_s < WATER_S:
             return
-        self._water_s, config = now, parts.run.config.coverage
+        self._water_s, config = now, dive.dive_run.config.coverage
 
         def read(maps: OwnedMaps, _: object) -> None:
             for number, attenuation in attenuations(maps.mappers).items():
                 self._limits[number] = mapping_range(attenuation, config.least_contrast)
 
-        parts.maps.inspect("water for the coverage", read)
+        dive.maps.inspect("water for the coverage", read)
+
+
+def coverage_of(dive: RunningDive) -> DiveCoverage | None:
+    """What the camera has seen in the dive; None where that is switched off."""
+    made = dive.dive_run.deliverables.get("coverage")
+    return made.coverage if isinstance(made, CoverageFiles) else None
 
 
 def described(view: PageView) -> dict[str, Any]:

@@ -16,27 +16,18 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow import __version__
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.from_maps import water_in_numbers
-from aquaflow.dive.metric_outputs import (
-    MetricOutputs,
-    frame_numbers,
-    water_in,
-    worlds_in_words,
-)
+from aquaflow.dive.medium_json import medium_json
+from aquaflow.dive.metric_outputs import MetricOutputs, frame_numbers, water_in, worlds_in_words
 from aquaflow.dive.results import WaterSummary
 from aquaflow.dive.run import DiveRun
+from aquaflow.dive.trajectory_csv import PoseRow
 from aquaflow.geometry.arrays import Array
 from aquaflow.geometry.similarity import Sim3, quaternion_from_rotation
 from aquaflow.geometry.similarity_batch import Sim3Batch
-from aquaflow.survey.coverage import PageView
-from aquaflow.survey.coverage.coverage_files import current_views
-from aquaflow.survey.report import PathPlot, ReportData
-from aquaflow.survey.report.dive_measures import measures
-from aquaflow.survey.report.report_data import camera_summary, medium_curves
-from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.tracking.frame_table import CLASSES, NONE
 from aquaflow.tracking.frames import FrameClass
-from aquaflow.types import CameraModel
 
 if TYPE_CHECKING:
     from aquaflow.mapping.mapper import Mapper
@@ -106,12 +97,49 @@ class Interim:
             folder.write_cameras(camera, self._run.calibration)
 
     def write_report(self, mappers: Mapping[int, Mapper]) -> None:
-        """metrics.json and report.html."""
-        run, camera = self._run, self._run.slam.tracker.camera
+        """metrics.json, and what the deliverables make of the moment."""
+        run = self._run
         numbers = self._numbers(sum(len(mapper.gaussians) for mapper in mappers.values()))
         run.folder.write_json("metrics.json", numbers)
-        if camera is not None:
-            run.folder.write_report(self._report(camera, numbers))
+        if run.slam.tracker.camera is None:
+            return
+        dive = self._dive(numbers, mappers)
+        for name, each in run.deliverables.items():
+            with run.slam.failures.contain(name):
+                each.refresh(dive)
+
+    def _dive(self, numbers: dict[str, Any], mappers: Mapping[int, Mapper]) -> Dive:
+        """What is known of the moment; notes of a dive that goes on are in no file."""
+        run, waters = self._run, self._waters
+        frame, water = self._outputs.frame(self._main), waters.get(self._main)
+        known = None if water is None else water_in(water, frame.T_nm.scale)
+        notes = [NOTE, *self._notes, *run.slam.failures.notes()]
+        return Dive(
+            run.folder.path,
+            name=run.name,
+            config=run.config,
+            camera=run.slam.tracker.camera,
+            is_calibrated=run.calibration is not None,
+            metrics=numbers | {"notes": notes},
+            metric_frames=self._outputs.frames,
+            main=self._main,
+            poses=self._rows(),
+            medium_facts=medium_json(known, frame),
+            attenuations={n: each.beta_a for n, each in waters.items() if each is not None},
+            maps=mappers,
+            held_out=[],
+        )
+
+    def _rows(self) -> list[PoseRow]:
+        """Each pose in the order of the recording; what telemetry says of it comes at the end."""
+        poses, rows = self._posed(), []
+        for i in np.argsort(poses.index, kind="stable"):
+            x, y, z = poses.positions[i].tolist()
+            number = int(poses.sub_maps[i])
+            unit = self._outputs.frame(number).unit
+            index, t_s = int(poses.index[i]), float(poses.t_s[i])
+            rows.append(PoseRow(index, t_s, None, number, x, y, z, unit))
+        return rows
 
     @property
     def _main(self) -> int:
@@ -150,24 +178,6 @@ class Interim:
             **frame_numbers(self._outputs.frame(self._main)),
         }
 
-    def _report(self, camera: CameraModel, numbers: dict[str, Any]) -> ReportData:
-        run, poses = self._run, self._posed()
-        frame, water = self._outputs.frame(self._main), self._waters.get(self._main)
-        known = None if water is None else water_in(water, frame.T_nm.scale)
-        path, seen = _plot(poses, frame, self._outputs), dict[int, PageView]()
-        if run.coverage is not None:
-            seen = current_views(run.coverage, run.slam, self._outputs, self._waters)
-        return ReportData(
-            name=run.name,
-            camera=camera_summary(camera, run.calibration is not None),
-            metrics=numbers,
-            path=path,
-            measures=measures(path, frame, known),
-            medium=medium_curves(known, frame.unit),
-            coverage=seen.get(self._main),
-            notes=[NOTE, *self._notes, *run.slam.failures.notes()],
-        )
-
 
 def posed(
     parts: list[Array],  # each [n] FRAME
@@ -200,18 +210,3 @@ def _poses_of(
     rows: npt.NDArray[np.float64],  # [N, 13] as of_sim3 makes them
 ) -> Sim3Batch:
     return Sim3Batch(rows[:, :9].reshape(-1, 3, 3), rows[:, 9:12], rows[:, 12])
-
-
-def _plot(poses: Poses, frame: MetricFrame, outputs: MetricOutputs) -> PathPlot:
-    order = np.argsort(poses.index, kind="stable")
-    frames = [outputs.frame(int(number)) for number in np.unique(poses.sub_maps)]
-    level = bool(frames) and all(each.level for each in frames)
-    return PathPlot(
-        poses.positions[order],
-        [CLASSES[kind].value for kind in poses.classes[order].tolist()],
-        poses.sub_maps[order].tolist(),
-        unit=frame.unit,
-        up=frame.north if level else "",
-        depth_known=frame.depth_known,
-        placed=level and all(each.metric for each in frames),
-    )

@@ -16,8 +16,8 @@ from aquaflow.live.plan_view import PlanView
 from aquaflow.survey.coverage.classes import Seen
 from aquaflow.survey.coverage.hints import Hint
 from aquaflow.survey.coverage.picture import HEIGHT, WIDTH
-from tests.live.covered_dives import CoveredDive
 from tests.live.health.reports import REPORT
+from tests.survey.coverage.covered_dives import CoveredDive
 from tests.survey.coverage.surveys import lawnmower
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from aquaflow.base.errors.failures import Failures
 from aquaflow.config.coverage import CoverageConfig
 from aquaflow.keyframes import Pointmap
-from aquaflow.live.live_coverage import LiveCoverage
-from aquaflow.survey.coverage import DiveCoverage
+from aquaflow.survey.coverage.coverage_files import CoverageFiles
+from aquaflow.survey.coverage.live_coverage import LiveCoverage
 from tests.survey.coverage.surveys import ALTITUDE, CAMERA, above, metric
 
 
@@ -23,14 +23,15 @@ class CoveredDive:
         self.keyframes: list[Any] = []
         self.attenuation = attenuation
         self.config = SimpleNamespace(coverage=CoverageConfig())
-        run = SimpleNamespace(coverage=DiveCoverage(CoverageConfig()), config=self.config)
         store = SimpleNamespace(keyframes=self.keyframes)
         slam = SimpleNamespace(keyframes=store, metric_frame=lambda _: metric())
-        self.loop: Any = SimpleNamespace(latest=None)
-        maps = SimpleNamespace(inspect=self._inspect)
-        self.parts: Any = SimpleNamespace(run=run, slam=slam, maps=maps, loop=self.loop)
+        slam_to_be: Any = SimpleNamespace(config=self.config)
+        made, maps = {"coverage": CoverageFiles(slam_to_be)}, SimpleNamespace(inspect=self._inspect)
+        run = SimpleNamespace(deliverables=made, config=self.config, slam=slam)
+        self.loop: Any = SimpleNamespace(latest=None, dive_run=run, maps=maps)
+        self.parts: Any = SimpleNamespace(slam=slam, loop=self.loop)
         self.live = LiveCoverage(Failures(), cpu_s=lambda: 0.0)
-        self.live.show(self.parts)
+        self.live.show(self.loop)
         self.pictures = 0
 
     def _inspect(self, name: str, job: Callable[[Any, Any], None]) -> None:

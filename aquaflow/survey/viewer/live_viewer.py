@@ -5,36 +5,38 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.viewer import ViewerConfig
-from aquaflow.live.live_path import LivePath
-from aquaflow.live.loop import LiveLoop
-from aquaflow.live.showing import LOOK_S, Showing
+from aquaflow.dive.views import LOOK_S, DiveView, RunningDive, Showing
 from aquaflow.mapping.work import OwnedMaps
 from aquaflow.sources.newest import Newest
 from aquaflow.survey.coverage.plan import CoveragePlan
 from aquaflow.survey.measure.scale import Scale
-from aquaflow.survey.viewer.copies import MapCopy, Pose, shown
+from aquaflow.survey.viewer.copies import Pose, shown
+from aquaflow.survey.viewer.live_path import LivePath
 from aquaflow.survey.viewer.measuring import Frame
 from aquaflow.survey.viewer.page import ViewerPage
 from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.tracking.frames import Tracked
 
+if TYPE_CHECKING:
+    from aquaflow.mapping.map_copy import MapCopy
 
-class LiveViewer:
+
+class LiveViewer(DiveView):
     """Takes new data from the loop and the maps, and shows them from its own thread."""
 
     def __init__(
         self,
         config: ViewerConfig,
         report: Callable[[], dict[str, Any]],
-        plan: Callable[[int], CoveragePlan | None] = lambda sub_map: None,
+        plan: Callable[[int], CoveragePlan | None] | None = None,
     ) -> None:
-        """Raises what :class:`ViewerPage` raises. ``plan``: the coverage of a sub-map."""
+        """Raises what :class:`ViewerPage` raises. ``plan``: the coverage of a sub-map, if any."""
         self._config, self._report, self._plan = config, report, plan
         self._page = ViewerPage(config, "AquaFlow")
         self.address = self._page.address
@@ -52,22 +54,22 @@ class LiveViewer:
         """Gaussians that a browser gets at the moment."""
         return self._page.splats_shown
 
-    def begin(self) -> None:
+    def show(self, dive: RunningDive) -> None:
         """A dive begins: its path is shown, and no other's."""
         self._path, self._asked = LivePath(), False
 
-    def update(self, loop: LiveLoop) -> None:
+    def update(self, dive: RunningDive) -> None:
         """Called after every turn of the loop; queues what is new for the browser, never waits."""
-        now, latest, frame = time.monotonic(), loop.latest, loop.picture
+        now, latest, frame = time.monotonic(), dive.latest, dive.picture
         if latest is None or frame is None or latest.T_wc is None:
             return
         if now - self._pose_s >= 1.0 / self._config.pose_hz:
             self._pose_s = now
-            self._hand_over(loop, latest, frame.image)
+            self._hand_over(dive, latest, frame.image)
         if now - self._map_s >= self._config.refresh_s and not self._asked:
             self._map_s, self._asked = now, True
             sub_map = latest.sub_map
-            loop.maps.inspect("show the map", lambda maps, _: self._copy(maps, sub_map))
+            dive.maps.inspect("show the map", lambda maps, _: self._copy(maps, sub_map))
 
     def close(self) -> None:
         self._showing.close()
@@ -75,13 +77,13 @@ class LiveViewer:
 
     def _hand_over(
         self,
-        loop: LiveLoop,
+        dive: RunningDive,
         latest: Tracked,
         image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
     ) -> None:
         assert latest.T_wc is not None
-        self._path.add(latest, loop.run_.slam.metric_frame(latest.sub_map))
-        kept = loop.run_.pictures
+        self._path.add(latest, dive.dive_run.slam.metric_frame(latest.sub_map))
+        kept = dive.dive_run.pictures
         self._pictures = {} if kept is None else kept.paths
         step = max(1, image.shape[1] // self._config.picture_width)
         small = np.ascontiguousarray(image[::step, ::step])
@@ -92,7 +94,7 @@ class LiveViewer:
         self._asked = False
         mapper = maps.mappers.get(sub_map)
         if mapper is not None and mapper.views and len(mapper.gaussians):
-            from aquaflow.survey.viewer.snapshot import copied  # torch, which has made the map
+            from aquaflow.mapping.map_copy import copied  # torch, which has made the map
 
             self._copies.put((sub_map, copied(mapper)))
 
@@ -111,7 +113,7 @@ class LiveViewer:
         taken = self._copies.take(0.0)
         if taken is not None:
             sub_map, copy = taken
-            plan = self._plan(sub_map) if self._page.watched else None
+            plan = self._plan(sub_map) if self._plan is not None and self._page.watched else None
             self._page.show_splats(*shown(copy, self._config.splats, frame, plan))
         self._page.show_health(in_words(report))
 

@@ -1,0 +1,248 @@
+"""The files at the end of a dive; each part is computed and written separately.
+
+A part that fails is counted and made once more; one that fails again is named in the notes and left
+out, and never costs another. Where it was the maps' device that failed, they go on on the CPU, and
+the part is made there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, TypeVar
+
+from aquaflow.base.clocks.deadline import Deadline
+from aquaflow.dive.deliverable import Deliverable, Phase
+from aquaflow.dive.dive import Dive
+from aquaflow.dive.folder import IN_SITE, DiveFolder
+from aquaflow.dive.found_camera import FoundCamera
+from aquaflow.dive.from_maps import held_out_examples, water_in_numbers
+from aquaflow.dive.georeference import GEOREFERENCE, georeference
+from aquaflow.dive.held_out_example import HeldOut, mean_amplification
+from aquaflow.dive.in_site import in_site
+from aquaflow.dive.medium_json import medium_json
+from aquaflow.dive.metric_outputs import MetricOutputs, held_out_in, water_in, worlds_in_words
+from aquaflow.dive.path_rows import path_rows
+from aquaflow.dive.places_of_dive import write_places_of
+from aquaflow.dive.results import WaterSummary, largest_sub_map, refined_poses, tracked_poses
+from aquaflow.dive.trajectory_csv import PoseRow
+from aquaflow.geometry.similarity import Sim3
+from aquaflow.slam import Slam
+from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.tracking.frames import Tracked
+from aquaflow.types import CameraModel
+
+T = TypeVar("T")
+
+
+class Deliverables:
+    """Evaluates a finished dive and writes its files into the dive folder: those of the core, and
+    by :meth:`make` the others."""
+
+    def __init__(
+        self,
+        name: str,
+        folder: DiveFolder,
+        slam: Slam,
+        results: list[Tracked],
+        calibration: CameraModel | None,
+        outputs: MetricOutputs | None = None,
+        found: FoundCamera | None = None,
+        others: Mapping[str, Deliverable] | None = None,
+    ) -> None:
+        """``results``: all frames with their final poses; ``calibration``: as given, if any, else
+        ``found`` may be there; ``outputs``: None where nothing but the map is known; ``others``:
+        as :func:`aquaflow.dive.deliverable.deliverables_of` gives them."""
+        self.name, self.folder, self.slam = name, folder, slam
+        self.results, self.calibration, self._found = results, calibration, found
+        self._others = others or {}
+        self.outputs = outputs or MetricOutputs()
+        self.held_out: list[HeldOut] = []
+        """Ranges in the unit of the largest sub-map's metric frame."""
+        self.notes: list[str] = []
+        """What was left out."""
+        self._poses_m = tracked_poses(results)
+        """T_mc by frame index."""
+        self.poses: dict[int, Sim3] = self._in_n(self._poses_m)
+        """T_nc by frame index."""
+        self._main = largest_sub_map(results)
+        self._waters: dict[int, WaterSummary | None] = {}
+        """By sub-map, in map units; a sub-map whose summary failed is missing."""
+        self._rows: list[PoseRow] | None = None
+
+    def _attempt(self, stage: str, work: Callable[[], T]) -> T | None:
+        failures = self.slam.failures
+        before = failures.of_device
+        made = failures.attempt(stage, work)
+        # A part may have contained the failure itself, and be there without what it cost.
+        if failures.of_device > before and self.slam.maps.leave_device(f"in {stage}"):
+            made = failures.attempt(stage, work)
+        return made
+
+    @property
+    def metric_frame(self) -> MetricFrame:
+        """Of the largest sub-map."""
+        return self.outputs.frame(self._main)
+
+    def _in_n(self, poses: dict[int, Sim3]) -> dict[int, Sim3]:
+        sub_maps = {tracked.frame.index: tracked.sub_map for tracked in self.results}
+        return {index: self.outputs.frame(sub_maps[index]).pose(T) for index, T in poses.items()}
+
+    def summarise(self) -> None:
+        """Poses as the map refined them, and the water of each sub-map."""
+        attempt = self._attempt
+        refined = attempt("refined poses", lambda: refined_poses(self.slam, self.results))
+        self._poses_m = refined or self._poses_m
+        self.poses = self._in_n(self._poses_m)
+        for sub_map in self.slam.mappers:
+            attempt("water summary", partial(self._summarise_water, sub_map))
+
+    def _summarise_water(self, sub_map: int) -> None:
+        self._waters[sub_map] = water_in_numbers(self.slam.mappers[sub_map])
+
+    def evaluate(self, until: Deadline | None = None) -> None:
+        """Held-out views, as many as there is time for."""
+        main, attempt = self._main, self._attempt
+        found = attempt("evaluation", lambda: held_out_examples(self.slam, main, until)) or []
+        scale = self.metric_frame.T_nm.scale
+        self.held_out = [held_out_in(example, scale) for example in found]
+        there = len(self.slam.held_out.get(main, ()))
+        if until is not None and until.over and len(found) < there:
+            self.notes.append(
+                f"{there - len(found)} of {there} held-out views were not evaluated: the dive's "
+                "end had no more time (service.finish_s)"
+            )
+
+    def make(
+        self,
+        phase: Phase,
+        until: Deadline | None = None,
+        metrics: dict[str, Any] | None = None,
+    ) -> None:
+        """The deliverables of other floors that belong to ``phase``; ``metrics``: the content of
+        metrics.json with the notes, as far as it is known."""
+
+        def work(each: Deliverable) -> None:
+            each.make(self.dive(metrics or {}), until or Deadline(None))
+
+        for each in self._others.values():
+            if each.phase is phase:
+                self._attempt(each.stage, partial(work, each))
+
+    def dive(self, metrics: dict[str, Any]) -> Dive:
+        """What is known by now, as who reads the folder later will see it."""
+        known: dict[str, Any] = {
+            "name": self.name,
+            "config": self.slam.config,
+            "is_calibrated": self.calibration is not None,
+            "metrics": metrics,
+            "metric_frames": self.outputs.frames,
+            "main": self._main,
+            "medium_facts": self._medium_facts(),
+            "attenuations": self._attenuations(),
+            "maps": self.slam.mappers,
+            "held_out": self.held_out,
+        }
+        if self._rows is not None:
+            known["poses"] = self._rows
+        if self.slam.tracker.camera is not None:
+            known["camera"] = self.slam.tracker.camera
+        return Dive(self.folder.path, **known)
+
+    def _attenuations(self) -> dict[int, Sequence[float]]:
+        return {n: water.beta_a for n, water in self._waters.items() if water is not None}
+
+    def _path_rows(self) -> list[PoseRow]:
+        if self._rows is None:
+            self._rows = path_rows(self.outputs, self.results, self.poses)
+        return self._rows
+
+    def write(self) -> None:
+        """Trajectory, cameras and maps: what does not wait for an evaluation."""
+        attempt = self._attempt
+        attempt("writing trajectory.tum", self._write_trajectory)
+        attempt("writing trajectory.csv", self._write_path_table)
+        attempt("writing metric.json", self._write_metric_file)
+        attempt("writing georeference.json", self._write_georeference)
+        attempt(f"writing {IN_SITE}", self._write_in_site)
+        camera = self.slam.tracker.camera
+        if camera is not None:
+            attempt("writing camera.yaml", partial(self._write_cameras, camera))
+        for sub_map in self.slam.mappers:
+            self._write_map(sub_map)
+        places = partial(write_places_of, self.folder.path, self.slam, self._poses_m)
+        attempt("writing places.npz", places)
+
+    def write_evaluation(self) -> None:
+        """The held-out views, and the water with what they say of it."""
+        attempt = self._attempt
+        attempt("writing held-out views", partial(self.folder.write_held_out, self.held_out))
+        if self._is_water_known:
+            attempt("writing medium.json", self._write_medium)
+
+    def _write_cameras(self, mapped: CameraModel) -> None:
+        """With the calibration that was given, or found: in time for this dive or for the next."""
+        found = self._found if self.calibration is None else None
+        if found is None:
+            self.folder.write_cameras(mapped, self.calibration)
+            return
+        comment = f"found from the dive itself: focal length {found.words}"
+        self.folder.write_cameras(mapped, found.camera if found.used else None, comment)
+        if found.suggested:
+            self.folder.write_suggested_camera(found.camera, comment)
+
+    def _write_trajectory(self) -> None:
+        times = {tracked.frame.index: tracked.frame.t_ns * 1e-9 for tracked in self.results}
+        sub_maps = sorted({t.sub_map for t in self.results if t.frame.index in self.poses})
+        comment = worlds_in_words({number: self.outputs.frame(number) for number in sub_maps})
+        self.folder.write_trajectory(
+            [times[i] for i in self.poses], list(self.poses.values()), comment
+        )
+
+    def _write_path_table(self) -> None:
+        self.folder.write_path_table(self._path_rows())
+
+    def _write_metric_file(self) -> None:
+        self.folder.write_metric_frames(self.outputs.frames, self._main)
+
+    def _write_georeference(self) -> None:
+        content = georeference(self.outputs.frames, self._main)
+        if content is not None:
+            self.folder.write_json(GEOREFERENCE, content)
+
+    def _write_in_site(self) -> None:
+        if self.slam.in_base is not None:
+            self.folder.write_json(IN_SITE, in_site(self.slam.in_base, self.slam.keyframes))
+
+    def _water(self) -> WaterSummary | None:
+        """Of the largest sub-map, in the unit of its metric frame."""
+        water = self._waters.get(self._main)
+        return None if water is None else water_in(water, self.metric_frame.T_nm.scale)
+
+    def _write_medium(self) -> None:
+        self.folder.write_medium(self._medium_facts())
+
+    @property
+    def _is_water_known(self) -> bool:
+        return self._main in self._waters or not self.slam.mappers
+
+    def _medium_facts(self) -> dict[str, Any]:
+        if not self._is_water_known:
+            return {}
+        mapper = self.slam.mappers.get(self._main)
+        evidence = None if mapper is None else mapper.scene.water_evidence
+        amplification = mean_amplification(self.held_out)
+        return medium_json(self._water(), self.metric_frame, evidence, amplification)
+
+    def _write_map(self, sub_map: int) -> None:
+        suffix = "" if sub_map == self._main else f"_{sub_map}"
+        water, frame = self._waters.get(sub_map), self.outputs.frame(sub_map)
+
+        def write_map() -> None:
+            self.folder.write_map(self.slam.mappers[sub_map], suffix)
+
+        def write_splats() -> None:
+            self.folder.write_splats(self.slam.mappers[sub_map], water, frame, suffix)
+
+        self._attempt(f"writing map{suffix}.aqf", write_map)
+        self._attempt(f"writing map{suffix}.ply", write_splats)
