@@ -7,12 +7,15 @@ import math
 from collections.abc import Callable
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from aquaflow.base.errors import InputError
 from aquaflow.cli.console import Json, progress_bars
+
+if TYPE_CHECKING:
+    from aquaflow.dive.dive import Dive
 
 
 class ExportFormat(str, Enum):
@@ -69,8 +72,6 @@ MESHES: dict[ExportFormat, Literal["ply", "obj", "glb"]] = {
 }
 """Formats that are triangles."""
 
-MAP_FILE = "map.aqf"
-"""What every finished dive with a map has."""
 
 Progress = Callable[[int, int], None]
 
@@ -121,8 +122,10 @@ def export(
     _refuse_others(format, given)
     if resolution is not None and not (math.isfinite(resolution) and resolution > 0.0):
         raise InputError(f"--resolution {resolution:g} is no size of a pixel; give a positive one")
-    if not (dive / MAP_FILE).exists():
-        raise InputError(f"{dive} holds no finished dive: {MAP_FILE} is missing")
+    from aquaflow.dive.dive import MAP, Dive
+
+    read = Dive(dive)
+    read.require(MAP)
     target = out or dive / NAMES[format]
     with progress_bars(quiet=as_json) as bars:
 
@@ -130,20 +133,20 @@ def export(
             bars(format.value, done, total)
 
         if format is ExportFormat.restored:
-            said, facts = _restored(dive, target, recording, progress)
+            said, facts = _restored(read, target, recording, progress)
         elif format in (ExportFormat.laz, ExportFormat.e57):
-            said, facts = _points(dive, target, format, water, progress)
+            said, facts = _points(read, target, format, water, progress)
         elif format is ExportFormat.spz:
-            said, facts = _compressed(dive, target, water)
+            said, facts = _compressed(read, target, water)
         elif format in (ExportFormat.ortho, ExportFormat.dem):
             kind: Literal["ortho", "dem"] = "dem" if format is ExportFormat.dem else "ortho"
-            said, facts = _survey(dive, target, kind, resolution, water, bars)
+            said, facts = _survey(read, target, kind, resolution, water, bars)
         elif format in MESHES:
-            said, facts = _mesh(dive, target, MESHES[format], resolution, water, bars)
+            said, facts = _mesh(read, target, MESHES[format], resolution, water, bars)
         elif format is ExportFormat.mcap:
-            said, facts = _messages(dive, target, recording, progress)
+            said, facts = _messages(read, target, recording, progress)
         else:
-            said, facts = _posed_pictures(dive, target, format, recording, restored, progress)
+            said, facts = _posed_pictures(read, target, format, recording, restored, progress)
     if as_json:
         typer.echo(json.dumps({"out": str(target), **facts}))
     else:
@@ -157,7 +160,7 @@ def _refuse_others(format: ExportFormat, given: dict[str, bool]) -> None:
 
 
 def _restored(
-    dive: Path, folder: Path, recording: Path | None, progress: Progress
+    dive: Dive, folder: Path, recording: Path | None, progress: Progress
 ) -> tuple[str, dict[str, Any]]:
     from aquaflow.dive.restored import export_restored
 
@@ -166,7 +169,7 @@ def _restored(
 
 
 def _points(
-    dive: Path, path: Path, format: ExportFormat, water: bool, progress: Progress
+    dive: Dive, path: Path, format: ExportFormat, water: bool, progress: Progress
 ) -> tuple[str, dict[str, Any]]:
     from aquaflow.dive.point_cloud import read_point_cloud
     from aquaflow.survey.export.e57 import write_e57
@@ -184,7 +187,7 @@ def _points(
     }
 
 
-def _compressed(dive: Path, path: Path, water: bool) -> tuple[str, dict[str, Any]]:
+def _compressed(dive: Dive, path: Path, water: bool) -> tuple[str, dict[str, Any]]:
     from aquaflow.survey.export.spz import export_spz
 
     count, where = export_spz(dive, path, water)
@@ -193,7 +196,7 @@ def _compressed(dive: Path, path: Path, water: bool) -> tuple[str, dict[str, Any
 
 
 def _mesh(
-    dive: Path,
+    dive: Dive,
     path: Path,
     kind: Literal["ply", "obj", "glb"],
     resolution: float | None,
@@ -219,7 +222,7 @@ def _mesh(
 
 
 def _posed_pictures(
-    dive: Path,
+    dive: Dive,
     folder: Path,
     format: ExportFormat,
     recording: Path | None,
@@ -236,7 +239,7 @@ def _posed_pictures(
 
 
 def _messages(
-    dive: Path, path: Path, recording: Path | None, progress: Progress
+    dive: Dive, path: Path, recording: Path | None, progress: Progress
 ) -> tuple[str, dict[str, Any]]:
     from aquaflow.survey.export.mcap_export import export_mcap
 
@@ -254,7 +257,7 @@ def _messages(
 
 
 def _survey(
-    dive: Path,
+    dive: Dive,
     folder: Path,
     kind: Literal["ortho", "dem"],
     resolution: float | None,

@@ -69,6 +69,10 @@ class Dive:
         """Number of frames, posed or not."""
         return len(self.frames)
 
+    def __str__(self) -> str:
+        """Its folder, for sentences."""
+        return str(self.path)
+
     # --- the folder -----------------------------------------------------------------------------
 
     def file(self, name: str) -> Path:
@@ -189,6 +193,11 @@ class Dive:
         return load_camera(self.file(CAMERA))
 
     @cached_property
+    def calibration(self) -> CameraModel | None:
+        """The camera that the pictures were undistorted with; None where they were not."""
+        return load_camera(self.file(CALIBRATION)) if self.has(CALIBRATION) else None
+
+    @cached_property
     def is_calibrated(self) -> bool:
         """True if the user gave the lens; False if the dive itself showed it."""
         try:
@@ -243,7 +252,7 @@ class Dive:
     def medium(self) -> Medium | None:
         """The water of the largest sub-map, with rates per ``unit``; None if none is modelled."""
         facts = self.medium_facts
-        return medium_of(facts, self.file(MEDIUM)) if facts else None
+        return medium_of(facts, self.file(MEDIUM)) if facts or self.has(MEDIUM) else None
 
     @cached_property
     def attenuations(self) -> Mapping[int, Sequence[float]]:

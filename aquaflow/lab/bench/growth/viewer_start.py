@@ -8,7 +8,8 @@ from pathlib import Path
 from urllib.request import urlopen
 
 from aquaflow.config.viewer import ViewerConfig
-from aquaflow.survey.viewer.finished import read_dive, show_dive
+from aquaflow.dive.dive import Dive
+from aquaflow.survey.viewer.finished import finished_dive, show_dive
 
 PATIENCE_S = 60.0
 """After which a viewer that does not answer has failed."""
@@ -24,7 +25,7 @@ def viewer_start(dive: Path) -> dict[str, float]:
     """
     began = time.perf_counter()
     config = ViewerConfig(port=0)
-    page = show_dive(read_dive(dive, config.splats), config)
+    page = show_dive(finished_dive(Dive(dive), config.splats), config)
     try:
         _get(page.address)
         page_s = time.perf_counter() - began
