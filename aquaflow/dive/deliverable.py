@@ -39,7 +39,8 @@ class Deliverable:
         self.slam = slam
 
     def look(self) -> None:
-        """Take in what is new of the dive; called while frames come."""
+        """Take in what is new of the dive; called while the frames of a replay come, after each
+        keyframe. A live dive's coverage is looked at by a thread of its own."""
 
     def refresh(self, dive: Dive) -> None:
         """Make it of a ``dive`` that goes on, where that is cheap."""
