@@ -7,13 +7,16 @@ import math
 from collections.abc import Callable
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import refuse_linked_folders
 from aquaflow.cli.console import Json, progress_bars
+
+if TYPE_CHECKING:
+    from aquaflow.dive.dive import Dive
 
 
 class ExportFormat(str, Enum):
@@ -120,9 +123,10 @@ def export(
     _refuse_others(format, given)
     if resolution is not None and not (math.isfinite(resolution) and resolution > 0.0):
         raise InputError(f"--resolution {resolution:g} is no size of a pixel; give a positive one")
-    from aquaflow.base.storage.dive_status import refuse_without_map
+    from aquaflow.dive.dive import MAP, Dive
 
-    refuse_without_map(dive)
+    read = Dive(dive)
+    read.require(MAP)
     target = out or _own_target(dive / NAMES[format])
     with progress_bars(quiet=as_json) as bars:
 
@@ -130,20 +134,20 @@ def export(
             bars(format.value, done, total)
 
         if format is ExportFormat.restored:
-            said, facts = _restored(dive, target, recording, progress)
+            said, facts = _restored(read, target, recording, progress)
         elif format in (ExportFormat.laz, ExportFormat.e57):
-            said, facts = _points(dive, target, format, water, progress)
+            said, facts = _points(read, target, format, water, progress)
         elif format is ExportFormat.spz:
-            said, facts = _compressed(dive, target, water)
+            said, facts = _compressed(read, target, water)
         elif format in (ExportFormat.ortho, ExportFormat.dem):
             kind: Literal["ortho", "dem"] = "dem" if format is ExportFormat.dem else "ortho"
-            said, facts = _survey(dive, target, kind, resolution, water, bars)
+            said, facts = _survey(read, target, kind, resolution, water, bars)
         elif format in MESHES:
-            said, facts = _mesh(dive, target, MESHES[format], resolution, water, bars)
+            said, facts = _mesh(read, target, MESHES[format], resolution, water, bars)
         elif format is ExportFormat.mcap:
-            said, facts = _messages(dive, target, recording, progress)
+            said, facts = _messages(read, target, recording, progress)
         else:
-            said, facts = _posed_pictures(dive, target, format, recording, restored, progress)
+            said, facts = _posed_pictures(read, target, format, recording, restored, progress)
     if as_json:
         typer.echo(json.dumps({"out": str(target), **facts}))
     else:
@@ -168,7 +172,7 @@ def _refuse_others(format: ExportFormat, given: dict[str, bool]) -> None:
 
 
 def _restored(
-    dive: Path, folder: Path, recording: Path | None, progress: Progress
+    dive: Dive, folder: Path, recording: Path | None, progress: Progress
 ) -> tuple[str, dict[str, Any]]:
     from aquaflow.dive.restored import export_restored
 
@@ -177,7 +181,7 @@ def _restored(
 
 
 def _points(
-    dive: Path, path: Path, format: ExportFormat, water: bool, progress: Progress
+    dive: Dive, path: Path, format: ExportFormat, water: bool, progress: Progress
 ) -> tuple[str, dict[str, Any]]:
     from aquaflow.dive.point_cloud import read_point_cloud
     from aquaflow.survey.export.e57 import write_e57
@@ -195,7 +199,7 @@ def _points(
     }
 
 
-def _compressed(dive: Path, path: Path, water: bool) -> tuple[str, dict[str, Any]]:
+def _compressed(dive: Dive, path: Path, water: bool) -> tuple[str, dict[str, Any]]:
     from aquaflow.survey.export.spz import export_spz
 
     count, where = export_spz(dive, path, water)
@@ -204,7 +208,7 @@ def _compressed(dive: Path, path: Path, water: bool) -> tuple[str, dict[str, Any
 
 
 def _mesh(
-    dive: Path,
+    dive: Dive,
     path: Path,
     kind: Literal["ply", "obj", "glb"],
     resolution: float | None,
@@ -230,7 +234,7 @@ def _mesh(
 
 
 def _posed_pictures(
-    dive: Path,
+    dive: Dive,
     folder: Path,
     format: ExportFormat,
     recording: Path | None,
@@ -247,7 +251,7 @@ def _posed_pictures(
 
 
 def _messages(
-    dive: Path, path: Path, recording: Path | None, progress: Progress
+    dive: Dive, path: Path, recording: Path | None, progress: Progress
 ) -> tuple[str, dict[str, Any]]:
     from aquaflow.survey.export.mcap_export import export_mcap
 
@@ -265,7 +269,7 @@ def _messages(
 
 
 def _survey(
-    dive: Path,
+    dive: Dive,
     folder: Path,
     kind: Literal["ortho", "dem"],
     resolution: float | None,

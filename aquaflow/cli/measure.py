@@ -15,6 +15,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.cli.console import Json, progress_bars
 
 if TYPE_CHECKING:
+    from aquaflow.dive.dive import Dive
     from aquaflow.survey.measure.answers import Answer
     from aquaflow.survey.measure.reef_numbers import ReefNumbers
     from aquaflow.survey.measure.units import LengthUnit
@@ -73,13 +74,10 @@ def measure(
     as_json: Json = False,
 ) -> None:
     """Measure in a finished dive: the ground in numbers, or between points; or tend its notes."""
-    from aquaflow.base.storage.dive_status import refuse_without_map
-
     if notes or delete:
         if point or any(each is not None for each in (shape, cell, note, csv)):
             raise InputError("--notes and --delete measure nothing; give no other options")
-        refuse_without_map(dive)
-        _tend_notes(dive, delete or [], as_json)
+        _tend_notes(_with_map(dive), delete or [], as_json)
         return
     if cell is not None and not (math.isfinite(cell) and cell > 0.0):
         raise InputError(f"--cell {cell:g} is no size of a cell; give a positive one")
@@ -87,36 +85,41 @@ def measure(
         raise InputError(f"{csv} does not end in .csv; give the table a file of its own")
     if not point and (shape is not None or note is not None):
         raise InputError("--as and --note need points; give --point for each")
-    refuse_without_map(dive)
-    from aquaflow.dive.dive import Dive
+    read = _with_map(dive)
     from aquaflow.survey.measure.finished_dive import numbers_of_dive
     from aquaflow.survey.measure.reef_files import write_csv
 
     with progress_bars(quiet=as_json) as bars, tempfile.TemporaryDirectory() as work:
         found: Answer | ReefNumbers
         if point:
-            found = _between(dive, point, shape, cell, Path(work), bars)
+            found = _between(read, point, shape, cell, Path(work), bars)
         else:
-            found = numbers_of_dive(Dive(dive), Path(work), cell, bars)
+            found = numbers_of_dive(read, Path(work), cell, bars)
     if note is not None:
-        _pin(dive, note, found)
+        _pin(read, note, found)
     if csv is not None:
         write_csv(csv, found.rows())
     unit: LengthUnit = "feet" if units is Units.feet else "metres"
     typer.echo(json.dumps(found.to_json()) if as_json else _in_words(found, unit))
 
 
-def _tend_notes(dive: Path, delete: list[str], as_json: bool) -> None:
-    """Remove the notes with these keys, and list what is left."""
-    from aquaflow.dive.map_file import SUFFIX
-    from aquaflow.survey.measure.notes import listed, read_notes, without, write_notes
-    from aquaflow.telemetry.metric_file import read_frame_of_map
+def _with_map(dive: Path) -> Dive:
+    from aquaflow.dive.dive import MAP, Dive
 
-    frame = read_frame_of_map(dive / f"map{SUFFIX}")
-    notes = read_notes(dive, frame)
+    read = Dive(dive)
+    read.require(MAP)
+    return read
+
+
+def _tend_notes(dive: Dive, delete: list[str], as_json: bool) -> None:
+    """Remove the notes with these keys, and list what is left."""
+    from aquaflow.survey.measure.notes import listed, read_notes, without, write_notes
+
+    frame = dive.frame
+    notes = read_notes(dive.path, frame)
     if delete:
         notes = without(notes, delete)
-        write_notes(dive, notes, frame)
+        write_notes(dive.path, notes, frame)
     if as_json:
         typer.echo(json.dumps({"unit": frame.unit, "notes": [note.to_json() for note in notes]}))
         return
@@ -124,7 +127,7 @@ def _tend_notes(dive: Path, delete: list[str], as_json: bool) -> None:
 
 
 def _between(
-    dive: Path,
+    dive: Dive,
     texts: list[str],
     shape: Shape | None,
     cell: float | None,
@@ -139,17 +142,15 @@ def _between(
     return answer(dive, asked, None if shape is None else shape.value, work, cell, progress)
 
 
-def _pin(dive: Path, text: str, found: Any) -> None:
-    from aquaflow.dive.map_file import SUFFIX
+def _pin(dive: Dive, text: str, found: Any) -> None:
     from aquaflow.survey.measure.notes import new_note, read_notes, write_notes
-    from aquaflow.telemetry.metric_file import read_frame_of_map
 
-    frame = read_frame_of_map(dive / f"map{SUFFIX}")
-    notes = read_notes(dive, frame)
+    frame = dive.frame
+    notes = read_notes(dive.path, frame)
     measured = found.to_json()["measured"]
     shape: Literal["Polygon", "LineString"] = "Polygon" if found.shape == "area" else "LineString"
     note = new_note(notes, text, shape, found.places, {"measured": measured})
-    write_notes(dive, [*notes, note], frame)
+    write_notes(dive.path, [*notes, note], frame)
 
 
 def _in_words(found: Any, unit: LengthUnit) -> str:

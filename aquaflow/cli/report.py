@@ -28,12 +28,10 @@ def report(
     """Write the report of a finished dive as one PDF, to print or to send."""
     if pdf is not None and pdf.suffix.lower() != ".pdf":
         raise InputError(f"{pdf} does not end in .pdf; give the report a file of its own")
-    from aquaflow.base.storage.dive_status import refuse_unfinished
     from aquaflow.dive.dive import FRAMES, METRICS, Dive
     from aquaflow.survey.report.pdf import write_pdf
     from aquaflow.survey.report.report_of import report_of
 
-    refuse_unfinished(dive)
     out, of = pdf or dive / NAME, Dive(dive)
     of.require(FRAMES, METRICS)
     pages = write_pdf(out, report_of(of))

@@ -80,13 +80,14 @@ def _measured(
         raise typer.BadParameter("points x,y need --frame, the number of the picture's frame")
     if len(start) == 3 and frame is not None:
         raise typer.BadParameter("points x,y,z are of the map; leave out --frame")
+    from aquaflow.dive.dive import Dive
     from aquaflow.survey.measure.scale_bar import between_pixels, between_points  # loads torch
 
     if frame is None:
         ends = [(point[0], point[1], point[2]) for point in (start, end)]
-        return between_points(dive, ends[0], ends[1], length_m, sigma_m)
+        return between_points(Dive(dive), ends[0], ends[1], length_m, sigma_m)
     pixels = [(point[0], point[1]) for point in (start, end)]
-    return between_pixels(dive, frame, pixels[0], pixels[1], length_m, sigma_m)
+    return between_pixels(Dive(dive), frame, pixels[0], pixels[1], length_m, sigma_m)
 
 
 def _numbers(option: str, text: str) -> tuple[float, ...]:

@@ -65,9 +65,10 @@ def video(
         "--width": width is not None,
     }  # fmt: skip
     _refuse(kind, given, seconds, width)
-    from aquaflow.base.storage.dive_status import refuse_without_map
+    from aquaflow.dive.dive import MAP, Dive
 
-    refuse_without_map(dive)
+    read = Dive(dive)
+    read.require(MAP)
     with progress_bars(quiet=as_json) as bars:
 
         def progress(done: int, total: int) -> None:
@@ -78,19 +79,19 @@ def video(
             from aquaflow.survey.video.fly_through import fly_through
 
             flight_s = FLIGHT_S if seconds is None else seconds
-            count = fly_through(dive, out, flight_s, water, width, progress)
+            count = fly_through(read, out, flight_s, water, width, progress)
             said, facts = f"Wrote a flight of {count} pictures to {out}.", {"frames": count}
         elif kind is VideoKind.side_by_side:
             from aquaflow.survey.video.side_by_side import side_by_side
 
-            count = side_by_side(dive, out, recording, progress)
+            count = side_by_side(read, out, recording, progress)
             said, facts = f"Wrote {count} frames side by side to {out}.", {"frames": count}
         else:
             from aquaflow.survey.video.every_frame import restore_every_frame
 
             if recording is None:
                 raise InputError("--kind restored needs --recording: a dive keeps no pictures")
-            wrote = restore_every_frame(dive, out, recording, width, progress)
+            wrote = restore_every_frame(read, out, recording, width, progress)
             said = f"Wrote {wrote.frames} frames to {out}, {wrote.restored} of them restored."
             facts = {"frames": wrote.frames, "restored": wrote.restored}
     typer.echo(json.dumps({"out": str(out), **facts}) if as_json else said)

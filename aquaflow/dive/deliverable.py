@@ -39,7 +39,8 @@ class Deliverable:
         self.slam = slam
 
     def look(self) -> None:
-        """Take in what is new of the dive; called while frames come."""
+        """Take in what is new of the dive; called while the frames of a replay come, after each
+        keyframe. A live dive's coverage is looked at by a thread of its own."""
 
     def refresh(self, dive: Dive) -> None:
         """Make it of a ``dive`` that goes on, where that is cheap."""
@@ -59,6 +60,9 @@ class Deliverable:
 
 def deliverables_of(slam: Slam) -> dict[str, Deliverable]:
     """One of each that is installed, by name, in the order in which they are made: by phase, then
-    by name."""
-    found = {entry.name: entry.load()(slam) for entry in entry_points(group=GROUP)}
+    by name. One that cannot be loaded costs itself."""
+    found: dict[str, Deliverable] = {}
+    for entry in entry_points(group=GROUP):
+        with slam.failures.contain(f"loading the deliverable {entry.name}"):
+            found[entry.name] = entry.load()(slam)
     return dict(sorted(found.items(), key=lambda each: (each[1].phase, each[0])))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,13 +12,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.base.errors import DamagedError, InputError, reason_of
+from aquaflow.base.errors import DamagedError, InputError, printable, reason_of
+from aquaflow.base.errors.regular_file import open_regular_text, read_regular_json
+from aquaflow.base.storage import dive_status
+from aquaflow.base.storage.dive_status import DiveStatus, read_status, refuse_unfinished
 from aquaflow.config import Config, load_config
 from aquaflow.dive.frames_csv import FrameRow, read_rows
 from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.dive.medium import NAME as MEDIUM
 from aquaflow.dive.medium import Medium, medium_of
-from aquaflow.dive.status import DiveStatus, read_status
+from aquaflow.dive.png import read_png
 from aquaflow.dive.trajectory_csv import NAME as TRAJECTORY_CSV
 from aquaflow.dive.trajectory_csv import PoseRow, read_trajectory_csv
 from aquaflow.dive.tum import Trajectory, associate, read_tum
@@ -32,10 +34,9 @@ from aquaflow.telemetry.metric_frame import MetricFrame
 if TYPE_CHECKING:
     from aquaflow.mapping.mapper import Mapper
 
-FRAMES, TRAJECTORY, METRICS = "frames.csv", "trajectory.tum", "metrics.json"
+FRAMES, METRICS, MAP = dive_status.FRAMES, dive_status.METRICS, dive_status.MAP
+TRAJECTORY = "trajectory.tum"
 CAMERA, CALIBRATION, CONFIG = "camera.yaml", "calibration.yaml", "config.yaml"
-MAP = "map.aqf"
-"""Of the largest sub-map; that of another one is map_N.aqf."""
 HELD_OUT = "heldout"
 """Folder of the held-out views."""
 FOUND = "found from the dive"
@@ -69,6 +70,10 @@ class Dive:
         """Number of frames, posed or not."""
         return len(self.frames)
 
+    def __str__(self) -> str:
+        """Its folder, for sentences."""
+        return str(self.path)
+
     # --- the folder -----------------------------------------------------------------------------
 
     def file(self, name: str) -> Path:
@@ -80,11 +85,12 @@ class Dive:
         return self.file(name).is_file()
 
     def require(self, *names: str) -> None:
-        """For whoever can do nothing without these files.
+        """For whoever can do nothing without these files of a finished dive.
 
         Raises:
-            InputError: one is missing.
+            InputError: the dive is not finished, or one of them is missing.
         """
+        refuse_unfinished(self.path)
         for name in names:
             if not self.has(name):
                 raise InputError(f"{self.path} holds no finished dive: {name} is missing")
@@ -123,7 +129,7 @@ class Dive:
     @cached_property
     def name(self) -> str:
         """Of the dive, for people."""
-        return self.path.resolve().name
+        return printable(self.path.resolve().name)
 
     @cached_property
     def config(self) -> Config:
@@ -138,7 +144,7 @@ class Dive:
     @cached_property
     def trajectory(self) -> Trajectory:
         """P poses, camera to world: positions in ``unit``, times in s since the first frame."""
-        return read_tum(self.file(TRAJECTORY))
+        return read_tum(self.file(TRAJECTORY), inside=True)
 
     @cached_property
     def frame_of_pose(self) -> npt.NDArray[np.intp]:
@@ -186,13 +192,19 @@ class Dive:
     @cached_property
     def camera(self) -> CameraModel:
         """The pinhole camera of the mapped pictures, pixels."""
-        return load_camera(self.file(CAMERA))
+        return load_camera(self.file(CAMERA), inside=True)
+
+    @cached_property
+    def calibration(self) -> CameraModel | None:
+        """The camera that the pictures were undistorted with; None where they were not."""
+        path = self.file(CALIBRATION)
+        return load_camera(path, inside=True) if path.is_file() else None
 
     @cached_property
     def is_calibrated(self) -> bool:
         """True if the user gave the lens; False if the dive itself showed it."""
         try:
-            with self.file(CALIBRATION).open(encoding="utf-8") as stream:
+            with open_regular_text(self.file(CALIBRATION)) as stream:
                 return FOUND not in stream.readline()
         except (OSError, ValueError):
             return False
@@ -243,7 +255,7 @@ class Dive:
     def medium(self) -> Medium | None:
         """The water of the largest sub-map, with rates per ``unit``; None if none is modelled."""
         facts = self.medium_facts
-        return medium_of(facts, self.file(MEDIUM)) if facts else None
+        return medium_of(facts, self.file(MEDIUM)) if facts or self.has(MEDIUM) else None
 
     @cached_property
     def attenuations(self) -> Mapping[int, Sequence[float]]:
@@ -338,12 +350,10 @@ class HeldOutFiles:
 
     def _read(self, kind: str) -> npt.NDArray[np.uint8]:
         """Raises InputError if the picture is missing or damaged."""
-        from PIL import Image, UnidentifiedImageError
-
         path = self.dive.file(self._name(kind))
         try:
-            return np.asarray(Image.open(path))
-        except (OSError, ValueError, SyntaxError, UnidentifiedImageError) as error:
+            return read_png(path, folders=1)
+        except (OSError, ValueError) as error:
             raise InputError(
                 f"cannot read {path}: {reason_of(error)}; map the dive again"
             ) from error
@@ -353,10 +363,12 @@ def read_dive(path: str | os.PathLike[str]) -> Dive:
     """Read the finished dive in the folder ``path``.
 
     Raises:
-        InputError: a file is missing or malformed, or does not match another.
+        InputError: the dive is not finished, or a file is missing or malformed, or does not match
+            another.
         ConfigError: ``camera.yaml`` is malformed.
     """
     dive = Dive(path)
+    dive.require()
     for attribute in ("frames", "frame_of_pose", "camera", "medium", "metrics", "metric_frames"):
         getattr(dive, attribute)
     return dive

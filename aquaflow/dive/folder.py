@@ -24,7 +24,7 @@ from aquaflow.base.storage.atomic import (
     write_json,
     write_yaml,
 )
-from aquaflow.base.storage.dive_status import CHECKPOINT, FRAMES, DiveState, DiveStatus
+from aquaflow.base.storage.dive_status import CHECKPOINT, DiveState, DiveStatus
 from aquaflow.base.storage.dive_status import NAME as STATUS
 from aquaflow.base.storage.folder_lock import FolderLock
 from aquaflow.config import Config

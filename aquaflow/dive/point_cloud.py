@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
 from aquaflow.base.errors import InputError
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.placement import Placement
 from aquaflow.dive.ply import PlyGaussians, read_ply
-from aquaflow.dive.posed_views import PosedView, read_mapper, read_posed_views
+from aquaflow.dive.posed_views import PosedView, read_posed_views
 from aquaflow.geometry.similarity import rotation_from_quaternion
 
 Array = npt.NDArray[np.float64]
@@ -101,14 +101,14 @@ def nearest_cameras(
     return np.asarray(found)
 
 
-def read_point_cloud(dive: Path, water: bool = False) -> PointCloud:
+def read_point_cloud(dive: Dive, water: bool = False) -> PointCloud:
     """The points of the dive's largest sub-map; ``water``: in the colours that it gives them.
 
     Raises:
         InputError: the dive has no map, or nothing in it is opaque enough.
         ConfigError: the dive's settings cannot be read.
     """
-    views, where = read_posed_views(dive, read_mapper(dive))
+    views, where = read_posed_views(dive, dive.map())
     cloud = PointCloud(read_splats(dive, where, water), views, where)
     if not len(cloud):
         raise InputError(
@@ -118,14 +118,14 @@ def read_point_cloud(dive: Path, water: bool = False) -> PointCloud:
     return cloud
 
 
-def read_splats(dive: Path, placement: Placement, water: bool) -> PlyGaussians:
+def read_splats(dive: Dive, placement: Placement, water: bool) -> PlyGaussians:
     """The Gaussians of the dive's largest sub-map in the upright frame: without water, or with
     ``water`` as seen through it at the dive's median range.
 
     Raises:
         InputError: the dive has no such map, or an empty one.
     """
-    path = dive / ("map.ply" if water else "map_clear.ply")
+    path = dive.file("map.ply" if water else "map_clear.ply")
     splats = read_ply(path)
     if not len(splats.means):
         raise InputError(f"{path} holds no Gaussians; map the dive again")

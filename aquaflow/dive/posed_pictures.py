@@ -10,9 +10,10 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.storage.whole_folder import whole_folder
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.png import write_png
 from aquaflow.dive.point_cloud import PointCloud, read_splats
-from aquaflow.dive.posed_views import PosedView, read_mapper, read_posed_views
+from aquaflow.dive.posed_views import PosedView, read_posed_views
 from aquaflow.dive.recorded import recorded_pictures
 from aquaflow.dive.restored import exposure_without_water, restored_frames
 from aquaflow.mapping.mapper import Mapper
@@ -33,7 +34,7 @@ def picture_name(frame_index: int) -> str:
 
 
 def export_posed_pictures(
-    dive: Path,
+    dive: Dive,
     out: Path,
     write_model: WriteModel,
     recording: Path | None,
@@ -51,7 +52,7 @@ def export_posed_pictures(
             written.
         ConfigError: the dive's settings cannot be read.
     """
-    mapper = read_mapper(dive)
+    mapper = dive.map()
     views, where = read_posed_views(dive, mapper)
     cloud = PointCloud(read_splats(dive, where, water=not restored), views, where)
     pictures = (
@@ -67,7 +68,7 @@ def export_posed_pictures(
     return len(views)
 
 
-def _seen(dive: Path, mapper: Mapper, recording: Path | None) -> Pictures:
+def _seen(dive: Dive, mapper: Mapper, recording: Path | None) -> Pictures:
     if recording is None:
         raise InputError(
             f"{dive} holds no pictures of its own; add --recording with what was mapped, or "
@@ -77,7 +78,7 @@ def _seen(dive: Path, mapper: Mapper, recording: Path | None) -> Pictures:
     return ((view.frame_index, picture) for view, picture in pictures)
 
 
-def _without_water(dive: Path, mapper: Mapper, recording: Path | None) -> Pictures:
+def _without_water(dive: Dive, mapper: Mapper, recording: Path | None) -> Pictures:
     exposure = exposure_without_water(dive, mapper)
     frames = restored_frames(dive, mapper, recording)
     return ((index, picture.picture_bytes(exposure)) for index, picture in frames)

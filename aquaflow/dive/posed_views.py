@@ -4,22 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
-from aquaflow.base.storage.dive_status import refuse_without_map
-from aquaflow.config import load_config
-from aquaflow.dive.map_file import SUFFIX, read_map_file
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.placement import Placement, placement
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.render import select_renderer
 from aquaflow.render.views import View, in_time
-from aquaflow.telemetry.metric_file import read_frame_of_map
 from aquaflow.telemetry.metric_frame import MetricFrame
 
 
@@ -54,25 +49,13 @@ def posed_views(views: Iterable[View], frame: MetricFrame, where: Placement) -> 
     return posed
 
 
-def read_mapper(dive: Path) -> Mapper:
-    """The largest sub-map of the dive.
-
-    Raises:
-        InputError: the dive is not finished, or has no map.
-        ConfigError: the dive's settings cannot be read.
-    """
-    refuse_without_map(dive)
-    renderer = select_renderer(load_config(dive / "config.yaml", inside=True).mapping.renderer)
-    return read_map_file(dive / f"map{SUFFIX}", renderer)
-
-
-def read_posed_views(dive: Path, mapper: Mapper) -> tuple[list[PosedView], Placement]:
+def read_posed_views(dive: Dive, mapper: Mapper) -> tuple[list[PosedView], Placement]:
     """The views of ``mapper``, which is the map of ``dive``, and where they lie.
 
     Raises:
         InputError: there are none, or the dive's metric.json is damaged.
     """
-    frame = read_frame_of_map(dive / f"map{SUFFIX}")
+    frame = dive.frame
     where = placement(frame)
     views = posed_views(mapper.views, frame, where)
     if not views:

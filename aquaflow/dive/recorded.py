@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
-from aquaflow.config import load_config
-from aquaflow.geometry.camera import CameraModel, load_camera
+from aquaflow.dive.dive import Dive
+from aquaflow.geometry.camera import CameraModel
 from aquaflow.render.views import View
 from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation
@@ -19,7 +19,7 @@ from aquaflow.types import Frame
 
 
 def recorded_pictures(
-    dive: Path, recording: Path, views: Sequence[View]
+    dive: Dive, recording: Path, views: Sequence[View]
 ) -> Iterator[tuple[View, npt.NDArray[np.uint8]]]:
     """Each of ``views``, which are in the order of the recording, with its picture [H, W, 3] RGB:
     cropped, undistorted by the dive's camera and resized.
@@ -49,20 +49,17 @@ def recorded_pictures(
         )
 
 
-def preparation_of(dive: Path, width: int | None = None) -> Preparation:
+def preparation_of(dive: Dive, width: int | None = None) -> Preparation:
     """How the pictures of ``dive`` were prepared: cropped, undistorted and resized, to ``width``
     pixels in place of what was mapped.
 
     Raises:
         InputError, ConfigError: the dive's settings or its calibration cannot be read.
     """
-    calibration = dive / "calibration.yaml"
-    source = load_config(dive / "config.yaml", inside=True).source
+    source = dive.config.source
     if width is not None:
         source = source.model_copy(update={"width": width})
-    return Preparation(
-        source, load_camera(calibration, inside=True) if calibration.is_file() else None
-    )
+    return Preparation(source, dive.calibration)
 
 
 def _check_size(

@@ -12,8 +12,8 @@ import torch
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.storage.whole_folder import whole_folder
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.png import write_png
-from aquaflow.dive.posed_views import read_mapper
 from aquaflow.dive.recorded import recorded_pictures
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.rendering import Shown
@@ -32,7 +32,7 @@ Progress = Callable[[int, int], None]
 
 
 def export_restored(
-    dive: Path, out: Path, recording: Path | None = None, progress: Progress | None = None
+    dive: Dive, out: Path, recording: Path | None = None, progress: Progress | None = None
 ) -> int:
     """Write every mapped frame of the dive's largest sub-map to ``out``, as INDEX.png; how many.
 
@@ -44,7 +44,7 @@ def export_restored(
         InputError: the dive has no map or no water, or the recording is another.
         ConfigError: the dive's settings cannot be read.
     """
-    mapper = read_mapper(dive)
+    mapper = dive.map()
     exposure, count = exposure_without_water(dive, mapper), 0
     with whole_folder(out) as made:
         for index, picture in restored_frames(dive, mapper, recording):
@@ -57,7 +57,7 @@ def export_restored(
     return count
 
 
-def exposure_without_water(dive: Path, mapper: Mapper) -> float:
+def exposure_without_water(dive: Dive, mapper: Mapper) -> float:
     """The one gain of all restored pictures of ``dive``, whose map is ``mapper``.
 
     Raises:
@@ -91,7 +91,7 @@ class SeenFrame:
     shown: Shown
 
 
-def seen_frames(dive: Path, mapper: Mapper, recording: Path | None) -> Iterator[SeenFrame]:
+def seen_frames(dive: Dive, mapper: Mapper, recording: Path | None) -> Iterator[SeenFrame]:
     """Each mapped frame of ``dive``, whose map is ``mapper``, in the order of the recording.
 
     Raises:
@@ -114,7 +114,7 @@ def without_water(mapper: Mapper, seen: SeenFrame) -> RestoredPicture:
 
 
 def restored_frames(
-    dive: Path, mapper: Mapper, recording: Path | None
+    dive: Dive, mapper: Mapper, recording: Path | None
 ) -> Iterator[tuple[int, RestoredPicture]]:
     """Frame index and restored picture of each view, in the order of the recording; without a
     ``recording``, the map as it would look without water.

@@ -11,14 +11,13 @@ from aquaflow.base.errors import InputError
 from aquaflow.base.errors.failures import Failures
 from aquaflow.base.storage.dive_status import CHECKPOINT, DiveState, read_status, refuse_unfinished
 from aquaflow.base.storage.folder_lock import refuse_held
-from aquaflow.config import load_config
 from aquaflow.config.device import MountingConfig
 from aquaflow.config.vehicle import VehicleConfig
-from aquaflow.dive.dive import CALIBRATION
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.folder import MARKER, WORK
 from aquaflow.dive.frames_csv import readable_rows
 from aquaflow.dive.run import Finished
-from aquaflow.geometry.camera import CameraModel, load_camera
+from aquaflow.geometry.camera import CameraModel
 from aquaflow.live.checkpoint.generations import generations
 from aquaflow.live.checkpoint.resume import Choice, newest_usable
 from aquaflow.live.dive_clock import Continued
@@ -89,7 +88,7 @@ def settings_of(dive: Path, seconds: float | None) -> VehicleConfig:
     Raises:
         InputError, ConfigError: its config.yaml cannot be read.
     """
-    settings = load_config(dive / "config.yaml", inside=True).model_dump()
+    settings = Dive(dive).config.model_dump()
     if seconds is not None:
         settings["mapping"]["optimiser"]["refine_seconds"] = max(seconds, LEAST_S)
     service = VehicleConfig().service.model_dump() | {"finish_s": None}
@@ -110,8 +109,7 @@ class NoFeed:
         self.notes: list[str] = []
         self.failure: str | None = None
         self.continued = Continued()
-        calibration = dive / CALIBRATION
-        self._calibration = load_camera(calibration, inside=True) if calibration.is_file() else None
+        self._calibration = Dive(dive).calibration
         rows, _ = readable_rows(dive / MARKER)
         self._names = {row.index: row.source for row in rows}
 

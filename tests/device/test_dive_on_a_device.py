@@ -14,6 +14,7 @@ import pytest
 
 from aquaflow.api.map import load_map
 from aquaflow.base.storage.facts_file import read_facts_file
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.map_file import read_map_file
 from aquaflow.dive.ply import read_ply
 from aquaflow.dive.restored import export_restored
@@ -131,7 +132,7 @@ def test_its_restored_frames_are_the_same(
     for where, folder in zip(WHERE, dives.folders, strict=True):
         with machine_with(where):
             recording = dives.recording if with_pictures else None
-            export_restored(folder, tmp_path / where.type, recording)
+            export_restored(Dive(folder), tmp_path / where.type, recording)
     assert_same_pictures(tmp_path / PRETENDED.type, tmp_path / CPU.type, 8)
     assert not device.strays
 
@@ -156,7 +157,7 @@ def test_a_scale_bar_in_it_is_as_long(dives: Dives, device: Device) -> None:
     lengths = []
     for where, folder in zip(WHERE, dives.folders, strict=True):
         with machine_with(where):
-            bar = between_pixels(folder, MAPPED, (30.0, 30.0), (60.0, 45.0), 1.0, 0.01)
+            bar = between_pixels(Dive(folder), MAPPED, (30.0, 30.0), (60.0, 45.0), 1.0, 0.01)
         lengths.append(bar.map_length)
     assert lengths[1] == pytest.approx(lengths[0], rel=10.0 * NEAR)
     assert not device.strays

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from aquaflow.base.errors import InputError
 from aquaflow.cli import app
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.posed_pictures import WriteModel, export_posed_pictures
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import to_bytes
@@ -32,7 +33,7 @@ Array = npt.NDArray[np.float64]
 WRITERS = (write_colmap, write_nerfstudio)
 
 
-class Dive:
+class MappedDive:
     """A small dive on the earth, its recording and its map."""
 
     def __init__(self, folder: Path) -> None:
@@ -41,13 +42,13 @@ class Dive:
         self.pictures = write_recording(self.recording, self.mapper)
 
     def export(self, out: Path, write: WriteModel, restored: bool = False) -> Path:
-        export_posed_pictures(self.path, out, write, self.recording, restored)
+        export_posed_pictures(Dive(self.path), out, write, self.recording, restored)
         return out
 
 
 @pytest.fixture
-def dive(tmp_path: Path) -> Dive:
-    return Dive(tmp_path)
+def dive(tmp_path: Path) -> MappedDive:
+    return MappedDive(tmp_path)
 
 
 def in_the_map(mapper: Mapper, frame: int) -> Array:
@@ -79,7 +80,9 @@ def by_pycolmap(out: Path) -> Any:
     return pycolmap.Reconstruction(str(out / "sparse" / "0"))
 
 
-def test_colmap_projects_every_point_to_where_the_map_has_it(dive: Dive, tmp_path: Path) -> None:
+def test_colmap_projects_every_point_to_where_the_map_has_it(
+    dive: MappedDive, tmp_path: Path
+) -> None:
     model = by_pycolmap(dive.export(tmp_path / "out", write_colmap))
     assert (model.num_images(), model.num_cameras(), model.num_points3D()) == (3, 1, 1200)
     points = [model.points3D[n].xyz for n in sorted(model.points3D)]
@@ -91,7 +94,7 @@ def test_colmap_projects_every_point_to_where_the_map_has_it(dive: Dive, tmp_pat
 
 
 def test_colmaps_points_have_the_colours_that_its_pictures_have_there(
-    dive: Dive, tmp_path: Path
+    dive: MappedDive, tmp_path: Path
 ) -> None:
     out = dive.export(tmp_path / "out", write_colmap, restored=True)
     model = by_pycolmap(out)
@@ -104,7 +107,7 @@ def test_colmaps_points_have_the_colours_that_its_pictures_have_there(
         assert agreement(picture_of(out, frame), mirrored, colours) < 0.3
 
 
-def test_colmaps_camera_is_a_pinhole_of_the_pictures_size(dive: Dive, tmp_path: Path) -> None:
+def test_colmaps_camera_is_a_pinhole_of_the_pictures_size(dive: MappedDive, tmp_path: Path) -> None:
     (camera,) = by_pycolmap(dive.export(tmp_path / "out", write_colmap)).cameras.values()
     assert camera.model.name == "PINHOLE"
     assert (camera.width, camera.height) == (CAMERA.width, CAMERA.height)
@@ -112,7 +115,7 @@ def test_colmaps_camera_is_a_pinhole_of_the_pictures_size(dive: Dive, tmp_path: 
 
 
 def test_colmap_reads_and_writes_the_model_in_its_own_newest_form(
-    dive: Dive, tmp_path: Path
+    dive: MappedDive, tmp_path: Path
 ) -> None:
     model = by_pycolmap(dive.export(tmp_path / "out", write_colmap))
     again = tmp_path / "again"
@@ -123,7 +126,7 @@ def test_colmap_reads_and_writes_the_model_in_its_own_newest_form(
 
 
 def test_nerfstudios_cameras_see_every_point_where_the_map_has_it(
-    dive: Dive, tmp_path: Path
+    dive: MappedDive, tmp_path: Path
 ) -> None:
     trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed")
     out = dive.export(tmp_path / "out", write_nerfstudio)
@@ -141,7 +144,7 @@ def test_nerfstudios_cameras_see_every_point_where_the_map_has_it(
         )
 
 
-def test_nerfstudios_world_is_metric_with_z_up(dive: Dive, tmp_path: Path) -> None:
+def test_nerfstudios_world_is_metric_with_z_up(dive: MappedDive, tmp_path: Path) -> None:
     out = dive.export(tmp_path / "out", write_nerfstudio)
     poses = [
         f["transform_matrix"] for f in json.loads((out / "transforms.json").read_text())["frames"]
@@ -155,7 +158,7 @@ def test_nerfstudios_world_is_metric_with_z_up(dive: Dive, tmp_path: Path) -> No
     np.testing.assert_allclose(np.array(poses[0])[:3, 1], [0.0, 1.0, 0.0], atol=1e-9)  # top: north
 
 
-def test_nerfstudios_points_have_normals_and_colours(dive: Dive, tmp_path: Path) -> None:
+def test_nerfstudios_points_have_normals_and_colours(dive: MappedDive, tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed")
     out = dive.export(tmp_path / "out", write_nerfstudio, restored=True)
     cloud = trimesh.load(out / "points.ply")
@@ -166,14 +169,16 @@ def test_nerfstudios_points_have_normals_and_colours(dive: Dive, tmp_path: Path)
 
 
 @pytest.mark.parametrize("write", WRITERS)
-def test_pictures_are_those_of_the_recording(dive: Dive, tmp_path: Path, write: WriteModel) -> None:
+def test_pictures_are_those_of_the_recording(
+    dive: MappedDive, tmp_path: Path, write: WriteModel
+) -> None:
     out = dive.export(tmp_path / "out", write)
     assert len(list((out / "images").iterdir())) == len(FRAMES)
     for frame in FRAMES:
         np.testing.assert_array_equal(picture_of(out, frame), dive.pictures[frame])
 
 
-def test_restored_pictures_are_without_water(dive: Dive, tmp_path: Path) -> None:
+def test_restored_pictures_are_without_water(dive: MappedDive, tmp_path: Path) -> None:
     out = dive.export(tmp_path / "out", write_colmap, restored=True)
     clean = to_bytes(dive.mapper.show(dive.mapper.views[0]).radiance.clamp(0.0, 1.0).numpy())
     picture = picture_of(out, 0).astype(float)
@@ -182,22 +187,24 @@ def test_restored_pictures_are_without_water(dive: Dive, tmp_path: Path) -> None
 
 
 def test_pictures_without_a_recording_are_refused_before_anything_is_written(
-    dive: Dive, tmp_path: Path
+    dive: MappedDive, tmp_path: Path
 ) -> None:
     with pytest.raises(InputError, match="add --recording"):
-        export_posed_pictures(dive.path, tmp_path / "out", write_colmap, None)
+        export_posed_pictures(Dive(dive.path), tmp_path / "out", write_colmap, None)
     assert not (tmp_path / "out").exists()
 
 
 def test_restored_pictures_are_drawn_where_there_is_no_recording(
-    dive: Dive, tmp_path: Path
+    dive: MappedDive, tmp_path: Path
 ) -> None:
-    count = export_posed_pictures(dive.path, tmp_path / "out", write_colmap, None, restored=True)
+    count = export_posed_pictures(
+        Dive(dive.path), tmp_path / "out", write_colmap, None, restored=True
+    )
     assert count == len(list((tmp_path / "out" / "images").iterdir())) == 3
 
 
 @pytest.mark.parametrize("name", ["colmap", "nerfstudio"])
-def test_the_command_writes_a_folder_in_the_dive(dive: Dive, name: str) -> None:
+def test_the_command_writes_a_folder_in_the_dive(dive: MappedDive, name: str) -> None:
     asked = ["export", str(dive.path), "--format", name, "--recording", str(dive.recording)]
     result = CliRunner().invoke(app, [*asked, "--json"])
     assert result.exit_code == 0, result.output

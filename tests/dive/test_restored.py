@@ -16,17 +16,18 @@ from aquaflow.base.errors import InputError
 from aquaflow.base.storage.atomic import write_yaml
 from aquaflow.cli import app
 from aquaflow.config import Config, MappingConfig
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.map_file import write_map_file
 from aquaflow.dive.restored import export_restored
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import to_bytes
 from tests.mapping.mapping_scenes import floor, renderer, view_of
 
-Dive = tuple[Path, Path, npt.NDArray[np.uint8]]
+Written = tuple[Path, Path, npt.NDArray[np.uint8]]
 
 
 @pytest.fixture
-def dive(tmp_path: Path) -> Dive:
+def dive(tmp_path: Path) -> Written:
     """A dive folder of three frames, its recording, and the first picture without water."""
     mapper = Mapper(MappingConfig(), renderer(), seed=0)
     mapper.scene.gaussians = floor(columns=40, rows=30, scale=0.06)
@@ -54,12 +55,15 @@ def pictures(folder: Path) -> dict[str, npt.NDArray[np.uint8]]:
 
 @pytest.mark.parametrize("recorded", [False, True])
 def test_every_mapped_frame_is_written_as_it_would_look_without_water(
-    dive: Dive, tmp_path: Path, recorded: bool
+    dive: Written, tmp_path: Path, recorded: bool
 ) -> None:
     folder, recording, clean = dive
     steps: list[tuple[int, int]] = []
     count = export_restored(
-        folder, tmp_path / "out", recording if recorded else None, lambda *step: steps.append(step)
+        Dive(folder),
+        tmp_path / "out",
+        recording if recorded else None,
+        lambda *step: steps.append(step),
     )
     found = pictures(tmp_path / "out")
     names = ["000000", "000002", "000004"]
@@ -72,9 +76,9 @@ def test_every_mapped_frame_is_written_as_it_would_look_without_water(
     assert np.abs(first / gain - clean).mean() < 3.0
 
 
-def test_the_confidence_is_grey_and_lies_beside_its_picture(dive: Dive, tmp_path: Path) -> None:
+def test_the_confidence_is_grey_and_lies_beside_its_picture(dive: Written, tmp_path: Path) -> None:
     folder, recording, _ = dive
-    export_restored(folder, tmp_path / "out", recording)
+    export_restored(Dive(folder), tmp_path / "out", recording)
     path = tmp_path / "out" / "000002_confidence.png"
     confidence = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert confidence.shape == (48, 64)
@@ -83,7 +87,7 @@ def test_the_confidence_is_grey_and_lies_beside_its_picture(dive: Dive, tmp_path
 
 @pytest.mark.parametrize("recorded", [False, True])
 def test_open_water_that_is_to_be_removed_is_transparent(
-    dive: Dive, tmp_path: Path, recorded: bool
+    dive: Written, tmp_path: Path, recorded: bool
 ) -> None:
     folder, recording, _ = dive
     config = MappingConfig.model_validate({"medium": {"open_water": "removed"}})
@@ -94,7 +98,7 @@ def test_open_water_that_is_to_be_removed_is_transparent(
     solid = mapper.show(mapper.views[0]).alpha.numpy() > 0.5
     assert 0.1 < solid.mean() < 0.9
     write_map_file(folder / "map.aqf", mapper)
-    export_restored(folder, tmp_path / "out", recording if recorded else None)
+    export_restored(Dive(folder), tmp_path / "out", recording if recorded else None)
     picture = cv2.imread(str(tmp_path / "out" / "000000.png"), cv2.IMREAD_UNCHANGED)
     assert picture.shape == (48, 64, 4)
     if recorded:  # the dive's pictures show no open water
@@ -104,30 +108,30 @@ def test_open_water_that_is_to_be_removed_is_transparent(
         assert not picture[~solid].any()
 
 
-def test_a_recording_without_the_frames_is_refused(dive: Dive, tmp_path: Path) -> None:
+def test_a_recording_without_the_frames_is_refused(dive: Written, tmp_path: Path) -> None:
     folder, recording, _ = dive
     (recording / "000004.png").unlink()
     with pytest.raises(InputError, match="no readable frame 4"):
-        export_restored(folder, tmp_path / "out", recording)
+        export_restored(Dive(folder), tmp_path / "out", recording)
 
 
-def test_a_recording_of_another_shape_is_refused(dive: Dive, tmp_path: Path) -> None:
+def test_a_recording_of_another_shape_is_refused(dive: Written, tmp_path: Path) -> None:
     folder, recording, _ = dive
     for path in recording.iterdir():
         cv2.imwrite(str(path), np.zeros((64, 64, 3), np.uint8))
     with pytest.raises(InputError, match="64 x 64 once prepared"):
-        export_restored(folder, tmp_path / "out", recording)
+        export_restored(Dive(folder), tmp_path / "out", recording)
 
 
-def test_a_clear_dive_has_nothing_to_restore(dive: Dive, tmp_path: Path) -> None:
+def test_a_clear_dive_has_nothing_to_restore(dive: Written, tmp_path: Path) -> None:
     mapper = Mapper(MappingConfig(), renderer(), seed=0)
     mapper.medium.active = False
     write_map_file(dive[0] / "map.aqf", mapper)
     with pytest.raises(InputError, match="no water to remove"):
-        export_restored(dive[0], tmp_path / "out")
+        export_restored(Dive(dive[0]), tmp_path / "out")
 
 
-def test_the_command_writes_into_the_dive_and_says_so(dive: Dive) -> None:
+def test_the_command_writes_into_the_dive_and_says_so(dive: Written) -> None:
     asked = ["export", str(dive[0]), "--format", "restored"]
     result = CliRunner().invoke(app, [*asked, "--json"])
     assert result.exit_code == 0, result.output

@@ -7,11 +7,11 @@ import shutil
 from pathlib import Path
 
 import pytest
+from aquaflow.survey.report.report_of_folder import report_of_folder
 
 from aquaflow.base.errors import printable
 from aquaflow.dive.frames_csv import read_rows
 from aquaflow.survey.report import render_report
-from aquaflow.survey.report.report_of_folder import report_of_folder
 from tests.command_line import Cli, refused
 from tests.small_recording import HASTY
 

@@ -15,7 +15,8 @@ from aquaflow.base.storage.folder_lock import is_held
 
 NAME = "dive.json"
 FRAMES, METRICS, MAP = "frames.csv", "metrics.json", "map.aqf"
-"""Files that every dive has, every finished one, and every finished one with a map."""
+"""Files that every dive has, every finished one, and every finished one with a map: that of its
+largest sub-map, where that of another is map_N.aqf."""
 CHECKPOINT = "checkpoint"
 """Folder of the checkpoints of a live run."""
 

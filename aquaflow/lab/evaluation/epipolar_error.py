@@ -19,9 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
-from aquaflow.config import load_config
 from aquaflow.dive.dive import Dive
-from aquaflow.geometry.camera import CameraModel, load_camera
+from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.epipolar import epipolar_distances
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.two_view import MIN_MATCHES, relative_pose
@@ -118,9 +117,8 @@ def _moments(
     dive: Path, recording: Path, estimate: Trajectory, true: Trajectory | None
 ) -> Iterator[_Moment]:
     """The recording's pictures at the times of the poses, prepared as the dive's but wider."""
-    source = load_config(dive / "config.yaml").source
-    path = dive / "calibration.yaml"
-    calibration = load_camera(path) if path.is_file() else None
+    read = Dive(dive)
+    source, calibration = read.config.source, read.calibration
     opened, prepare = open_recording(recording), None
     try:
         for frame in opened.frames(source.every, source.start, source.stop):
@@ -135,7 +133,7 @@ def _moments(
             prepared = prepare(frame)
             camera = prepared.camera
             if calibration is None:  # what the dive found
-                camera = load_camera(dive / "camera.yaml").scaled(camera.width, camera.height)
+                camera = read.camera.scaled(camera.width, camera.height)
             yield _Moment(
                 float(estimate.t_s[row]),
                 camera,

@@ -10,16 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
-from aquaflow.config import load_config
 from aquaflow.config.source import SourceConfig
-from aquaflow.dive.dive import Dive
-from aquaflow.geometry.camera import CameraModel, load_camera
+from aquaflow.dive.dive import MAP, Dive
+from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.lab.evaluation.dive_files import evaluated_dive
 from aquaflow.prior.oracle import TrueView, write_oracle
 from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation
-from aquaflow.telemetry.metric_file import read_frame_of_map
 from aquaflow.types import Frame
 
 Array = npt.NDArray[np.float64]
@@ -65,18 +63,18 @@ def _synthetic(recording: Path) -> Iterator[tuple[TrueView, CameraModel]]:
 
 def _mapped(recording: Path, dive: Path) -> Iterator[tuple[TrueView, CameraModel]]:
     """The frames that the map's own sub-map placed, with the ranges that the map shows."""
-    from aquaflow.dive.map_file import SUFFIX, read_map_file  # torch, which no other kind needs
+    from aquaflow.dive.map_file import read_map_file  # torch, which no other kind needs
     from aquaflow.render import select_renderer
     from aquaflow.render.transfers import picture_out
     from aquaflow.render.views import View
 
-    file = dive / f"map{SUFFIX}"
-    mapper, T_nm = read_map_file(file, select_renderer("auto", None)), read_frame_of_map(file).T_nm
-    found, calibration = evaluated_dive(Dive(dive)).trajectory, dive / "calibration.yaml"
+    read = Dive(dive)
+    T_nm = read.frame.T_nm
+    mapper = read_map_file(read.file(MAP), select_renderer("auto", None))
+    found = evaluated_dive(read).trajectory
     placed = zip(found.R_wc, found.positions, strict=True)
     poses = dict(zip(np.round(1e6 * found.t_s), placed, strict=True))
-    camera = load_camera(calibration) if calibration.is_file() else None
-    for frame in _prepared(recording, load_config(dive / "config.yaml").source, camera):
+    for frame in _prepared(recording, read.config.source, read.calibration):
         pose = poses.get(round(1e-3 * frame.t_ns))
         if pose is None:
             continue

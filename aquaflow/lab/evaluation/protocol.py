@@ -14,6 +14,7 @@ import numpy as np
 
 from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive
+from aquaflow.dive.medium import NAME as MEDIUM
 from aquaflow.lab.evaluation import medium as water
 from aquaflow.lab.evaluation.dive_files import EvaluatedDive, evaluated_dive
 from aquaflow.lab.evaluation.metric_error import MetricError, metric_error
@@ -118,7 +119,7 @@ def evaluate_dive(
             "are not compared"
         )
     compared = None
-    if known.medium is not None and read.medium_facts:
+    if known.medium is not None and read.has(MEDIUM):
         found, active = water.recovered_water(read, scale)
         compared = water.compare_medium(found, load_medium(known.medium), active=active)
     return Evaluation(estimate, error, compared, metric, read.metrics, notes)

@@ -19,8 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
-from aquaflow.config import load_config
-from aquaflow.geometry.camera import CameraModel, load_camera
+from aquaflow.dive.dive import Dive
 from aquaflow.lab.evaluation.held_out import Kind, held_out_indices, read_picture
 from aquaflow.lab.evaluation.water_peers.contract import NAMES, NotRestoredError, Pictures
 from aquaflow.lab.evaluation.water_peers.held_out_ranges import held_out_ranges
@@ -148,12 +147,11 @@ def clean_pictures(dive: Path, clean: Path, crop: str | None, indices: list[int]
         InputError: a frame is missing or cannot be read.
         ConfigError: the crop does not fit the pictures.
     """
-    source = load_config(dive / "config.yaml").source.model_copy(
-        update={"crop": crop, "mask": None}
-    )
+    read = Dive(dive)
+    source = read.config.source.model_copy(update={"crop": crop, "mask": None})
     if (clean / SYNTHETIC_MARK).is_file():
         clean = clean / SYNTHETIC_CLEAN
-    prepare = Preparation(source, _calibration(dive))
+    prepare = Preparation(source, read.calibration)
     found = {frame.index: prepare(frame).image for frame in _frames(clean, indices)}
     missing = [index for index in indices if index not in found]
     if missing:
@@ -175,9 +173,3 @@ def _frames(clean: Path, indices: list[int]) -> Iterator[Frame]:
                 yield frame
     finally:
         recording.close()
-
-
-def _calibration(dive: Path) -> CameraModel | None:
-    """The calibration that the dive's pictures were undistorted with; None if it had none."""
-    path = dive / "calibration.yaml"
-    return load_camera(path) if path.is_file() else None

@@ -13,6 +13,7 @@ import numpy as np
 
 from aquaflow import __version__
 from aquaflow.base.errors import InputError
+from aquaflow.dive.dive import Dive
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.change.change_picture import change_png
 from aquaflow.survey.change.change_raster import write_change_raster
@@ -24,7 +25,6 @@ from aquaflow.survey.change.registration import Registration, register
 from aquaflow.survey.change.surface import Progress, Surface, surface_of
 from aquaflow.survey.export.ortho.geotiff import require_rasterio
 from aquaflow.survey.export.ortho.ground import Ground, ground_of
-from aquaflow.survey.export.ortho.survey import read_map
 
 FORMAT = 1
 """Of change.json; raised whenever an older AquaFlow could no longer read it."""
@@ -104,7 +104,8 @@ def find_changes(asked: Asked, work: Path, progress: Progress) -> Changes:
         InputError: a dive has no map or no surface, or the two share too little ground.
         ConfigError: a dive's settings cannot be read.
     """
-    (one, frame), (other, _) = read_map(asked.first), read_map(asked.second)
+    earlier, later = Dive(asked.first), Dive(asked.second)
+    one, frame, other = earlier.filled_map(), earlier.frame, later.filled_map()
     ground = ground_of(frame, one.views)
     first, voxel = surface_of(one, ground.T_gm, work, None, progress)
     second, _ = surface_of(other, ground.T_gm @ asked.T_ab, work, voxel, progress)

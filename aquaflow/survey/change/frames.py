@@ -8,13 +8,12 @@ import numpy as np
 
 from aquaflow.base.errors import DamagedError, InputError, reason_of
 from aquaflow.base.errors.regular_file import read_regular_json
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.georeference import to_geodetic
-from aquaflow.dive.map_file import SUFFIX
 from aquaflow.geometry.earth import north_east
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.site.manifest import SiteDive, read_site
 from aquaflow.survey.site.merged_file import PlacedSubMap, merge_of
-from aquaflow.telemetry.metric_file import read_frame_of_map
 from aquaflow.telemetry.metric_frame import MetricFrame
 
 ROTATION_TOLERANCE = 1e-6
@@ -67,7 +66,7 @@ def between(first: Path, second: Path, transform: Path | None) -> Sim3:
     Raises:
         InputError: a file cannot be read.
     """
-    one, other = (read_frame_of_map(dive / f"map{SUFFIX}") for dive in (first, second))
+    one, other = (Dive(dive).frame for dive in (first, second))
     T_nn = on_earth(one, other) if transform is None else read_transform(transform)
     return one.T_nm.inverse() @ T_nn @ other.T_nm
 

@@ -7,11 +7,11 @@ from functools import partial
 from pathlib import Path
 
 from aquaflow.base.errors import AquaFlowError, InputError
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.ply import read_ply
 from aquaflow.survey.change.site_map import DayMap, Part, combine
 from aquaflow.survey.change.surface import Progress
 from aquaflow.survey.export.mesh.view_surfaces import surfaces_of_map
-from aquaflow.survey.export.ortho.survey import read_map
 from aquaflow.survey.site.manifest import check_unchanged, read_site
 from aquaflow.survey.site.merged_file import PlacedSubMap, merge_of
 from aquaflow.survey.site.site_map_file import SiteMapPart, names_of, write_site_map
@@ -70,10 +70,11 @@ def make_site_map(site: Path, component: int | None, work: Path, progress: Progr
 
 
 def _day(folder: Path, placed: PlacedSubMap, work: Path, progress: Progress) -> DayMap:
-    mapper, _ = read_map(folder)
+    dive = Dive(folder)
+    mapper = dive.filled_map()
     views = surfaces_of_map(mapper, placed.T_sm, work, partial(progress, f"views of {placed.dive}"))
-    ply = folder / "map_clear.ply"
-    gaussians = read_ply(ply if ply.is_file() else folder / "map.ply")
+    ply = "map_clear.ply" if dive.has("map_clear.ply") else "map.ply"
+    gaussians = read_ply(dive.file(ply))
     return DayMap(placed.dive, gaussians.transformed(placed.T_sn), views)
 
 

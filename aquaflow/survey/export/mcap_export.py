@@ -12,15 +12,14 @@ import numpy as np
 from aquaflow import __version__
 from aquaflow.base.errors import InputError, printable
 from aquaflow.base.storage.atomic import write_json
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.finished_frames import (
     FinishedFrame,
-    read_facts,
     read_finished_frames,
     start_ns,
 )
 from aquaflow.dive.placement import Placement, placement
 from aquaflow.dive.point_cloud import read_point_cloud
-from aquaflow.dive.posed_views import read_mapper
 from aquaflow.dive.restored import SeenFrame, exposure_without_water, seen_frames, without_water
 from aquaflow.dive.ros import messages, topics
 from aquaflow.dive.ros.frames import MAP, OPTICAL, FrameTree
@@ -29,7 +28,6 @@ from aquaflow.dive.ros.mcap_file import RosFile, ros_file
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import to_bytes
 from aquaflow.render.transfers import picture_out
-from aquaflow.telemetry.metric_file import read_frame_of_map
 from aquaflow.telemetry.metric_frame import MetricFrame
 
 Progress = Callable[[int, int], None]
@@ -59,19 +57,17 @@ class McapExport:
     where: Placement
 
 
-class _Dive:
+class _Source:
     """What the parts of the file are made from."""
 
-    def __init__(self, dive: Path, recording: Path | None) -> None:
-        self.path, self.recording = dive, recording
+    def __init__(self, dive: Dive, recording: Path | None) -> None:
+        self.dive, self.recording = dive, recording
         self.frames = read_finished_frames(dive)
-        self.metrics = read_facts(dive / "metrics.json")
-        self.medium = read_facts(dive / "medium.json")
-        self.frame = read_frame_of_map(dive / "map.aqf")
+        self.frame = dive.frame
         self.where = placement(self.frame)
         self.tree = FrameTree(self.frame, self.where)
-        self.mapper: Mapper = read_mapper(dive)
-        start = start_ns(self.metrics)
+        self.mapper: Mapper = dive.map()
+        start = start_ns(dive.metrics)
         self.times = SINCE_START if start is None else UTC
         self._start_ns = start or 0
         self.posed = [frame for frame in self.frames if frame.T_nc is not None]
@@ -88,7 +84,7 @@ class _Dive:
 
 
 def export_mcap(
-    dive: Path, path: Path, recording: Path | None = None, progress: Progress | None = None
+    dive: Dive, path: Path, recording: Path | None = None, progress: Progress | None = None
 ) -> McapExport:
     """Write the largest sub-map of ``dive`` to ``path``, and ``NAME.layout.json`` beside it.
 
@@ -100,7 +96,7 @@ def export_mcap(
             or a file cannot be written.
         ConfigError: the dive's settings cannot be read.
     """
-    source = _Dive(dive, recording)
+    source = _Source(dive, recording)
     shown = 0
     with ros_file(path, _facts(source)) as file:
         seen = _Pictures(source, progress)
@@ -115,32 +111,32 @@ def export_mcap(
     return McapExport(beside, count, len(source.posed), shown, source.times, source.where)
 
 
-def _facts(source: _Dive) -> dict[str, str]:
+def _facts(source: _Source) -> dict[str, str]:
     """The metadata record of the file."""
     return {
         "version": __version__,
-        "dive": printable(source.path.name),
+        "dive": printable(source.dive.path.name),
         "unit": source.where.unit,
         "map": source.where.in_words() if source.where.epsg is None else source.where.axes,
         "times": source.times,
     }
 
 
-def _write_lasting(file: RosFile, source: _Dive, t_ns: int) -> None:
+def _write_lasting(file: RosFile, source: _Source, t_ns: int) -> None:
     """What holds for the whole dive, at its beginning, so that it is seen from there on."""
     tree, where = source.tree, source.where
     file.write(topics.TF_STATIC, t_ns, messages.transforms(t_ns, tree.fixed))
     poses = [(source.at(f), tree.moving(f.T_nc).T) for f in source.posed if f.T_nc is not None]
     file.write(topics.PATH, t_ns, messages.path(t_ns, MAP, poses))
-    points = messages.packed_points(read_point_cloud(source.path))
+    points = messages.packed_points(read_point_cloud(source.dive))
     file.write(topics.POINTS, t_ns, messages.point_cloud(t_ns, MAP, points))
-    warnings = source.metrics.get("warnings", [])
+    warnings = source.dive.metrics.get("warnings", [])
     level = messages.WARN if warnings else messages.OK
     said = "; ".join(warnings) or "no warnings"
     lengths = {"unit": where.unit, "scale": source.frame.scale_source, "x of n": source.frame.north}
     statuses = [
         messages.status(level, "aquaflow: dive", said, {**lengths, "times": source.times}),
-        _water_status(source.medium),
+        _water_status(source.dive.medium_facts),
     ]
     file.write(topics.DIAGNOSTICS, t_ns, messages.diagnostics(t_ns, statuses))
 
@@ -159,7 +155,7 @@ def _water_status(medium: dict[str, Any]) -> Any:
     return messages.status(messages.OK, name, "parameters of the image formation", values)
 
 
-def _write_frame(file: RosFile, source: _Dive, frame: FinishedFrame) -> None:
+def _write_frame(file: RosFile, source: _Source, frame: FinishedFrame) -> None:
     """Tracking state of one frame, and its pose."""
     t_ns, row = source.at(frame), frame.row
     level = messages.WARN if row.frame_class in NO_POSE else messages.OK
@@ -202,11 +198,11 @@ def _sigmas(
 class _Pictures:
     """The pictures of the mapped frames, made as the frames come by."""
 
-    def __init__(self, source: _Dive, progress: Progress | None) -> None:
+    def __init__(self, source: _Source, progress: Progress | None) -> None:
         mapper = source.mapper
         self._source, self._progress, self._done = source, progress, 0
-        self._exposure = exposure_without_water(source.path, mapper) if source.has_water else 1.0
-        self._seen: Iterator[SeenFrame] = seen_frames(source.path, mapper, source.recording)
+        self._exposure = exposure_without_water(source.dive, mapper) if source.has_water else 1.0
+        self._seen: Iterator[SeenFrame] = seen_frames(source.dive, mapper, source.recording)
         self._next = next(self._seen, None)
 
     def write(self, file: RosFile, frame: FinishedFrame) -> int:

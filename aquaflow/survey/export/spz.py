@@ -17,12 +17,11 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.storage.atomic import atomic_write
-from aquaflow.dive.map_file import SUFFIX
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.placement import Placement, placement
 from aquaflow.dive.ply import SH_C0, PlyGaussians
 from aquaflow.dive.point_cloud import CHUNK, read_splats
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.telemetry.metric_file import read_frame_of_map
 
 Array = npt.NDArray[np.floating]
 Bytes = npt.NDArray[np.uint8]
@@ -44,14 +43,14 @@ ROTATION_BITS = 9
 """Of each of the three smallest components of a quaternion, besides its sign."""
 
 
-def export_spz(dive: Path, path: Path, water: bool = False) -> tuple[int, Placement]:
+def export_spz(dive: Dive, path: Path, water: bool = False) -> tuple[int, Placement]:
     """Write the dive's largest sub-map, without water or with it; returns the number of Gaussians
     and where they lie, which is upright with y up.
 
     Raises:
         InputError: the dive has no map, or the file cannot be written.
     """
-    where = placement(read_frame_of_map(dive / f"map{SUFFIX}"))
+    where = placement(dive.frame)
     turned = replace(where, T_un=Sim3(RIGHT_UP_BACK, np.zeros(3), 1.0) @ where.T_un)
     splats = read_splats(dive, turned, water)
     write_spz(path, splats)

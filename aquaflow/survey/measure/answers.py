@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
+from aquaflow.dive.dive import Dive
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.transfers import picture_out
 from aquaflow.survey.export.ortho.ground import Ground, ground_of
-from aquaflow.survey.export.ortho.survey import read_map
 from aquaflow.survey.measure.asked import Asked, Place, located
 from aquaflow.survey.measure.drawn_heights import Progress, draw_heights
 from aquaflow.survey.measure.height_field import HeightField
@@ -79,7 +79,7 @@ _COLUMNS = ("along", "height", "sigma", "low_95", "high_95")
 
 
 def answer(
-    dive: Path,
+    dive: Dive,
     asked: list[Asked],
     shape: Shape | None,
     work: Path,
@@ -100,7 +100,7 @@ def answer(
     chosen = shape or ("line" if len(asked) < LEAST_CORNERS else "area")
     if chosen == "profile" and len(asked) != 2:
         raise InputError(f"a profile lies between 2 points, not {len(asked)}; give both ends")
-    mapper, frame = read_map(dive)
+    mapper, frame = dive.filled_map(), dive.frame
     drawn: HeightField | None = None
     ground: Ground | None = None
     if chosen != "line" or any(isinstance(each, Place) for each in asked):

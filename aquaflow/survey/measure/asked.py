@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 
 from aquaflow.base.errors import InputError
+from aquaflow.dive.dive import Dive
 from aquaflow.geometry.earth import north_east
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.survey.export.ortho.ground import Ground
@@ -88,7 +88,7 @@ def located(
     asked: list[Asked],
     mapper: Mapper,
     frame: MetricFrame,
-    dive: Path,
+    dive: Dive,
     field: HeightField | None,
     ground: Ground | None,
     reach: float,
@@ -113,7 +113,7 @@ def _located(
     asked: Asked,
     mapper: Mapper,
     frame: MetricFrame,
-    dive: Path,
+    dive: Dive,
     field: HeightField | None,
     ground: Ground | None,
 ) -> Picked:

@@ -18,7 +18,6 @@ from aquaflow.telemetry.known_lengths.known_lengths_file import (
     with_length,
     write_known_lengths,
 )
-from aquaflow.telemetry.metric_file import read_main, read_metric_file
 
 Progress = Callable[[str, int, int], None]
 """Called with what is done, how much of it, and how much there is."""
@@ -59,10 +58,11 @@ def keep_length(dive: Path, known: KnownLength, progress: Progress | None = None
     members = [each for each in lengths if each.sub_map == known.sub_map]
     together = scale_of(members)
     assert together is not None  # of one length at least
-    unchanged = why_not(read_metric_file(dive).get(known.sub_map), together)
+    read = Dive(dive)
+    unchanged = why_not(read.metric_frames.get(known.sub_map), together)
     if unchanged is None:
-        rescale(dive, known.sub_map, members, together)
-        if known.sub_map == read_main(dive):
+        rescale(read, known.sub_map, members, together)
+        if known.sub_map == read.main:
             _measure_anew(dive, progress)
     return Marked(known, together, unchanged)
 

@@ -7,12 +7,12 @@ point of a picture is where its ray meets the map as the renderer draws it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
+from aquaflow.dive.dive import Dive
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.transfers import map_out, picture_out
 from aquaflow.render.views import View
@@ -91,7 +91,7 @@ def seen(
     return points
 
 
-def view_of_frame(mapper: Mapper, frame: int, dive: Path) -> View:
+def view_of_frame(mapper: Mapper, frame: int, dive: Dive) -> View:
     """The view of a frame.
 
     Raises:

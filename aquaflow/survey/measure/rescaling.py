@@ -8,6 +8,7 @@ its scale came from many measurements, and its origin and depth hang on it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,15 +17,17 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError, reason_of
-from aquaflow.base.errors.regular_file import open_regular_text, read_regular_json
+from aquaflow.base.errors.regular_file import open_regular_text
 from aquaflow.base.storage.archive import read_arrays_of
 from aquaflow.base.storage.atomic import atomic_write, write_json
 from aquaflow.base.storage.dive_status import rescaling
 from aquaflow.dive import trajectory_csv
+from aquaflow.dive.dive import HELD_OUT, METRICS, TRAJECTORY, Dive
+from aquaflow.dive.medium import NAME as MEDIUM
 from aquaflow.dive.metric_outputs import frame_numbers, worlds_in_words
 from aquaflow.dive.path_rows import position_sigma, speeds_of
 from aquaflow.dive.ply import PlyGaussians, read_ply, write_ply
-from aquaflow.dive.trajectory_csv import PoseRow, read_trajectory_csv, write_trajectory_csv
+from aquaflow.dive.trajectory_csv import PoseRow, write_trajectory_csv
 from aquaflow.dive.tum import write_tum
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.coverage.coverage_file import NAME as COVERAGE
@@ -32,7 +35,7 @@ from aquaflow.survey.coverage.coverage_file import read_coverage_file
 from aquaflow.survey.coverage.coverage_files import write_coverage
 from aquaflow.survey.measure.notes import read_notes, scaled, write_notes
 from aquaflow.telemetry.known_lengths.known_length import KnownLength, LengthScale
-from aquaflow.telemetry.metric_file import read_main, read_metric_file, write_metric_file
+from aquaflow.telemetry.metric_file import write_metric_file
 from aquaflow.telemetry.metric_frame import LARGEST_SCALE_SIGMA, MetricFrame, SourceReport
 
 Array = npt.NDArray[np.float64]
@@ -56,51 +59,51 @@ def why_not(frame: MetricFrame | None, scale: LengthScale) -> str | None:
     return None
 
 
-def rescale(dive: Path, sub_map: int, lengths: Sequence[KnownLength], scale: LengthScale) -> None:
+def rescale(dive: Dive, sub_map: int, lengths: Sequence[KnownLength], scale: LengthScale) -> None:
     """Bring the files of a sub-map to metres; ``why_not`` has found nothing against it.
 
     Raises:
         InputError: a file of the dive cannot be read or written.
     """
-    frames, main = read_metric_file(dive), read_main(dive)
+    frames, main, folder = dict(dive.metric_frames), dive.main, dive.path
     before = frames[sub_map]
     frames[sub_map] = _metric(before, lengths, scale)
     times = scale.metres_per_unit / before.T_nm.scale
     suffix = "" if sub_map == main else f"_{sub_map}"
     # All is read before anything is written: a damaged file changes none.
-    plys = [dive / f"{name}{suffix}.ply" for name in ("map", "map_clear")]
+    plys = [dive.file(f"{name}{suffix}.ply") for name in ("map", "map_clear")]
     splats = {path: read_ply(path) for path in plys if path.is_file()}
-    rows = read_trajectory_csv(dive / trajectory_csv.NAME)
-    poses = _poses(dive / "trajectory.tum")
+    rows, poses = dive.poses, _poses(dive.file(TRAJECTORY))
     inside = {round(1e9 * row.t_s) for row in rows if row.sub_map == sub_map}
     chosen = np.array([round(1e9 * t) in inside for t in poses[:, 0]], bool)
     poses[chosen, 1:4] *= times
-    seen = read_coverage_file(dive / COVERAGE) if (dive / COVERAGE).is_file() else {}
+    seen = read_coverage_file(dive.file(COVERAGE)) if dive.has(COVERAGE) else {}
     texts, notes = {}, []
     if sub_map == main:
-        notes = scaled(read_notes(dive, before), times)
-        texts["metrics.json"] = _json(dive / "metrics.json") | frame_numbers(frames[main])
-        if (dive / "medium.json").is_file():
-            texts["medium.json"] = _medium(_json(dive / "medium.json"), frames[main], times)
-    with rescaling(dive):
+        dive.require(METRICS)
+        notes = scaled(read_notes(folder, before), times)
+        texts[METRICS] = dive.metrics | frame_numbers(frames[main])
+        if dive.medium_facts:
+            texts[MEDIUM] = _medium(deepcopy(dive.medium_facts), frames[main], times)
+    with rescaling(folder):
         for path, each in splats.items():
             write_ply(path, _scaled(each, times))
         table = _rows(rows, sub_map, frames[sub_map], times)
-        write_trajectory_csv(dive / trajectory_csv.NAME, table)
+        write_trajectory_csv(folder / trajectory_csv.NAME, table)
         write_tum(
-            dive / "trajectory.tum", poses[:, 0], poses[:, 1:4], poses[:, [7, 4, 5, 6]],
+            folder / TRAJECTORY, poses[:, 0], poses[:, 1:4], poses[:, [7, 4, 5, 6]],
             worlds_in_words(frames),
         )  # fmt: skip
         for name, content in texts.items():
-            write_json(dive / name, content)
+            write_json(folder / name, content)
         if sub_map == main:
-            _scale_ranges(dive / "heldout", times)
+            _scale_ranges(folder / HELD_OUT, times)
             if notes:
-                write_notes(dive, notes, frames[main])
+                write_notes(folder, notes, frames[main])
         if sub_map in seen:
             seen[sub_map] = seen[sub_map].rescaled(times, frames[sub_map].unit)
-            write_coverage(dive, seen, main)
-        write_metric_file(dive, frames, main)
+            write_coverage(folder, seen, main)
+        write_metric_file(folder, frames, main)
 
 
 def _metric(frame: MetricFrame, lengths: Sequence[KnownLength], scale: LengthScale) -> MetricFrame:
@@ -178,12 +181,4 @@ def _poses(path: Path) -> Array:
         with open_regular_text(path) as stream:
             return np.loadtxt(stream, np.float64, ndmin=2).reshape(-1, 8)
     except (OSError, ValueError) as error:
-        raise InputError(f"cannot read {path}: {reason_of(error)}; map the dive again") from error
-
-
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        data = read_regular_json(path)
-        return dict(data)
-    except (OSError, ValueError, TypeError) as error:
         raise InputError(f"cannot read {path}: {reason_of(error)}; map the dive again") from error

@@ -7,17 +7,12 @@ point of a picture is where its ray meets the map as the renderer draws it.
 from __future__ import annotations
 
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 
 from aquaflow.base.errors import InputError
-from aquaflow.base.storage.dive_status import refuse_unfinished
-from aquaflow.config import load_config
-from aquaflow.dive.frames_csv import read_rows
-from aquaflow.dive.map_file import SUFFIX, read_map_file
+from aquaflow.dive.dive import Dive
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.render import select_renderer
 from aquaflow.render.views import View
 from aquaflow.survey.measure.picked import (
     CLICK_SIGMA_PX,
@@ -27,7 +22,6 @@ from aquaflow.survey.measure.picked import (
     view_of_frame,
 )
 from aquaflow.telemetry.known_lengths.known_length import KnownLength
-from aquaflow.telemetry.metric_file import read_frame_of_map
 
 POINT_SIGMA = 0.01
 """Of a point marked in the viewer, as a share of the marked length (judgement: a splat has a
@@ -37,7 +31,7 @@ LEAST_LENGTH_PX = 10.0
 
 
 def between_pixels(
-    dive: Path,
+    dive: Dive,
     frame: int,
     start: tuple[float, float],
     end: tuple[float, float],
@@ -69,7 +63,7 @@ def between_pixels(
 
 
 def between_points(
-    dive: Path,
+    dive: Dive,
     start: tuple[float, float, float],
     end: tuple[float, float, float],
     length_m: float,
@@ -81,7 +75,7 @@ def between_points(
         InputError: the dive has no table of its frames, its metric.json is damaged, or the points
             are the same.
     """
-    metres_per_unit = read_frame_of_map(dive / f"map{SUFFIX}").T_nm.scale
+    metres_per_unit = dive.frame.T_nm.scale
     length = float(np.linalg.norm(np.subtract(end, start))) / metres_per_unit
     if not np.isfinite(length) or length <= 0.0:
         raise InputError("the two points are one and the same; mark both ends of a length")
@@ -90,23 +84,20 @@ def between_points(
     return KnownLength(-1, source, length, POINT_SIGMA * length, length_m, sigma_m, sub_map)
 
 
-def _mapped(dive: Path, frame: int) -> tuple[Mapper, View, int]:
+def _mapped(dive: Dive, frame: int) -> tuple[Mapper, View, int]:
     """The map that has a view of the frame, the view, and the sub-map's number."""
     sub_maps = _sub_maps(dive)
     if frame not in sub_maps:
         raise InputError(f"frame {frame} of {dive} has no pose; choose another --frame")
     number, largest = sub_maps[frame], _largest(sub_maps)
-    renderer = select_renderer(load_config(dive / "config.yaml", inside=True).mapping.renderer)
-    name = "map" if number == largest else f"map_{number}"
-    refuse_unfinished(dive)
-    mapper = read_map_file(dive / f"{name}{SUFFIX}", renderer)
+    dive.require()
+    mapper = dive.map(None if number == largest else number)
     return mapper, view_of_frame(mapper, frame, dive), number
 
 
-def _sub_maps(dive: Path) -> dict[int, int]:
+def _sub_maps(dive: Dive) -> dict[int, int]:
     """Sub-map by frame index, of the frames that have one."""
-    rows = read_rows(dive / "frames.csv")
-    return {row.index: row.sub_map for row in rows if row.sub_map is not None}
+    return {row.index: row.sub_map for row in dive.frames if row.sub_map is not None}
 
 
 def _largest(sub_maps: dict[int, int]) -> int:

@@ -7,9 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from aquaflow.base.errors import InputError
+from aquaflow.dive.dive import Dive
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes.place import KeypointDepths, Place
-from aquaflow.keyframes.places_file import NAME as PLACES
 from aquaflow.keyframes.places_file import PlacesFile
 from aquaflow.survey.site.frames import frame_of
 from aquaflow.survey.site.manifest import check_unchanged, is_site, read_site
@@ -56,7 +56,7 @@ def site_as_base(folder: Path) -> Base | None:
 
 def _unchanged(dive: Path, before: str) -> PlacesFile:
     check_unchanged(dive, before)
-    return PlacesFile(dive / PLACES)
+    return Dive(dive).places
 
 
 def _places(

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from aquaflow.base.errors import InputError
+from aquaflow.dive.dive import Dive
 from aquaflow.keyframes.places_file import NAME as PLACES
-from aquaflow.keyframes.places_file import PlacesFile
 from aquaflow.survey.site.manifest import SiteDive, read_site, state_of
 from aquaflow.survey.site.merged_file import MergedSite, read_merged
 
@@ -38,7 +38,7 @@ def _of_dive(site: Path, dive: SiteDive, merged: MergedSite | None) -> list[str]
     found = []
     if state == "changed":
         found.append(f"{dive.name}: {folder} changed since it was added; add it again.")
-    places = PlacesFile(folder / PLACES)
+    places = Dive(folder).places
     for place in places.places:
         places.keypoints(place.number)
     if merged is not None and merged.fingerprints.get(dive.name) != dive.fingerprint:

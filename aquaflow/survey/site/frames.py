@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from aquaflow.dive.dive import Dive
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
-from aquaflow.telemetry.metric_file import read_metric_file
 from aquaflow.telemetry.metric_frame import MetricFrame
 
 
@@ -71,8 +71,8 @@ def frame_of(stated: Mapping[str, Any], dives: Mapping[str, Path]) -> MetricFram
     """
     axes = stated["axes_of"]
     folder = dives.get(axes["dive"])
-    frames = {} if folder is None else read_metric_file(folder)
-    first = frames.get(int(axes["sub_map"]), MetricFrame.unknown())
+    number = int(axes["sub_map"])
+    first = MetricFrame.unknown() if folder is None else Dive(folder).frame_of(number)
     covariance = first.covariance.copy()
     if stated["metric"]:
         covariance[6, 6] = float(stated["scale_sigma"]) ** 2

@@ -11,9 +11,8 @@ from pathlib import Path
 from aquaflow.base.errors import DamagedError, InputError, printable, reason_of
 from aquaflow.base.errors.regular_file import read_regular_json, sha256_regular
 from aquaflow.base.storage.atomic import write_json
-from aquaflow.base.storage.dive_status import refuse_unfinished
+from aquaflow.dive.dive import Dive
 from aquaflow.keyframes.places_file import NAME as PLACES
-from aquaflow.keyframes.places_file import PlacesFile
 from aquaflow.telemetry.metric_file import NAME as METRIC
 
 NAME = "site.json"
@@ -111,8 +110,9 @@ def add_dives(site: Path, folders: Sequence[Path]) -> list[SiteDive]:
     there = list(read_site(site)) if (site / NAME).exists() else []
     new = []
     for folder in folders:
-        refuse_unfinished(folder)
-        PlacesFile(folder / PLACES)  # refuses what cannot be recognised again
+        read = Dive(folder)
+        read.require()
+        _ = read.places  # refuses what cannot be recognised again
         mark = fingerprint(folder)
         at = next((i for i, dive in enumerate(there) if _same(dive.folder(site), folder)), None)
         if at is None:

@@ -14,9 +14,9 @@ from aquaflow.base.errors import DamagedError, InputError, reason_of
 from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.base.storage.archive import read_array_file
 from aquaflow.base.storage.atomic import atomic_write, write_json
+from aquaflow.dive.dive import Dive
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.site.manifest import SiteDive
-from aquaflow.telemetry.metric_file import read_main
 
 NAME, ARRAYS = "merged.json", "merged.npy"
 """In a site's folder."""
@@ -99,7 +99,7 @@ class MergedSite:
         Raises:
             InputError: the dive's metric.json is damaged.
         """
-        main = read_main(dive.folder(site))
+        main = Dive(dive.folder(site)).main
         return next((each for each in self.of_dive(dive.name) if each.number == main), None)
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.storage.folder_lock import FolderLock
-from aquaflow.keyframes.places_file import NAME as PLACES
+from aquaflow.dive.dive import Dive
 from aquaflow.keyframes.places_file import PlacesFile
 from aquaflow.survey.site.joining import join
 from aquaflow.survey.site.joint_graph import JointGraph, by_knowledge, sub_maps_of
@@ -25,7 +25,6 @@ from aquaflow.survey.site.merged_file import MergedSite, remove_merged, write_me
 from aquaflow.survey.site.placing import placed
 from aquaflow.survey.site.site_log import say
 from aquaflow.survey.site.site_paths import write_paths
-from aquaflow.telemetry.metric_file import read_metric_file
 from aquaflow.telemetry.metric_frame import MetricFrame
 
 Progress = Callable[[str, int, int | None], None]
@@ -74,8 +73,8 @@ def _taking(site: Path, dives: Sequence[SiteDive]) -> tuple[list[Taking], dict[s
             if state != "as added":
                 left_out[dive.name] = _WHY[state]
                 continue
-            places, frames = PlacesFile(folder / PLACES), read_metric_file(folder)
-            taking.append(Taking(dive, folder, places, frames))
+            read = Dive(folder)
+            taking.append(Taking(dive, folder, read.places, dict(read.metric_frames)))
         except InputError as error:
             left_out[dive.name] = str(error)
     if not taking:

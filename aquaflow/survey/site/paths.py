@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.base.errors import InputError, reason_of
-from aquaflow.base.errors.regular_file import open_regular_text
-from aquaflow.dive.tum import Trajectory, read_tum
+from aquaflow.dive.dive import Dive
+from aquaflow.dive.tum import Trajectory
 from aquaflow.geometry.similarity import Sim3, quaternion_from_rotation
 from aquaflow.geometry.similarity_batch import Sim3Batch
 
@@ -21,22 +18,13 @@ FOLDER = "paths"
 """In a site: DIVE_COMPONENT.tum."""
 
 
-def sub_maps_of_frames(dive: Path) -> dict[int, int]:
-    """The sub-map of every posed frame, by its time in us.
+def sub_maps_of_frames(dive: Dive) -> dict[int, int]:
+    """The sub-map of each posed frame by its time, microseconds.
 
     Raises:
-        InputError: frames.csv cannot be read.
+        InputError: the table of frames cannot be read.
     """
-    path = dive / "frames.csv"
-    try:
-        with open_regular_text(path) as stream:
-            return {
-                _microsecond(float(row["t_s"])): int(row["sub_map"])
-                for row in csv.DictReader(stream)
-                if row["sub_map"]
-            }
-    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
-        raise InputError(f"cannot read {path}: {reason_of(error)}; map the dive again") from error
+    return {_microsecond(row.t_s): row.sub_map for row in dive.frames if row.sub_map is not None}
 
 
 def moved_path(
@@ -62,13 +50,13 @@ def moved_path(
     return Trajectory(path.t_s, positions, quaternion_from_rotation(move.R @ path.R_wc))
 
 
-def path_of_sub_map(dive: Path, sub_map: int, sub_maps: dict[int, int]) -> Trajectory:
+def path_of_sub_map(dive: Dive, sub_map: int, sub_maps: dict[int, int]) -> Trajectory:
     """The part of a dive's trajectory that is in ``sub_map``, in n.
 
     Raises:
         InputError: it cannot be read.
     """
-    path = read_tum(dive / "trajectory.tum", inside=True)
+    path = dive.trajectory
     there = [sub_maps.get(_microsecond(float(t))) == sub_map for t in path.t_s]
     return path.select(np.array(there, dtype=bool))
 

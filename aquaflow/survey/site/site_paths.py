@@ -9,14 +9,11 @@ import numpy as np
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.storage.atomic import make_subfolder
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.tum import Trajectory, write_tum
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes.places_file import NAME as PLACES
-from aquaflow.keyframes.places_file import PlacesFile
 from aquaflow.survey.site.merged_file import MergedSite
 from aquaflow.survey.site.paths import FOLDER, moved_path, path_of_sub_map, sub_maps_of_frames
-from aquaflow.telemetry.metric_file import read_metric_file
-from aquaflow.telemetry.metric_frame import MetricFrame
 
 
 def write_paths(site: Path, folders: Mapping[str, Path], merged: MergedSite) -> None:
@@ -41,15 +38,15 @@ def write_paths(site: Path, folders: Mapping[str, Path], merged: MergedSite) -> 
 
 def _paths_of(folder: Path, index: int, name: str, merged: MergedSite) -> dict[int, Trajectory]:
     """The path of a dive by component."""
-    file, frames = PlacesFile(folder / PLACES), read_metric_file(folder)
-    sub_maps = sub_maps_of_frames(folder)
+    dive = Dive(folder)
+    sub_maps = sub_maps_of_frames(dive)
     parts: dict[int, list[Trajectory]] = {}
     for placed in merged.of_dive(name):
-        path = path_of_sub_map(folder, placed.number, sub_maps)
+        path = path_of_sub_map(dive, placed.number, sub_maps)
         if not len(path):
             continue
-        frame = frames.get(placed.number, MetricFrame.unknown())
-        places = [place for place in file.places if place.sub_map == placed.number]
+        frame = dive.frame_of(placed.number)
+        places = [place for place in dive.places.places if place.sub_map == placed.number]
         rows = merged.keyframes[
             (merged.keyframes["dive"] == index) & (merged.keyframes["sub_map"] == placed.number)
         ]

@@ -12,8 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from aquaflow.base.errors import InputError
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.finished_frames import FinishedFrame, read_finished_frames
-from aquaflow.dive.posed_views import read_mapper
 from aquaflow.dive.recorded import preparation_of
 from aquaflow.dive.restored import SeenFrame, exposure_without_water, without_water
 from aquaflow.geometry.similarity import Sim3
@@ -23,7 +23,6 @@ from aquaflow.sources import open_recording
 from aquaflow.survey.video.encoder import check_name, video_file
 from aquaflow.survey.video.overlay import marked
 from aquaflow.survey.video.timeline import Timeline, usual_fps
-from aquaflow.telemetry.metric_file import read_frame_of_map
 from aquaflow.types import Frame
 
 Progress = Callable[[int, int], None]
@@ -75,7 +74,7 @@ def _rigid(T_mc: Sim3) -> Sim3:
 
 
 def restore_every_frame(
-    dive: Path,
+    dive: Dive,
     path: Path,
     recording: Path,
     width: int | None = None,
@@ -93,7 +92,7 @@ def restore_every_frame(
         ConfigError: the dive's settings cannot be read.
     """
     check_name(path)
-    mapper = read_mapper(dive)
+    mapper = dive.map()
     exposure = exposure_without_water(dive, mapper)
     frames = sorted(read_finished_frames(dive), key=lambda frame: frame.row.index)
     if not frames:
@@ -101,7 +100,7 @@ def restore_every_frame(
     first, last = frames[0].row.index, frames[-1].row.index
     indices = np.array([frame.row.index for frame in frames])
     fps = usual_fps(np.array([frame.row.t_s for frame in frames]), indices)
-    poses, light = Poses(frames, read_frame_of_map(dive / "map.aqf").T_nm), _Light(mapper)
+    poses, light = Poses(frames, dive.frame.T_nm), _Light(mapper)
     restored, count = 0, 0
     with video_file(path, fps) as file:
         timeline = Timeline(file, fps)
@@ -123,7 +122,7 @@ def restore_every_frame(
 
 
 def _recorded(
-    dive: Path, recording: Path, frames: Sequence[FinishedFrame], width: int | None
+    dive: Dive, recording: Path, frames: Sequence[FinishedFrame], width: int | None
 ) -> Iterator[tuple[int, Frame]]:
     """Every frame of the mapped part with its time on the dive's clock (ns), prepared."""
     prepare, first, last = preparation_of(dive, width), frames[0], frames[-1]

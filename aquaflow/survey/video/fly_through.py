@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.map_splats import splats_of
-from aquaflow.dive.posed_views import read_mapper
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
@@ -33,7 +33,7 @@ LEAST_KNOTS = 4
 
 
 def fly_through(
-    dive: Path,
+    dive: Dive,
     path: Path,
     seconds: float,
     water: bool = False,
@@ -50,7 +50,7 @@ def fly_through(
         ConfigError: the dive's settings cannot be read.
     """
     check_name(path)
-    mapper = read_mapper(dive)
+    mapper = dive.map()
     views = in_time(mapper.views)
     count = max(round(seconds * FPS), 2)
     knots = max(round(seconds / SECONDS_PER_KNOT), LEAST_KNOTS)

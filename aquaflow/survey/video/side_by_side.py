@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.finished_frames import FinishedFrame, read_finished_frames
-from aquaflow.dive.posed_views import read_mapper
 from aquaflow.dive.restored import exposure_without_water, seen_frames, without_water
 from aquaflow.mapping.restoration import to_bytes
 from aquaflow.render.transfers import picture_out
@@ -18,7 +18,6 @@ from aquaflow.render.views import in_time
 from aquaflow.survey.video.encoder import check_name, video_file
 from aquaflow.survey.video.overlay import band, words_of
 from aquaflow.survey.video.timeline import Timeline, usual_fps
-from aquaflow.telemetry.metric_file import read_frame_of_map
 
 Progress = Callable[[int, int], None]
 
@@ -27,7 +26,7 @@ LEAST_FPS, MOST_FPS = 1.0, 60.0
 
 
 def side_by_side(
-    dive: Path, path: Path, recording: Path | None = None, progress: Progress | None = None
+    dive: Dive, path: Path, recording: Path | None = None, progress: Progress | None = None
 ) -> int:
     """Write the mapped frames of the largest sub-map, each at its own time; how many there are.
 
@@ -40,7 +39,7 @@ def side_by_side(
         ConfigError: the dive's settings cannot be read.
     """
     check_name(path)
-    mapper = read_mapper(dive)
+    mapper = dive.map()
     exposure = exposure_without_water(dive, mapper)
     frames = _by_index(read_finished_frames(dive))
     shown = [view.frame_index for view in in_time(mapper.views)]
@@ -49,7 +48,7 @@ def side_by_side(
     times = np.array([frames[index].row.t_s for index in shown])
     # Of the frames that were mapped: what lies between repeats the one before.
     fps = float(np.clip(usual_fps(times, np.arange(len(shown))), LEAST_FPS, MOST_FPS))
-    north = read_frame_of_map(dive / "map.aqf").north
+    north = dive.frame.north
     left = "map, through the water" if recording is None else "camera"
     with video_file(path, fps) as file:
         timeline = Timeline(file, fps)

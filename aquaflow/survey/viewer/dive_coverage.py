@@ -5,16 +5,15 @@ its plan of the moment."""
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
+from aquaflow.dive.dive import Dive
 from aquaflow.survey.coverage.classes import COLOURS, WORDS, Seen
 from aquaflow.survey.coverage.coverage_file import NAME, read_coverage_file
 from aquaflow.survey.viewer.levels import Palette
-from aquaflow.telemetry.metric_file import read_main
 from aquaflow.telemetry.metric_frame import MetricFrame
 
 log = logging.getLogger(__name__)
@@ -31,16 +30,16 @@ CLASSES = Palette(
 
 
 def coverage_of_dive(
-    folder: Path,
+    dive: Dive,
     centres: npt.NDArray[np.floating],  # [N, 3] in n
     frame: MetricFrame,
 ) -> npt.NDArray[np.uint8] | None:
     """[N] a :class:`aquaflow.survey.coverage.Seen` for each; None where the dive keeps no
     coverage."""
-    if not (folder / NAME).is_file():
+    if not dive.has(NAME):
         return None
     try:
-        view = read_coverage_file(folder / NAME).get(read_main(folder))
+        view = read_coverage_file(dive.file(NAME)).get(dive.main)
     except InputError as error:
         log.warning("the viewer shows no coverage: %s", error)
         return None

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.ply import read_ply
 from aquaflow.survey.viewer.dive_coverage import CLASSES, COVERAGE, coverage_of_dive
 from aquaflow.survey.viewer.levels import RANGE, Palette, range_level
@@ -26,20 +27,20 @@ class DiveMap:
 
 
 def read_map(
-    folder: Path,
+    dive: Dive,
     ply: Path,
     cameras: npt.NDArray[np.float64],  # [M, 3] of the path
     frame: MetricFrame,
     budget: int,
 ) -> DiveMap:
-    """The Gaussians in ``ply``, at most ``budget``, of the dive in ``folder``.
+    """The Gaussians in ``ply``, at most ``budget``, of ``dive``.
 
     Raises:
         InputError: the file cannot be read.
     """
     gaussians = read_ply(ply)
     levels, palettes = _levels(gaussians.means, cameras, frame.unit)
-    classes = coverage_of_dive(folder, gaussians.means, frame)
+    classes = coverage_of_dive(dive, gaussians.means, frame)
     if classes is not None:
         levels[COVERAGE], palettes[COVERAGE] = classes, CLASSES
     shown = splats(

@@ -11,18 +11,19 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
+from aquaflow.dive.dive import HELD_OUT, Dive
 from aquaflow.dive.trajectory_csv import NAME as PATH_TABLE
-from aquaflow.dive.trajectory_csv import PoseRow, read_trajectory_csv
+from aquaflow.dive.trajectory_csv import PoseRow
 from aquaflow.recordings.kept_pictures import kept_pictures
 from aquaflow.survey.viewer.moments import Float, moments
 
 log = logging.getLogger(__name__)
 
 
-def pictures_of_dive(folder: Path) -> dict[int, Path]:
+def pictures_of_dive(dive: Dive) -> dict[int, Path]:
     """What the camera saw, by the frame's index: the held-out pictures and the small ones."""
-    found = kept_pictures(folder)
-    for path in (folder / "heldout").glob("*_real.png"):
+    found = kept_pictures(dive.path)
+    for path in dive.file(HELD_OUT).glob("*_real.png"):
         number = path.name.removesuffix("_real.png")
         if path.is_symlink() or path.parent.is_symlink():
             continue
@@ -32,14 +33,14 @@ def pictures_of_dive(folder: Path) -> dict[int, Path]:
 
 
 def moments_of_dive(
-    folder: Path,
+    dive: Dive,
     t_s: npt.NDArray[np.float64],  # [N] of the poses in trajectory.tum
     index: npt.NDArray[np.int64],  # [N] of their frames, -1 where not known
     kept: Iterable[int],
 ) -> tuple[Float, datetime | None]:
     """[N, 5] as :func:`aquaflow.survey.viewer.moments.moments` gives them, and the UTC of the
     first pose, if it is known."""
-    table = _table(folder)
+    table = _table(dive)
     rows = [table.get(round(float(each) * 1e6)) for each in t_s]
     depth = np.array([_or_nan(row.depth_m if row else None) for row in rows], np.float64)
     heading = np.array([_or_nan(row.heading_deg if row else None) for row in rows], np.float64)
@@ -51,12 +52,12 @@ def moments_of_dive(
     return moments(t_s, depth, heading, index, kept), began
 
 
-def _table(folder: Path) -> dict[int, PoseRow]:
+def _table(dive: Dive) -> dict[int, PoseRow]:
     """By microsecond; nothing where there is no such file, or one of another version."""
-    if not (folder / PATH_TABLE).is_file():
+    if not dive.has(PATH_TABLE):
         return {}
     try:
-        return {round(row.t_s * 1e6): row for row in read_trajectory_csv(folder / PATH_TABLE)}
+        return {round(row.t_s * 1e6): row for row in dive.poses}
     except InputError as error:
         log.warning("the viewer shows neither depth nor heading: %s", error)
         return {}

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import InputError, reason_of
 from aquaflow.base.errors.regular_file import open_regular_text
+from aquaflow.dive.dive import FRAMES, TRAJECTORY, Dive
 from aquaflow.geometry.similarity import Sim3, rotation_from_quaternion
 from aquaflow.survey.viewer.dive_moments import moments_of_dive, pictures_of_dive
 from aquaflow.survey.viewer.exhibit import POSE_NUMBERS
@@ -66,16 +67,16 @@ class DivePath:
         )  # fmt: skip
 
 
-def read_path(folder: Path) -> DivePath:
-    """The path of the finished dive in ``folder``.
+def read_path(dive: Dive) -> DivePath:
+    """The path of a finished dive.
 
     Raises:
         InputError: a file cannot be read, or holds something else.
     """
-    poses, t_s = _poses(folder / "trajectory.tum")
-    quality, indices = _of_frames(folder, t_s)
-    pictures = pictures_of_dive(folder)
-    moments, began = moments_of_dive(folder, t_s, indices, pictures)
+    poses, t_s = _poses(dive.file(TRAJECTORY))
+    quality, indices = _of_frames(dive, t_s)
+    pictures = pictures_of_dive(dive)
+    moments, began = moments_of_dive(dive, t_s, indices, pictures)
     return DivePath(t_s, poses, quality, moments, began, pictures)
 
 
@@ -92,11 +93,11 @@ def _poses(path: Path) -> tuple[list[Sim3], npt.NDArray[np.float64]]:
 
 
 def _of_frames(
-    folder: Path,
+    dive: Dive,
     times: npt.NDArray[np.float64],  # [N] s
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
     """Quality and index of the frame at each time; -1 where there is none."""
-    shown = _shown_by_microsecond(folder / "frames.csv")
+    shown = _shown_by_microsecond(dive.file(FRAMES))
     quality, indices = [], []
     for t_s in times:
         inliers, index = shown.get(_microsecond(t_s), (1.0, -1))

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from aquaflow.base.errors import DamagedError, InputError, printable, reason_of
-from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.base.storage.dive_status import unfinished
 from aquaflow.config.viewer import ViewerConfig
-from aquaflow.geometry.camera import CameraModel, load_camera
+from aquaflow.dive.dive import CAMERA, FRAMES, TRAJECTORY, Dive
+from aquaflow.geometry.camera import CameraModel
 from aquaflow.survey.viewer.dive_map import DiveMap, read_map
 from aquaflow.survey.viewer.dive_path import DivePath, read_path
 from aquaflow.survey.viewer.levels import Palette
@@ -26,12 +26,11 @@ from aquaflow.survey.viewer.scale_tool import Mark, marked
 from aquaflow.survey.viewer.seen_water import SeenWater, water_of
 from aquaflow.survey.viewer.splats import Splats
 from aquaflow.survey.viewer.tools import SCALE, Tools
-from aquaflow.telemetry.metric_file import read_frame_of_map
 from aquaflow.telemetry.metric_frame import MetricFrame
 
 log = logging.getLogger(__name__)
 
-WHOLE = ("map.ply", "trajectory.tum", "camera.yaml", "frames.csv")
+WHOLE = ("map.ply", TRAJECTORY, CAMERA, FRAMES)
 """Files without which a folder is no finished dive."""
 
 
@@ -83,30 +82,23 @@ def frame_in_words(frame: MetricFrame) -> str:
     return f"{unit}; x points to {frame.north}, z down" if frame.level else unit
 
 
-def read_dive(folder: Path, budget: int) -> FinishedDive:
-    """The finished dive in ``folder``; its Gaussians are read when they are asked for.
+def finished_dive(dive: Dive, budget: int) -> FinishedDive:
+    """What the viewer shows of ``dive``; its Gaussians are read when they are asked for.
 
     Raises:
-        InputError: there is none.
+        InputError: it is not finished.
     """
-    said = unfinished(folder)
+    said = unfinished(dive.path)
     for name in WHOLE:
-        if said is not None and not (folder / name).is_file():
-            raise InputError(said)
-        if not (folder / name).is_file():
-            raise InputError(f"{folder} holds no finished dive: {name} is missing")
-    path = read_path(folder)
-    frame, camera = (
-        read_frame_of_map(folder / "map.aqf"),
-        load_camera(folder / "camera.yaml", inside=True),
-    )
-    water = _water(folder / "medium.json")
-    ply = folder / "map_clear.ply"
+        if not dive.has(name):
+            raise InputError(said or f"{dive} holds no finished dive: {name} is missing")
+    path, frame, camera, folder = read_path(dive), dive.frame, dive.camera, dive.path
+    water, ply = _water(dive), dive.file("map_clear.ply")
     if water is None or not ply.is_file():  # colours with the water in them are all there is
-        water, ply = None, folder / "map.ply"
+        water, ply = None, dive.file("map.ply")
     key = key_of(folder, budget)
     return FinishedDive(
-        folder, ply, cache(partial(read_map, folder, ply, path.places, frame, budget)),
+        folder, ply, cache(partial(read_map, dive, ply, path.places, frame, budget)),
         read_packed(folder, key), key, water, path, camera, frame,
     )  # fmt: skip
 
@@ -132,7 +124,7 @@ def show_folder(folder: Path, config: ViewerConfig) -> ViewerPage:
         InputError: there is no finished dive, or the address is taken.
         ConfigError: the token will not do.
     """
-    return show_dive(read_dive(folder, config.splats), config)
+    return show_dive(finished_dive(Dive(folder), config.splats), config)
 
 
 def fill(page: ViewerPage, dive: FinishedDive) -> None:
@@ -165,12 +157,12 @@ def open_dive(folder: Path, config: ViewerConfig, mark: Mark | None = None) -> V
     def scale(given: Asked) -> Asked:
         said = marked(given, mark) if mark is not None else {}
         if said.get("rescaled"):
-            fill(page[0], read_dive(folder, config.splats))
+            fill(page[0], finished_dive(Dive(folder), config.splats))
         return said
 
     if mark is not None:
         tools.others[SCALE] = scale
-    dive = read_dive(folder, config.splats)
+    dive = finished_dive(Dive(folder), config.splats)
     page.append(show_dive(dive, config, tools))
     prepare(folder, dive.key, dive.packed, dive.map, page[0])
     return page[0]
@@ -201,10 +193,10 @@ def prepare(
     return thread
 
 
-def _water(path: Path) -> SeenWater | None:
+def _water(dive: Dive) -> SeenWater | None:
     """None for a dive without water, and for a file that does not say it."""
     try:
-        return water_of(read_regular_json(path))
-    except (OSError, ValueError, AttributeError, DamagedError) as error:
-        log.warning("the viewer shows no water: %s: %s", path, reason_of(error))
+        return water_of(dive.medium_facts)
+    except (InputError, ValueError, AttributeError, DamagedError) as error:
+        log.warning("the viewer shows no water: %s: %s", dive, reason_of(error))
         return None

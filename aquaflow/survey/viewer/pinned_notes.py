@@ -11,10 +11,10 @@ from typing import Any, get_args
 import numpy as np
 
 from aquaflow.base.errors import InputError
+from aquaflow.dive.dive import Dive
 from aquaflow.survey.measure.notes import MOST_NOTES, Note, Shape, read_notes, write_notes
 from aquaflow.survey.viewer.measuring import Asked, is_finite, vector
 from aquaflow.survey.viewer.tools import NOTES
-from aquaflow.telemetry.metric_file import read_frame_of_map
 from aquaflow.telemetry.metric_frame import MetricFrame
 
 LONGEST = 1000
@@ -78,7 +78,7 @@ class PinnedNotes:
         return {}
 
     def _frame(self) -> MetricFrame:
-        return read_frame_of_map(self.dive / "map.aqf")
+        return Dive(self.dive).frame
 
 
 def _measured(given: Any) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from aquaflow.base.errors import InputError
+from aquaflow.dive.dive import Dive
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.site.frames import frame_of
 from aquaflow.survey.site.manifest import SiteDive, check_unchanged, read_site
@@ -15,7 +16,7 @@ from aquaflow.survey.site.merged_file import MergedSite, PlacedSubMap, merge_of
 from aquaflow.survey.site.paths import sub_maps_of_frames
 from aquaflow.survey.site.site_map_file import SiteMapPart, parts_of
 from aquaflow.survey.viewer.dive_path import DivePath
-from aquaflow.survey.viewer.finished import FinishedDive, read_dive
+from aquaflow.survey.viewer.finished import FinishedDive, finished_dive
 from aquaflow.telemetry.metric_frame import MetricFrame
 
 log = logging.getLogger(__name__)
@@ -102,8 +103,10 @@ def _placed(
     main = merged.main_of(dive, site)
     if main is None or main not in placed:
         raise InputError(f"the map of {name} is of a sub-map that is not in this component")
-    read = read_dive(folder, budget)
-    return PlacedDive(name, read, main.T_sn, _moved(read.path, sub_maps_of_frames(folder), placed))
+    read = Dive(folder)
+    shown = finished_dive(read, budget)
+    path = _moved(shown.path, sub_maps_of_frames(read), placed)
+    return PlacedDive(name, shown, main.T_sn, path)
 
 
 def _moved(path: DivePath, sub_maps: Mapping[int, int], placed: Sequence[PlacedSubMap]) -> DivePath:

@@ -11,6 +11,7 @@ import numpy as np
 
 from aquaflow.base.errors import InputError, printable
 from aquaflow.config.viewer import ViewerConfig
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.ply import PlyGaussians, read_ply
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.site.site_map_file import joined, read_site_map
@@ -82,7 +83,7 @@ def map_of_site(shown: ShownSite, budget: int) -> DiveMap:
     maps = _one_map(shown) or [_own_map(placed) for placed in shown.dives]
     for number, (placed, own) in enumerate(zip(shown.dives, maps, strict=True)):
         in_n = placed.T_sn.inverse().apply(np.asarray(own.means, np.float64))
-        classes.append(coverage_of_dive(placed.dive.folder, in_n, placed.dive.frame))
+        classes.append(coverage_of_dive(Dive(placed.dive.folder), in_n, placed.dive.frame))
         numbers.append(np.full(len(own.means), min(number, MOST_NAMED), np.uint8))
     names = tuple(placed.name for placed in shown.dives)[: MOST_NAMED + 1]
     stops = tuple(DIVE_COLOURS[i % len(DIVE_COLOURS)] for i in range(len(names)))

@@ -21,9 +21,9 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from aquaflow.base.errors import InputError
-from aquaflow.dive.dive import read_dive
+from aquaflow.dive.dive import Dive, read_dive
 from aquaflow.dive.point_cloud import read_point_cloud
-from aquaflow.dive.posed_views import read_mapper, read_posed_views
+from aquaflow.dive.posed_views import read_posed_views
 from aquaflow.dive.restored import exposure_without_water, restored_frames
 from aquaflow.dive.ros.topics import LASTING, TYPES
 from aquaflow.survey.export.mcap_export import export_mcap
@@ -71,7 +71,7 @@ def dive(small_dive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def exported(dive: Path, small_recording: Path) -> Path:
     path = dive / "dive.mcap"
-    export_mcap(dive, path, small_recording)
+    export_mcap(Dive(dive), path, small_recording)
     return path
 
 
@@ -152,7 +152,7 @@ def test_messages_bear_the_dives_own_times_in_utc(messages: Messages, dive: Path
 
 
 def test_frames_compose_to_the_pose_of_each_picture(messages: Messages, dive: Path) -> None:
-    where = read_posed_views(dive, read_mapper(dive))[1]
+    where = read_posed_views(Dive(dive), Dive(dive).map())[1]
     trajectory = read_dive(dive).trajectory
     T_un = where.T_un.matrix
     found = list(camera_to_map(messages))
@@ -181,7 +181,7 @@ def test_a_point_of_the_cloud_lies_where_a_picture_shows_it(messages: Messages, 
     kind = np.dtype([(name, "<f4") for name in names])
     assert cloud.point_step == kind.itemsize
     points = np.frombuffer(bytes(cloud.data), kind)
-    given = read_point_cloud(dive)
+    given = read_point_cloud(Dive(dive))
     assert len(points) == cloud.width == len(given)
     (chunk,) = given.chunks()
     np.testing.assert_allclose(points["z"], chunk.positions[:, 2], rtol=1e-6)
@@ -193,7 +193,7 @@ def test_a_point_of_the_cloud_lies_where_a_picture_shows_it(messages: Messages, 
     info = messages["/camera/camera_info"][0]
     poses = dict(camera_to_map(messages))
     T_om = np.linalg.inv(poses[stamp_ns(info.ros_msg.header)])
-    ours = read_posed_views(dive, read_mapper(dive))[0][0]
+    ours = read_posed_views(Dive(dive), Dive(dive).map())[0][0]
     places = np.stack([points["x"], points["y"], points["z"], np.ones(len(points))]).astype(float)
     in_camera = (T_om @ places)[:3]
     pixels = (np.array(info.ros_msg.k).reshape(3, 3) @ in_camera)[:2] / in_camera[2]
@@ -207,11 +207,11 @@ def test_a_point_of_the_cloud_lies_where_a_picture_shows_it(messages: Messages, 
 def test_pictures_are_those_of_the_camera_the_map_and_the_restoration(
     messages: Messages, dive: Path, small_recording: Path
 ) -> None:
-    mapper = read_mapper(dive)
-    exposure = exposure_without_water(dive, mapper)
+    mapper = Dive(dive).map()
+    exposure = exposure_without_water(Dive(dive), mapper)
     restored = [
         picture.picture_bytes(exposure)
-        for _, picture in restored_frames(dive, mapper, small_recording)
+        for _, picture in restored_frames(Dive(dive), mapper, small_recording)
     ]
     found = messages["/camera/restored/compressed"]
     assert len(found) == len(restored) == len(messages["/camera/rendered/compressed"])
@@ -291,7 +291,7 @@ def test_the_layout_shows_only_topics_that_are_in_the_file(
 
 
 def test_without_a_recording_the_map_is_drawn(small_dive: Path, tmp_path: Path) -> None:
-    wrote = export_mcap(small_dive, tmp_path / "dive.mcap")
+    wrote = export_mcap(Dive(small_dive), tmp_path / "dive.mcap")
     topics = {read.topic for read in read_all(tmp_path / "dive.mcap")}
     assert "/camera/image/compressed" not in topics
     assert {"/camera/rendered/compressed", "/camera/restored/compressed"} <= topics
@@ -303,13 +303,13 @@ def test_without_a_recording_the_map_is_drawn(small_dive: Path, tmp_path: Path) 
 def test_the_same_dive_gives_the_same_bytes(
     exported: Path, dive: Path, small_recording: Path, tmp_path: Path
 ) -> None:
-    export_mcap(dive, tmp_path / "again.mcap", small_recording)
+    export_mcap(Dive(dive), tmp_path / "again.mcap", small_recording)
     assert (tmp_path / "again.mcap").read_bytes() == exported.read_bytes()
 
 
 def test_another_recording_leaves_no_file(dive: Path, pictures: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no readable frame"):
-        export_mcap(dive, tmp_path / "dive.mcap", pictures)
+        export_mcap(Dive(dive), tmp_path / "dive.mcap", pictures)
     assert list(tmp_path.glob("*.mcap*")) == list(tmp_path.glob(".*.part")) == []
 
 

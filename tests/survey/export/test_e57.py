@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from aquaflow.base.errors import InputError
 from aquaflow.cli import app
 from aquaflow.dive import point_cloud
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.point_cloud import Points, read_point_cloud
 from aquaflow.survey.export.e57 import COLOURS, NORMALS, POSITIONS, SIGMA, write_e57
 from tests.survey.export.small_dive import north_up_frame, write_small_dive
@@ -29,7 +30,7 @@ def dive(tmp_path: Path) -> Path:
 
 
 def all_points(dive: Path) -> Points:
-    (points,) = read_point_cloud(dive).chunks()
+    (points,) = read_point_cloud(Dive(dive)).chunks()
     return points
 
 
@@ -50,10 +51,10 @@ def fields(path: Path, names: tuple[str, ...]) -> dict[str, npt.NDArray[Any]]:
 
 
 def test_positions_are_on_the_grid_to_a_tenth_of_a_millimetre(dive: Path, tmp_path: Path) -> None:
-    write_e57(tmp_path / "a.e57", read_point_cloud(dive))
+    write_e57(tmp_path / "a.e57", read_point_cloud(Dive(dive)))
     with pye57.E57(str(tmp_path / "a.e57")) as file:
         found = file.read_scan(0, colors=True, ignore_missing_fields=True)
-    points, where = all_points(dive), read_point_cloud(dive).placement
+    points, where = all_points(dive), read_point_cloud(Dive(dive)).placement
     expected = where.on_grid(points.positions)
     assert expected[:, 1].min() > 6e6  # northing at 59 degrees
     assert np.abs(np.stack([found[name] for name in POSITIONS], axis=1) - expected).max() < 1e-4
@@ -63,7 +64,7 @@ def test_positions_are_on_the_grid_to_a_tenth_of_a_millimetre(dive: Path, tmp_pa
 
 
 def test_normals_and_sigma_are_there_as_extensions(dive: Path, tmp_path: Path) -> None:
-    write_e57(tmp_path / "a.e57", read_point_cloud(dive))
+    write_e57(tmp_path / "a.e57", read_point_cloud(Dive(dive)))
     found = fields(tmp_path / "a.e57", (*NORMALS, SIGMA))
     normals = np.stack([found[name] for name in NORMALS], axis=1)
     np.testing.assert_allclose(normals, np.tile([0.0, 0.0, 1.0], (1200, 1)), atol=1e-6)
@@ -71,9 +72,9 @@ def test_normals_and_sigma_are_there_as_extensions(dive: Path, tmp_path: Path) -
 
 
 def test_the_file_names_its_grid_or_its_unit(dive: Path, tmp_path: Path) -> None:
-    write_e57(tmp_path / "a.e57", read_point_cloud(dive))
+    write_e57(tmp_path / "a.e57", read_point_cloud(Dive(dive)))
     write_small_dive(tmp_path / "other")
-    write_e57(tmp_path / "b.e57", read_point_cloud(tmp_path / "other"))
+    write_e57(tmp_path / "b.e57", read_point_cloud(Dive(tmp_path / "other")))
     said = {}
     for name in ("a", "b"):
         with pye57.E57(str(tmp_path / f"{name}.e57")) as file:
@@ -87,10 +88,10 @@ def test_the_file_names_its_grid_or_its_unit(dive: Path, tmp_path: Path) -> None
 
 def test_chunks_change_nothing(dive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = (*POSITIONS, *NORMALS, SIGMA)
-    write_e57(tmp_path / "a.e57", read_point_cloud(dive))
+    write_e57(tmp_path / "a.e57", read_point_cloud(Dive(dive)))
     monkeypatch.setattr(point_cloud, "CHUNK", 97)
     steps: list[tuple[int, int]] = []
-    write_e57(tmp_path / "b.e57", read_point_cloud(dive), lambda *step: steps.append(step))
+    write_e57(tmp_path / "b.e57", read_point_cloud(Dive(dive)), lambda *step: steps.append(step))
     whole, parts = (fields(tmp_path / f"{name}.e57", names) for name in ("a", "b"))
     for name in names:
         np.testing.assert_array_equal(whole[name], parts[name])
@@ -102,12 +103,12 @@ def test_a_missing_package_is_named_with_what_installs_it(
 ) -> None:
     monkeypatch.setitem(sys.modules, "pye57", None)
     with pytest.raises(InputError, match="an E57 file needs the library pye57"):
-        write_e57(tmp_path / "a.e57", read_point_cloud(dive))
+        write_e57(tmp_path / "a.e57", read_point_cloud(Dive(dive)))
     assert not list(tmp_path.glob("*.e57"))
 
 
 def test_what_the_library_cannot_write_is_one_sentence(dive: Path, tmp_path: Path) -> None:
-    cloud = read_point_cloud(dive)
+    cloud = read_point_cloud(Dive(dive))
 
     def disk_is_full(done: int, total: int) -> None:
         raise pye57.libe57.E57Exception("the disk is full")

@@ -15,9 +15,10 @@ from typer.testing import CliRunner
 from aquaflow.base.errors import InputError
 from aquaflow.cli import app
 from aquaflow.dive import point_cloud
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.ply import read_ply
 from aquaflow.dive.point_cloud import nearest_cameras, read_point_cloud
-from aquaflow.dive.posed_views import read_mapper, read_posed_views
+from aquaflow.dive.posed_views import read_posed_views
 from aquaflow.survey.export.laz import write_laz
 from tests.survey.export.small_dive import (
     ORIGIN,
@@ -40,7 +41,7 @@ def dive(tmp_path: Path) -> Path:
 
 
 def written(dive: Path, path: Path, water: bool = False) -> Any:
-    write_laz(path, read_point_cloud(dive, water))
+    write_laz(path, read_point_cloud(Dive(dive), water))
     return laspy.read(path)
 
 
@@ -77,7 +78,7 @@ def test_normals_face_the_camera_and_point_as_the_grid_does(dive: Path, tmp_path
 
 
 def test_directions_turn_to_the_grid_as_positions_do(dive: Path) -> None:
-    where = read_point_cloud(dive).placement
+    where = read_point_cloud(Dive(dive)).placement
     ahead = np.array([[0.0, 100.0, 0.0]])
     moved = where.on_grid(ahead)[0] - where.on_grid(np.zeros((1, 3)))[0]
     turned = where.turned_to_grid(ahead)[0]
@@ -86,8 +87,8 @@ def test_directions_turn_to_the_grid_as_positions_do(dive: Path) -> None:
 
 
 def test_sigma_is_the_spread_along_the_ray(dive: Path, tmp_path: Path) -> None:
-    views, _ = read_posed_views(dive, read_mapper(dive))
-    cloud = read_point_cloud(dive)
+    views, _ = read_posed_views(Dive(dive), Dive(dive).map())
+    cloud = read_point_cloud(Dive(dive))
     points = next(cloud.chunks())
     rays = points.positions - nearest_cameras(points.positions, views)
     cosine = np.abs(rays[:, 2]) / np.linalg.norm(rays, axis=1)
@@ -121,7 +122,7 @@ def test_chunks_change_nothing(dive: Path, tmp_path: Path, monkeypatch: pytest.M
     whole = written(dive, tmp_path / "a.laz")
     monkeypatch.setattr(point_cloud, "CHUNK", 97)
     steps: list[tuple[int, int]] = []
-    write_laz(tmp_path / "b.laz", read_point_cloud(dive), lambda *step: steps.append(step))
+    write_laz(tmp_path / "b.laz", read_point_cloud(Dive(dive)), lambda *step: steps.append(step))
     parts = laspy.read(tmp_path / "b.laz")
     np.testing.assert_array_equal(whole.points.array, parts.points.array)
     assert steps[0] == (97, 1200)
@@ -129,7 +130,7 @@ def test_chunks_change_nothing(dive: Path, tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_a_camera_that_does_not_see_a_point_is_taken_only_where_none_does(dive: Path) -> None:
-    views, _ = read_posed_views(dive, read_mapper(dive))
+    views, _ = read_posed_views(Dive(dive), Dive(dive).map())
     first = next(view for view in views if view.frame_index == 0)
     below = first.T_uc.apply(np.array([[0.0, 0.0, 3.0], [0.0, 0.0, -3.0]]))
     seen, unseen = nearest_cameras(below, [first])
@@ -142,7 +143,7 @@ def test_a_camera_that_does_not_see_a_point_is_taken_only_where_none_does(dive: 
 def test_a_map_of_haze_alone_gives_no_points(dive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(point_cloud, "LEAST_OPACITY", 0.95)
     with pytest.raises(InputError, match=r"has an opacity of 0\.95 or more"):
-        read_point_cloud(dive)
+        read_point_cloud(Dive(dive))
 
 
 def test_a_missing_package_is_named_with_what_installs_it(
@@ -150,7 +151,7 @@ def test_a_missing_package_is_named_with_what_installs_it(
 ) -> None:
     monkeypatch.setitem(sys.modules, "lazrs", None)
     with pytest.raises(InputError, match=r"lazrs.*pip install 'aquaflow\[survey\]'"):
-        write_laz(tmp_path / "a.laz", read_point_cloud(dive))
+        write_laz(tmp_path / "a.laz", read_point_cloud(Dive(dive)))
     assert not list(tmp_path.glob("*.laz"))
 
 

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from aquaflow.base.errors import InputError
 from aquaflow.cli import app
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.map_file import write_map_file
 from aquaflow.dive.placement import placement
 from aquaflow.geometry.similarity import Sim3
@@ -55,7 +56,7 @@ def dive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def written(dive: Path) -> dict[str, Path]:
     paths = {kind: dive / f"mesh.{kind}" for kind in KINDS}
     for kind, path in paths.items():
-        export_mesh(dive, path, kind)  # type: ignore[arg-type]
+        export_mesh(Dive(dive), path, kind)  # type: ignore[arg-type]
     return paths
 
 
@@ -116,7 +117,7 @@ def test_the_same_dive_gives_the_same_bytes(
 ) -> None:
     for kind in KINDS:
         again = tmp_path / f"mesh.{kind}"
-        export_mesh(dive, again, kind)  # type: ignore[arg-type]
+        export_mesh(Dive(dive), again, kind)  # type: ignore[arg-type]
         assert again.read_bytes() == written[kind].read_bytes()
     assert (tmp_path / "mesh.png").read_bytes() == written["obj"].with_suffix(".png").read_bytes()
     names = ["mesh.glb", "mesh.mtl", "mesh.obj", "mesh.ply", "mesh.png"]
@@ -125,7 +126,7 @@ def test_the_same_dive_gives_the_same_bytes(
 
 def test_a_dive_on_the_earth_lies_on_its_utm_grid(tmp_path: Path) -> None:
     dive = write_survey(tmp_path / "dive", surveyed())
-    mesh = export_mesh(dive, tmp_path / "a.glb", "glb")
+    mesh = export_mesh(Dive(dive), tmp_path / "a.glb", "glb")
     _, vertices = read(tmp_path / "a.glb")
     north, east = (each.ravel() for each in np.meshgrid(*[np.linspace(0.8, 3.0, 12)] * 2))
     truth = on_utm(np.column_stack([north, east, DEPTH_M - height(north, east)]))
@@ -164,10 +165,10 @@ def test_a_dive_in_map_units_says_so_and_water_colours_it(tmp_path: Path) -> Non
     mapper = surveyed(metric_frame(T_nm=Sim3.identity()))
     mapper.medium.set_water(*(torch.tensor(values) for values in WATER))
     dive = write_survey(tmp_path / "dive", mapper, MetricFrame.unknown())
-    clear = export_mesh(dive, tmp_path / "clear.ply", "ply")
+    clear = export_mesh(Dive(dive), tmp_path / "clear.ply", "ply")
     assert clear.where.unit == "map units"
     assert clear.seen == "without water"
-    seen = export_mesh(dive, tmp_path / "seen.ply", "ply", water=True)
+    seen = export_mesh(Dive(dive), tmp_path / "seen.ply", "ply", water=True)
     assert seen.seen.endswith("map units of water")
     means = []
     for name in ("clear", "seen"):
@@ -179,7 +180,7 @@ def test_a_dive_in_map_units_says_so_and_water_colours_it(tmp_path: Path) -> Non
 
 
 def test_a_larger_resolution_gives_fewer_triangles(dive: Path, tmp_path: Path) -> None:
-    coarse = export_mesh(dive, tmp_path / "a.ply", "ply", resolution=0.08)
+    coarse = export_mesh(Dive(dive), tmp_path / "a.ply", "ply", resolution=0.08)
     assert coarse.voxel == 0.08
     _, vertices = read(tmp_path / "a.ply")
     error = vertices[:, 2] - height(vertices[:, 1], vertices[:, 0]) + DEPTH_M
@@ -200,14 +201,14 @@ def test_what_fails_leaves_nothing_behind(
         interrupted,
     )
     with pytest.raises(KeyboardInterrupt):
-        export_mesh(dive, tmp_path / f"a.{kind}", kind)  # type: ignore[arg-type]
+        export_mesh(Dive(dive), tmp_path / f"a.{kind}", kind)  # type: ignore[arg-type]
     assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_that_is_a_file_is_refused_in_a_sentence(dive: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="give a folder with room"):
-        export_mesh(dive, tmp_path / "file" / "a.ply", "ply")
+        export_mesh(Dive(dive), tmp_path / "file" / "a.ply", "ply")
 
 
 def test_a_dive_without_gaussians_views_or_surface_is_one_sentence(
@@ -217,17 +218,17 @@ def test_a_dive_without_gaussians_views_or_surface_is_one_sentence(
     write_small_dive(dive)
     monkeypatch.setattr(export_module, "LEAST_VIEWS", 9)
     with pytest.raises(InputError, match="too little of the map is seen well by two views"):
-        export_mesh(dive, tmp_path / "a.ply", "ply")
+        export_mesh(Dive(dive), tmp_path / "a.ply", "ply")
     mapper = small_mapper()
     mapper.views = []
     write_map_file(dive / "map.aqf", mapper)
     with pytest.raises(InputError, match="has no views"):
-        export_mesh(dive, tmp_path / "a.ply", "ply")
+        export_mesh(Dive(dive), tmp_path / "a.ply", "ply")
     mapper = small_mapper()
     mapper.gaussians.parameters["opacity_logits"].fill_(-9.0)
     write_map_file(dive / "map.aqf", mapper)
     with pytest.raises(InputError, match="show no surface of its map"):
-        export_mesh(dive, tmp_path / "a.ply", "ply")
+        export_mesh(Dive(dive), tmp_path / "a.ply", "ply")
     assert not list(tmp_path.glob("*.ply"))
 
 
@@ -237,7 +238,7 @@ def test_a_missing_package_is_named_with_what_installs_it(
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(InputError, match=rf"{module}.*pip install 'aquaflow\[survey\]'"):
-        export_mesh(dive, tmp_path / "a", kind)  # type: ignore[arg-type]
+        export_mesh(Dive(dive), tmp_path / "a", kind)  # type: ignore[arg-type]
 
 
 def test_the_command_writes_into_the_dive_and_says_what_it_is(dive: Path) -> None:

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from aquaflow.cli import app
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.ply import SH_C0, PlyGaussians, read_ply
 from aquaflow.survey.export import spz
 from aquaflow.survey.export.spz import export_spz, fraction_bits, write_spz
@@ -132,7 +133,7 @@ def test_an_empty_map_is_a_header_alone(tmp_path: Path) -> None:
 
 def test_a_dive_is_upright_in_a_viewer_whose_y_is_up(tmp_path: Path) -> None:
     write_small_dive(tmp_path / "dive", north_up_frame())
-    count, _ = export_spz(tmp_path / "dive", tmp_path / "a.spz")
+    count, _ = export_spz(Dive(tmp_path / "dive"), tmp_path / "a.spz")
     found = decoded(tmp_path / "a.spz")
     north, east, down = read_ply(tmp_path / "dive" / "map_clear.ply").means.T
     np.testing.assert_allclose(found.means, np.stack([east, -down, -north], axis=1), atol=2e-4)

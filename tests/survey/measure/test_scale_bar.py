@@ -11,6 +11,7 @@ import pytest
 
 from aquaflow.base.errors import InputError
 from aquaflow.config import Config
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.frames_csv import read_rows
 from aquaflow.geometry.alignment import align
@@ -65,7 +66,7 @@ def test_a_length_in_a_picture_gives_the_scale_that_the_path_has(
     frame, camera = mapped_frame(dive), load_camera(dive / "camera.yaml")
     size = (camera.width, camera.height)
     metres = true_length_m(small_recording, frame, size)
-    known = between_pixels(dive, frame, *ends(*size), metres, 0.001)
+    known = between_pixels(Dive(dive), frame, *ends(*size), metres, 0.001)
     found, true = read_tum(dive / "trajectory.tum"), read_tum(small_recording / "poses.tum")
     mine, theirs = associate(found.t_s, true.t_s)
     aligned = align(found.positions[mine], true.positions[theirs], with_scale=True)
@@ -94,14 +95,14 @@ def test_the_command_prints_metres_with_plus_minus_and_keeps_them(dive: Path, co
 
 def test_two_points_of_the_map_need_no_picture(dive: Path) -> None:
     (dive / "metric.json").unlink()
-    known = between_points(dive, (0.0, 0.0, 1.0), (0.3, 0.4, 1.0), 1.0, 0.001)
+    known = between_points(Dive(dive), (0.0, 0.0, 1.0), (0.3, 0.4, 1.0), 1.0, 0.001)
     assert known.metres_per_unit == pytest.approx(2.0)
     assert known.frame_index == -1
 
 
 def test_points_of_a_map_in_metres_are_taken_back_to_its_own_unit(dive: Path) -> None:
     write_metric_file(dive, {0: metric_frame()}, main=0)
-    known = between_points(dive, (0.0, 0.0, 1.0), (0.3, 0.4, 1.0), 1.0, 0.001)
+    known = between_points(Dive(dive), (0.0, 0.0, 1.0), (0.3, 0.4, 1.0), 1.0, 0.001)
     assert known.metres_per_unit == pytest.approx(2.0 * SCALE)
 
 
@@ -132,9 +133,9 @@ def test_points_that_cannot_be_measured_are_refused_in_a_sentence(
 def test_points_outside_or_too_near_or_in_the_open_water_are_refused(dive: Path) -> None:
     frame = mapped_frame(dive)
     with pytest.raises(InputError, match="outside"):
-        between_pixels(dive, frame, (1.0, 1.0), (5000.0, 1.0), 1.0, 0.001)
+        between_pixels(Dive(dive), frame, (1.0, 1.0), (5000.0, 1.0), 1.0, 0.001)
     with pytest.raises(InputError, match="apart"):
-        between_pixels(dive, frame, (50.0, 50.0), (52.0, 50.0), 1.0, 0.001)
+        between_pixels(Dive(dive), frame, (50.0, 50.0), (52.0, 50.0), 1.0, 0.001)
 
 
 def test_a_frame_that_was_not_mapped_names_the_nearest(dive: Path) -> None:
@@ -143,7 +144,7 @@ def test_a_frame_that_was_not_mapped_names_the_nearest(dive: Path) -> None:
         (dive / "frames.csv").read_text() + f"500,x,{rows[-1].t_s + 1},common,0,0,1.0,\n"
     )
     with pytest.raises(InputError, match="the nearest mapped one is"):
-        between_pixels(dive, 500, (10.0, 10.0), (60.0, 60.0), 1.0, 0.001)
+        between_pixels(Dive(dive), 500, (10.0, 10.0), (60.0, 60.0), 1.0, 0.001)
 
 
 @pytest.mark.parametrize("content", ["{", "[]", '{"lengths": [{}]}', '{"lengths": 3}'])

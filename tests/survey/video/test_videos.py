@@ -13,8 +13,8 @@ import numpy.typing as npt
 import pytest
 
 from aquaflow.base.errors import InputError
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.finished_frames import read_finished_frames
-from aquaflow.dive.posed_views import read_mapper
 from aquaflow.dive.restored import exposure_without_water, restored_frames, seen_frames
 from aquaflow.mapping.restoration import to_bytes
 from aquaflow.survey.video.every_frame import LONGEST_GAP_S, Poses, restore_every_frame
@@ -54,11 +54,11 @@ def difference(one: npt.NDArray[Any], two: npt.NDArray[Any]) -> float:
 @pytest.fixture(scope="module")
 def restored(small_dive: Path, small_recording: Path) -> dict[int, Picture]:
     """The restored mapped frames by index."""
-    mapper = read_mapper(small_dive)
-    exposure = exposure_without_water(small_dive, mapper)
+    mapper = Dive(small_dive).map()
+    exposure = exposure_without_water(Dive(small_dive), mapper)
     return {
         index: picture.picture_bytes(exposure)[..., :3]
-        for index, picture in restored_frames(small_dive, mapper, small_recording)
+        for index, picture in restored_frames(Dive(small_dive), mapper, small_recording)
     }
 
 
@@ -67,14 +67,14 @@ def beside(
     small_dive: Path, small_recording: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     path = tmp_path_factory.mktemp("beside") / "dive.mp4"
-    side_by_side(small_dive, path, small_recording)
+    side_by_side(Dive(small_dive), path, small_recording)
     return path
 
 
 def test_each_mapped_frame_is_shown_at_its_own_time(
     beside: Path, restored: dict[int, Picture], small_dive: Path
 ) -> None:
-    times = {frame.row.index: frame.row.t_s for frame in read_finished_frames(small_dive)}
+    times = {frame.row.index: frame.row.t_s for frame in read_finished_frames(Dive(small_dive))}
     begun, end = times[min(restored)], times[max(restored)]
     stated = stated_times(beside)
     assert len(pictures_of(beside)) == len(stated) == round((end - begun) * 10.0) + 1
@@ -104,7 +104,7 @@ def test_the_words_go_on_with_the_dive(beside: Path) -> None:
 def test_a_browser_plays_it_in_its_colours(
     beside: Path, restored: dict[int, Picture], small_dive: Path, tmp_path: Path
 ) -> None:
-    times = {frame.row.index: frame.row.t_s for frame in read_finished_frames(small_dive)}
+    times = {frame.row.index: frame.row.t_s for frame in read_finished_frames(Dive(small_dive))}
     chosen = sorted(restored)[:: len(restored) // 2][:3]
     asked = [times[index] - times[min(restored)] + 0.05 for index in chosen]
     duration, shown = played(beside, tmp_path / "profile", asked)
@@ -115,9 +115,9 @@ def test_a_browser_plays_it_in_its_colours(
 
 
 def test_without_a_recording_the_map_is_on_the_left(small_dive: Path, tmp_path: Path) -> None:
-    side_by_side(small_dive, tmp_path / "a.mp4")
+    side_by_side(Dive(small_dive), tmp_path / "a.mp4")
     first = pictures_of(tmp_path / "a.mp4")[0]
-    seen = next(seen_frames(small_dive, read_mapper(small_dive), None))
+    seen = next(seen_frames(Dive(small_dive), Dive(small_dive).map(), None))
     drawn = to_bytes(seen.shown.image.numpy())
     assert difference(first[:HEIGHT, :WIDTH], drawn) < LOST_IN_VIDEO
 
@@ -141,7 +141,7 @@ def test_every_frame_is_restored_from_a_pose_in_between(
     path = tmp_path / "all.mp4"
     steps: list[tuple[int, int]] = []
     wrote = restore_every_frame(
-        gaps, path, small_recording, progress=lambda *step: steps.append(step)
+        Dive(gaps), path, small_recording, progress=lambda *step: steps.append(step)
     )
     found = pictures_of(path)
     assert (wrote.frames, wrote.restored) == (FRAMES, FRAMES - 3)
@@ -157,7 +157,7 @@ def test_every_frame_is_restored_from_a_pose_in_between(
 def test_a_frame_without_a_pose_is_shown_as_it_is_with_a_mark(
     gaps: Path, small_recording: Path, tmp_path: Path
 ) -> None:
-    restore_every_frame(gaps, tmp_path / "all.mp4", small_recording)
+    restore_every_frame(Dive(gaps), tmp_path / "all.mp4", small_recording)
     last = pictures_of(tmp_path / "all.mp4")[-1]
     recorded = cv2.imread(str(sorted((small_recording / "images").iterdir())[-1]))[..., ::-1]
     assert difference(last[HEIGHT // 4 :], recorded[HEIGHT // 4 :]) < LOST_IN_VIDEO
@@ -168,7 +168,7 @@ def test_a_frame_without_a_pose_is_shown_as_it_is_with_a_mark(
 def test_a_wider_video_shows_the_same_scene(
     small_dive: Path, small_recording: Path, restored: dict[int, Picture], tmp_path: Path
 ) -> None:
-    restore_every_frame(small_dive, tmp_path / "a.mp4", small_recording, width=96)
+    restore_every_frame(Dive(small_dive), tmp_path / "a.mp4", small_recording, width=96)
     found = pictures_of(tmp_path / "a.mp4")[0]
     assert found.shape == (72, 96, 3)
     small = cv2.resize(restored[0], (96, 72), interpolation=cv2.INTER_AREA)
@@ -176,9 +176,9 @@ def test_a_wider_video_shows_the_same_scene(
 
 
 def test_a_pose_in_between_lies_between_and_a_long_gap_has_none(small_dive: Path) -> None:
-    frames = read_finished_frames(small_dive)
+    frames = read_finished_frames(Dive(small_dive))
     T_nm = read_frame_of_map(small_dive / "map.aqf").T_nm
-    poses, views = Poses(frames, T_nm), read_mapper(small_dive).views
+    poses, views = Poses(frames, T_nm), Dive(small_dive).map().views
     by_index = {frame.row.index: frame for frame in frames}
     for view in views:  # the map's own world
         pose = poses.at(by_index[view.frame_index].t_ns)
@@ -205,15 +205,15 @@ def test_a_flight_begins_with_what_the_first_frame_shows(
     small_dive: Path, tmp_path: Path, water: bool
 ) -> None:
     path = tmp_path / "fly.mp4"
-    assert fly_through(small_dive, path, seconds=0.4, water=water) == 0.4 * FPS
+    assert fly_through(Dive(small_dive), path, seconds=0.4, water=water) == 0.4 * FPS
     found = pictures_of(path)
     assert len(found) == len(stated_times(path)) == 0.4 * FPS
-    mapper = read_mapper(small_dive)
-    seen = next(seen_frames(small_dive, mapper, None))
+    mapper = Dive(small_dive).map()
+    seen = next(seen_frames(Dive(small_dive), mapper, None))
     shown = to_bytes(seen.shown.image.numpy())
     if not water:
-        exposure = exposure_without_water(small_dive, mapper)
-        shown = next(restored_frames(small_dive, mapper, None))[1].picture_bytes(exposure)
+        exposure = exposure_without_water(Dive(small_dive), mapper)
+        shown = next(restored_frames(Dive(small_dive), mapper, None))[1].picture_bytes(exposure)
     # The camera's way is smoothed and colours are bounded: the scene is the same, not every pixel.
     assert difference(found[0], shown[..., :3]) < 12.0
     assert difference(found[0], found[-1]) > 5.0
@@ -222,7 +222,7 @@ def test_a_flight_begins_with_what_the_first_frame_shows(
 def test_the_same_dive_gives_the_same_bytes(
     beside: Path, small_dive: Path, small_recording: Path, tmp_path: Path
 ) -> None:
-    side_by_side(small_dive, tmp_path / "again.mp4", small_recording)
+    side_by_side(Dive(small_dive), tmp_path / "again.mp4", small_recording)
     assert (tmp_path / "again.mp4").read_bytes() == beside.read_bytes()
 
 
@@ -233,7 +233,7 @@ def test_another_recording_is_refused_and_leaves_no_file(
         folder = tmp_path / "out"
         folder.mkdir(exist_ok=True)
         with pytest.raises(InputError, match="no readable frame"):
-            make(small_dive, folder / "a.mp4", pictures)
+            make(Dive(small_dive), folder / "a.mp4", pictures)
         assert list(folder.iterdir()) == []
 
 

@@ -20,8 +20,9 @@ from pathlib import Path
 import numpy as np
 
 from aquaflow.config.viewer import ViewerConfig
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.ply import PlyGaussians, write_ply
-from aquaflow.survey.viewer.finished import prepare, read_dive, show_dive
+from aquaflow.survey.viewer.finished import finished_dive, prepare, show_dive
 from tests.browser import Browser
 
 ROUND_TRIP_S = 0.02
@@ -97,7 +98,7 @@ def relief(count: int) -> tuple[PlyGaussians, PlyGaussians]:
 def measure(dive: Path, mbit: float, picture: Path | None) -> dict[str, float]:
     """Seconds since the address was opened, and megabytes sent by then."""
     began = time.monotonic()
-    read = read_dive(dive, 10**9)
+    read = finished_dive(Dive(dive), 10**9)
     page = show_dive(read, ViewerConfig(port=0))
     behind = prepare(dive, read.key, read.packed, read.map, page)
     ready_s = time.monotonic() - began

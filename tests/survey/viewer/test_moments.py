@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.trajectory_csv import NAME, read_trajectory_csv, write_trajectory_csv
 from aquaflow.survey.viewer.dive_moments import moments_of_dive, pictures_of_dive
 from aquaflow.survey.viewer.moments import moments
@@ -45,7 +46,7 @@ def test_time_depth_and_heading_come_from_the_table_of_the_path(
     write_trajectory_csv(dive / NAME, told)
     t_s = np.array([row.t_s for row in rows])
     index = np.array([row.index for row in rows], np.int64)
-    found, began = moments_of_dive(dive, t_s, index, pictures_of_dive(dive))
+    found, began = moments_of_dive(Dive(dive), t_s, index, pictures_of_dive(Dive(dive)))
     assert set(found[:, 1].tolist()) == {4.5}
     assert set(found[:, 2].tolist()) == {90.0}
     assert began is not None
@@ -53,9 +54,9 @@ def test_time_depth_and_heading_come_from_the_table_of_the_path(
 
 
 def test_a_dive_without_that_table_shows_times_alone(small_dive: Path, tmp_path: Path) -> None:
-    found, began = moments_of_dive(tmp_path, T_S, np.arange(4), [])
+    found, began = moments_of_dive(Dive(tmp_path), T_S, np.arange(4), [])
     assert found[:, 0].tolist() == [0.0, 0.5, 1.0, 1.5]
     (tmp_path / NAME).write_text("damaged")
-    again, _ = moments_of_dive(tmp_path, T_S, np.arange(4), [])
+    again, _ = moments_of_dive(Dive(tmp_path), T_S, np.arange(4), [])
     assert np.array_equal(found, again, equal_nan=True)
     assert began is None

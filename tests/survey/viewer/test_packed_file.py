@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 
 from aquaflow.config.viewer import ViewerConfig
+from aquaflow.dive.dive import Dive
 from aquaflow.survey.viewer import finished
-from aquaflow.survey.viewer.finished import FinishedDive, prepare, read_dive, show_dive
+from aquaflow.survey.viewer.finished import FinishedDive, finished_dive, prepare, show_dive
 from aquaflow.survey.viewer.packed_file import NAME, key_of, read_packed
 from aquaflow.survey.viewer.page import ViewerPage
 
@@ -26,7 +27,7 @@ def dive(small_dive: Path, tmp_path: Path) -> Path:
 
 def looked_at(dive: Path) -> tuple[FinishedDive, ViewerPage]:
     """Shown once, until what is done behind the page is done."""
-    found = read_dive(dive, BUDGET)
+    found = finished_dive(Dive(dive), BUDGET)
     page = show_dive(found, ViewerConfig(port=0))
     prepare(dive, found.key, found.packed, found.map, page).join(60.0)
     return found, page
@@ -49,7 +50,7 @@ def test_the_second_look_sends_the_same_without_reading_the_map(
     first = served(page)
     page.close()
     monkeypatch.setattr(finished, "read_map", lambda *_: pytest.fail("the map was read"))
-    found = read_dive(dive, BUDGET)
+    found = finished_dive(Dive(dive), BUDGET)
     assert found.packed is not None
     page = show_dive(found, ViewerConfig(port=0))
     again = served(page)

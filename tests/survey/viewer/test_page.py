@@ -15,9 +15,10 @@ import pytest
 
 from aquaflow.base.errors import InputError
 from aquaflow.config.viewer import ViewerConfig
+from aquaflow.dive.dive import Dive
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.survey.viewer.finished import open_dive, read_dive
+from aquaflow.survey.viewer.finished import finished_dive, open_dive
 from aquaflow.survey.viewer.page import ViewerPage
 from aquaflow.survey.viewer.pinned_notes import PinnedNotes
 from aquaflow.survey.viewer.splats import splats
@@ -73,7 +74,7 @@ def test_a_browser_that_never_reads_does_not_hold_up_who_shows(page: ViewerPage)
 
 
 def test_a_finished_dive_is_read_with_its_colours_poses_and_pictures(small_dive: Path) -> None:
-    dive = read_dive(small_dive, budget=500)
+    dive = finished_dive(Dive(small_dive), budget=500)
     assert len(dive.splats) == 500
     assert set(dive.splats.levels) == set(dive.palettes) == {"range", "coverage"}
     assert len(dive.path.poses) == len(dive.path.quality) == len(dive.path.moments)
@@ -92,19 +93,19 @@ def test_the_water_of_a_dive_is_read_and_a_damaged_one_costs_itself(dive: Path) 
         "restored": {"gain": [1.0, 1.0, 1.0]}, "map_ply_reference_range": 2.5,
     }  # fmt: skip
     (dive / "medium.json").write_text(json.dumps(medium))
-    water = read_dive(dive, budget=50).water
+    water = finished_dive(Dive(dive), budget=50).water
     assert water is not None
     assert (water.beta, water.range) == ((0.5, 0.2, 0.2), 2.5)
     for damage in ("{", json.dumps(medium | {"backscatter": None}), "[]"):
         (dive / "medium.json").write_text(damage)
-        assert read_dive(dive, budget=50).water is None
+        assert finished_dive(Dive(dive), budget=50).water is None
 
 
 def test_a_metric_dive_says_its_unit_and_has_its_z_axis_down(dive: Path) -> None:
     (dive / "metric.json").unlink()
-    assert "map units" in read_dive(dive, budget=50).summary
+    assert "map units" in finished_dive(Dive(dive), budget=50).summary
     write_metric_file(dive, {0: metric_frame()}, main=0)
-    shown = read_dive(dive, budget=50)
+    shown = finished_dive(Dive(dive), budget=50)
     assert "metres, \u00b1 0.4 %; x points to true north, z down" in shown.summary
     page = open_dive(dive, ViewerConfig(port=0, splats=100))
     try:
@@ -118,7 +119,10 @@ def test_a_damaged_line_of_the_frames_costs_itself(small_dive: Path, dive: Path)
     header, *lines = (dive / "frames.csv").read_text().splitlines()
     lines[5] = lines[5].replace("0.", "0g.")
     (dive / "frames.csv").write_text("\n".join([header, "x", ",1e999,,,", *lines]))
-    damaged, whole = read_dive(dive, budget=50), read_dive(small_dive, budget=50)
+    damaged, whole = (
+        finished_dive(Dive(dive), budget=50),
+        finished_dive(Dive(small_dive), budget=50),
+    )
     assert len(damaged.path.poses) == len(whole.path.poses)
     assert (damaged.path.quality != whole.path.quality).sum() <= 1
 
@@ -129,12 +133,12 @@ def test_a_damaged_line_of_the_frames_costs_itself(small_dive: Path, dive: Path)
 def test_a_trajectory_that_holds_no_poses_is_refused(dive: Path, line: str) -> None:
     (dive / "trajectory.tum").write_text(f"{line}\n")
     with pytest.raises(InputError, match=r"trajectory\.tum"):
-        read_dive(dive, budget=50)
+        finished_dive(Dive(dive), budget=50)
 
 
 def test_a_folder_without_a_dive_is_refused_in_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"map\.ply is missing"):
-        read_dive(tmp_path, budget=500)
+        finished_dive(Dive(tmp_path), budget=500)
 
 
 # --- what a browser leaves in a dive ------------------------------------------------------------

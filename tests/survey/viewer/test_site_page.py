@@ -13,12 +13,13 @@ import pytest
 
 from aquaflow.base.errors import InputError
 from aquaflow.config.viewer import ViewerConfig
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.ply import read_ply
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.site.adding import add_to_site
 from aquaflow.survey.site.merged_file import NAME as MERGED
 from aquaflow.survey.site.merging import merge
-from aquaflow.survey.viewer.finished import read_dive
+from aquaflow.survey.viewer.finished import finished_dive
 from aquaflow.survey.viewer.levels import RANGE
 from aquaflow.survey.viewer.moments import PICTURE
 from aquaflow.survey.viewer.packed_file import NAME as PACKED
@@ -57,7 +58,7 @@ def scene_of(page: ViewerPage) -> dict[str, object]:
 def test_maps_and_paths_of_all_dives_are_where_the_merge_put_them(
     site: Path, small_dive: Path
 ) -> None:
-    own = read_dive(small_dive, 10**6)
+    own = finished_dive(Dive(small_dive), 10**6)
     shown = read_shown(site, None, 10**6)
     found = map_of_site(shown, 10**6)
     monday, tuesday = (found.splats.among(found.splats.levels[DIVE] == k) for k in (0, 1))
@@ -83,7 +84,7 @@ def test_a_budget_keeps_what_covers_most_of_all_dives_together(site: Path) -> No
 
 
 def test_the_page_says_whose_a_pose_and_a_picture_is(site: Path, small_dive: Path) -> None:
-    own = read_dive(small_dive, 100)
+    own = finished_dive(Dive(small_dive), 100)
     page = open_site(site, CONFIG)
     try:
         said = scene_of(page)

@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.extra import load
-from aquaflow.dive.map_file import SUFFIX
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.placement import Placement
-from aquaflow.dive.posed_views import read_mapper, read_posed_views
+from aquaflow.dive.posed_views import read_posed_views
 from aquaflow.survey.export.mesh.atlas import lay_out, painted
 from aquaflow.survey.export.mesh.blocks import Blocks
 from aquaflow.survey.export.mesh.colouring import batches, look_at, shown_colours
@@ -29,7 +29,6 @@ from aquaflow.survey.export.mesh.triangle_mesh import TriangleMesh
 from aquaflow.survey.export.mesh.view_surfaces import ViewSurfaces, drawn_surfaces
 from aquaflow.survey.export.ortho.colours import Colours
 from aquaflow.survey.export.ortho.grid import rounded
-from aquaflow.telemetry.metric_file import read_frame_of_map
 
 Array = npt.NDArray[np.float64]
 Kind = Literal["ply", "obj", "glb"]
@@ -82,7 +81,7 @@ class FusedSurface:
 
 
 def export_mesh(
-    dive: Path,
+    dive: Dive,
     path: Path,
     kind: Kind,
     resolution: float | None = None,
@@ -104,7 +103,7 @@ def export_mesh(
     require_marching_cubes()
     if kind != "ply":
         load("xatlas", "a textured mesh", "survey")
-    mapper, frame = read_mapper(dive), read_frame_of_map(dive / f"map{SUFFIX}")
+    mapper, frame = dive.map(), dive.frame
     posed, where = read_posed_views(dive, mapper)
     if len(mapper.gaussians) == 0:
         raise InputError(f"the map of {dive} is empty; map a recording that shows more")

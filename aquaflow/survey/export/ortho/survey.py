@@ -12,11 +12,8 @@ from typing import Literal
 import numpy as np
 
 from aquaflow import __version__
-from aquaflow.base.errors import InputError
 from aquaflow.base.storage.whole_folder import whole_folder
-from aquaflow.dive.map_file import SUFFIX
-from aquaflow.dive.posed_views import read_mapper
-from aquaflow.mapping.mapper import Mapper
+from aquaflow.dive.dive import Dive
 from aquaflow.survey.export.ortho.colours import Colours
 from aquaflow.survey.export.ortho.drawing import MOST_FINER, Splats
 from aquaflow.survey.export.ortho.geotiff import require_rasterio, writing_raster
@@ -24,7 +21,6 @@ from aquaflow.survey.export.ortho.grid import Grid, Tile, rounded
 from aquaflow.survey.export.ortho.ground import LEAST_VIEWS, Ground, ground_of
 from aquaflow.survey.export.ortho.layers import DEM, ORTHO, QUALITY, TilePixels
 from aquaflow.survey.export.ortho.sightings import PICTURE_SIGMA_PX, ViewRanges
-from aquaflow.telemetry.metric_file import read_frame_of_map
 from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.water.posed_picture import SOLID
 
@@ -67,7 +63,7 @@ class Survey:
 
 
 def export_survey(
-    dive: Path,
+    dive: Dive,
     out: Path,
     kind: Kind,
     resolution: float | None = None,
@@ -87,7 +83,7 @@ def export_survey(
         ConfigError: the dive's settings cannot be read.
     """
     require_rasterio()
-    mapper, frame = read_map(dive)
+    mapper, frame = dive.filled_map(), dive.frame
     ground = ground_of(frame, mapper.views)
     ranges = ViewRanges(mapper, ground, out.parent, progress and partial(progress, "views"))
     side = resolution or rounded(ranges.footprint)
@@ -145,26 +141,13 @@ class _Tiles:
         return TilePixels(solid & (views >= LEAST_VIEWS), drawn.height, sigma, views, picture)
 
 
-def read_map(dive: Path) -> tuple[Mapper, MetricFrame]:
-    """The largest sub-map of a dive and how it lies in the world.
-
-    Raises:
-        InputError: the dive has no map, or an empty one.
-        ConfigError: the dive's settings cannot be read.
-    """
-    mapper = read_mapper(dive)
-    if not mapper.views or len(mapper.gaussians) == 0:
-        raise InputError(f"the map of {dive} is empty; map a recording that shows more")
-    return mapper, read_frame_of_map(dive / f"map{SUFFIX}")
-
-
 def _tags(
-    dive: Path, frame: MetricFrame, ground: Ground, side: float, through: float | None, ortho: bool
+    dive: Dive, frame: MetricFrame, ground: Ground, side: float, through: float | None, ortho: bool
 ) -> dict[str, str]:
     """What the files say of themselves, in words."""
     tags = {
         "SOFTWARE": f"AquaFlow {__version__}",
-        "DIVE": dive.resolve().name,
+        "DIVE": dive.name,
         "UNIT": ground.unit,
         "AXES": ground.axes,
         "VERTICAL": ground.vertical,
