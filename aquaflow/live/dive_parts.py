@@ -9,6 +9,7 @@ from functools import partial
 from aquaflow.base.cores import core_count
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.base.profiler import Profiler
+from aquaflow.base.worker import Worker
 from aquaflow.config import Config, parse_config
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.folder import DiveFolder
@@ -85,7 +86,10 @@ def assembled(
     thread = MapThread(
         maps, service.mapping, vitals.heartbeats, lambda: vitals.degradation.level
     )  # fmt: skip
-    slam = Slam(config, profiler, folder.work, True, thread, failures)
+    slam = Slam(
+        config, profiler, folder.work, Worker(failures, threads=True), thread, failures
+    )  # fmt: skip
+    slam.prior.warm_up()
     said = look_in_base(slam, service.dive.site, choice.checkpoint)
     with failures.contain("camera mounting"):
         stated = camera_mounting(config, service, feed)

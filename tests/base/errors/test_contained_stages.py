@@ -56,7 +56,7 @@ STAGES: list[tuple[type | ModuleType, str, int, str]] = [
     (Initialiser, "solve", 1, "initialisation"),
     (KeyframeTracker, "place", 16, "pose"),
     (Places, "of_frame", 1, "relocalisation"),
-    (KeyframeGraph, "_close_loops", 1, "loop search"),
+    (KeyframeGraph, "close_loops", 1, "loop search"),
     (Places, "add", 2, "place index"),
     (KeyframeGraph, "add", 3, "keyframe graph"),
     (Mapper, "add_view", 3, "view"),
