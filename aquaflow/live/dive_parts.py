@@ -9,6 +9,7 @@ from functools import partial
 from aquaflow.base.cores import core_count
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.base.profiler import Profiler
+from aquaflow.base.stages import Stages
 from aquaflow.base.worker import Worker
 from aquaflow.config import Config, parse_config
 from aquaflow.config.vehicle import VehicleConfig
@@ -86,9 +87,8 @@ def assembled(
     thread = MapThread(
         maps, service.mapping, vitals.heartbeats, lambda: vitals.degradation.level
     )  # fmt: skip
-    slam = Slam(
-        config, profiler, folder.work, Worker(failures, threads=True), thread, failures
-    )  # fmt: skip
+    worker = Worker(failures, threads=True)
+    slam = Slam(config, Stages(profiler, failures), folder.work, worker, thread)
     slam.prior.warm_up()
     said = look_in_base(slam, service.dive.site, choice.checkpoint)
     with failures.contain("camera mounting"):

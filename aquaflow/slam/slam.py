@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.errors import ConfigError
-from aquaflow.base.errors.failures import Failures
-from aquaflow.base.profiler import Profiler
+from aquaflow.base.stages import Stages
 from aquaflow.base.worker import Worker
 from aquaflow.config import Config
 from aquaflow.keyframes import KeyframeStore
@@ -53,25 +52,23 @@ class Slam:
     def __init__(
         self,
         config: Config,
-        profiler: Profiler | None = None,
+        stages: Stages | None = None,
         work: Path | None = None,
         worker: Worker | None = None,
         maps: MapWork | None = None,
-        failures: Failures | None = None,
     ) -> None:
-        """What does not fit into memory waits in the folder ``work``, if there is one.
+        """``stages`` time the dive; what one of them raises is counted, and costs that stage. What
+        does not fit into memory waits in the folder ``work``, if there is one.
 
         Without a ``worker`` everything is done in step with the frames, and a replay repeats bit
         for bit; one with threads lets no frame wait for loops, and corrections come when they are
-        there. ``maps`` may do their work in another thread. What a stage raises is counted in
-        ``failures`` and costs that stage.
+        there. ``maps`` may do their work in another thread.
 
         Raises:
             ConfigError: the prior cannot give what the config asks tracking for.
         """
-        self.config = config
-        self.profiler = profiler or Profiler()
-        self.failures = failures or Failures()
+        self.config, self.stages = config, stages or Stages()
+        self.profiler, self.failures = self.stages.profiler, self.stages.failures
         self.prior = make_prior(config.prior)
         if config.tracking.residual == "point" and not self.prior.ranged:
             raise ConfigError(
@@ -291,14 +288,14 @@ class Slam:
         if not self.config.tracking.mask_overlays:
             return frame
         masked = frame
-        with self.profiler.stage("overlay"), self.failures.contain("overlay", frame.index):
+        with self.stages("overlay", frame.index):
             masked = self.overlays.masked(frame)
         return masked
 
     def _gate(self, frame: Frame) -> Verdict:
         """Whether the frame is worth tracking; it is decided here which of those are held out."""
         verdict = Verdict(GateKind.PASS)
-        with self.profiler.stage("gate"), self.failures.contain("frame gate", frame.index):
+        with self.stages("gate", frame.index):
             verdict = self.gate.judge(frame.image, frame.mask)
         if verdict.passed:
             if self._contributions is not None:
@@ -329,7 +326,7 @@ class Slam:
         if tracked.frame_class is FrameClass.KEYFRAME:
             self._follow_graph(at_keyframe=True)
             index = tracked.frame.index
-            with self.profiler.stage("graph"), self.failures.contain("keyframe graph", index):
+            with self.stages("graph", index):
                 self.graph.add(tracked.keyframe, links.get(tracked.keyframe))
             if self.in_base is not None:
                 with self.profiler.stage("base"):
@@ -349,9 +346,8 @@ class Slam:
         sightings, mapped = self.metric.sightings, (FrameClass.KEYFRAME, FrameClass.MAPPING)
         if sightings.looks_for and tracked.T_wc is not None and tracked.frame_class in mapped:
             frame = tracked.frame
-            camera, failures = self.tracker.camera or frame.camera, self.failures
-            with self.profiler.stage("look"), failures.contain("known lengths", frame.index):
-                sightings.look(frame.index, frame.image, camera)
+            with self.stages("look", frame.index):
+                sightings.look(frame.index, frame.image, self.tracker.camera or frame.camera)
 
     def _map(self, tracked: Tracked) -> None:
         """Hold the frame out, or let the map grow by it."""
@@ -391,9 +387,8 @@ class Slam:
         """Keyframes move as the graph was optimised, and the map follows them."""
         if self.in_base is not None and self.in_base.has_news():
             self.graph.straighten()
-        with self.failures.contain("correction of the map"):
-            with self.profiler.stage("correct"):
-                correction = self.graph.correction(wait)
+        with self.stages("correct"):
+            correction = self.graph.correction(wait)
             if correction.moves:
                 self.maps.correct(correction.moves, correction.merged)
 

@@ -14,6 +14,7 @@ import pytest
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.failures import Failures
+from aquaflow.base.stages import Stages
 from aquaflow.config import Config
 from aquaflow.dive import replay
 from aquaflow.dive.folder import DiveFolder
@@ -200,7 +201,7 @@ def finished_slam(small_recording: Path, tmp_path_factory: pytest.TempPathFactor
     """A dive whose frames have all been mapped, before anything of it is written."""
     recording = open_recording(small_recording)
     prepare = Preparation(SETTINGS.source, recording.camera)
-    slam = Slam(SETTINGS, failures=Failures(strict=False))
+    slam = Slam(SETTINGS, Stages(failures=Failures(strict=False)))
     for frame in recording.frames(stop=12):
         assert isinstance(frame, Frame)
         slam.process(prepare(frame))
