@@ -8,7 +8,6 @@ from functools import partial
 
 from aquaflow.base.cores import core_count
 from aquaflow.base.errors import AquaFlowError
-from aquaflow.base.profiler import Profiler
 from aquaflow.base.stages import Stages
 from aquaflow.base.worker import Worker
 from aquaflow.config import Config, parse_config
@@ -38,7 +37,7 @@ from aquaflow.recordings.kept_pictures import PictureThread
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
 from aquaflow.recordings.telemetry_lines import TelemetryLog
 from aquaflow.slam import Slam
-from aquaflow.slam.map_parts import make_maps
+from aquaflow.slam.map_inputs import make_maps
 from aquaflow.types import Dropped
 
 log = logging.getLogger(__name__)
@@ -78,17 +77,17 @@ def assembled(
         ConfigError: the prior cannot give what the config asks tracking for.
     """
     config, service, failures = plain(vehicle), vehicle.service, feed.failures
-    profiler, before = Profiler(), read_status(folder.path)
+    stages, before = Stages(failures=failures), read_status(folder.path)
     # A core is left for tracking, where there is more than one.
     threads = config.threads or max(1, core_count() - 1)
     # A dive whose map was made before mapping was switched off keeps it.
     mapped = config.mapping.enabled or _has_maps(choice.checkpoint)
-    maps = make_maps(config, profiler, folder.work, failures, mapped, threads)
+    maps = make_maps(config, stages, folder.work, mapped, threads)
     thread = MapThread(
         maps, service.mapping, vitals.heartbeats, lambda: vitals.degradation.level
     )  # fmt: skip
     worker = Worker(failures, threads=True)
-    slam = Slam(config, Stages(profiler, failures), folder.work, worker, thread)
+    slam = Slam(config, stages, folder.work, worker, thread)
     slam.prior.warm_up()
     said = look_in_base(slam, service.dive.site, choice.checkpoint)
     with failures.contain("camera mounting"):

@@ -17,7 +17,7 @@ from aquaflow.keyframes import KeyframeStore
 from aquaflow.mapping.work import MapWork
 from aquaflow.prior.factory import make_prior
 from aquaflow.slam.finish_time import FinishTime
-from aquaflow.slam.map_parts import make_contributions, make_maps
+from aquaflow.slam.map_inputs import MapInputs, make_maps
 from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.tracking.adjustment.adjuster import Adjuster
 from aquaflow.tracking.anchored import Anchored, Anchors
@@ -102,19 +102,14 @@ class Slam:
         )  # fmt: skip
         self.in_base: InBase | None = None
         """Where this dive lies in an earlier one; None: none was given."""
-        self.maps: MapWork = maps or make_maps(
-            config, self.profiler, work, self.failures, config.mapping.enabled
-        )
+        self.maps: MapWork = maps or make_maps(config, self.stages, work, config.mapping.enabled)
+        self._map_inputs = MapInputs(self.maps, self.keyframes, config.mapping, self.metric_frame)
         self.skipped: Counter[str] = Counter()
         """Frames that the gate kept from tracking, by its reason's kind."""
         self.frames = FrameTable()
         """Finished frames, in completion order."""
         self.used = 0
         """Frames that passed the gate so far."""
-        self._contributions = make_contributions(
-            config, self.maps, self.keyframes, self.metric_frame
-        )
-        """None with mapping off."""
         self._latest: int | None = None
         """The row of the frame linked last, if it has a pose."""
 
@@ -131,32 +126,18 @@ class Slam:
         )
 
     def process(self, frame: Frame) -> list[Tracked]:
-        """One frame's way through the paper; returns the frames that it finished."""
-        # Sec. 3.2, Eq. 4: what was found beside the frames: loops, and a graph that was optimised.
-        self.take_finished()
-        self._follow_graph(at_keyframe=False)
-
-        # Not in the paper: what a recorder burned into the pictures is masked.
+        """One frame (paper, Sec. 3); returns every frame that it finished."""
+        self.take_finished()  # by the worker: loops, returns to keyframes, frames of the past
+        self._follow_graph(at_keyframe=False)  # Eq. 4: keyframes move, and the map with them
         frame = self._without_overlay(frame)
-
-        # Not in the paper: frames that cannot help are skipped before anything costly.
         verdict = self._gate(frame)
         if not verdict.passed:
             return [self._publish(self._skipped(frame, verdict))]
-
-        # Sec. 3.1, Eq. 1: encode the picture and match it to the keyframe in use.
-        # Sec. 3.2, Eq. 3: its Sim(3) pose, its class, and the poses of frames that waited for it.
-        step = self._track(frame)
-
-        # For this frame, and for those that waited for it:
-        # Sec. 3.2, Eq. 4: a new keyframe gets its link, and loops to earlier ones are closed.
-        # Sec. 3.3.3, Eqs. 16 and 17: medium-guided insertion of Gaussians.
-        # Sec. 3.4, Eqs. 18 to 23: joint optimisation of Gaussians and medium.
-        # The frame's row, from which its pose follows after every later correction.
-        return self._take(step)
+        step = self._track(frame)  # Eqs. 1 and 3
+        return self._take(step)  # edges to the graph, frames to the maps, jobs to the worker
 
     def _take(self, step: Step) -> list[Tracked]:
-        """Edges to the graph, frames to the maps and into the table."""
+        """The frames of a step, and the edges that it found, each to who needs it."""
         finished = []
         for anchored in self._anchor(step.frames):
             linked = self._link(anchored, step.links)
@@ -215,9 +196,8 @@ class Slam:
         limits = limits or FinishTime()
         finished = self.finish_tracking(limits.settling)
         self._settle_graph(limits.settling)
-        if self._contributions is not None:
-            with self.failures.contain("insertion"):
-                self._contributions.retire_last()
+        with self.failures.contain("insertion"):
+            self._map_inputs.retire_last()
         with self.failures.contain("refinement"):
             self.maps.refine(progress, limits.refining)
         settled = self.results(len(self.frames) - len(finished))
@@ -284,7 +264,8 @@ class Slam:
     # --- the steps of a frame -----------------------------------------------------------------
 
     def _without_overlay(self, frame: Frame) -> Frame:
-        """The frame with overlays masked, as far as they are found by now."""
+        """Not in the paper: what a recorder burned into the pictures is masked, as far as it is
+        found by now."""
         if not self.config.tracking.mask_overlays:
             return frame
         masked = frame
@@ -293,20 +274,21 @@ class Slam:
         return masked
 
     def _gate(self, frame: Frame) -> Verdict:
-        """Whether the frame is worth tracking; it is decided here which of those are held out."""
+        """Not in the paper: frames that cannot help are skipped before anything costly; it is
+        decided here which of the others are held out."""
         verdict = Verdict(GateKind.PASS)
         with self.stages("gate", frame.index):
             verdict = self.gate.judge(frame.image, frame.mask)
         if verdict.passed:
-            if self._contributions is not None:
-                self._contributions.expect(frame.index, self.used)
+            self._map_inputs.expect(frame.index, self.used)
             self.used += 1
         else:
             self.skipped[verdict.kind.value] += 1
         return verdict
 
     def _track(self, frame: Frame) -> Step:
-        """The frames whose pose, or lack of one, this frame makes known, and edges."""
+        """Sec. 3.1, Eq. 1: encode the picture and match it to the keyframe in use; Sec. 3.2, Eq. 3:
+        its Sim(3) pose, its class, and the poses of frames that waited for it."""
         with self.profiler.stage("track"):
             step = self.tracker.track(frame)
         if self.tracker.lost:
@@ -318,7 +300,8 @@ class Slam:
         return [self._anchors.anchored(each) for each in tracked]
 
     def _link(self, anchored: Anchored, links: Mapping[int, Link]) -> Anchored:
-        """Add a keyframe to the graph; the frame with its pose after that."""
+        """Sec. 3.2, Eq. 4: a new keyframe gets its edge, and loops to earlier ones are closed; the
+        frame with its pose after that."""
         tracked, T_kf = anchored.tracked, anchored.T_kf
         if tracked.keyframe is None or T_kf is None:
             self._latest = None
@@ -350,16 +333,15 @@ class Slam:
                 sightings.look(frame.index, frame.image, self.tracker.camera or frame.camera)
 
     def _map(self, tracked: Tracked) -> None:
-        """Hold the frame out, or let the map grow by it."""
-        if self._contributions is None or tracked.T_wc is None:
-            return
+        """Sec. 3.3.3, Eqs. 16 and 17: medium-guided insertion of Gaussians; Sec. 3.4, Eqs. 18 to
+        23: joint optimisation of Gaussians and medium. Or the frame is held out."""
         with self.failures.contain("mapping", tracked.frame.index):
-            self._contributions.add(tracked, self.tracker.camera or tracked.frame.camera)
+            self._map_inputs.add(tracked, self.tracker.camera or tracked.frame.camera)
 
     def _publish(self, anchored: Anchored) -> Tracked:
-        """The frame is finished: its row goes into the table."""
-        if self._contributions is not None:
-            self._contributions.forget(anchored.tracked.frame.index)
+        """The frame is finished: it has a row, from which its pose follows after every later
+        correction."""
+        self._map_inputs.forget(anchored.tracked.frame.index)
         self.frames.add(anchored.tracked, anchored.T_kf)
         return anchored.tracked
 
