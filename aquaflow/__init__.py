@@ -6,6 +6,9 @@ The functions below are the public interface; everything else may change between
     scene = aquaflow.load_map("out/dive")
     picture = scene.render(scene.views[0].T_wc).image
 
+    slam = aquaflow.Slam(aquaflow.Config())                 # or frame by frame
+    finished = slam.process(aquaflow.Frame(0, t_ns, t_ns, image, camera))
+
 Importing this package is cheap: torch, OpenCV and matplotlib load where they are used.
 """
 
@@ -19,7 +22,14 @@ if TYPE_CHECKING:
     from aquaflow.api.map import Map, load_map
     from aquaflow.api.recording import map_recording
     from aquaflow.base.errors import AquaFlowError
+    from aquaflow.config import Config
     from aquaflow.dive.dive import Dive, read_dive
+    from aquaflow.dive.tum import Trajectory, associate, read_tum
+    from aquaflow.geometry.alignment import align
+    from aquaflow.geometry.camera import CameraModel, guess_camera
+    from aquaflow.geometry.similarity import Sim3
+    from aquaflow.slam import Slam
+    from aquaflow.types import Frame
 
 try:
     __version__ = version("aquaflow")
@@ -28,21 +38,41 @@ except PackageNotFoundError:  # imported from a checkout that was never installe
 
 __all__ = [
     "AquaFlowError",
+    "CameraModel",
+    "Config",
     "Dive",
+    "Frame",
     "Map",
+    "Sim3",
+    "Slam",
+    "Trajectory",
     "__version__",
+    "align",
+    "associate",
+    "guess_camera",
     "load_map",
     "map_recording",
     "read_dive",
+    "read_tum",
 ]
 
 _HOMES = {
     "AquaFlowError": "aquaflow.base.errors",
+    "CameraModel": "aquaflow.geometry.camera",
+    "Config": "aquaflow.config",
     "Dive": "aquaflow.dive.dive",
+    "Frame": "aquaflow.types",
     "Map": "aquaflow.api.map",
+    "Sim3": "aquaflow.geometry.similarity",
+    "Slam": "aquaflow.slam",
+    "Trajectory": "aquaflow.dive.tum",
+    "align": "aquaflow.geometry.alignment",
+    "associate": "aquaflow.dive.tum",
+    "guess_camera": "aquaflow.geometry.camera",
     "load_map": "aquaflow.api.map",
     "map_recording": "aquaflow.api.recording",
     "read_dive": "aquaflow.dive.dive",
+    "read_tum": "aquaflow.dive.tum",
 }
 """The module of each public name; it is imported when the name is first used."""
 

@@ -32,7 +32,7 @@ from tests.pretended_allocator import Allocator, asked_through_torch
 
 PRETENDED = torch.device("meta")
 OWN = str(Path(aquaflow.__file__).parent)
-TRANSFERS = str(Path(OWN, "mapping", "transfers.py"))
+TRANSFERS = str(Path(OWN, "render", "transfers.py"))
 """Folder of our modules, and the one that may move tensors."""
 aten: Any = torch.ops.aten
 

@@ -10,7 +10,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
 from aquaflow.slam import Slam
-from aquaflow.tracking.frames import FrameClass, Revisit, Tracked
+from aquaflow.tracking.frames import FrameClass, Step, Tracked
 from aquaflow.types import Frame
 
 CAMERA = CameraModel(64, 48, 55.0, 55.0, 32.0, 24.0)
@@ -43,12 +43,14 @@ class ToldTracker:
 
     def __init__(self, slam: Slam, classes: str, sub_maps: str = "") -> None:
         self._slam, self._classes, self._sub_maps = slam, classes, sub_maps or "0" * len(classes)
-        self.revisits: list[Revisit] = []
 
-    def track(self, frame: Frame) -> list[Tracked]:
+    def track(self, frame: Frame) -> Step:
+        return Step([self._decided(frame)])
+
+    def _decided(self, frame: Frame) -> Tracked:
         kind, sub_map = self._classes[frame.index], int(self._sub_maps[frame.index])
         if kind == "L":
-            return [Tracked(frame, FrameClass.LOST, sub_map, reason="told so")]
+            return Tracked(frame, FrameClass.LOST, sub_map, reason="told so")
         T_wc = Sim3(np.eye(3), np.array([0.01 * frame.index, 0.0, 0.0]))
         frame_class, seen = FrameClass.COMMON, None
         if kind in "KM":
@@ -59,7 +61,7 @@ class ToldTracker:
             depths = pointmap(*frame.image.shape[:2])
             self._slam.keyframes.add(frame.index, 0, encoding, T_wc, depths, sub_map)
         number = len(self._slam.keyframes) - 1
-        return [Tracked(frame, frame_class, sub_map, number, T_wc, pointmap=seen)]
+        return Tracked(frame, frame_class, sub_map, number, T_wc, pointmap=seen)
 
-    def finish(self, until: Deadline | None = None) -> list[Tracked]:
-        return []
+    def finish(self, until: Deadline | None = None) -> Step:
+        return Step()

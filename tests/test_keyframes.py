@@ -128,8 +128,8 @@ def test_a_better_pointmap_takes_the_place_of_any(tmp_path: Path, in_files: bool
 
 def swum(frames: list[Frame], store: KeyframeStore, prior: ClassicalPrior) -> np.ndarray:
     tracker = Tracker(prior, store, TrackingConfig())
-    decided = [tracked for frame in frames for tracked in tracker.track(frame)]
-    posed = [tracked.T_wc for tracked in [*decided, *tracker.finish()]]
+    decided = [tracked for frame in frames for tracked in tracker.track(frame).frames]
+    posed = [tracked.T_wc for tracked in [*decided, *tracker.finish().frames]]
     return np.array([T.matrix for T in posed if T is not None])
 
 

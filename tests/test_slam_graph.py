@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from aquaflow.base.worker import Worker
 from aquaflow.slam import Slam
 from aquaflow.tracking.frames import Link
 from aquaflow.tracking.graph.keyframe_graph import Correction
@@ -31,19 +32,21 @@ class ToldGraph:
 
 
 @pytest.mark.parametrize(
-    ("live", "asked"),
+    ("threads", "asked"),
     [
         (False, ["wait", "add 0", "wait", "add 1", "wait", "adjust", "wait"]),
         (True, ["look", "add 0", "look", "look", "add 1", "look", "wait", "adjust", "wait"]),
     ],
 )
 def test_only_a_replay_waits_for_the_graph_and_only_at_keyframes(
-    live: bool, asked: list[str], monkeypatch: pytest.MonkeyPatch
+    threads: bool, asked: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    slam, graph = Slam(config(OPEN_GATE, enabled=False), live=live), ToldGraph()
+    worker = Worker(threads=threads)
+    slam, graph = Slam(config(OPEN_GATE, enabled=False), worker=worker), ToldGraph()
     monkeypatch.setattr(slam, "tracker", ToldTracker(slam, "KCKC"))
     monkeypatch.setattr(slam, "graph", graph)
     for index in range(4):
         slam.process(frame_of(index))
     slam.finish()
     assert graph.asked == asked
+    worker.close()

@@ -9,6 +9,7 @@ from aquaflow.base.cores import usable_threads
 from aquaflow.base.errors import NotMappedError
 from aquaflow.base.errors.failures import Failures
 from aquaflow.base.profiler import Profiler
+from aquaflow.base.stages import Stages
 from aquaflow.config import Config, SourceConfig
 from aquaflow.dive.calibration_pass import found_in
 from aquaflow.dive.folder import DiveFolder
@@ -61,7 +62,7 @@ def map_recording(
     folder, failures = DiveFolder(out, config, overwrite), Failures()
     given = telemetry or TelemetryInput()
     try:
-        slam = Slam(config, Profiler(trace, settle), folder.work, failures=failures)
+        slam = Slam(config, Stages(Profiler(trace, settle), failures), folder.work)
         calibration = calibration or recording.camera
         run = DiveRun(name, folder, config, slam, calibration, recording.name_of, trace)
         try:
@@ -88,7 +89,7 @@ def map_recording(
 
 def _find_camera(run: DiveRun, recording: RecordedCamera, progress: Progress) -> None:
     """Give the run the camera that the recording itself shows, if it shows one."""
-    with run.profiler.stage("self-calibration"), run.slam.failures.contain("self-calibration"):
+    with run.slam.stages("self-calibration"):
         found = found_in(recording, run.config, lambda done, of: progress("calibrate", done, of))
         if found is not None:
             run.adopt(found)
@@ -102,7 +103,6 @@ def _replay(
     stop = count if source.stop is None else min(source.stop, count or source.stop)
     total = None if stop is None else len(range(source.start, stop, source.every))
     done = 0
-    contain = run.slam.failures.contain
     for event in _events(run, playback, source):
         if not isinstance(event, (Frame, Dropped)):
             run.sample(event)
@@ -114,7 +114,7 @@ def _replay(
             decided = run.frame(event)
             if any(tracked.frame_class is FrameClass.KEYFRAME for tracked in decided):
                 run.look()
-        with run.profiler.stage("progress"), contain("progress"):
+        with run.slam.stages("progress"):
             progress("map", done, total)
     if done == 0:
         end = "the end" if source.stop is None else f"--stop {source.stop}"

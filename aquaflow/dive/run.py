@@ -142,8 +142,7 @@ class DiveRun:
     def _prepared(self, frame: Frame) -> Frame | None:
         """None for a picture that cannot be prepared, which is dropped."""
         reason = "preparation failed, see log.jsonl"
-        contain = self.slam.failures.contain("preparation", frame.index)
-        with self.profiler.stage("prepare"), contain:
+        with self.slam.stages("prepare", frame.index):
             try:
                 return self.preparation(frame)
             except InputError as error:
@@ -155,7 +154,7 @@ class DiveRun:
         if self.picture_thread is not None:
             self.picture_thread.offer(frame)
         elif self.pictures is not None:
-            with self.profiler.stage("keep"), self.slam.failures.contain("keeping of a picture"):
+            with self.slam.stages("keep"):
                 self.pictures.offer(frame)
 
     def catch_up(self) -> list[Tracked]:
@@ -289,10 +288,7 @@ class DiveRun:
     def _find_camera(self) -> None:
         """From the keyframes, for the next dive, where neither the user nor a first pass gave a
         camera for this one."""
-        with (
-            self.profiler.stage("self-calibration"),
-            self.slam.failures.contain("self-calibration"),
-        ):
+        with self.slam.stages("self-calibration"):
             self.found = from_keyframes(self.slam.keyframes.readable)
 
     def _why_not(self, read: int) -> str:
@@ -358,10 +354,7 @@ class DiveRun:
     def _check_calibration(self) -> None:
         if self.calibration is None:
             return
-        with (
-            self.profiler.stage("calibration check"),
-            self.slam.failures.contain("calibration check"),
-        ):
+        with self.slam.stages("calibration check"):
             self.lens_error = lens_error(self.slam.keyframes.readable)
 
     def _shortcomings(self) -> list[str]:

@@ -8,8 +8,9 @@ from functools import partial
 
 from aquaflow.base.cores import core_count
 from aquaflow.base.errors import AquaFlowError
-from aquaflow.base.profiler import Profiler
+from aquaflow.base.stages import Stages
 from aquaflow.base.storage.dive_status import DiveStatus, read_status
+from aquaflow.base.worker import Worker
 from aquaflow.config import Config, parse_config
 from aquaflow.config.device import MountingConfig
 from aquaflow.config.vehicle import VehicleConfig
@@ -37,7 +38,7 @@ from aquaflow.recordings.kept_pictures import PictureThread
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
 from aquaflow.recordings.telemetry_lines import TelemetryLog
 from aquaflow.slam import Slam
-from aquaflow.slam.map_parts import make_maps
+from aquaflow.slam.map_inputs import make_maps
 from aquaflow.types import Dropped
 
 log = logging.getLogger(__name__)
@@ -77,17 +78,19 @@ def assembled(
         ConfigError: the prior cannot give what the config asks tracking for.
     """
     config, service, failures = plain(vehicle), vehicle.service, feed.failures
-    profiler = Profiler()
+    stages = Stages(failures=failures)
     before = None if choice.checkpoint is None else read_status(folder.path)
     # A core is left for tracking, where there is more than one.
     threads = config.threads or max(1, core_count() - 1)
     # A dive whose map was made before mapping was switched off keeps it.
     mapped = config.mapping.enabled or _has_maps(choice.checkpoint)
-    maps = make_maps(config, profiler, folder.work, failures, mapped, threads)
+    maps = make_maps(config, stages, folder.work, mapped, threads)
     thread = MapThread(
         maps, service.mapping, vitals.heartbeats, lambda: vitals.degradation.level
     )  # fmt: skip
-    slam = Slam(config, profiler, folder.work, True, thread, failures)
+    worker = Worker(failures, threads=True)
+    slam = Slam(config, stages, folder.work, worker, thread)
+    slam.prior.warm_up()
     said = look_in_base(slam, service.dive.site, choice.checkpoint)
     with failures.contain("camera mounting"):
         stated = camera_mounting(config, service, feed)

@@ -112,7 +112,7 @@ class LiveLoop:
         """Poses of the frames that wait for idle moments, as many as there is time for."""
         while self._past is not None and not until.over:
             self._catch_up(self._past)
-            self.dive_run.slam.side_work.settle(wait=True)
+            self.dive_run.slam.take_finished(wait=True)
 
     def end(self) -> None:
         """After the last turn: telemetry of after the last frame is taken."""

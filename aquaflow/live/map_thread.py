@@ -1,8 +1,9 @@
 """Mapping in parallel to tracking: one thread that runs tracking's requests in order.
 
-Tracking never waits for it. Beyond the backlog limit common frames come as views without steps of
-their own, then requests are dropped and counted, common frames first; between requests the thread
-goes on optimising until every view has had its steps.
+Tracking never waits for it, nor asks for results. Beyond the backlog limit common frames come as
+views without steps of their own, then requests are dropped and counted, common frames first;
+between requests the thread goes on optimising until every view has had its steps. Such a queue, in
+which a checkpoint's job goes first, is no :class:`aquaflow.base.worker.Worker`.
 """
 
 from __future__ import annotations

@@ -1,19 +1,23 @@
 """Work on the maps of a dive, which live on one device until that fails.
 
-Where the device's memory is full, work that may be left out is, and the maps stay where they are.
-Other work, such as a correction, and all work that fails because the device is gone, is done again
-on the CPU, where all maps go on (see host_copies.py).
+Nothing else knows of that: work on a map is asked for by :meth:`DeviceWork.do` or
+:meth:`DeviceWork.change`. Where the device's memory is full, work that may be left out is, and the
+maps stay where they are. Other work, such as a correction, and all work that fails because the
+device is gone, is done again on the CPU, where all maps go on (see host_copies.py).
 """
 
 from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Concatenate, ParamSpec
 
 from aquaflow.base.errors import first_line, is_device_failure, is_device_full
 from aquaflow.base.errors.failures import Failures
 from aquaflow.config import Config
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.host_copies import HostCopies
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render import cpu_renderer
@@ -22,10 +26,13 @@ from aquaflow.render.device_memory import give_back_after
 
 log = logging.getLogger(__name__)
 
+P = ParamSpec("P")
+
 MOST_LEFT_OUT = 10
 """Times in a row that a full device may cost a kind of work: the map is too large for it then."""
 
-Work = Callable[[Mapper], object]
+MAY_BE_LEFT_OUT = {"copy of the map", "insertion", "optimisation", "voxels in metres"}
+"""Work without which a map goes on: it leaves a whole map, whatever it raises."""
 
 
 class DeviceWork:
@@ -34,7 +41,7 @@ class DeviceWork:
     def __init__(self, config: Config, renderer: Renderer, failures: Failures) -> None:
         self.renderer = renderer
         self.mappers: dict[int, Mapper] = {}
-        self.copies = HostCopies()
+        self._copies = HostCopies()
         self._config, self._failures = config, failures
         self._left_out: Counter[str] = Counter()
         """By stage, how often in a row."""
@@ -50,15 +57,16 @@ class DeviceWork:
         self,
         stage: str,
         number: int,
-        work: Work,
-        frame: int | None = None,
-        may_be_left_out: bool = False,
+        frame: int | None,
+        work: Callable[Concatenate[Mapper, P], object],
+        *args: P.args,
+        **kwargs: P.kwargs,
     ) -> bool:
-        """Do ``work`` on map ``number``; what it raises is counted, and False returned.
-
-        Work that ``may_be_left_out`` leaves a whole map, whatever it raises.
-        """
-        error = self._tried(stage, number, work, frame)
+        """Do ``work`` on map ``number``, with these arguments after the map, which is another one
+        once its device is lost; what it raises is counted, for ``frame``, and False returned."""
+        may_be_left_out = stage in MAY_BE_LEFT_OUT
+        attempt = partial(self._tried, stage, number, frame, work, *args, **kwargs)
+        error = attempt()
         if error is not None and self._is_of_device(error):
             full = is_device_full(error)
             if full:
@@ -67,23 +75,44 @@ class DeviceWork:
                 self._left_out[stage] += 1
             else:
                 self.leave_device(first_line(error))
-                error = self._tried(stage, number, work, frame)
+                error = attempt()
         if error is None:
             self._left_out[stage] = 0
         elif may_be_left_out:
             self.mend(number)
         return error is None
 
-    def change(self, stage: str, number: int, work: Work) -> bool:
+    def change(
+        self,
+        stage: str,
+        number: int,
+        work: Callable[Concatenate[Mapper, P], object],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> bool:
         """A change that is made wholly, and once: a map that a failing device left half changed
         goes on from its copy, which is of before."""
-        error = self._tried(stage, number, work)
+        attempt = partial(self._tried, stage, number, None, work, *args, **kwargs)
+        error = attempt()
         if error is not None and self._is_of_device(error):
             self.leave_device(first_line(error), half_changed=number)
-            error = self._tried(stage, number, work)
+            error = attempt()
         if error is not None:
             self.mend(number)
         return error is None
+
+    def move(self, number: int, moves: Mapping[int, Sim3]) -> None:
+        """Map ``number`` follows its keyframes, and so does its copy."""
+        if self.change("correction of the map", number, Mapper.move, moves):
+            self._copies.moved(number, moves)
+
+    def copy_grown(self, number: int) -> None:
+        """Map ``number`` has grown by a view; now and then it is copied."""
+        self.do("copy of the map", number, None, lambda mapper: self._copies.grown(number, mapper))
+
+    def copy(self, number: int) -> None:
+        """Copy map ``number``, as it would go on without its device."""
+        self.do("copy of the map", number, None, lambda mapper: self._copies.take(number, mapper))
 
     def leave_device(self, why: str, half_changed: int | None = None) -> None:
         """From here on all maps are drawn and optimised on the CPU."""
@@ -93,8 +122,8 @@ class DeviceWork:
         self.renderer = cpu_renderer(self._config.threads)
         for number, mapper in self.mappers.items():
             half = number == half_changed
-            self.mappers[number] = self.copies.on_cpu(number, mapper, self.renderer, half)
-        self.copies = HostCopies()
+            self.mappers[number] = self._copies.on_cpu(number, mapper, self.renderer, half)
+        self._copies = HostCopies()
 
     def mend(self, number: int) -> None:
         """After a failure: the map is whole, wherever it is."""
@@ -106,12 +135,18 @@ class DeviceWork:
             self.leave_device(first_line(error))  # where every map is made whole
 
     def _tried(
-        self, stage: str, number: int, work: Work, frame: int | None = None
+        self,
+        stage: str,
+        number: int,
+        frame: int | None,
+        work: Callable[Concatenate[Mapper, P], object],
+        *args: P.args,
+        **kwargs: P.kwargs,
     ) -> Exception | None:
         """What ``work`` raised, if it was contained or the device's."""
         try:
             with self._failures.contain(stage, frame) as run:
-                work(self.mapper(number))
+                work(self.mapper(number), *args, **kwargs)
         except Exception as error:
             if not self._is_of_device(error):
                 raise

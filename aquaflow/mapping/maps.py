@@ -57,14 +57,11 @@ class Maps:
 
     def grow(self, growth: Growth) -> None:
         view, number = growth.view, growth.sub_map
+        do, index = self._work.do, view.frame_index
         with self.profiler.stage("view"):
-            self._work.do("view", number, lambda mapper: self._add(view, mapper), view.frame_index)
-        metres = growth.metres_per_unit
-        if metres is not None:
-            self._work.do(
-                "voxels in metres", number, lambda mapper: mapper.use_unit(metres),
-                view.frame_index, may_be_left_out=True,
-            )  # fmt: skip
+            do("view", number, index, self._add, view)
+        if growth.metres_per_unit is not None:
+            do("voxels in metres", number, index, Mapper.use_unit, growth.metres_per_unit)
 
         # Sec. 3.3.3: medium-guided insertion, from this frame and from the keyframe it retires.
         for retired in growth.retired:
@@ -75,12 +72,9 @@ class Maps:
         # Sec. 3.4: joint optimisation of Gaussians and water.
         with self.profiler.stage("optimise"):
             self.optimise(number, growth.steps)
-        self._work.do(
-            "copy of the map", number, lambda mapper: self._work.copies.grown(number, mapper),
-            may_be_left_out=True,
-        )  # fmt: skip
+        self._work.copy_grown(number)
 
-    def _add(self, view: View, mapper: Mapper) -> None:
+    def _add(self, mapper: Mapper, view: View) -> None:
         self.views.keep(view)
         mapper.add_view(view)  # some views trigger another fit of the water
         group = same_group(view, mapper.views)
@@ -88,9 +82,7 @@ class Maps:
 
     def optimise(self, sub_map: int, steps: int) -> None:
         """Steps of the optimiser on a sub-map's map."""
-        self._work.do(
-            "optimisation", sub_map, lambda mapper: mapper.optimise(steps), may_be_left_out=True
-        )
+        self._work.do("optimisation", sub_map, None, Mapper.optimise, steps)
 
     def hold_out(self, view: View, sub_map: int) -> None:
         views = self.held_out.setdefault(sub_map, [])
@@ -98,21 +90,15 @@ class Maps:
         drop_surplus(views, views, self.config.mapping.held_out_most)
 
     def insert(self, insertion: Insertion) -> None:
-        view, number = insertion.view, insertion.sub_map
-
-        def insert(mapper: Mapper) -> None:
-            mapper.insert(view, insertion.pointmap)
-
+        view, depths = insertion.view, insertion.pointmap
         with self.profiler.stage("insert"):
-            self._work.do("insertion", number, insert, view.frame_index, may_be_left_out=True)
+            self._work.do(
+                "insertion", insertion.sub_map, view.frame_index, Mapper.insert, view, depths
+            )
 
     def correct(self, moves: Mapping[int, Sim3], merged: Mapping[int, int]) -> None:
         for number in self.mappers:
-            moved = self._work.change(
-                "correction of the map", number, lambda mapper: mapper.move(moves)
-            )
-            if moved:
-                self._work.copies.moved(number, moves)
+            self._work.move(number, moves)
         for views in self.held_out.values():
             move_views(views, moves)
         for source, target in merged.items():
@@ -126,18 +112,13 @@ class Maps:
         if source not in self.mappers:
             return
         before = len(self._work.mapper(target).gaussians)
-        merged = self._work.change(
-            "merging of maps", target, lambda mapper: mapper.absorb(self.mappers[source])
-        )
+        merged = self._work.change("merging of maps", target, self._absorb, source)
         if merged or len(self._work.mapper(target).gaussians) > before:
             del self.mappers[source]
-            self._take_copy(target)
+            self._work.copy(target)
 
-    def _take_copy(self, number: int) -> None:
-        self._work.do(
-            "copy of the map", number, lambda mapper: self._work.copies.take(number, mapper),
-            may_be_left_out=True,
-        )  # fmt: skip
+    def _absorb(self, mapper: Mapper, source: int) -> None:
+        mapper.absorb(self.mappers[source])
 
     def refine(self, progress: Progress | None = None, until: Deadline | None = None) -> None:
         """Maps share the time by their views."""
@@ -148,13 +129,10 @@ class Maps:
             for number in list(self.mappers):
                 if number in views:
                     share = limit.share(views[number] / sum(views.values()))
-                    self._refine(number, progress, share)
+                    self._work.do("refinement", number, None, Mapper.refine, progress, share)
                     del views[number]
                 self._work.mend(number)
-                self._take_copy(number)
-
-    def _refine(self, number: int, progress: Progress | None, until: Deadline) -> None:
-        self._work.do("refinement", number, lambda mapper: mapper.refine(progress, until))
+                self._work.copy(number)
 
     def leave_device(self, why: str) -> bool:
         if self.renderer.device.type == "cpu":

@@ -3,35 +3,36 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.errors import ConfigError
-from aquaflow.base.errors.failures import Failures
-from aquaflow.base.profiler import Profiler
+from aquaflow.base.stages import Stages
+from aquaflow.base.worker import Worker
 from aquaflow.config import Config
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.mapping.work import MapWork
 from aquaflow.prior.factory import make_prior
 from aquaflow.slam.finish_time import FinishTime
-from aquaflow.slam.map_parts import make_contributions, make_maps
+from aquaflow.slam.map_inputs import MapInputs, make_maps
 from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.tracking.adjustment.adjuster import Adjuster
 from aquaflow.tracking.anchored import Anchored, Anchors
 from aquaflow.tracking.base.base import Base
-from aquaflow.tracking.base.in_base import InBase
+from aquaflow.tracking.base.in_base import InBase, LookedUp
 from aquaflow.tracking.frame_table import FrameTable
-from aquaflow.tracking.frames import FrameClass, Tracked
+from aquaflow.tracking.frames import FrameClass, Link, Revisit, Step, Tracked
 from aquaflow.tracking.gate.gate import FrameGate, GateKind, Verdict
-from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph
+from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph, LoopsFound
+from aquaflow.tracking.initialisation.back_fill import LookedBack
 from aquaflow.tracking.loops.relocaliser import Places
 from aquaflow.tracking.metric.learned_scales import learned_scales
 from aquaflow.tracking.metric.metric_frames import MetricFrames
 from aquaflow.tracking.overlay.finder import OverlayFinder
-from aquaflow.tracking.side_work import SideWork
+from aquaflow.tracking.returning import Looked
 from aquaflow.tracking.tracker import Tracker
 from aquaflow.types import Frame
 
@@ -51,33 +52,29 @@ class Slam:
     def __init__(
         self,
         config: Config,
-        profiler: Profiler | None = None,
+        stages: Stages | None = None,
         work: Path | None = None,
-        live: bool = False,
+        worker: Worker | None = None,
         maps: MapWork | None = None,
-        failures: Failures | None = None,
     ) -> None:
-        """What does not fit into memory waits in the folder ``work``, if there is one.
+        """``stages`` time the dive; what one of them raises is counted, and costs that stage. What
+        does not fit into memory waits in the folder ``work``, if there is one.
 
-        A ``live`` run takes over an optimised keyframe graph, and what side work has found, as soon
-        as they are there; a replay waits for the one at the next keyframe, has the other done at
-        once, and so repeats bit for bit. ``maps`` may do their work in another thread. What a stage
-        raises is counted in ``failures`` and costs that stage.
+        Without a ``worker`` everything is done in step with the frames, and a replay repeats bit
+        for bit; one with threads lets no frame wait for loops, and corrections come when they are
+        there. ``maps`` may do their work in another thread.
 
         Raises:
             ConfigError: the prior cannot give what the config asks tracking for.
         """
-        self.config = config
-        self.profiler = profiler or Profiler()
-        self.failures = failures or Failures()
+        self.config, self.stages = config, stages or Stages()
+        self.profiler, self.failures = self.stages.profiler, self.stages.failures
         self.prior = make_prior(config.prior)
         if config.tracking.residual == "point" and not self.prior.ranged:
             raise ConfigError(
                 "tracking.residual 'point' needs points of each frame's own, which the "
                 f"{self.prior.name} prior does not have; choose pixel or ray, or another prior"
             )
-        if live:
-            self.prior.warm_up()
         self.keyframes = KeyframeStore(work, self.prior)
         places = Places(self.keyframes, config.tracking)
         self._anchors = Anchors(self.keyframes, self.failures)
@@ -87,11 +84,12 @@ class Slam:
             self.keyframes, lambda: self.frames, config.fusion, self.failures
         )
         """Telemetry, and the frames in metres that it gives."""
-        self.side_work = SideWork(self.failures, live)
-        """Looks for loops, for keyframes to return to, and for frames of before the map's start."""
+        self.worker = worker or Worker(self.failures)
+        """Looks for loops, for keyframes to return to, and for frames of before the map's start,
+        and optimises the keyframe graph."""
         self.tracker = Tracker(
-            self.prior, self.keyframes, config.tracking, places, live, self.failures,
-            self.metric.motion, self.side_work,
+            self.prior, self.keyframes, config.tracking, places, self.failures,
+            self.metric.motion, self.worker,
         )  # fmt: skip
         adjustment = config.tracking.adjustment
         self.adjuster = Adjuster(self.keyframes, adjustment)
@@ -100,24 +98,18 @@ class Slam:
             self.keyframes, places, config.tracking, self.failures, self.metric,
             self.adjuster if adjustment.enabled else None,
             learned_scales(self.keyframes, self.prior.unit_sigma, config.tracking.learned),
-            self.side_work,
+            self.worker,
         )  # fmt: skip
         self.in_base: InBase | None = None
         """Where this dive lies in an earlier one; None: none was given."""
-        self.maps: MapWork = maps or make_maps(
-            config, self.profiler, work, self.failures, config.mapping.enabled
-        )
+        self.maps: MapWork = maps or make_maps(config, self.stages, work, config.mapping.enabled)
+        self._map_inputs = MapInputs(self.maps, self.keyframes, config.mapping, self.metric_frame)
         self.skipped: Counter[str] = Counter()
         """Frames that the gate kept from tracking, by its reason's kind."""
-        self._live = live
         self.frames = FrameTable()
         """Finished frames, in completion order."""
         self.used = 0
         """Frames that passed the gate so far."""
-        self._contributions = make_contributions(
-            config, self.maps, self.keyframes, self.metric_frame
-        )
-        """None with mapping off."""
         self._latest: int | None = None
         """The row of the frame linked last, if it has a pose."""
 
@@ -130,64 +122,69 @@ class Slam:
         """
         base.refuse_other_prior(self.prior.name)
         self.in_base = self.metric.base = InBase(
-            base, self.keyframes, self.config.tracking, self.side_work, self.failures, self._live
+            base, self.keyframes, self.config.tracking, self.worker, self.failures
         )
 
     def process(self, frame: Frame) -> list[Tracked]:
-        """One frame's way through the paper; returns the frames that it finished."""
-        # Sec. 3.2, Eq. 4: the graph as optimised meanwhile; keyframes move, and the map follows.
-        if self._live:
-            with self.profiler.stage("graph"):
-                self.side_work.settle()
-            self._follow_graph(wait=False)
-
-        # Not in the paper: what a recorder burned into the pictures is masked.
+        """One frame (paper, Sec. 3); returns every frame that it finished."""
+        self.take_finished()  # by the worker: loops, returns to keyframes, frames of the past
+        self._follow_graph(at_keyframe=False)  # Eq. 4: keyframes move, and the map with them
         frame = self._without_overlay(frame)
-
-        # Not in the paper: frames that cannot help are skipped before anything costly.
         verdict = self._gate(frame)
         if not verdict.passed:
             return [self._publish(self._skipped(frame, verdict))]
+        step = self._track(frame)  # Eqs. 1 and 3
+        return self._take(step)  # edges to the graph, frames to the maps, jobs to the worker
 
-        # Sec. 3.1, Eq. 1: encode the picture and match it to the keyframe in use.
-        # Sec. 3.2, Eq. 3: its Sim(3) pose, its class, and the poses of frames that waited for it.
-        tracked = self._track(frame)
-
-        # For this frame, and for those that waited for it:
-        # Sec. 3.2, Eq. 4: a new keyframe gets its link, and loops to earlier ones are closed.
-        # Sec. 3.3.3, Eqs. 16 and 17: medium-guided insertion of Gaussians.
-        # Sec. 3.4, Eqs. 18 to 23: joint optimisation of Gaussians and medium.
-        # The frame's row, from which its pose follows after every later correction.
-        finished = self._link_map_publish(tracked)
-
-        # Not in the paper: keyframes that the monitor of scale had to join anew.
-        self._revisit(frame)
-        return finished
-
-    def _link_map_publish(self, tracked: list[Tracked]) -> list[Tracked]:
+    def _take(self, step: Step) -> list[Tracked]:
+        """The frames of a step, and the edges that it found, each to who needs it."""
         finished = []
-        for anchored in self._anchor(tracked):
-            linked = self._link(anchored)
+        for anchored in self._anchor(step.frames):
+            linked = self._link(anchored, step.links)
             self._look_for_known_lengths(linked.tracked)
             self._map(linked.tracked)
             finished.append(self._publish(linked))
+        for revisit in step.revisits:
+            self._revisit(revisit)
         return finished
 
+    def take_finished(self, wait: bool = False) -> None:
+        """Apply what the worker has found since; with ``wait``, all that was asked for."""
+        if self.worker.waiting():
+            with self.profiler.stage("graph"):
+                for each in self.worker.finished(wait):
+                    with self.failures.contain(each.stage, each.frame):
+                        self._apply(each.found)
+
+    def _apply(self, found: object) -> None:
+        """Loops, keyframes to return to, keyframes that the base knows, frames of the past."""
+        if isinstance(found, LoopsFound):
+            self.graph.close_loops(found)
+        elif isinstance(found, Looked):
+            revisit = self.tracker.looked(found)
+            if revisit is not None:
+                self._revisit(revisit)
+        elif isinstance(found, LookedUp) and self.in_base is not None:
+            self.in_base.take(found)
+        elif isinstance(found, LookedBack):
+            self.tracker.looked_back(found)
+
     def catch_up(self) -> list[Tracked]:
-        """In a live run's idle moments: poses of the past, which waited for a map (Sec. 3.2)."""
+        """In idle moments: poses of the past, which waited for a map (Sec. 3.2)."""
         newest = self._latest
+        self.take_finished()
         with self.profiler.stage("back-fill"):
-            self.side_work.settle()
-            tracked = self.tracker.back_fill()
-        finished = self._link_map_publish(tracked)
+            step = self.tracker.back_fill()
+        finished = self._take(step)
         self._latest = newest
         return finished
 
     def finish_tracking(self, until: Deadline | None = None) -> list[Tracked]:
         """After the last frame: the frames that still wait."""
+        self.take_finished(wait=True)
         with self.profiler.stage("track"):
-            tracked = self.tracker.finish(until)
-        return self._link_map_publish(tracked)
+            step = self.tracker.finish(until)
+        return self._take(step)
 
     def finish(
         self,
@@ -199,9 +196,8 @@ class Slam:
         limits = limits or FinishTime()
         finished = self.finish_tracking(limits.settling)
         self._settle_graph(limits.settling)
-        if self._contributions is not None:
-            with self.failures.contain("insertion"):
-                self._contributions.retire_last()
+        with self.failures.contain("insertion"):
+            self._map_inputs.retire_last()
         with self.failures.contain("refinement"):
             self.maps.refine(progress, limits.refining)
         settled = self.results(len(self.frames) - len(finished))
@@ -225,15 +221,14 @@ class Slam:
                 self.metric.update(self.graph.snapshot)
 
     def _wait_for_graph(self) -> None:
-        self.side_work.settle(wait=True)
-        self._follow_graph(wait=True)
+        self.take_finished(wait=True)
+        self._correct(wait=True)
         while self.graph.optimising:
-            self._follow_graph(wait=True)
+            self._correct(wait=True)
 
     def close(self, keep: bool = False) -> None:
         """End the background work; remove the files of the work folder, or ``keep`` them."""
-        self.side_work.close()
-        self.graph.close()
+        self.worker.close()
         self.keyframes.close(keep)
         self.maps.close(keep)
 
@@ -269,86 +264,84 @@ class Slam:
     # --- the steps of a frame -----------------------------------------------------------------
 
     def _without_overlay(self, frame: Frame) -> Frame:
-        """The frame with overlays masked, as far as they are found by now."""
+        """Not in the paper: what a recorder burned into the pictures is masked, as far as it is
+        found by now."""
         if not self.config.tracking.mask_overlays:
             return frame
         masked = frame
-        with self.profiler.stage("overlay"), self.failures.contain("overlay", frame.index):
+        with self.stages("overlay", frame.index):
             masked = self.overlays.masked(frame)
         return masked
 
     def _gate(self, frame: Frame) -> Verdict:
-        """Whether the frame is worth tracking; it is decided here which of those are held out."""
+        """Not in the paper: frames that cannot help are skipped before anything costly; it is
+        decided here which of the others are held out."""
         verdict = Verdict(GateKind.PASS)
-        with self.profiler.stage("gate"), self.failures.contain("frame gate", frame.index):
+        with self.stages("gate", frame.index):
             verdict = self.gate.judge(frame.image, frame.mask)
         if verdict.passed:
-            if self._contributions is not None:
-                self._contributions.expect(frame.index, self.used)
+            self._map_inputs.expect(frame.index, self.used)
             self.used += 1
         else:
             self.skipped[verdict.kind.value] += 1
         return verdict
 
-    def _track(self, frame: Frame) -> list[Tracked]:
-        """The frames whose pose, or lack of one, this frame makes known."""
+    def _track(self, frame: Frame) -> Step:
+        """Sec. 3.1, Eq. 1: encode the picture and match it to the keyframe in use; Sec. 3.2, Eq. 3:
+        its Sim(3) pose, its class, and the poses of frames that waited for it."""
         with self.profiler.stage("track"):
-            tracked = self.tracker.track(frame)
+            step = self.tracker.track(frame)
         if self.tracker.lost:
             self.gate.forget()
-        return tracked
+        return step
 
     def _anchor(self, tracked: list[Tracked]) -> list[Anchored]:
         """T_kf of all frames, before a loop closure among them moves the keyframes."""
         return [self._anchors.anchored(each) for each in tracked]
 
-    def _link(self, anchored: Anchored) -> Anchored:
-        """Add a keyframe to the graph; the frame with its pose after that."""
+    def _link(self, anchored: Anchored, links: Mapping[int, Link]) -> Anchored:
+        """Sec. 3.2, Eq. 4: a new keyframe gets its edge, and loops to earlier ones are closed; the
+        frame with its pose after that."""
         tracked, T_kf = anchored.tracked, anchored.T_kf
         if tracked.keyframe is None or T_kf is None:
             self._latest = None
             return anchored
         if tracked.frame_class is FrameClass.KEYFRAME:
-            if not self._live:
-                self._follow_graph(wait=True)
+            self._follow_graph(at_keyframe=True)
             index = tracked.frame.index
-            with self.profiler.stage("graph"), self.failures.contain("keyframe graph", index):
-                self.graph.add(tracked.keyframe, tracked.link)
+            with self.stages("graph", index):
+                self.graph.add(tracked.keyframe, links.get(tracked.keyframe))
             if self.in_base is not None:
                 with self.profiler.stage("base"):
                     self.in_base.look(tracked.keyframe)
-            tracked = replace(tracked, link=None)  # its matches are let go
         settled = self._anchors.settled(tracked, T_kf)
         linked = Anchored(settled, None if settled.T_wc is None else T_kf)
         self._latest = None if linked.T_kf is None else len(self.frames)
         return linked
 
-    def _revisit(self, frame: Frame) -> None:
-        found, self.tracker.revisits = self.tracker.revisits, []
-        for revisit in found:
-            with self.failures.contain("keyframe graph", frame.index):
-                self.graph.revisit(revisit)
+    def _revisit(self, revisit: Revisit) -> None:
+        """Not in the paper: two keyframes that one frame was matched to get an edge."""
+        with self.failures.contain("keyframe graph", self.keyframes[revisit.keyframe].frame_index):
+            self.graph.revisit(revisit)
 
     def _look_for_known_lengths(self, tracked: Tracked) -> None:
         """In the pictures that the map is made from, if there is anything to look for."""
         sightings, mapped = self.metric.sightings, (FrameClass.KEYFRAME, FrameClass.MAPPING)
         if sightings.looks_for and tracked.T_wc is not None and tracked.frame_class in mapped:
             frame = tracked.frame
-            camera, failures = self.tracker.camera or frame.camera, self.failures
-            with self.profiler.stage("look"), failures.contain("known lengths", frame.index):
-                sightings.look(frame.index, frame.image, camera)
+            with self.stages("look", frame.index):
+                sightings.look(frame.index, frame.image, self.tracker.camera or frame.camera)
 
     def _map(self, tracked: Tracked) -> None:
-        """Hold the frame out, or let the map grow by it."""
-        if self._contributions is None or tracked.T_wc is None:
-            return
+        """Sec. 3.3.3, Eqs. 16 and 17: medium-guided insertion of Gaussians; Sec. 3.4, Eqs. 18 to
+        23: joint optimisation of Gaussians and medium. Or the frame is held out."""
         with self.failures.contain("mapping", tracked.frame.index):
-            self._contributions.add(tracked, self.tracker.camera or tracked.frame.camera)
+            self._map_inputs.add(tracked, self.tracker.camera or tracked.frame.camera)
 
     def _publish(self, anchored: Anchored) -> Tracked:
-        """The frame is finished: its row goes into the table."""
-        if self._contributions is not None:
-            self._contributions.forget(anchored.tracked.frame.index)
+        """The frame is finished: it has a row, from which its pose follows after every later
+        correction."""
+        self._map_inputs.forget(anchored.tracked.frame.index)
         self.frames.add(anchored.tracked, anchored.T_kf)
         return anchored.tracked
 
@@ -362,17 +355,22 @@ class Slam:
         before, T_kf = self.frames[self._latest]
         skipped = replace(
             self._anchors.settled(before, T_kf), frame=frame, frame_class=FrameClass.SKIPPED,
-            pointmap=None, reason=verdict.reason, link=None,
+            pointmap=None, reason=verdict.reason,
         )  # fmt: skip
         return Anchored(skipped, None if skipped.T_wc is None else T_kf)
 
-    def _follow_graph(self, wait: bool) -> None:
-        """Take over what the graph's optimisation found; the map follows its keyframes."""
+    def _follow_graph(self, at_keyframe: bool) -> None:
+        """Take over what the graph's optimisation found: in step with the frames it is waited for
+        at keyframes; else it is looked for between frames."""
+        if at_keyframe is self.worker.in_step:
+            self._correct(wait=at_keyframe)
+
+    def _correct(self, wait: bool) -> None:
+        """Keyframes move as the graph was optimised, and the map follows them."""
         if self.in_base is not None and self.in_base.has_news():
             self.graph.straighten()
-        with self.failures.contain("correction of the map"):
-            with self.profiler.stage("correct"):
-                correction = self.graph.correction(wait)
+        with self.stages("correct"):
+            correction = self.graph.correction(wait)
             if correction.moves:
                 self.maps.correct(correction.moves, correction.merged)
 

@@ -20,7 +20,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
 from aquaflow.prior.contract import Encoding, Float, Mask, PairGeometry, Prior
-from aquaflow.tracking.frames import FrameClass, Link, Quality, Tracked
+from aquaflow.tracking.frames import FrameClass, Quality, Tracked
 from aquaflow.tracking.learned.fusion import add_learned
 from aquaflow.tracking.learned.moving import SeenBefore, moving
 from aquaflow.tracking.learned.scaling import LearnedDepth
@@ -77,11 +77,10 @@ class CurrentKeyframe:
         frame_class: FrameClass,
         quality: Quality,
         pointmap: Pointmap | None = None,
-        link: Link | None = None,
     ) -> Tracked:
         """The result for the last frame."""
         sub_map, number = self.keyframe.sub_map, self.keyframe.number
-        return Tracked(frame, frame_class, sub_map, number, self.T_wc, quality, pointmap, link=link)
+        return Tracked(frame, frame_class, sub_map, number, self.T_wc, quality, pointmap)
 
 
 def only_where(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -77,8 +77,6 @@ class Tracked:
     pointmap: Pointmap | None = None
     """Depth of this frame's own pixels; present for keyframes and mapping frames."""
     reason: str = ""
-    link: Link | None = None
-    """Of a keyframe that continues a sub-map."""
 
     @staticmethod
     def lost(frame: Frame, sub_map: int, reason: str = "no pose found") -> Tracked:
@@ -88,6 +86,17 @@ class Tracked:
     def bare(self) -> Tracked:
         """A copy without picture and pointmap, small enough to keep for every frame."""
         return replace(self, frame=without_pictures(self.frame), pointmap=None)
+
+
+@dataclass(frozen=True)
+class Step:
+    """What tracking found out with a frame: plain data for the graph, the maps and the table."""
+
+    frames: list[Tracked] = field(default_factory=list)
+    """Finished by it, each with its pose or why it has none: that frame, and some before it."""
+    links: dict[int, Link] = field(default_factory=dict)
+    """Of the new keyframes that continue a sub-map, by their numbers."""
+    revisits: list[Revisit] = field(default_factory=list)
 
 
 def without_pictures(frame: Frame) -> Frame:

@@ -53,11 +53,12 @@ class MapStart:
         config: TrackingConfig,
         waiting: WaitingFrames,
         failures: Failures,
-        live: bool,
+        in_step: bool,
     ) -> None:
-        """A ``live`` run continues from the newest frame: the others wait for idle time."""
+        """A map that is not made ``in_step`` with the frames goes on from the newest one: the
+        others wait for idle time."""
         self._prior, self._config = prior, config
-        self._waiting, self._failures, self._live = waiting, failures, live
+        self._waiting, self._failures, self._in_step = waiting, failures, in_step
         self._initialiser: Initialiser | None = None
 
     def add(self, frame: Frame, encoding: Encoding) -> bool:
@@ -134,7 +135,7 @@ class MapStart:
             for waiting, T in zip(solution.waiting, solution.T, strict=True)
         ]
         start = Started(reference, encoding, pointmap, camera, solution.focal_sigma, posed)
-        if self._live:
+        if not self._in_step:
             return replace(start, posed=posed[-1:], T_waiting=solution.T[-1])
         thinned = [PosedFrame(frame) for frame in self._waiting.of(Wait.THINNED)]
         in_order = sorted([*posed, *thinned], key=lambda each: each.frame.index)

@@ -1,16 +1,16 @@
 """Return to an earlier keyframe instead of making a new one.
 
-To look for one costs as much as tracking two or three frames, so it is side work: in a live run the
+To look for one costs as much as tracking two or three frames, so a worker does it: on a vehicle the
 answer comes some frames later, and until then no keyframe is made.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 from aquaflow.base.errors.failures import Failures
+from aquaflow.base.worker import Worker
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
@@ -19,10 +19,9 @@ from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
 from aquaflow.tracking.loops.neighbours import Neighbour
 from aquaflow.tracking.pose.expected_matches import expected_matches
 from aquaflow.tracking.pose.matcher import Matched
-from aquaflow.tracking.side_work import SideWork
 
 STAGE = "return to a keyframe"
-"""Name of this side work."""
+"""Name of this work."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +40,13 @@ class Look:
     around: Sequence[Neighbour]
 
 
-Take = Callable[[Look, CurrentKeyframe, Matched], None]
-"""Gets an earlier keyframe that shows the frame of a look, and the frame's pose there."""
+@dataclass(frozen=True)
+class Looked:
+    """What a look found."""
+
+    look: Look
+    back: tuple[CurrentKeyframe, Matched] | None
+    """An earlier keyframe that shows the frame, and the frame's pose there; None: there is none."""
 
 
 class Returning:
@@ -52,49 +56,47 @@ class Returning:
         self,
         keyframe_tracker: KeyframeTracker,
         config: TrackingConfig,
-        side_work: SideWork,
+        worker: Worker,
         failures: Failures,
-        take: Take,
     ) -> None:
         self._keyframe_tracker, self._config = keyframe_tracker, config
-        self._side_work, self._failures, self._take = side_work, failures, take
+        self._worker, self._failures = worker, failures
         self._looked_for: CurrentKeyframe | None = None
         """The keyframe in use for which an earlier one was looked for last."""
         self._in_vain: CurrentKeyframe | None = None
         """The one for which that has just been found out not to be there."""
 
-    def does(
+    def due(
         self,
         frame: int,
         at: CurrentKeyframe,
         solved: Matched,
         encoding: Encoding,
         camera: CameraModel,
-    ) -> bool:
-        """True if no new keyframe is made: an earlier one shows the frame well, or, in a place that
-        has keyframes enough, the one in use does; or that is not known yet.
+    ) -> bool | Look:
+        """False if no new keyframe is made: an earlier one shows the frame well, or, in a place
+        that has keyframes enough, the one in use does; or that is not known yet. A look, where it
+        is to be found out by :meth:`search`.
 
         Only one that agrees with the keyframe in use about where the frame is: of a place that the
         graph does not know to be the same, a new keyframe closes the loop.
         """
-        if self._looked_for is at and self._side_work.awaits(STAGE):
-            return True
-        if self._was_in_vain(at):
+        if self._looked_for is at and self._worker.waiting(STAGE):
             return False
+        if self.was_in_vain(at):
+            return True
         if self._looked_already(at, solved):
             self._keyframe_tracker.leave(at)
-            return True
+            return False
         neighbours = self._keyframe_tracker.neighbours
         around = neighbours.around(at.T_wc, camera, at.keyframe.sub_map, at.keyframe)
         if not around:
-            return False
+            return True
         self._looked_for = at
-        look = Look(frame, at.t_ns, at, at.T_fk, solved, encoding, camera, around)
-        found, answer = partial(self._found, look), partial(self._answer, look)
-        self._side_work.do(STAGE, frame, found, answer)
-        return not self._was_in_vain(at)
+        return Look(frame, at.t_ns, at, at.T_fk, solved, encoding, camera, around)
 
-    def _was_in_vain(self, at: CurrentKeyframe) -> bool:
+    def was_in_vain(self, at: CurrentKeyframe) -> bool:
+        """True, once, if no keyframe was found to take the place of the one in use."""
         in_vain, self._in_vain = self._in_vain, None
         return in_vain is at
 
@@ -110,7 +112,7 @@ class Returning:
             and solved.share >= config.crowd_share
         )
 
-    def _found(self, look: Look) -> tuple[CurrentKeyframe, Matched] | None:
+    def search(self, look: Look) -> Looked:
         """The keyframe that shows the frame best, if one does well enough; in any thread."""
         config, best = self._config, None
         least = look.solved.share if self._is_crowded(look) else config.return_share
@@ -123,12 +125,11 @@ class Returning:
                     best, least = back, back[1].share
                 if least >= config.return_share:
                     break
-        return best
+        return Looked(look, best)
 
-    def _answer(self, look: Look, best: tuple[CurrentKeyframe, Matched] | None) -> None:
-        if best is not None:
-            self._take(look, *best)
-        elif self._is_crowded(look) and look.solved.share >= self._config.crowd_share:
+    def stay(self, look: Look) -> None:
+        """None was found: the keyframe in use is kept in a crowded place, else a new one is due."""
+        if self._is_crowded(look) and look.solved.share >= self._config.crowd_share:
             look.at.kept = look.t_ns, look.solved.share
             self._keyframe_tracker.leave(look.at)  # its points are kept, as of one that is left
         else:

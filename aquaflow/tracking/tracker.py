@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from typing import TypeAlias
 
 from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.errors.failures import Failures
+from aquaflow.base.worker import Worker
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
@@ -15,15 +18,15 @@ from aquaflow.keyframes import Keyframe, KeyframeStore
 from aquaflow.prior.contract import Encoding, PairGeometry, Prior
 from aquaflow.tracking.consistency import ConsistencyMonitor
 from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
-from aquaflow.tracking.frames import FrameClass, Link, Quality, Revisit, Tracked
-from aquaflow.tracking.initialisation.back_fill import BackFills
+from aquaflow.tracking.frames import FrameClass, Link, Quality, Revisit, Step, Tracked
+from aquaflow.tracking.initialisation.back_fill import BackFills, LookedBack
 from aquaflow.tracking.loops.relocaliser import Places
 from aquaflow.tracking.map_start import MapStart, Started
 from aquaflow.tracking.pose.matcher import Matched
 from aquaflow.tracking.repairs import LastFrame, Repairs
-from aquaflow.tracking.returning import Look, Returning, carry
+from aquaflow.tracking.returning import STAGE as RETURN
+from aquaflow.tracking.returning import Looked, Returning, carry
 from aquaflow.tracking.revisits import revisited
-from aquaflow.tracking.side_work import SideWork
 from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
 from aquaflow.types import Frame
 
@@ -43,18 +46,17 @@ class Tracker:
         keyframes: KeyframeStore,
         config: TrackingConfig,
         places: Places | None = None,
-        live: bool = False,
         failures: Failures | None = None,
         motion: ExpectedMotion | None = None,
-        side_work: SideWork | None = None,
+        worker: Worker | None = None,
     ) -> None:
         """Without ``places`` there is no relocalisation: a lost camera starts a new sub-map.
 
-        Frames that waited for a keyframe get their poses once it is there; in a ``live`` run
-        whenever there is time, by :meth:`back_fill`. What raises is counted in ``failures``.
-        ``motion`` is asked for what gyro and DVL measured since the last frame. Where a keyframe is
-        due, an earlier one is looked for as ``side_work``, by default at once; so are the frames
-        of :meth:`back_fill`.
+        Frames that waited for a keyframe get their poses once it is there, or, with a ``worker``
+        that is not in step, whenever there is time, by :meth:`back_fill`. The worker, which does
+        things at once by default, looks for them, and for an earlier keyframe where one is due.
+        What raises is counted in ``failures``. ``motion`` is asked for what gyro and DVL measured
+        since the last frame.
         """
         self.sub_map = 0
         self.camera: CameraModel | None = None
@@ -66,50 +68,47 @@ class Tracker:
         self.sub_maps = 1
         """Number of sub-maps started so far."""
         self._waiting = waiting = WaitingFrames()
-        self._start = MapStart(prior, config, waiting, self._failures, live)
-        side_work = side_work or SideWork(self._failures)
-        self._back_fills = BackFills(
-            waiting, prior, self._keyframe_tracker, self._failures, live, side_work
-        )
+        self._worker = worker = worker or Worker(self._failures)
+        self._start = MapStart(prior, config, waiting, self._failures, worker.in_step)
+        self._back_fills = BackFills(waiting, prior, self._keyframe_tracker, self._failures, worker)
         self._at: CurrentKeyframe | None = None
         self._origin = Sim3.identity()
         self.monitor = ConsistencyMonitor(self._keyframe_tracker.neighbours, config)
         self._repair = Repairs(self.monitor, self._keyframe_tracker)
-        self._returning = Returning(
-            self._keyframe_tracker, config, side_work, self._failures, self._return
-        )
+        self._returning = Returning(self._keyframe_tracker, config, worker, self._failures)
         self._solved: Matched | None = None
         """The last frame at the keyframe in use; None if it has become a keyframe itself."""
         self._joined: set[tuple[int, int]] = set()
         """Pairs of keyframes, the later one first, whose relative pose was noted."""
-        self.revisits: list[Revisit] = []
-        """Relative poses of keyframes that one frame was matched to, to be taken by the graph."""
+        self._edges = Step()
+        """Links and revisits of the step that is being made."""
 
-    def track(self, frame: Frame) -> list[Tracked]:
-        """Track a frame; returns the frames finished by it: none while it waits, several
-        afterwards.
+    def track(self, frame: Frame) -> Step:
+        """Track a frame; no frame is finished by it while it waits, several may be afterwards.
 
         Every frame leaves once, here, in :meth:`back_fill` or in :meth:`finish`.
         """
         self._waiting.enter(frame)
-        return self._leaving("tracking", frame, lambda: self._track(frame))
+        return self._step("tracking", frame, lambda: self._track(frame))
 
     @property
     def past(self) -> Frame | None:
         """The frame that :meth:`back_fill` will finish next."""
         return self._back_fills.next
 
-    def back_fill(self) -> list[Tracked]:
-        """Finish :attr:`past`, with or without a pose; returns nothing if no frame waits, or while
-        it is looked for."""
-        return self._leaving("back-filling", self.past, self._back_fills.step)
+    def back_fill(self) -> Step:
+        """Finish :attr:`past`, with or without a pose; nothing is finished if no frame waits, or
+        while it is looked for."""
+        return self._step("back-filling", self.past, self._back_fills.step)
 
-    def finish(self, until: Deadline | None = None) -> list[Tracked]:
+    def looked_back(self, found: LookedBack) -> None:
+        """The worker has looked for :attr:`past`, which the next :meth:`back_fill` finishes."""
+        self._back_fills.take(found)
+
+    def finish(self, until: Deadline | None = None) -> Step:
         """Finish the waiting frames after a last attempt to pose them, as far as there is time."""
-        decided = self._leaving(
-            "tracking", None, lambda: self._begin() + self._back_fills.all(until)
-        )
-        return decided + self._waiting.give_up(self._as_lost)
+        step = self._step("tracking", None, lambda: self._begin() + self._back_fills.all(until))
+        return replace(step, frames=step.frames + self._waiting.give_up(self._as_lost))
 
     @property
     def lost(self) -> bool:
@@ -127,17 +126,16 @@ class Tracker:
         """Register a keyframe of an earlier run for relocalisation."""
         self._keyframe_tracker.leave(CurrentKeyframe(keyframe))
 
-    def _leaving(
-        self, stage: str, frame: Frame | None, decide: Callable[[], list[Tracked]]
-    ) -> list[Tracked]:
-        """The frames that leave with what ``decide`` decides; where it raises, ``frame`` is lost,
-        whatever it came to wait for."""
+    def _step(self, stage: str, frame: Frame | None, decide: Callable[[], list[Tracked]]) -> Step:
+        """The frames that leave with what ``decide`` decides, and the edges that it found; where it
+        raises, ``frame`` is lost, whatever it came to wait for."""
         decided: list[Tracked] = []
         with self._failures.contain(stage, None if frame is None else frame.index) as run:
             decided = decide()
         if run.failed and frame is not None:
             self._waiting.put([frame], Wait.IN_HAND)
-        return self._waiting.settle(decided, self._as_lost)
+        edges, self._edges = self._edges, Step()
+        return replace(edges, frames=self._waiting.settle(decided, self._as_lost))
 
     def _as_lost(self, frame: Frame, reason: str = "no pose found") -> Tracked:
         return Tracked.lost(frame, self.sub_map, self._failures.reason(frame.index) or reason)
@@ -223,21 +221,51 @@ class Tracker:
             repaired = self._repair(finding, at, LastFrame(encoding, camera, solved))
             if repaired is not None:
                 self._at = repaired.at
-                self.revisits += [] if repaired.revisit is None else [repaired.revisit]
+                self._note(repaired.revisit)
 
-    def _return(self, look: Look, back: CurrentKeyframe, solved_back: Matched) -> None:
-        """Go on at an earlier keyframe that shows the frame of ``look``, unless tracking has left
-        the one that was in use then."""
-        at = look.at
+    # --- return to a keyframe -----------------------------------------------------------------
+
+    def _becomes_keyframe(
+        self,
+        frame: Frame,
+        at: CurrentKeyframe,
+        solved: Matched,
+        encoding: Encoding,
+        camera: CameraModel,
+    ) -> bool:
+        """Whether a frame at which a keyframe is due becomes one. An earlier one that the worker
+        finds at once is taken up here."""
+        due = self._returning.due(frame.index, at, solved, encoding, camera)
+        if isinstance(due, bool):
+            return due
+        look = partial(self._returning.search, due)
+        for found in self._worker.ask(RETURN, frame.index, look):
+            with self._failures.contain(RETURN, frame.index):
+                self._note(self.looked(found))
+        return self._returning.was_in_vain(at)
+
+    def looked(self, found: Looked) -> Revisit | None:
+        """Go on at an earlier keyframe that shows the frame of a look, unless tracking has left
+        the one that was in use then; what that says of the two keyframes."""
+        look, at = found.look, found.look.at
+        if found.back is None:
+            self._returning.stay(look)
+            return None
         if self._at is not at:
-            return
+            return None
+        back, solved_back = found.back
         self._keyframe_tracker.take_up(back)
         self._keyframe_tracker.leave(at)
-        self._join(at, look.solved, back, solved_back, look.camera)
+        revisit = self._join(at, look.solved, back, solved_back, look.camera)
         moved_on = at.T_fk is not look.T_fk
         if moved_on:
             carry(back, look)
         self._at, self._solved = back, None if moved_on else solved_back
+        return revisit
+
+    def _note(self, revisit: Revisit | None) -> None:
+        if revisit is not None:
+            self._edges.revisits.append(revisit)
 
     def _join(
         self,
@@ -246,16 +274,15 @@ class Tracker:
         back: CurrentKeyframe,
         solved_back: Matched,
         camera: CameraModel,
-    ) -> None:
-        """Note what the last frame, placed at both, says of two keyframes; once for a pair."""
+    ) -> Revisit | None:
+        """What the last frame, placed at both, says of two keyframes; once for a pair."""
         numbers = at.keyframe.number, back.keyframe.number
         pair = (max(numbers), min(numbers))
         if pair[0] == pair[1] or pair in self._joined:
-            return
+            return None
         self._joined.add(pair)
         pointmap, _ = self._keyframe_tracker.pointmap(at, solved, camera)
-        revisit = revisited(at, solved, back, solved_back, pointmap)
-        self.revisits += [] if revisit is None else [revisit]
+        return revisited(at, solved, back, solved_back, pointmap)
 
     # --- loss -----------------------------------------------------------------------------------
 
@@ -335,7 +362,7 @@ class Tracker:
         frame_class = keyframe_tracker.classify(at, solved, camera)
         self._solved = solved
         if frame_class is FrameClass.KEYFRAME:
-            due = not self._returning.does(frame.index, at, solved, encoding, camera)
+            due = self._becomes_keyframe(frame, at, solved, encoding, camera)
             frame_class = FrameClass.KEYFRAME if due else FrameClass.COMMON
         if frame_class is FrameClass.COMMON:
             return self._at.tracked(frame, frame_class, self._solved.quality)
@@ -353,4 +380,5 @@ class Tracker:
         self._joined.add((len(self._keyframes), at.keyframe.number))
         new = keyframe_tracker.at_new_keyframe
         self._at = new(frame, encoding, at.T_wc, pointmap, self.sub_map, at.motion)
-        return self._at.tracked(frame, frame_class, solved.quality, pointmap.copy(), link)
+        self._edges.links[self._at.keyframe.number] = link
+        return self._at.tracked(frame, frame_class, solved.quality, pointmap.copy())

@@ -42,7 +42,7 @@ def copy_of(whole: Maps) -> Maps:
     maps = Maps(whole.config, SinglePrecision(PRETENDED), failures=Failures(strict=False))
     maps.mappers[0] = again(whole.mappers[0], PRETENDED)
     maps.mappers[0].failures = maps.mappers[0].water_fitting.failures = maps.failures
-    maps._take_copy(0)
+    maps._work.copy(0)
     return maps
 
 

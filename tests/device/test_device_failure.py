@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from aquaflow.mapping.host_copies import COPY_EVERY
+from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.work import Growth
 from aquaflow.render.contract import CPU
 from tests.device.failing_dives import (
@@ -124,7 +125,7 @@ def test_another_error_leaves_the_map_on_its_device(
     def broken(*_: object) -> None:
         raise ValueError("no such pixel")
 
-    monkeypatch.setattr(maps.mappers[0], "insert", broken)
+    monkeypatch.setattr(Mapper, "insert", broken)
     maps.grow(growth(2))
     assert maps.renderer.device == PRETENDED
     assert maps.failures.total == 1

@@ -10,6 +10,7 @@ import numpy as np
 
 from aquaflow.base.clocks.device import Learned
 from aquaflow.base.errors.failures import Failures
+from aquaflow.base.worker import Worker
 from aquaflow.config import Config, parse_config
 from aquaflow.config.device import MountingConfig
 from aquaflow.config.service import ServiceConfig
@@ -160,7 +161,7 @@ class Told:
             Maps(config), self.config.mapping, self.heartbeats, lambda: self.degradation.level
         )
         self.dive = DiveFolder(folder, config)
-        self.slam = Slam(config, live=True, maps=self.maps)
+        self.slam = Slam(config, worker=Worker(threads=True), maps=self.maps)
         self.run = ToldRun("told", self.dive, config, self.slam, None, self.feed.name_of)
         self.loop = LiveLoop(
             self.run, self.feed, self.maps, self.config, self.vitals, self.control,

@@ -12,7 +12,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.tracking.consistency import Cause
 from aquaflow.tracking.current_keyframe import CurrentKeyframe
-from aquaflow.tracking.frames import Tracked
+from aquaflow.tracking.frames import Step, Tracked
 from aquaflow.tracking.pose.depth_fusion import MOST_FUSED
 from aquaflow.tracking.tracker import Tracker
 from tests.tracking.tracked_clips import PLACED, QUICK, SMALL, error_share, path, told
@@ -61,15 +61,20 @@ def drift(at: CurrentKeyframe, index: int) -> None:
         at.keyframe.pointmap.variance /= 1.005**2
 
 
-def swim(fault: Fault, enabled: bool = True) -> tuple[Tracker, list[Tracked]]:
+def steps(fault: Fault, enabled: bool = True) -> tuple[Tracker, list[Step]]:
     config = QUICK.model_copy(update={"monitor": MonitorConfig(enabled=enabled)})
     prior, store = told(HOVER), KeyframeStore()
-    tracker, tracked = Tracker(prior, store, config), []
+    tracker, made = Tracker(prior, store, config), []
     for frame in prior.frames(SMALL):
         if tracker._at is not None:
             fault(tracker._at, frame.index)
-        tracked += tracker.track(frame)
-    return tracker, tracked + tracker.finish()
+        made.append(tracker.track(frame))
+    return tracker, [*made, tracker.finish()]
+
+
+def swim(fault: Fault, enabled: bool = True) -> tuple[Tracker, list[Tracked]]:
+    tracker, made = steps(fault, enabled)
+    return tracker, [tracked for step in made for tracked in step.frames]
 
 
 def late_error(tracked: list[Tracked]) -> float:
@@ -136,7 +141,9 @@ def test_a_finding_is_shown_for_some_seconds() -> None:
 
 
 def test_a_keyframe_whose_scale_is_wrong_is_returned_to_no_more() -> None:
-    tracker, tracked = swim(scale)
+    tracker, made = steps(scale)
+    tracked = [tracked for step in made for tracked in step.frames]
+    revisits = [revisit for step in made for revisit in step.revisits]
     found = tracker.monitor.counts.findings[0]
     assert found.keyframe not in {t.keyframe for t in tracked if t.frame.index > found.frame}
-    assert [revisit.keyframe for revisit in tracker.revisits] == [found.keyframe]
+    assert [revisit.keyframe for revisit in revisits] == [found.keyframe]

@@ -160,7 +160,7 @@ def test_keyframes_of_slightly_other_scale_leave_the_frames_their_own(
             return solve(matcher, problem, Sim3(at.R, at.t / at.scale) if none else at)
 
         monkeypatch.setattr(KeyframeMatcher, "_solve", start)
-        later += tracker.track(frame)
+        later += tracker.track(frame).frames
     scales = [t.T_wc.scale for t in later if t.T_wc is not None]
     of_keyframes = [keyframe.T_wc.scale for keyframe in store.keyframes]
     assert len({t.keyframe for t in later}) > 1
@@ -188,7 +188,7 @@ def test_a_keyframe_that_cannot_be_read_back_costs_itself(monkeypatch: pytest.Mo
     frames = prior.frames(SMALL)
     store = KeyframeStore()
     tracker = Tracker(prior, store, QUICK)
-    tracked = [t for frame in frames[:12] for t in tracker.track(frame)]
+    tracked = [t for frame in frames[:12] for t in tracker.track(frame).frames]
     left, content = len(store), store.content
 
     def unreadable(number: int) -> object:
@@ -197,6 +197,6 @@ def test_a_keyframe_that_cannot_be_read_back_costs_itself(monkeypatch: pytest.Mo
         return content(number)
 
     monkeypatch.setattr(store, "content", unreadable)
-    tracked += [t for frame in frames[12:] for t in tracker.track(frame)]
+    tracked += [t for frame in frames[12:] for t in tracker.track(frame).frames]
     assert len(store) > left
     assert {t.frame_class for t in tracked} <= PLACED

@@ -10,18 +10,29 @@ from threading import Event
 import pytest
 
 from aquaflow.base.errors.failures import Failures
+from aquaflow.base.worker import Worker
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.tracking.current_keyframe import KeyframeTracker
 from aquaflow.tracking.frames import FrameClass, Tracked
-from aquaflow.tracking.returning import STAGE
-from aquaflow.tracking.side_work import SideWork
+from aquaflow.tracking.returning import STAGE, Looked
 from aquaflow.tracking.tracker import Tracker
 from tests.tracking.tracked_clips import PLACED, QUICK, SMALL, error_share, path, told
 
 THERE = path(12)
 HOVER = [*THERE, *(THERE[::-1] + THERE) * 2]
 """Out, and twice back and out again."""
+
+
+class Answering(Worker):
+    """Looks for keyframes in its thread; all else goes as in a replay."""
+
+    def __init__(self, failures: Failures) -> None:
+        super().__init__(failures, threads=True)
+
+    @property
+    def in_step(self) -> bool:
+        return True
 
 
 @dataclass
@@ -34,30 +45,34 @@ class Swim:
 
     def __post_init__(self) -> None:
         prior = told(self.poses)
-        self.store, self.side_work = KeyframeStore(), SideWork(self.failures, threaded=True)
+        self.store, self.worker = KeyframeStore(), Answering(self.failures)
         self.frames = iter(prior.frames(SMALL))
-        self.tracker = Tracker(
-            prior, self.store, QUICK, failures=self.failures, side_work=self.side_work
-        )
+        self.tracker = Tracker(prior, self.store, QUICK, failures=self.failures, worker=self.worker)
 
     def next(self, answers: bool) -> None:
         """One frame; before it all ``answers``, or none."""
         if answers:
-            self.side_work.settle(wait=True)
-        self.tracked += self.tracker.track(next(self.frames))
+            self.answer()
+        self.tracked += self.tracker.track(next(self.frames)).frames
+
+    def answer(self) -> None:
+        """Every answer is taken."""
+        for each in self.worker.finished(wait=True):
+            if isinstance(each.found, Looked):
+                self.tracker.looked(each.found)
 
     @contextmanager
     def until_asked(self) -> Iterator[None]:
         """Frames up to one at which a keyframe is due and an earlier one is looked for, which ends
         with this context only."""
         held = Event()
-        while not self.side_work.awaits(STAGE):
-            self.side_work.settle(wait=True)
-            self.side_work.do("hold", 0, lambda: held.wait(60.0), lambda _: None)
-            self.tracked += self.tracker.track(next(self.frames))
-            if not self.side_work.awaits(STAGE):
+        while not self.worker.waiting(STAGE):
+            self.answer()
+            self.worker.ask("hold", 0, lambda: held.wait(60.0))
+            self.tracked += self.tracker.track(next(self.frames)).frames
+            if not self.worker.waiting(STAGE):
                 held.set()
-                self.side_work.settle(wait=True)
+                self.answer()
                 held.clear()
         yield
         held.set()
@@ -67,7 +82,7 @@ class Swim:
 def swim() -> Iterator[Swim]:
     swim = Swim(HOVER)
     yield swim
-    swim.side_work.close()
+    swim.worker.close()
 
 
 def test_hovering_adds_no_keyframes_where_answers_come_a_frame_later(swim: Swim) -> None:
@@ -76,7 +91,7 @@ def test_hovering_adds_no_keyframes_where_answers_come_a_frame_later(swim: Swim)
     first = Swim(THERE)
     for _ in THERE:
         first.next(answers=True)
-    first.side_work.close()
+    first.worker.close()
     assert len(swim.store) == len(first.store) > 1
     assert {t.frame_class for t in swim.tracked} <= PLACED
     assert error_share(swim.tracked, HOVER) < 0.01
@@ -110,7 +125,7 @@ def test_tracking_goes_on_at_an_earlier_keyframe_from_where_the_camera_is_by_the
 def test_an_answer_for_a_keyframe_that_was_left_meanwhile_is_dropped(swim: Swim) -> None:
     with swim.until_asked():
         swim.tracker._at = None
-    swim.side_work.settle(wait=True)
+    swim.answer()
     assert swim.tracker._at is None
     assert not swim.failures.kinds
 

@@ -45,7 +45,8 @@ def swum(clip: list[Frame], **settings: bool) -> tuple[Counting, np.ndarray]:
     """The prior that was asked, and the camera centres."""
     prior = Counting()
     tracker = Tracker(prior, KeyframeStore(), TrackingConfig(**settings))
-    tracked = [t for frame in clip for t in tracker.track(frame)] + tracker.finish()
+    tracked = [t for frame in clip for t in tracker.track(frame).frames]
+    tracked += tracker.finish().frames
     return prior, np.array([t.T_wc.t for t in tracked if t.T_wc is not None])
 
 

@@ -173,7 +173,7 @@ def test_a_dive_that_begins_in_the_middle_of_a_swing_starts_from_one_of_its_ends
     swing = [pose((0.0, 0.0, 0.0), (x, 0.0, 0.0)) for x in [*right, *left] * 2 + right]
     config = TrackingConfig(initialisation=InitialisationConfig(parallax_widths=0.025))
     tracker = Tracker(ClassicalPrior(), KeyframeStore(), config)
-    tracked = [each for frame in filmed(SeaFloor(), swing) for each in tracker.track(frame)]
+    tracked = [each for frame in filmed(SeaFloor(), swing) for each in tracker.track(frame).frames]
     assert sum(each.T_wc is not None for each in tracked) == len(swing)
 
 

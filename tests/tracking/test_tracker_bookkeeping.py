@@ -60,9 +60,9 @@ def test_frames_that_wait_for_ever_are_given_up_oldest_first(
     monkeypatch.setitem(BOUNDS, Wait.FOR_A_KEYFRAME, Bound(3, "no parallax yet"))
     prior = told(path(8), blind=range(8))
     tracker = Tracker(prior, KeyframeStore(), QUICK)
-    given_up = [[t.frame.index for t in tracker.track(f)] for f in prior.frames(SMALL)]
+    given_up = [[t.frame.index for t in tracker.track(f).frames] for f in prior.frames(SMALL)]
     assert given_up == [[], [], [], [], [0], [1], [2], [3]]
-    assert sorted(t.frame.index for t in tracker.finish()) == [4, 5, 6, 7]
+    assert sorted(t.frame.index for t in tracker.finish().frames) == [4, 5, 6, 7]
 
 
 @pytest.mark.parametrize(("widths", "mapping"), [(1e-4, True), (10.0, False)], ids=["low", "high"])

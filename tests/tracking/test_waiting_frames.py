@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aquaflow.base.errors.failures import Failures
+from aquaflow.base.worker import Worker
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
@@ -23,6 +24,7 @@ from aquaflow.tracking.frames import FrameClass, Quality, Tracked
 from aquaflow.tracking.tracker import Tracker
 from aquaflow.tracking.waiting_frames import BOUNDS, Bound, Wait, WaitingFrames
 from aquaflow.types import Frame
+from tests.tracking.tracked_clips import Prompt
 
 CAMERA = guess_camera(8, 6)
 PICTURE = np.zeros((6, 8, 3), np.uint8)
@@ -121,14 +123,16 @@ class DrawnInitialiser:
 class DrawnTracker(Tracker):
     """Everything that looks at a picture is drawn; who waits for what, and how long, is real."""
 
-    def __init__(self, drawn: Drawn, live: bool) -> None:
+    def __init__(self, drawn: Drawn, worker: Worker) -> None:
         at: Any = SimpleNamespace(number=0, sub_map=0, T_wc=Sim3.identity())
         found = SimpleNamespace(keyframe=at, estimate=SimpleNamespace(T=Sim3.identity()))
         prior: Any = SimpleNamespace(encode=lambda *_: drawn.works() or None)
         keyframes: Any = SimpleNamespace(hold=lambda number: at)
         places: Any = SimpleNamespace(of_frame=lambda *_: found if drawn.works() else None)
         failures = Failures(strict=False)
-        super().__init__(prior, keyframes, TrackingConfig(lost_after=3), places, live, failures)
+        super().__init__(
+            prior, keyframes, TrackingConfig(lost_after=3), places, failures, worker=worker
+        )
         self._drawn = drawn
         keyframe_tracker: Any = self._keyframe_tracker
         keyframe_tracker.place = lambda *_: (drawn.works(), None)[1]
@@ -144,10 +148,12 @@ class DrawnTracker(Tracker):
 
 
 @given(
-    outcomes=st.lists(st.integers(0, 4), max_size=200), count=st.integers(0, 40), live=st.booleans()
+    outcomes=st.lists(st.integers(0, 4), max_size=200),
+    count=st.integers(0, 40),
+    kind=st.sampled_from([Worker, Prompt]),
 )
 def test_every_frame_that_enters_leaves_once_whatever_each_step_comes_to(
-    outcomes: list[int], count: int, live: bool
+    outcomes: list[int], count: int, kind: type[Worker]
 ) -> None:
     drawn = Drawn(outcomes)
     few = {state: Bound(4, bound.reason) for state, bound in BOUNDS.items()}
@@ -157,13 +163,13 @@ def test_every_frame_that_enters_leaves_once_whatever_each_step_comes_to(
         patch.object(map_start, "Initialiser", lambda frame, *_: DrawnInitialiser(drawn, frame)),
         patch.object(map_start, "fused_pointmap", lambda *_: pointmap),
     ):
-        tracker, left = DrawnTracker(drawn, live), []
+        tracker, left = DrawnTracker(drawn, kind(Failures(strict=False))), []
         for index in range(count):
-            left += tracker.track(frame_of(index))
+            left += tracker.track(frame_of(index)).frames
             if index % 3 == 0:
-                left += tracker.back_fill()
+                left += tracker.back_fill().frames
             assert tracker._waiting.count(Wait.IN_HAND) == 0
             assert all(tracker._waiting.count(state) <= 4 for state in BOUNDS)
-        left += tracker.finish()
+        left += tracker.finish().frames
     assert sorted(tracked.frame.index for tracked in left) == list(range(count))
     assert tracker.past is None

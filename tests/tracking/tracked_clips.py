@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from aquaflow.base.worker import Worker
 from aquaflow.config import InitialisationConfig, TrackingConfig
 from aquaflow.geometry.alignment import align
 from aquaflow.geometry.camera import CameraModel
@@ -20,6 +21,14 @@ from aquaflow.types import Frame
 from tests.tracking.tracking_scenes import KnownPrior, KnownView, pose
 
 PLACED = {FrameClass.KEYFRAME, FrameClass.MAPPING, FrameClass.COMMON}
+
+
+class Prompt(Worker):
+    """Of a vehicle, but with every answer at once."""
+
+    @property
+    def in_step(self) -> bool:
+        return False
 
 
 @dataclass
@@ -41,8 +50,8 @@ def run(
     tracker = Tracker(prior or ClassicalPrior(), store, config or TrackingConfig())
     tracked: list[Tracked] = []
     for frame in frames:
-        tracked += tracker.track(frame)
-    tracked += tracker.finish()
+        tracked += tracker.track(frame).frames
+    tracked += tracker.finish().frames
     # Whatever happens in between: every frame comes out exactly once.
     assert sorted(t.frame.index for t in tracked) == sorted(f.index for f in frames)
     return Run(tracked, store, tracker)

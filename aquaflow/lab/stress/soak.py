@@ -68,14 +68,14 @@ def _swim_in_circles(check: Check, seed: int, count: int) -> None:
     tracker = Tracker(ClassicalPrior(), store, TrackingConfig())
     posed, seen, warm_mb, warm_keyframes = 0, 0, 0.0, 0
     for frame in _circle(seed, count):
-        for tracked in tracker.track(frame):
+        for tracked in tracker.track(frame).frames:
             seen += 1
             if tracked.T_wc is not None:
                 posed += 1
                 check.pose(f"pose of frame {tracked.frame.index}", tracked.T_wc)
         if frame.index == WARM:
             warm_mb, warm_keyframes = _peak_mb(), len(store)
-    seen += len(tracker.finish())
+    seen += len(tracker.finish().frames)
     check.true("every frame comes out once", seen == count)
     check.below("share of frames without a pose", 1.0 - posed / count, 0.2)
     allowed_mb = ELSE_MB + (len(store) - warm_keyframes) * KEYFRAME_KB / 1024.0

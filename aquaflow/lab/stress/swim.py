@@ -135,8 +135,8 @@ def track(frames: Sequence[Frame]) -> Tracking:
     tracker = Tracker(ClassicalPrior(), store, TrackingConfig())
     tracked: list[Tracked] = []
     for frame in frames:
-        tracked += tracker.track(frame)
-    return Tracking(tracked + tracker.finish(), store)
+        tracked += tracker.track(frame).frames
+    return Tracking(tracked + tracker.finish().frames, store)
 
 
 @lru_cache(maxsize=2)

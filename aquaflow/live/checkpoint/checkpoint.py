@@ -74,8 +74,8 @@ class Checkpointer:
         looked for."""
         if self._now_s() < self._due_s or self._writing or disk_is_full:
             return
-        self._slam.side_work.settle()
-        if self._slam.side_work.awaits(LOOP_SEARCH):
+        self._slam.take_finished()
+        if self._slam.worker.waiting(LOOP_SEARCH):
             return
         self._due_s = self._now_s() + self._every_s
         self.take()
@@ -87,8 +87,8 @@ class Checkpointer:
     def take(self) -> None:
         """Take a checkpoint now; requests that wait in the mapping thread are not in it, except
         corrections. A search of loops is waited for: a dive that goes on does not make it again."""
-        if self._slam.side_work.awaits(LOOP_SEARCH):
-            self._slam.side_work.settle(wait=True)
+        if self._slam.worker.waiting(LOOP_SEARCH):
+            self._slam.take_finished(wait=True)
         with self._run.profiler.stage("checkpoint"):
             parts = tracking.serialise(self._slam, self._run)
             if parts is None:

@@ -1,7 +1,7 @@
 """A dive in the base: looks its keyframes up, decides what is believed, and says where it lies.
 
-Every keyframe is looked up once, as side work that no frame waits for. In a live run few look-ups
-wait at a time: while they do, further keyframes go without.
+Every keyframe is looked up once, and no frame waits for it. Few look-ups wait at a time: while they
+do, further keyframes go without.
 """
 
 from __future__ import annotations
@@ -13,27 +13,36 @@ from functools import partial
 import numpy as np
 
 from aquaflow.base.errors.failures import Failures
+from aquaflow.base.worker import Worker
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry.similarity_batch import Sim3Batch
-from aquaflow.keyframes import KeyframeStore
+from aquaflow.keyframes import KeyframeStore, Pointmap
+from aquaflow.prior.contract import Encoding
 from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.tracking.base.base import Base
 from aquaflow.tracking.base.known_places import KnownPlaces, Recognised
 from aquaflow.tracking.base.links import BaseLink, Placed, agree, link_covariance, placed
 from aquaflow.tracking.graph.table import Snapshot
 from aquaflow.tracking.metric.world_edges import World, WorldEdge
-from aquaflow.tracking.side_work import SideWork
 
 STAGE = "look-up in the base"
-"""Name of this side work."""
+"""Name of this work."""
 MOST_WAITING = 3
-"""Look-ups in a live run: as many keyframes as the start of a map makes at once."""
+"""Look-ups: as many keyframes as the start of a map makes at once."""
 LEAST_AGREEING = 2
 """Keyframes that must put the dive at the same place before anything is believed."""
 TO_OVERRULE = 3
 """Keyframes that must agree against those that are believed, and be more than they are."""
 WAITING = 32
 """Recognitions that are kept while no other agrees with them."""
+
+
+@dataclass(frozen=True)
+class LookedUp:
+    """A keyframe that was looked up, and where it lies in the base, if it was recognised."""
+
+    keyframe: int
+    recognised: Recognised | None
 
 
 @dataclass(frozen=True)
@@ -53,9 +62,8 @@ class InBase:
         base: Base,
         keyframes: KeyframeStore,
         config: TrackingConfig,
-        side_work: SideWork,
+        worker: Worker,
         failures: Failures,
-        live: bool = False,
     ) -> None:
         self.base = base
         self.links: list[BaseLink] = []
@@ -65,8 +73,7 @@ class InBase:
         say that they cannot be."""
         self.first: FirstRecognised | None = None
         self._places = KnownPlaces(base, config)
-        self._keyframes, self._side_work, self._failures = keyframes, side_work, failures
-        self._live = live
+        self._keyframes, self._worker, self._failures = keyframes, worker, failures
         self._waiting: list[BaseLink] = []
         self._news = False
         self._placed: dict[int, Placed] | None = None
@@ -78,15 +85,19 @@ class InBase:
 
     def look(self, number: int) -> None:
         """Look a new keyframe up."""
-        if self._live and self._side_work.waiting(STAGE) >= MOST_WAITING:
+        if self._worker.waiting(STAGE) >= MOST_WAITING:
             self.passed_over += 1
             return
         keyframe = self._keyframes[number]
         with self._failures.contain(STAGE, keyframe.frame_index):
             encoding, pointmap = keyframe.encoding, keyframe.pointmap.copy()  # fused meanwhile
             self.looked_up += 1
-            look_up = partial(self._places.of, encoding, pointmap)
-            self._side_work.do(STAGE, keyframe.frame_index, look_up, partial(self._answer, number))
+            look_up = partial(self._look_up, number, encoding, pointmap)
+            for found in self._worker.ask(STAGE, keyframe.frame_index, look_up):
+                self.take(found)
+
+    def _look_up(self, number: int, encoding: Encoding, pointmap: Pointmap) -> LookedUp:
+        return LookedUp(number, self._places.of(encoding, pointmap))
 
     def has_news(self) -> bool:
         """True once after links were added: the graph should take them in."""
@@ -108,15 +119,15 @@ class InBase:
 
     # --- what is believed ---------------------------------------------------------------------
 
-    def _answer(self, number: int, found: Recognised | None) -> None:
-        if found is None:
+    def take(self, found: LookedUp) -> None:
+        """What a look-up found of a keyframe."""
+        where = found.recognised
+        if where is None:
             return
-        known, estimate = found.place, found.proof.estimate
-        covariance = link_covariance(estimate.covariance)
+        known, covariance = where.place, link_covariance(where.proof.estimate.covariance)
+        inliers = where.proof.inliers
         self.add(
-            BaseLink(
-                number, known.number, known.sub_map, found.T_sk, covariance, found.proof.inliers
-            )
+            BaseLink(found.keyframe, known.number, known.sub_map, where.T_sk, covariance, inliers)
         )
 
     def add(self, link: BaseLink) -> None:

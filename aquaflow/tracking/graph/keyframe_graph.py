@@ -1,17 +1,17 @@
 """The keyframe graph: edges along the path, loop closures, and their corrections (Eq. 4).
 
-A loop starts an optimisation in another thread, on a snapshot of the graph; its result is
-applied by ``correction``. A replay waits for it at the next keyframe, so that the same frames
-give the same poses however long it took; a live run asks without waiting. Keyframes and links that
-came meanwhile are moved along, and loops that came meanwhile start the next optimisation.
+A loop starts an optimisation beside the frames, on a snapshot of the graph; its result is applied
+by ``correction``. A replay waits for it at the next keyframe, so that the same frames give the same
+poses however long it took; a vehicle does not wait. Keyframes and links that came meanwhile are
+moved along, and loops that came meanwhile start the next optimisation.
 
-Loops are looked for as side work: in a live run they may come some frames after their keyframe.
+Loops are looked for by the same worker: they may come some frames after their keyframe.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Protocol
@@ -19,19 +19,28 @@ from typing import Protocol
 import numpy as np
 
 from aquaflow.base.errors.failures import Failures
+from aquaflow.base.worker import Worker
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
-from aquaflow.keyframes import Keyframe, KeyframeStore
+from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
+from aquaflow.prior.contract import Encoding
 from aquaflow.tracking.frames import Link, Revisit
 from aquaflow.tracking.graph.improvement import Improvement
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph, edge_information, solve
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
 from aquaflow.tracking.loops.relocaliser import Places, Relocalised
-from aquaflow.tracking.side_work import SideWork
 
 LOOP_SEARCH = "loop search"
-"""Name of that side work."""
+"""Name of that work."""
+
+
+@dataclass(frozen=True)
+class LoopsFound:
+    """Earlier keyframes that prove to show the place of a new one."""
+
+    keyframe: int
+    places: list[Relocalised]
 
 
 @dataclass(frozen=True)
@@ -93,8 +102,7 @@ class Adjustments(Protocol):
 class KeyframeGraph:
     """Grows with the keyframes; sets their poses and sub-maps when the graph was optimised.
 
-    To be used from one thread: nothing changes but in ``add``, ``correction`` and where side work
-    is settled.
+    To be used from one thread: nothing changes but in its methods.
     """
 
     def __init__(
@@ -106,15 +114,15 @@ class KeyframeGraph:
         telemetry: Measurements | None = None,
         adjustments: Adjustments | None = None,
         scales: Measurements | None = None,
-        side_work: SideWork | None = None,
+        worker: Worker | None = None,
     ) -> None:
         """``telemetry`` takes part in the optimisations, once there is some, and until then
         ``scales``; ``adjustments`` come before them, and of all keyframes after those that closed
-        loops. These are looked for as ``side_work``, by default at once."""
+        loops. These are looked for by ``worker``, by default at once."""
         self.graph = PoseGraph(config.graph)
         self._telemetry, self._scales = telemetry, scales
         self._failures = failures or Failures()
-        self._side_work = side_work or SideWork(self._failures)
+        self._worker = worker or Worker(self._failures)
         self._keyframes, self._places, self._config = keyframes, places, config.graph
         self._adjustment_config = config.adjustment
         self.loops = 0
@@ -123,7 +131,6 @@ class KeyframeGraph:
         """Pairs of keyframes that have such an edge."""
         self._known: list[Keyframe] = []
         """In the graph; the store may hold some that are not yet."""
-        self._executor = ThreadPoolExecutor(1, "keyframe graph")
         self._optimisation: Future[GraphResult] | None = None
         self._adjustments = adjustments
         self._to_adjust: int | None = None
@@ -146,8 +153,7 @@ class KeyframeGraph:
     def add(self, number: int, link: Link | None) -> None:
         """Add a keyframe and its relative-pose edge to the keyframe it was tracked against.
 
-        If it proves to close a loop, an optimisation starts in another thread, after one that is
-        running.
+        If it proves to close a loop, an optimisation starts, after one that is running.
         """
         keyframe = self._keyframes[number]
         if link is not None:  # the earlier one may have been moved since they were linked
@@ -217,7 +223,7 @@ class KeyframeGraph:
 
         ``wait``: block until it has ended. An error in its thread counts as a failure here.
         """
-        self._optimise()  # of loops that side work has found since
+        self._optimise()  # of loops that were found since
         if self._optimisation is None or not (wait or self._optimisation.done()):
             return Correction()
         finished, self._optimisation = self._optimisation, None
@@ -244,10 +250,6 @@ class KeyframeGraph:
             and count <= config.most_at_loops
         )
 
-    def close(self) -> None:
-        """End the thread; the result of a running optimisation is discarded."""
-        self._executor.shutdown()
-
     def _optimise(self, everything: bool = False) -> None:
         """Start an adjustment or optimisation if there is something new and none is running."""
         if self._optimisation is not None:
@@ -264,7 +266,7 @@ class KeyframeGraph:
         elif not with_telemetry:
             optimise = solve
         self._due = False
-        self._optimisation = self._executor.submit(self._improved, job, snapshot, optimise)
+        self._optimisation = self._worker.start(partial(self._improved, job, snapshot, optimise))
 
     def _adjustment(self, everything: bool) -> Callable[[Snapshot], Improvement] | None:
         number, self._to_adjust = self._to_adjust, None
@@ -282,7 +284,7 @@ class KeyframeGraph:
         snapshot: Snapshot,
         optimise: Callable[[Snapshot], GraphResult] | None,
     ) -> GraphResult:
-        """In the graph's thread: adjust, then optimise with what that found. Without ``optimise``
+        """Beside the frames: adjust, then optimise with what that found. Without ``optimise``
         telemetry's next turn does it: what it straightened must not be bent back meanwhile."""
         better = Improvement.none()
         if adjust is not None:
@@ -297,12 +299,19 @@ class KeyframeGraph:
         number, frame, places = keyframe.number, keyframe.frame_index, self._places
         with self._failures.contain(LOOP_SEARCH, frame):
             encoding, pointmap = keyframe.encoding, keyframe.pointmap.copy()  # fused meanwhile
+            known: list[LoopsFound] = []
             if self._config.enabled:
                 near = self._on_the_path(number)
-                search = partial(places.of_keyframe, encoding, pointmap, near)
-                self._side_work.do(LOOP_SEARCH, frame, search, partial(self._close_loops, number))
-            index = partial(places.add, number, encoding)
-            self._side_work.do("place index", frame, index, lambda _: None)
+                search = partial(self._search, number, encoding, pointmap, near)
+                known = self._worker.ask(LOOP_SEARCH, frame, search)
+            self._worker.ask("place index", frame, partial(places.add, number, encoding))
+            for found in known:
+                self.close_loops(found)
+
+    def _search(
+        self, number: int, encoding: Encoding, pointmap: Pointmap, near: Container[int]
+    ) -> LoopsFound:
+        return LoopsFound(number, self._places.of_keyframe(encoding, pointmap, near))
 
     def _on_the_path(self, number: int) -> Container[int]:
         """The keyframes just before ``number``, of whose place the path knows anyway."""
@@ -311,9 +320,10 @@ class KeyframeGraph:
         known = {other for other in before if other in self.graph}
         return {other for other in known if self.graph.component_of(other) == component}
 
-    def _close_loops(self, number: int, found: list[Relocalised]) -> None:
+    def close_loops(self, found: LoopsFound) -> None:
         """Edges to all earlier keyframes that prove to show the same place."""
-        for place in found:
+        number = found.keyframe
+        for place in found.places:
             T_fk, covariance = place.estimate.T, place.estimate.covariance
             sigma = float(np.sqrt(covariance[6, 6]))
             information = edge_information(covariance[:6, :6], sigma, T_fk)

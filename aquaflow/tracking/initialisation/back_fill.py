@@ -8,6 +8,7 @@ from functools import partial
 
 from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.errors.failures import Failures
+from aquaflow.base.worker import Worker
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
@@ -16,12 +17,11 @@ from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.tracking.pose.expected_matches import expected_matches
 from aquaflow.tracking.pose.matcher import Matched
-from aquaflow.tracking.side_work import SideWork
 from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
 from aquaflow.types import Frame
 
 STAGE = "back-fill"
-"""Name of this side work."""
+"""Name of this work."""
 
 
 @dataclass(frozen=True)
@@ -116,8 +116,18 @@ class BackFill:
         return done[::-1]
 
 
+@dataclass(frozen=True)
+class LookedBack:
+    """A frame of the past that was looked for, and its pose, if one was found."""
+
+    fill: BackFill
+    frame: Frame
+    placed: Placed | None
+
+
 class BackFills:
-    """Poses of frames that waited for a keyframe: at once or, in a live run, in its idle time."""
+    """Poses of frames that waited for a keyframe: at once, or in idle time where the worker is not
+    in step with the frames."""
 
     def __init__(
         self,
@@ -125,26 +135,24 @@ class BackFills:
         prior: Prior,
         keyframe_tracker: KeyframeTracker,
         failures: Failures,
-        live: bool,
-        side_work: SideWork,
+        worker: Worker,
     ) -> None:
-        """A ``live`` run's frames are looked for as ``side_work``."""
         self._waiting, self._prior, self._keyframe_tracker = waiting, prior, keyframe_tracker
-        self._failures, self._live, self._side_work = failures, live, side_work
+        self._failures, self._worker = failures, worker
         self._left: list[BackFill] = []
         """The frames left for idle time, in processing order."""
-        self._answer: tuple[BackFill, Frame, Placed | None] | None = None
-        """What was found of the last frame that was looked for."""
+        self._answer: LookedBack | None = None
+        """Of the last frame that was looked for."""
 
     def start(self, at: CurrentKeyframe, camera: CameraModel) -> list[Tracked]:
         """Against ``at``, all frames that wait for a keyframe; those that are placed at once."""
-        after = Wait.IN_IDLE_TIME if self._live else Wait.IN_HAND
+        after = Wait.IN_HAND if self._worker.in_step else Wait.IN_IDLE_TIME
         frames = sorted(self._waiting.of(Wait.FOR_A_KEYFRAME), key=lambda frame: frame.index)
         self._waiting.put(frames, after)
         if not frames:
             return []
         fill = BackFill(frames, at, camera, self._prior, self._keyframe_tracker, self._failures)
-        if not self._live:
+        if self._worker.in_step:
             return fill.all(frames)
         waiting = self._waiting.of(Wait.IN_IDLE_TIME)
         self._left = [each for each in (*self._left, fill) if each.left(waiting)]
@@ -163,31 +171,35 @@ class BackFills:
         answer, self._answer = self._answer, None
         if answer is None:
             return []
-        fill, frame, placed = answer
-        self._waiting.put([frame], Wait.IN_HAND)
-        tracked = fill.take(frame, placed)
+        self._waiting.put([answer.frame], Wait.IN_HAND)
+        tracked = answer.fill.take(answer.frame, answer.placed)
         self._look()
         return [tracked]
 
     def _look(self) -> None:
         """Look for the next frame, unless one is looked for, or the last answer is not taken."""
-        if self._answer is not None or self._side_work.awaits(STAGE):
+        if self._answer is not None or self._worker.waiting(STAGE):
             return
         waiting = self._waiting.of(Wait.IN_IDLE_TIME)
         self._left = [fill for fill in self._left if fill.left(waiting)]
         if self._left:
             fill = self._left[0]
             frame = fill.left(waiting)[-1]
-            found = partial(self._found, fill, frame)
-            self._side_work.do(STAGE, frame.index, partial(fill.place, frame), found)
+            for found in self._worker.ask(STAGE, frame.index, partial(_look_back, fill, frame)):
+                self.take(found)
 
-    def _found(self, fill: BackFill, frame: Frame, placed: Placed | None) -> None:
-        self._answer = fill, frame, placed
+    def take(self, found: LookedBack) -> None:
+        """What was found of a frame; :meth:`step` finishes it."""
+        self._answer = found
 
     def all(self, until: Deadline | None = None) -> list[Tracked]:
         """Every frame that waits for idle time, or those that there is time for."""
-        self._side_work.settle(wait=True)
+        self._worker.drop(STAGE)
         self._answer = None
         waiting = self._waiting.move(Wait.IN_IDLE_TIME, Wait.IN_HAND)
         fills, self._left = self._left, []
         return [tracked for fill in fills for tracked in fill.all(fill.left(waiting), until)]
+
+
+def _look_back(fill: BackFill, frame: Frame) -> LookedBack:
+    return LookedBack(fill, frame, fill.place(frame))

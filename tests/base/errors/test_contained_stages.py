@@ -13,6 +13,7 @@ import pytest
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.failures import Failures
+from aquaflow.base.stages import Stages
 from aquaflow.config import Config
 from aquaflow.dive import replay
 from aquaflow.dive.deliverable import Phase, deliverables_of
@@ -56,7 +57,7 @@ STAGES: list[tuple[type | ModuleType, str, int, str]] = [
     (Initialiser, "solve", 1, "initialisation"),
     (KeyframeTracker, "place", 16, "pose"),
     (Places, "of_frame", 1, "relocalisation"),
-    (KeyframeGraph, "_close_loops", 1, "loop search"),
+    (KeyframeGraph, "close_loops", 1, "loop search"),
     (Places, "add", 2, "place index"),
     (KeyframeGraph, "add", 3, "keyframe graph"),
     (Mapper, "add_view", 3, "view"),
@@ -203,7 +204,7 @@ def finished_slam(small_recording: Path, tmp_path_factory: pytest.TempPathFactor
     """A dive whose frames have all been mapped, before anything of it is written."""
     recording = open_recording(small_recording)
     prepare = Preparation(SETTINGS.source, recording.camera)
-    slam = Slam(SETTINGS, failures=Failures(strict=False))
+    slam = Slam(SETTINGS, Stages(failures=Failures(strict=False)))
     for frame in recording.frames(stop=12):
         assert isinstance(frame, Frame)
         slam.process(prepare(frame))

@@ -35,7 +35,7 @@ def cut(
     for frame in frames:
         assert isinstance(frame, Frame)
         dive.parts.loop.take(frame)
-        dive.parts.slam.side_work.settle(wait=True)
+        dive.parts.slam.take_finished(wait=True)
     caught_up(dive)
     dive.parts.checkpointer.take()
     caught_up(dive)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors.failures import Failures
+from aquaflow.base.worker import Worker
 from aquaflow.config import TrackingConfig
 from aquaflow.config.tracking import AdjustmentConfig, GraphConfig
 from aquaflow.geometry.similarity import Sim3
@@ -91,20 +92,23 @@ def _steps(
 
 @pytest.fixture
 def swim() -> Iterator[Callable[..., Swim]]:
-    made: list[Swim] = []
+    workers: list[Worker] = []
 
     def make(wait: bool = True, **settings: object) -> Swim:
         store, failures = KeyframeStore(), Failures(strict=False)
         adjustment = AdjustmentConfig.model_validate(settings)
         config = TrackingConfig(adjustment=adjustment, graph=GraphConfig(loop_gap=3))
         adjuster = Adjuster(store, adjustment)
-        graph = KeyframeGraph(store, Places(store, config), config, failures, None, adjuster)
-        made.append(Swim(adjuster, graph, store, failures, wait))
-        return made[-1]
+        worker = Worker(failures)
+        workers.append(worker)
+        graph = KeyframeGraph(
+            store, Places(store, config), config, failures, None, adjuster, worker=worker
+        )
+        return Swim(adjuster, graph, store, failures, wait)
 
     yield make
-    for each in made:
-        each.graph.close()
+    for each in workers:
+        each.close()
 
 
 def test_lengths_of_links_come_right(swim: Callable[..., Swim]) -> None:

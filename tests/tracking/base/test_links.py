@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aquaflow.base.errors.failures import Failures
+from aquaflow.base.worker import Worker
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
@@ -18,7 +19,6 @@ from aquaflow.telemetry.metric_frame import MetricFrame, Origin
 from aquaflow.tracking.base.base import Base
 from aquaflow.tracking.base.in_base import InBase
 from aquaflow.tracking.base.links import BaseLink, agree, link_covariance, placed
-from aquaflow.tracking.side_work import SideWork
 from tests.tracking.tracking_scenes import KnownView
 
 CAMERA = CameraModel(4, 3, 4.0, 4.0, 2.0, 1.5)
@@ -43,7 +43,7 @@ def in_base(frame: MetricFrame | None = None, count: int = 12) -> InBase:
         store.add(number, number * 10**9, view, pose_of(number), Pointmap.unknown(CAMERA), 0)
     frames = {} if frame is None else {0: frame}
     base = Base(Path("yesterday"), "", (), lambda number: pytest.fail("nothing is read"), frames)
-    return InBase(base, store, TrackingConfig(), SideWork(), Failures())
+    return InBase(base, store, TrackingConfig(), Worker(), Failures())
 
 
 def apart(a: Sim3, b: Sim3) -> float:

@@ -12,6 +12,7 @@ from typing import cast
 import numpy as np
 import pytest
 
+from aquaflow.base.worker import Worker
 from aquaflow.config import TrackingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
@@ -23,7 +24,6 @@ from aquaflow.tracking.graph.keyframe_graph import Correction, KeyframeGraph
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
 from aquaflow.tracking.loops.relocaliser import Places, Relocalised
 from aquaflow.tracking.pose.solver import Degeneracy, PoseEstimate
-from aquaflow.tracking.side_work import SideWork
 from tests.tracking.graph.graph_scenes import LOOP_SIGMA, SIGMA, circle
 
 COUNT = 24
@@ -73,8 +73,8 @@ class Drifting:
 
     def __post_init__(self) -> None:
         places = cast(Places, KnownPlaces(self.store, self.loops, self.go_on))
-        self.side_work = SideWork(threaded=self.go_on is not None)
-        self.graph = KeyframeGraph(self.store, places, TrackingConfig(), side_work=self.side_work)
+        self.worker = Worker(threads=self.go_on is not None)
+        self.graph = KeyframeGraph(self.store, places, TrackingConfig(), worker=self.worker)
         self.link_T = [
             (between(i, i + 1) @ Sim3.exp(SIGMA * np.array([0, 0, 0, 0, 0, 1, 1]))).inverse()
             for i in range(COUNT - 1)
@@ -89,6 +89,12 @@ class Drifting:
         nothing = cast(Encoding, SimpleNamespace(camera=CAMERA, number=number))
         self.store.add(number, number, nothing, T_wc, Pointmap.unknown(CAMERA), 0)
         self.graph.add(number, link)
+
+    def close_loops(self, wait: bool = False) -> None:
+        """Those that were found since."""
+        for each in self.worker.finished(wait):
+            if each.found is not None:
+                self.graph.close_loops(each.found)
 
     def seam_m(self, a: int, b: int) -> float:
         found = self.store[a].T_wc.inverse() @ self.store[b].T_wc
@@ -160,16 +166,16 @@ def test_a_loop_that_is_found_some_keyframes_later_closes_all_the_same() -> None
     assert dive.go_on is not None
     for number in range(COUNT):
         dive.add(number)
-        dive.side_work.settle()
+        dive.close_loops()
         assert dive.graph.correction(wait=False) == Correction()
     assert dive.graph.loops == 0
     drifted = dive.seam_m(0, 20)
     dive.go_on.set()
-    dive.side_work.settle(wait=True)
+    dive.close_loops(wait=True)
     assert dive.graph.loops == 1
     assert dive.graph.correction(wait=True).moves
     assert dive.seam_m(0, 20) < drifted / 3.0
-    dive.side_work.close()
+    dive.worker.close()
 
 
 def test_a_correction_is_told_once() -> None:
@@ -227,12 +233,3 @@ def test_what_is_raised_in_the_thread_is_raised_where_the_result_is_asked_for(
     drifted = dive.seam_m(0, 20)
     assert dive.graph.correction(wait=True).moves  # the next loop takes up what was left
     assert dive.seam_m(0, 20) < drifted / 3.0
-
-
-def test_closing_ends_the_thread() -> None:
-    dive = Drifting({20: 0})
-    for number in range(21):
-        dive.add(number)
-    dive.graph.close()
-    with pytest.raises(RuntimeError, match="shutdown"):
-        dive.graph._executor.submit(print)

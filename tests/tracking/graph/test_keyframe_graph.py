@@ -13,7 +13,7 @@ from aquaflow.geometry.alignment import align
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.prior.classical import ClassicalPrior
-from aquaflow.tracking.frames import FrameClass, Revisit, Tracked
+from aquaflow.tracking.frames import FrameClass, Link, Revisit, Step, Tracked
 from aquaflow.tracking.graph.keyframe_graph import Correction, KeyframeGraph
 from aquaflow.tracking.loops.relocaliser import Places
 from aquaflow.tracking.tracker import Tracker
@@ -50,29 +50,30 @@ class Swim:
         self.tracker = Tracker(prior, self.store, self.settings, places)
         self.graph = KeyframeGraph(self.store, places, self.settings)
         self.tracked: list[Tracked] = []
+        self.links: dict[int, Link] = {}
         self.anchors: dict[int, tuple[int, Sim3]] = {}
         self.corrections: list[Correction] = []
 
     def run(self, frames: Sequence[Frame]) -> Swim:
         for frame in frames:
             self._take(self.tracker.track(frame))
-            found, self.tracker.revisits = self.tracker.revisits, []
-            for revisit in found:
-                self.graph.revisit(revisit)
         self._take(self.tracker.finish())
         self.corrections.append(self.graph.correction(wait=True))
         return self
 
-    def _take(self, decided: list[Tracked]) -> None:
-        for tracked in decided:
+    def _take(self, step: Step) -> None:
+        for tracked in step.frames:
             if tracked.T_wc is not None and tracked.keyframe is not None:
                 T_kw = self.store[tracked.keyframe].T_wc.inverse()
                 self.anchors[tracked.frame.index] = (tracked.keyframe, T_kw @ tracked.T_wc)
-        for tracked in decided:
+        for tracked in step.frames:
             if tracked.frame_class is FrameClass.KEYFRAME and tracked.keyframe is not None:
                 self.corrections.append(self.graph.correction(wait=True))
-                self.graph.add(tracked.keyframe, tracked.link)
-        self.tracked += decided
+                self.graph.add(tracked.keyframe, step.links.get(tracked.keyframe))
+        for revisit in step.revisits:
+            self.graph.revisit(revisit)
+        self.tracked += step.frames
+        self.links |= step.links
 
     def errors(self, poses: Sequence[Sim3]) -> np.ndarray:
         """[n, 3] m, after one similarity for all posed frames."""
@@ -131,11 +132,10 @@ def test_drift_at_the_seam_falls_fivefold_when_the_loop_closes() -> None:
         store.add(keyframe.frame_index, 0, keyframe.encoding, keyframe.T_wc, keyframe.pointmap, 0)
     step = Sim3.exp(np.array([0.01, 0.004, 0.006, 0.002, 0.003, 0.004, 0.01]))
     drifted = Sim3.identity()
-    links = {t.keyframe: t.link for t in swim.tracked if t.link is not None}
     truth = [keyframe.T_wc for keyframe in swim.store.keyframes]
     seam = [0.0, 0.0]
     for number, keyframe in enumerate(store.keyframes):
-        link = links.get(number)
+        link = swim.links.get(number)
         keyframe.T_wc = truth[number] @ drifted
         if link is not None:
             drifted = drifted @ step

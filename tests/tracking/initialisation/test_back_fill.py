@@ -8,15 +8,15 @@ from threading import Event
 import pytest
 
 from aquaflow.base.clocks.deadline import Deadline
+from aquaflow.base.worker import Worker
 from aquaflow.config import InitialisationConfig, TrackingConfig
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.prior.classical import ClassicalPrior
-from aquaflow.tracking.frames import Tracked
-from aquaflow.tracking.side_work import SideWork
+from aquaflow.tracking.frames import Step, Tracked
 from aquaflow.tracking.tracker import Tracker
 from aquaflow.tracking.waiting_frames import BOUNDS, Bound, Wait
 from aquaflow.types import Frame
-from tests.tracking.tracked_clips import error_share, run
+from tests.tracking.tracked_clips import Prompt, error_share, run
 from tests.tracking.tracking_scenes import SeaFloor, black, filmed, lawn_path
 
 POSES = lawn_path(12, step_m=0.12)
@@ -35,14 +35,15 @@ def clip() -> list[Frame]:
     return filmed(SeaFloor(), POSES)
 
 
-def live(config: TrackingConfig | None = None) -> Tracker:
-    return Tracker(ClassicalPrior(), KeyframeStore(), config or TrackingConfig(), live=True)
+def live(config: TrackingConfig | None = None, worker: Worker | None = None) -> Tracker:
+    settings = config or TrackingConfig()
+    return Tracker(ClassicalPrior(), KeyframeStore(), settings, worker=worker or Prompt())
 
 
 def until_started(tracker: Tracker, clip: list[Frame]) -> tuple[list[Tracked], int]:
     """What the frame that starts the map decides, and that frame's index."""
     for frame in clip:
-        decided = tracker.track(frame)
+        decided = tracker.track(frame).frames
         if decided:
             return decided, frame.index
     pytest.fail("no map was started")
@@ -61,12 +62,12 @@ def test_the_past_is_placed_frame_by_frame_and_as_well(clip: list[Frame]) -> Non
     tracker = live()
     decided, newest = until_started(tracker, clip)
     for frame in clip[newest + 1 :]:
-        decided += tracker.track(frame)
+        decided += tracker.track(frame).frames
     while tracker.past is not None:
-        placed = tracker.back_fill()
+        placed = tracker.back_fill().frames
         assert len(placed) == 1
         decided += placed
-    assert tracker.back_fill() == []
+    assert tracker.back_fill() == Step()
     assert sorted(tracked.frame.index for tracked in decided) == list(range(len(clip)))
     assert all(tracked.T_wc is not None for tracked in decided)
     assert error_share(decided, POSES) < 0.01
@@ -87,35 +88,34 @@ def test_a_live_run_looks_back_from_the_newest_frame_to_the_oldest() -> None:
     decided, newest = until_started(tracker, filmed(SeaFloor(), SLOW_POSES))
     placed = []
     while tracker.past is not None:
-        placed += tracker.back_fill()
+        placed += tracker.back_fill().frames
     assert newest > 6
     assert [tracked.frame.index for tracked in placed] == list(range(newest - 1, 0, -1))
     assert error_share([*decided, *placed], SLOW_POSES) < 1e-3
 
 
 def test_a_frame_of_the_past_is_looked_for_beside_tracking(clip: list[Frame]) -> None:
-    side_work, go_on = SideWork(threaded=True), Event()
-    tracker = Tracker(
-        ClassicalPrior(), KeyframeStore(), TrackingConfig(), live=True, side_work=side_work
-    )
+    worker, go_on = Worker(threads=True), Event()
+    tracker = live(worker=worker)
     _, newest = until_started(tracker, clip)
-    side_work.do("hold", 0, lambda: go_on.wait(60.0), lambda _: None)
-    assert tracker.back_fill() == tracker.back_fill() == []
+    worker.ask("hold", 0, lambda: go_on.wait(60.0))
+    assert tracker.back_fill() == tracker.back_fill() == Step()
     assert tracker.past is not None
     go_on.set()
-    side_work.settle(wait=True)
-    (placed,) = tracker.back_fill()
+    _, looked_back = worker.finished(wait=True)
+    tracker.looked_back(looked_back.found)
+    (placed,) = tracker.back_fill().frames
     assert placed.frame.index == newest - 1
     assert placed.T_wc is not None
-    ended = tracker.finish()
+    ended = tracker.finish().frames
     assert sorted(tracked.frame.index for tracked in ended) == list(range(1, newest - 1))
-    side_work.close()
+    worker.close()
 
 
 def test_the_end_of_a_dive_leaves_nobody_waiting(clip: list[Frame]) -> None:
     tracker = live()
     decided, newest = until_started(tracker, clip)
-    decided += tracker.finish()
+    decided += tracker.finish().frames
     assert sorted(tracked.frame.index for tracked in decided) == list(range(newest + 1))
     assert tracker.past is None
 
@@ -123,7 +123,7 @@ def test_the_end_of_a_dive_leaves_nobody_waiting(clip: list[Frame]) -> None:
 def test_an_end_without_time_leaves_the_oldest_without_a_pose(clip: list[Frame]) -> None:
     tracker, looks = live(), itertools.count()
     decided, newest = until_started(tracker, clip)
-    ended = tracker.finish(Deadline(2.5, lambda: float(next(looks))))
+    ended = tracker.finish(Deadline(2.5, lambda: float(next(looks)))).frames
     posed = {tracked.frame.index for tracked in ended if tracked.T_wc is not None}
     assert posed == {newest - 1, newest - 2}
     decided += ended
@@ -146,7 +146,7 @@ def test_a_frame_of_the_past_that_shows_nothing_is_lost(clip: list[Frame]) -> No
     tracker = live()
     _, newest = until_started(tracker, clip)
     tracker._waiting.put([black(newest - 1)], Wait.IN_IDLE_TIME)
-    (lost,) = tracker.back_fill()
+    (lost,) = tracker.back_fill().frames
     assert lost.T_wc is None
     assert lost.reason == "no pose found"
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from aquaflow.base.profiler import Profiler
+from aquaflow.base.stages import Stages
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.replay import fix_threads
 from aquaflow.dive.run import DiveRun
@@ -35,7 +36,7 @@ def perform(job: GrowthJob) -> dict[str, Any]:
     start_mb = resident_mb()
     folder = DiveFolder(Path(job.out), config, overwrite=True)
     try:
-        slam = Slam(config, Profiler(clock=time.thread_time), folder.work)
+        slam = Slam(config, Stages(Profiler(clock=time.thread_time)), folder.work)
         try:
             run = DiveRun("survey", folder, config, slam, survey.camera, survey.name_of)
             row = _dived(run, survey, job.frames) | _finished(run)

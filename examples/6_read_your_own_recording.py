@@ -1,6 +1,6 @@
 """A camera driver of your own, here for pictures in one numpy file.
 
-python examples/5_read_your_own_recording.py PICTURES.npz DIVE
+python examples/6_read_your_own_recording.py PICTURES.npz DIVE
 
 `aquaflow map PICTURES.npz` finds the class once its own package registers it in pyproject.toml:
 
@@ -17,8 +17,6 @@ from pathlib import Path
 import numpy as np
 
 import aquaflow
-from aquaflow.geometry.camera import guess_camera
-from aquaflow.types import CameraModel, Frame
 
 
 class NumpyRecording:
@@ -30,7 +28,7 @@ class NumpyRecording:
         with np.load(path) as arrays:
             self.images, self.t_s = arrays["images"], arrays["t_s"]
         self.notes: list[str] = []  # sentences for the user on what was left out
-        self.camera: CameraModel | None = None  # this file holds no calibration
+        self.camera: aquaflow.CameraModel | None = None  # this file holds no calibration
         self.frame_count: int | None = len(self.images)
 
     @classmethod
@@ -44,11 +42,13 @@ class NumpyRecording:
     def name_of(self, index: int) -> str:
         return f"picture {index}"
 
-    def frames(self, every: int = 1, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        camera = guess_camera(self.images.shape[2], self.images.shape[1])
+    def frames(
+        self, every: int = 1, start: int = 0, stop: int | None = None
+    ) -> Iterator[aquaflow.Frame]:
+        camera = aquaflow.guess_camera(self.images.shape[2], self.images.shape[1])
         for index in range(len(self.images))[start:stop:every]:
             t_ns = round(1e9 * float(self.t_s[index] - self.t_s[0]))
-            yield Frame(index, t_ns, t_ns, self.images[index], camera)
+            yield aquaflow.Frame(index, t_ns, t_ns, self.images[index], camera)
 
     def close(self) -> None: ...
 

@@ -1,4 +1,4 @@
-"""Map a recording and read the result: python examples/1_map_a_recording.py SOURCE DIVE
+"""Map a recording and read the result: python examples/2_map_a_recording.py SOURCE DIVE
 
 SOURCE is a video, a folder of pictures, or what `aquaflow synth SOURCE` wrote.
 """

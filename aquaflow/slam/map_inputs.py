@@ -1,20 +1,49 @@
-"""What tracked frames contribute to the maps: views, some held out, and retired keyframes."""
+"""The maps of a dive, and what tracked frames bring to them: views, some held out, and keyframes.
+
+With mapping off neither is loaded: both need torch, 100 MB that tracking alone has no use for.
+"""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from aquaflow.config import MappingConfig
+from aquaflow.base.stages import Stages
+from aquaflow.config import Config, MappingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.keyframes import KeyframeStore
-from aquaflow.mapping.work import Growth, Insertion, MapWork
-from aquaflow.render.views import View
+from aquaflow.mapping.no_maps import NoMaps
+from aquaflow.mapping.work import Growth, Insertion, MapWork, OwnedMaps
 from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.tracking.frames import FrameClass, Tracked
 
+if TYPE_CHECKING:
+    from aquaflow.render.views import View
 
-class Contributions:
-    """Hands posed frames to the maps."""
+
+def make_maps(
+    config: Config,
+    stages: Stages,
+    work: Path | None,
+    enabled: bool,
+    threads: int | None = None,
+) -> OwnedMaps:
+    """Maps that are drawn in ``threads`` (None: as many as the config says, or the machine has);
+    none of them where they are not ``enabled``."""
+    if not enabled:
+        return NoMaps(stages.profiler, stages.failures)
+    from aquaflow.mapping.maps import Maps
+    from aquaflow.render import select_renderer
+
+    count = threads or config.threads or os.cpu_count()
+    renderer = select_renderer(config.mapping.renderer, count)
+    return Maps(config, renderer, stages.profiler, work, stages.failures)
+
+
+class MapInputs:
+    """Hands posed frames to the maps; to none with mapping off."""
 
     def __init__(
         self,
@@ -41,7 +70,9 @@ class Contributions:
             self._to_hold_out.add(index)
 
     def add(self, tracked: Tracked, camera: CameraModel) -> None:
-        """Hold a posed frame out, or let its map grow by it."""
+        """Hold a frame that has a pose out, or let its map grow by it."""
+        if not self._config.enabled or tracked.T_wc is None:
+            return
         view = _view(tracked, camera)
         if tracked.frame.index in self._to_hold_out:
             self._maps.hold_out(view, tracked.sub_map)
@@ -86,6 +117,8 @@ class Contributions:
 
 
 def _view(tracked: Tracked, camera: CameraModel) -> View:
+    from aquaflow.render.views import View
+
     assert tracked.T_wc is not None
     assert tracked.keyframe is not None
     return View(

@@ -1,6 +1,6 @@
 """Remove the water from a picture with the medium that a dive found.
 
-python examples/4_remove_the_water.py DIVE PICTURE.png
+python examples/5_remove_the_water.py DIVE PICTURE.png
 
 `aquaflow export DIVE --format restored` does this for every frame, and also takes care of the
 camera's shading, its exposure, and sunlight that moves.

@@ -1,6 +1,6 @@
 """Plot a trajectory with its truth and its errors.
 
-python examples/3_plot_the_trajectory.py DIVE poses.tum PLOT.png
+python examples/4_plot_the_trajectory.py DIVE poses.tum PLOT.png
 """
 
 from __future__ import annotations
@@ -12,19 +12,17 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import aquaflow
-from aquaflow.geometry.alignment import align
-from aquaflow.lab.evaluation.trajectory import associate, read_tum
 
 
 def main(dive_folder: str, truth_file: str, plot: str) -> None:
     """Align the dive with the truth and plot path and errors."""
-    dive, truth = aquaflow.read_dive(dive_folder), read_tum(Path(truth_file))
+    dive, truth = aquaflow.read_dive(dive_folder), aquaflow.read_tum(Path(truth_file))
     # Sub-maps that never met have no common frame of reference: take the largest.
     sub_maps = dive.sub_map_of_pose
     ours = dive.trajectory.select(sub_maps == np.bincount(sub_maps).argmax())
-    of_ours, of_truth = associate(ours.t_s, truth.t_s)
+    of_ours, of_truth = aquaflow.associate(ours.t_s, truth.t_s)
     # One camera knows no metres, so the path is scaled to the truth (Sim(3) alignment).
-    found = align(ours.positions[of_ours], truth.positions[of_truth], with_scale=True)
+    found = aquaflow.align(ours.positions[of_ours], truth.positions[of_truth], with_scale=True)
     aligned = ours.select(of_ours).transformed(found.T_target_source).positions
     error_m = np.linalg.norm(aligned - truth.positions[of_truth], axis=1)
     print(f"a length of 1 in {dive.unit} is {found.T_target_source.scale:.3f} m of the truth")

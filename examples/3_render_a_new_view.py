@@ -1,4 +1,4 @@
-"""Render a map from where no camera was: python examples/2_render_a_new_view.py DIVE PICTURE.png
+"""Render a map from where no camera was: python examples/3_render_a_new_view.py DIVE PICTURE.png
 
 The picture shows the map through the water on the left, and without it on the right.
 """
@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 
 import aquaflow
-from aquaflow.geometry.similarity import Sim3
 
 ASIDE = 0.1  # metres, or map units: a tenth of the median depth that the first keyframe saw
 
@@ -21,7 +20,7 @@ def main(dive: str, picture: str) -> None:
     scene = aquaflow.load_map(dive)
     view = scene.views[len(scene.views) // 2]
     # Camera axes are x right, y down, z forward; T_wc takes them to the world.
-    to_the_right = view.T_wc @ Sim3(np.eye(3), np.array([ASIDE, 0.0, 0.0]))
+    to_the_right = view.T_wc @ aquaflow.Sim3(np.eye(3), np.array([ASIDE, 0.0, 0.0]))
     shown = scene.render(to_the_right, view.camera)
     covered = shown.alpha > 0.5
     depths = np.percentile(shown.range[covered], (5, 50, 95)).round(2)
