@@ -44,6 +44,13 @@ from aquaflow.types import CameraModel, Dropped, Frame, TelemetrySample
 log = logging.getLogger(__name__)
 
 
+UNCHECKED = (
+    "whether the calibration fits could not be checked: too few keyframes see the same places "
+    "while the camera turns"
+)
+"""As in a short live dive, which has fewer keyframes than a replay of the same pictures."""
+
+
 @dataclass(frozen=True)
 class Finished:
     """A finished run."""
@@ -321,7 +328,9 @@ class DiveRun:
             self.notes += made.notes
         with self.profiler.stage("write"):
             made.write_evaluation()
-        self._check_calibration()
+        self.check_calibration()
+        if self.calibration is not None and self.lens_error is None:
+            self.notes.append(UNCHECKED)
         with self.profiler.stage("report"):
             self.warnings = self._shortcomings()
             made.make(Phase.REPORT, limits.whole, self._numbers(results, made))
@@ -351,7 +360,9 @@ class DiveRun:
                 f"room and {again}"
             )
 
-    def _check_calibration(self) -> None:
+    def check_calibration(self) -> None:
+        """Ask the keyframes whether the calibration that was given fits them; a live dive also does
+        so while it goes on."""
         if self.calibration is None:
             return
         with self.slam.stages("calibration check"):
@@ -360,11 +371,19 @@ class DiveRun:
     def _shortcomings(self) -> list[str]:
         gaussians = sum(len(mapper.gaussians) for mapper in self.slam.mappers.values())
         found = shortcomings(self.config, self.folder.rows, gaussians)
-        if self.calibration is not None and self.lens_error is not None and self.lens_error.wrong:
-            found.append(calibration_findings.warning(self.lens_error, self.calibration))
-        return found
+        return found + self.calibration_warnings
 
-    def _calibration_numbers(self) -> dict[str, Any] | None:
+    @property
+    def calibration_warnings(self) -> list[str]:
+        """A sentence where the calibration does not fit, as far as it was checked; else none."""
+        error = self.lens_error
+        if self.calibration is None or error is None or not error.wrong:
+            return []
+        return [calibration_findings.warning(error, self.calibration)]
+
+    @property
+    def calibration_numbers(self) -> dict[str, Any] | None:
+        """What the check found; None before it, without a calibration, and where it cannot tell."""
         if self.calibration is None or self.lens_error is None:
             return None
         return calibration_findings.to_json(self.lens_error, self.calibration)
@@ -374,7 +393,7 @@ class DiveRun:
         numbers = metrics(self.slam, results, self.dropped, made.held_out, wall_s)
         numbers |= frame_numbers(made.metric_frame) | utc_numbers(made.outputs.navigation)
         numbers["warnings"], numbers["failures"] = self.warnings, self.slam.failures.to_json()
-        numbers["calibration_check"] = self._calibration_numbers()
+        numbers["calibration_check"] = self.calibration_numbers
         numbers["self_calibration"] = None if self.found is None else self.found.to_json()
         in_base = self.slam.in_base
         numbers["in_site"] = None if in_base is None else in_site_numbers(in_base)

@@ -1,7 +1,7 @@
 """Deliverables while the dive goes on: a container is killed, not stopped.
 
-They are written in the mapping thread, behind the requests that wait there, in three parts with
-mapping in between. What they cost is measured, and bounds how often they are written.
+They are written in the mapping thread, behind the requests that wait there, in parts with mapping
+in between. What they cost is measured, and bounds how often they are written.
 """
 
 from __future__ import annotations
@@ -57,6 +57,7 @@ class Refresher:
         parts: list[tuple[str, Job]] = [
             ("write the maps", lambda maps: moment.write_maps(maps.mappers)),
             ("write the path", lambda _: moment.write_path()),
+            ("check the calibration", lambda _: self._run.check_calibration()),
             ("write the report", lambda maps: moment.write_report(maps.mappers)),
         ]
         self._post(parts, self._now_s())

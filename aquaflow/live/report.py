@@ -54,6 +54,7 @@ def report(
         "deliverables": parts.refresher.to_json(),
         "machine": asdict(loop.pressure) | {"peak_rss_mb": _peak_rss_mb()},
         **_devices(loop.feed),
+        "calibration_check": parts.loop.dive_run.calibration_numbers,
         "metric_frame": metric_frame_numbers(parts.slam.metric_frame(parts.slam.tracker.sub_map)),
         "pose_output": None if poses is None else poses.to_json(),
     }
@@ -88,6 +89,7 @@ def report_between_dives(
         "deliverables": None,
         "machine": {"peak_rss_mb": _peak_rss_mb()},
         **_devices(feed),
+        "calibration_check": None,
         "metric_frame": None,
         "pose_output": None,
     }  # fmt: skip

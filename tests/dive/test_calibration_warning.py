@@ -42,6 +42,18 @@ def test_a_wrong_focal_length_is_said_first_and_ends_with_3(
     assert "the calibration does not fit the dive" in (dive / "report.html").read_text()
 
 
+def test_a_calibration_that_cannot_be_checked_is_noted(
+    small_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run, "lens_error", lambda keyframes: None)
+    finished = replay.map_recording(
+        open_recording(small_recording), "unchecked", tmp_path / "dive", TRACKING
+    )
+    assert finished.metrics["calibration_check"] is None
+    [note] = [each for each in finished.notes if "calibration" in each]
+    assert note.startswith("whether the calibration fits could not be checked")
+
+
 def test_the_right_calibration_is_no_warning(small_dive: Path) -> None:
     numbers = json.loads((small_dive / "metrics.json").read_text())
     assert numbers["warnings"] == []

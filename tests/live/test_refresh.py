@@ -30,8 +30,14 @@ class Scene:
         self.thread = MapThread(self.maps, LiveMappingConfig(nice=0), Heartbeats())
         self.frames, self.wrote, self.part_s = [0] * 3, list[str](), 0.1
         self.fails: Callable[[], None] = lambda: None
-        run: Any = SimpleNamespace(slam=SimpleNamespace(frames=self.frames))
+        run: Any = SimpleNamespace(
+            slam=SimpleNamespace(frames=self.frames), check_calibration=self.check_calibration
+        )
+        self.check: Callable[[], None] = lambda: None
         self.refresher = Refresher(run, self.thread, EVERY_S, self.clock, self.cpu)
+
+    def check_calibration(self) -> None:
+        self.check()
 
     def wrote_part(self, name: str) -> None:
         self.wrote.append(name)
@@ -43,7 +49,7 @@ class Scene:
         self.wrote.clear()
         self.clock.pass_(seconds)
         self.refresher.write_if_due(disk_is_full=False)
-        for _ in range(4):  # each part is posted by the one before
+        for _ in range(5):  # each part is posted by the one before
             self.caught_up()
         return list(self.wrote)
 
@@ -145,3 +151,8 @@ def test_a_part_that_fails_or_finds_no_room_costs_itself(scene: Scene) -> None:
         "write the maps", "write the path", "write the report",
     ]  # fmt: skip
     assert not scene.maps.failures.disk_was_full
+
+
+def test_the_calibration_is_checked_before_each_report(scene: Scene) -> None:
+    scene.check = lambda: scene.wrote_part("calibration")
+    assert scene.after(EVERY_S) == ["maps", "path", "calibration", "report"]
