@@ -16,6 +16,7 @@ from aquaflow.keyframes import Pointmap
 from aquaflow.live.health.degradation import DegradationLevel
 from aquaflow.live.health.heartbeats import Heartbeats
 from aquaflow.live.map_thread import LONGEST_REST_S, STAGE, MapThread
+from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.work import Growth, Insertion
 from aquaflow.render.views import View
 from tests.live.live_scenes import HEIGHT, WIDTH, RecordedMaps
@@ -146,7 +147,10 @@ class StubMapper:
             self.done.set()
 
 
-def test_idle_steps_go_on_until_the_views_that_are_kept_have_had_theirs(beside: Beside) -> None:
+def test_idle_steps_go_on_until_the_views_that_are_kept_have_had_theirs(
+    beside: Beside, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Mapper, "optimise", StubMapper.optimise)
     mapper = StubMapper([growth(index).view for index in range(3)])
     beside.maps.mappers[0] = mapper  # type: ignore[assignment]
     beside.thread.grow(growth(9))
