@@ -32,7 +32,7 @@ GRAVITY_M_S2 = 9.80665
 
 @dataclass
 class ReplayPicture:
-    """See aquaflow.drivers.oak.backend.OakPicture."""
+    """See aquaflow.drivers.oak.camera.OakPicture."""
 
     shot: Shot
     exposed_ns: int
@@ -57,7 +57,7 @@ class ReplayPicture:
 
 @dataclass
 class ReplayImuReading:
-    """See aquaflow.drivers.oak.backend.ImuReading."""
+    """See aquaflow.drivers.oak.camera.ImuReading."""
 
     acceleration_ns: int
     acceleration_m_s2: tuple[float, float, float]
@@ -92,7 +92,7 @@ class ReplayOak:
 
 
 class ReplayBackend:
-    """See aquaflow.drivers.oak.backend.OakBackend. The vehicle stands level and still."""
+    """See aquaflow.drivers.oak.camera.OakBackend. The vehicle stands level and still."""
 
     def __init__(self, device: ReplayOak, config: Any) -> None:
         rate_hz = config.imu_rate_hz

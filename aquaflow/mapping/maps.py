@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.errors.failures import Failures
 from aquaflow.base.profiler import Profiler
 from aquaflow.config import Config
-from aquaflow.geometry.arrays import Arrays
+from aquaflow.geometry.arrays import Arrays, of_camera, of_sim3, prefixed, to_camera, to_sim3, under
 from aquaflow.geometry.similarity import Sim3
+from aquaflow.mapping import state
 from aquaflow.mapping.device_work import DeviceWork
 from aquaflow.mapping.gaussians.reanchoring import move_views
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.maps_state import restored, serialised
-from aquaflow.mapping.view_budget import drop_surplus, same_group
+from aquaflow.mapping.state import NO_PIXELS
 from aquaflow.mapping.work import MIN_VIEWS, Growth, Insertion, Progress
 from aquaflow.render import select_renderer
 from aquaflow.render.contract import Renderer
 from aquaflow.render.device_memory import give_back_idle, usable_share
-from aquaflow.render.views import View, ViewStore
+from aquaflow.render.views import View, ViewStore, in_time
 
 
 class Maps:
@@ -175,3 +177,95 @@ class Maps:
 
     def close(self, keep: bool = False) -> None:
         self.views.close(keep)
+
+
+# --------------------------------------------------------------------------------------------------
+# Limits the number of views: a long dive keeps only some of the views of each place.
+
+
+def same_group(view: View, views: Sequence[View]) -> list[View]:
+    """Those of ``views`` with the same keyframe and the same robustness as ``view``."""
+    return [v for v in views if v.keyframe == view.keyframe and v.robust == view.robust]
+
+
+def drop_surplus(
+    views: list[View],
+    group: Sequence[View],  # those of ``views`` that have a budget together
+    most: int,
+) -> None:
+    """Drop views, and their pixels, until the ``group`` has at most ``most``.
+
+    Always the one whose neighbours are nearest to each other in time, the earliest of equals, so
+    that those that stay are spread over the whole time. First and last stay.
+    """
+    kept = in_time(group)
+    while len(kept) > max(most, 2):
+        index = [view.frame_index for view in kept]
+        gaps = [after - before for before, after in zip(index, index[2:])]  # noqa: B905
+        dropped = kept.pop(1 + gaps.index(min(gaps)))
+        views.remove(dropped)
+        dropped.delete_pixels()
+
+
+# --------------------------------------------------------------------------------------------------
+# All maps of a dive as facts and arrays, for a checkpoint; their pictures are stored apart.
+
+
+def serialised(
+    mappers: Mapping[int, Mapper], held_out: Mapping[int, Sequence[View]]
+) -> tuple[dict[str, Any], Arrays]:
+    """Facts for JSON, and arrays, which are copies; both arguments are by sub-map."""
+    facts: dict[str, Any] = {"maps": {}, "held_out": {}}
+    arrays: Arrays = {}
+    for number, mapper in mappers.items():
+        facts["maps"][str(number)], parts = state.serialise(mapper, optimiser=True)
+        arrays |= prefixed(f"map{number}", parts)
+    for number, views in held_out.items():
+        facts["held_out"][str(number)], parts = _held_out(views)
+        arrays |= prefixed(f"held_out{number}", parts)
+    return facts, arrays
+
+
+def restored(
+    facts: dict[str, Any],
+    arrays: Arrays,  # as from serialised
+    renderer: Renderer,
+    failures: Failures,
+) -> tuple[dict[int, Mapper], dict[int, list[View]]]:
+    """Maps and held-out views by sub-map, as they were serialised, without their pictures.
+
+    Raises:
+        KeyError, ValueError, TypeError, RuntimeError: this is no such checkpoint.
+    """
+    mappers = {
+        int(number): state.deserialise(values, under(f"map{number}", arrays), renderer, failures)
+        for number, values in facts["maps"].items()
+    }
+    held_out = {
+        int(number): _read_held_out(values, under(f"held_out{number}", arrays))
+        for number, values in facts["held_out"].items()
+    }
+    return mappers, held_out
+
+
+def _held_out(views: Sequence[View]) -> tuple[list[dict[str, Any]], Arrays]:
+    """What was never learned from has a camera and a pose, and no more."""
+    cameras = list(dict.fromkeys(view.camera for view in views))
+    numbers = [(v.frame_index, v.keyframe, v.robust, cameras.index(v.camera)) for v in views]
+    arrays = {
+        "numbers": np.array(numbers, np.int64).reshape(-1, 4),
+        "poses": of_sim3([view.T_wc for view in views]),
+    }
+    return [of_camera(camera) for camera in cameras], arrays
+
+
+def _read_held_out(
+    cameras: list[dict[str, Any]],
+    arrays: Arrays,  # as from _held_out
+) -> list[View]:
+    known = [to_camera(values) for values in cameras]
+    rows = zip(arrays["numbers"].tolist(), arrays["poses"], strict=True)
+    return [
+        View(index, NO_PIXELS, known[camera], to_sim3(pose), keyframe, bool(robust))
+        for (index, keyframe, robust, camera), pose in rows
+    ]

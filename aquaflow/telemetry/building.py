@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from datetime import datetime, timezone
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +14,6 @@ from aquaflow.config.device import MountingConfig
 from aquaflow.geometry.earth import north_east
 from aquaflow.telemetry import start as rough
 from aquaflow.telemetry.camera_path import CameraPath
-from aquaflow.telemetry.declination import declination_of
 from aquaflow.telemetry.directions import oriented
 from aquaflow.telemetry.factors.altitude import AltitudeFactor
 from aquaflow.telemetry.factors.depth import DepthFactor
@@ -25,7 +25,9 @@ from aquaflow.telemetry.metric_frame import Origin, SourceReport
 from aquaflow.telemetry.problem import ANY_TURN, OPEN_M, Carried, Problem
 from aquaflow.telemetry.sources import LEAST_SAMPLES, UsableSeries
 from aquaflow.telemetry.state import LAG, SHIFT, TURN
-from aquaflow.telemetry.telemetry import Telemetry
+from aquaflow.telemetry.telemetry import Telemetry, device_of
+from aquaflow.telemetry.utc import fit_utc
+from aquaflow.types import Attitude, Position
 
 Array = npt.NDArray[np.float64]
 
@@ -171,3 +173,51 @@ def _move_to_depth(problem: Problem, usable: UsableSeries, path: CameraPath) -> 
         _, at = problem.start.body(*path.at(depth.t_s))
         t_n[2] = problem.start.t_n[2] + float(np.median(depth.values[:, 0] - at[:, 2]))
     problem.start = replace(problem.start, t_n=t_n)
+
+
+# --------------------------------------------------------------------------------------------------
+# What a compass's north differs from true north: the magnetic declination, unless it is applied.
+#
+# ArduPilot's vehicles, ArduSub among them, look the declination up and add it to their heading from
+# the moment that they know where they are (AP_Compass.cpp, ``try_set_initial_location``;
+# COMPASS_AUTODEC is 1 by default). Without a position of their own they add COMPASS_DEC, which is 0
+# by default, so that their heading is magnetic (bluerobotics/qgroundcontrol, issue 143).
+
+MODEL_YEARS = (2010.0, 2029.99)
+"""Of the World Magnetic Model's coefficients that pygeomag brings; a later dive takes the last ones
+(the model changes by some 0.1 degrees a year)."""
+
+
+def declination_of(telemetry: Telemetry, config: FusionConfig) -> float | None:
+    """rad to be added to the compass's heading, positive where magnetic north lies in the east.
+
+    None where it is not known: x of the world then points to magnetic north.
+    """
+    if config.declination == "none":
+        return None
+    if config.declination != "auto":
+        return float(np.radians(config.declination))
+    compasses, places = telemetry.of(Attitude), telemetry.of(Position)
+    if not compasses or not places:
+        return None
+    if device_of(compasses[0].source) in {device_of(each.source) for each in places}:
+        return 0.0
+    clock = fit_utc(telemetry.utc)
+    if clock is None:
+        return None
+    place = np.median(places[0].values[:, :2], axis=0)
+    date = clock.utc_of(round(1e9 * float(places[0].t_s[0])))
+    return _by_model(float(place[0]), float(place[1]), date)
+
+
+def _by_model(latitude_deg: float, longitude_deg: float, date: datetime) -> float | None:
+    """rad by the World Magnetic Model; None near a magnetic pole, where it gives none."""
+    from pygeomag import GeoMag
+
+    began = datetime(date.year, 1, 1, tzinfo=timezone.utc)
+    year = date.year + (date - began).total_seconds() / (365.25 * 86400.0)
+    model = GeoMag(base_year=float(np.clip(year, *MODEL_YEARS)))
+    field = model.calculate(
+        latitude_deg, longitude_deg, 0.0, year, allow_date_outside_lifespan=True
+    )
+    return None if field.in_blackout_zone else float(np.radians(field.d))

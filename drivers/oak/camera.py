@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from operator import attrgetter
+from typing import Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +17,6 @@ from aquaflow.drivers.capture import RawPicture, UnusablePictureError
 from aquaflow.drivers.events import about
 from aquaflow.drivers.live import LiveCamera
 from aquaflow.drivers.mounting import BodyFrame, Mounting
-from aquaflow.drivers.oak.backend import ImuReading, OakBackend, OakPicture, OpenBackend
 from aquaflow.drivers.oak.dai_backend import DaiBackend
 from aquaflow.geometry.similarity import BODY_FROM_CAMERA
 from aquaflow.sources.newest import Newest
@@ -163,3 +163,64 @@ def _decoded(picture: OakPicture) -> npt.NDArray[np.uint8]:
         return picture.decode()
     except ValueError as error:
         raise UnusablePictureError(f"cannot be decoded: {error}") from error
+
+
+# --------------------------------------------------------------------------------------------------
+# The functions of an OAK camera that :class:`aquaflow.drivers.oak.camera.OakCamera` needs.
+#
+# ``DaiBackend`` speaks to the device; the replay backend in sim_drivers needs none.
+
+
+class OakPicture(Protocol):
+    """A picture as the device delivered it."""
+
+    exposed_ns: int
+    """Middle of the exposure, CLOCK_MONOTONIC, as the library's time synchronisation has it."""
+    device_ns: int
+    """The same moment on the device's clock."""
+    sequence: int
+    exposure_s: float | None
+    iso: float | None
+
+    def decode(self) -> npt.NDArray[np.uint8]:
+        """[H, W, 3] RGB; raises ValueError if the data makes no picture."""
+        ...
+
+    def jpeg(self) -> bytes | None:
+        """The file that the device made; None where it sends pixels."""
+        ...
+
+
+class ImuReading(Protocol):
+    """Accelerometer and gyroscope, each with its moment, in the axes of the IMU."""
+
+    acceleration_ns: int
+    acceleration_m_s2: tuple[float, float, float]
+    rate_ns: int
+    rate_rad_s: tuple[float, float, float]
+
+
+class OakBackend(Protocol):
+    """One opening of one camera; every call raises OSError when the device is gone."""
+
+    def calibration(self) -> CameraModel | None:
+        """Of the pictures' size; None if the device carries none."""
+        ...
+
+    def imu_to_camera(self) -> npt.NDArray[np.float64] | None:
+        """[3, 3] rotation of the IMU's axes into the camera's (right, down, forward)."""
+        ...
+
+    def read(self, timeout_s: float) -> OakPicture | None:
+        """The next picture; None when ``timeout_s`` passed without one."""
+        ...
+
+    def imu(self) -> Sequence[ImuReading]:
+        """Readings since the last call."""
+        ...
+
+    def close(self) -> None: ...
+
+
+OpenBackend: TypeAlias = Callable[[OakConfig], OakBackend]
+"""Finds and starts the camera; raises OSError with a sentence while it is not there."""

@@ -10,16 +10,15 @@ import contextlib
 import logging
 import os
 from datetime import timedelta
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors.extra import load
 from aquaflow.config.cameras import OakConfig
-from aquaflow.drivers.oak.calibration import camera_model, imu_rotation
-from aquaflow.drivers.oak.encoding import JPEG_QUALITY, chosen, said
 from aquaflow.drivers.oak.messages import DaiImuReading, DaiPicture, imu_readings, picture_of
+from aquaflow.geometry.camera import DistortionModel
 from aquaflow.types import CameraModel
 
 SEARCH_MS = 500
@@ -177,3 +176,99 @@ class DaiBackend:
         if config.white_balance_k is not None:
             control.setManualWhiteBalance(config.white_balance_k)
         return control
+
+
+# --------------------------------------------------------------------------------------------------
+# The calibration that an OAK carries in its EEPROM, as a CameraModel.
+
+HALF_PIXEL = 0.5
+"""OpenCV puts the centre of the first pixel at 0, AquaFlow at 0.5."""
+
+
+def camera_model(handler: Any, socket: Any, size: tuple[int, int]) -> CameraModel | None:
+    """From a ``dai.CalibrationHandler``, for pictures of exactly ``size`` (width, height).
+
+    It was made in air: behind a flat port in water it is wrong, and ``calibration`` in the config
+    replaces it. None if the device was never calibrated.
+    """
+    try:
+        K = handler.getCameraIntrinsics(socket, *size)
+        coefficients = handler.getDistortionCoefficients(socket)
+        fisheye = handler.getDistortionModel(socket).name == "Fisheye"
+    except RuntimeError:
+        return None
+    if not np.all(np.isfinite(K)) or K[0][0] <= 0.0 or K[1][1] <= 0.0:
+        return None
+    model: DistortionModel = "fisheye" if fisheye else "radtan"
+    return CameraModel(
+        *size,
+        K[0][0],
+        K[1][1],
+        K[0][2] + HALF_PIXEL,
+        K[1][2] + HALF_PIXEL,
+        distortion_model=model,
+        distortion=tuple(coefficients[:4] if fisheye else coefficients),
+    )
+
+
+def imu_rotation(handler: Any, socket: Any) -> npt.NDArray[np.float64] | None:
+    """[3, 3] rotation of IMU axes into camera axes; None if the device does not know."""
+    try:
+        transform = np.array(handler.getImuToCameraExtrinsics(socket), dtype=np.float64)
+    except RuntimeError:
+        return None
+    rotation = transform[:3, :3]
+    known = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+    return rotation if known else None
+
+
+# --------------------------------------------------------------------------------------------------
+# How pictures come from an OAK: whole, with less colour, or as JPEG, by what its link carries.
+#
+# Bytes a second are those of the pictures; the figures of links are what is left of their nominal
+# rate for one camera beside the IMU.
+
+Encoding: TypeAlias = Literal["bgr", "nv12", "mjpeg"]
+
+BYTES_PER_PIXEL: dict[Encoding, float] = {"bgr": 3.0, "nv12": 1.5}
+"""Of those that are not compressed, the best first. NV12 has one colour for four pixels, as the
+sensor's own mosaic and every JPEG do."""
+
+LINK_BYTES_S = {
+    "SUPER_PLUS": 300e6,
+    "SUPER": 300e6,
+    "HIGH": 28e6,
+    "UNKNOWN": 60e6,
+}
+"""By the name of ``dai.UsbSpeed``: USB 3 of 5 Gbit/s, USB 2 of 480 Mbit/s, of which some 35 MB/s
+arrive; UNKNOWN is a camera on the network, whose own port has 1 Gbit/s. Slower than all of these
+are USB 1's LOW and FULL."""
+SLOWEST_BYTES_S = 1e6
+
+NAMES = {"SUPER_PLUS": "USB 3", "SUPER": "USB 3", "HIGH": "USB 2", "UNKNOWN": "the network"}
+
+JPEG_QUALITY = 95
+"""Percent; a tenth of BGR's bytes, and finer than what tracking sees."""
+
+
+def chosen(config: OakConfig, speed: str) -> Encoding:
+    """As configured, else the best that a link of this ``dai.UsbSpeed`` carries."""
+    if config.encoding != "auto":
+        return config.encoding
+    room = LINK_BYTES_S.get(speed, SLOWEST_BYTES_S)
+    for encoding, size in BYTES_PER_PIXEL.items():
+        if _rate(config, size) <= room:
+            return encoding
+    return "mjpeg"
+
+
+def said(config: OakConfig, speed: str, encoding: Encoding) -> str:
+    """The choice in words, for the log."""
+    link = NAMES.get(speed, "USB 1")
+    raw = _rate(config, BYTES_PER_PIXEL["bgr"]) * 1e-6
+    return f"on {link}; pictures come as {encoding.upper()} (BGR would be {raw:.0f} MB/s)"
+
+
+def _rate(config: OakConfig, bytes_per_pixel: float) -> float:
+    """Bytes a second."""
+    return config.width * config.height * config.fps * bytes_per_pixel

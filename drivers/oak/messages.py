@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 @dataclass
 class DaiPicture:
-    """See :class:`aquaflow.drivers.oak.backend.OakPicture`."""
+    """See :class:`aquaflow.drivers.oak.camera.OakPicture`."""
 
     message: Any
     exposed_ns: int
@@ -52,7 +52,7 @@ class DaiPicture:
 
 @dataclass
 class DaiImuReading:
-    """See :class:`aquaflow.drivers.oak.backend.ImuReading`."""
+    """See :class:`aquaflow.drivers.oak.camera.ImuReading`."""
 
     acceleration_ns: int
     acceleration_m_s2: tuple[float, float, float]

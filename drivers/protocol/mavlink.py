@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from typing import Any
 
 from aquaflow.config.telemetry import MavlinkConfig
 from aquaflow.drivers.device_clock import DeviceClock
+from aquaflow.drivers.events import about
 from aquaflow.drivers.mavlink_dialect import dialect
-from aquaflow.drivers.protocol.mavlink_commands import MESSAGES, MavlinkCommands
 from aquaflow.drivers.protocol.mavlink_frames import Header, MavlinkFraming, header_of
 from aquaflow.drivers.protocol.mavlink_outbound import Receiver, messages_of
-from aquaflow.drivers.protocol.mavlink_samples import SINCE_1970_US, MessageTime
-from aquaflow.drivers.protocol.mavlink_senders import MavlinkSenders
+from aquaflow.drivers.protocol.mavlink_samples import SINCE_1970_US, MavlinkSamples, MessageTime
 from aquaflow.drivers.protocol.packets import PacketDecoder
 from aquaflow.drivers.transport.mavlink2rest import Wanted
 from aquaflow.sources.outbound import OutboundMessage, StatusText
-from aquaflow.sources.pilot import Obey
+from aquaflow.sources.pilot import Obey, PilotRequest
 from aquaflow.types import TelemetrySample
 
 OUR_COMPONENT = 197
@@ -184,3 +184,117 @@ class MavlinkDecoder(PacketDecoder):
             known = 0 < message.time_usec < SINCE_1970_US
             return self.clock.moment(message.time_usec * 1000, arrival_ns) if known else arrival_ns
         return self.clock.stamp(boot_ns, arrival_ns) if boot_ns > 0 else arrival_ns
+
+
+# --------------------------------------------------------------------------------------------------
+# Commands of MAVLink to AquaFlow's component (mavlink.io/en/services/command.html).
+#
+# MAV_CMD_USER_1 to 4, which the standard leaves to each vehicle's maker, are the four requests of a
+# dive. Each is acknowledged; a repetition, as senders make while no acknowledgement reached them,
+# is acknowledged as before and not obeyed twice.
+
+FIRST_COMMAND = 31010
+"""MAV_CMD_USER_1."""
+REQUESTS: dict[int, PilotRequest] = {
+    FIRST_COMMAND: "start",
+    FIRST_COMMAND + 1: "stop",
+    FIRST_COMMAND + 2: "finish",
+    FIRST_COMMAND + 3: "new",
+}
+"""By MAV_CMD."""
+MESSAGES = frozenset({"COMMAND_LONG", "COMMAND_INT"})
+ACCEPTED, REFUSED_NOW, UNSUPPORTED = 0, 1, 3
+"""MAV_RESULT."""
+
+
+class MavlinkCommands:
+    """Of one link; without :attr:`asked` it is silent."""
+
+    def __init__(self, dialect: Any, system_id: int, component_id: int) -> None:
+        """The numbers are ours: commands to others are theirs."""
+        self.asked: Obey | None = None
+        self._dialect, self._us = dialect, (system_id, component_id)
+        self._answered: tuple[Header, int, int] | None = None
+        """Who sent the last command, which one, and its result."""
+
+    def acknowledged(self, header: Header, message: Any) -> Any | None:
+        """The COMMAND_ACK of a COMMAND_LONG or COMMAND_INT; None if it is none of ours."""
+        if self.asked is None or (message.target_system, message.target_component) != self._us:
+            return None
+        result = self._result(header, message, self.asked)
+        self._answered = header, message.command, result
+        return self._dialect.MAVLink_command_ack_message(
+            command=message.command,
+            result=result,
+            target_system=header.system,
+            target_component=header.component,
+        )
+
+    def _result(self, header: Header, message: Any, asked: Obey) -> int:
+        request = REQUESTS.get(message.command)
+        if request is None:
+            return UNSUPPORTED
+        before = self._answered
+        if getattr(message, "confirmation", 0) > 0 and before is not None:
+            (_, system, component, _), command, result = before
+            if (system, component, command) == (header.system, header.component, message.command):
+                return result
+        return ACCEPTED if asked(request) else REFUSED_NOW
+
+
+# --------------------------------------------------------------------------------------------------
+# Whose MAVLink messages are used: the autopilot's, and those that the config names as well.
+
+log = logging.getLogger(__name__)
+
+MOST_WARNINGS = 16
+"""Senders and messages that a warning names; the others are counted only."""
+OF_MANY = frozenset({"SYSTEM_TIME"})
+"""Ground stations send it too; that is no loss."""
+
+
+class MavlinkSenders:
+    """The converters of each sender on one link."""
+
+    def __init__(self, name: str, config: MavlinkConfig) -> None:
+        asked = [str(message) for message in config.messages]
+        asked += [] if config.external_pressure is None else [config.external_pressure]
+        asked += [] if config.lights is None else [config.lights.message]
+        self._name = name
+        self.autopilot = (config.system_id, config.component_id)
+        self._samples = {self.autopilot: MavlinkSamples(config, asked)}
+        for other in config.also:
+            sender = (other.system_id or config.system_id, other.component_id)
+            self._samples[sender] = MavlinkSamples(config, other.messages)
+        self._warned: set[tuple[int, int, str]] = set()
+
+    @property
+    def wanted(self) -> frozenset[str]:
+        """Names of the messages that make samples, whoever sends them."""
+        return frozenset().union(*(each.wanted for each in self._samples.values()))
+
+    @property
+    def asked(self) -> dict[tuple[int, int], frozenset[str]]:
+        """The same by system and component of the sender."""
+        return {sender: each.wanted for sender, each in self._samples.items()}
+
+    def of(self, header: Header, message: str) -> MavlinkSamples | None:
+        """What converts ``message`` of this sender; None if it is not asked for it."""
+        samples = self._samples.get((header.system, header.component))
+        return samples if samples is not None and message in samples.wanted else None
+
+    def unheard(self, header: Header, message: str) -> bool:
+        """Whether a message that is used of others is lost; a warning names its sender once."""
+        if message in OF_MANY or message not in self.wanted:
+            return False
+        if (header.system, header.component) in self._samples:
+            return False
+        sender = (header.system, header.component, message)
+        if sender not in self._warned and len(self._warned) < MOST_WARNINGS:
+            self._warned.add(sender)
+            log.warning(
+                "%s: %s of system %d, component %d is not used; to use it, add "
+                "{system_id: %d, component_id: %d, messages: [%s]} under 'also'",
+                self._name, message, *sender[:2], *sender, extra=about(self._name, "unheard"),
+            )  # fmt: skip
+        return True

@@ -16,7 +16,7 @@ PACKED = {"YUYV": "COLOR_YUV2RGB_YUYV", "UYVY": "COLOR_YUV2RGB_UYVY"}
 HALF_COLOURED = frozenset({"NV12", "NM12"})
 """A byte a pixel, then a pair of colours for four; NM12 has these in memory of their own."""
 STREAMED = "H264"
-"""Pictures that need those before them (:mod:`aquaflow.drivers.v4l2.streamed`)."""
+"""Pictures that need those before them (:mod:`aquaflow.drivers.v4l2.camera`)."""
 
 JPEG_PIXELS = frozenset({"MJPG", "JPEG"})
 """V4L2's two names of a picture that is a JPEG file."""

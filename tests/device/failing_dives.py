@@ -8,7 +8,7 @@ import torch
 from aquaflow.base.errors.failures import Failures
 from aquaflow.config import Config
 from aquaflow.mapping.maps import Maps
-from aquaflow.mapping.neural.regrouping import is_whole
+from aquaflow.mapping.neural.neural import is_whole
 from aquaflow.mapping.state import serialise
 from aquaflow.mapping.work import Growth
 from aquaflow.render.contract import CPU

@@ -18,8 +18,8 @@ from aquaflow.dive.dive import Dive
 from aquaflow.dive.map_file import read_map_file
 from aquaflow.dive.ply import read_ply
 from aquaflow.dive.restored import export_restored
-from aquaflow.lab.bench.measure import measured
 from aquaflow.lab.bench.scene import BenchmarkScene
+from aquaflow.lab.bench.worker import measured
 from aquaflow.render.contract import CPU
 from aquaflow.survey.measure.scale_bar import between_pixels
 from tests.device.device_scenes import WHERE, counted

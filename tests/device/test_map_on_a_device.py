@@ -15,7 +15,7 @@ from aquaflow.mapping.map_copy import copied
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.contract import CPU
 from aquaflow.render.cpu import CpuRenderer
-from aquaflow.survey.viewer.copies import shown
+from aquaflow.survey.viewer.live_viewer import shown
 from tests.device.device_scenes import (
     SMALL,
     WHERE,

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from aquaflow.config import Config
-from aquaflow.dive.shortcomings import shortcomings
+from aquaflow.dive.run import shortcomings
 from aquaflow.lab.bench.job import Job
 from aquaflow.lab.bench.runner import in_process
 from aquaflow.lab.bench.scene import BenchmarkScene

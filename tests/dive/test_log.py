@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from aquaflow.dive.log import MOST_EARLY, EarlyRecords, JsonLog
-from aquaflow.dive.log_repeats import EVERY_S, KINDS, WHOLE, Repeats
+from aquaflow.dive.log import EVERY_S, KINDS, MOST_EARLY, WHOLE, EarlyRecords, JsonLog, Repeats
 
 log = logging.getLogger("aquaflow.test")
 

@@ -11,7 +11,7 @@ import pytest
 
 from aquaflow.base.errors import InputError
 from aquaflow.config import Config
-from aquaflow.dive import places_of_dive
+from aquaflow.dive import deliverables as places_of_dive
 from aquaflow.dive.replay import map_recording
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes.place import Place

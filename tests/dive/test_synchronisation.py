@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.failures import Failures
+from aquaflow.dive.replay import synchronise, turns_of
 from aquaflow.dive.run import DiveRun
-from aquaflow.dive.synchronisation import synchronise, turns_of
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.recordings.images import SUBFOLDER
 from aquaflow.sources import RecordedTelemetry

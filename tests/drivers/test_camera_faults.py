@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aquaflow.drivers.camera_state import CameraState
-from aquaflow.drivers.exposure_clock import MAX_LATENCY_NS
+from aquaflow.drivers.live import MAX_LATENCY_NS, CameraState
 from aquaflow.sim_drivers.camera_feed import CameraFaults, first_images
 from aquaflow.types import Dropped, Frame
 from tests.drivers.camera_scenes import COUNT, KINDS, Pictures, live, settled, until

@@ -17,9 +17,13 @@ import pytest
 from aquaflow.base.errors import InputError
 from aquaflow.config.cameras import OakConfig
 from aquaflow.drivers.oak import OakCamera
-from aquaflow.drivers.oak.calibration import camera_model, imu_rotation
-from aquaflow.drivers.oak.dai_backend import DaiBackend, find_device
-from aquaflow.drivers.oak.encoding import LINK_BYTES_S
+from aquaflow.drivers.oak.dai_backend import (
+    LINK_BYTES_S,
+    DaiBackend,
+    camera_model,
+    find_device,
+    imu_rotation,
+)
 from aquaflow.drivers.oak.messages import imu_readings, nanoseconds, picture_of
 
 os.environ.setdefault("DEPTHAI_LEVEL", "off")

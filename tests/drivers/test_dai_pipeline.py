@@ -15,8 +15,7 @@ import pytest
 
 from aquaflow.config.cameras import OakConfig
 from aquaflow.drivers.oak import dai_backend
-from aquaflow.drivers.oak.dai_backend import DaiBackend
-from aquaflow.drivers.oak.encoding import chosen
+from aquaflow.drivers.oak.dai_backend import DaiBackend, chosen
 from aquaflow.drivers.oak.messages import imu_readings, picture_of
 
 

@@ -9,8 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from aquaflow.drivers.camera_state import CameraState
-from aquaflow.drivers.live import LiveCamera
+from aquaflow.drivers.live import CameraState, LiveCamera
 from aquaflow.sim_drivers.camera_feed import CameraFaults, CameraFeed, Shot
 from aquaflow.sim_drivers.rtp_camera import RtspCamera
 from aquaflow.types import Frame

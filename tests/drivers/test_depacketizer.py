@@ -8,7 +8,7 @@ from itertools import chain, pairwise
 import pytest
 
 from aquaflow.drivers.stream.depacketizer import Depacketizer, ReceivedPicture
-from aquaflow.sim_drivers.rtp_packets import Packetizer
+from aquaflow.sim_drivers.rtp_camera import Packetizer
 
 NS = 1_000_000_000
 SMALL, LARGE = b"\x67abc", bytes([0x65]) + bytes(range(256)) * 20

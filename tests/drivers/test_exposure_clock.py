@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aquaflow.drivers.exposure_clock import MAX_FUTURE_NS, MAX_LATENCY_NS, ExposureClock
+from aquaflow.drivers.live import MAX_FUTURE_NS, MAX_LATENCY_NS, ExposureClock
 
 MS = 1_000_000
 PERIOD = 33 * MS

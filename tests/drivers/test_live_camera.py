@@ -13,9 +13,8 @@ import pytest
 
 from aquaflow.base.errors import InputError
 from aquaflow.config.cameras import LiveCameraConfig
-from aquaflow.drivers.camera_state import CameraState
 from aquaflow.drivers.capture import Capture, RawPicture
-from aquaflow.drivers.live import LiveCamera
+from aquaflow.drivers.live import CameraState, LiveCamera
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.camera_file import save_camera
 from aquaflow.types import CameraModel, Dropped, Frame

@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from aquaflow.config.telemetry import parse_telemetry
-from aquaflow.drivers.protocol.mavlink import OUR_COMPONENT
-from aquaflow.drivers.protocol.mavlink_commands import (
+from aquaflow.drivers.protocol.mavlink import (
     ACCEPTED,
     FIRST_COMMAND,
+    OUR_COMPONENT,
     REFUSED_NOW,
     UNSUPPORTED,
 )

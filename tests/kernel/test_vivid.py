@@ -13,7 +13,7 @@ import pytest
 
 from aquaflow.base.errors import InputError
 from aquaflow.config.cameras import V4l2Config
-from aquaflow.drivers.camera_state import CameraState
+from aquaflow.drivers.live import CameraState
 from aquaflow.drivers.v4l2 import V4l2Camera
 from aquaflow.drivers.v4l2.discovery import camera_nodes, modes
 from aquaflow.drivers.v4l2.system import Kernel

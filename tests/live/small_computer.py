@@ -19,7 +19,7 @@ from typing import Any
 
 from aquaflow.config.presets import preset
 from aquaflow.config.vehicle import VehicleConfig
-from aquaflow.lab.bench.growth.stored import folder_bytes
+from aquaflow.lab.bench.growth.worker import folder_bytes
 from aquaflow.lab.bench.memory import peak_memory_mb, resident_mb
 from aquaflow.lab.synthetic.survey import FPS, Survey
 from aquaflow.live.checkpoint.resume import resumed

@@ -12,7 +12,7 @@ import pytest
 from aquaflow.config import SourceConfig
 from aquaflow.config.cameras import StreamConfig
 from aquaflow.config.service import ServiceConfig
-from aquaflow.drivers.camera_state import CameraState
+from aquaflow.drivers.live import CameraState
 from aquaflow.drivers.stream import StreamCamera
 from aquaflow.live.control import Control
 from aquaflow.live.feed import LiveFeed

@@ -25,7 +25,7 @@ from aquaflow.config.cameras import V4l2Config
 from aquaflow.config.telemetry import parse_telemetry
 from aquaflow.dive.frames_csv import read_rows
 from aquaflow.dive.log import EarlyRecords
-from aquaflow.drivers.camera_state import CameraState
+from aquaflow.drivers.live import CameraState
 from aquaflow.drivers.telemetry import LinkTelemetry
 from aquaflow.drivers.v4l2 import V4l2Camera
 from aquaflow.live.checkpoint.resume import resumed

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from aquaflow.config import parse_config
-from aquaflow.mapping.maps import Maps
-from aquaflow.mapping.view_budget import drop_surplus, same_group
+from aquaflow.mapping.maps import Maps, drop_surplus, same_group
 from aquaflow.mapping.work import Growth
 from aquaflow.render.views import View, ViewStore
 from tests.mapping.mapping_scenes import CAMERA, view_of

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.render import gsplat
-from aquaflow.render.adam import SelectiveAdam
-from aquaflow.render.adam_rows import fused_kernel
+from aquaflow.render.adam import SelectiveAdam, fused_kernel
 
 
 class OneRow:

@@ -7,7 +7,7 @@ import pytest
 
 from aquaflow.recordings.h264 import decode_units, is_key
 from aquaflow.sim_drivers.h264_writer import access_unit
-from aquaflow.sim_drivers.rtp_packets import LARGEST, Packetizer
+from aquaflow.sim_drivers.rtp_camera import LARGEST, Packetizer
 
 
 def picture(number: int, width: int = 64, height: int = 48) -> np.ndarray:

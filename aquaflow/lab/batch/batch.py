@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import os
+import subprocess
+import sys
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import read_regular
@@ -15,15 +20,13 @@ from aquaflow.base.storage.folder_lock import FolderLock
 from aquaflow.base.storage.whole_folder import remove_abandoned
 from aquaflow.config import Config
 from aquaflow.config.batch import BatchConfig
-from aquaflow.lab.batch.estimate import memory_mb
-from aquaflow.lab.batch.examine import Examiner
 from aquaflow.lab.batch.job import WRITTEN, Job
 from aquaflow.lab.batch.journal import JOURNAL, Journal
-from aquaflow.lab.batch.machine import core_count, memory_for_dives_mb
 from aquaflow.lab.batch.membership import Sites, add_members, make_site
 from aquaflow.lab.batch.object_store import ObjectStore, is_url
 from aquaflow.lab.batch.ray_workers import RayWorkers
 from aquaflow.lab.batch.recordings import Recording, find_recordings
+from aquaflow.lab.batch.run_job import KILOBYTE, MEGABYTE
 from aquaflow.lab.batch.season import Season, run_season
 from aquaflow.lab.batch.site import DIVES
 from aquaflow.lab.batch.workers import LocalWorkers, Workers
@@ -138,3 +141,167 @@ def _workers(batch: BatchConfig) -> Workers:
         return RayWorkers(batch.cluster, batch.jobs)
     lent = memory_for_dives_mb() if batch.memory_gb is None else batch.memory_gb * GIGABYTE_MB
     return LocalWorkers(core_count(), round(lent), batch.jobs)
+
+
+# --------------------------------------------------------------------------------------------------
+# What this machine can lend to a batch: cores, and memory that is free.
+
+SHARE_OF_FREE = 0.8
+"""Of the free memory that a batch takes by itself: the rest is for files and for what others do."""
+LEAST_MB = 512
+"""Where the free memory cannot be found out."""
+
+
+def core_count() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+def memory_for_dives_mb(root: Path = Path("/")) -> int:
+    """Memory that dives may take together, 1e6 bytes: a share of what is free now."""
+    free = [each for each in (_of_machine(root), _of_control_group(root)) if each is not None]
+    return round(SHARE_OF_FREE * min(free)) if free else LEAST_MB
+
+
+def _of_machine(root: Path) -> float | None:
+    try:
+        lines = (root / "proc/meminfo").read_text().splitlines()
+        fields = (line.split() for line in lines if line.startswith("MemAvailable:"))
+        return int(next(fields)[1]) * KILOBYTE / MEGABYTE
+    except (OSError, ValueError, StopIteration):
+        return None
+
+
+def _of_control_group(root: Path) -> float | None:
+    """Of a container, or of a unit with MemoryMax."""
+    try:
+        group = (root / "proc/self/cgroup").read_text().rpartition("::")[2].strip()
+        folder = root / "sys/fs/cgroup" / group.lstrip("/")
+        limit = int((folder / "memory.max").read_text())
+        used = int((folder / "memory.current").read_text())
+    except (OSError, ValueError):
+        return None  # no limit ("max"), or no control groups of version 2
+    return max(limit - used, 0) / MEGABYTE
+
+
+# --------------------------------------------------------------------------------------------------
+# A look at every recording before the first is mapped, in a process that one of them may crash.
+
+PROGRAM = "aquaflow.lab.batch.examining_process"
+PATIENCE_S = 120.0
+"""For one recording; a video's index takes well under a second, a long bag's several."""
+
+
+class Examiner:
+    """Looks at one recording after the other."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self) -> Examiner:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._end()
+
+    def look(self, source: str) -> Examined:
+        """What can be known of the recording at ``source``; nothing of one in an object store,
+        or one that crashes who looks at it."""
+        if is_url(source):
+            return Examined()
+        if self._process is None:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL, start_new_session=True,
+            )  # fmt: skip
+        process = self._process
+        assert process.stdin is not None
+        assert process.stdout is not None
+        alarm = threading.Timer(PATIENCE_S, process.kill)
+        alarm.start()
+        try:
+            process.stdin.write(json.dumps(source).encode() + b"\n")
+            process.stdin.flush()
+            return Examined(**json.loads(process.stdout.readline()))
+        except (OSError, ValueError, TypeError):
+            self._end()
+            return Examined()
+        finally:
+            alarm.cancel()
+
+    def _end(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.communicate()
+            self._process = None
+
+
+# --------------------------------------------------------------------------------------------------
+# How much memory a dive will take: from its pictures' size, their number and the map's Gaussians.
+#
+# Fitted to resident sets that were measured (docs/performance.md#memory), and on the safe side.
+
+BASE_MAP_MB = 325.0
+"""`aquaflow map` before its first frame."""
+BASE_TRACKING_MB = 161.0
+"""The same with ``--tracking-only``, which loads no torch."""
+VIEWS_BYTES_PER_PIXEL = 128 * 11.1
+"""128 views in memory; one takes 0.85 MB at 320 x 240 px."""
+KEYFRAMES_BYTES_PER_PIXEL = 32 * 33.9
+"""32 keyframes in memory; one takes 0.65 MB at 160 x 120 px."""
+BYTES_PER_GAUSSIAN = 2000.0
+"""What is left of 470 to 580 MB, resident with 80,000 of them at 160 px."""
+MB_PER_FRAME = 0.058
+"""At the end of a dive all keyframes are adjusted: 0.48 MB each, at 120 in 1,000 frames."""
+MARGIN = 1.35
+"""Over the sum of the above: measured peaks are at most 1.32 of it (320 px, 20,000 Gaussians)."""
+DEFAULT_WIDTH = 480
+"""px that a recording is mapped at where nothing is asked."""
+USUAL_ASPECT = 0.75
+"""Height over width; wider pictures have fewer pixels."""
+BYTES_PER_FRAME = 20_000
+"""Of a recording whose frames are not counted: 1080p video at 4.8 Mbit/s, 30 frames/s. Pictures in
+files take ten times as much, so that this errs to the safe side."""
+
+
+@dataclass(frozen=True)
+class Examined:
+    """What is known of a recording before it is mapped."""
+
+    frames: int | None = None
+    width: int | None = None
+    """px"""
+    height: int | None = None
+    """px"""
+
+
+def memory_mb(seen: Examined, size_bytes: int, config: Config) -> int:
+    """Estimate of a dive's peak, 1e6 bytes; ``size_bytes`` of the recording."""
+    pixels = _pixels(seen, config)
+    per_pixel, fixed_mb = KEYFRAMES_BYTES_PER_PIXEL, BASE_TRACKING_MB
+    if config.mapping.enabled:
+        per_pixel += VIEWS_BYTES_PER_PIXEL
+        fixed_mb = BASE_MAP_MB + BYTES_PER_GAUSSIAN * config.mapping.max_gaussians / MEGABYTE
+    frames = _frames(seen, size_bytes, config)
+    return round(MARGIN * (fixed_mb + per_pixel * pixels / MEGABYTE + MB_PER_FRAME * frames))
+
+
+def _pixels(seen: Examined, config: Config) -> float:
+    """Of a mapped picture."""
+    width = config.source.width or min(DEFAULT_WIDTH, seen.width or DEFAULT_WIDTH)
+    if seen.width and seen.height:
+        return width * width * seen.height / seen.width
+    return width * width * USUAL_ASPECT
+
+
+def _frames(seen: Examined, size_bytes: int, config: Config) -> int:
+    """Frames that are mapped."""
+    source = config.source
+    there = seen.frames if seen.frames is not None else size_bytes // BYTES_PER_FRAME
+    stop = there if source.stop is None else min(source.stop, there)
+    return len(range(source.start, stop, source.every))

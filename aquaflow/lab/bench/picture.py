@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from aquaflow.lab.bench.pareto import pareto_front
 from aquaflow.lab.bench.summary import ATE_PCT, PSNR, TOTAL_MS, Column, contender_of
 
 if TYPE_CHECKING:
@@ -170,3 +169,17 @@ def _legend(figure: Figure, rows: Sequence[Row], colours: dict[str, str]) -> Non
     figure.legend(
         handles=[*scenes, *kinds], loc="outside right center", fontsize=8.5, frameon=False
     )
+
+
+# --------------------------------------------------------------------------------------------------
+# The Pareto front: the runs that no other run improves in both time and error.
+
+
+def pareto_front(cost: Sequence[float], error: Sequence[float]) -> list[int]:
+    """Indices of the points with no other as cheap and as good, and better in one; by cost."""
+    order = sorted(range(len(cost)), key=lambda i: (cost[i], error[i]))
+    front: list[int] = []
+    for i in order:
+        if not front or error[i] < error[front[-1]]:
+            front.append(i)
+    return front

@@ -10,7 +10,7 @@ beat. Where open water was removed, neither is compared.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,15 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive
-from aquaflow.lab.evaluation.held_out import Kind, held_out_indices, read_picture
-from aquaflow.lab.evaluation.water_peers.contract import NAMES, NotRestoredError, Pictures
-from aquaflow.lab.evaluation.water_peers.held_out_ranges import held_out_ranges
-from aquaflow.lab.evaluation.water_peers.methods import METHODS
+from aquaflow.lab.evaluation.held_out import Kind, held_out_indices, read_picture, read_range
+from aquaflow.lab.evaluation.water_peers import grey_world, sea_thru, udcp
+from aquaflow.lab.evaluation.water_peers.contract import (
+    NAMES,
+    Method,
+    NotRestoredError,
+    Pictures,
+    Ranges,
+)
 from aquaflow.render.image_metrics import channel_gain, psnr
 from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation
@@ -173,3 +178,35 @@ def _frames(clean: Path, indices: list[int]) -> Iterator[Frame]:
                 yield frame
     finally:
         recording.close()
+
+
+# --------------------------------------------------------------------------------------------------
+# The methods by the keys of ``contract.NAMES``.
+
+METHODS: dict[str, Method] = {
+    "sea_thru": sea_thru.restore,
+    "udcp": udcp.restore,
+    "grey_world": grey_world.restore,
+}
+
+
+# --------------------------------------------------------------------------------------------------
+# The map's ranges of a dive's held-out views.
+
+
+def held_out_ranges(dive: Path, indices: Sequence[int], size: tuple[int, int]) -> Ranges | None:
+    """[N, H, W] in the dive's unit, 0 where the map is not solid; None if any is missing or
+    damaged.
+
+    ``size`` is the height and width of the held-out pictures.
+    """
+    found = []
+    for index in indices:
+        try:
+            z = read_range(dive, index)
+        except InputError:
+            return None
+        if z is None or z.shape != size:
+            return None
+        found.append(z)
+    return np.stack(found)

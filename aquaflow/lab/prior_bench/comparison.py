@@ -8,21 +8,30 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from aquaflow.base.errors import AquaFlowError
-from aquaflow.config import PriorConfig
+from aquaflow.base.errors import AquaFlowError, InputError
+from aquaflow.config import Config, PriorConfig, parse_config
+from aquaflow.config.presets import merged
 from aquaflow.config.stage import validated
+from aquaflow.geometry.camera import CameraModel
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.lab.bench import machine
-from aquaflow.lab.prior_bench.clip_pairs import clip_pairs
+from aquaflow.lab.bench.peers.dive import prepared_frames
+from aquaflow.lab.bench.real_suite import scene_of_clip
+from aquaflow.lab.evaluation.trajectory import ASSOCIATION_TOLERANCE_S, associate, read_tum
 from aquaflow.lab.prior_bench.known_pairs import generated_pairs, warped_pairs
-from aquaflow.lab.prior_bench.methods import DenseMethod, Method, SparseMethod
-from aquaflow.lab.prior_bench.pair import KnownPair, Picture
+from aquaflow.lab.prior_bench.pair import FoundMatches, KnownPair, Picture
 from aquaflow.lab.prior_bench.pair_figures import PairFigures, figures_of
+from aquaflow.prior.contract import Keypoints, Prior
 from aquaflow.prior.factory import NetworkKind, keypoint_network, make_prior
-from aquaflow.prior.keypoint_networks.keypoint_prior import KeypointPrior
+from aquaflow.prior.fields import pixel_grid
+from aquaflow.prior.hybrid import HybridEncoding
+from aquaflow.prior.keypoint_networks.keypoint_prior import KeypointEncoding, KeypointPrior
+from aquaflow.prior.keypoint_networks.network import KeypointNetwork, Size, warm_up
+from aquaflow.types import Frame
 
 Progress = Callable[[str, int, int], None]
 
@@ -148,3 +157,125 @@ def _median(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None and not math.isnan(value)]
     middle = float(np.median(known)) if known else math.inf
     return round(middle, 3) if math.isfinite(middle) else None
+
+
+# --------------------------------------------------------------------------------------------------
+# Pairs of a real clip whose poses are known, at several distances in time.
+#
+# Of such a pair only the epipolar line of a match is known, not the place on it.
+
+TRUTH, CALIBRATION = "poses_sfm.tum", "camera.yaml"
+"""Files of a clip's folder that are needed."""
+SPACINGS = (1, 4, 8, 16)
+"""Between the two pictures, in poses of the truth."""
+
+
+def clip_pairs(folder: Path, count: int) -> list[KnownPair]:
+    """Up to ``count`` pairs of each spacing, evenly over the clip.
+
+    Raises:
+        InputError: the folder holds no clip, no calibration or no poses.
+    """
+    scene = scene_of_clip(folder) if folder.is_dir() else None
+    missing = [name for name in (TRUTH, CALIBRATION) if not (folder / name).is_file()]
+    if scene is None or missing:
+        lacking = " and ".join(missing) or "video or pictures"
+        raise InputError(f"{folder} has no {lacking}; give the folder of a clip with its poses")
+    config = parse_config(merged(Config().model_dump(), scene.overrides), str(folder))
+    frames, truth = prepared_frames(scene, config).frames, read_tum(folder / TRUTH)
+    ours, theirs = associate(
+        np.array([frame.t_ns * 1e-9 for frame in frames]), truth.t_s, ASSOCIATION_TOLERANCE_S
+    )
+    known = [
+        (frames[i], Sim3(truth.R_wc[j], truth.positions[j]))
+        for i, j in zip(ours, theirs, strict=True)
+    ]
+    return [pair for n in SPACINGS for pair in _spaced(folder.name, known, n, count)]
+
+
+def _spaced(
+    name: str, known: Sequence[tuple[Frame, Sim3]], spacing: int, count: int
+) -> list[KnownPair]:
+    both = list(zip(known, known[spacing:], strict=False))
+    if not both:
+        return []
+    apart_s = float(np.median([b.t_ns - a.t_ns for (a, _), (b, _) in both])) * 1e-9
+    chosen = np.unique(np.linspace(0, len(both) - 1, min(count, len(both))).round().astype(int))
+    return [
+        KnownPair(
+            f"{name}, {apart_s:.2f} s", a.image, b.image, a.camera, b.camera,
+            T_ba=T_wb.inverse() @ T_wa,
+        )
+        for (a, T_wa), (b, T_wb) in (both[i] for i in chosen)
+    ]  # fmt: skip
+
+
+# --------------------------------------------------------------------------------------------------
+# The methods that are compared: priors, dense, and keypoint networks alone, sparse.
+
+
+class Method(Protocol):
+    """What is done once for a picture, and what for a pair."""
+
+    name: str
+
+    def describe(
+        self,
+        picture: Picture,  # [H, W, 3] RGB
+        camera: CameraModel,
+    ) -> Any:
+        """What :meth:`match` needs of a picture."""
+        ...
+
+    def match(self, a: Any, b: Any) -> FoundMatches:
+        """Nothing about the motion is expected."""
+        ...
+
+
+class DenseMethod:
+    """A prior's flow: a match for every pixel that survives its own check."""
+
+    def __init__(self, name: str, prior: Prior) -> None:
+        self.name, self._prior = name, prior
+        prior.warm_up()
+
+    def describe(
+        self,
+        picture: Picture,  # [H, W, 3] RGB
+        camera: CameraModel,
+    ) -> Any:
+        """The encoding; a network's features, which may wait until they are needed, are in it."""
+        encoding = self._prior.encode(picture, camera)
+        if isinstance(encoding, (HybridEncoding, KeypointEncoding)):
+            _ = encoding.features
+        return encoding
+
+    def match(self, a: Any, b: Any) -> FoundMatches:
+        """Valid matches, and where texture is."""
+        pair = self._prior.decode(a, b)
+        valid = pair.valid
+        here = pixel_grid(*valid.shape)[valid]
+        return FoundMatches(here, pair.matches[valid], a.interesting)
+
+
+class SparseMethod:
+    """A keypoint network's own matches; there is no flow."""
+
+    def __init__(self, name: str, network: KeypointNetwork) -> None:
+        self.name, self._network = name, network
+        warm_up(network)
+
+    def describe(
+        self,
+        picture: Picture,  # [H, W, 3] RGB
+        camera: CameraModel,
+    ) -> tuple[Keypoints, Size]:
+        """Keypoints, and the picture's height and width."""
+        del camera  # a network's keypoints need none
+        return self._network.detect(picture), (picture.shape[0], picture.shape[1])
+
+    def match(self, a: Any, b: Any) -> FoundMatches:
+        """Keypoints that show the same thing."""
+        (keypoints_a, size_a), (keypoints_b, size_b) = a, b
+        in_a, in_b = self._network.match(keypoints_a, keypoints_b, size_a, size_b)
+        return FoundMatches(keypoints_a.pixels[in_a], keypoints_b.pixels[in_b])

@@ -7,17 +7,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import Tensor
 
 from aquaflow.base.errors import InputError
-from aquaflow.lab.training.correspondences import overlap
-from aquaflow.lab.training.datasets.fitting import view_of
+from aquaflow.lab.training.correspondences import nearest_pixels, overlap, project
 from aquaflow.lab.training.datasets.posed import Posed
 from aquaflow.lab.training.datasets.posed import Sequence as Scene
-from aquaflow.lab.training.datasets.validity import moved
-from aquaflow.lab.training.pairs import Pair, ViewBatch
+from aquaflow.lab.training.pairs import Pair, ViewBatch, seen_from
 
 LEAST_OVERLAP = 0.3
 """Of the valid pixels, seen by both (paper, Sec. 3.1)."""
@@ -165,3 +165,101 @@ def _without(
 def _batch(views: Sequence[ViewBatch]) -> ViewBatch:
     names = ("image", "depth", "K", "T_wc", "valid")
     return ViewBatch(*(torch.cat([getattr(view, name) for view in views]) for name in names))
+
+
+# --------------------------------------------------------------------------------------------------
+# Posed pictures made views of the size that a network takes.
+
+
+def view_of(
+    posed: Posed,
+    width: int,
+    height: int,
+    T_rw: npt.NDArray[np.floating] | None = None,  # [4, 4] world to reference
+) -> ViewBatch:
+    """[1, ...] the picture's middle, as large as fits; poses are of the camera to ``r``.
+
+    Depth is never averaged: between near and far there is nothing.
+    """
+    old_height, old_width = posed.depth.shape
+    scale = max(width / old_width, height / old_height)
+    size = (max(width, round(scale * old_width)), max(height, round(scale * old_height)))
+    way = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR
+    left, top = (size[0] - width) // 2, (size[1] - height) // 2
+    window = (slice(top, top + height), slice(left, left + width))
+    image = cv2.resize(posed.image, size, interpolation=way)[window]
+    depth = cv2.resize(posed.depth, size, interpolation=cv2.INTER_NEAREST)[window]
+    valid = cv2.resize(valid_pixels(posed).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)[
+        window
+    ]
+    K = np.diag([size[0] / old_width, size[1] / old_height, 1.0]) @ posed.K
+    K[:2, 2] -= (left, top)
+    T = posed.T_wc if T_rw is None else T_rw @ posed.T_wc
+    # Unknown depths are 1: what is not a number would be one in every sum, masked or not.
+    known = valid.astype(bool)
+    return ViewBatch(
+        torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))[None]).float() / 255.0,
+        torch.from_numpy(np.where(known, depth, 1.0)[None]).float(),
+        torch.from_numpy(K[None]).float(),
+        torch.from_numpy(np.ascontiguousarray(T)[None]).float(),
+        torch.from_numpy(known[None]),
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# Which pixels teach: not the moving, the mirroring, the veiled, or those of unknown depth.
+#
+# Paper, Sec. 3.1: "joint geometric and semantic masking to remove dynamic objects, invalid depth
+# regions, specular highlights, and scattering artifacts". What moved is found from geometry here: a
+# point of one view in front of what the other view sees there was not there any more.
+
+Mask = npt.NDArray[np.bool_]
+
+NEAR_M, FAR_M = 0.1, 80.0
+"""Depths beyond are the simulator's sky, and no camera in water sees there."""
+HIGHLIGHT = 250
+"""Grey level that all three channels reach in a mirrored lamp or sun."""
+HIGHLIGHT_BORDER_PX = 2
+"""Around a highlight, its glare."""
+CONTRAST_WINDOW_PX = 15
+"""Edge of the window that the contrast is measured in."""
+VEILED = 0.7
+"""Grey levels of contrast: rounding alone makes 0.3, and where no more is left only the veil is
+seen."""
+THROUGH = 0.1
+"""Share of its depth by which a point lies in front of what the other view sees in its place."""
+
+
+def valid_pixels(posed: Posed) -> Mask:
+    """[H, W] of one picture alone: depth is known, no highlight, not lost in the veil."""
+    known = np.isfinite(posed.depth) & (posed.depth > NEAR_M) & (posed.depth < FAR_M)
+    return known & ~_highlights(posed.image) & ~_veiled(posed.image)
+
+
+def moved(a: ViewBatch, b: ViewBatch) -> Tensor:
+    """[B, H, W] bool: a's point would hide what b sees there, so it was elsewhere by then."""
+    points = seen_from(b.T_wc, a.points(), a.T_wc)
+    pixels, inside = project(points, b)
+    rows, columns = nearest_pixels(pixels, b)
+    batch = torch.arange(len(rows), device=rows.device)[:, None, None]
+    seen = b.depth[batch, rows, columns]
+    known = inside & a.valid & b.valid[batch, rows, columns]
+    return known & (seen > (1.0 + THROUGH) * points[..., 2])
+
+
+def _highlights(
+    image: npt.NDArray[np.uint8],  # [H, W, 3]
+) -> Mask:
+    bright = (image.min(axis=2) >= HIGHLIGHT).astype(np.uint8)
+    side = 2 * HIGHLIGHT_BORDER_PX + 1
+    return np.asarray(cv2.dilate(bright, np.ones((side, side), np.uint8)) > 0)
+
+
+def _veiled(
+    image: npt.NDArray[np.uint8],  # [H, W, 3]
+) -> Mask:
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float64)
+    size = (CONTRAST_WINDOW_PX, CONTRAST_WINDOW_PX)
+    mean = cv2.blur(grey, size)
+    variance = np.maximum(cv2.blur(grey * grey, size) - mean * mean, 0.0)
+    return np.asarray(np.sqrt(variance) < VEILED)

@@ -9,18 +9,19 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from aquaflow import __version__
 from aquaflow.base.clocks.device import Learned
 from aquaflow.base.errors import InputError
 from aquaflow.dive.run import DiveRun
-from aquaflow.geometry.arrays import Arrays, prefixed, under
+from aquaflow.geometry.arrays import Arrays, of_sim3, prefixed, to_sim3, under
 from aquaflow.live.checkpoint import tracking
-from aquaflow.live.checkpoint.corrections import catch_up, serialise_corrections
 from aquaflow.live.checkpoint.generations import (
     FORMAT,
     Checkpoint,
@@ -30,7 +31,7 @@ from aquaflow.live.checkpoint.generations import (
 )
 from aquaflow.live.map_thread import MapCorrection, MapThread
 from aquaflow.live.moment import Moment
-from aquaflow.mapping.work import OwnedMaps
+from aquaflow.mapping.work import MapWork, OwnedMaps
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
 from aquaflow.slam import Slam
 from aquaflow.tracking.graph.keyframe_graph import LOOP_SEARCH
@@ -154,3 +155,32 @@ def restore(checkpoint: Checkpoint, slam: Slam, run: DiveRun, maps: OwnedMaps) -
         catch_up(maps, facts["mapping"]["lacking"], under("mapping", arrays))
     except (KeyError, ValueError, TypeError, IndexError, RuntimeError, InputError) as error:
         raise UnusableStateError(f"{checkpoint.file} cannot be used: {error}") from error
+
+
+# --------------------------------------------------------------------------------------------------
+# Corrections that the maps of a checkpoint do not contain yet.
+
+
+def serialise_corrections(lacking: Sequence[MapCorrection]) -> tuple[list[dict[str, Any]], Arrays]:
+    """Corrections that the maps do not contain yet: facts for JSON, and arrays."""
+    facts: list[dict[str, Any]] = []
+    arrays: Arrays = {}
+    for i, correction in enumerate(lacking):
+        merged = {str(source): target for source, target in correction.merged.items()}
+        facts.append({"merged": merged})
+        arrays[f"lacking{i}.keyframes"] = np.array(list(correction.moves), np.int64)
+        arrays[f"lacking{i}.moves"] = of_sim3(list(correction.moves.values()))
+    return facts, arrays
+
+
+def catch_up(
+    maps: MapWork,
+    lacking: list[dict[str, Any]],
+    arrays: Arrays,  # as from serialise_corrections
+) -> None:
+    """Apply the corrections of :func:`serialise_corrections` to the maps."""
+    for i, facts in enumerate(lacking):
+        numbers, moves = arrays[f"lacking{i}.keyframes"], arrays[f"lacking{i}.moves"]
+        by_keyframe = {int(n): to_sim3(row) for n, row in zip(numbers, moves, strict=True)}
+        merged = {int(source): int(target) for source, target in facts["merged"].items()}
+        maps.correct(by_keyframe, merged)

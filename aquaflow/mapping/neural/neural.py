@@ -9,6 +9,7 @@ attributes if they are not frozen, take theirs at every view.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -17,12 +18,12 @@ from aquaflow.config.mapping import DecoderConfig
 from aquaflow.mapping.gaussians.gaussians import GaussianMap
 from aquaflow.mapping.neural.decode import DECODED, in_picture, without_residuals
 from aquaflow.mapping.neural.decoder import Decoder, Trunk
-from aquaflow.mapping.neural.feature_optimisers import FeatureOptimisers
 from aquaflow.mapping.neural.neural_field import NeuralField, camera_centre
 from aquaflow.mapping.neural.observation import observation
-from aquaflow.mapping.neural.regrouping import is_whole, regrouped, resized
-from aquaflow.mapping.neural.voxel_groups import VoxelGroups
-from aquaflow.mapping.neural.window import Window
+from aquaflow.mapping.neural.voxel_groups import EMPTY, VoxelGroups
+from aquaflow.render.adam import SelectiveAdam
+from aquaflow.render.dense_adam import DenseAdam
+from aquaflow.render.transfers import groups_out
 from aquaflow.render.views import View
 
 OTHER_SIZE = 0.1
@@ -245,3 +246,193 @@ class NeuralGaussians:
         if len(optimisers.local.steps) != count:
             optimisers.renew_local()
         optimisers.bind()
+
+
+# --------------------------------------------------------------------------------------------------
+# Voxel groups made anew: after a failure that left their tables half changed, or in voxels of
+# another size.
+
+
+def is_whole(
+    groups: VoxelGroups,
+    count: int,  # N Gaussians in the map
+) -> bool:
+    """True if every Gaussian has one place in one group, and all tables agree."""
+    group, slot, table = groups.group, groups.slot, groups.table
+    if len(group) != count or len(slot) != count:
+        return False
+    if not len(groups) == len(table) == len(groups.voxel) == len(groups.features):
+        return False
+    inside = (group >= 0) & (group < len(groups)) & (slot >= 0) & (slot < table.shape[1])
+    rows = torch.arange(count, device=groups.device)
+    if not bool(inside.all()) or not torch.equal(table[group, slot], rows):
+        return False
+    taken = (table != EMPTY).sum(1)
+    numbers = torch.arange(len(groups), device=groups.device)
+    listed = torch.equal(torch.sort(groups.order()).values, numbers)
+    return listed and torch.equal(taken, groups.fill) and int(taken.sum()) == count
+
+
+def regrouped(
+    groups: VoxelGroups,
+    means: Tensor,  # [N, 3] of all Gaussians
+) -> VoxelGroups:
+    """All Gaussians placed anew; a voxel's first group keeps the feature known of that voxel."""
+    new = _placed(groups, means, groups.size)
+    known: dict[int, Tensor] = {}
+    for voxel, feature in zip(groups_out(groups.voxel), groups.features, strict=False):
+        known.setdefault(voxel, feature)
+    for group, voxel in enumerate(groups_out(new.voxel)):
+        feature = known.pop(voxel, None)
+        if feature is not None and bool(torch.isfinite(feature).all()):
+            new.features[group] = feature
+    return new
+
+
+def resized(
+    groups: VoxelGroups,
+    means: Tensor,  # [N, 3] of all Gaussians
+    size: float,
+) -> VoxelGroups:
+    """All Gaussians in voxels of ``size`` map units; a new group takes over the feature that its
+    first Gaussian's had."""
+    new = _placed(groups, means, size)
+    if len(new):
+        new.features.copy_(groups.features[groups.group[new.table[:, 0]]])
+    return new
+
+
+def _placed(
+    groups: VoxelGroups,
+    means: Tensor,  # [N, 3]
+    size: float,
+) -> VoxelGroups:
+    new = VoxelGroups(groups.config, groups.features.shape[1], groups.device)
+    new.size = size
+    new.insert(means)
+    return new
+
+
+# --------------------------------------------------------------------------------------------------
+# Adam of a neural field's features, row by row, and of its decoder's weights.
+
+
+class FeatureOptimisers:
+    """A row of state for each Gaussian and each group; rows come and go with them."""
+
+    def __init__(self, field: NeuralField, betas: tuple[float, float]) -> None:
+        self.field, self._betas = field, betas
+        self.local = self._new("local", field.local)
+        self.shared = self._new("shared", field.shared)
+        weights = {"params": field.decoder.parameters(), "lr": field.config.rate}
+        self.weights = DenseAdam([weights], betas)
+        self.skipped = 0
+        """Windows whose weights were not stepped, as a gradient was not finite."""
+
+    def _new(
+        self,
+        name: str,
+        features: Tensor,  # [N, F]
+    ) -> SelectiveAdam:
+        groups = {name: (features, self.field.config.feature_rate)}
+        return SelectiveAdam(groups, self._betas, threads=self.field.threads)
+
+    def step(self, window: Window) -> None:
+        """One step with the gradient of the window's views."""
+        assert window.local.grad is not None
+        assert window.shared.grad is not None
+        tokens, device = window.whole.tokens, self.field.device
+        rows = torch.zeros(len(window.local), dtype=torch.bool, device=device)
+        rows[tokens.rows] = True
+        groups = torch.zeros(len(window.shared), dtype=torch.bool, device=device)
+        groups[tokens.groups] = True
+        self.local.step(rows, {"local": window.local.grad})
+        self.shared.step(groups, {"shared": window.shared.grad})
+        gradients = [w.grad for w in self.field.decoder.parameters() if w.grad is not None]
+        finite = [torch.isfinite(gradient).all() for gradient in gradients]
+        if bool(torch.stack(finite).all()):
+            self.weights.step()
+        else:
+            self.skipped += 1
+        self.forget_gradients()
+
+    def forget_gradients(self) -> None:
+        """Drop what the weights were to learn."""
+        self.weights.forget_gradients()
+
+    def slow_down(self, factor: float) -> None:
+        """Set the learning rates to this share of the configured ones."""
+        config = self.field.config
+        self.local.learning_rates["local"] = factor * config.feature_rate
+        self.shared.learning_rates["shared"] = factor * config.feature_rate
+        self.weights.rates[0] = factor * config.rate
+
+    def renew_shared(self) -> None:
+        """Begin at step 0 with the groups as they are."""
+        self.shared = self._new("shared", self.field.shared)
+
+    def renew_local(self) -> None:
+        """Begin at step 0 with the Gaussians as they are."""
+        self.local = self._new("local", self.field.local)
+
+    def bind(self) -> None:
+        """Use the field's features as they are now; new groups begin at step 0."""
+        self.shared.extend(len(self.field.groups) - len(self.shared.steps))
+        self.shared.bind({"shared": self.field.shared})
+        self.local.bind({"local": self.field.local})
+
+
+# --------------------------------------------------------------------------------------------------
+# A window of steps of the optimiser that share one trunk, each on its own view.
+#
+# The window's gradients meet in the trunk's output; when it ends they go through the trunk at once.
+
+
+@dataclass
+class Window:
+    """A trunk, and the views that still have to be decoded from it."""
+
+    whole: Trunk
+    """From features and weights on."""
+    hidden: Tensor
+    """[P, d] its output as a leaf; gathers the gradient of the window's views."""
+    local: Tensor
+    """[N, F_l] leaf."""
+    shared: Tensor
+    """[G, F_g] leaf."""
+    views: list[tuple[View, Tensor]]
+    """Each with the Gaussians [N] bool that it shows."""
+
+    @staticmethod
+    def opened(field: NeuralField, views: Sequence[View]) -> Window:
+        """The window of ``views``; if the trunk takes an observation, it is the first one's."""
+        means = field.gaussians.means
+        seen = [in_picture(means, each, each.viewmat()) for each in views]
+        local = field.local.detach().requires_grad_()
+        shared = field.shared.detach().requires_grad_()
+        centre = camera_centre(views[0].viewmat())
+        trunk = field.trunk(field.context(seen), centre, (local, shared))
+        hidden = trunk.hidden.detach().requires_grad_()
+        return Window(trunk, hidden, local, shared, list(zip(views, seen, strict=True)))
+
+    def has(self, view: View) -> bool:
+        """True if ``view`` still has to be decoded."""
+        return any(each is view for each, _ in self.views)
+
+    def go_on_to(self, view: View) -> Tensor:
+        """[N] bool: what ``view`` shows; steps that were left out before it are passed over."""
+        while self.views[0][0] is not view:
+            self.views.pop(0)
+        return self.views.pop(0)[1]
+
+    @property
+    def trunk(self) -> Trunk:
+        """What a view is decoded from: its gradient ends in ``hidden``."""
+        return Trunk(self.whole.tokens, self.hidden, self.whole.sound)
+
+    def differentiate(self) -> bool:
+        """Let the gradient of ``hidden`` reach features and weights; False if there is none."""
+        if self.hidden.grad is None:
+            return False
+        torch.autograd.backward(self.whole.hidden, self.hidden.grad)
+        return True

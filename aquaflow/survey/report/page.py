@@ -9,7 +9,6 @@ from aquaflow.base.errors import printable_text
 from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.survey.report import measures, sections, survey_sections
 from aquaflow.survey.report.data import ReportData
-from aquaflow.survey.report.style import STYLE_SHEET
 
 
 def write_report(path: Path, data: ReportData) -> None:
@@ -70,3 +69,76 @@ def _lead(data: ReportData) -> str:
             f" On {held_out:,} frames that the mapper never saw, its pictures reach {psnr:.1f} dB."
         )
     return said
+
+
+# --------------------------------------------------------------------------------------------------
+# The report's style sheet: no web fonts, no images, light and dark.
+
+STYLE_SHEET = """
+:root {
+  color-scheme: light dark;
+  --paper: #f6f9fa; --card: #ffffff; --ink: #12262e; --soft: #56707a; --grid: #d5e0e4;
+  --accent: #0b7f95;
+  --keyframe: #0b7f95; --mapping: #4fb3c4; --common: #b5ccd2; --skipped: #e0d6b8;
+  --lost: #e8505b; --dropped: #8d3b72;
+}
+@media (prefers-color-scheme: dark) {
+  :root {
+    --paper: #0d171b; --card: #142127; --ink: #e3eef1; --soft: #92aab3; --grid: #2b3d45;
+    --accent: #4cc3d9;
+    --keyframe: #4cc3d9; --mapping: #2a8a9c; --common: #3b545d; --skipped: #6b6346;
+    --lost: #f0717b; --dropped: #b86a9e;
+  }
+}
+* { box-sizing: border-box; }
+body {
+  margin: 0; padding: 2.5rem 1.25rem 4rem; background: var(--paper); color: var(--ink);
+  font: 16px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "Noto Sans", sans-serif;
+}
+main { max-width: 62rem; margin: 0 auto; }
+h1 { font-size: 2rem; line-height: 1.2; margin: 0 0 .4rem; overflow-wrap: anywhere; }
+h2 { font-size: 1.2rem; margin: 0 0 .2rem; }
+.brand { color: var(--accent); font-weight: 600; margin: 0 0 .6rem; }
+.lead { font-size: 1.1rem; color: var(--soft); margin: 0 0 1.6rem; max-width: 46rem; }
+section { background: var(--card); border: 1px solid var(--grid); border-radius: 12px;
+  padding: 1.3rem 1.4rem 1.4rem; margin: 0 0 1.2rem; }
+section > p { color: var(--soft); margin: 0 0 1rem; max-width: 46rem; }
+section > p.after { margin: .8rem 0 0; }
+svg { width: 100%; height: auto; display: block; font-family: inherit; }
+.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(7.2rem, 1fr)); gap: .7rem;
+  margin: 0 0 1.2rem; padding: 0; }
+.tile { background: var(--card); border: 1px solid var(--grid); border-radius: 12px;
+  padding: .8rem .85rem; }
+.tile b { display: block; font-size: 1.3rem; font-weight: 650; line-height: 1.2;
+  font-variant-numeric: tabular-nums; }
+.tile span { color: var(--soft); font-size: .8rem; line-height: 1.35; display: block; }
+.strip { width: 100%; height: 34px; border-radius: 6px; overflow: hidden; }
+.key { display: flex; flex-wrap: wrap; gap: .3rem 1.2rem; margin: .7rem 0 0; padding: 0;
+  list-style: none; font-size: .9rem; color: var(--soft); }
+.key i { display: inline-block; width: .8em; height: .8em; border-radius: 3px;
+  margin-right: .45em; vertical-align: -.05em; }
+.views { display: grid; gap: .7rem; margin: 0 0 .4rem; }
+@media (min-width: 34rem) {
+  .of2, .of4 { grid-template-columns: 1fr 1fr; }
+  .of3 { grid-template-columns: 1fr 1fr 1fr; }
+}
+figure { margin: 0; }
+figcaption { font-size: .84rem; color: var(--soft); margin-top: .25rem; }
+.views img { width: 100%; border-radius: 8px; display: block; }
+.overview img { display: block; max-width: 100%; max-height: 30rem; margin: 0 auto; }
+.shot { margin: 1.1rem 0 .5rem; font-weight: 600; }
+.shot small { font-weight: 400; color: var(--soft); margin-left: .5em; }
+table { border-collapse: collapse; width: 100%; font-size: .92rem; }
+th { text-align: left; color: var(--soft); font-weight: 600; }
+td, th { padding: .34rem .7rem .34rem 0; border-bottom: 1px solid var(--grid);
+  vertical-align: top; overflow-wrap: anywhere; }
+tr:last-child td { border-bottom: 0; }
+.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+.bar { width: 34%; }
+.bar i { display: block; height: .75em; margin-top: .4em; border-radius: 3px;
+  background: var(--accent); min-width: 2px; }
+details summary { cursor: pointer; color: var(--accent); }
+footer { color: var(--soft); font-size: .86rem; margin-top: 1.6rem; }
+@media print { body { padding: 0; } section, .tile { break-inside: avoid; } }
+"""
+"""Colours of the frame classes are here, by the classes' names."""

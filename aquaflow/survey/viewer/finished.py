@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from aquaflow.base.errors import DamagedError, InputError, printable, reason_of
 from aquaflow.base.storage.dive_status import unfinished
@@ -18,11 +19,10 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.survey.viewer.dive_map import DiveMap, read_map
 from aquaflow.survey.viewer.dive_path import DivePath, read_path
 from aquaflow.survey.viewer.levels import Palette
-from aquaflow.survey.viewer.measuring import Asked, Frame
+from aquaflow.survey.viewer.measuring import Asked, Frame, vector
 from aquaflow.survey.viewer.packed_file import PackedFile, key_of, read_packed, write_packed
 from aquaflow.survey.viewer.page import ViewerPage
 from aquaflow.survey.viewer.pinned_notes import PinnedNotes
-from aquaflow.survey.viewer.scale_tool import Mark, marked
 from aquaflow.survey.viewer.seen_water import SeenWater, water_of
 from aquaflow.survey.viewer.splats import Splats
 from aquaflow.survey.viewer.tools import SCALE, Tools
@@ -200,3 +200,34 @@ def _water(dive: Dive) -> SeenWater | None:
     except (InputError, ValueError, AttributeError, DamagedError) as error:
         log.warning("the viewer shows no water: %s: %s", dive, reason_of(error))
         return None
+
+
+# --------------------------------------------------------------------------------------------------
+# The scale bar: two points of the map and the true length between them.
+
+Place: TypeAlias = tuple[float, float, float]
+Mark: TypeAlias = Callable[[tuple[Place, Place], float, float], tuple[str, bool]]
+"""Keeps a length between two points of the map: metres and 1 sigma of them. Returns sentences about
+it, and whether the dive's files were rescaled."""
+
+
+def marked(given: Asked, mark: Mark) -> Asked:
+    """What a browser is told of the scale bar that it asked for.
+
+    Raises:
+        InputError: it is none, or a file of the dive cannot be read or written.
+    """
+    places = given.get("places")
+    if not isinstance(places, list) or len(places) != 2:
+        raise InputError("a scale bar has two ends; mark both")
+    a, b = (vector(place, "an end of the scale bar") for place in places)
+    length, sigma = (_metres(given.get(name), name) for name in ("length_m", "sigma_m"))
+    words, rescaled = mark(((a[0], a[1], a[2]), (b[0], b[1], b[2])), length, sigma)
+    return {"words": words, "rescaled": rescaled}
+
+
+def _metres(given: Any, name: str) -> float:
+    if not isinstance(given, (int, float)) or not 0.0 < given < math.inf:
+        what = "length" if name == "length_m" else "1 sigma"
+        raise InputError(f"the {what} of the scale bar must be a positive number of metres")
+    return float(given)

@@ -2,29 +2,39 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.viewer import ViewerConfig
+from aquaflow.dive.path_rows import attitude_of
 from aquaflow.dive.views import LOOK_S, DiveView, RunningDive, Showing
+from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.work import OwnedMaps
 from aquaflow.sources.newest import Newest
 from aquaflow.survey.coverage.plan import CoveragePlan
 from aquaflow.survey.measure.scale import Scale
-from aquaflow.survey.viewer.copies import Pose, shown
-from aquaflow.survey.viewer.live_path import LivePath
+from aquaflow.survey.viewer.dive_coverage import CLASSES, COVERAGE
+from aquaflow.survey.viewer.exhibit import POSE_NUMBERS
+from aquaflow.survey.viewer.levels import RANGE, Palette, range_level, steps_level
 from aquaflow.survey.viewer.measuring import Frame
+from aquaflow.survey.viewer.moments import moments
 from aquaflow.survey.viewer.page import ViewerPage
+from aquaflow.survey.viewer.seen_water import SeenWater, seen_water
+from aquaflow.survey.viewer.splats import Splats, splats
 from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.tracking.frames import Tracked
+from aquaflow.types import CameraModel
 
 if TYPE_CHECKING:
-    from aquaflow.mapping.map_copy import MapCopy
+    from aquaflow.mapping.map_copy import MapCopy  # it loads torch
 
 
 class LiveViewer(DiveView):
@@ -138,3 +148,120 @@ def in_words(report: dict[str, Any]) -> str:
         f"{report['overtaken']} frames overtaken, {report['failures']} failed",
     ]
     return "\n\n".join(lines)
+
+
+# --------------------------------------------------------------------------------------------------
+# The path of a running dive, as the viewer shows it: poses with their moments.
+
+LONGEST_PATH = 5000
+"""Most poses of the path that are shown; a longer one is thinned."""
+OLD_S = 3.0
+"""A depth that was measured so long ago is not the pose's."""
+Rows = npt.NDArray[np.float32]
+
+
+class _Row(NamedTuple):
+    pose: tuple[float, ...]
+    frame: int
+    t_s: float
+    depth_m: float
+    heading_deg: float
+
+
+class LivePath:
+    """Tracking's thread adds poses; the viewer's thread says what the vehicle measures."""
+
+    def __init__(self) -> None:
+        self.began: datetime | None = None
+        """UTC of the first pose, once a source of telemetry stated the time."""
+        self._rows: list[_Row] = []
+        self._depth_m = math.nan
+
+    def add(self, tracked: Tracked, frame: MetricFrame) -> None:
+        """A posed frame, in the metric ``frame`` of its sub-map as it is known by now."""
+        T_wc = tracked.T_wc
+        assert T_wc is not None
+        pose = (*T_wc.t.tolist(), *T_wc.quaternion.tolist(), tracked.quality.inlier_share)
+        heading, _, _ = attitude_of(frame, frame.pose(T_wc))
+        turned = math.nan if heading is None else heading
+        at = tracked.frame
+        self._rows.append(_Row(pose, at.index, 1e-9 * at.t_ns, self._depth_m, turned))
+        if len(self._rows) > LONGEST_PATH:
+            self._rows = self._rows[::2]
+
+    def hear(self, telemetry: dict[str, dict[str, dict[str, Any]]]) -> None:
+        """The newest values by source and kind, as /health has them."""
+        kinds = {kind: said for each in telemetry.values() for kind, said in each.items()}
+        depth, utc = kinds.get("depth"), kinds.get("utc_time")
+        known = depth is not None and depth["age_s"] <= OLD_S
+        self._depth_m = float(depth["value"]) if known and depth is not None else math.nan
+        rows = self._rows
+        if utc is not None and self.began is None and rows:
+            now = datetime.fromisoformat(utc["value"].replace("Z", "+00:00"))
+            ago_s = rows[-1].t_s - rows[0].t_s - float(utc["age_s"])
+            self.began = now - timedelta(seconds=ago_s)
+
+    def rows(self, kept: Iterable[int]) -> tuple[Rows, Rows]:
+        """Poses [N, 8] and moments [N, 5]; ``kept``: frames whose picture is there."""
+        rows = self._rows
+        poses = np.array([row.pose for row in rows], np.float32).reshape(-1, POSE_NUMBERS)
+        t_s, depth, heading = np.array([row[2:] for row in rows], np.float64).reshape(-1, 3).T
+        index = np.array([row.frame for row in rows], np.int64)
+        return poses, moments(t_s, depth, heading, index, kept)
+
+
+# --------------------------------------------------------------------------------------------------
+# The live viewer's copy of a dive, made by threads that have no time for browsers.
+#
+# The loop and the mapping thread put new data into queues of one; a thread of the viewer takes it
+# from there, computes what a browser needs, and hands it to the server.
+
+SEEN = "seen"
+"""Name of the level that says how often a Gaussian was seen."""
+OFTEN = 200.0
+"""Steps of the optimiser after which a Gaussian counts as seen as often as can be."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where the camera is, and what it sees."""
+
+    T_wc: Sim3
+    camera: CameraModel
+    picture: npt.NDArray[np.uint8]
+    """[H, W, 3] RGB"""
+
+
+def shown(
+    copy: MapCopy, budget: int, frame: Frame | None = None, plan: CoveragePlan | None = None
+) -> tuple[Splats, SeenWater | None, dict[str, Palette]]:
+    """In the viewer's thread: what a browser gets, the water before it, and the palettes of what
+    each Gaussian is coloured by: how often it was seen, from how far away, and, by the ``plan`` of
+    its sub-map's coverage, how well."""
+    plain, water, unit = copy.parameters, _water(copy), frame or Frame.of(MetricFrame.unknown())
+    with np.errstate(over="ignore"):
+        opacities = (1.0 / (1.0 + np.exp(-plain["opacity_logits"][:, 0]))).astype(np.float32)
+        scales = np.exp(plain["log_scales"])
+    often, palette = steps_level(copy.steps, OFTEN)
+    chosen = splats(
+        plain["means"], plain["quats"], scales, opacities, copy.clear, budget, {SEEN: often}
+    )
+    cameras = np.array([T_wc.t for T_wc in copy.views])
+    ranges, range_palette = range_level(chosen.centres, cameras, unit.scale.unit, unit.metres)
+    levels, palettes = chosen.levels | {RANGE: ranges}, {SEEN: palette, RANGE: range_palette}
+    if plan is not None:
+        levels[COVERAGE] = plan.classes_of(chosen.centres.astype(np.float64))
+        palettes[COVERAGE] = CLASSES
+    return replace(chosen, levels=levels), water, palettes
+
+
+def _water(copy: MapCopy) -> SeenWater | None:
+    """None where there is none, or none that can be shown yet."""
+    if copy.water is None or not len(copy.parameters["means"]):
+        return None
+    away = np.linalg.norm(copy.parameters["means"] - copy.views[-1].t, axis=1)
+    try:
+        beta, B_inf, b, B_res, d, gain = copy.water
+        return seen_water(beta, B_inf, b, B_res, d, gain, float(np.median(away)))
+    except ValueError:
+        return None

@@ -17,15 +17,17 @@ import numpy as np
 from aquaflow.base.errors import InputError
 from aquaflow.config.tracking import AdjustmentConfig
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes import Keyframe, KeyframeStore
-from aquaflow.prior.flow_pair import FlowEncoding
+from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
+from aquaflow.prior.candidates import best_flow, from_prediction
+from aquaflow.prior.contract import Encoding
+from aquaflow.prior.flow import FlowMatcher
+from aquaflow.prior.flow_pair import FlowEncoding, FlowPair
 from aquaflow.tracking.adjustment.anchored_points import (
     AnchoredPoints,
     sampled_points,
     see_each_other,
 )
 from aquaflow.tracking.adjustment.joint import adjust
-from aquaflow.tracking.adjustment.matching import KeyframePairs, KeyframeView
 from aquaflow.tracking.adjustment.window import (
     MeasuredLink,
     copied,
@@ -37,6 +39,7 @@ from aquaflow.tracking.frames import Link
 from aquaflow.tracking.graph.improvement import Improvement
 from aquaflow.tracking.graph.pose_graph import Edge
 from aquaflow.tracking.graph.table import Snapshot
+from aquaflow.tracking.pose.expected_matches import expected_matches
 
 Adjust = Callable[[Snapshot], Improvement]
 """A job for any thread."""
@@ -229,3 +232,34 @@ class Adjuster:
         self.tally.kept += int(outcome.kept)
         self.tally.refused += int(not outcome.kept)
         self.tally.cpu_ms.append(outcome.cpu_ms)
+
+
+# --------------------------------------------------------------------------------------------------
+# Matches between keyframes that the graph's thread makes: dense flow from where poses lead.
+
+
+@dataclass(frozen=True)
+class KeyframeView:
+    """What matching needs of a keyframe; nothing of it changes later."""
+
+    number: int
+    encoding: Encoding
+    pointmap: Pointmap
+
+
+class KeyframePairs:
+    """Matches pairs of keyframes; for one thread, because OpenCV's flow keeps a state."""
+
+    def __init__(self) -> None:
+        self._matcher = FlowMatcher()
+
+    def match(self, a: KeyframeView, b: KeyframeView, T_ba: Sim3) -> FlowPair | None:
+        """The pair's matches, looked for where ``T_ba`` leads to and nowhere else; None for
+        pictures that were not made ready for flow."""
+        first, second = a.encoding, b.encoding
+        if not (isinstance(first, FlowEncoding) and isinstance(second, FlowEncoding)):
+            return None
+        expected = expected_matches(a.pointmap, T_ba, b.pointmap.camera)
+        return FlowPair(
+            first, second, best_flow(self._matcher, first, second, from_prediction(expected))
+        )

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from aquaflow.lab.batch.examine import Examiner
+from aquaflow.lab.batch.batch import Examiner
 from tests.lab.batch.seasons import (  # fmt: skip
     SHORT,
     contents,

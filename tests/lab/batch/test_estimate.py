@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from aquaflow.config import Config
-from aquaflow.lab.batch.estimate import Examined, memory_mb
-from aquaflow.lab.batch.machine import SHARE_OF_FREE, memory_for_dives_mb
+from aquaflow.lab.batch.batch import SHARE_OF_FREE, Examined, memory_for_dives_mb, memory_mb
 
 
 def config(

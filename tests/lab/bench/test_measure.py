@@ -10,11 +10,11 @@ import numpy as np
 from aquaflow.base.profiler import pace
 from aquaflow.base.storage.atomic import write_yaml
 from aquaflow.config import Config
-from aquaflow.lab.bench.measure import COLOURS, RESTORED, depth_error, measured
 from aquaflow.lab.bench.runner import KEYS
 from aquaflow.lab.bench.scene import BenchmarkScene
 from aquaflow.lab.bench.summary import COLUMNS, attenuation_error_pct
 from aquaflow.lab.bench.table import markdown
+from aquaflow.lab.bench.worker import COLOURS, RESTORED, depth_error, measured
 from aquaflow.render.image_metrics import PSNR_LIMIT_DB
 
 RUN = {"scene": "a", "preset": "fast", "peer": None, "repeat": 0, "failed": None}

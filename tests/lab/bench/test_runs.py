@@ -14,7 +14,7 @@ from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.lab.bench import ablation
 from aquaflow.lab.bench.benchmark import benchmark, contenders_of, scenes_of
 from aquaflow.lab.bench.job import Job
-from aquaflow.lab.bench.pareto import pareto_front
+from aquaflow.lab.bench.picture import pareto_front
 from aquaflow.lab.bench.readme import BEGIN, END, section, write_readme
 from aquaflow.lab.bench.runner import KEYS, Contender, in_process, jobs_for
 from aquaflow.lab.bench.scene import BenchmarkScene, scene_at

@@ -15,11 +15,18 @@ from torch import Tensor
 from typer.testing import CliRunner
 
 from aquaflow import cli
-from aquaflow.lab.training import compact, compact_figures, compact_run, held_out
+from aquaflow.lab.training import compact, compact_run, held_out
+from aquaflow.lab.training import compact_run as compact_figures
 from aquaflow.lab.training.compact import CompactSettings
-from aquaflow.lab.training.compact_figures import LEAST_FACTOR, with_honest_range
 from aquaflow.lab.training.compact_recall import tracked_recall
-from aquaflow.lab.training.compact_run import CompactRun, calibration, hardware_of, training_record
+from aquaflow.lab.training.compact_run import (
+    LEAST_FACTOR,
+    CompactRun,
+    calibration,
+    hardware_of,
+    training_record,
+    with_honest_range,
+)
 from aquaflow.lab.training.correspondences import overlap
 from aquaflow.lab.training.held_out import SETS, held_out_pairs, turned_pictures
 from aquaflow.lab.training.pair_generator.cameras import TRAINING, Motion

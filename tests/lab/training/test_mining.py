@@ -13,11 +13,17 @@ import torch
 from aquaflow.base.errors import InputError
 from aquaflow.lab.training import mining
 from aquaflow.lab.training.correspondences import overlap
-from aquaflow.lab.training.datasets.fitting import view_of
 from aquaflow.lab.training.datasets.posed import Frames, Posed
 from aquaflow.lab.training.datasets.tartanair import tartanair
-from aquaflow.lab.training.datasets.validity import moved, valid_pixels
-from aquaflow.lab.training.mining import MinedPairs, load_index, mine, save_index
+from aquaflow.lab.training.mining import (
+    MinedPairs,
+    load_index,
+    mine,
+    moved,
+    save_index,
+    valid_pixels,
+    view_of,
+)
 from aquaflow.lab.training.pairs import true_pointmaps
 from tests.lab.training.data_trees import FOCAL, STEP_M, WIDTH, depth_at, write_tartanair
 

@@ -12,8 +12,7 @@ import pytest
 from aquaflow.base.storage.dive_status import DiveState
 from aquaflow.base.storage.folder_lock import FolderLock
 from aquaflow.config.service import CheckpointConfig
-from aquaflow.live.checkpoint.age import age_of
-from aquaflow.live.checkpoint.resume import Choice, choose
+from aquaflow.live.checkpoint.resume import Choice, age_of, choose
 from aquaflow.live.moment import Moment
 from tests.live.unfinished_dives import YESTERDAY, H, unfinished
 

@@ -22,7 +22,7 @@ from aquaflow.lab.evaluation.trajectory import read_tum
 from aquaflow.live.checkpoint.generations import read_state, state_file
 from aquaflow.live.checkpoint.resume import choose, is_begun, resumed
 from aquaflow.live.dive_clock import Continued
-from aquaflow.live.health.prometheus import exposition
+from aquaflow.live.health.http import exposition
 from aquaflow.live.live_dive import LiveDive
 from aquaflow.live.moment import Moment
 from aquaflow.live.report import report

@@ -6,7 +6,7 @@ import re
 
 from prometheus_client.parser import text_string_to_metric_families
 
-from aquaflow.live.health.prometheus import exposition
+from aquaflow.live.health.http import exposition
 from aquaflow.live.health.state import State
 from tests.live.health.reports import REPORT
 

@@ -17,7 +17,7 @@ from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.geometry.similarity import Sim3, so3_log
 from aquaflow.live.checkpoint.resume import Choice
 from aquaflow.live.dive_clock import Continued
-from aquaflow.live.health.prometheus import exposition
+from aquaflow.live.health.http import exposition
 from aquaflow.live.live_dive import LiveDive
 from aquaflow.live.onboard import map_live
 from aquaflow.live.report import report

@@ -13,8 +13,7 @@ import pytest
 
 from aquaflow.config.telemetry import parse_telemetry
 from aquaflow.drivers.protocol.mavlink import MavlinkDecoder
-from aquaflow.drivers.protocol.mavlink_outbound import ARDUPILOT
-from aquaflow.drivers.protocol.mavlink_text import MOST_CHUNKS
+from aquaflow.drivers.protocol.mavlink_outbound import ARDUPILOT, MOST_CHUNKS
 from aquaflow.geometry.similarity import so3_exp
 from aquaflow.live.vehicle.pilot_messages import PilotMessages
 from aquaflow.sources.outbound import (

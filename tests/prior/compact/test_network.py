@@ -8,7 +8,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from aquaflow.prior.compact.blocks import locally_normalised
 from aquaflow.prior.compact.matching import coarse_at, fine_around
 from aquaflow.prior.compact.network import (
     COARSE,
@@ -16,6 +15,7 @@ from aquaflow.prior.compact.network import (
     CompactPrior,
     NetworkSize,
     cell_rays,
+    locally_normalised,
 )
 
 pytestmark = pytest.mark.usefixtures("one_thread")

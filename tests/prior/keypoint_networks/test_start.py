@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.prior.fields import pixel_grid
-from aquaflow.prior.keypoint_networks.start import flow_from_matches
+from aquaflow.prior.keypoint_networks.keypoint_prior import flow_from_matches
 
 WIDTH, HEIGHT = 240, 180
 TURN = np.array([[0.97, -0.17, 40.0], [0.17, 0.97, -12.0], [2e-4, 1e-4, 1.0]])

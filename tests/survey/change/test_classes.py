@@ -9,7 +9,6 @@ import pytest
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.change.change_raster import bands_of, grid_of
-from aquaflow.survey.change.change_table import COLUMNS, csv_of, row_of
 from aquaflow.survey.change.comparison import (
     BLEACHED,
     GAINED,
@@ -19,6 +18,7 @@ from aquaflow.survey.change.comparison import (
     NOT_SEEN,
     UNCHANGED,
 )
+from aquaflow.survey.change.find_changes import COLUMNS, csv_of, row_of
 from aquaflow.survey.change.patches import NAMES
 from aquaflow.survey.export.ortho.ground import Ground
 from tests.survey.change.sites import HALF, RESOLUTION, TALL, changes, day, views_of

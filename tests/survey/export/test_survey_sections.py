@@ -28,7 +28,7 @@ from aquaflow.survey.report import (
     survey_sections,
 )
 from aquaflow.survey.report.pdf import write_pdf
-from aquaflow.survey.report.survey_data import MOST_REASONS, left_out, profile
+from aquaflow.survey.report.report_of import MOST_REASONS, left_out, profile
 from aquaflow.telemetry.metric_frame import MetricFrame
 from tests.survey.coverage.surveys import lawnmower, metric, survey_of
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from aquaflow.survey.measure.path import way
+from aquaflow.survey.measure.reef_numbers import visibility
 from aquaflow.survey.measure.scale import Scale
-from aquaflow.survey.measure.visibility import visibility
 
 METRES = Scale("m", 0.01, 0.0)
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.survey.video.smooth_path import smooth_path
+from aquaflow.survey.video.fly_through import smooth_path
 
 
 def poses(jitter: float, count: int = 60) -> list[Sim3]:

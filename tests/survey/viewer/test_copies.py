@@ -9,8 +9,8 @@ import numpy as np
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.map_copy import MapCopy
-from aquaflow.survey.viewer.copies import shown
 from aquaflow.survey.viewer.dive_coverage import CLASSES, COVERAGE
+from aquaflow.survey.viewer.live_viewer import shown
 
 
 def copied(count: int) -> MapCopy:

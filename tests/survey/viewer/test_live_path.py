@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.survey.viewer.live_path import LONGEST_PATH, LivePath
+from aquaflow.survey.viewer.live_viewer import LONGEST_PATH, LivePath
 from aquaflow.telemetry.metric_frame import MetricFrame
 from tests.metric_scenes import metric_frame
 

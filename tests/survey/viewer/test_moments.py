@@ -10,7 +10,7 @@ import numpy as np
 
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.trajectory_csv import NAME, read_trajectory_csv, write_trajectory_csv
-from aquaflow.survey.viewer.dive_moments import moments_of_dive, pictures_of_dive
+from aquaflow.survey.viewer.dive_path import moments_of_dive, pictures_of_dive
 from aquaflow.survey.viewer.moments import moments
 
 T_S = np.array([10.0, 10.5, 11.0, 11.5])

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from aquaflow.config import Config, parse_config
-from aquaflow.dive.places_of_dive import write_places_of
+from aquaflow.dive.deliverables import write_places_of
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.slam import Slam
 from aquaflow.types import Frame

@@ -10,7 +10,7 @@ import pytest
 from aquaflow.config import TrackingConfig
 from aquaflow.config.tracking import LearnedConfig
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.tracking.initialisation.learned_start import learned_start
+from aquaflow.tracking.map_start import learned_start
 from tests.tracking.tracked_clips import PLACED, SMALL, error_share, plane_depth, run
 from tests.tracking.tracking_scenes import KnownPair, KnownPrior, KnownView, pose
 

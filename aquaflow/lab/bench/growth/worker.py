@@ -6,22 +6,30 @@ output is the row as JSON.
 
 from __future__ import annotations
 
+import json
 import time
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.request import urlopen
+
+import numpy as np
 
 from aquaflow.base.profiler import Profiler
 from aquaflow.base.stages import Stages
+from aquaflow.base.storage.facts_file import write_facts_file
+from aquaflow.config.viewer import ViewerConfig
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.replay import fix_threads
 from aquaflow.dive.run import DiveRun
+from aquaflow.dive.views import open_finished
+from aquaflow.geometry.arrays import Arrays, of_sim3, prefixed
 from aquaflow.lab.bench.answer import answer
 from aquaflow.lab.bench.growth.job import THREADS, GrowthJob
-from aquaflow.lab.bench.growth.stages import TenthsMeter
-from aquaflow.lab.bench.growth.stored import checkpoint_bytes, folder_bytes
-from aquaflow.lab.bench.growth.viewer_start import viewer_start
 from aquaflow.lab.bench.memory import peak_memory_mb, resident_mb
 from aquaflow.lab.synthetic.survey import Survey
+from aquaflow.mapping import state
 from aquaflow.slam import Slam
 
 
@@ -81,3 +89,138 @@ def _finished(run: DiveRun) -> dict[str, Any]:
 
 if __name__ == "__main__":
     answer(GrowthJob.from_text, perform)
+
+
+# --------------------------------------------------------------------------------------------------
+# How long a browser waits for a finished dive: from the command to the page and to the map.
+
+PATIENCE_S = 60.0
+"""After which a viewer that does not answer has failed."""
+
+
+def viewer_start(dive: Path) -> dict[str, float]:
+    """Open the finished ``dive`` as a browser does: seconds on the wall until the first request is
+    answered with the page, ``page_s``, and until the map's Gaussians have come, ``map_s``.
+
+    Raises:
+        InputError: the dive lacks a file.
+        OSError: the viewer does not answer.
+    """
+    began = time.perf_counter()
+    page = open_finished(dive, ViewerConfig(port=0))
+    try:
+        _get(page.address)
+        page_s = time.perf_counter() - began
+        about = json.loads(_get(f"{page.address}scene.json"))["map"]
+        for number in range(len(about["ends"])):
+            _get(f"{page.address}map/{about['version']}/{number}")
+        return {"page_s": round(page_s, 3), "map_s": round(time.perf_counter() - began, 3)}
+    finally:
+        page.close()
+
+
+def _get(address: str) -> bytes:
+    with urlopen(address, timeout=PATIENCE_S) as answer:
+        return bytes(answer.read())
+
+
+# --------------------------------------------------------------------------------------------------
+# Bytes that a dive takes on the disk.
+
+
+def folder_bytes(folder: Path) -> int:
+    """Of all files in ``folder`` and below."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def checkpoint_bytes(slam: Slam, scratch: Path) -> int:
+    """Of what a live dive's checkpoint would hold now; written to the file ``scratch``, which is
+    removed again.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    facts, arrays = {}, _of_tracking(slam)
+    for number, mapper in slam.mappers.items():
+        facts[str(number)], parts = state.serialise(mapper, optimiser=True)
+        arrays |= prefixed(f"map{number}", parts)
+    try:
+        write_facts_file(scratch, facts, arrays)
+        return scratch.stat().st_size
+    finally:
+        scratch.unlink(missing_ok=True)
+
+
+def _of_tracking(slam: Slam) -> Arrays:
+    keyframes = slam.keyframes.keyframes
+    return {
+        "frames": slam.frames.rows(),
+        "keyframes": np.array([(k.frame_index, k.t_ns, k.sub_map, 0, 0) for k in keyframes]),
+        "poses": of_sim3([keyframe.T_wc for keyframe in keyframes]),
+        **prefixed("graph", dict(slam.graph.graph.tables())),
+    }
+
+
+# --------------------------------------------------------------------------------------------------
+# CPU time of the parts of a frame's way, in each tenth of a dive.
+
+TRACKING = ("prepare", "overlay", "gate", "track", "record")
+MAPPING = ("view", "insert", "optimise")
+GRAPH = ("graph", "correct")
+"""Stages of the profiler; the graph has all that other threads spend as well."""
+TENTHS = 10
+"""Parts of a dive that are looked at."""
+
+
+Tenth = dict[str, float | None]
+"""``tracking_ms``, ``mapping_ms`` and ``graph_ms``, means over the frames of a tenth; at its end
+``frames``, ``keyframes``, ``gaussians`` and ``resident_mb`` (None where unknown)."""
+
+
+@dataclass(frozen=True)
+class _Spent:
+    """Milliseconds of CPU time since the start."""
+
+    process: float
+    thread: float
+    stages: Mapping[str, float]
+
+    @staticmethod
+    def now(run: DiveRun) -> _Spent:
+        return _Spent(1e3 * time.process_time(), 1e3 * time.thread_time(), run.profiler.totals_ms())
+
+
+class TenthsMeter:
+    """Looks at a run after every tenth of its frames; its profiler has the thread's clock."""
+
+    def __init__(self, run: DiveRun, frames: int) -> None:
+        self.tenths: list[Tenth] = []
+        self._run, self._frames = run, frames
+        self._done, self._last, self._before = 0, 0, _Spent.now(run)
+
+    def frame_done(self) -> None:
+        """Count a frame."""
+        self._done += 1
+        if self._done * TENTHS >= (len(self.tenths) + 1) * self._frames:
+            self.tenths.append(self._tenth())
+
+    def _tenth(self) -> Tenth:
+        spent, before, count = _Spent.now(self._run), self._before, self._done - self._last
+        self._before, self._last = spent, self._done
+
+        def mean_ms(stages: tuple[str, ...]) -> float:
+            of = [spent.stages.get(name, 0.0) - before.stages.get(name, 0.0) for name in stages]
+            return sum(of) / count
+
+        elsewhere = (spent.process - before.process) - (spent.thread - before.thread)
+        elsewhere = max(elsewhere, 0.0)  # two clocks are read one after the other
+        slam = self._run.slam
+        return {
+            "frames": self._done,
+            "tracking_ms": round(mean_ms(TRACKING), 3),
+            "mapping_ms": round(mean_ms(MAPPING), 3),
+            "graph_ms": round(mean_ms(GRAPH) + elsewhere / count, 3),
+            "keyframes": len(slam.keyframes),
+            "gaussians": sum(len(mapper.gaussians) for mapper in slam.mappers.values()),
+            "resident_mb": resident_mb(),
+        }

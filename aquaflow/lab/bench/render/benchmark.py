@@ -12,7 +12,6 @@ from aquaflow.base.errors import AquaFlowError, InputError
 from aquaflow.base.storage.atomic import write_json
 from aquaflow.lab.bench import machine
 from aquaflow.lab.bench.meter import require
-from aquaflow.lab.bench.render.accuracy import gradient_errors
 from aquaflow.lab.bench.render.blend_limit import measure_blend_limit
 from aquaflow.lab.bench.render.contenders import (
     BenchmarkedRenderer,
@@ -26,8 +25,9 @@ from aquaflow.lab.bench.render.peak import Peak, measure_peak
 from aquaflow.lab.bench.render.picture import draw
 from aquaflow.lab.bench.render.rows import Row, row_of
 from aquaflow.lab.bench.render.timing import Sample, interleaved
-from aquaflow.render.contract import CPU
-from aquaflow.render.example_scene import SMALL, Size, SplatScene, height_field
+from aquaflow.render.contract import CPU, Renderer
+from aquaflow.render.example_scene import NAMES, SMALL, Size, SplatScene, height_field
+from aquaflow.render.parity import differences
 
 JSON_FILE, PICTURE_FILE = "render_bench.json", "render_bench.png"
 """What a benchmark writes."""
@@ -176,3 +176,13 @@ def caption(described: dict[str, Any]) -> str:
         f"AquaFlow {described['aquaflow']} on {machine.in_words(described)}, "
         f"{described['date']}, load {described['load']}; medians on the wall"
     )
+
+
+# --------------------------------------------------------------------------------------------------
+# Speed means nothing for a wrong gradient: each kernel against the float64 reference.
+
+
+def gradient_errors(renderers: Sequence[Renderer], scene: SplatScene) -> dict[str, float]:
+    """Input -> largest relative L2 error of its gradient among ``renderers``; none: empty."""
+    found = [differences(renderer, scene) for renderer in renderers]
+    return {name: max(each[name] for each in found) for name in NAMES} if found else {}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,16 +13,16 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.extra import load
+from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.placement import Placement
+from aquaflow.dive.png import encoded_png
 from aquaflow.dive.posed_views import read_posed_views
 from aquaflow.survey.export.mesh.atlas import lay_out, painted
 from aquaflow.survey.export.mesh.blocks import Blocks
 from aquaflow.survey.export.mesh.colouring import batches, look_at, shown_colours
 from aquaflow.survey.export.mesh.fusion import fused
 from aquaflow.survey.export.mesh.glb import write_glb
-from aquaflow.survey.export.mesh.mesh_ply import write_mesh_ply
-from aquaflow.survey.export.mesh.obj import write_obj
 from aquaflow.survey.export.mesh.placed_mesh import PlacedMesh, Texture
 from aquaflow.survey.export.mesh.surface import SurfaceBuilder, require_marching_cubes
 from aquaflow.survey.export.mesh.triangle_mesh import TriangleMesh
@@ -193,3 +193,117 @@ def _placed(surface: FusedSurface, where: Placement, seen: str) -> PlacedMesh:
         where,
         seen,
     )
+
+
+# --------------------------------------------------------------------------------------------------
+# Meshes as PLY files: triangles with normals, colours and sigmas at the vertices.
+#
+# Format: G. Turk, "The PLY Polygon File Format" (1994); binary little-endian.
+
+VERTEX = np.dtype(
+    [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
+    + [(name, "u1") for name in ("red", "green", "blue")]
+    + [("sigma", "<f4")]
+)
+FACE = np.dtype([("count", "u1"), ("vertex_indices", "<i4", (3,))])
+NAMES = {"<f4": "float", "|u1": "uchar"}
+"""PLY's names of numpy's types."""
+
+
+def write_mesh_ply(
+    path: Path,
+    mesh: PlacedMesh,
+    colours: npt.NDArray[np.uint8],  # [N, 3] RGB
+) -> None:
+    """Write the mesh, whole or not at all.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    vertices = np.zeros(len(mesh.positions), VERTEX)
+    for names, values in ((("x", "y", "z"), mesh.positions), (("nx", "ny", "nz"), mesh.normals)):
+        for name, column in zip(names, values.T, strict=True):
+            vertices[name] = column
+    for name, column in zip(("red", "green", "blue"), colours.T, strict=True):
+        vertices[name] = column
+    vertices["sigma"] = mesh.sigma
+    faces = np.zeros(len(mesh.faces), FACE)
+    faces["count"], faces["vertex_indices"] = 3, mesh.faces
+    with atomic_write(path) as stream:
+        stream.write("\n".join([*_header(mesh), ""]).encode("ascii", "replace"))
+        stream.write(vertices.tobytes())
+        stream.write(faces.tobytes())
+
+
+def _header(mesh: PlacedMesh) -> list[str]:
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [f"comment {line}" for line in mesh.comments()]
+    lines.append(f"element vertex {len(mesh.positions)}")
+    for name in VERTEX.names or ():
+        lines.append(f"property {NAMES[VERTEX[name].str]} {name}")
+    lines.append(f"element face {len(mesh.faces)}")
+    return [*lines, "property list uchar int vertex_indices", "end_header"]
+
+
+# --------------------------------------------------------------------------------------------------
+# Meshes as Wavefront OBJ files with their material and texture beside them.
+#
+# Format: Wavefront Technologies, "Advanced Visualizer Manual", appendix B (OBJ) and MTL; numbers
+# start at 1, and v of a texture starts at the bottom.
+
+LINES = 1 << 16
+"""Lines that are formatted at a time."""
+MATERIAL = "surface"
+"""Its name in both files."""
+
+
+def write_obj(path: Path, mesh: PlacedMesh, texture: Texture) -> list[Path]:
+    """Write the mesh, and beside it its material (.mtl) and texture (.png); returns all three. Each
+    is whole or not there, and the mesh is there last.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
+    material, picture = path.with_suffix(".mtl"), path.with_suffix(".png")
+    png = encoded_png(texture.picture)
+    with (
+        atomic_write(path) as obj,
+        atomic_write(material) as mtl,
+        atomic_write(picture) as image,
+    ):
+        image.write(png)
+        # Its light is in the picture: no shading, no highlights.
+        mtl.write(
+            f"newmtl {MATERIAL}\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 0\n"
+            f"map_Ka {picture.name}\nmap_Kd {picture.name}\n".encode()
+        )
+        for text in _lines(mesh, texture, material.name):
+            obj.write(text.encode())
+        for stream in (obj, mtl, image):
+            stream.flush()
+        path.unlink(missing_ok=True)  # an earlier mesh has another texture
+    return [path, material, picture]
+
+
+def _lines(mesh: PlacedMesh, texture: Texture, material: str) -> Iterator[str]:
+    yield "".join(f"# {line}\n" for line in mesh.comments())
+    yield f"mtllib {material}\no {MATERIAL}\n"
+    layout = texture.layout
+    upwards = layout.uv() * (1.0, -1.0) + (0.0, 1.0)
+    yield from _formatted("v %.5f %.5f %.5f\n", mesh.positions)
+    yield from _formatted("vt %.6f %.6f\n", upwards)
+    yield from _formatted("vn %.4f %.4f %.4f\n", mesh.normals)
+    yield f"usemtl {MATERIAL}\ns 1\n"
+    corners = layout.source[layout.faces] + 1, layout.faces + 1
+    table = np.stack([corners[0], corners[1], corners[0]], axis=-1).reshape(len(mesh.faces), 9)
+    yield from _formatted("f %d/%d/%d %d/%d/%d %d/%d/%d\n", table)
+
+
+def _formatted(
+    line: str,
+    values: npt.NDArray[np.generic],  # [N, C]
+) -> Iterator[str]:
+    """Lines of all rows, many at a time."""
+    for first in range(0, len(values), LINES):
+        part = values[first : first + LINES]
+        yield line * len(part) % tuple(part.ravel().tolist())

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aquaflow.lab.evaluation.water_peers.held_out_ranges import held_out_ranges
+from aquaflow.lab.evaluation.restoration import held_out_ranges
 
 SIZE = (4, 6)
 

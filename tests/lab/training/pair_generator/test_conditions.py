@@ -11,18 +11,21 @@ import torch
 from aquaflow.lab.training.correspondences import correspondences
 from aquaflow.lab.training.pair_generator.bodies import with_bodies
 from aquaflow.lab.training.pair_generator.cameras import TRAINING
-from aquaflow.lab.training.pair_generator.caustics import with_caustics
-from aquaflow.lab.training.pair_generator.conditions import CALM, Conditions
+from aquaflow.lab.training.pair_generator.conditions import (
+    CALM,
+    Conditions,
+    in_low_light,
+    with_caustics,
+    with_motion_blur,
+    with_snow,
+)
 from aquaflow.lab.training.pair_generator.draw import Draw
 from aquaflow.lab.training.pair_generator.drawing import (
     WindowVariation,
     through_water,
     training_pair,
 )
-from aquaflow.lab.training.pair_generator.low_light import in_low_light
-from aquaflow.lab.training.pair_generator.motion_blur import with_motion_blur
 from aquaflow.lab.training.pair_generator.overlays import with_overlay
-from aquaflow.lab.training.pair_generator.particles import with_snow
 from aquaflow.lab.training.pair_generator.render import render_pairs
 from aquaflow.lab.training.pair_generator.scene import Detail
 from aquaflow.lab.training.pair_generator.water import random_water, turbidity
