@@ -166,8 +166,8 @@ fi
 if [[ -n $start ]]; then
   if command -v udevadm >/dev/null; then udevadm control --reload || true; udevadm trigger || true; fi
   systemctl daemon-reload
-  systemctl enable aquaflow.live
-  systemctl restart aquaflow.live
+  systemctl enable aquaflow.service
+  systemctl restart aquaflow.service
   echo 'install.sh: started; see: systemctl status aquaflow, aquaflow status'
 elif [[ -z $root ]]; then
   systemctl daemon-reload 2>/dev/null || true

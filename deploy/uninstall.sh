@@ -13,7 +13,7 @@ esac
 ((EUID == 0)) || { echo 'uninstall.sh: run me as root' >&2; exit 1; }
 
 if [[ -f /etc/systemd/system/aquaflow.service ]]; then
-  systemctl disable --now aquaflow.live || true
+  systemctl disable --now aquaflow.service || true
   rm -f /etc/systemd/system/aquaflow.service
   rm -rf /etc/systemd/system/aquaflow.service.d
   systemctl daemon-reload

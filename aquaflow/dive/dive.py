@@ -81,8 +81,8 @@ class Dive:
         return self.path / name
 
     def has(self, name: str) -> bool:
-        """True if there is such a file."""
-        return self.file(name).is_file()
+        """True if something has this name; what is no regular file is refused when it is read."""
+        return os.path.lexists(self.file(name))
 
     def require(self, *names: str) -> None:
         """For whoever can do nothing without these files of a finished dive.
@@ -102,7 +102,7 @@ class Dive:
             InputError: the file is damaged.
         """
         path = self.file(name)
-        if not path.is_file():
+        if not self.has(name):
             return {}
         try:
             found = read_regular_json(path)

@@ -87,10 +87,13 @@ def estimate(
         rejected[wrong.source, wrong.kind] = SourceReport(
             wrong.source, wrong.kind, rejected=wrong.samples, reason=wrong.reason
         )
+    confirmed = True
     if clocks.leave_open(problem):
         ground = points()
         confirmation = confirmation_of(path, lambda part: problem_along(part, lambda: ground))
-        if confirmation.refuted or confirmation.vague or not clocks.known:
+        confirmed = not confirmation.vague
+        if confirmed and (confirmation.refuted or not clocks.known):
             solution = confirmation.applied(solution)
             problem.doubt = f"{confirmation.in_words()}, and {clocks.why_open}"
-    return Estimate(clocks.stated(frame_of(problem, solution, path)), problem, solution)
+    frame = replace(frame_of(problem, solution, path), scale_confirmed=confirmed)
+    return Estimate(clocks.stated(frame), problem, solution)

@@ -82,6 +82,9 @@ class MetricFrame:
     clock_offset_s: float = 0.0
     """Pictures' time less that of telemetry's stamps, as rotations show it now and as it was
     corrected; 0 where none was found."""
+    scale_confirmed: bool = True
+    """False while too little of the path shows whether a source whose clock nothing shows fits the
+    pictures: nothing that steers may use the scale."""
     site: str = ""
     """The earlier dive whose frame n is, where this one was recognised in it; empty otherwise."""
 

@@ -23,8 +23,8 @@ def unit(tmp_path: Path) -> Path:
     """The unit with a program that is there."""
     if shutil.which("systemd-analyze") is None:
         pytest.skip("systemd-analyze is not installed")
-    text = (DEPLOY / "aquaflow.live").read_text()
-    file = tmp_path / "aquaflow.live"
+    text = (DEPLOY / "aquaflow.service").read_text()
+    file = tmp_path / "aquaflow.service"
     file.write_text(re.sub(r"^ExecStart=.*$", "ExecStart=/bin/true", text, flags=re.MULTILINE))
     return file
 
@@ -71,7 +71,7 @@ PROC_DEVICES = {
 
 def allowed_groups() -> list[str]:
     """Device groups of the unit, which systemd looks up in /proc/devices by glob."""
-    text = (DEPLOY / "aquaflow.live").read_text()
+    text = (DEPLOY / "aquaflow.service").read_text()
     return re.findall(r"^DeviceAllow=char-(\S+) rw$", text, flags=re.MULTILINE)
 
 

@@ -203,7 +203,7 @@ def test_a_folder_is_open_before_anything_in_it_is_touched_and_finished_when_tha
 def test_a_folder_that_was_cut_off_before_its_table_can_be_mapped_into_again(
     tmp_path: Path,
 ) -> None:
-    (tmp_path / ".dive.json.part").touch()
+    (tmp_path / f".{32 * '0'}.part").touch()
     with opened(tmp_path):
         pass
     (tmp_path / "frames.csv").unlink()

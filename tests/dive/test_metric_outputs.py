@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import aquaflow
+from aquaflow.base.storage.dive_status import DiveState, DiveStatus
 from aquaflow.config import Config, load_config
 from aquaflow.dive.deliverable import Phase, deliverables_of
 from aquaflow.dive.deliverables import Deliverables
@@ -66,7 +67,9 @@ def written(slam: Slam, path: Path, outputs: MetricOutputs | None) -> Path:
     made.evaluate()
     made.write_evaluation()
     made.make(Phase.REPORT, metrics=NUMBERS)
+    folder.write_json("metrics.json", NUMBERS)
     folder.close()
+    DiveStatus(DiveState.FINISHED).write(path)
     return path
 
 

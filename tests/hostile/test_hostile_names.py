@@ -7,11 +7,12 @@ import shutil
 from pathlib import Path
 
 import pytest
-from aquaflow.survey.report.report_of_folder import report_of_folder
 
 from aquaflow.base.errors import printable
+from aquaflow.dive.dive import Dive
 from aquaflow.dive.frames_csv import read_rows
 from aquaflow.survey.report import render_report
+from aquaflow.survey.report.report_of import report_of
 from tests.command_line import Cli, refused
 from tests.small_recording import HASTY
 
@@ -84,7 +85,7 @@ def test_a_report_made_inside_a_folder_of_such_a_name_shows_it_as_text(
     copy = tmp_path / "dive\x1b[31m<script>alert(1)"
     shutil.copytree(dive, copy)
     monkeypatch.chdir(copy)
-    page = render_report(report_of_folder(Path()))
+    page = render_report(report_of(Dive(Path())))
     assert not set(COMMANDS) & set(page)
     assert "<script>alert" not in page
     assert "dive\\x1b[31m&lt;script&gt;" in page

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-import aquaflow.config
 from aquaflow.base.errors import crash_report
+from aquaflow.config import vehicle
 from tests.command_line import Cli, refused
 
 OUR_MISTAKE = 70
@@ -27,7 +27,7 @@ def failing(command: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Cl
     def run(*arguments: object) -> object:
         (error,) = arguments
         assert isinstance(error, BaseException)
-        monkeypatch.setattr(aquaflow.config, "load_config", broken(error))
+        monkeypatch.setattr(vehicle, "load_any", broken(error))
         return command("config", tmp_path / "any.yaml")
 
     return run  # type: ignore[return-value]

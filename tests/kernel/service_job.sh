@@ -12,7 +12,7 @@ until_true() {
   local end=$((SECONDS + $1)); shift
   until "$@"; do ((SECONDS < end)) || return 1; sleep 4; done
 }
-property() { systemctl show --value -p "$1" aquaflow.live; }
+property() { systemctl show --value -p "$1" aquaflow.service; }
 is() { [[ $(property "$1") == "$2" ]]; }
 says() { [[ $(property StatusText) == *"$1"* ]]; }
 folders() { find "$dives" -mindepth 1 -maxdepth 1 -type d | wc -l; }

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from aquaflow.recordings import telemetry_lines
 from aquaflow.recordings.dive_telemetry import DiveTelemetry
 from aquaflow.recordings.telemetry_lines import LONGEST_LINE, TelemetryLines, TelemetryLog, of_line
 from aquaflow.types import (
@@ -90,8 +91,12 @@ def test_a_sample_that_is_not_finite_is_left_out(tmp_path: Path) -> None:
     assert list(TelemetryLines(path).samples()) == SAMPLES[:1]
 
 
-def test_a_full_disk_costs_samples_and_is_counted() -> None:
-    log = TelemetryLog(Path("/dev/full"))
+def test_a_full_disk_costs_samples_and_is_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = Path("/dev/full").open("ab")  # noqa: SIM115 - the log closes it
+    monkeypatch.setattr(telemetry_lines, "open_to_append", lambda path: full)
+    log = TelemetryLog(tmp_path / "telemetry.jsonl")
     for _ in range(100):  # more than waits in memory
         log.add(SAMPLES)
     assert 0 < log.lost < 100 * len(SAMPLES)

@@ -22,8 +22,9 @@ from aquaflow.config.link import SerialConfig
 from aquaflow.config.recording import RecordingConfig
 from aquaflow.config.telemetry import NmeaConfig
 from aquaflow.geometry.camera import guess_camera
-from aquaflow.live.recorder import Recorder, mcap_messages
+from aquaflow.live.recorder import Recorder
 from aquaflow.live.recorder.pictures import encode
+from aquaflow.recordings import mcap_messages
 from aquaflow.recordings.h264 import is_key
 from aquaflow.recordings.mcap_camera import McapCamera
 from aquaflow.recordings.mcap_messages import McapMessages

@@ -135,7 +135,8 @@ def test_a_dvl_without_attitude_gives_metres_but_no_gravity(dive: Swum) -> None:
     frame = found.frame
     assert (frame.metric, frame.level, frame.north) == (True, False, "first keyframe")
     np.testing.assert_array_equal(frame.T_nm.R, np.eye(3))
-    assert abs(scale_error(found, dive)) < 4.0 * frame.scale_sigma < 0.02
+    # No rotation shows its clock: its sigma is what parts of the path agree to, not 0.4 %.
+    assert abs(scale_error(found, dive)) < 4.0 * frame.scale_sigma < 0.03
     assert frame.scale_source.startswith("DVL '")
 
 

@@ -80,7 +80,8 @@ def working_folder(parent: Path, name: str) -> Iterator[Path]:
         folder.mkdir(parents=True)
     except OSError as error:
         raise InputError(
-            f"cannot make {folder}: {error.strerror}; give a folder that can be written to as --out"
+            f"cannot make {parent / name}: {error.strerror}; give a folder that can be written to "
+            "as --out"
         ) from error
     lock = FolderLock(folder)
     try:

@@ -85,7 +85,7 @@ def nan_in_the_map(check: Check, seed: int) -> None:
     check.finite("map", *mapper.gaussians.parameters.values())
 
 
-@case("gaussians", "mapping.views.is_usable")
+@case("gaussians", "render.views.is_usable")
 def nan_in_pose_gradient(check: Check, seed: int) -> None:
     """A pose gradient that is no number leaves the pose alone."""
     view = _mapper(seed)[1]

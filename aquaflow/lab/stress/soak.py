@@ -43,13 +43,13 @@ def tracked_frames_20000(check: Check, seed: int) -> None:
     _swim_in_circles(check, seed, LONG)
 
 
-@case("soak", "mapping.views.refine_pose")
+@case("soak", "render.views.refine_pose")
 def mapping_steps(check: Check, seed: int) -> None:
     """500 refinement steps of a small map and its poses."""
     _optimise(check, seed, 500)
 
 
-@case("soak", "mapping.views.refine_pose", long=True)
+@case("soak", "render.views.refine_pose", long=True)
 def mapping_steps_20000(check: Check, seed: int) -> None:
     """20,000 refinement steps of a small map and its poses."""
     _optimise(check, seed, LONG)

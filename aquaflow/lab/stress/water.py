@@ -34,7 +34,7 @@ def _ranges() -> Tensor:
     return torch.tensor(RANGES_M)[None]
 
 
-@case("water", "mapping.water.image_formation.MAX_OPTICAL_DEPTH")
+@case("water", "water.image_formation.MAX_OPTICAL_DEPTH")
 def attenuation_0_to_50(check: Check, seed: int) -> None:
     """beta from 0 to 50 1/m over 1 cm to 1 km: transmission is never 0, its inverse never wild."""
     for beta in RATES:
@@ -49,7 +49,7 @@ def attenuation_0_to_50(check: Check, seed: int) -> None:
         check.finite(f"gradient at beta {beta}", gradient)
 
 
-@case("water", "mapping.water.image_formation.MAX_OPTICAL_DEPTH")
+@case("water", "water.image_formation.MAX_OPTICAL_DEPTH")
 def range_1_cm_to_1_km(check: Check, seed: int) -> None:
     """Ranges behind the camera, at 0 and beyond 1 km are no more transparent than clear water."""
     z = torch.tensor([[-1e3, -1.0, 0.0, *RANGES_M, 1e9]])
@@ -59,7 +59,7 @@ def range_1_cm_to_1_km(check: Check, seed: int) -> None:
         check.below("transmission", float(transmission.detach().max()), 1.0)
 
 
-@case("water", "mapping.water.image_formation.MIN_TRANSMISSION")
+@case("water", "water.image_formation.MIN_TRANSMISSION")
 def transmission_to_0(check: Check, seed: int) -> None:
     """Where no light arrives nothing is restored, and the mask is False."""
     image = torch.rand(1, len(RANGES_M), 3, generator=torch.Generator().manual_seed(seed))
@@ -71,7 +71,7 @@ def transmission_to_0(check: Check, seed: int) -> None:
     check.true("near pixels are recoverable", bool(recoverable[0][0]))
 
 
-@case("water", "mapping.water.medium.B_INF_RANGE")
+@case("water", "water.medium.B_INF_RANGE")
 def B_inf_at_0_and_1(check: Check, seed: int) -> None:
     """Water that scatters nothing, and water that is white: the learnable medium takes both."""
     for B_inf in (0.0, 1.0):
@@ -81,7 +81,7 @@ def B_inf_at_0_and_1(check: Check, seed: int) -> None:
         check.below("error of B_inf", _off(medium(torch.eye(3)).B_inf, B_inf), 0.02)
 
 
-@case("water", "mapping.water.medium.MIN_RATE")
+@case("water", "water.medium.MIN_RATE")
 def rates_at_0_and_50(check: Check, seed: int) -> None:
     """The learnable medium starts from clear water and from ink."""
     for rate in (0.0, 50.0):

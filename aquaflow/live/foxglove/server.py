@@ -1,6 +1,6 @@
 """Foxglove's websocket server with the topics of a dive.
 
-The protocol is Foxglove's own (github.com/foxglove/ws-protocol, docs/spec.md), of which a server
+The protocol is Foxglove's own (github.com/foxglove/ws-protocol), of which a server
 that only shows needs four messages. It is spoken here because foxglove-sdk's server lets every
 web page in: it looks at neither Host nor Origin, and knows no token.
 """

@@ -53,6 +53,7 @@ class Withheld(str, Enum):
 
     NO_SCALE = "the map's scale in metres is not known"
     VAGUE_SCALE = "the map's scale is not known to service.pose.max_scale_sigma"
+    UNCONFIRMED = "too little of the path shows whether telemetry and pictures are of one time"
     OUT_OF_STEP = "pictures and telemetry are out of step, see metric_frame.clock_offset_s"
     NOT_LEVEL = "the direction of gravity is not known"
     NO_MOUNTING = "the camera's mounting is not known; set fusion.camera or service.pose.mounting"
@@ -137,6 +138,8 @@ class PoseOutput:
             return Withheld.NO_SCALE
         if not frame.scale_sigma <= self._config.max_scale_sigma:
             return Withheld.VAGUE_SCALE
+        if not frame.scale_confirmed:
+            return Withheld.UNCONFIRMED
         if not abs(frame.clock_offset_s) <= LARGEST_OFFSET_S:
             return Withheld.OUT_OF_STEP
         if self._config.message == "odometry" and not frame.level:

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import InputError, first_line
 from aquaflow.base.errors.extra import load
-from aquaflow.base.storage.atomic import atomic_write
+from aquaflow.base.storage.atomic import fresh_file
 from aquaflow.dive.point_cloud import CHUNK, PointCloud, Points
 
 Progress = Callable[[int, int], None]
@@ -43,9 +43,9 @@ def write_e57(path: Path, cloud: PointCloud, progress: Progress | None = None) -
     """
     load("pye57", "an E57 file", "survey")
     libe57 = load("pye57.libe57", "an E57 file", "survey")
-    with atomic_write(path) as stream:
+    with fresh_file(path) as part:  # the library opens files by name alone
         try:
-            file = libe57.ImageFile(stream.name, "w")  # the library opens files by name alone
+            file = libe57.ImageFile(str(part), "w")
             try:
                 _fill(libe57, file, cloud, progress)
             finally:

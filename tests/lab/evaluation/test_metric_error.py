@@ -110,9 +110,9 @@ def test_the_evaluation_of_a_synthetic_dive_says_each_error_and_its_sigma(tmp_pa
     assert result["notes"] == []
     said = "\n".join(in_words(result))
     for text in (
-        "scale error               2 %, 5 times its stated sigma of 0.4",
-        "gravity error             0.5 degrees, 2.9 times its stated sigma of 0.172",
-        "heading error             -3 degrees, 5.2 times its stated sigma of 0.573",
+        "scale error                     2 %, 5 times its stated sigma of 0.4",
+        "gravity error                   0.5 degrees, 2.9 times its stated sigma of 0.172",
+        "heading error                   -3 degrees, 5.2 times its stated sigma of 0.573",
         "only turned about the vertical and shifted",
     ):
         assert text in said, said

@@ -126,7 +126,7 @@ def test_a_variance_is_widened_where_errors_are_larger_and_never_narrowed(
     monkeypatch.setattr(compact_figures, "onnx_encoder", lambda path: None)
     monkeypatch.setattr(compact_figures, "onnx_comparison", lambda path: None)
     monkeypatch.setattr(compact_figures, "normalised_errors", lambda *inputs: errors)
-    shipped = Path(compact_network.__file__).parents[2] / "weights" / "compact"
+    shipped = Path(compact_network.__file__).parents[1] / "weights" / "compact"
     folder = Path(shutil.copytree(shipped, tmp_path / "prior"))
     card = with_honest_range(folder, read_card(folder), [])
     assert card.range_variance_factor == pytest.approx(factor)

@@ -17,9 +17,10 @@ from aquaflow.config.device import MountingConfig
 from aquaflow.config.recording import RecordingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.port import FlatPort
-from aquaflow.live.recorder import Recorder, RecorderStatus, dive_file
+from aquaflow.live.recorder import Recorder, RecorderStatus
 from aquaflow.live.recorder.pictures import encode
 from aquaflow.live.recorder.session import RecordingSession
+from aquaflow.recordings import dive_file
 from aquaflow.recordings.dive_file import DiveFile
 from aquaflow.recordings.mcap_camera import McapCamera
 from aquaflow.recordings.mcap_messages import McapMessages, mcap_files
