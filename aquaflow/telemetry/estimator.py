@@ -87,13 +87,17 @@ def estimate(
         rejected[wrong.source, wrong.kind] = SourceReport(
             wrong.source, wrong.kind, rejected=wrong.samples, reason=wrong.reason
         )
-    confirmed = True
+    unconfirmed = ""
     if clocks.leave_open(problem):
         ground = points()
         confirmation = confirmation_of(path, lambda part: problem_along(part, lambda: ground))
-        confirmed = not confirmation.vague
-        if confirmed and (confirmation.refuted or not clocks.known):
+        if confirmation.vague:
+            unconfirmed = f"not confirmed: {confirmation.in_words()}, and {clocks.why_open}"
+        elif confirmation.refuted or not clocks.known:
             solution = confirmation.applied(solution)
             problem.doubt = f"{confirmation.in_words()}, and {clocks.why_open}"
-    frame = replace(frame_of(problem, solution, path), scale_confirmed=confirmed)
+    frame = frame_of(problem, solution, path)
+    if unconfirmed and frame.metric:
+        said = f"{frame.scale_source}; {unconfirmed}"
+        frame = replace(frame, scale_confirmed=False, scale_source=said)
     return Estimate(clocks.stated(frame), problem, solution)

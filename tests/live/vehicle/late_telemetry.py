@@ -128,7 +128,7 @@ class Outcome:
     first_s: float
     """Of the dive's clock, when the first pose went out; infinite for never."""
     stated_sigmas: float
-    """Largest error of a scale that was stated as metric, sent or not, in stated sigmas."""
+    """Largest error of a scale that was stated as confirmed, sent or not, in stated sigmas."""
     said: str
     """Why nothing was sent at last."""
 
@@ -196,7 +196,7 @@ def outcome_of(case: Case, until_sent: bool = False) -> Outcome:
     for k, t_s in enumerate(dive.path.t_s.tolist()):
         if due and t_s >= due[0]:
             frame, true = dive.frame_at(due.pop(0))
-            if frame.metric:
+            if frame.metric and frame.scale_confirmed:
                 error = abs(float(np.log(frame.T_nm.scale / true)))
                 stated = max(stated, error / frame.scale_sigma)
         picture = replace(frame_of(k), t_ns=round(1e9 * t_s))
