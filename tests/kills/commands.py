@@ -90,7 +90,7 @@ READERS: tuple[Callable[[Path, Path], tuple[object, ...]], ...] = (
     lambda dive, out: ("report", dive, "--pdf", out / "x.pdf"),
     lambda dive, _: ("evaluate", dive),
     lambda dive, _: ("measure", dive, "--notes"),
-    lambda dive, out: ("change", dive, dive, "--out", out / "change"),
+    lambda dive, out: ("change", "--from", dive, "--to", dive, "--out", out / "change"),
     lambda dive, out: ("site", "add", out / "site", dive),
 )
 """Commands that read a dive."""
