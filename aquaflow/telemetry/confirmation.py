@@ -78,7 +78,10 @@ def confirmation_of(
 
     ``problem_along`` a part of the path, with what telemetry says there.
     """
-    logs, variances, kinds, shown = [], [], set(), 0
+    logs: list[float] = []
+    variances: list[float] = []
+    kinds: set[str] = set()
+    shown = 0
     for part in _parts(path):
         before = len(logs)
         problem = problem_along(part)
