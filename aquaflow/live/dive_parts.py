@@ -22,7 +22,7 @@ from aquaflow.live.checkpoint.generations import Checkpoint
 from aquaflow.live.checkpoint.resume import Choice
 from aquaflow.live.checkpoint.salvage import lost_with_their_files
 from aquaflow.live.checkpoint.telemetry import hear_again
-from aquaflow.live.control import Control
+from aquaflow.live.control import ServiceControl
 from aquaflow.live.device_errors import DeviceErrors
 from aquaflow.live.dive_clock import Continued
 from aquaflow.live.feed import Feed
@@ -36,7 +36,7 @@ from aquaflow.live.vitals import Vitals
 from aquaflow.mapping.work import OwnedMaps
 from aquaflow.recordings.kept_pictures import PictureThread
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
-from aquaflow.recordings.telemetry_lines import TelemetryLog
+from aquaflow.recordings.telemetry_lines import TelemetryWriter
 from aquaflow.slam import Slam
 from aquaflow.slam.map_inputs import make_maps
 from aquaflow.types import Dropped
@@ -68,7 +68,7 @@ def assembled(
     vehicle: VehicleConfig,
     folder: DiveFolder,
     vitals: Vitals,
-    control: Control,
+    control: ServiceControl,
     losses: list[str],
 ) -> Parts:
     """All parts of a dive; ``losses``: what damaged files cost one that goes on.
@@ -106,7 +106,7 @@ def assembled(
     failures.attempt(
         "writing calibration.yaml", partial(folder.write_calibration, feed.calibration)
     )
-    telemetry_log = partial(TelemetryLog, folder.path / TELEMETRY)
+    telemetry_log = partial(TelemetryWriter, folder.path / TELEMETRY)
     run.telemetry_log = failures.attempt(f"opening {TELEMETRY}", telemetry_log)
     vitals.health.begin()
     pressure = PressureReader(folder.path, gpu_free=thread.usable_memory)

@@ -12,12 +12,12 @@ from aquaflow.base.errors import AquaFlowError
 from aquaflow.config.service import ServiceConfig
 from aquaflow.dive.run import DiveRun
 from aquaflow.live import troubles
-from aquaflow.live.control import Control
+from aquaflow.live.control import ServiceControl
 from aquaflow.live.feed import Feed
 from aquaflow.live.health.counters import Counters
 from aquaflow.live.health.degradation import DegradationLevel
 from aquaflow.live.health.pressure import Need, Pressure, Shortage
-from aquaflow.live.health.state import Facts, Judgement, State, judged
+from aquaflow.live.health.state import Facts, Judgement, ServiceState, judged
 from aquaflow.live.map_thread import MapThread
 from aquaflow.live.vitals import Vitals
 from aquaflow.tracking.frames import FrameClass, Tracked
@@ -54,7 +54,7 @@ class LiveLoop:
         maps: MapThread,
         config: ServiceConfig,
         vitals: Vitals,
-        control: Control,
+        control: ServiceControl,
         pressure: Callable[[], Pressure],
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -202,7 +202,9 @@ class LiveLoop:
             self.counters.update()
         with contain("health state"):
             paused = self.control.paused
-            self.health.set(*(Judgement(State.PAUSED, PAUSED) if paused else judged(self._facts())))
+            self.health.set(
+                *(Judgement(ServiceState.PAUSED, PAUSED) if paused else judged(self._facts()))
+            )
         self.tell_watchers()
         with contain("notification of systemd"):
             self.vitals.notify()

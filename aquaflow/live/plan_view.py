@@ -66,7 +66,7 @@ class PlanView:
         for keyframe in list(slam.keyframes.keyframes):  # tracking appends to it meanwhile
             centres.setdefault(keyframe.sub_map, []).append(keyframe.T_wc.t)
         plans = {
-            number: _Plan(slam.metric_frame(number), _thinned(own))
+            number: _SubMapPlan(slam.metric_frame(number), _thinned(own))
             for number, own in sorted(centres.items())
         }
         now = None
@@ -80,7 +80,7 @@ class PlanView:
         return {"sub_maps": sub_maps, "now": now, "hints": self._coverage.in_words()}
 
 
-class _Plan:
+class _SubMapPlan:
     """One sub-map's path, and the plane that it is shown in."""
 
     def __init__(

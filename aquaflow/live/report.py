@@ -10,16 +10,22 @@ from typing import Any
 from aquaflow import __version__
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.dive.in_site import in_site_numbers
-from aquaflow.live.control import Control
+from aquaflow.live.control import ServiceControl
 from aquaflow.live.dive_parts import Parts
 from aquaflow.live.feed import Feed
-from aquaflow.live.health.state import State
+from aquaflow.live.health.state import ServiceState
 from aquaflow.live.health.telemetry import metric_frame_numbers, newest_values
 from aquaflow.live.standby import Standby
 from aquaflow.live.vehicle.pose_output import PoseOutput
 from aquaflow.live.vitals import Vitals
 
-GOOD = (State.TRACKING, State.INITIALISING, State.IDLE, State.PAUSED, State.FINISHING)
+GOOD = (
+    ServiceState.TRACKING,
+    ServiceState.INITIALISING,
+    ServiceState.IDLE,
+    ServiceState.PAUSED,
+    ServiceState.FINISHING,
+)
 """States that need no action."""
 CHANGES_LISTED = 10
 """Latest changes of state that the report lists."""
@@ -61,7 +67,7 @@ def report(
 
 
 def report_between_dives(
-    standby: Standby, control: Control, feed: Feed, now_s: float | None = None
+    standby: Standby, control: ServiceControl, feed: Feed, now_s: float | None = None
 ) -> dict[str, Any]:
     """The same keys while there is no dive: its numbers are 0, or null."""
     vitals = standby.vitals

@@ -8,7 +8,7 @@ from typing import Any
 
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.views import DiveView, open_coverage, open_viewer
-from aquaflow.live.control import Control
+from aquaflow.live.control import ServiceControl
 from aquaflow.live.dive_parts import Parts
 from aquaflow.live.feed import Feed
 from aquaflow.live.health.http import HealthServer
@@ -28,7 +28,7 @@ class Station:
     """Close it after the last dive."""
 
     def __init__(
-        self, feed: Feed, vehicle: VehicleConfig, control: Control, vitals: Vitals
+        self, feed: Feed, vehicle: VehicleConfig, control: ServiceControl, vitals: Vitals
     ) -> None:
         """Begin to listen.
 

@@ -9,9 +9,9 @@ from aquaflow.config.service import LimitsConfig
 from aquaflow.live.health import sentences
 from aquaflow.live.health.degradation import Degradation, DegradationLevel
 from aquaflow.live.health.pressure import Pressure
-from aquaflow.live.health.state import State, Trouble
+from aquaflow.live.health.state import ServiceState, Trouble
 from aquaflow.live.map_thread import MapThread
-from aquaflow.tracking.consistency import Finding
+from aquaflow.tracking.consistency import InconsistentKeyframe
 
 Devices = Mapping[str, Mapping[str, object]]
 
@@ -21,10 +21,10 @@ def silent_camera(devices: Devices) -> Trouble:
     for name, device in devices.items():
         if device["kind"] == "camera":
             return Trouble(str(device["reason"]), sentences.no_picture(name))
-    return Trouble("", sentences.OF_STATE[State.WAITING])
+    return Trouble("", sentences.OF_STATE[ServiceState.WAITING])
 
 
-def inconsistency(found: Finding | None) -> Trouble | None:
+def inconsistency(found: InconsistentKeyframe | None) -> Trouble | None:
     """Of a finding of the monitor of consistency."""
     return None if found is None else Trouble(str(found), sentences.OF_CAUSE[found.cause])
 

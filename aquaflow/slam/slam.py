@@ -24,8 +24,8 @@ from aquaflow.tracking.anchored import Anchored, Anchors
 from aquaflow.tracking.base.base import Base
 from aquaflow.tracking.base.in_base import InBase, LookedUp
 from aquaflow.tracking.frame_table import FrameTable
-from aquaflow.tracking.frames import FrameClass, Link, Revisit, Step, Tracked
-from aquaflow.tracking.gate.gate import FrameGate, GateKind, Verdict
+from aquaflow.tracking.frames import FrameClass, KeyframeEdge, Revisit, Step, Tracked
+from aquaflow.tracking.gate.gate import FrameGate, GateKind, GateVerdict
 from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph, LoopsFound
 from aquaflow.tracking.initialisation.back_fill import LookedBack
 from aquaflow.tracking.loops.relocaliser import Places
@@ -273,10 +273,10 @@ class Slam:
             masked = self.overlays.masked(frame)
         return masked
 
-    def _gate(self, frame: Frame) -> Verdict:
+    def _gate(self, frame: Frame) -> GateVerdict:
         """Not in the paper: frames that cannot help are skipped before anything costly; it is
         decided here which of the others are held out."""
-        verdict = Verdict(GateKind.PASS)
+        verdict = GateVerdict(GateKind.PASS)
         with self.stages("gate", frame.index):
             verdict = self.gate.judge(frame.image, frame.mask)
         if verdict.passed:
@@ -299,7 +299,7 @@ class Slam:
         """T_kf of all frames, before a loop closure among them moves the keyframes."""
         return [self._anchors.anchored(each) for each in tracked]
 
-    def _link(self, anchored: Anchored, links: Mapping[int, Link]) -> Anchored:
+    def _link(self, anchored: Anchored, links: Mapping[int, KeyframeEdge]) -> Anchored:
         """Sec. 3.2, Eq. 4: a new keyframe gets its edge, and loops to earlier ones are closed; the
         frame with its pose after that."""
         tracked, T_kf = anchored.tracked, anchored.T_kf
@@ -347,7 +347,7 @@ class Slam:
 
     # --- poses --------------------------------------------------------------------------------
 
-    def _skipped(self, frame: Frame, verdict: Verdict) -> Anchored:
+    def _skipped(self, frame: Frame, verdict: GateVerdict) -> Anchored:
         """A frame that the gate refused; a duplicate has the pose of the frame before it."""
         if not verdict.same_place or self._latest is None:
             sub_map = self.tracker.sub_map

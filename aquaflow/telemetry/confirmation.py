@@ -16,7 +16,7 @@ from scipy.special import chdtrc, ndtr, stdtrit
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.contradictions import LARGEST_ALONE, MAP_SCALE_SIGMA, SCALING
 from aquaflow.telemetry.metric_frame import UNKNOWN_SIGMA
-from aquaflow.telemetry.problem import Problem
+from aquaflow.telemetry.problem import TelemetryProblem
 from aquaflow.telemetry.solve import Solution, solve
 from aquaflow.telemetry.state import SCALE
 
@@ -68,7 +68,7 @@ class Confirmation:
 
 def confirmation_of(
     path: CameraPath,
-    problem_along: Callable[[CameraPath], Problem],
+    problem_along: Callable[[CameraPath], TelemetryProblem],
 ) -> Confirmation:
     """Estimate the scale anew from every part and every kind of source.
 

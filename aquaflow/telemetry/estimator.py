@@ -17,7 +17,7 @@ from aquaflow.telemetry.contradictions import contradiction_in
 from aquaflow.telemetry.device_clocks import DeviceClocks
 from aquaflow.telemetry.factors.factor import Factor
 from aquaflow.telemetry.metric_frame import MetricFrame, SourceReport
-from aquaflow.telemetry.problem import Carried, Problem
+from aquaflow.telemetry.problem import Carried, TelemetryProblem
 from aquaflow.telemetry.solution_frame import frame_of
 from aquaflow.telemetry.solve import Solution, solve
 from aquaflow.telemetry.start import camera_in_body
@@ -34,7 +34,7 @@ class Estimate:
     """The frame of a sub-map, and how it came about."""
 
     frame: MetricFrame
-    problem: Problem | None = None
+    problem: TelemetryProblem | None = None
     solution: Solution | None = None
     """None where no telemetry could be used."""
 
@@ -72,7 +72,7 @@ def estimate(
     telemetry = clocks.corrected(telemetry)
     rejected = clocks.unlike(telemetry)
 
-    def problem_along(path: CameraPath, points: Callable[[], Array]) -> Problem:
+    def problem_along(path: CameraPath, points: Callable[[], Array]) -> TelemetryProblem:
         return problem_of(telemetry, path, config, mounting, points, carried, extra, rejected)
 
     while True:

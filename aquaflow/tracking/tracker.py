@@ -18,10 +18,10 @@ from aquaflow.keyframes import Keyframe, KeyframeStore
 from aquaflow.prior.contract import Encoding, PairGeometry, Prior
 from aquaflow.tracking.consistency import ConsistencyMonitor
 from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
-from aquaflow.tracking.frames import FrameClass, Link, Quality, Revisit, Step, Tracked
+from aquaflow.tracking.frames import FrameClass, KeyframeEdge, Quality, Revisit, Step, Tracked
 from aquaflow.tracking.initialisation.back_fill import BackFills, LookedBack
 from aquaflow.tracking.loops.relocaliser import Places
-from aquaflow.tracking.map_start import MapStart, Started
+from aquaflow.tracking.map_start import MapStart, NewMap
 from aquaflow.tracking.pose.matcher import Matched
 from aquaflow.tracking.repairs import LastFrame, Repairs
 from aquaflow.tracking.returning import STAGE as RETURN
@@ -177,7 +177,7 @@ class Tracker:
             return []
         return tracked if matched else tracked + self._track(frame)
 
-    def _begin(self, started: Started | None = None) -> list[Tracked]:
+    def _begin(self, started: NewMap | None = None) -> list[Tracked]:
         """Make the first keyframe from the initial geometry, and pose the frames that waited."""
         started = started or self._start.solve()
         if started is None:
@@ -373,7 +373,7 @@ class Tracker:
             at.mapped_parallax_px = solved.parallax_px
             return at.tracked(frame, frame_class, solved.quality, pointmap.copy())
         estimate = solved.estimate
-        link = Link(at.keyframe.number, estimate.T, estimate.covariance, solved.pair)
+        link = KeyframeEdge(at.keyframe.number, estimate.T, estimate.covariance, solved.pair)
         self.sub_map = at.keyframe.sub_map
         keyframe_tracker.leave(at)
         self._solved = None

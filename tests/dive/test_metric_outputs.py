@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import aquaflow
 from aquaflow.base.storage.dive_status import DiveState, DiveStatus
 from aquaflow.config import Config, load_config
-from aquaflow.dive.deliverable import Phase, deliverables_of
+from aquaflow.dive.deliverable import DeliverablePhase, deliverables_of
 from aquaflow.dive.deliverables import Deliverables
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.metric_outputs import (
@@ -63,10 +63,10 @@ def written(slam: Slam, path: Path, outputs: MetricOutputs | None) -> Path:
     made = Deliverables("dive", folder, slam, slam.results(), None, outputs, others=others)
     made.summarise()
     made.write()
-    made.make(Phase.WRITE)
+    made.make(DeliverablePhase.WRITE)
     made.evaluate()
     made.write_evaluation()
-    made.make(Phase.REPORT, metrics=NUMBERS)
+    made.make(DeliverablePhase.REPORT, metrics=NUMBERS)
     folder.write_json("metrics.json", NUMBERS)
     folder.close()
     DiveStatus(DiveState.FINISHED).write(path)

@@ -19,7 +19,7 @@ from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import DiveRun
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.live.control import Control
+from aquaflow.live.control import ServiceControl
 from aquaflow.live.dive_clock import Continued
 from aquaflow.live.feed import LatestSamples
 from aquaflow.live.health.degradation import Degradation
@@ -150,7 +150,7 @@ class Told:
     """A live loop of which the test holds every end."""
 
     def __init__(self, folder: Path, config: Config = SETTINGS, **service: object) -> None:
-        self.clock, self.feed, self.control = Clock(), ToldFeed(), Control()
+        self.clock, self.feed, self.control = Clock(), ToldFeed(), ServiceControl()
         self.pressure = CALM
         self.config = ServiceConfig.model_validate(service)
         self.vitals = Vitals(self.config)

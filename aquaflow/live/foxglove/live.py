@@ -38,7 +38,7 @@ WELL = frozenset(state.value for state in GOOD)
 
 
 @dataclass(frozen=True)
-class _Moment:
+class _PosedMessage:
     """A posed frame, handed over by the loop."""
 
     t_ns: int
@@ -56,7 +56,7 @@ class LiveFoxglove(DiveView):
         self._config, self._report = config, report
         self._server = FoxgloveServer(config, "AquaFlow")
         self.port = self._server.port
-        self._moments: Newest[_Moment] = Newest()
+        self._moments: Newest[_PosedMessage] = Newest()
         self._maps: Newest[MapMoment] = Newest()
         self._forget()
         self._showing = Showing("foxglove", self._show, config.refresh_s)
@@ -109,7 +109,7 @@ class LiveFoxglove(DiveView):
             self._preparation = Preparation(run.config.source, run.preparation.calibration)
         picture = dive.picture
         same = picture is not None and picture.index == latest.frame.index
-        moment = _Moment(t_ns, latest, picture if same else None, frame, self._preparation)
+        moment = _PosedMessage(t_ns, latest, picture if same else None, frame, self._preparation)
         self._moments.put(moment)
 
     def _take(
@@ -131,7 +131,7 @@ class LiveFoxglove(DiveView):
         if shown is not None:
             self._show_map(shown)
 
-    def _show_pose(self, moment: _Moment) -> None:
+    def _show_pose(self, moment: _PosedMessage) -> None:
         tracked, frame, t_ns, send = moment.tracked, moment.frame, moment.t_ns, self._server.send
         assert tracked.T_wc is not None
         tree = FrameTree(frame, placement(frame))
@@ -165,7 +165,7 @@ class LiveFoxglove(DiveView):
             poses = [(at_ns, tree.moving(frame.pose(T)).T) for at_ns, T in own]
             self._server.send(topics.PATH, t_ns, messages.path(t_ns, MAP, poses))
 
-    def _show_picture(self, moment: _Moment) -> None:
+    def _show_picture(self, moment: _PosedMessage) -> None:
         if moment.picture is None or not self._server.wanted(topics.CAMERA):
             return
         t_ns, prepared = moment.t_ns, moment.preparation(moment.picture)

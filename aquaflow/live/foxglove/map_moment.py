@@ -20,7 +20,7 @@ from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import common_exposure, drawn_without_water, to_bytes
 from aquaflow.render.transfers import picture_out
 from aquaflow.telemetry.metric_frame import MetricFrame
-from aquaflow.water.image_formation import Water
+from aquaflow.water.image_formation import WaterParameters
 
 Picture = npt.NDArray[np.uint8]
 
@@ -42,7 +42,7 @@ class MapMoment:
     """Of the newest view, whose pictures follow."""
     rendered: Picture | None
     restored: Picture | None
-    water: Water | None
+    water: WaterParameters | None
 
 
 @torch.no_grad()
@@ -80,7 +80,7 @@ def cloud_of(moment: MapMoment, budget: int) -> npt.NDArray[np.void] | None:
     return points[:: -(-len(points) // budget)] if len(points) else points
 
 
-def water_status(water: Water | None, frame: MetricFrame) -> Any:
+def water_status(water: WaterParameters | None, frame: MetricFrame) -> Any:
     """diagnostic_msgs/DiagnosticStatus with the parameters of the image formation; rates per metre,
     or per map unit."""
     name = "aquaflow: water"

@@ -24,7 +24,7 @@ from aquaflow.live.feed import Feed
 from aquaflow.live.loop import LiveLoop
 from aquaflow.live.vehicle.body_geometry import body_pose, pose_covariance
 from aquaflow.live.vehicle.body_track import BodyTrack, Sighting
-from aquaflow.sources.outbound import BodyMotion, BodyPose, OutboundMessage
+from aquaflow.sources.outbound import BodyPose, BodyPoseChange, OutboundMessage
 from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.telemetry.start import camera_in_body
 from aquaflow.tracking.frames import Tracked
@@ -179,7 +179,7 @@ class PoseOutput:
 
     def _motion(self, t_ns: int, quality: float) -> OutboundMessage | Withheld:
         step = self._track.step()
-        return Withheld.NO_VELOCITY if step is None else BodyMotion(t_ns, *step, quality)
+        return Withheld.NO_VELOCITY if step is None else BodyPoseChange(t_ns, *step, quality)
 
     def _rate_hz(self) -> float:
         """Rate of the last poses; 0 while there are too few."""

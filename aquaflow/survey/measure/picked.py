@@ -36,7 +36,7 @@ not of this map."""
 
 
 @dataclass(frozen=True)
-class Seen:
+class PixelMeasurement:
     """A point of a picture in the map."""
 
     place: Array
@@ -51,7 +51,7 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Picked:
+class PickedPoint:
     """A place with what it errs alone and together with its neighbours, in n."""
 
     place: Array
@@ -66,7 +66,7 @@ def seen(
     mapper: Mapper,
     view: View,
     pixels: Array,  # [N, 2] px of the mapped picture
-) -> list[Seen]:
+) -> list[PixelMeasurement]:
     """Where the rays of pixels meet the map.
 
     Raises:
@@ -87,7 +87,7 @@ def seen(
         sigma = float(np.hypot(RANGE_SIGMA * distance, around))
         ray = view.T_wc.R @ view.camera.unproject(np.array([u, v]))
         ray /= np.linalg.norm(ray)
-        points.append(Seen(view.T_wc.t + distance * ray, ray, distance, sigma, around))
+        points.append(PixelMeasurement(view.T_wc.t + distance * ray, ray, distance, sigma, around))
     return points
 
 
@@ -125,7 +125,7 @@ def of_pixel(
     frame: MetricFrame,
     view: View,
     pixel: Array,  # [2] px
-) -> Picked:
+) -> PickedPoint:
     """A point of a mapped picture.
 
     Raises:
@@ -141,7 +141,7 @@ def of_map(
     mapper: Mapper,
     frame: MetricFrame,
     place: Array,  # [3] in n, as map.ply and the viewer have it
-) -> Picked:
+) -> PickedPoint:
     """A point of the map; its range error lies along the ray from the nearest mapped view.
 
     Raises:
@@ -172,10 +172,12 @@ def _picked(
     across: float,
     along: float,
     shared: float,
-) -> Picked:
+) -> PickedPoint:
     """Sigmas across and along the ray, of the point alone, and along it, of its neighbourhood."""
     T = frame.T_nm
     direction = T.R @ ray
     along_ray = np.outer(direction, direction)
     own = across**2 * (np.eye(3) - along_ray) + along**2 * along_ray
-    return Picked(T.apply(place[None])[0], T.scale**2 * own, (T.scale * shared) ** 2 * along_ray)
+    return PickedPoint(
+        T.apply(place[None])[0], T.scale**2 * own, (T.scale * shared) ** 2 * along_ray
+    )

@@ -22,12 +22,12 @@ from aquaflow.survey.measure.quantity import Quantity
 from aquaflow.survey.measure.reef_files import JSON as REEF
 from aquaflow.survey.report import (
     CameraSummary,
+    DepthProfile,
     HeldOutExample,
     LeftOut,
     Measures,
     MediumCurves,
     PathPlot,
-    Profile,
     ReefRow,
     ReportData,
 )
@@ -169,7 +169,7 @@ NUMBER = re.compile(r"\d+(\.\d+)?")
 """What makes one reason look like many."""
 
 
-def profile(rows: Sequence[PoseRow], frame: MetricFrame) -> Profile | None:
+def profile(rows: Sequence[PoseRow], frame: MetricFrame) -> DepthProfile | None:
     """Depth and altitude of the dive in metres; None where neither is known.
 
     Without a depth sensor the depth is that of the path, where the metric frame knows the surface.
@@ -185,7 +185,7 @@ def profile(rows: Sequence[PoseRow], frame: MetricFrame) -> Profile | None:
         said = "depth of the camera" if frame.depth_known else "camera, down from the dive's start"
     if not (np.isfinite(depth).any() or np.isfinite(altitude).any()):
         return None
-    return Profile(np.array([row.t_s for row in chosen]), depth, altitude, said)
+    return DepthProfile(np.array([row.t_s for row in chosen]), depth, altitude, said)
 
 
 def left_out(rows: Iterable[FrameRow]) -> list[LeftOut]:

@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes.place import Place
+from aquaflow.keyframes.place import KeyframePlace
 from aquaflow.keyframes.places_file import PlacesFile
 from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph
@@ -36,10 +36,10 @@ class SubMap:
     number: int
     """Of the sub-map in its dive."""
     frame: MetricFrame
-    places: tuple[Place, ...]
+    places: tuple[KeyframePlace, ...]
     """In order."""
 
-    def start(self, place: Place) -> Sim3:
+    def start(self, place: KeyframePlace) -> Sim3:
         """T_nc of a keyframe, with the scale that takes its unit to that of n."""
         return self.frame.T_nm @ place.T_mc
 

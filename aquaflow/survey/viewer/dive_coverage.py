@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive
-from aquaflow.survey.coverage.classes import COLOURS, WORDS, Seen
+from aquaflow.survey.coverage.classes import COLOURS, WORDS, CoverageClass
 from aquaflow.survey.coverage.coverage_file import NAME, read_coverage_file
 from aquaflow.survey.viewer.levels import Palette
 from aquaflow.telemetry.metric_frame import MetricFrame
@@ -24,8 +24,8 @@ UNSEEN = (60, 60, 66)
 """RGB of what was not seen: dark, as it is missing."""
 CLASSES = Palette(
     "by coverage",
-    tuple(COLOURS.get(seen, UNSEEN) for seen in Seen),
-    tuple(WORDS[seen] for seen in Seen),
+    tuple(COLOURS.get(seen, UNSEEN) for seen in CoverageClass),
+    tuple(WORDS[seen] for seen in CoverageClass),
 )
 
 

@@ -12,7 +12,7 @@ from aquaflow.dive.dive import Dive
 from aquaflow.dive.ply import read_ply
 from aquaflow.survey.viewer.dive_coverage import CLASSES, COVERAGE, coverage_of_dive
 from aquaflow.survey.viewer.levels import RANGE, Palette, range_level
-from aquaflow.survey.viewer.splats import Splats, splats
+from aquaflow.survey.viewer.splats import ViewerSplats, splats
 from aquaflow.telemetry.metric_frame import MetricFrame
 
 
@@ -20,7 +20,7 @@ from aquaflow.telemetry.metric_frame import MetricFrame
 class DiveMap:
     """What is shown of a map."""
 
-    splats: Splats
+    splats: ViewerSplats
     palettes: dict[str, Palette]
     total: int
     """Gaussians of the whole map."""

@@ -24,11 +24,11 @@ from aquaflow.survey.measure.scale import Scale
 from aquaflow.survey.viewer.dive_coverage import CLASSES, COVERAGE
 from aquaflow.survey.viewer.exhibit import POSE_NUMBERS
 from aquaflow.survey.viewer.levels import RANGE, Palette, range_level, steps_level
-from aquaflow.survey.viewer.measuring import Frame
+from aquaflow.survey.viewer.measuring import LengthUnit
 from aquaflow.survey.viewer.moments import moments
 from aquaflow.survey.viewer.page import ViewerPage
 from aquaflow.survey.viewer.seen_water import SeenWater, seen_water
-from aquaflow.survey.viewer.splats import Splats, splats
+from aquaflow.survey.viewer.splats import ViewerSplats, splats
 from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.tracking.frames import Tracked
 from aquaflow.types import CameraModel
@@ -50,7 +50,7 @@ class LiveViewer(DiveView):
         self._config, self._report, self._plan = config, report, plan
         self._page = ViewerPage(config, "AquaFlow")
         self.address = self._page.address
-        self._poses: Newest[Pose] = Newest()
+        self._poses: Newest[ViewerPose] = Newest()
         self._copies: Newest[tuple[int, MapCopy]] = Newest()
         """With their sub-maps."""
         self._path = LivePath()
@@ -97,7 +97,7 @@ class LiveViewer(DiveView):
         self._pictures = {} if kept is None else kept.paths
         step = max(1, image.shape[1] // self._config.picture_width)
         small = np.ascontiguousarray(image[::step, ::step])
-        self._poses.put(Pose(latest.T_wc, latest.frame.camera, small))
+        self._poses.put(ViewerPose(latest.T_wc, latest.frame.camera, small))
 
     def _copy(self, maps: OwnedMaps, sub_map: int) -> None:
         """In the mapping thread."""
@@ -128,13 +128,13 @@ class LiveViewer(DiveView):
         self._page.show_health(in_words(report))
 
 
-def frame_of(report: dict[str, Any]) -> Frame:
+def frame_of(report: dict[str, Any]) -> LengthUnit:
     """How lengths are said: the map is in its own units, and metres may be known by now."""
     known = report.get("metric_frame") or {}
     metres = known.get("metres_per_map_unit")
     if metres is None:
-        return Frame.of(MetricFrame.unknown())
-    return Frame(Scale("m", known.get("scale_sigma") or 0.0, 0.0), metres)
+        return LengthUnit.of(MetricFrame.unknown())
+    return LengthUnit(Scale("m", known.get("scale_sigma") or 0.0, 0.0), metres)
 
 
 def in_words(report: dict[str, Any]) -> str:
@@ -223,7 +223,7 @@ OFTEN = 200.0
 
 
 @dataclass(frozen=True)
-class Pose:
+class ViewerPose:
     """Where the camera is, and what it sees."""
 
     T_wc: Sim3
@@ -233,12 +233,16 @@ class Pose:
 
 
 def shown(
-    copy: MapCopy, budget: int, frame: Frame | None = None, plan: CoveragePlan | None = None
-) -> tuple[Splats, SeenWater | None, dict[str, Palette]]:
+    copy: MapCopy, budget: int, frame: LengthUnit | None = None, plan: CoveragePlan | None = None
+) -> tuple[ViewerSplats, SeenWater | None, dict[str, Palette]]:
     """In the viewer's thread: what a browser gets, the water before it, and the palettes of what
     each Gaussian is coloured by: how often it was seen, from how far away, and, by the ``plan`` of
     its sub-map's coverage, how well."""
-    plain, water, unit = copy.parameters, _water(copy), frame or Frame.of(MetricFrame.unknown())
+    plain, water, unit = (
+        copy.parameters,
+        _water(copy),
+        frame or LengthUnit.of(MetricFrame.unknown()),
+    )
     with np.errstate(over="ignore"):
         opacities = (1.0 / (1.0 + np.exp(-plain["opacity_logits"][:, 0]))).astype(np.float32)
         scales = np.exp(plain["log_scales"])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from aquaflow.base.errors import InputError
-from aquaflow.keyframes.place import KeypointDepths, Place
+from aquaflow.keyframes.place import KeyframePlace, KeypointDepths
 from aquaflow.telemetry.metric_frame import MetricFrame
 
 
@@ -18,7 +18,7 @@ class Base:
     folder: Path
     prior: str
     """That described its keypoints; empty where that is not known."""
-    places: Sequence[Place]
+    places: Sequence[KeyframePlace]
     keypoints: Callable[[int], KeypointDepths]
     """Of a keyframe, by its number; raises InputError where they cannot be read."""
     frames: Mapping[int, MetricFrame]

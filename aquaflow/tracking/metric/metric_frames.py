@@ -20,9 +20,9 @@ from aquaflow.telemetry.telemetry import Telemetry
 from aquaflow.tracking.frame_table import FrameTable
 from aquaflow.tracking.graph.pose_graph import solve
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
-from aquaflow.tracking.metric.sightings import Sightings
+from aquaflow.tracking.metric.sightings import LengthSightings
 from aquaflow.tracking.metric.straightening import estimates_of, straightened
-from aquaflow.tracking.metric.survey import Survey, sampled_points
+from aquaflow.tracking.metric.survey import TrackingSnapshot, sampled_points
 from aquaflow.tracking.metric.world_edges import World
 from aquaflow.types import TelemetrySample
 
@@ -51,7 +51,7 @@ class EarlierDive(Protocol):
 
 
 class MetricFrames:
-    """Collects samples, sightings and keyframes' points; a :class:`Survey` does the rest."""
+    """Collects samples, sightings and points; a :class:`TrackingSnapshot` does the rest."""
 
     def __init__(
         self, keyframes: KeyframeStore, frames: Callable[[], FrameTable], config: FusionConfig,
@@ -59,7 +59,7 @@ class MetricFrames:
     ) -> None:  # fmt: skip
         self.telemetry = Telemetry()
         self._recent = RecentMotion()
-        self.sightings = Sightings(config)
+        self.sightings = LengthSightings(config)
         """Objects of known size in the pictures."""
         self.mounting = config.camera
         """Of the camera in the body; a recording that states it may set it."""
@@ -129,10 +129,10 @@ class MetricFrames:
         with self._failures.contain("points for the altimeter"):
             self._points[number] = sampled_points(keyframe.pointmap)
 
-    def survey(self, snapshot: Snapshot) -> Survey:
+    def survey(self, snapshot: Snapshot) -> TrackingSnapshot:
         """All that is known now, for any thread."""
         parts, telemetry = self._frames().parts(), self.telemetry.copy()
-        return Survey(
+        return TrackingSnapshot(
             snapshot.nodes, parts, telemetry, tuple(self._points), self.mounting, self._config,
             self.sightings.copy(),
         )  # fmt: skip

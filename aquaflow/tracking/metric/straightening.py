@@ -19,11 +19,11 @@ from aquaflow.tracking.graph.optimisation import Optimisation
 from aquaflow.tracking.graph.table import EDGE, NODE, TRUST, GraphResult, Snapshot
 from aquaflow.tracking.metric.measured import world_edges
 from aquaflow.tracking.metric.sightings import SeenLengths
-from aquaflow.tracking.metric.survey import Survey
+from aquaflow.tracking.metric.survey import TrackingSnapshot
 from aquaflow.tracking.metric.world_edges import World
 
 
-def estimates_of(survey: Survey) -> dict[int, Estimate]:
+def estimates_of(survey: TrackingSnapshot) -> dict[int, Estimate]:
     """The metric frame of every component of the graph, by its first keyframe."""
     found: dict[int, Estimate] = {}
     before: tuple[Estimate, CameraPath] | None = None
@@ -63,7 +63,10 @@ class Straightened:
 
 
 def straightened(
-    snapshot: Snapshot, survey: Survey, t_s: Mapping[int, float], bases: Sequence[World] = ()
+    snapshot: Snapshot,
+    survey: TrackingSnapshot,
+    t_s: Mapping[int, float],
+    bases: Sequence[World] = (),
 ) -> Straightened:
     """Optimise a snapshot together with what telemetry says of its keyframes.
 

@@ -22,7 +22,7 @@ Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Measured:
+class KeyframeMeasurements:
     """What telemetry says of one keyframe; None where it says nothing."""
 
     depth_m: tuple[float, float] | None = None
@@ -54,7 +54,7 @@ class WorldEdge:
 def world_edge(
     keyframe: int,
     T_nk: Sim3,
-    measured: Measured,
+    measured: KeyframeMeasurements,
 ) -> WorldEdge | None:
     """The edge to a keyframe that is at ``T_nk`` now; None if nothing was measured.
 

@@ -30,7 +30,7 @@ from aquaflow.dive.placement import placement
 from aquaflow.dive.ros import messages, topics
 from aquaflow.dive.ros.definitions import encoded
 from aquaflow.live.checkpoint.resume import resumed
-from aquaflow.live.control import Control
+from aquaflow.live.control import ServiceControl
 from aquaflow.live.foxglove.live import LiveFoxglove
 from aquaflow.live.foxglove.map_moment import cloud_of, taken
 from aquaflow.live.foxglove.server import BACKLOG, FoxgloveServer
@@ -304,7 +304,10 @@ def test_a_service_shows_its_dives_where_it_is_asked_to_and_stops_listening(
     dive: Any = SimpleNamespace(parts=SimpleNamespace(loop=loop))
     for service, count in ((VEHICLE.service, 0), (changed, 1)):
         vehicle = VEHICLE.model_copy(update={"service": service})
-        with Vitals(service) as vitals, Station(ToldFeed(), vehicle, Control(), vitals) as station:
+        with (
+            Vitals(service) as vitals,
+            Station(ToldFeed(), vehicle, ServiceControl(), vitals) as station,
+        ):
             station.show(dive)
             station.hide()
         assert len(made) == count

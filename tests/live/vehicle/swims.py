@@ -9,7 +9,7 @@ import numpy as np
 
 from aquaflow.config.device import MountingConfig
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.live.vehicle.body_geometry import Pose
+from aquaflow.live.vehicle.body_geometry import BodyPoseInWorld
 from aquaflow.live.vehicle.pose_output import PoseOutput
 from aquaflow.telemetry.metric_frame import MetricFrame, North
 from aquaflow.telemetry.start import camera_in_body
@@ -41,18 +41,18 @@ def turned(known: MetricFrame, xi: Sequence[float]) -> MetricFrame:
     return replace(known, T_nm=Sim3.exp(np.array(xi)) @ known.T_nm)
 
 
-def diving(seconds: np.ndarray) -> list[Pose]:
+def diving(seconds: np.ndarray) -> list[BodyPoseInWorld]:
     """A vehicle that swims ahead at 0.5 m/s, turns at 0.3 rad/s and descends at 0.275 m/s."""
     poses = []
     for s in seconds:
         heading = 0.8 + 0.3 * s
         R = so3_exp(np.array([0.0, 0.0, heading]))
         ahead = 0.5 / 0.3 * np.array([np.sin(heading) - np.sin(0.8), np.cos(0.8) - np.cos(heading)])
-        poses.append(Pose(R, np.array([*ahead, 0.275 * s])))
+        poses.append(BodyPoseInWorld(R, np.array([*ahead, 0.275 * s])))
     return poses
 
 
-def seen(pose: Pose, known: MetricFrame, mounting: str = "forward") -> Sim3:
+def seen(pose: BodyPoseInWorld, known: MetricFrame, mounting: str = "forward") -> Sim3:
     """The camera's pose in the map."""
     T_nb = Sim3(pose.R, pose.t_m)
     return known.T_nm.inverse() @ T_nb @ camera_in_body(MOUNTINGS[mounting])

@@ -23,7 +23,7 @@ from aquaflow.live.onboard import map_live
 from aquaflow.live.report import report
 from aquaflow.live.vehicle.pose_output import PoseOutput, Withheld
 from aquaflow.live.vehicle.scale_sources import refuse_without_scale
-from aquaflow.sources.outbound import BodyMotion, BodyPose
+from aquaflow.sources.outbound import BodyPose, BodyPoseChange
 from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.tracking.frames import FrameClass, Tracked
 from tests.live.health.reports import REPORT
@@ -271,7 +271,7 @@ def test_motions_are_in_the_axes_of_the_body_and_never_span_a_jump(told: Told) -
     for k, pose in enumerate(path):
         T = seen(pose, known, "down")
         show(told, out, Sim3(T.R, T.t + ASIDE, T.scale) if k >= 10 else T)
-    motions = [word for word in told.feed.told if isinstance(word, BodyMotion)]
+    motions = [word for word in told.feed.told if isinstance(word, BodyPoseChange)]
     assert len(motions) == len(path) - 2
     step = path[4].R.T @ (path[4].t_m - path[3].t_m)
     for motion in motions:

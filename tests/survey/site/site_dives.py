@@ -11,7 +11,7 @@ from aquaflow.base.storage.dive_status import DiveState, DiveStatus
 from aquaflow.dive.tum import write_tum
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes.place import KeypointDepths, Place
+from aquaflow.keyframes.place import KeyframePlace, KeypointDepths
 from aquaflow.keyframes.places_file import EDGE, NAME, write_places
 from aquaflow.prior.contract import Keypoints
 from aquaflow.telemetry.metric_file import write_metric_file
@@ -66,7 +66,7 @@ def stated_dive(
     ]
     seen = [scene.seen(T, rng) for T in poses]
     in_m = [T_ms @ T for T in poses]
-    places = [Place(i, i, numbers[i], 10**9 * i, in_m[i], CAMERA) for i in range(count)]
+    places = [KeyframePlace(i, i, numbers[i], 10**9 * i, in_m[i], CAMERA) for i in range(count)]
     links = [(i + 1, i) for i in range(count - 1) if numbers[i] == numbers[i + 1]]
     edges = np.zeros(len(links), EDGE)
     for row, (a, b) in zip(edges, links, strict=True):
