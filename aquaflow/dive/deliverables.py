@@ -35,7 +35,7 @@ from aquaflow.keyframes import Keyframe, KeyframeStore
 from aquaflow.keyframes.place import KeyframePlace, KeypointDepths, depths_at
 from aquaflow.keyframes.places_file import EDGE, NAME, Rows, write_places
 from aquaflow.slam import Slam
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.frames import Tracked
 from aquaflow.tracking.graph.table import Snapshot
 from aquaflow.types import CameraModel
@@ -88,7 +88,7 @@ class Deliverables:
         return made
 
     @property
-    def metric_frame(self) -> MetricFrame:
+    def metric_frame(self) -> WorldFrame:
         """Of the largest sub-map."""
         return self.outputs.frame(self._main)
 

@@ -16,23 +16,23 @@ from aquaflow.config.device import MountingConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import DiveRun
-from aquaflow.live.checkpoint.base import look_in_base
+from aquaflow.live.checkpoint.base import localise_in_base
 from aquaflow.live.checkpoint.checkpoint import Checkpointer, restore
 from aquaflow.live.checkpoint.generations import Checkpoint
+from aquaflow.live.checkpoint.repair import lost_with_their_files
 from aquaflow.live.checkpoint.resume import Choice
-from aquaflow.live.checkpoint.salvage import lost_with_their_files
 from aquaflow.live.checkpoint.telemetry import hear_again
 from aquaflow.live.control import ServiceControl
+from aquaflow.live.deliverable_updates import DeliverableUpdater
 from aquaflow.live.device_errors import DeviceErrors
 from aquaflow.live.dive_clock import Continued
+from aquaflow.live.dive_status_file import DiveStatusFile
 from aquaflow.live.feed import Feed
 from aquaflow.live.health.pressure import PressureReader
 from aquaflow.live.loop import LiveLoop
 from aquaflow.live.map_thread import MapThread
 from aquaflow.live.mounting import camera_mounting
-from aquaflow.live.refresh import Refresher
-from aquaflow.live.standing import Standing
-from aquaflow.live.vitals import Vitals
+from aquaflow.live.service_health import ServiceHealth
 from aquaflow.mapping.work import OwnedMaps
 from aquaflow.recordings.kept_pictures import PictureThread
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
@@ -53,9 +53,9 @@ class Parts:
     run: DiveRun
     maps: MapThread
     checkpointer: Checkpointer
-    refresher: Refresher
+    refresher: DeliverableUpdater
     choice: Choice
-    standing: Standing
+    standing: DiveStatusFile
     device_errors: DeviceErrors
     frames_before: int
     """Of an earlier run of the same dive."""
@@ -67,7 +67,7 @@ def assembled(
     feed: Feed,
     vehicle: VehicleConfig,
     folder: DiveFolder,
-    vitals: Vitals,
+    vitals: ServiceHealth,
     control: ServiceControl,
     losses: list[str],
 ) -> Parts:
@@ -91,7 +91,7 @@ def assembled(
     worker = Worker(failures, threads=True)
     slam = Slam(config, stages, folder.work, worker, thread)
     slam.prior.warm_up()
-    said = look_in_base(slam, service.dive.site, choice.checkpoint)
+    said = localise_in_base(slam, service.dive.site, choice.checkpoint)
     with failures.contain("camera mounting"):
         stated = camera_mounting(config, service, feed)
         slam.metric.mounting = stated or _mounting_of(before)
@@ -119,7 +119,7 @@ def assembled(
         folder.path, run, slam, thread, service.checkpoint.every_s, feed.clocks,
         lambda: feed.continued.known_shift_ns,
     )  # fmt: skip
-    refresher = Refresher(run, thread, service.checkpoint.deliverables_s)
+    refresher = DeliverableUpdater(run, thread, service.checkpoint.deliverables_s)
 
     def write_what_is_due(live: LiveLoop) -> None:
         disk_is_full = live.pressure.disk_is_full(service.limits)
@@ -130,7 +130,7 @@ def assembled(
         checkpointer.take_soon()
         refresher.write_soon()
 
-    standing = Standing(folder.path, failures, slam.metric.mounting, before, paused)
+    standing = DiveStatusFile(folder.path, failures, slam.metric.mounting, before, paused)
     errors = DeviceErrors(feed.describe)
     loop.watchers += [standing.update, write_what_is_due, lambda live: errors.update()]
     frames_before = len(slam.frames)

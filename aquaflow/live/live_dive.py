@@ -14,14 +14,14 @@ from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.replay import fix_threads
 from aquaflow.dive.run import Finished
+from aquaflow.live.checkpoint.repair import salvaged_from
 from aquaflow.live.checkpoint.resume import Choice
-from aquaflow.live.checkpoint.salvage import salvaged_from
 from aquaflow.live.control import ServiceControl
 from aquaflow.live.dive_parts import assembled, plain
 from aquaflow.live.feed import Feed
 from aquaflow.live.health.state import ServiceState
-from aquaflow.live.standby import FINISHING
-from aquaflow.live.vitals import Vitals
+from aquaflow.live.idle_loop import FINISHING
+from aquaflow.live.service_health import ServiceHealth
 from aquaflow.mapping.work import Progress
 from aquaflow.slam.finish_time import FinishTime
 
@@ -52,7 +52,7 @@ class LiveDive:
         feed: Feed,
         config: VehicleConfig,
         overwrite: bool = False,
-        vitals: Vitals | None = None,
+        vitals: ServiceHealth | None = None,
         control: ServiceControl | None = None,
     ) -> None:
         """Construct all parts; ``vitals`` and ``control`` are the service's, where it has several
@@ -70,7 +70,7 @@ class LiveDive:
         rows = None if salvaged is None else salvaged.rows
         self.folder = DiveFolder(choice.folder, plain(config), overwrite, rows, feed.dive_s)
         self.feed, self.control = feed, control or ServiceControl()
-        self.vitals = vitals or Vitals(config.service)
+        self.vitals = vitals or ServiceHealth(config.service)
         self._own_vitals = vitals is None
         self._finish_s, self._stop_s = config.service.finish_s, config.service.stop_s
         self._finished = False

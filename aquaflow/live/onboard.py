@@ -17,16 +17,16 @@ from aquaflow.dive.run import Finished
 from aquaflow.live.checkpoint.checkpoint import UnusableStateError
 from aquaflow.live.checkpoint.resume import Choice, choose, is_begun, resumed, tidy
 from aquaflow.live.checkpoint.set_aside import SetAside
+from aquaflow.live.clock_reading import ClockReading
 from aquaflow.live.control import DivePhase, ServiceControl, ServiceRequest
 from aquaflow.live.feed import Feed
 from aquaflow.live.health.state import ServiceState
+from aquaflow.live.idle_loop import FINISHING, IDLE
 from aquaflow.live.live_dive import LiveDive
-from aquaflow.live.moment import Moment
-from aquaflow.live.standby import FINISHING, IDLE
-from aquaflow.live.station import Station
+from aquaflow.live.service_frontends import ServiceFrontends
+from aquaflow.live.service_health import ServiceHealth
 from aquaflow.live.vehicle.arming import refuse_without_autopilot
 from aquaflow.live.vehicle.scale_sources import refuse_without_scale
-from aquaflow.live.vitals import Vitals
 from aquaflow.mapping.work import Progress
 
 log = logging.getLogger(__name__)
@@ -75,8 +75,8 @@ def map_live(
     control = control or ServiceControl()
     with contextlib.ExitStack() as around:
         around.callback(feed.close)
-        vitals = around.enter_context(Vitals(vehicle.service))
-        station = around.enter_context(Station(feed, vehicle, control, vitals))
+        vitals = around.enter_context(ServiceHealth(vehicle.service))
+        station = around.enter_context(ServiceFrontends(feed, vehicle, control, vitals))
         around.callback(_stop_after(seconds, control).cancel)
         around.enter_context(stop_on_signals(control.told, control.stopping, once=True))
         onboard = Onboard(feed, vehicle, control, station, progress)
@@ -91,7 +91,7 @@ class Onboard:
         feed: Feed,
         vehicle: VehicleConfig,
         control: ServiceControl,
-        station: Station,
+        station: ServiceFrontends,
         progress: Progress | None = None,
     ) -> None:
         self._feed, self._vehicle, self._control = feed, vehicle, control
@@ -184,7 +184,7 @@ def begun(
     feed: Feed,
     vehicle: VehicleConfig,
     asked: OnboardSettings,
-    vitals: Vitals | None = None,
+    vitals: ServiceHealth | None = None,
     control: ServiceControl | None = None,
 ) -> LiveDive:
     """The dive of :func:`map_live`, before its first frame. If a checkpoint cannot be resumed, the
@@ -215,7 +215,7 @@ def chosen(vehicle: VehicleConfig, asked: OnboardSettings) -> Choice:
     if asked.out is not None:
         return Choice(asked.out) if asked.overwrite else resumed(asked.out, asked.new)
     service = vehicle.service
-    choice = choose(service.dives, service.checkpoint, asked.new, Moment.now())
+    choice = choose(service.dives, service.checkpoint, asked.new, ClockReading.now())
     tidy(service.dives, choice)
     return choice
 

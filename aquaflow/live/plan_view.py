@@ -14,7 +14,7 @@ from aquaflow.dive.page_axes import names_of, page_axes
 from aquaflow.dive.views import CoverageView
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.live.dive_parts import Parts
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 Array = npt.NDArray[np.float64]
 
@@ -85,7 +85,7 @@ class _SubMapPlan:
 
     def __init__(
         self,
-        frame: MetricFrame,
+        frame: WorldFrame,
         centres: Array,  # [N, 3] in the sub-map's world
     ) -> None:
         self._frame = frame

@@ -21,12 +21,12 @@ from aquaflow.telemetry.factors.factor import Factor
 from aquaflow.telemetry.factors.length import LengthFactor
 from aquaflow.telemetry.factors.position import PlaceFactor, PositionFactor
 from aquaflow.telemetry.factors.velocity import VelocityFactor
-from aquaflow.telemetry.metric_frame import Origin, SourceReport
 from aquaflow.telemetry.problem import ANY_TURN, OPEN_M, Carried, TelemetryProblem
 from aquaflow.telemetry.sources import LEAST_SAMPLES, UsableSeries
 from aquaflow.telemetry.state import LAG, SHIFT, TURN
 from aquaflow.telemetry.telemetry import Telemetry, device_of
 from aquaflow.telemetry.utc import fit_utc
+from aquaflow.telemetry.world_frame import Origin, SourceReport
 from aquaflow.types import Attitude, Position
 
 Array = npt.NDArray[np.float64]

@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.telemetry.camera_path import CameraPath
-from aquaflow.telemetry.metric_frame import MetricFrame, SourceReport
 from aquaflow.telemetry.offset_search import SHORTEST_OVERLAP_S
 from aquaflow.telemetry.problem import TelemetryProblem
 from aquaflow.telemetry.telemetry import Series, Telemetry, device_of
@@ -26,6 +25,7 @@ from aquaflow.telemetry.time_offset import (
     estimate_time_offset,
 )
 from aquaflow.telemetry.turns import Turns, best_turns
+from aquaflow.telemetry.world_frame import SourceReport, WorldFrame
 from aquaflow.types import AngularRate, Attitude
 
 Array = npt.NDArray[np.float64]
@@ -171,7 +171,7 @@ class DeviceClocks:
         clock = self.reference
         return "some devices have no gyro or attitude" if clock.known else clock.reason
 
-    def stated(self, frame: MetricFrame) -> MetricFrame:
+    def stated(self, frame: WorldFrame) -> WorldFrame:
         """The frame with what was found of the clocks."""
         clock = self.reference
         said = "; ".join(filter(None, (frame.scale_source, clock.in_words())))

@@ -14,7 +14,6 @@ from aquaflow.telemetry import start as rough
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.factors.attitude import ForceFactor, HeadingFactor, TiltFactor
 from aquaflow.telemetry.factors.constant_depth import ConstantDepthFactor
-from aquaflow.telemetry.metric_frame import SourceReport
 from aquaflow.telemetry.problem import ANY_TURN, FIXED, Carried, TelemetryProblem
 from aquaflow.telemetry.sources import UsableSeries
 from aquaflow.telemetry.state import (
@@ -30,6 +29,7 @@ from aquaflow.telemetry.state import (
     P,
 )
 from aquaflow.telemetry.telemetry import Series
+from aquaflow.telemetry.world_frame import SourceReport
 
 SCALE_SIGMA = 3.0
 """Log: a start's median depth may be 5 cm or 20 m."""

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.telemetry.factors.factor import Factor
-from aquaflow.telemetry.metric_frame import Origin, SourceReport
 from aquaflow.telemetry.state import MetricState
+from aquaflow.telemetry.world_frame import Origin, SourceReport
 
 Array = npt.NDArray[np.float64]
 

@@ -11,17 +11,17 @@ from aquaflow.geometry.similarity import Sim3, hat
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.contradictions import SCALING
 from aquaflow.telemetry.factors.factor import Factor
-from aquaflow.telemetry.metric_frame import (
-    LARGEST_SCALE_SIGMA,
-    LARGEST_TILT_SIGMA,
-    MAP_UNIT,
-    MetricFrame,
-    North,
-    SourceReport,
-)
 from aquaflow.telemetry.problem import TelemetryProblem
 from aquaflow.telemetry.solve import Solution, inverse_of
 from aquaflow.telemetry.state import SCALE, SHIFT, TURN
+from aquaflow.telemetry.world_frame import (
+    LARGEST_SCALE_SIGMA,
+    LARGEST_TILT_SIGMA,
+    MAP_UNIT,
+    North,
+    SourceReport,
+    WorldFrame,
+)
 
 Array = npt.NDArray[np.float64]
 
@@ -32,7 +32,7 @@ WORTH_NAMING = 5.0
 """A source whose own scale is less sure than the result's by more than this is not named."""
 
 
-def frame_of(problem: TelemetryProblem, solution: Solution, path: CameraPath) -> MetricFrame:
+def frame_of(problem: TelemetryProblem, solution: Solution, path: CameraPath) -> WorldFrame:
     """The frame, in metres and level only as far as its covariance allows."""
     state, covariance = solution.state, _left_tangent(solution)
     if any(factor.kind == "depth" for factor in problem.factors):
@@ -46,7 +46,7 @@ def frame_of(problem: TelemetryProblem, solution: Solution, path: CameraPath) ->
         T_nm = Sim3(state.R_nm, np.zeros(3), 1.0)
     if not level:
         T_nm = Sim3(np.eye(3), np.zeros(3), T_nm.scale)
-    return MetricFrame(
+    return WorldFrame(
         T_nm,
         covariance,
         metric=metric,

@@ -28,7 +28,7 @@ from aquaflow.live.health.state import Health
 from aquaflow.live.live_dive import LiveDive
 from aquaflow.live.loop import LiveLoop
 from aquaflow.live.map_thread import MapThread
-from aquaflow.live.vitals import Vitals
+from aquaflow.live.service_health import ServiceHealth
 from aquaflow.mapping.maps import Maps
 from aquaflow.mapping.work import Growth, Insertion
 from aquaflow.slam import Slam
@@ -153,7 +153,7 @@ class Told:
         self.clock, self.feed, self.control = Clock(), ToldFeed(), ServiceControl()
         self.pressure = CALM
         self.config = ServiceConfig.model_validate(service)
-        self.vitals = Vitals(self.config)
+        self.vitals = ServiceHealth(self.config)
         self.vitals.health = Health(self.clock)
         self.vitals.degradation = Degradation(self.config.limits, self.clock)
         self.degradation, self.heartbeats = self.vitals.degradation, self.vitals.heartbeats

@@ -18,7 +18,7 @@ from aquaflow.live.control import ServiceControl
 from aquaflow.live.feed import LiveFeed
 from aquaflow.live.health.state import ServiceState
 from aquaflow.live.loop import PATIENCE_S, LiveLoop
-from aquaflow.live.vitals import Vitals
+from aquaflow.live.service_health import ServiceHealth
 from aquaflow.sim_drivers.camera_feed import CameraFeed
 from aquaflow.sim_drivers.rtp_camera import RtpCamera, RtspCamera
 from tests.drivers.camera_scenes import Pictures, free_port
@@ -47,7 +47,7 @@ def test_a_dead_stream_is_waited_for_and_comes_back_without_flapping(
     camera = StreamCamera("front", StreamConfig.model_validate(asked))
     feed = LiveFeed("front", {"front": camera}, None, SourceConfig())
     told = Told(tmp_path)
-    control, vitals = ServiceControl(), Vitals(ServiceConfig())
+    control, vitals = ServiceControl(), ServiceHealth(ServiceConfig())
     loop = LiveLoop(
         told.run, feed, told.maps, ServiceConfig(), vitals, control, lambda: told.pressure
     )

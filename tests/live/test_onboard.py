@@ -17,13 +17,13 @@ from aquaflow.base.signals import stop_on_signals
 from aquaflow.base.storage.dive_status import DiveState, DiveStatus
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.live import onboard as module
+from aquaflow.live.clock_reading import ClockReading
 from aquaflow.live.control import DivePhase, ServiceControl, ServiceRequest
 from aquaflow.live.live_dive import STAGE
-from aquaflow.live.moment import Moment
 from aquaflow.live.onboard import Onboard, OnboardSettings, map_live
-from aquaflow.live.station import Station
-from aquaflow.live.vitals import Vitals
-from aquaflow.live.watched import Watched
+from aquaflow.live.service_frontends import ServiceFrontends
+from aquaflow.live.service_health import ServiceHealth
+from aquaflow.live.service_status import ServiceStatus
 from tests.live.live_scenes import VEHICLE, ToldFeed
 from tests.live.unfinished_dives import unfinished
 
@@ -81,16 +81,16 @@ class Service:
     def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch, begin: str) -> None:
         self.feed, self.control = LastingFeed(), ServiceControl()
         self.vehicle = vehicle(root / "dives", begin)
-        self.vitals = Vitals(self.vehicle.service)
-        self.station = Station(self.feed, self.vehicle, self.control, self.vitals)
+        self.vitals = ServiceHealth(self.vehicle.service)
+        self.station = ServiceFrontends(self.feed, self.vehicle, self.control, self.vitals)
         self.onboard = Onboard(self.feed, self.vehicle, self.control, self.station)
         self.begun: list[OnboardSettings] = []
         self.dives: list[FakeDive] = []
         self.idle: list[Callable[[], None]] = [self.control.stopping.set]
         """What happens in the turns without a dive, one after the other."""
         monkeypatch.setattr(module, "begun", self._begin)
-        monkeypatch.setattr(Station, "show", lambda station, dive: None)
-        monkeypatch.setattr("aquaflow.live.standby.TURN_S", 0.01)
+        monkeypatch.setattr(ServiceFrontends, "show", lambda station, dive: None)
+        monkeypatch.setattr("aquaflow.live.idle_loop.TURN_S", 0.01)
         self.station.standby.watchers.append(self._turn)
 
     def _begin(self, feed: object, vehicle: object, asked: OnboardSettings, *_: object) -> FakeDive:
@@ -100,7 +100,7 @@ class Service:
     def start(self) -> None:
         self.control.ask(ServiceRequest.START)
 
-    def _turn(self, standby: Watched) -> None:
+    def _turn(self, standby: ServiceStatus) -> None:
         if self.control.phase is DivePhase.IDLE and self.idle:
             self.idle.pop(0)()
 
@@ -159,10 +159,10 @@ def test_a_dive_that_cannot_be_begun_leaves_the_service_idle_with_the_reason(
 ) -> None:
     (tmp_path / "dives").write_text("not a folder")
     control, feed, reasons = ServiceControl(), LastingFeed(), list[str]()
-    with Vitals(VEHICLE.service) as vitals:
-        station = Station(feed, vehicle(tmp_path / "dives"), control, vitals)
+    with ServiceHealth(VEHICLE.service) as vitals:
+        station = ServiceFrontends(feed, vehicle(tmp_path / "dives"), control, vitals)
 
-        def look(standby: Watched) -> None:
+        def look(standby: ServiceStatus) -> None:
             reasons.append(standby.health.reason)
             if len(reasons) == 1:
                 control.ask(ServiceRequest.START)
@@ -219,7 +219,7 @@ def test_a_camera_that_is_gone_for_good_ends_the_service_also_while_it_is_idle(
 def test_a_dive_that_a_crash_cut_off_goes_on_without_the_pilots_word(
     service: Service, tmp_path: Path, state: DiveState | None, begins: bool
 ) -> None:
-    dives, now = tmp_path / "dives", Moment.now()
+    dives, now = tmp_path / "dives", ClockReading.now()
     dives.mkdir()
     if state is not None:
         unfinished(dives, taken=now, state=state)
@@ -258,7 +258,7 @@ def test_a_paused_dive_that_the_pilot_starts_is_not_paused(service: Service) -> 
 
 
 def test_a_finishing_that_takes_far_longer_than_its_time_is_hung() -> None:
-    with Vitals(VEHICLE.service) as vitals:
+    with ServiceHealth(VEHICLE.service) as vitals:
         now = vitals.heartbeats._now_s()
         vitals.heartbeats.beat(STAGE, ahead_s=100.0)
         assert vitals.heartbeats.hung(60.0) is None

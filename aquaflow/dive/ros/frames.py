@@ -16,7 +16,7 @@ import numpy as np
 
 from aquaflow.dive.placement import Placement
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 MAP, BODY, CAMERA, OPTICAL = "map", "base_link", "camera", "camera_optical"
 
@@ -38,7 +38,7 @@ class FrameTransform:
 class FrameTree:
     """From ``map`` down to ``camera_optical``; every frame has one parent."""
 
-    def __init__(self, frame: MetricFrame, where: Placement) -> None:
+    def __init__(self, frame: WorldFrame, where: Placement) -> None:
         """``frame`` is that of the sub-map, ``where`` how it is placed upright."""
         self._T_un = where.T_un
         camera = FrameTransform(CAMERA, OPTICAL, Sim3(CAMERA_FROM_OPTICAL, np.zeros(3)))

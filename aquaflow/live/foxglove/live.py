@@ -12,7 +12,7 @@ from aquaflow.dive.path_rows import attitude_of
 from aquaflow.dive.placement import placement
 from aquaflow.dive.ros import messages, topics
 from aquaflow.dive.ros.frames import MAP, OPTICAL, FrameTree
-from aquaflow.dive.views import LOOK_S, DiveView, RunningDive, Showing
+from aquaflow.dive.views import LOOK_S, DisplayThread, DiveView, RunningDive
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.live.foxglove.map_moment import MapMoment, cloud_of, taken, water_status
 from aquaflow.live.foxglove.server import FoxgloveServer
@@ -20,7 +20,7 @@ from aquaflow.live.report import GOOD
 from aquaflow.mapping.work import OwnedMaps
 from aquaflow.sources.newest import Newest
 from aquaflow.sources.preprocessing import Preparation
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.frames import Tracked
 from aquaflow.types import Frame
 
@@ -44,7 +44,7 @@ class _PosedMessage:
     t_ns: int
     tracked: Tracked
     picture: Frame | None
-    frame: MetricFrame
+    frame: WorldFrame
     preparation: Preparation
 
 
@@ -59,7 +59,7 @@ class LiveFoxglove(DiveView):
         self._moments: Newest[_PosedMessage] = Newest()
         self._maps: Newest[MapMoment] = Newest()
         self._forget()
-        self._showing = Showing("foxglove", self._show, config.refresh_s)
+        self._showing = DisplayThread("foxglove", self._show, config.refresh_s)
 
     def _forget(self) -> None:
         self._path: list[tuple[int, int, Sim3]] = []
@@ -103,7 +103,7 @@ class LiveFoxglove(DiveView):
         self._showing.close()
         self._server.close()
 
-    def _hand_over(self, dive: RunningDive, latest: Tracked, t_ns: int, frame: MetricFrame) -> None:
+    def _hand_over(self, dive: RunningDive, latest: Tracked, t_ns: int, frame: WorldFrame) -> None:
         run = dive.dive_run
         if self._preparation is None:  # of its own: the loop's prepares the next frame meanwhile
             self._preparation = Preparation(run.config.source, run.preparation.calibration)
@@ -113,7 +113,7 @@ class LiveFoxglove(DiveView):
         self._moments.put(moment)
 
     def _take(
-        self, maps: OwnedMaps, sub_map: int, frame: MetricFrame, points: bool, drawn: bool
+        self, maps: OwnedMaps, sub_map: int, frame: WorldFrame, points: bool, drawn: bool
     ) -> None:
         """In the mapping thread."""
         self._asked = False
@@ -158,7 +158,7 @@ class LiveFoxglove(DiveView):
             send(topics.TF_STATIC, t_ns, messages.transforms(t_ns, tree.fixed))
             self._show_path(t_ns, tracked.sub_map, frame, tree)
 
-    def _show_path(self, t_ns: int, sub_map: int, frame: MetricFrame, tree: FrameTree) -> None:
+    def _show_path(self, t_ns: int, sub_map: int, frame: WorldFrame, tree: FrameTree) -> None:
         """All poses so far, where the dive's metric frame, which changes, has them now."""
         if self._server.wanted(topics.PATH):
             own = [(at_ns, T) for at_ns, number, T in self._path if number == sub_map]
@@ -174,7 +174,7 @@ class LiveFoxglove(DiveView):
             info = messages.camera_info(t_ns, OPTICAL, prepared.camera)
             self._server.send(topics.CAMERA_INFO, t_ns, info)
 
-    def _statuses(self, report: dict[str, Any], frame: MetricFrame) -> list[Any]:
+    def _statuses(self, report: dict[str, Any], frame: WorldFrame) -> list[Any]:
         level = messages.OK if report["state"] in WELL else messages.WARN
         values = {"unit": frame.unit, "scale": frame.scale_source, "level": report["level"]}
         said = f"{report['state']}: {report['reason']}"

@@ -82,7 +82,7 @@ class Health:
         self.visits[self.state] = 1
 
 
-class Trouble(NamedTuple):
+class ServiceWarning(NamedTuple):
     """Why something does not work."""
 
     reason: str
@@ -109,14 +109,14 @@ class Facts:
     """Longest time without a frame before the state is WAITING."""
     pictured: bool
     """A frame came since the start."""
-    camera: Trouble
+    camera: ServiceWarning
     """Why the camera sends nothing, as its driver says."""
     posed: bool
     """The newest frame has a pose."""
     ever_posed: bool
-    inconsistent: Trouble | None
+    inconsistent: ServiceWarning | None
     """Why the poses of the last seconds are doubtful, by the monitor of scale."""
-    troubles: list[Trouble]
+    troubles: list[ServiceWarning]
     """Why the service works with less than everything."""
 
 

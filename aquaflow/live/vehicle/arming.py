@@ -11,7 +11,7 @@ from aquaflow.config.service import DiveConfig
 from aquaflow.config.telemetry import MavlinkConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.live.control import DivePhase, RefusedError, ServiceControl, ServiceRequest
-from aquaflow.live.watched import Watched
+from aquaflow.live.service_status import ServiceStatus
 from aquaflow.sources.pilot import HearsPilot, PilotRequest
 
 log = logging.getLogger(__name__)
@@ -62,7 +62,7 @@ class Arming:
             return False
         return True
 
-    def update(self, service: Watched, now_s: float | None = None) -> None:
+    def update(self, service: ServiceStatus, now_s: float | None = None) -> None:
         """Called after every turn; asks for what arming and disarming mean."""
         now, armed = time.monotonic() if now_s is None else now_s, self._pilot.armed
         if armed is None:

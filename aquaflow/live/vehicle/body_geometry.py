@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.telemetry.metric_frame import MetricFrame, moved_by_frame
+from aquaflow.telemetry.world_frame import WorldFrame, moved_by_frame
 
 Array = npt.NDArray[np.float64]
 
@@ -32,14 +32,14 @@ class BodyPoseInWorld:
         return np.asarray(turn), later.R.T @ (later.t_m - self.t_m)
 
 
-def body_pose(frame: MetricFrame, T_bc: Sim3, T_mc: Sim3) -> BodyPoseInWorld:
+def body_pose(frame: WorldFrame, T_bc: Sim3, T_mc: Sim3) -> BodyPoseInWorld:
     """The body's pose for a camera pose ``T_mc`` in the sub-map that ``frame`` places."""
     R = frame.T_nm.R @ T_mc.R @ T_bc.R.T
     return BodyPoseInWorld(R, frame.T_nm.apply(T_mc.t) - R @ T_bc.t)
 
 
 def pose_covariance(
-    frame: MetricFrame,
+    frame: WorldFrame,
     pose: BodyPoseInWorld,
     own: Array,  # [6, 6] of the pose in the map: position, m, and rotation vector, rad, in n
 ) -> Array:

@@ -10,7 +10,7 @@ from aquaflow.config.service import VehicleReportConfig
 from aquaflow.live.feed import Feed
 from aquaflow.live.health.sentences import OF_STATE
 from aquaflow.live.health.state import Health, ServiceState
-from aquaflow.live.watched import Watched
+from aquaflow.live.service_status import ServiceStatus
 from aquaflow.sources.outbound import NamedValue, StatusText
 
 EVERY_S = 1.0
@@ -52,7 +52,7 @@ class PilotMessages:
         """When each sentence of the last ``REPEAT_S`` was said."""
         self._told_s = -EVERY_S
 
-    def update(self, loop: Watched, now_s: float | None = None) -> None:
+    def update(self, loop: ServiceStatus, now_s: float | None = None) -> None:
         """Called after every turn of the loop; sends what is new or due."""
         now = time.monotonic() if now_s is None else now_s
         if self._config.status_text:

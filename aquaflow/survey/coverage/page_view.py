@@ -15,7 +15,7 @@ from aquaflow.survey.coverage.plan import CoveragePlan, plan_of
 from aquaflow.survey.coverage.sub_map_coverage import SubMapCoverage
 from aquaflow.survey.coverage.survey_lines import survey_lines
 from aquaflow.survey.coverage.swath import MOST_SIGHTS, extent
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 Array = npt.NDArray[np.float64]
 
@@ -70,7 +70,7 @@ def page_view(
     sub_map: int,
     coverage: SubMapCoverage,
     centres: Array,  # [N, 3] of all keyframes in the sub-map's world, in time
-    frame: MetricFrame,
+    frame: WorldFrame,
     limit: float | None,
     config: CoverageConfig,
 ) -> PageView | None:

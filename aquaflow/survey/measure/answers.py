@@ -23,7 +23,7 @@ from aquaflow.survey.measure.quantity import Quantity
 from aquaflow.survey.measure.roughness import MATCH_SIGMA, surface_ratio
 from aquaflow.survey.measure.scale import Scale, scale_of
 from aquaflow.survey.measure.shapes import LEAST_CORNERS, area, path_length, plan_area
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.water.posed_picture import SOLID
 
 Array = npt.NDArray[np.float64]
@@ -121,7 +121,7 @@ def answer(
     return _area(drawn, R_gn, points, scale)
 
 
-def _reach(mapper: Mapper, frame: MetricFrame) -> float:
+def _reach(mapper: Mapper, frame: WorldFrame) -> float:
     """Width of what a picture shows, median over some views, in n's unit."""
     step = max(1, len(mapper.views) // REACH_VIEWS)
     widths = []

@@ -22,7 +22,7 @@ from aquaflow.survey.export.ortho.ground import Ground
 from aquaflow.survey.measure.height_field import HeightField
 from aquaflow.survey.measure.picked import PickedPoint, of_map, of_pixel, view_of_frame
 from aquaflow.survey.measure.points import MeasuredPoints
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 _ON_EARTH = re.compile(r"([\d.]+)([NS]),([\d.]+)([EW])")
 
@@ -89,7 +89,7 @@ def parse_point(text: str) -> Asked:
 def located(
     asked: list[Asked],
     mapper: Mapper,
-    frame: MetricFrame,
+    frame: WorldFrame,
     dive: Dive,
     field: HeightField | None,
     ground: Ground | None,
@@ -114,7 +114,7 @@ def located(
 def _located(
     asked: Asked,
     mapper: Mapper,
-    frame: MetricFrame,
+    frame: WorldFrame,
     dive: Dive,
     field: HeightField | None,
     ground: Ground | None,

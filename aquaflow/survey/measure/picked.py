@@ -16,7 +16,7 @@ from aquaflow.dive.dive import Dive
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.transfers import map_out, picture_out
 from aquaflow.render.views import View
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 Array = npt.NDArray[np.float64]
 
@@ -122,7 +122,7 @@ def refuse_outside(
 
 def of_pixel(
     mapper: Mapper,
-    frame: MetricFrame,
+    frame: WorldFrame,
     view: View,
     pixel: Array,  # [2] px
 ) -> PickedPoint:
@@ -139,7 +139,7 @@ def of_pixel(
 
 def of_map(
     mapper: Mapper,
-    frame: MetricFrame,
+    frame: WorldFrame,
     place: Array,  # [3] in n, as map.ply and the viewer have it
 ) -> PickedPoint:
     """A point of the map; its range error lies along the ray from the nearest mapped view.
@@ -166,7 +166,7 @@ def of_map(
 
 
 def _picked(
-    frame: MetricFrame,
+    frame: WorldFrame,
     place: Array,  # [3] in the sub-map's world
     ray: Array,  # [3] unit, in the same
     across: float,

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.survey.coverage import PageView
-from aquaflow.telemetry.metric_frame import SourceReport
+from aquaflow.telemetry.world_frame import SourceReport
 
 FocalSource = Literal["calibrated", "guessed", "refined"]
 

@@ -14,7 +14,7 @@ from aquaflow.dive.dive import Dive
 from aquaflow.survey.coverage.classes import COLOURS, WORDS, CoverageClass
 from aquaflow.survey.coverage.coverage_file import NAME, read_coverage_file
 from aquaflow.survey.viewer.levels import Palette
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +32,7 @@ CLASSES = Palette(
 def coverage_of_dive(
     dive: Dive,
     centres: npt.NDArray[np.floating],  # [N, 3] in n
-    frame: MetricFrame,
+    frame: WorldFrame,
 ) -> npt.NDArray[np.uint8] | None:
     """[N] a :class:`aquaflow.survey.coverage.Seen` for each; None where the dive keeps no
     coverage."""

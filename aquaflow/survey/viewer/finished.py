@@ -26,7 +26,7 @@ from aquaflow.survey.viewer.pinned_notes import PinnedNotes
 from aquaflow.survey.viewer.seen_water import SeenWater, water_of
 from aquaflow.survey.viewer.splats import ViewerSplats
 from aquaflow.survey.viewer.tools import SCALE, Tools
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +50,7 @@ class FinishedDive:
     water: SeenWater | None
     path: DivePath
     camera: CameraModel
-    frame: MetricFrame
+    frame: WorldFrame
 
     @property
     def splats(self) -> ViewerSplats:
@@ -74,7 +74,7 @@ class FinishedDive:
         return "\n\n".join(filter(None, (said, note_unfinished(self.folder))))
 
 
-def frame_in_words(frame: MetricFrame) -> str:
+def frame_in_words(frame: WorldFrame) -> str:
     """Unit and axes."""
     unit = "Lengths are map units"
     if frame.metric:

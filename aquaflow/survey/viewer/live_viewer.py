@@ -15,21 +15,21 @@ import numpy.typing as npt
 
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.dive.path_rows import attitude_of
-from aquaflow.dive.views import LOOK_S, DiveView, RunningDive, Showing
+from aquaflow.dive.views import LOOK_S, DisplayThread, DiveView, RunningDive
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.work import OwnedMaps
 from aquaflow.sources.newest import Newest
 from aquaflow.survey.coverage.plan import CoveragePlan
 from aquaflow.survey.measure.scale import Scale
 from aquaflow.survey.viewer.dive_coverage import CLASSES, COVERAGE
-from aquaflow.survey.viewer.exhibit import POSE_NUMBERS
 from aquaflow.survey.viewer.levels import RANGE, Palette, range_level, steps_level
 from aquaflow.survey.viewer.measuring import LengthUnit
 from aquaflow.survey.viewer.moments import moments
 from aquaflow.survey.viewer.page import ViewerPage
 from aquaflow.survey.viewer.seen_water import SeenWater, seen_water
 from aquaflow.survey.viewer.splats import ViewerSplats, splats
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.survey.viewer.viewer_content import POSE_NUMBERS
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.frames import Tracked
 from aquaflow.types import CameraModel
 
@@ -57,7 +57,7 @@ class LiveViewer(DiveView):
         self._pictures: Mapping[int, Path] = {}
         self._pose_s = self._map_s = 0.0
         self._asked = False
-        self._showing = Showing("viewer", self._show, config.refresh_s)
+        self._showing = DisplayThread("viewer", self._show, config.refresh_s)
 
     @property
     def splats_shown(self) -> int:
@@ -133,7 +133,7 @@ def frame_of(report: dict[str, Any]) -> LengthUnit:
     known = report.get("metric_frame") or {}
     metres = known.get("metres_per_map_unit")
     if metres is None:
-        return LengthUnit.of(MetricFrame.unknown())
+        return LengthUnit.of(WorldFrame.unknown())
     return LengthUnit(Scale("m", known.get("scale_sigma") or 0.0, 0.0), metres)
 
 
@@ -177,7 +177,7 @@ class LivePath:
         self._rows: list[_Row] = []
         self._depth_m = math.nan
 
-    def add(self, tracked: Tracked, frame: MetricFrame) -> None:
+    def add(self, tracked: Tracked, frame: WorldFrame) -> None:
         """A posed frame, in the metric ``frame`` of its sub-map as it is known by now."""
         T_wc = tracked.T_wc
         assert T_wc is not None
@@ -241,7 +241,7 @@ def shown(
     plain, water, unit = (
         copy.parameters,
         _water(copy),
-        frame or LengthUnit.of(MetricFrame.unknown()),
+        frame or LengthUnit.of(WorldFrame.unknown()),
     )
     with np.errstate(over="ignore"):
         opacities = (1.0 / (1.0 + np.exp(-plain["opacity_logits"][:, 0]))).astype(np.float32)

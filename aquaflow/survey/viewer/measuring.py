@@ -18,7 +18,7 @@ from aquaflow.survey.measure.scale import Scale, scale_of
 from aquaflow.survey.measure.shapes import area, path_length, plan_area
 from aquaflow.survey.viewer.picking import PickedGaussian, pick, within_reach
 from aquaflow.survey.viewer.splats import ViewerSplats
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 Array = npt.NDArray[np.float64]
 Asked = dict[str, Any]
@@ -42,7 +42,7 @@ class LengthUnit:
     """Up is against gravity."""
 
     @staticmethod
-    def of(frame: MetricFrame) -> LengthUnit:
+    def of(frame: WorldFrame) -> LengthUnit:
         """Of a finished dive, whose files are in n."""
         return LengthUnit(scale_of(frame), level=frame.level)
 

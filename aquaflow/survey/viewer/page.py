@@ -13,7 +13,6 @@ import numpy.typing as npt
 
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.survey.viewer.exhibit import POSE_NUMBERS, Exhibit, PathPart, ShownCamera, ShownMap
 from aquaflow.survey.viewer.levels import Palette
 from aquaflow.survey.viewer.measuring import LengthUnit
 from aquaflow.survey.viewer.moments import unknown
@@ -23,6 +22,13 @@ from aquaflow.survey.viewer.seen_water import SeenWater
 from aquaflow.survey.viewer.server import ViewerServer
 from aquaflow.survey.viewer.splats import ViewerSplats
 from aquaflow.survey.viewer.tools import Tools
+from aquaflow.survey.viewer.viewer_content import (
+    POSE_NUMBERS,
+    PathPart,
+    ShownCamera,
+    ShownMap,
+    ViewerContent,
+)
 from aquaflow.types import CameraModel
 
 Float = npt.NDArray[np.floating[Any]]
@@ -52,7 +58,7 @@ class ViewerPage:
             InputError: the address is taken.
             ConfigError: the token will not do.
         """
-        self._exhibit = Exhibit(title, UP["-y"], live)
+        self._exhibit = ViewerContent(title, UP["-y"], live)
         self._tools = tools or Tools()
         self._tools.exhibit = self._exhibit
         self._exhibit.can = self._tools.can()

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 from aquaflow.base.errors import InputError
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.survey.viewer.client import ClientFile, client_file
-from aquaflow.survey.viewer.exhibit import Exhibit
+from aquaflow.survey.viewer.viewer_content import ViewerContent
 from aquaflow.web import HttpRequest, HttpResponse, WebServer
 from aquaflow.web.access import Access, path_of
 
@@ -52,7 +52,7 @@ Ask: TypeAlias = Callable[[str, dict[str, Any]], dict[str, Any]]
 class ViewerServer:
     """Serves an exhibit and its tools at the configured address."""
 
-    def __init__(self, config: ViewerConfig, exhibit: Exhibit, ask: Ask) -> None:
+    def __init__(self, config: ViewerConfig, exhibit: ViewerContent, ask: Ask) -> None:
         """Listen at once.
 
         Raises:

@@ -18,7 +18,6 @@ from aquaflow.survey.site.site_map_file import joined, read_site_map
 from aquaflow.survey.viewer.dive_coverage import CLASSES, COVERAGE, coverage_of_dive
 from aquaflow.survey.viewer.dive_map import DiveMap
 from aquaflow.survey.viewer.dive_path import LONGEST_PATH
-from aquaflow.survey.viewer.exhibit import PathPart
 from aquaflow.survey.viewer.finished import frame_in_words, prepare
 from aquaflow.survey.viewer.levels import RANGE, RGB, Palette, range_level
 from aquaflow.survey.viewer.measuring import LengthUnit
@@ -27,6 +26,7 @@ from aquaflow.survey.viewer.packed_file import read_packed
 from aquaflow.survey.viewer.page import ViewerPage
 from aquaflow.survey.viewer.site_dives import PlacedDive, ShownSite, read_shown
 from aquaflow.survey.viewer.splats import Levels, splats
+from aquaflow.survey.viewer.viewer_content import PathPart
 
 log = logging.getLogger(__name__)
 

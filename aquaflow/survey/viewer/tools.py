@@ -10,10 +10,10 @@ import numpy as np
 
 from aquaflow.base.errors import InputError
 from aquaflow.survey.measure.points import MOST_POINTS
-from aquaflow.survey.viewer.exhibit import Exhibit, ShownMap
 from aquaflow.survey.viewer.measuring import Asked, LengthUnit, MeasuringScene, measured, ray_of
 from aquaflow.survey.viewer.picking import pick
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.survey.viewer.viewer_content import ShownMap, ViewerContent
+from aquaflow.telemetry.world_frame import WorldFrame
 
 NOTES, SCALE = ("notes/list", "notes/add", "notes/remove"), "scale"
 """Names of the tools that a finished dive has besides."""
@@ -25,9 +25,9 @@ BUSY_S = 20.0
 class Tools:
     """Answers browsers, one at a time; ``others`` are a dive's own tools by name."""
 
-    frame: LengthUnit = field(default_factory=lambda: LengthUnit.of(MetricFrame.unknown()))
+    frame: LengthUnit = field(default_factory=lambda: LengthUnit.of(WorldFrame.unknown()))
     others: dict[str, Callable[[Asked], Asked]] = field(default_factory=dict)
-    exhibit: Exhibit | None = None
+    exhibit: ViewerContent | None = None
     _turn: threading.Lock = field(default_factory=threading.Lock)
 
     def can(self) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.keyframes import KeyframeStore, Pointmap
 from aquaflow.keyframes.place import KeyframePlace, depths_at
 from aquaflow.prior.contract import Encoding
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.base.base import Base
 from aquaflow.tracking.base.links import BaseLink, SubMapInBase, agree, link_covariance, placed
 from aquaflow.tracking.graph.table import Snapshot
@@ -42,7 +42,7 @@ WAITING = 32
 
 
 @dataclass(frozen=True)
-class LookedUp:
+class BaseLookup:
     """A keyframe that was looked up, and where it lies in the base, if it was recognised."""
 
     keyframe: int
@@ -100,8 +100,8 @@ class InBase:
             for found in self._worker.ask(STAGE, keyframe.frame_index, look_up):
                 self.take(found)
 
-    def _look_up(self, number: int, encoding: Encoding, pointmap: Pointmap) -> LookedUp:
-        return LookedUp(number, self._places.of(encoding, pointmap))
+    def _look_up(self, number: int, encoding: Encoding, pointmap: Pointmap) -> BaseLookup:
+        return BaseLookup(number, self._places.of(encoding, pointmap))
 
     def has_news(self) -> bool:
         """True once after links were added: the graph should take them in."""
@@ -123,7 +123,7 @@ class InBase:
 
     # --- what is believed ---------------------------------------------------------------------
 
-    def take(self, found: LookedUp) -> None:
+    def take(self, found: BaseLookup) -> None:
         """What a look-up found of a keyframe."""
         where = found.recognised
         if where is None:
@@ -206,7 +206,7 @@ class InBase:
             }
         return self._placed
 
-    def frame(self, sub_map: int, own: MetricFrame) -> MetricFrame:
+    def frame(self, sub_map: int, own: WorldFrame) -> WorldFrame:
         """The base's frame with the place of ``sub_map`` in it; ``own``, by the dive's telemetry,
         where that was not recognised."""
         where = self.places().get(sub_map)

@@ -16,7 +16,7 @@ from aquaflow.keyframes import Pointmap
 from aquaflow.telemetry.known_lengths.board_size import BoardView, PixelDepths
 from aquaflow.telemetry.known_lengths.finder import KnownLengthFinder
 from aquaflow.telemetry.known_lengths.known_length import KnownLength
-from aquaflow.telemetry.metric_frame import SourceReport
+from aquaflow.telemetry.world_frame import SourceReport
 
 Array = npt.NDArray[np.float64]
 PlaceOf = Callable[[int], tuple[Sim3, int] | None]

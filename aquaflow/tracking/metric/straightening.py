@@ -13,7 +13,7 @@ from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.dead_reckoning import carried_from
 from aquaflow.telemetry.estimator import Estimate, estimate
 from aquaflow.telemetry.factors.length import length_factors
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.graph.equations import Rows, poses_of
 from aquaflow.tracking.graph.optimisation import Optimisation
 from aquaflow.tracking.graph.table import EDGE, NODE, TRUST, GraphResult, Snapshot
@@ -58,7 +58,7 @@ class Straightened:
     """Keyframes as loops and telemetry want them, and the worlds that they lie in then."""
 
     result: GraphResult
-    frames: dict[int, MetricFrame]
+    frames: dict[int, WorldFrame]
     """By component."""
 
 

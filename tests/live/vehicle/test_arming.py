@@ -14,8 +14,8 @@ from aquaflow.config.service import DiveConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.live.control import DivePhase, RefusedError, ServiceControl, ServiceRequest
 from aquaflow.live.onboard import map_live
+from aquaflow.live.service_status import ServiceStatus
 from aquaflow.live.vehicle.arming import Arming, refuse_without_autopilot
-from aquaflow.live.watched import Watched
 from aquaflow.sources.pilot import Obey
 from tests.live.live_scenes import ToldFeed
 
@@ -27,7 +27,7 @@ class LastingFeed(ToldFeed):
 
 
 BOTH = DiveConfig(begin="when_armed", finish="when_disarmed", disarmed_s=10.0, commands=True)
-SERVICE = cast(Watched, SimpleNamespace())
+SERVICE = cast(ServiceStatus, SimpleNamespace())
 
 
 class Autopilot:

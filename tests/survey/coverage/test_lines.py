@@ -13,7 +13,7 @@ from aquaflow.survey.coverage.classes import CoverageClass
 from aquaflow.survey.coverage.next_line import LineState, line_state
 from aquaflow.survey.coverage.page_view import PageView
 from aquaflow.survey.coverage.survey_lines import MOST_POINTS, survey_lines
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from tests.survey.coverage.surveys import HEIGHT, WIDTH, lawnmower, metric, surveyed
 
 CONFIG = CoverageConfig()
@@ -33,7 +33,7 @@ def state(path: np.ndarray, overlap: float = 0.6, covered: object = nothing) -> 
 
 
 def viewed(
-    path: np.ndarray, frame: MetricFrame | None = None, limit: float | None = None
+    path: np.ndarray, frame: WorldFrame | None = None, limit: float | None = None
 ) -> PageView:
     centres = np.column_stack([path, np.full(len(path), 2.0)])
     view = page_view(0, surveyed(path), centres, frame or metric(), limit, CONFIG)
@@ -143,7 +143,7 @@ def test_points_of_the_map_have_the_class_of_the_cell_below_them() -> None:
 
 
 def test_without_gravity_the_page_is_in_map_units() -> None:
-    unknown = replace(MetricFrame.unknown(), scale_source="none")
+    unknown = replace(WorldFrame.unknown(), scale_source="none")
     view = viewed(lawnmower(2, 6.0, 1.0, 0.45), unknown)
     assert view.unit == "map units"
     assert view.state.swath > 0.0

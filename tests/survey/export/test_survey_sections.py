@@ -29,7 +29,7 @@ from aquaflow.survey.report import (
 )
 from aquaflow.survey.report.pdf import write_pdf
 from aquaflow.survey.report.report_of import MOST_REASONS, left_out, profile
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from tests.survey.coverage.surveys import lawnmower, metric, survey_of
 
 VIEW = survey_of(lawnmower(3, 6.0, 1.0, 0.45))
@@ -123,7 +123,7 @@ def test_the_profile_is_what_the_vehicle_measured_else_the_paths() -> None:
     assert of_path is not None
     assert (of_path.depth == 5.0).all()
     assert of_path.depth_is == "depth of the camera"
-    assert profile(rows(None, None, "map units"), MetricFrame.unknown()) is None
+    assert profile(rows(None, None, "map units"), WorldFrame.unknown()) is None
 
 
 def test_reasons_that_differ_in_numbers_are_one_and_rare_ones_are_summed() -> None:

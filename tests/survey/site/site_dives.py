@@ -15,7 +15,7 @@ from aquaflow.keyframes.place import KeyframePlace, KeypointDepths
 from aquaflow.keyframes.places_file import EDGE, NAME, write_places
 from aquaflow.prior.contract import Keypoints
 from aquaflow.telemetry.metric_file import write_metric_file
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 CAMERA = CameraModel(320, 240, 270.0, 270.0, 160.0, 120.0)
 POINTS = 1500
@@ -53,7 +53,7 @@ def stated_dive(
     count: int = 6,
     world: Sim3 | None = None,
     seed: int = 0,
-    frame: MetricFrame | None = None,
+    frame: WorldFrame | None = None,
     sub_maps: Sequence[int] | None = None,
 ) -> Path:
     """A finished dive along x from ``start``; ``world``: T_ms, from the scene's world to the map's.
@@ -75,7 +75,7 @@ def stated_dive(
     edges["information"], edges["trust"] = np.eye(7) / 0.003**2, 1.0
     folder.mkdir(parents=True)
     write_places(folder / NAME, zip(places, seen, strict=True), edges)
-    metric = frame or MetricFrame.unknown()
+    metric = frame or WorldFrame.unknown()
     write_metric_file(folder, dict.fromkeys(sorted(set(numbers)), metric), 0)
     in_n = [metric.T_nm @ T for T in in_m]
     write_tum(

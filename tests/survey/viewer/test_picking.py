@@ -11,7 +11,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.survey.measure.scale import Scale
 from aquaflow.survey.viewer.measuring import LengthUnit, MeasuringScene, measured, ray_of
 from aquaflow.survey.viewer.picking import pick, within_reach
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from tests.survey.viewer.planes import DEPTH, floor
 
 EYE = np.array([0.3, -0.2, 0.0])
@@ -103,7 +103,7 @@ def test_lengths_of_a_live_map_are_said_in_metres_once_they_are_known() -> None:
     assert np.isclose(
         measured("distance", ends, scene(live))["quantities"]["distance"]["value"], 6.0, atol=0.06
     )
-    unknown = measured("distance", ends, scene(LengthUnit.of(MetricFrame.unknown())))
+    unknown = measured("distance", ends, scene(LengthUnit.of(WorldFrame.unknown())))
     assert "map units" in unknown["words"]
 
 

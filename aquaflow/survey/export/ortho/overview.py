@@ -13,7 +13,7 @@ from aquaflow.survey.export.ortho.colours import Colours
 from aquaflow.survey.export.ortho.drawing import GroundSplats
 from aquaflow.survey.export.ortho.grid import Grid, GridTile, rounded
 from aquaflow.survey.export.ortho.ground import Ground, ground_of
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 Array = npt.NDArray[np.float64]
 
@@ -30,7 +30,7 @@ SOLID_ALPHA = 0.5
 """Cover of a pixel above which the map is there."""
 
 
-def overview_png(mapper: Mapper, frame: MetricFrame) -> bytes:
+def overview_png(mapper: Mapper, frame: WorldFrame) -> bytes:
     """A PNG file, transparent where the map is not; its top is what is up on the ground's axes.
 
     Raises:

@@ -21,7 +21,7 @@ from aquaflow.survey.export.ortho.grid import Grid, GridTile, rounded
 from aquaflow.survey.export.ortho.ground import LEAST_VIEWS, Ground, ground_of
 from aquaflow.survey.export.ortho.layers import DEM, ORTHO, QUALITY, TilePixels
 from aquaflow.survey.export.ortho.sightings import PICTURE_SIGMA_PX, ViewRanges
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.water.posed_picture import SOLID
 
 Kind = Literal["ortho", "dem"]
@@ -142,7 +142,7 @@ class _Tiles:
 
 
 def _tags(
-    dive: Dive, frame: MetricFrame, ground: Ground, side: float, through: float | None, ortho: bool
+    dive: Dive, frame: WorldFrame, ground: Ground, side: float, through: float | None, ortho: bool
 ) -> dict[str, str]:
     """What the files say of themselves, in words."""
     tags = {

@@ -9,7 +9,7 @@ from aquaflow.live.health.state import Health, ServiceState
 from aquaflow.live.health.systemd import Notifier
 
 
-class Vitals:
+class ServiceHealth:
     """Close it after the last dive."""
 
     def __init__(self, config: ServiceConfig) -> None:
@@ -40,7 +40,7 @@ class Vitals:
         self._watchdog.close()
         self.notifier.close()
 
-    def __enter__(self) -> Vitals:
+    def __enter__(self) -> ServiceHealth:
         return self
 
     def __exit__(self, *_: object) -> None:

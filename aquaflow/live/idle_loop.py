@@ -10,8 +10,8 @@ from aquaflow.live.control import ServiceControl
 from aquaflow.live.feed import Feed
 from aquaflow.live.health.counters import Counters
 from aquaflow.live.health.state import ServiceState
-from aquaflow.live.vitals import Vitals
-from aquaflow.live.watched import Watched
+from aquaflow.live.service_health import ServiceHealth
+from aquaflow.live.service_status import ServiceStatus
 from aquaflow.types import Frame
 
 STAGE = "standby"
@@ -24,11 +24,11 @@ FINISHING = "the map is refined and the report written"
 """The reason of the state FINISHING."""
 
 
-class Standby:
+class IdleLoop:
     """To be used from the service's own thread."""
 
-    def __init__(self, feed: Feed, control: ServiceControl, vitals: Vitals) -> None:
-        self.watchers: list[Callable[[Watched], None]] = []
+    def __init__(self, feed: Feed, control: ServiceControl, vitals: ServiceHealth) -> None:
+        self.watchers: list[Callable[[ServiceStatus], None]] = []
         """Called after every turn; must not wait."""
         self.vitals = vitals
         self.health, self.degradation = vitals.health, vitals.degradation

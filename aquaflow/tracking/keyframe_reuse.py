@@ -41,7 +41,7 @@ class ReuseRequest:
 
 
 @dataclass(frozen=True)
-class Looked:
+class ReuseResult:
     """What a look found."""
 
     look: ReuseRequest
@@ -49,7 +49,7 @@ class Looked:
     """An earlier keyframe that shows the frame, and the frame's pose there; None: there is none."""
 
 
-class Returning:
+class KeyframeReuse:
     """Decides whether a frame at which a keyframe is due becomes one."""
 
     def __init__(
@@ -86,7 +86,7 @@ class Returning:
         if self.was_in_vain(at):
             return True
         if self._looked_already(at, solved):
-            self._keyframe_tracker.leave(at)
+            self._keyframe_tracker.release(at)
             return False
         neighbours = self._keyframe_tracker.neighbours
         around = neighbours.around(at.T_wc, camera, at.keyframe.sub_map, at.keyframe)
@@ -112,7 +112,7 @@ class Returning:
             and solved.share >= config.crowd_share
         )
 
-    def search(self, look: ReuseRequest) -> Looked:
+    def search(self, look: ReuseRequest) -> ReuseResult:
         """The keyframe that shows the frame best, if one does well enough; in any thread."""
         config, best = self._config, None
         least = look.solved.share if self._is_crowded(look) else config.return_share
@@ -125,13 +125,13 @@ class Returning:
                     best, least = back, back[1].share
                 if least >= config.return_share:
                     break
-        return Looked(look, best)
+        return ReuseResult(look, best)
 
     def stay(self, look: ReuseRequest) -> None:
         """None was found: the keyframe in use is kept in a crowded place, else a new one is due."""
         if self._is_crowded(look) and look.solved.share >= self._config.crowd_share:
             look.at.kept = look.t_ns, look.solved.share
-            self._keyframe_tracker.leave(look.at)  # its points are kept, as of one that is left
+            self._keyframe_tracker.release(look.at)  # its points are kept, as of one that is left
         else:
             self._in_vain = look.at
 

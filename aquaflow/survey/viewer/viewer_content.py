@@ -84,7 +84,7 @@ class PathPart:
 
 
 @dataclass
-class Exhibit:
+class ViewerContent:
     """Attributes are replaced as a whole; they are not changed in place."""
 
     title: str
