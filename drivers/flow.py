@@ -20,7 +20,7 @@ class _Second:
         self.number, self.count, self.lag_ns = number, 0, 0
 
 
-class Flow:
+class DeviceState:
     """Written by the device's thread, read by anyone."""
 
     def __init__(self, now_ns: Callable[[], int] = time.monotonic_ns) -> None:

@@ -17,7 +17,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.config.cameras import LiveCameraConfig
 from aquaflow.drivers.capture import Capture, OpenCapture, RawPicture, UnusablePictureError
 from aquaflow.drivers.events import Event, about
-from aquaflow.drivers.flow import Flow
+from aquaflow.drivers.flow import DeviceState
 from aquaflow.drivers.sequence import SequenceGaps
 from aquaflow.geometry.camera import guess_camera, load_camera
 from aquaflow.sources import is_asked
@@ -58,7 +58,7 @@ class LiveCamera:
         self.state = CameraState.CLOSED
         self.reason = ""
         """Why the camera is lost, for people."""
-        self.flow = Flow(now_ns)
+        self.flow = DeviceState(now_ns)
         self._config = config
         self._open_capture = open_capture
         self._now_ns = now_ns

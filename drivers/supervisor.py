@@ -10,7 +10,7 @@ from enum import Enum
 from typing import Protocol, TypeAlias, runtime_checkable
 
 from aquaflow.drivers.events import Event, about
-from aquaflow.drivers.flow import Flow
+from aquaflow.drivers.flow import DeviceState
 from aquaflow.drivers.link import ByteLink, LinkCounters, LinkDecoder, LinkLostError
 from aquaflow.drivers.transport import OpenLink
 from aquaflow.sources import RawTap
@@ -69,7 +69,7 @@ class Supervisor:
         self.state = LinkState.WAITING
         self.reason = "nothing heard yet"
         """Why it is not connected, for people."""
-        self.flow = Flow()
+        self.flow = DeviceState()
         self.is_open = False
         self._open_link = open_link
         self._decoder = decoder

@@ -95,7 +95,7 @@ WAIT_S = 0.05
 """Longest wait for a picture before the camera looks whether it shall end."""
 
 
-class _Camera(ABC):
+class _CameraThread(ABC):
     """A thread that sends a feed's pictures, while it is plugged in."""
 
     def __init__(self, feed: CameraFeed, payload_type: int = H264) -> None:
@@ -131,7 +131,7 @@ class _Camera(ABC):
         return packets[: len(packets) // 2] if shot.corrupt else packets
 
 
-class RtpCamera(_Camera):
+class RtpCamera(_CameraThread):
     """Sends to a port of this computer, whether or not anyone listens; as BlueOS does to 5600."""
 
     def __init__(self, port: int, feed: CameraFeed, payload_type: int = H264) -> None:
@@ -148,7 +148,7 @@ class RtpCamera(_Camera):
                         sender.sendto(packet, self._address)
 
 
-class RtspCamera(_Camera):
+class RtspCamera(_CameraThread):
     """An RTSP server for one client at a time (RFC 2326), as many network cameras are. RTP goes
     over the connection itself or, if the client asks for it, over UDP."""
 

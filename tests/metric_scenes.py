@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.telemetry.metric_frame import MetricFrame, Origin, SourceReport
+from aquaflow.telemetry.world_frame import Origin, SourceReport, WorldFrame
 
 SCALE = 2.5
 TURN = Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix()
@@ -23,9 +23,9 @@ SOURCES = (
 )
 
 
-def metric_frame(**changes: object) -> MetricFrame:
+def metric_frame(**changes: object) -> WorldFrame:
     """All that a frame can know; ``changes`` replace fields."""
-    frame = MetricFrame(
+    frame = WorldFrame(
         T_nm=Sim3(TURN, SHIFT, SCALE),
         covariance=np.diag(SIGMAS**2),
         metric=True,

@@ -96,13 +96,13 @@ def test_only_the_keyframe_added_last_may_be_changed_in_place(
 @pytest.mark.parametrize("in_files", WORK)
 def test_an_earlier_keyframe_may_be_changed_once_it_is_held(tmp_path: Path, in_files: bool) -> None:
     store = filled(tmp_path if in_files else None)
-    keyframe = store.hold(2)
+    keyframe = store.load(2)
     assert keyframe is store[2]
     held = keyframe.pointmap
     for number in range(6):  # whatever else is looked at meanwhile
         _ = store[number].encoding
     held.rho[0, 0] = 9.0
-    store.hold(4)
+    store.load(4)
     for number in range(6):
         _ = store[number].encoding
     assert store[2].pointmap.rho[0, 0] == 9.0
@@ -204,7 +204,7 @@ def test_another_thread_reads_while_keyframes_come_and_go(tmp_path: Path) -> Non
         looking = threads.submit(look)
         for number in range(6, 24):
             add(store, number)
-            store.hold(number // 2)
+            store.load(number // 2)
             store.save()
         looking.result()
     assert len(read) == 60

@@ -6,7 +6,7 @@ import pytest
 
 from aquaflow.base.worker import Worker
 from aquaflow.slam import Slam
-from aquaflow.tracking.frames import Link
+from aquaflow.tracking.frames import KeyframeEdge
 from aquaflow.tracking.graph.keyframe_graph import Correction
 from tests.slam_scenes import OPEN_GATE, ToldTracker, config, frame_of
 
@@ -18,7 +18,7 @@ class ToldGraph:
         self.asked: list[str] = []
         self.optimising = False
 
-    def add(self, number: int, link: Link | None) -> None:
+    def add(self, number: int, link: KeyframeEdge | None) -> None:
         self.asked.append(f"add {number}")
         self.optimising = True
 

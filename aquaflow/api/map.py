@@ -24,7 +24,7 @@ from aquaflow.render import RendererName, select_renderer
 from aquaflow.render.transfers import picture_out, water_out
 from aquaflow.render.views import View, in_time
 from aquaflow.telemetry.metric_file import read_frame_of_map
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 FloatImage = npt.NDArray[np.float32]
 
@@ -64,9 +64,9 @@ class Map:
     them, else the first keyframe's camera and map units.
     """
 
-    def __init__(self, mapper: Mapper, metric_frame: MetricFrame | None = None) -> None:
+    def __init__(self, mapper: Mapper, metric_frame: WorldFrame | None = None) -> None:
         self._mapper = mapper
-        self.metric_frame = metric_frame or MetricFrame.unknown()
+        self.metric_frame = metric_frame or WorldFrame.unknown()
         """What the world is, how well that is known, and from which telemetry."""
         self.views: list[MappedView] = [
             MappedView(view.frame_index, view.keyframe, view.camera, self._posed(view.T_wc))

@@ -24,14 +24,14 @@ class Stages:
     def __init__(self, profiler: Profiler | None = None, failures: Failures | None = None) -> None:
         self.profiler, self.failures = profiler or Profiler(), failures or Failures()
 
-    def __call__(self, name: str, frame: int | None = None) -> Stage:
+    def __call__(self, name: str, frame: int | None = None) -> StageRun:
         """One run of a stage, of the frame with this index. Exceptions that have their own way to
         the user come through, as from :meth:`Failures.contain`."""
         contained = self.failures.contain(FAILING.get(name, name), frame)
-        return Stage(self.profiler, name, contained)
+        return StageRun(self.profiler, name, contained)
 
 
-class Stage:
+class StageRun:
     """One run of a stage."""
 
     __slots__ = ("_contained", "_timed")

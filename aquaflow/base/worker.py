@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Finished:
+class WorkResult:
     """What one piece of work found."""
 
     stage: str
@@ -71,14 +71,14 @@ class Worker:
         goes on until it needs the result."""
         return self._long.submit(work)
 
-    def finished(self, wait: bool = False) -> Iterator[Finished]:
+    def finished(self, wait: bool = False) -> Iterator[WorkResult]:
         """What has been found of what was asked for, each once; with ``wait`` all of it."""
         while self._asked and (wait or self._asked[0].future.done()):
             asked = self._asked.popleft()
             with self._failures.contain(asked.stage, asked.frame) as run:
                 found = asked.future.result()
             if not run.failed:
-                yield Finished(asked.stage, asked.frame, found)
+                yield WorkResult(asked.stage, asked.frame, found)
 
     def waiting(self, stage: str | None = None) -> int:
         """Pieces of work, of all stages or of one, whose results have not been taken yet."""

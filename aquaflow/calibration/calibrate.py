@@ -13,7 +13,7 @@ import numpy.typing as npt
 from aquaflow.base.errors import ConfigError, InputError, reason_of
 from aquaflow.base.storage.atomic import write_json
 from aquaflow.calibration.board import Board, Detector
-from aquaflow.calibration.fit import Fit, fit_lens, fit_port
+from aquaflow.calibration.fit import CalibrationFit, fit_lens, fit_port
 from aquaflow.calibration.views import Views, find_views
 from aquaflow.geometry.camera import CameraModel, DistortionModel
 from aquaflow.geometry.camera_file import save_camera
@@ -31,7 +31,7 @@ class Calibration:
     """The result, and the pictures that it is from."""
 
     views: Views
-    fit: Fit
+    fit: CalibrationFit
 
     def to_json(self) -> dict[str, Any]:
         """Figures for calibration.json."""
@@ -149,7 +149,7 @@ ARROW_SHARE = 0.04
 """Length of the 95th percentile's arrow, over the picture's width."""
 
 
-def draw_residuals(views: Views, fit: Fit, path: Path) -> None:
+def draw_residuals(views: Views, fit: CalibrationFit, path: Path) -> None:
     """Residual vectors over the picture, their histogram, and the error of every picture.
 
     Raises:

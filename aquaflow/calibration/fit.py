@@ -12,8 +12,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from aquaflow.base.errors import InputError
-from aquaflow.calibration.parameters import Parameters
-from aquaflow.calibration.views import View
+from aquaflow.calibration.parameters import CameraUnknowns
+from aquaflow.calibration.views import BoardImage
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.optics import pixels_of_points, rays_of_pixels, virtual_centre
 
@@ -37,7 +37,7 @@ UNSEEN_PX = 1e4
 
 
 @dataclass(frozen=True)
-class Fit:
+class CalibrationFit:
     """A camera, how well its numbers are known, and what is left of every corner."""
 
     camera: CameraModel
@@ -58,7 +58,7 @@ class Fit:
         return float(np.sqrt(np.mean(np.concatenate(left) ** 2)))
 
 
-def fit_lens(views: Sequence[View], start: CameraModel) -> Fit:
+def fit_lens(views: Sequence[BoardImage], start: CameraModel) -> CalibrationFit:
     """Find the lens of ``start``'s kind, size and port, from the best of several focal lengths.
 
     Raises:
@@ -76,10 +76,10 @@ def fit_lens(views: Sequence[View], start: CameraModel) -> Fit:
             "no lens explains the corners of the board; check --columns, --rows and --model"
         )
     _, guess, poses = min(fits, key=lambda each: each[0])
-    return _refined(views, Parameters(guess), poses)
+    return _refined(views, CameraUnknowns(guess), poses)
 
 
-def fit_port(views: Sequence[View], start: CameraModel) -> Fit:
+def fit_port(views: Sequence[BoardImage], start: CameraModel) -> CalibrationFit:
     """Find the distance and the normal of ``start``'s flat port; its lens is kept.
 
     Raises:
@@ -91,10 +91,10 @@ def fit_port(views: Sequence[View], start: CameraModel) -> Fit:
             "the pictures of the board do not go with the camera that is given; check that its "
             "lens was calibrated in air"
         )
-    return _refined(views, Parameters(start, port=True), poses)
+    return _refined(views, CameraUnknowns(start, port=True), poses)
 
 
-def _poses(views: Sequence[View], camera: CameraModel) -> Array | None:
+def _poses(views: Sequence[BoardImage], camera: CameraModel) -> Array | None:
     """[V, 6] of the board as a pinhole at the virtual centre sees it; None if it does not."""
     poses, centre = [], virtual_centre(camera)
     for view in views:
@@ -113,7 +113,7 @@ def _poses(views: Sequence[View], camera: CameraModel) -> Array | None:
 
 
 def _cost(
-    views: Sequence[View],
+    views: Sequence[BoardImage],
     camera: CameraModel,
     poses: Array,  # [V, 6]
 ) -> float:
@@ -122,7 +122,7 @@ def _cost(
 
 
 def _residuals(
-    views: Sequence[View],
+    views: Sequence[BoardImage],
     camera: CameraModel,
     poses: Array,  # [V, 6]
 ) -> Array:
@@ -137,10 +137,10 @@ def _residuals(
 
 
 def _refined(
-    views: Sequence[View],
-    parameters: Parameters,
+    views: Sequence[BoardImage],
+    parameters: CameraUnknowns,
     poses: Array,  # [V, 6]
-) -> Fit:
+) -> CalibrationFit:
     """Fit, leave out what was found wrongly, and fit again."""
     counts = [len(view.found.numbers) for view in views]
     everything = np.ones(sum(counts), bool)
@@ -153,12 +153,12 @@ def _refined(
     camera = parameters.camera(values)
     ends = np.cumsum(counts)[:-1]
     residuals = np.split(_residuals(views, camera, poses), ends)
-    return Fit(camera, parameters.names, values, sigma, residuals, np.split(kept, ends))
+    return CalibrationFit(camera, parameters.names, values, sigma, residuals, np.split(kept, ends))
 
 
 def _solve(
-    views: Sequence[View],
-    parameters: Parameters,
+    views: Sequence[BoardImage],
+    parameters: CameraUnknowns,
     values: Array,  # [P]
     poses: Array,  # [V, 6]
     kept: npt.NDArray[np.bool_],  # [N] corners to use

@@ -23,7 +23,7 @@ PORT = ("distance_m", "normal_x", "normal_y")
 
 
 @dataclass(frozen=True)
-class Parameters:
+class CameraUnknowns:
     """Which numbers of a camera are open."""
 
     start: CameraModel

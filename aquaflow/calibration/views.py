@@ -27,7 +27,7 @@ COVERAGE_CELLS = 8
 
 
 @dataclass(frozen=True)
-class View:
+class BoardImage:
     """One picture with the board in it."""
 
     name: str
@@ -40,7 +40,7 @@ class Views:
 
     width: int
     height: int
-    used: list[View]
+    used: list[BoardImage]
     read: int
     """Pictures in all."""
     without_board: list[str]
@@ -65,7 +65,7 @@ def find_views(
         InputError: the pictures are of several sizes, too few show the board, or too few of those
             differ.
     """
-    used: list[View] = []
+    used: list[BoardImage] = []
     without, alike, size, read = [], [], (0, 0), 0
     for name, image in pictures:
         height, width = image.shape[:2]
@@ -81,7 +81,7 @@ def find_views(
         elif any(_alike(found, other.found, LEAST_MOVE * width) for other in used):
             alike.append(name)
         else:
-            used.append(View(name, found))
+            used.append(BoardImage(name, found))
     views = Views(*size, _spread(used), read, without, alike)
     _refuse_too_few(views)
     return views
@@ -117,7 +117,7 @@ def _alike(one: Found, other: Found, least_px: float) -> bool:
     return bool(moved.mean() < least_px)
 
 
-def _spread(views: list[View]) -> list[View]:
+def _spread(views: list[BoardImage]) -> list[BoardImage]:
     """At most MOST_VIEWS of them, evenly over the order in which they were taken."""
     if len(views) <= MOST_VIEWS:
         return views

@@ -13,7 +13,7 @@ from aquaflow.cli.console import PRESETS, Json, progress_bars, table_console
 
 if TYPE_CHECKING:
     from aquaflow.lab.batch.batch import Batched
-    from aquaflow.lab.batch.job import Outcome
+    from aquaflow.lab.batch.job import BatchOutcome
 
 POOR_RESULT = 3
 """Exit status where every dive was written, and some with warnings, as of `map`."""
@@ -151,7 +151,7 @@ def _print_table(batched: Batched) -> None:
         typer.echo(f"The batch ended early: {why}.")
 
 
-def _cells(outcome: Outcome | None) -> list[str]:
+def _cells(outcome: BatchOutcome | None) -> list[str]:
     if outcome is None:
         return ["not made", *[""] * 6]
     state = "there before" if outcome.earlier else outcome.state

@@ -61,7 +61,12 @@ def change(
             refuse_without_map(Path(name))
     names = f"{Path(first).resolve().name}_{Path(second).resolve().name}"
     target = out or (site or Path("out")) / f"change_{names}"
-    from aquaflow.survey.change.find_changes import Asked, find_changes, refuse_taken, write_changes
+    from aquaflow.survey.change.find_changes import (
+        ChangeSettings,
+        find_changes,
+        refuse_taken,
+        write_changes,
+    )
     from aquaflow.survey.change.frames import between, in_site
 
     refuse_taken(target, overwrite)
@@ -70,7 +75,7 @@ def change(
         T_ab = between(one, other, transform)
     else:
         one, other, T_ab = in_site(site, first, second)
-    asked = Asked(one, other, T_ab, false, cylinder, reach)
+    asked = ChangeSettings(one, other, T_ab, false, cylinder, reach)
     with progress_bars(quiet=as_json) as bars, tempfile.TemporaryDirectory() as work:
         found = find_changes(asked, Path(work), bars)
         files = write_changes(target, found, overwrite)

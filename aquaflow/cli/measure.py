@@ -16,12 +16,12 @@ from aquaflow.cli.console import Json, progress_bars
 
 if TYPE_CHECKING:
     from aquaflow.dive.dive import Dive
-    from aquaflow.survey.measure.answers import Answer
+    from aquaflow.survey.measure.answers import PointMeasurements
     from aquaflow.survey.measure.reef_numbers import ReefNumbers
     from aquaflow.survey.measure.units import LengthUnit
 
 
-class Shape(str, Enum):
+class PointShape(str, Enum):
     """What points are taken as."""
 
     line = "line"
@@ -50,7 +50,7 @@ def measure(
         ),
     ] = None,
     shape: Annotated[
-        Shape | None,
+        PointShape | None,
         typer.Option("--as", help="Two points are a line, more an area, unless this says else."),
     ] = None,
     cell: Annotated[
@@ -90,7 +90,7 @@ def measure(
     from aquaflow.survey.measure.reef_files import write_csv
 
     with progress_bars(quiet=as_json) as bars, tempfile.TemporaryDirectory() as work:
-        found: Answer | ReefNumbers
+        found: PointMeasurements | ReefNumbers
         if point:
             found = _between(read, point, shape, cell, Path(work), bars)
         else:
@@ -129,11 +129,11 @@ def _tend_notes(dive: Dive, delete: list[str], as_json: bool) -> None:
 def _between(
     dive: Dive,
     texts: list[str],
-    shape: Shape | None,
+    shape: PointShape | None,
     cell: float | None,
     work: Path,
     progress: Any,
-) -> Answer:
+) -> PointMeasurements:
     from aquaflow.survey.measure.asked import parse_point
 
     asked = [parse_point(text) for text in texts]

@@ -28,7 +28,7 @@ from aquaflow.config.mapping import (
 from aquaflow.config.pictures import PicturesConfig
 from aquaflow.config.prior import PriorConfig
 from aquaflow.config.source import SourceConfig
-from aquaflow.config.stage import Stage, validated
+from aquaflow.config.stage import StageConfig, validated
 from aquaflow.config.tracking import (
     GateConfig,
     GraphConfig,
@@ -68,7 +68,7 @@ __all__ = [
 ]
 
 
-class Config(Stage):
+class Config(StageConfig):
     """Everything a run depends on."""
 
     seed: int = 0

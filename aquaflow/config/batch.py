@@ -6,10 +6,10 @@ from pathlib import Path
 
 from pydantic import Field
 
-from aquaflow.config.stage import Stage
+from aquaflow.config.stage import StageConfig
 
 
-class BatchConfig(Stage):
+class BatchConfig(StageConfig):
     """How a batch is run (docs/batch.md); nothing here changes a byte of a dive."""
 
     jobs: int | None = Field(

@@ -8,10 +8,10 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field, model_validator
 
 from aquaflow.config.device import MountingConfig
-from aquaflow.config.stage import Stage
+from aquaflow.config.stage import StageConfig
 
 
-class LiveCameraConfig(Stage):
+class LiveCameraConfig(StageConfig):
     """What all live cameras have in common."""
 
     calibration: Path | None = Field(

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from aquaflow.config.device import Assumptions, PositioningConfig
 from aquaflow.config.link import CanConfig
-from aquaflow.config.stage import Stage
+from aquaflow.config.stage import StageConfig
 
 
 class Nmea2000Config(PositioningConfig):
@@ -19,7 +19,7 @@ class Nmea2000Config(PositioningConfig):
     assume: Assumptions = Assumptions()
 
 
-class DbcSignal(Stage):
+class DbcSignal(StageConfig):
     """Signals of one CAN message that make a sample."""
 
     message: str

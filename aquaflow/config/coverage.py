@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from aquaflow.config.stage import Stage
+from aquaflow.config.stage import StageConfig
 
 
-class CoverageConfig(Stage):
+class CoverageConfig(StageConfig):
     """What the camera has seen from above, and the lines that it was seen along."""
 
     enabled: bool = Field(True, description="False: neither shown nor written nor hinted at")

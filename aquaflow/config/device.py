@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from aquaflow.config.stage import Stage
+from aquaflow.config.stage import StageConfig
 
 
-class MountingConfig(Stage):
+class MountingConfig(StageConfig):
     """Where a sensor sits in the body frame (forward, right, down)."""
 
     position_m: tuple[float, float, float] = Field(
@@ -21,7 +21,7 @@ class MountingConfig(Stage):
     )
 
 
-class DeviceConfig(Stage):
+class DeviceConfig(StageConfig):
     """What every device has."""
 
     mounting: MountingConfig = MountingConfig()
@@ -49,7 +49,7 @@ class PositioningConfig(DeviceConfig):
     )
 
 
-class Assumptions(Stage):
+class Assumptions(StageConfig):
     """What may be assumed where a device measures only part of a quantity.
 
     A heading without roll and pitch is no attitude. With ``level`` it becomes one: true within the

@@ -8,10 +8,10 @@ from pydantic import Field
 
 from aquaflow.config.device import MountingConfig
 from aquaflow.config.known_lengths import BoardConfig, LasersConfig
-from aquaflow.config.stage import Stage
+from aquaflow.config.stage import StageConfig
 
 
-class FusionConfig(Stage):
+class FusionConfig(StageConfig):
     """How telemetry gives the map its metres, its gravity and its north."""
 
     enabled: bool = Field(True, description="False: telemetry is recorded and nothing else")

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, TypeAlias
 
 from pydantic import Field, model_validator
 
-from aquaflow.config.stage import Stage
+from aquaflow.config.stage import StageConfig
 
 Dictionary: TypeAlias = Literal[
     "APRILTAG_16h5", "APRILTAG_25h9", "APRILTAG_36h10", "APRILTAG_36h11",
@@ -17,7 +17,7 @@ Dictionary: TypeAlias = Literal[
 """Names of OpenCV's predefined dictionaries, without DICT_."""
 
 
-class MarkersConfig(Stage):
+class MarkersConfig(StageConfig):
     """AprilTag or ArUco markers that lie anywhere, each of the same size."""
 
     kind: Literal["markers"] = "markers"
@@ -27,7 +27,7 @@ class MarkersConfig(Stage):
     ids: tuple[int, ...] = Field((), description="of the markers in use; none: every one counts")
 
 
-class CharucoConfig(Stage):
+class CharucoConfig(StageConfig):
     """A ChArUco board: a chessboard with markers in its white squares."""
 
     kind: Literal["charuco"] = "charuco"
@@ -49,7 +49,7 @@ class CharucoConfig(Stage):
 BoardConfig: TypeAlias = Annotated[MarkersConfig | CharucoConfig, Field(discriminator="kind")]
 
 
-class LasersConfig(Stage):
+class LasersConfig(StageConfig):
     """Two laser dots, whose beams run parallel to the optical axis."""
 
     colour: Literal["red", "green", "blue"]

@@ -7,12 +7,12 @@ from typing import Annotated, Literal, TypeAlias
 
 from pydantic import Field, model_validator
 
-from aquaflow.config.stage import Stage
+from aquaflow.config.stage import StageConfig
 
 Port: TypeAlias = Annotated[int, Field(ge=1, le=65535)]
 
 
-class SerialConfig(Stage):
+class SerialConfig(StageConfig):
     """A serial port, a USB adapter or a pseudo terminal; 8 data bits, no parity, 1 stop bit."""
 
     kind: Literal["serial"] = "serial"
@@ -24,7 +24,7 @@ EVERY_ADDRESS = frozenset({"", "0.0.0.0", "::"})
 """Hosts that bind a port on all addresses of this computer."""
 
 
-class UdpConfig(Stage):
+class UdpConfig(StageConfig):
     """Datagrams. ``listen`` binds the port and answers the last sender (BlueOS: an endpoint of
     type UDP client); ``send`` talks to the address first and hears its answers. Several devices may
     listen on one port."""
@@ -59,7 +59,7 @@ class UdpConfig(Stage):
         return host.strip("[]"), int(port)
 
 
-class TcpConfig(Stage):
+class TcpConfig(StageConfig):
     """A connection that AquaFlow opens."""
 
     kind: Literal["tcp"] = "tcp"
@@ -67,7 +67,7 @@ class TcpConfig(Stage):
     port: Port
 
 
-class CanConfig(Stage):
+class CanConfig(StageConfig):
     """A CAN bus behind any interface of python-can."""
 
     kind: Literal["can"] = "can"
@@ -79,7 +79,7 @@ class CanConfig(Stage):
     )
 
 
-class Mavlink2restConfig(Stage):
+class Mavlink2restConfig(StageConfig):
     """MAVLink by way of mavlink2rest, a service of BlueOS, where AquaFlow has no endpoint of its
     own."""
 

@@ -6,10 +6,10 @@ from typing import Literal
 
 from pydantic import Field
 
-from aquaflow.config.stage import Stage
+from aquaflow.config.stage import StageConfig
 
 
-class WaterPriorsConfig(Stage):
+class WaterPriorsConfig(StageConfig):
     """Priors of the water fit on scenes and waters; all weak, none in the paper.
 
     Measured on twelve fits of six known waters (mean error of beta_a), and on Curasao and IUI3
@@ -25,7 +25,7 @@ class WaterPriorsConfig(Stage):
     white_backscatter: bool = Field(False, description="open water has little colour of its own")
 
 
-class MediumConfig(Stage):
+class MediumConfig(StageConfig):
     """The water (paper, Sec. 3.3.2)."""
 
     enabled: bool = Field(True, description="False: the map is what the camera saw, water included")
@@ -79,7 +79,7 @@ class MediumConfig(Stage):
     initial_residual_decay: float = Field(1.0, gt=0, description="1 / map unit")
 
 
-class SunlightConfig(Stage):
+class SunlightConfig(StageConfig):
     """Light that waves focus on the ground, view by view (not in the paper; see sunlight.py)."""
 
     enabled: bool = Field(
@@ -95,7 +95,7 @@ class SunlightConfig(Stage):
     )
 
 
-class InsertionConfig(Stage):
+class InsertionConfig(StageConfig):
     """Where new Gaussians go (paper, Sec. 3.3.3)."""
 
     medium_reduced: bool = Field(
@@ -150,7 +150,7 @@ class InsertionConfig(Stage):
     max_spacing_widths: float = Field(0.1, gt=0, description="largest spacing over image width")
 
 
-class LossConfig(Stage):
+class LossConfig(StageConfig):
     """Weights of the objective (paper, Sec. 3.4 and Implementation Details)."""
 
     ssim: float = Field(0.2, ge=0, le=1, description="lambda_ssim; paper: 0.2")
@@ -159,7 +159,7 @@ class LossConfig(Stage):
     tau_e: float = Field(0.2, gt=0, description="residual masked on common frames (ARTDECO: 0.2)")
 
 
-class OptimiserConfig(Stage):
+class OptimiserConfig(StageConfig):
     """Adam rates and the number of steps."""
 
     betas: tuple[float, float] = Field(
@@ -214,7 +214,7 @@ class OptimiserConfig(Stage):
     )
 
 
-class VoxelConfig(Stage):
+class VoxelConfig(StageConfig):
     """Groups of neighbouring Gaussians (paper, Sec. 3.3.1)."""
 
     size: float = Field(
@@ -231,7 +231,7 @@ class VoxelConfig(Stage):
     capacity: int = Field(32, ge=1, description="Gaussians a group; paper: 32")
 
 
-class DecoderConfig(Stage):
+class DecoderConfig(StageConfig):
     """Rotation, scale and colour decoded from features and observation (paper, Sec. 3.3.1).
 
     Measured on a CPU, compiled kernel and all: after as many steps 0.2 dB better on the reef clip,
@@ -276,7 +276,7 @@ class DecoderConfig(Stage):
     voxels: VoxelConfig = VoxelConfig()
 
 
-class MappingConfig(Stage):
+class MappingConfig(StageConfig):
     """The map (paper, Sec. 3.3 and 3.4)."""
 
     enabled: bool = Field(True, description="False: trajectory only")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from aquaflow.config.stage import Stage
+from aquaflow.config.stage import StageConfig
 
 
-class PicturesConfig(Stage):
+class PicturesConfig(StageConfig):
     """One a second, for the viewer; fewer of a long dive."""
 
     enabled: bool = Field(True, description="False: none are kept")

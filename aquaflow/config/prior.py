@@ -7,10 +7,10 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from aquaflow.config.stage import Stage
+from aquaflow.config.stage import StageConfig
 
 
-class PriorConfig(Stage):
+class PriorConfig(StageConfig):
     """Which prior tracks, and where its network runs (paper, Sec. 3.1)."""
 
     kind: Literal["compact", "classical", "folder", "xfeat", "aliked"] = Field(

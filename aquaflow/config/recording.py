@@ -6,10 +6,10 @@ from typing import Literal
 
 from pydantic import Field
 
-from aquaflow.config.stage import Stage
+from aquaflow.config.stage import StageConfig
 
 
-class RecordingConfig(Stage):
+class RecordingConfig(StageConfig):
     """How pictures are kept, how files are cut, and when to stop."""
 
     keep_received: bool = Field(

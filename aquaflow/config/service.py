@@ -10,7 +10,7 @@ from pydantic import Field, IPvAnyNetwork, model_validator
 
 from aquaflow.config.device import MountingConfig
 from aquaflow.config.link import Port
-from aquaflow.config.stage import Stage
+from aquaflow.config.stage import StageConfig
 
 
 def is_loopback(host: str) -> bool:
@@ -23,7 +23,7 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-class ListenConfig(Stage):
+class ListenConfig(StageConfig):
     """Where a server listens. Beyond loopback only with a token."""
 
     enabled: bool = True
@@ -65,7 +65,7 @@ class FoxgloveConfig(ListenConfig):
     points: int = Field(60_000, ge=100, description="of the map at most; 20 bytes each")
 
 
-class LiveMappingConfig(Stage):
+class LiveMappingConfig(StageConfig):
     """How mapping runs in parallel to tracking."""
 
     backlog: int = Field(
@@ -93,7 +93,7 @@ class LiveMappingConfig(Stage):
     )
 
 
-class DiveConfig(Stage):
+class DiveConfig(StageConfig):
     """When dives begin and end. Recordings (``--source``) begin at once, whatever it says."""
 
     begin: Literal["at_once", "when_armed", "on_command"] = Field(
@@ -125,7 +125,7 @@ class DiveConfig(Stage):
     )
 
 
-class CheckpointConfig(Stage):
+class CheckpointConfig(StageConfig):
     """What a kill or a power cut may cost."""
 
     every_s: float = Field(10.0, gt=0, description="s between checkpoints, and so the most lost")
@@ -140,7 +140,7 @@ class CheckpointConfig(Stage):
     )
 
 
-class LimitsConfig(Stage):
+class LimitsConfig(StageConfig):
     """When the service takes less for itself, and how it climbs back."""
 
     disk_mb: int = Field(1500, ge=0, description="MB free, below which nothing new is written")
@@ -157,7 +157,7 @@ class LimitsConfig(Stage):
     calm_s: float = Field(20.0, gt=0, description="s without need until it climbs up one step")
 
 
-class PoseConfig(Stage):
+class PoseConfig(StageConfig):
     """The vehicle's pose back to its autopilot. Off unless asked for, and only in metres."""
 
     enabled: bool = False
@@ -179,7 +179,7 @@ class PoseConfig(Stage):
     )
 
 
-class VehicleReportConfig(Stage):
+class VehicleReportConfig(StageConfig):
     """Messages to the pilot over MAVLink."""
 
     status_text: bool = Field(True, description="STATUSTEXT when something changes")
@@ -190,7 +190,7 @@ class VehicleReportConfig(Stage):
     values: bool = Field(True, description="NAMED_VALUE_FLOAT once a second: AQ_STATE, AQ_LAG, ...")
 
 
-class ServiceConfig(Stage):
+class ServiceConfig(StageConfig):
     """What ``aquaflow run`` does in addition to mapping."""
 
     dives: Path = Field(Path("dives"), description="folder that gets a folder for each dive")

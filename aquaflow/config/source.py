@@ -6,10 +6,10 @@ from pathlib import Path
 
 from pydantic import Field
 
-from aquaflow.config.stage import Stage
+from aquaflow.config.stage import StageConfig
 
 
-class SourceConfig(Stage):
+class SourceConfig(StageConfig):
     """Which frames, and how they are prepared."""
 
     every: int = Field(1, ge=1, description="use every n-th frame")

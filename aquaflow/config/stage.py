@@ -9,13 +9,13 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from aquaflow.base.errors import ConfigError, path_of_key, words_of
 
 
-class Stage(BaseModel):
+class StageConfig(BaseModel):
     """A stage's settings: immutable, and a misspelt key is an error."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-AnyStage = TypeVar("AnyStage", bound=Stage)
+AnyStage = TypeVar("AnyStage", bound=StageConfig)
 
 
 def validated(model: type[AnyStage], data: dict[str, Any], origin: str) -> AnyStage:

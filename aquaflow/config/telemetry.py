@@ -18,10 +18,10 @@ from aquaflow.config.instruments import (
     WaterLinkedSerialConfig,
 )
 from aquaflow.config.link import EVERY_ADDRESS, ByteLinkConfig, MavlinkLinkConfig, UdpConfig
-from aquaflow.config.stage import Stage, validated
+from aquaflow.config.stage import StageConfig, validated
 
 
-class LightsConfig(Stage):
+class LightsConfig(StageConfig):
     """The servo or RC channel that dims the lamps (ardupilot.org/sub: 1100 us off, 1900 full)."""
 
     message: Literal["SERVO_OUTPUT_RAW", "RC_CHANNELS"] = "SERVO_OUTPUT_RAW"
@@ -54,7 +54,7 @@ MavlinkSource: TypeAlias = Literal[
 ]
 
 
-class MavlinkSenderConfig(Stage):
+class MavlinkSenderConfig(StageConfig):
     """Another component on the autopilot's link, such as the sonar service of BlueOS."""
 
     system_id: int | None = Field(None, ge=1, le=255, description="None: the autopilot's")
@@ -158,7 +158,7 @@ AnyDevice: TypeAlias = Annotated[
 ]
 
 
-class TelemetryConfig(Stage):
+class TelemetryConfig(StageConfig):
     """Every telemetry device of a vehicle, by the name that its samples carry."""
 
     devices: dict[str, AnyDevice] = Field(default_factory=dict)

@@ -6,13 +6,13 @@ from typing import Literal
 
 from pydantic import Field
 
-from aquaflow.config.stage import Stage
+from aquaflow.config.stage import StageConfig
 
 PoseResidual = Literal["point", "ray", "pixel"]
 """What a pose is solved from: points against points (the paper), rays, or calibrated pixels."""
 
 
-class InitialisationConfig(Stage):
+class InitialisationConfig(StageConfig):
     """Two-view initialisation (docs/measurements.md#initialisation)."""
 
     points: int = Field(800, ge=100, description="sample points; 800 solve in 0.1 s")
@@ -49,7 +49,7 @@ class InitialisationConfig(Stage):
     )
 
 
-class GateConfig(Stage):
+class GateConfig(StageConfig):
     """The frame gate: what is skipped before anything costly looks at it.
 
     See docs/architecture.md#skips.
@@ -100,7 +100,7 @@ class GateConfig(Stage):
     )
 
 
-class RetrievalConfig(Stage):
+class RetrievalConfig(StageConfig):
     """Candidates for loop closure and relocalisation."""
 
     words: int = Field(
@@ -123,7 +123,7 @@ class RetrievalConfig(Stage):
     candidates: int = Field(3, ge=1, description="verified for each keyframe; MASt3R-SLAM: 3")
 
 
-class GraphConfig(Stage):
+class GraphConfig(StageConfig):
     """The keyframe graph: robust Sim(3) pose-graph optimisation."""
 
     enabled: bool = Field(True, description="False: no loops are looked for, no sub-maps merged")
@@ -173,7 +173,7 @@ class GraphConfig(Stage):
     )
 
 
-class AdjustmentConfig(Stage):
+class AdjustmentConfig(StageConfig):
     """Joint adjustment of keyframe poses and depths (docs/adjustment.md)."""
 
     enabled: bool = Field(True, description="False: links stay as tracking measured them")
@@ -209,7 +209,7 @@ class AdjustmentConfig(Stage):
     )
 
 
-class LearnedConfig(Stage):
+class LearnedConfig(StageConfig):
     """What a prior that knows ranges (X, Q) is used for; a classical one knows none."""
 
     depth: bool = Field(
@@ -246,7 +246,7 @@ class LearnedConfig(Stage):
     )
 
 
-class MonitorConfig(Stage):
+class MonitorConfig(StageConfig):
     """The monitor of consistency (docs/frame.md#consistency)."""
 
     enabled: bool = Field(True, description="False: a wrong scale is not looked for")
@@ -289,7 +289,7 @@ class MonitorConfig(Stage):
     )
 
 
-class VerificationConfig(Stage):
+class VerificationConfig(StageConfig):
     """When a place counts as found again. Measured on all shared clips: in 912 pairs of different
     places at most 19 keypoints match and none agree on a pose; where a clip's frames still share a
     third of the picture, at least 160 do, in 18 cells."""
@@ -313,7 +313,7 @@ class VerificationConfig(Stage):
     )
 
 
-class TrackingConfig(Stage):
+class TrackingConfig(StageConfig):
     """Tracking and frame classes (paper, Sec. 3.2)."""
 
     keyframe_share: float = Field(

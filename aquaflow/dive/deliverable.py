@@ -16,7 +16,7 @@ GROUP = "aquaflow.deliverables"
 """Entry points: subclasses of :class:`Deliverable`, each called with the dive's ``Slam``."""
 
 
-class Phase(IntEnum):
+class DeliverablePhase(IntEnum):
     """When, at the end of a dive, a deliverable is made."""
 
     WRITE = 1
@@ -30,7 +30,7 @@ class Phase(IntEnum):
 class Deliverable:
     """One thing that is made of a dive. Whatever it raises costs itself alone."""
 
-    phase = Phase.WRITE
+    phase = DeliverablePhase.WRITE
     stage: str
     """What is done, in words, for the note on a failure: ``drawing the overview``."""
 

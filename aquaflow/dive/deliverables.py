@@ -17,7 +17,7 @@ import numpy as np
 
 from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.errors import InputError
-from aquaflow.dive.deliverable import Deliverable, Phase
+from aquaflow.dive.deliverable import Deliverable, DeliverablePhase
 from aquaflow.dive.dive import Dive
 from aquaflow.dive.folder import IN_SITE, DiveFolder
 from aquaflow.dive.found_camera import FoundCamera
@@ -32,10 +32,10 @@ from aquaflow.dive.results import WaterSummary, largest_sub_map, refined_poses, 
 from aquaflow.dive.trajectory_csv import PoseRow
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore
-from aquaflow.keyframes.place import KeypointDepths, Place, depths_at
+from aquaflow.keyframes.place import KeyframePlace, KeypointDepths, depths_at
 from aquaflow.keyframes.places_file import EDGE, NAME, Rows, write_places
 from aquaflow.slam import Slam
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.frames import Tracked
 from aquaflow.tracking.graph.table import Snapshot
 from aquaflow.types import CameraModel
@@ -88,7 +88,7 @@ class Deliverables:
         return made
 
     @property
-    def metric_frame(self) -> MetricFrame:
+    def metric_frame(self) -> WorldFrame:
         """Of the largest sub-map."""
         return self.outputs.frame(self._main)
 
@@ -123,7 +123,7 @@ class Deliverables:
 
     def make(
         self,
-        phase: Phase,
+        phase: DeliverablePhase,
         until: Deadline | None = None,
         metrics: dict[str, Any] | None = None,
     ) -> None:
@@ -277,7 +277,7 @@ def write_places_of(dive: Path, slam: Slam, poses: Mapping[int, Sim3]) -> None:
 
 def _places(
     keyframes: KeyframeStore, poses: Mapping[int, Sim3]
-) -> Iterator[tuple[Place, KeypointDepths]]:
+) -> Iterator[tuple[KeyframePlace, KeypointDepths]]:
     for keyframe in keyframes.readable:
         try:
             yield (
@@ -288,10 +288,10 @@ def _places(
             log.warning("keyframe %d is not in %s: %s", keyframe.number, NAME, error)
 
 
-def _place(keyframe: Keyframe, poses: Mapping[int, Sim3]) -> Place:
+def _place(keyframe: Keyframe, poses: Mapping[int, Sim3]) -> KeyframePlace:
     T_wc = keyframe.T_wc
     refined = poses.get(keyframe.frame_index, T_wc)
-    return Place(
+    return KeyframePlace(
         keyframe.number,
         keyframe.frame_index,
         keyframe.sub_map,

@@ -29,7 +29,7 @@ from aquaflow.geometry.camera import CameraModel, load_camera
 from aquaflow.keyframes.places_file import NAME as PLACES
 from aquaflow.keyframes.places_file import PlacesFile
 from aquaflow.telemetry.metric_file import read_main, read_metric_file
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 if TYPE_CHECKING:
     from aquaflow.mapping.mapper import Mapper
@@ -218,7 +218,7 @@ class Dive:
     # --- its world ------------------------------------------------------------------------------
 
     @cached_property
-    def metric_frames(self) -> Mapping[int, MetricFrame]:
+    def metric_frames(self) -> Mapping[int, WorldFrame]:
         """By sub-map: what its world is, how well that is known, and from which telemetry; empty
         for a dive that was mapped by an older AquaFlow."""
         return read_metric_file(self.path)
@@ -229,20 +229,20 @@ class Dive:
         return read_main(self.path)
 
     @property
-    def frame(self) -> MetricFrame:
+    def frame(self) -> WorldFrame:
         """Of the largest sub-map."""
         return self.frame_of(self.main)
 
-    def frame_of(self, sub_map: int) -> MetricFrame:
+    def frame_of(self, sub_map: int) -> WorldFrame:
         """Of a sub-map; the unknown one where nothing is known of it."""
-        return self.metric_frames.get(sub_map, MetricFrame.unknown())
+        return self.metric_frames.get(sub_map, WorldFrame.unknown())
 
     @property
     def unit(self) -> str:
         """Of lengths in the largest sub-map: ``m`` or ``map units``."""
         if self.metric_frames:
             return self.frame.unit
-        return str(self.metrics.get("unit", MetricFrame.unknown().unit))
+        return str(self.metrics.get("unit", WorldFrame.unknown().unit))
 
     # --- water, maps, pictures, places ----------------------------------------------------------
 

@@ -44,7 +44,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
 from aquaflow.telemetry.known_lengths.known_lengths_file import FILE as KNOWN_LENGTHS
 from aquaflow.telemetry.metric_file import write_metric_file
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 if TYPE_CHECKING:
     from aquaflow.mapping.mapper import Mapper
@@ -275,7 +275,7 @@ class DiveFolder:
         """trajectory.csv."""
         write_trajectory_csv(self.path / PATH_TABLE, rows)
 
-    def write_metric_frames(self, frames: Mapping[int, MetricFrame], main: int) -> None:
+    def write_metric_frames(self, frames: Mapping[int, WorldFrame], main: int) -> None:
         """metric.json; ``main`` is the largest sub-map."""
         write_metric_file(self.path, frames, main)
 
@@ -302,7 +302,7 @@ class DiveFolder:
         from_maps.write_exact(self.path, mapper, suffix)
 
     def write_splats(
-        self, mapper: Mapper, water: WaterSummary | None, frame: MetricFrame, suffix: str = ""
+        self, mapper: Mapper, water: WaterSummary | None, frame: WorldFrame, suffix: str = ""
     ) -> None:
         """map.ply as seen through water at the median range, map_clear.ply without water, both in
         ``frame``; where there is a decoder, each Gaussian as the mapped view nearest to it sees it.

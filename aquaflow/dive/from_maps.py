@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.dive.results import WaterSummary
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 if TYPE_CHECKING:
     from aquaflow.mapping.mapper import Mapper
@@ -44,7 +44,7 @@ def write_exact(folder: Path, mapper: Mapper, suffix: str = "") -> None:
 
 
 def write_splats(
-    folder: Path, mapper: Mapper, water: WaterSummary | None, frame: MetricFrame, suffix: str = ""
+    folder: Path, mapper: Mapper, water: WaterSummary | None, frame: WorldFrame, suffix: str = ""
 ) -> None:
     """See :func:`aquaflow.dive.map_files.write_splats`."""
     from aquaflow.dive import map_files

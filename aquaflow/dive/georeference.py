@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from aquaflow.dive.utm_grid import UtmGrid
 from aquaflow.geometry.earth import latitude_longitude
-from aquaflow.telemetry.metric_frame import MetricFrame, Origin
+from aquaflow.telemetry.world_frame import Origin, WorldFrame
 
 Array = npt.NDArray[np.float64]
 
@@ -30,7 +30,7 @@ def to_geodetic(
     return latitude_longitude(points_n, (origin.latitude_deg, origin.longitude_deg))
 
 
-def georeference(frames: Mapping[int, MetricFrame], main: int) -> dict[str, Any] | None:
+def georeference(frames: Mapping[int, WorldFrame], main: int) -> dict[str, Any] | None:
     """The content of ``georeference.json``; None if no position was heard.
 
     n and its origin are those of sub-map ``main``, or of the first sub-map that has an origin.

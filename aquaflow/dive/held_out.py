@@ -12,7 +12,7 @@ import torch
 from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.dive.held_out_example import Fidelity, HeldOut
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.rendering import Shown
+from aquaflow.mapping.rendering import RenderedMap
 from aquaflow.mapping.restoration import (
     RestoredPicture,
     common_exposure,
@@ -51,12 +51,14 @@ def examine_held_out(slam: Slam, sub_map: int, until: Deadline | None = None) ->
     return examined
 
 
-def _pictures(view: View, shown: Shown) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+def _pictures(
+    view: View, shown: RenderedMap
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
     """[H, W, 3] of the map and of the camera."""
     return picture_out(shown.image.clamp(0.0, 1.0)), picture_out(view.target())
 
 
-def _fidelity(view: View, shown: Shown) -> Fidelity:
+def _fidelity(view: View, shown: RenderedMap) -> Fidelity:
     rendered, real = _pictures(view, shown)
     return Fidelity(psnr(rendered, real), ssim(rendered, real))
 

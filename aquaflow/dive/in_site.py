@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from aquaflow.keyframes import KeyframeStore
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.base.in_base import InBase
 from aquaflow.tracking.base.links import BaseLink
 
@@ -69,7 +69,7 @@ def in_site_notes(in_base: InBase, keyframes: KeyframeStore) -> list[str]:
 def _placed(
     in_base: InBase, sub_map: int, links: list[BaseLink], keyframes: KeyframeStore
 ) -> dict[str, Any]:
-    frame = in_base.frame(sub_map, MetricFrame.unknown())
+    frame = in_base.frame(sub_map, WorldFrame.unknown())
     T, covariance = frame.T_nm, in_base.places()[sub_map].covariance
     return {
         "site_sub_map": links[0].base_sub_map,

@@ -42,7 +42,7 @@ NOTE = (
 
 
 @dataclass(frozen=True)
-class Poses:
+class DivePoses:
     """Posed frames in the order of the table, in n."""
 
     index: npt.NDArray[np.int64]
@@ -71,7 +71,7 @@ class Interim:
         self._outputs = MetricOutputs({number: slam.metric_frame(number) for number in sub_maps})
         self._dropped, self._notes = len(run.dropped), list(run.notes)
         self._waters: dict[int, WaterSummary | None] = {}
-        self._poses: Poses | None = None
+        self._poses: DivePoses | None = None
 
     def write_maps(self, mappers: Mapping[int, Mapper]) -> None:
         """map.ply and map_clear.ply of every sub-map, with the water as it is known by now."""
@@ -147,7 +147,7 @@ class Interim:
         counts = np.bincount(self._posed().sub_maps, minlength=1)
         return int(counts.argmax())
 
-    def _posed(self) -> Poses:
+    def _posed(self) -> DivePoses:
         if self._poses is None:
             self._poses = posed(self._parts, self._keyframes, self._outputs)
         return self._poses
@@ -184,7 +184,7 @@ def posed(
     parts: list[Array],  # each [n] FRAME
     keyframes: list[tuple[Sim3, int]],  # pose and sub-map of each
     outputs: MetricOutputs,
-) -> Poses:
+) -> DivePoses:
     """The posed frames of a table, each by its keyframe."""
     rows = np.concatenate(parts)
     rows = rows[rows["keyframe"] != NONE]
@@ -195,7 +195,7 @@ def posed(
     sound = np.flatnonzero(np.isfinite(numbers).all(axis=1))
     rows, sub_maps, world = rows[sound], sub_maps[sound], world[sound]
     wxyz = quaternion_from_rotation(world.R) if len(rows) else np.zeros((0, 4))
-    return Poses(
+    return DivePoses(
         rows["index"], rows["t_ns"] * 1e-9, world.t, wxyz, sub_maps, rows["class"],
     )  # fmt: skip
 

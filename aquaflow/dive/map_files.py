@@ -15,7 +15,7 @@ from aquaflow.mapping.clear_colours import restored_gaussians
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.activation import radiance
 from aquaflow.render.transfers import map_out
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 
 def write_exact(folder: Path, mapper: Mapper, suffix: str) -> None:
@@ -24,7 +24,7 @@ def write_exact(folder: Path, mapper: Mapper, suffix: str) -> None:
 
 
 def write_splats(
-    folder: Path, mapper: Mapper, water: WaterSummary | None, frame: MetricFrame, suffix: str
+    folder: Path, mapper: Mapper, water: WaterSummary | None, frame: WorldFrame, suffix: str
 ) -> None:
     """map.ply and map_clear.ply, as :meth:`aquaflow.dive.folder.DiveFolder.write_splats` says."""
     with torch.no_grad():

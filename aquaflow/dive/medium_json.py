@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from aquaflow.dive.results import WaterSummary
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 
 def medium_json(
     water: WaterSummary | None,
-    frame: MetricFrame,
+    frame: WorldFrame,
     evidence: float | None = None,
     amplification: tuple[list[float], list[float]] | None = None,
 ) -> dict[str, Any]:

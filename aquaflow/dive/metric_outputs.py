@@ -12,9 +12,9 @@ import numpy as np
 from aquaflow.dive.held_out_example import HeldOut
 from aquaflow.dive.results import WaterSummary
 from aquaflow.telemetry.interpolation import Interpolation
-from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.telemetry.telemetry import Telemetry
 from aquaflow.telemetry.utc import UtcClock, fit_utc
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.types import Altitude, Depth
 
 CAMERA_WORLD = (
@@ -54,13 +54,13 @@ class Navigation:
 class MetricOutputs:
     """The frames of all sub-maps, and what else telemetry says of the poses."""
 
-    frames: Mapping[int, MetricFrame] = field(default_factory=dict)
+    frames: Mapping[int, WorldFrame] = field(default_factory=dict)
     """By sub-map."""
     navigation: Navigation = Navigation()
 
-    def frame(self, sub_map: int) -> MetricFrame:
+    def frame(self, sub_map: int) -> WorldFrame:
         """Of a sub-map; the unknown one where there is none."""
-        return self.frames.get(sub_map, MetricFrame.unknown())
+        return self.frames.get(sub_map, WorldFrame.unknown())
 
 
 def water_in(water: WaterSummary, scale: float) -> WaterSummary:
@@ -86,7 +86,7 @@ def held_out_in(example: HeldOut, scale: float) -> HeldOut:
     return replace(example, z=(scale * example.z.astype(np.float64)).astype(np.float32))
 
 
-def frame_numbers(frame: MetricFrame) -> dict[str, Any]:
+def frame_numbers(frame: WorldFrame) -> dict[str, Any]:
     """The keys of metrics.json on the unit of length, gravity and telemetry."""
     return {
         "scale_source": frame.scale_source,
@@ -113,7 +113,7 @@ def utc_numbers(navigation: Navigation) -> dict[str, Any]:
     }
 
 
-def sub_maps_in_words(frames: list[MetricFrame]) -> str:
+def sub_maps_in_words(frames: list[WorldFrame]) -> str:
     """How the sub-maps of a dive, of which there are several, lie to one another."""
     count = len(frames)
     if all(frame.metric and frame.level for frame in frames):
@@ -123,7 +123,7 @@ def sub_maps_in_words(frames: list[MetricFrame]) -> str:
     return f"{count} sub-maps without a common scale"
 
 
-def worlds_in_words(frames: Mapping[int, MetricFrame]) -> str:
+def worlds_in_words(frames: Mapping[int, WorldFrame]) -> str:
     """The worlds of the sub-maps, for the first lines of trajectory.tum."""
     if not any(frame.metric or frame.level or frame.site for frame in frames.values()):
         return CAMERA_WORLD
@@ -133,7 +133,7 @@ def worlds_in_words(frames: Mapping[int, MetricFrame]) -> str:
     return "\n".join(f"camera to world; sub-map {number}: {each}" for number, each in said.items())
 
 
-def _world_in_words(frame: MetricFrame) -> str:
+def _world_in_words(frame: WorldFrame) -> str:
     whose = f" of {frame.site}, in which this dive was recognised" if frame.site else ""
     axes = f"world is the first keyframe's camera (x right, y down, z forward){whose}"
     if frame.level:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 Array = npt.NDArray[np.float64]
 
@@ -17,7 +17,7 @@ FACING = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def page_axes(
-    frame: MetricFrame,
+    frame: WorldFrame,
     path: Array,  # [N, 3] camera centres, n
 ) -> Array:
     """[2, 3] the directions of n that are right and up on the page: LEVEL, FORWARD or FACING."""
@@ -34,7 +34,7 @@ def page_rotation(
     return np.vstack([axes, np.cross(axes[0], axes[1])])
 
 
-def names_of(frame: MetricFrame, axes: Array) -> tuple[str, str, str]:  # [2, 3] of page_axes
+def names_of(frame: WorldFrame, axes: Array) -> tuple[str, str, str]:  # [2, 3] of page_axes
     """From where the page is seen, and what right and up on it are, in words."""
     if axes is FACING:
         return "as in the first picture", "right", "up"

@@ -11,7 +11,7 @@ from aquaflow.dive.georeference import to_geodetic
 from aquaflow.dive.metric_outputs import MetricOutputs
 from aquaflow.dive.trajectory_csv import PoseRow
 from aquaflow.geometry.similarity import BODY_FROM_CAMERA, Sim3
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.frames import Tracked
 
 Array = npt.NDArray[np.float64]
@@ -69,7 +69,7 @@ def _rows(
 
 
 def _places(
-    frame: MetricFrame,
+    frame: WorldFrame,
     positions: Array,  # [N, 3] n
 ) -> list[tuple[float | None, float | None]]:
     """Latitude and longitude of each, degrees."""
@@ -80,7 +80,7 @@ def _places(
 
 
 def attitude_of(
-    frame: MetricFrame, T_nc: Sim3
+    frame: WorldFrame, T_nc: Sim3
 ) -> tuple[float, float, float] | tuple[None, None, None]:
     """Heading, roll and pitch, degrees, of the body, or of the camera if the mounting is unknown;
     none while gravity is unknown."""
@@ -113,7 +113,7 @@ def speeds_of(
 
 
 def position_sigma(
-    frame: MetricFrame,
+    frame: WorldFrame,
     p_n: Array,  # [3]
 ) -> float | None:
     """m, 1 sigma of a place in the direction that is known least; None where it is not known."""
@@ -122,5 +122,5 @@ def position_sigma(
     return float(np.sqrt(np.linalg.eigvalsh(frame.position_covariance(p_n))[-1]))
 
 
-def _heading_sigma_deg(frame: MetricFrame) -> float | None:
+def _heading_sigma_deg(frame: WorldFrame) -> float | None:
     return float(np.degrees(frame.heading_sigma_rad)) if frame.level else None

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from aquaflow.dive.utm_grid import UtmGrid, grid_of
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 Array = npt.NDArray[np.float64]
 
@@ -75,7 +75,7 @@ class Placement:
         return f"EPSG:{self.epsg}, x easting, y northing, z up; m"
 
 
-def placement(frame: MetricFrame) -> Placement:
+def placement(frame: WorldFrame) -> Placement:
     """The placement of the sub-map that ``frame`` belongs to."""
     if frame.north == "first keyframe":
         R, axes = UPRIGHT_FROM_CAMERA, "x right, y forward, z up of the first keyframe's camera"

@@ -26,7 +26,7 @@ CHUNK = 1 << 16
 
 
 @dataclass(frozen=True)
-class Points:
+class CloudPoints:
     """Some points of a cloud, in the upright frame (:mod:`aquaflow.dive.placement`)."""
 
     positions: Array
@@ -60,7 +60,7 @@ class PointCloud:
         """The largest coordinate of a point, without its sign; 0 of an empty cloud."""
         return float(np.abs(self._splats.means[self._chosen]).max(initial=0.0))
 
-    def chunks(self) -> Iterator[Points]:
+    def chunks(self) -> Iterator[CloudPoints]:
         """All points, in the order of the map's file."""
         for first in range(0, len(self), CHUNK):
             yield self._points(self._chosen[first : first + CHUNK])
@@ -68,7 +68,7 @@ class PointCloud:
     def _points(
         self,
         chosen: npt.NDArray[np.intp],  # [N] of the Gaussians
-    ) -> Points:
+    ) -> CloudPoints:
         splats = self._splats
         positions = splats.means[chosen].astype(np.float64)
         scales = splats.scales[chosen].astype(np.float64)
@@ -80,7 +80,9 @@ class PointCloud:
         normals = np.where((normals * rays).sum(axis=1, keepdims=True) > 0.0, -normals, normals)
         along = np.einsum("nji,nj->ni", R, rays) * scales
         colours = np.clip(splats.colours[chosen], 0.0, 1.0) * 255.0 + 0.5
-        return Points(positions, colours.astype(np.uint8), normals, np.linalg.norm(along, axis=1))
+        return CloudPoints(
+            positions, colours.astype(np.uint8), normals, np.linalg.norm(along, axis=1)
+        )
 
 
 def nearest_cameras(

@@ -15,7 +15,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.views import View, in_time
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class PosedView:
         return np.asarray(inside & (points[:, 2] > 0.0))
 
 
-def posed_views(views: Iterable[View], frame: MetricFrame, where: Placement) -> list[PosedView]:
+def posed_views(views: Iterable[View], frame: WorldFrame, where: Placement) -> list[PosedView]:
     """The views in the order of the recording."""
     posed = []
     for view in in_time(views):

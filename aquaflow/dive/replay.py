@@ -77,7 +77,7 @@ def map_recording(
         run = DiveRun(name, folder, config, slam, calibration, recording.name_of, trace)
         try:
             if base is not None:
-                slam.look_in(base)
+                slam.localise_in(base)
             if slam.metric.mounting is None:
                 with failures.contain("camera mounting"):
                     slam.metric.mounting = mounting_of(recording)

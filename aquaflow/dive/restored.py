@@ -16,7 +16,7 @@ from aquaflow.dive.dive import Dive
 from aquaflow.dive.png import write_png
 from aquaflow.dive.recorded import recorded_pictures
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.mapping.rendering import Shown
+from aquaflow.mapping.rendering import RenderedMap
 from aquaflow.mapping.restoration import (
     RestoredPicture,
     common_exposure,
@@ -88,7 +88,7 @@ class SeenFrame:
     """With its picture, if there is one."""
     picture: npt.NDArray[np.uint8] | None
     """[H, W, 3] RGB of the recording; None without one."""
-    shown: Shown
+    shown: RenderedMap
 
 
 def seen_frames(dive: Dive, mapper: Mapper, recording: Path | None) -> Iterator[SeenFrame]:

@@ -16,9 +16,9 @@ from aquaflow.base.errors import InputError, NotMappedError, printable
 from aquaflow.base.profiler import pace
 from aquaflow.config import Config
 from aquaflow.config.mapping import InsertionConfig, OptimiserConfig
-from aquaflow.config.stage import Stage
+from aquaflow.config.stage import StageConfig
 from aquaflow.dive import calibration_findings
-from aquaflow.dive.deliverable import Phase, deliverables_of
+from aquaflow.dive.deliverable import DeliverablePhase, deliverables_of
 from aquaflow.dive.deliverables import Deliverables
 from aquaflow.dive.folder import SUGGESTED, TRACE, DiveFolder
 from aquaflow.dive.found_camera import FoundCamera, from_keyframes, in_words
@@ -35,7 +35,7 @@ from aquaflow.dive.results import metrics
 from aquaflow.mapping.work import MIN_VIEWS, Progress
 from aquaflow.recordings.kept_pictures import KeptPictures, PictureThread
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
-from aquaflow.recordings.telemetry_lines import TelemetryLog
+from aquaflow.recordings.telemetry_lines import TelemetryWriter
 from aquaflow.slam import Slam
 from aquaflow.slam.finish_time import FinishTime
 from aquaflow.sources.preprocessing import Preparation
@@ -92,7 +92,7 @@ class DiveRun:
         """The camera of a dive without calibration, as far as its own pictures show it."""
         self.live: dict[str, Any] | None = None
         """Counters of a live run for metrics.json."""
-        self.telemetry_log: TelemetryLog | None = None
+        self.telemetry_log: TelemetryWriter | None = None
         """Of a live run: a replay's telemetry is in files already."""
         self.deliverables = deliverables_of(slam)
         """By name: what is made of the dive beside the files of the core."""
@@ -322,11 +322,11 @@ class DiveRun:
             made.summarise()
         with self.profiler.stage("write"):
             made.write()
-            made.make(Phase.WRITE)
+            made.make(DeliverablePhase.WRITE)
         with self.profiler.stage("evaluate"):
             made.evaluate(limits.evaluating)
         with self.profiler.stage("measure"):
-            made.make(Phase.MEASURE, limits.evaluating)
+            made.make(DeliverablePhase.MEASURE, limits.evaluating)
             self.notes += made.notes
         with self.profiler.stage("write"):
             made.write_evaluation()
@@ -335,7 +335,7 @@ class DiveRun:
             self.notes.append(UNCHECKED)
         with self.profiler.stage("report"):
             self.warnings = self._shortcomings()
-            made.make(Phase.REPORT, limits.whole, self._numbers(results, made))
+            made.make(DeliverablePhase.REPORT, limits.whole, self._numbers(results, made))
         numbers = self._numbers(results, made)  # the report's own time included
         attempt, write = self.slam.failures.attempt, self.folder.write_json
         attempt("writing metrics.json", partial(write, "metrics.json", numbers))
@@ -446,7 +446,7 @@ def _what_to_do(config: Config) -> str:
     return "the camera must move sideways, over texture, for depths to be known"
 
 
-def _changed(name: str, asked: Stage, usual: Stage, prefix: str = "") -> list[str]:
+def _changed(name: str, asked: StageConfig, usual: StageConfig, prefix: str = "") -> list[str]:
     """Settings of a stage of the map that are not the default, those called ``prefix``..."""
     return [
         f"mapping.{name}.{key} is {getattr(asked, key)}, by default {getattr(usual, key)}"

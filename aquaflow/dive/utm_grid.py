@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.earth import latitude_longitude
-from aquaflow.telemetry.metric_frame import MetricFrame, Origin
+from aquaflow.telemetry.world_frame import Origin, WorldFrame
 
 Array = npt.NDArray[np.float64]
 
@@ -85,7 +85,7 @@ class UtmGrid:
         return str(CRS.from_epsg(self.epsg).to_wkt("WKT1_GDAL"))
 
 
-def grid_of(frame: MetricFrame) -> UtmGrid | None:
+def grid_of(frame: WorldFrame) -> UtmGrid | None:
     """The grid that a sub-map is laid on; None where it is not georeferenced, and near the
     poles."""
     if not frame.georeferenced or frame.origin is None:

@@ -160,7 +160,7 @@ def _loaded(name: str) -> Callable[..., Any]:
     raise InputError(f"no view '{name}' is installed; reinstall aquaflow")
 
 
-class Showing:
+class DisplayThread:
     """Calls ``show`` again and again in a thread of its own; what fails there costs the dive
     nothing."""
 

@@ -12,7 +12,7 @@ from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.contract import CPU
 from aquaflow.render.transfers import picture_out, water_in, water_out
 from aquaflow.render.views import View
-from aquaflow.water.image_formation import Water
+from aquaflow.water.image_formation import WaterParameters
 from aquaflow.water.posed_picture import SOLID
 
 RANGE_PERCENTILES = (5.0, 95.0)
@@ -75,7 +75,7 @@ def _solid_ranges(mapper: Mapper, view: View) -> torch.Tensor:
     return shown.z[shown.alpha > SOLID]
 
 
-def water_of(summary: WaterSummary, device: torch.device = CPU) -> Water:
+def water_of(summary: WaterSummary, device: torch.device = CPU) -> WaterParameters:
     """The summary as tensors."""
     fields = (summary.beta_a, summary.B_inf, summary.b, summary.B_res, summary.d)
-    return Water(*(water_in(values, device) for values in fields))
+    return WaterParameters(*(water_in(values, device) for values in fields))

@@ -6,15 +6,15 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from aquaflow.doctor import accelerator, computer, devices, packages
-from aquaflow.doctor.machine import Finding, MachineProbes
+from aquaflow.doctor.machine import CheckResult, MachineProbes
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["Finding", "MachineProbes", "examine", "print_findings", "to_json"]
+__all__ = ["CheckResult", "MachineProbes", "examine", "print_findings", "to_json"]
 
 
-def examine(machine: MachineProbes | None = None) -> list[Finding]:
+def examine(machine: MachineProbes | None = None) -> list[CheckResult]:
     """Look at everything AquaFlow can make use of; never raises for something absent."""
     machine = machine or MachineProbes()
     probes = (
@@ -33,12 +33,12 @@ def examine(machine: MachineProbes | None = None) -> list[Finding]:
     return [*found, *tried, *packages.findings(machine)]
 
 
-def to_json(findings: list[Finding]) -> dict[str, Any]:
+def to_json(findings: list[CheckResult]) -> dict[str, Any]:
     """Stable keys for ``aquaflow doctor --json``."""
     return {"findings": [{**asdict(finding), "ok": finding.ok} for finding in findings]}
 
 
-def print_findings(findings: list[Finding], console: Console) -> None:
+def print_findings(findings: list[CheckResult], console: Console) -> None:
     """A table for people: the finding, what it is used for, what to do."""
     from rich.markup import escape
     from rich.table import Table

@@ -6,7 +6,7 @@ import os
 import shutil
 from collections.abc import Iterator
 
-from aquaflow.doctor.machine import Finding, MachineProbes
+from aquaflow.doctor.machine import CheckResult, MachineProbes
 
 SUPPORTED = {("x86_64", 64), ("aarch64", 64)}
 """Processors and pointer sizes that torch, onnxruntime and the compiled renderer exist for."""
@@ -40,7 +40,7 @@ def isa_level(cpuinfo: str) -> str:
     return "unknown"
 
 
-def processor(machine: MachineProbes) -> Finding:
+def processor(machine: MachineProbes) -> CheckResult:
     """Name, cores and vector instructions of the processor."""
     cpuinfo = machine.text("proc/cpuinfo")
     rows = [line.partition(":") for line in cpuinfo.splitlines()]
@@ -49,16 +49,16 @@ def processor(machine: MachineProbes) -> Finding:
     cores = sum(1 for key, _, _ in rows if key.strip() == "processor")
     name = names[0] if names else board or "unknown processor"
     found = f"{name}, {cores or os.cpu_count() or 1} cores, {isa_level(cpuinfo)}"
-    return Finding("processor", found, "runs tracking and mapping")
+    return CheckResult("processor", found, "runs tracking and mapping")
 
 
-def system(machine: MachineProbes) -> Finding:
+def system(machine: MachineProbes) -> CheckResult:
     """Whether the interpreter is one of a 64-bit system."""
     architecture, bits = machine.architecture
     found = f"{architecture}, {bits}-bit"
     if machine.architecture in SUPPORTED:
-        return Finding("system", found, "supported: AquaFlow runs on 64-bit x86_64 and aarch64")
-    return Finding(
+        return CheckResult("system", found, "supported: AquaFlow runs on 64-bit x86_64 and aarch64")
+    return CheckResult(
         "system",
         found,
         "AquaFlow cannot run here: torch and onnxruntime have no builds for it",
@@ -67,7 +67,7 @@ def system(machine: MachineProbes) -> Finding:
     )
 
 
-def memory(machine: MachineProbes) -> Finding:
+def memory(machine: MachineProbes) -> CheckResult:
     """Memory in all and free, GB."""
     gigabytes = {
         key: float(value.split()[0]) * 1024.0 / 1e9
@@ -80,19 +80,19 @@ def memory(machine: MachineProbes) -> Finding:
         if 0 < total < LOW_MEMORY_GB
         else ""
     )
-    return Finding("memory", f"{total:.1f} GB, {free:.1f} GB free", "holds the map", advice)
+    return CheckResult("memory", f"{total:.1f} GB, {free:.1f} GB free", "holds the map", advice)
 
 
 def _lines(machine: MachineProbes, path: str) -> Iterator[str]:
     yield from machine.text(path).splitlines()
 
 
-def compiler(machine: MachineProbes) -> Finding:
+def compiler(machine: MachineProbes) -> CheckResult:
     """The C++ compiler, if there is one."""
     for name in COMPILERS:
         if place := machine.which(name):
-            return Finding("C++ compiler", place, "builds the fast rasteriser at installation")
-    return Finding(
+            return CheckResult("C++ compiler", place, "builds the fast rasteriser at installation")
+    return CheckResult(
         "C++ compiler",
         "none",
         "a rasteriser that came compiled with the package is used as it is",
@@ -104,22 +104,24 @@ def _variants(machine: MachineProbes) -> list[str]:
     return sorted(path.name for path in machine.native.glob("*.so"))
 
 
-def renderer(machine: MachineProbes) -> Finding:
+def renderer(machine: MachineProbes) -> CheckResult:
     """The renderer that maps are drawn with."""
     variants = ", ".join(_variants(machine)) or "no compiled variant"
     chosen = machine.renderer()
     if chosen is None:
-        return Finding(
+        return CheckResult(
             "renderer",
             "none",
             "nothing can be mapped",
             "reinstall aquaflow: its renderers are missing",
         )
-    return Finding("renderer", f"{chosen} (of {variants})", f"maps are rendered with: {chosen}")
+    return CheckResult("renderer", f"{chosen} (of {variants})", f"maps are rendered with: {chosen}")
 
 
-def disk(machine: MachineProbes) -> Finding:
+def disk(machine: MachineProbes) -> CheckResult:
     """Room where dives are written, GB."""
     free_gb = shutil.disk_usage(machine.disk).free / 1e9
     advice = "free some space or write dives elsewhere" if free_gb < LOW_DISK_GB else ""
-    return Finding("disk", f"{free_gb:.0f} GB free at {machine.disk}", "holds the dives", advice)
+    return CheckResult(
+        "disk", f"{free_gb:.0f} GB free at {machine.disk}", "holds the dives", advice
+    )

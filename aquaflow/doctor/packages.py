@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from aquaflow.doctor.machine import Finding, MachineProbes
+from aquaflow.doctor.machine import CheckResult, MachineProbes
 
 
 class Package(NamedTuple):
@@ -59,17 +59,17 @@ INSTALLED_OTHERWISE = {
 """Commands for packages that an extra does not install well."""
 
 
-def findings(machine: MachineProbes) -> list[Finding]:
+def findings(machine: MachineProbes) -> list[CheckResult]:
     """A finding for each optional package."""
     return [_finding(package, machine) for package in PACKAGES]
 
 
-def _finding(package: Package, machine: MachineProbes) -> Finding:
+def _finding(package: Package, machine: MachineProbes) -> CheckResult:
     name, extra = package.distribution, package.extra
     row = f"package {name}"  # what a GPU does with gsplat is another finding
     if machine.module_present(package.module):
         names = (name, *OTHER_BUILDS.get(name, ()))
         version = next(filter(None, map(machine.version, names)), "of unknown version")
-        return Finding(row, version, package.purpose)
+        return CheckResult(row, version, package.purpose)
     command = INSTALLED_OTHERWISE.get(name, f"pip install 'aquaflow[{extra}]'")
-    return Finding(row, "not installed", f"{package.purpose}: not here", f"run `{command}`")
+    return CheckResult(row, "not installed", f"{package.purpose}: not here", f"run `{command}`")

@@ -66,7 +66,7 @@ def depths_at(keypoints: Keypoints, pointmap: Pointmap) -> KeypointDepths:
 
 
 @dataclass(frozen=True)
-class Place:
+class KeyframePlace:
     """A keyframe of a finished dive without its picture."""
 
     number: int

@@ -21,7 +21,7 @@ from aquaflow.base.storage.archive import UNREADABLE, open_archive, read_array
 from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes.place import KeypointDepths, Place, packed, unpacked
+from aquaflow.keyframes.place import KeyframePlace, KeypointDepths, packed, unpacked
 
 Rows = npt.NDArray[Any]
 """A structured array."""
@@ -70,7 +70,7 @@ HEADER_BYTES = 1 << 14
 
 def write_places(
     path: Path,
-    places: Iterable[tuple[Place, KeypointDepths]],
+    places: Iterable[tuple[KeyframePlace, KeypointDepths]],
     edges: Rows,  # [E] EDGE
 ) -> int:
     """Write the keyframes as they come, and the edges between them; how many there were.
@@ -108,13 +108,13 @@ class PlacesFile:
                 f"{path} is not in format {FORMAT}, which this AquaFlow reads; update AquaFlow, or "
                 "map the dive again"
             )
-        self.places: tuple[Place, ...] = self._guarded(self._index)
+        self.places: tuple[KeyframePlace, ...] = self._guarded(self._index)
         """In the order of their numbers."""
         self.edges: Rows = self._guarded(self._edges)
         """[E] EDGE: the keyframe graph."""
 
     @cached_property
-    def by_number(self) -> dict[int, Place]:
+    def by_number(self) -> dict[int, KeyframePlace]:
         """The keyframes by their numbers."""
         return {place.number: place for place in self.places}
 
@@ -147,7 +147,7 @@ class PlacesFile:
                 limit = HEADER_BYTES + PLACE.itemsize * len(archive.namelist())
             return read_array(archive, name, limit)
 
-    def _index(self) -> tuple[Place, ...]:
+    def _index(self) -> tuple[KeyframePlace, ...]:
         rows = self._array(INDEX)
         if rows.dtype != PLACE or rows.ndim != 1:
             raise DamagedError("its index is none")
@@ -199,7 +199,7 @@ def _add(
     archive.writestr(entry, stream.getvalue(), zipfile.ZIP_DEFLATED, EFFORT)
 
 
-def _row(place: Place) -> tuple[Any, ...]:
+def _row(place: KeyframePlace) -> tuple[Any, ...]:
     camera, T = place.camera, place.T_mc
     return (
         *(place.number, place.frame_index, place.sub_map, place.t_ns),
@@ -208,11 +208,11 @@ def _row(place: Place) -> tuple[Any, ...]:
     )
 
 
-def _place(row: Any) -> Place:  # one of PLACE
+def _place(row: Any) -> KeyframePlace:  # one of PLACE
     width, height = int(row["width"]), int(row["height"])
     fx, fy, cx, cy = (float(row[name]) for name in ("fx", "fy", "cx", "cy"))
     T_mc = Sim3(np.array(row["R"]), np.array(row["t"]), float(row["scale"]))
-    return Place(
+    return KeyframePlace(
         int(row["number"]), int(row["frame"]), int(row["sub_map"]), int(row["t_ns"]), T_mc,
         CameraModel(width, height, fx, fy, cx, cy),
     )  # fmt: skip

@@ -107,9 +107,9 @@ class KeyframeStore:
         self.keyframes.append(keyframe)
         self._cameras.append((encoding.camera, pointmap.camera))
         self._set(number, _Content(encoding, pointmap))
-        return self.hold(number)
+        return self.load(number)
 
-    def hold(self, number: int) -> Keyframe:
+    def load(self, number: int) -> Keyframe:
         """Make this the one keyframe whose pointmap may be changed in place, until the next call.
 
         The one held before becomes read-only: from here on it may lie in a file.

@@ -12,7 +12,7 @@ from enum import Enum
 from aquaflow.base.errors import AquaFlowError
 
 
-class Phase(str, Enum):
+class DivePhase(str, Enum):
     """Where the service is in a dive; a request changes it at once, the service follows."""
 
     IDLE = "idle"
@@ -21,7 +21,7 @@ class Phase(str, Enum):
     FINISHING = "finishing"
 
 
-class Request(str, Enum):
+class ServiceRequest(str, Enum):
     """What a pilot may ask for."""
 
     START = "start"
@@ -34,23 +34,23 @@ class Request(str, Enum):
     """Finish the present dive, if there is one, and begin another."""
 
 
-AFTER: dict[tuple[Request, Phase], Phase] = {
-    (Request.START, Phase.IDLE): Phase.MAPPING,
-    (Request.START, Phase.PAUSED): Phase.MAPPING,
-    (Request.STOP, Phase.MAPPING): Phase.PAUSED,
-    (Request.FINISH, Phase.MAPPING): Phase.FINISHING,
-    (Request.FINISH, Phase.PAUSED): Phase.FINISHING,
-    (Request.NEW, Phase.IDLE): Phase.MAPPING,
-    (Request.NEW, Phase.MAPPING): Phase.FINISHING,
-    (Request.NEW, Phase.PAUSED): Phase.FINISHING,
+AFTER: dict[tuple[ServiceRequest, DivePhase], DivePhase] = {
+    (ServiceRequest.START, DivePhase.IDLE): DivePhase.MAPPING,
+    (ServiceRequest.START, DivePhase.PAUSED): DivePhase.MAPPING,
+    (ServiceRequest.STOP, DivePhase.MAPPING): DivePhase.PAUSED,
+    (ServiceRequest.FINISH, DivePhase.MAPPING): DivePhase.FINISHING,
+    (ServiceRequest.FINISH, DivePhase.PAUSED): DivePhase.FINISHING,
+    (ServiceRequest.NEW, DivePhase.IDLE): DivePhase.MAPPING,
+    (ServiceRequest.NEW, DivePhase.MAPPING): DivePhase.FINISHING,
+    (ServiceRequest.NEW, DivePhase.PAUSED): DivePhase.FINISHING,
 }
 """Requests that make sense, and what they lead to."""
 
 REFUSALS = {
-    Phase.IDLE: "there is no dive; start one first",
-    Phase.MAPPING: "the dive is being mapped already",
-    Phase.PAUSED: "the dive is paused already",
-    Phase.FINISHING: "the dive is being finished; ask again when that is done",
+    DivePhase.IDLE: "there is no dive; start one first",
+    DivePhase.MAPPING: "the dive is being mapped already",
+    DivePhase.PAUSED: "the dive is paused already",
+    DivePhase.FINISHING: "the dive is being finished; ask again when that is done",
 }
 """Why the others do not, in each phase."""
 
@@ -59,7 +59,7 @@ class RefusedError(AquaFlowError):
     """A request that makes no sense now."""
 
 
-class Control:
+class ServiceControl:
     """The present phase, and whether the service shall end."""
 
     def __init__(self) -> None:
@@ -69,26 +69,26 @@ class Control:
         self.told = threading.Event()
         """Set: by a signal, whose sender kills the process after a while."""
         self._lock, self._asked = threading.Lock(), threading.Event()
-        self._phase = Phase.IDLE
+        self._phase = DivePhase.IDLE
         self._another = False
         """A new dive is wanted, whatever could be gone on with."""
 
     @property
-    def phase(self) -> Phase:
+    def phase(self) -> DivePhase:
         """What is wanted now."""
         return self._phase
 
     @property
     def paused(self) -> bool:
         """True while pictures shall not be mapped."""
-        return self._phase is Phase.PAUSED
+        return self._phase is DivePhase.PAUSED
 
     @property
     def dive_ends(self) -> bool:
         """True once the dive in progress shall come to its end."""
-        return self.stopping.is_set() or self._phase is Phase.FINISHING
+        return self.stopping.is_set() or self._phase is DivePhase.FINISHING
 
-    def ask(self, request: Request) -> Phase:
+    def ask(self, request: ServiceRequest) -> DivePhase:
         """Ask for something; the phase that follows from it.
 
         Raises:
@@ -100,7 +100,7 @@ class Control:
             after = AFTER.get((request, self._phase))
             if after is None:
                 raise RefusedError(REFUSALS[self._phase])
-            self._another |= request is Request.NEW
+            self._another |= request is ServiceRequest.NEW
             self._phase = after
             self._asked.set()
             return after
@@ -125,4 +125,4 @@ class Control:
     def ended(self) -> None:
         """The dive was closed, or could not be begun: the service is idle, or begins the next."""
         with self._lock:
-            self._phase = Phase.MAPPING if self._another else Phase.IDLE
+            self._phase = DivePhase.MAPPING if self._another else DivePhase.IDLE

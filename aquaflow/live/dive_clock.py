@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from aquaflow.base.clocks.device import Learned
 from aquaflow.dive.frames_csv import FrameRow
-from aquaflow.live.moment import Moment
+from aquaflow.live.clock_reading import ClockReading
 from aquaflow.types import Dropped, Frame
 
 
@@ -24,15 +24,15 @@ class Continued:
 
     @staticmethod
     def after(
-        moment: Moment,
+        moment: ClockReading,
         rows: Sequence[FrameRow],
         clocks: Mapping[str, Learned],
-        now: Moment | None = None,
+        now: ClockReading | None = None,
     ) -> Continued:
         """After the run that took a checkpoint at ``moment``, knew the devices' ``clocks`` then and
         left ``rows``. With another boot CLOCK_MONOTONIC is another one: clocks are learned anew."""
         first = 1 + max((row.index for row in rows), default=-1)
-        now = now or Moment.now()
+        now = now or ClockReading.now()
         known = clocks if moment.is_of_the_boot_of(now) else {}
         return Continued(first, moment.shift_ns(now), known)
 

@@ -16,27 +16,27 @@ from aquaflow.config.device import MountingConfig
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import DiveRun
-from aquaflow.live.checkpoint.base import look_in_base
+from aquaflow.live.checkpoint.base import localise_in_base
 from aquaflow.live.checkpoint.checkpoint import Checkpointer, restore
 from aquaflow.live.checkpoint.generations import Checkpoint
+from aquaflow.live.checkpoint.repair import lost_with_their_files
 from aquaflow.live.checkpoint.resume import Choice
-from aquaflow.live.checkpoint.salvage import lost_with_their_files
 from aquaflow.live.checkpoint.telemetry import hear_again
-from aquaflow.live.control import Control
+from aquaflow.live.control import ServiceControl
+from aquaflow.live.deliverable_updates import DeliverableUpdater
 from aquaflow.live.device_errors import DeviceErrors
 from aquaflow.live.dive_clock import Continued
+from aquaflow.live.dive_status_file import DiveStatusFile
 from aquaflow.live.feed import Feed
 from aquaflow.live.health.pressure import PressureReader
 from aquaflow.live.loop import LiveLoop
 from aquaflow.live.map_thread import MapThread
 from aquaflow.live.mounting import camera_mounting
-from aquaflow.live.refresh import Refresher
-from aquaflow.live.standing import Standing
-from aquaflow.live.vitals import Vitals
+from aquaflow.live.service_health import ServiceHealth
 from aquaflow.mapping.work import OwnedMaps
 from aquaflow.recordings.kept_pictures import PictureThread
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
-from aquaflow.recordings.telemetry_lines import TelemetryLog
+from aquaflow.recordings.telemetry_lines import TelemetryWriter
 from aquaflow.slam import Slam
 from aquaflow.slam.map_inputs import make_maps
 from aquaflow.types import Dropped
@@ -53,9 +53,9 @@ class Parts:
     run: DiveRun
     maps: MapThread
     checkpointer: Checkpointer
-    refresher: Refresher
+    refresher: DeliverableUpdater
     choice: Choice
-    standing: Standing
+    standing: DiveStatusFile
     device_errors: DeviceErrors
     frames_before: int
     """Of an earlier run of the same dive."""
@@ -67,8 +67,8 @@ def assembled(
     feed: Feed,
     vehicle: VehicleConfig,
     folder: DiveFolder,
-    vitals: Vitals,
-    control: Control,
+    vitals: ServiceHealth,
+    control: ServiceControl,
     losses: list[str],
 ) -> Parts:
     """All parts of a dive; ``losses``: what damaged files cost one that goes on.
@@ -91,7 +91,7 @@ def assembled(
     worker = Worker(failures, threads=True)
     slam = Slam(config, stages, folder.work, worker, thread)
     slam.prior.warm_up()
-    said = look_in_base(slam, service.dive.site, choice.checkpoint)
+    said = localise_in_base(slam, service.dive.site, choice.checkpoint)
     with failures.contain("camera mounting"):
         stated = camera_mounting(config, service, feed)
         slam.metric.mounting = stated or _mounting_of(before)
@@ -106,7 +106,7 @@ def assembled(
     failures.attempt(
         "writing calibration.yaml", partial(folder.write_calibration, feed.calibration)
     )
-    telemetry_log = partial(TelemetryLog, folder.path / TELEMETRY)
+    telemetry_log = partial(TelemetryWriter, folder.path / TELEMETRY)
     run.telemetry_log = failures.attempt(f"opening {TELEMETRY}", telemetry_log)
     vitals.health.begin()
     pressure = PressureReader(folder.path, gpu_free=thread.usable_memory)
@@ -119,7 +119,7 @@ def assembled(
         folder.path, run, slam, thread, service.checkpoint.every_s, feed.clocks,
         lambda: feed.continued.known_shift_ns,
     )  # fmt: skip
-    refresher = Refresher(run, thread, service.checkpoint.deliverables_s)
+    refresher = DeliverableUpdater(run, thread, service.checkpoint.deliverables_s)
 
     def write_what_is_due(live: LiveLoop) -> None:
         disk_is_full = live.pressure.disk_is_full(service.limits)
@@ -130,7 +130,7 @@ def assembled(
         checkpointer.take_soon()
         refresher.write_soon()
 
-    standing = Standing(folder.path, failures, slam.metric.mounting, before, paused)
+    standing = DiveStatusFile(folder.path, failures, slam.metric.mounting, before, paused)
     errors = DeviceErrors(feed.describe)
     loop.watchers += [standing.update, write_what_is_due, lambda live: errors.update()]
     frames_before = len(slam.frames)

@@ -14,14 +14,14 @@ from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.replay import fix_threads
 from aquaflow.dive.run import Finished
+from aquaflow.live.checkpoint.repair import salvaged_from
 from aquaflow.live.checkpoint.resume import Choice
-from aquaflow.live.checkpoint.salvage import salvaged_from
-from aquaflow.live.control import Control
+from aquaflow.live.control import ServiceControl
 from aquaflow.live.dive_parts import assembled, plain
 from aquaflow.live.feed import Feed
-from aquaflow.live.health.state import State
-from aquaflow.live.standby import FINISHING
-from aquaflow.live.vitals import Vitals
+from aquaflow.live.health.state import ServiceState
+from aquaflow.live.idle_loop import FINISHING
+from aquaflow.live.service_health import ServiceHealth
 from aquaflow.mapping.work import Progress
 from aquaflow.slam.finish_time import FinishTime
 
@@ -52,8 +52,8 @@ class LiveDive:
         feed: Feed,
         config: VehicleConfig,
         overwrite: bool = False,
-        vitals: Vitals | None = None,
-        control: Control | None = None,
+        vitals: ServiceHealth | None = None,
+        control: ServiceControl | None = None,
     ) -> None:
         """Construct all parts; ``vitals`` and ``control`` are the service's, where it has several
         dives.
@@ -69,8 +69,8 @@ class LiveDive:
         salvaged = salvaged_from(choice, plain(config), feed.name_of)
         rows = None if salvaged is None else salvaged.rows
         self.folder = DiveFolder(choice.folder, plain(config), overwrite, rows, feed.dive_s)
-        self.feed, self.control = feed, control or Control()
-        self.vitals = vitals or Vitals(config.service)
+        self.feed, self.control = feed, control or ServiceControl()
+        self.vitals = vitals or ServiceHealth(config.service)
         self._own_vitals = vitals is None
         self._finish_s, self._stop_s = config.service.finish_s, config.service.stop_s
         self._finished = False
@@ -144,7 +144,7 @@ class LiveDive:
             most_s = self._stop_s if self.control.told.is_set() else self._finish_s or 0.0
             self.vitals.stop(reason, most_s + FINISH_MARGIN_S)
         else:
-            self.vitals.health.set(State.FINISHING, FINISHING)
+            self.vitals.health.set(ServiceState.FINISHING, FINISHING)
         self.parts.loop.tell_watchers()  # the pilot hears it while the feed is open
 
     def close(self) -> None:

@@ -11,15 +11,15 @@ from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.config.service import ServiceConfig
 from aquaflow.dive.run import DiveRun
-from aquaflow.live import troubles
-from aquaflow.live.control import Control
+from aquaflow.live import service_warnings
+from aquaflow.live.control import ServiceControl
 from aquaflow.live.feed import Feed
 from aquaflow.live.health.counters import Counters
 from aquaflow.live.health.degradation import DegradationLevel
 from aquaflow.live.health.pressure import Need, Pressure, Shortage
-from aquaflow.live.health.state import Facts, Judgement, State, judged
+from aquaflow.live.health.state import Facts, Judgement, ServiceState, judged
 from aquaflow.live.map_thread import MapThread
-from aquaflow.live.vitals import Vitals
+from aquaflow.live.service_health import ServiceHealth
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.types import Dropped, Frame
 
@@ -53,8 +53,8 @@ class LiveLoop:
         feed: Feed,
         maps: MapThread,
         config: ServiceConfig,
-        vitals: Vitals,
-        control: Control,
+        vitals: ServiceHealth,
+        control: ServiceControl,
         pressure: Callable[[], Pressure],
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -202,7 +202,9 @@ class LiveLoop:
             self.counters.update()
         with contain("health state"):
             paused = self.control.paused
-            self.health.set(*(Judgement(State.PAUSED, PAUSED) if paused else judged(self._facts())))
+            self.health.set(
+                *(Judgement(ServiceState.PAUSED, PAUSED) if paused else judged(self._facts()))
+            )
         self.tell_watchers()
         with contain("notification of systemd"):
             self.vitals.notify()
@@ -231,13 +233,15 @@ class LiveLoop:
             self._now_s() - self._frame_s,
             PATIENCE_S,
             self._pictured,
-            troubles.silent_camera(devices),
+            service_warnings.silent_camera(devices),
             self._unposed < LOST_AFTER,
             self._ever_posed,
-            troubles.inconsistency(slam.tracker.monitor.trouble),
+            service_warnings.inconsistency(slam.tracker.monitor.trouble),
             [
-                *troubles.of_the_machine(self.degradation, self.pressure, self.config.limits),
-                *troubles.of_the_stages(self.maps, slam.failures),
-                *troubles.of_the_devices(devices),
+                *service_warnings.of_the_machine(
+                    self.degradation, self.pressure, self.config.limits
+                ),
+                *service_warnings.of_the_stages(self.maps, slam.failures),
+                *service_warnings.of_the_devices(devices),
             ],
         )

@@ -17,23 +17,23 @@ from aquaflow.dive.run import Finished
 from aquaflow.live.checkpoint.checkpoint import UnusableStateError
 from aquaflow.live.checkpoint.resume import Choice, choose, is_begun, resumed, tidy
 from aquaflow.live.checkpoint.set_aside import SetAside
-from aquaflow.live.control import Control, Phase, Request
+from aquaflow.live.clock_reading import ClockReading
+from aquaflow.live.control import DivePhase, ServiceControl, ServiceRequest
 from aquaflow.live.feed import Feed
-from aquaflow.live.health.state import State
+from aquaflow.live.health.state import ServiceState
+from aquaflow.live.idle_loop import FINISHING, IDLE
 from aquaflow.live.live_dive import LiveDive
-from aquaflow.live.moment import Moment
-from aquaflow.live.standby import FINISHING, IDLE
-from aquaflow.live.station import Station
+from aquaflow.live.service_frontends import ServiceFrontends
+from aquaflow.live.service_health import ServiceHealth
 from aquaflow.live.vehicle.arming import refuse_without_autopilot
 from aquaflow.live.vehicle.scale_sources import refuse_without_scale
-from aquaflow.live.vitals import Vitals
 from aquaflow.mapping.work import Progress
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Asked:
+class OnboardSettings:
     """Where the dives go."""
 
     out: Path | None = None
@@ -52,7 +52,7 @@ def map_live(
     seconds: float | None = None,
     progress: Progress | None = None,
     overwrite: bool = False,
-    control: Control | None = None,
+    control: ServiceControl | None = None,
 ) -> Finished | None:
     """Map what ``feed`` brings until it ends, ``seconds`` have passed, or it is stopped; where
     pictures may come for ever, in as many dives as are asked for in ``control``.
@@ -72,15 +72,15 @@ def map_live(
         refuse_without_scale(vehicle)
     if feed.lasting:
         refuse_without_autopilot(vehicle)
-    control = control or Control()
+    control = control or ServiceControl()
     with contextlib.ExitStack() as around:
         around.callback(feed.close)
-        vitals = around.enter_context(Vitals(vehicle.service))
-        station = around.enter_context(Station(feed, vehicle, control, vitals))
+        vitals = around.enter_context(ServiceHealth(vehicle.service))
+        station = around.enter_context(ServiceFrontends(feed, vehicle, control, vitals))
         around.callback(_stop_after(seconds, control).cancel)
         around.enter_context(stop_on_signals(control.told, control.stopping, once=True))
         onboard = Onboard(feed, vehicle, control, station, progress)
-        return onboard.serve(Asked(out, new, overwrite))
+        return onboard.serve(OnboardSettings(out, new, overwrite))
 
 
 class Onboard:
@@ -90,15 +90,15 @@ class Onboard:
         self,
         feed: Feed,
         vehicle: VehicleConfig,
-        control: Control,
-        station: Station,
+        control: ServiceControl,
+        station: ServiceFrontends,
         progress: Progress | None = None,
     ) -> None:
         self._feed, self._vehicle, self._control = feed, vehicle, control
         self._station, self._progress = station, progress
         self._reason = IDLE
 
-    def serve(self, asked: Asked) -> Finished | None:
+    def serve(self, asked: OnboardSettings) -> Finished | None:
         """Dives and idle times, until the service shall end or nothing comes any more.
 
         Raises:
@@ -107,9 +107,9 @@ class Onboard:
         control, finished = self._control, None
         automatic = self._begins_by_itself(asked)
         if automatic:
-            control.ask(Request.START)
+            control.ask(ServiceRequest.START)
         while not control.stopping.is_set():
-            if control.phase is Phase.IDLE:
+            if control.phase is DivePhase.IDLE:
                 self._idle()
                 continue
             self._reason = IDLE
@@ -118,16 +118,16 @@ class Onboard:
             if not self._feed.lasting:
                 break
             self._feed.forget()
-            asked, automatic = Asked(asked.out, new=asked.out is not None), False
+            asked, automatic = OnboardSettings(asked.out, new=asked.out is not None), False
         return finished
 
     def _idle(self) -> None:
         self._feed.start()
-        self._station.standby.turn(State.IDLE, self._reason)
+        self._station.standby.turn(ServiceState.IDLE, self._reason)
         if self._feed.failure is not None:
             raise AquaFlowError(f"{self._feed.failure}; the service ends, to be started anew")
 
-    def _begins_by_itself(self, asked: Asked) -> bool:
+    def _begins_by_itself(self, asked: OnboardSettings) -> bool:
         """Without a pilot's word: as the config says, and where a process was cut off in a dive."""
         if not self._feed.lasting or self._vehicle.service.dive.begin == "at_once":
             return True
@@ -136,10 +136,10 @@ class Onboard:
         interrupted = status is not None and status.state is DiveState.OPEN
         return choice.checkpoint is not None and interrupted
 
-    def _dive(self, asked: Asked, automatic: bool) -> Finished | None:
+    def _dive(self, asked: OnboardSettings, automatic: bool) -> Finished | None:
         """One dive from its first frame to its report."""
         control, station, another = self._control, self._station, self._control.begin()
-        asked = Asked(asked.out, asked.new or another, asked.overwrite)
+        asked = OnboardSettings(asked.out, asked.new or another, asked.overwrite)
         try:
             dive = begun(self._feed, self._vehicle, asked, station.standby.vitals, control)
         except AquaFlowError as error:
@@ -149,7 +149,7 @@ class Onboard:
             return None
         with dive:
             if automatic and dive.parts.standing.was_paused:
-                control.ask(Request.STOP)
+                control.ask(ServiceRequest.STOP)
             station.show(dive)
             try:
                 dive.map()
@@ -164,7 +164,7 @@ class Onboard:
             work = threads.submit(dive.finish, self._progress)
             work.add_done_callback(lambda _: control.wake())
             while not work.done():
-                self._station.standby.turn(State.FINISHING, FINISHING)
+                self._station.standby.turn(ServiceState.FINISHING, FINISHING)
             self._station.standby.end()
         try:
             return work.result()
@@ -183,9 +183,9 @@ class Onboard:
 def begun(
     feed: Feed,
     vehicle: VehicleConfig,
-    asked: Asked,
-    vitals: Vitals | None = None,
-    control: Control | None = None,
+    asked: OnboardSettings,
+    vitals: ServiceHealth | None = None,
+    control: ServiceControl | None = None,
 ) -> LiveDive:
     """The dive of :func:`map_live`, before its first frame. If a checkpoint cannot be resumed, the
     one before is used, and then a new dive; in an unattended run also if the config does not fit.
@@ -207,20 +207,20 @@ def begun(
             if choice.checkpoint is None or asked.out is not None:
                 raise
             log.error("%s: %s; a new dive begins", folder, error)
-            asked = Asked(new=True)
+            asked = OnboardSettings(new=True)
 
 
-def chosen(vehicle: VehicleConfig, asked: Asked) -> Choice:
+def chosen(vehicle: VehicleConfig, asked: OnboardSettings) -> Choice:
     """The folder, and what is resumed in it."""
     if asked.out is not None:
         return Choice(asked.out) if asked.overwrite else resumed(asked.out, asked.new)
     service = vehicle.service
-    choice = choose(service.dives, service.checkpoint, asked.new, Moment.now())
+    choice = choose(service.dives, service.checkpoint, asked.new, ClockReading.now())
     tidy(service.dives, choice)
     return choice
 
 
-def _stop_after(seconds: float | None, control: Control) -> threading.Timer:
+def _stop_after(seconds: float | None, control: ServiceControl) -> threading.Timer:
     timer = threading.Timer(seconds or 0.0, control.stopping.set)
     timer.daemon = True
     if seconds is not None:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from aquaflow.live.watched import Watched
+from aquaflow.live.service_status import ServiceStatus
 from aquaflow.types import Frame
 
 WIDTH = 640
@@ -30,7 +30,7 @@ class NewestPicture:
         self._jpeg: tuple[Frame, bytes] | None = None
         self._making = threading.Lock()
 
-    def update(self, service: Watched) -> None:
+    def update(self, service: ServiceStatus) -> None:
         """Called after every turn of the service; never waits."""
         self._newest = service.picture or self._newest
 

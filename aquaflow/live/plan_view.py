@@ -14,7 +14,7 @@ from aquaflow.dive.page_axes import names_of, page_axes
 from aquaflow.dive.views import CoverageView
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.live.dive_parts import Parts
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 Array = npt.NDArray[np.float64]
 
@@ -66,7 +66,7 @@ class PlanView:
         for keyframe in list(slam.keyframes.keyframes):  # tracking appends to it meanwhile
             centres.setdefault(keyframe.sub_map, []).append(keyframe.T_wc.t)
         plans = {
-            number: _Plan(slam.metric_frame(number), _thinned(own))
+            number: _SubMapPlan(slam.metric_frame(number), _thinned(own))
             for number, own in sorted(centres.items())
         }
         now = None
@@ -80,12 +80,12 @@ class PlanView:
         return {"sub_maps": sub_maps, "now": now, "hints": self._coverage.in_words()}
 
 
-class _Plan:
+class _SubMapPlan:
     """One sub-map's path, and the plane that it is shown in."""
 
     def __init__(
         self,
-        frame: MetricFrame,
+        frame: WorldFrame,
         centres: Array,  # [N, 3] in the sub-map's world
     ) -> None:
         self._frame = frame

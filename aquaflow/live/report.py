@@ -10,16 +10,22 @@ from typing import Any
 from aquaflow import __version__
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.dive.in_site import in_site_numbers
-from aquaflow.live.control import Control
+from aquaflow.live.control import ServiceControl
 from aquaflow.live.dive_parts import Parts
 from aquaflow.live.feed import Feed
-from aquaflow.live.health.state import State
+from aquaflow.live.health.state import ServiceState
 from aquaflow.live.health.telemetry import metric_frame_numbers, newest_values
-from aquaflow.live.standby import Standby
+from aquaflow.live.idle_loop import IdleLoop
+from aquaflow.live.service_health import ServiceHealth
 from aquaflow.live.vehicle.pose_output import PoseOutput
-from aquaflow.live.vitals import Vitals
 
-GOOD = (State.TRACKING, State.INITIALISING, State.IDLE, State.PAUSED, State.FINISHING)
+GOOD = (
+    ServiceState.TRACKING,
+    ServiceState.INITIALISING,
+    ServiceState.IDLE,
+    ServiceState.PAUSED,
+    ServiceState.FINISHING,
+)
 """States that need no action."""
 CHANGES_LISTED = 10
 """Latest changes of state that the report lists."""
@@ -61,7 +67,7 @@ def report(
 
 
 def report_between_dives(
-    standby: Standby, control: Control, feed: Feed, now_s: float | None = None
+    standby: IdleLoop, control: ServiceControl, feed: Feed, now_s: float | None = None
 ) -> dict[str, Any]:
     """The same keys while there is no dive: its numbers are 0, or null."""
     vitals = standby.vitals
@@ -95,7 +101,7 @@ def report_between_dives(
     }  # fmt: skip
 
 
-def _state(vitals: Vitals, hang_s: float, now_s: float | None) -> dict[str, Any]:
+def _state(vitals: ServiceHealth, hang_s: float, now_s: float | None) -> dict[str, Any]:
     now = time.monotonic() if now_s is None else now_s
     health, hung = vitals.health, vitals.heartbeats.hung(hang_s)
     return {

@@ -19,7 +19,7 @@ from torch import Tensor
 from aquaflow.mapping.scene import Scene, orientations
 from aquaflow.render.transfers import map_out, water_in
 from aquaflow.render.views import View
-from aquaflow.water.image_formation import MIN_TRANSMISSION, Water
+from aquaflow.water.image_formation import MIN_TRANSMISSION, WaterParameters
 from aquaflow.water.white_balance import Recovered
 
 
@@ -28,7 +28,7 @@ def restored_radiance(
     scene: Scene,
     radiance: Tensor,  # [..., 3] J
     z: Tensor,  # [...] range from which it was seen, map units
-    water: Water | None,
+    water: WaterParameters | None,
 ) -> Recovered:
     """J as it is shown without ``water``, in the white balance of what is nearest; all of it where
     there is no water."""
@@ -42,12 +42,12 @@ def restored_radiance(
     return scene.balance.recover(radiance * T + water.backscatter(z), z, water)
 
 
-def mean_water(scene: Scene, views: Sequence[View]) -> Water | None:
+def mean_water(scene: Scene, views: Sequence[View]) -> WaterParameters | None:
     """The water of the mean of ``views``; None where there is none."""
     if not scene.medium.active or not views:
         return None
     with torch.no_grad():
-        water: Water = scene.medium(orientations(views, scene.device))
+        water: WaterParameters = scene.medium(orientations(views, scene.device))
         return replace(water, beta_a=water.beta_a.mean(dim=0))
 
 

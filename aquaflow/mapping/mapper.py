@@ -30,14 +30,14 @@ from aquaflow.mapping.optimisation.map_optimiser import MapOptimiser
 from aquaflow.mapping.optimisation.objective import Objective
 from aquaflow.mapping.optimisation.registration import register
 from aquaflow.mapping.optimisation.schedule import refining_rates, sampled_views, shuffled_views
-from aquaflow.mapping.rendering import Shown
+from aquaflow.mapping.rendering import RenderedMap
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.scene_water import rebalance
 from aquaflow.mapping.water_fitting import WaterFitting
 from aquaflow.render.contract import Renderer
 from aquaflow.render.device_memory import give_back_after
 from aquaflow.render.views import View, in_time
-from aquaflow.water.medium import Medium
+from aquaflow.water.medium import LearnedMedium
 
 MOST_FAILED_STEPS = 10
 """Steps in a row that raise until the final refinement gives up: the next would, too."""
@@ -264,7 +264,7 @@ class Mapper:
 
     # --- looking ------------------------------------------------------------------------------
 
-    def show(self, view: View) -> Shown:
+    def show(self, view: View) -> RenderedMap:
         """The map from ``view``."""
         self._take(view)
         return self.scene.show(view)
@@ -285,7 +285,7 @@ class Mapper:
         return self.scene.gaussians
 
     @property
-    def medium(self) -> Medium:
+    def medium(self) -> LearnedMedium:
         """The scene's medium."""
         return self.scene.medium
 

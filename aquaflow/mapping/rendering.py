@@ -11,11 +11,11 @@ from aquaflow.render.activation import activate
 from aquaflow.render.contract import Renderer
 from aquaflow.render.views import View
 from aquaflow.render.water import MIN_SOLID, compose_water
-from aquaflow.water.image_formation import Water
+from aquaflow.water.image_formation import WaterParameters
 
 
 @dataclass(frozen=True)
-class Shown:
+class RenderedMap:
     """The map from one view."""
 
     image: Tensor
@@ -36,14 +36,14 @@ class Shown:
 
 def show(
     parameters: Mapping[str, Tensor],  # of a GaussianMap
-    water: Water | None,
+    water: WaterParameters | None,
     gain: Tensor | None,  # [H, W] shading
     renderer: Renderer,
     view: View,
     viewmat: Tensor,  # [4, 4] world to camera
     active: Tensor | None = None,  # [rows, columns] bool, the tiles to draw
     uneven: Tensor | None = None,  # [H, W] gain of the backscatter
-) -> Shown:
+) -> RenderedMap:
     """Draw the map; differentiable in the parameters, the water and the view matrix.
 
     Range rides as a fourth colour channel divided by alpha, the same on every renderer.
@@ -75,4 +75,4 @@ def show(
         image, z = compose_water(
             drawn.image, drawn.alpha, water.stacked(), renderer.threads, uneven, gain
         )
-    return Shown(image, clean, drawn.alpha, z, drawn.visible, drawn.radius_px, active)
+    return RenderedMap(image, clean, drawn.alpha, z, drawn.visible, drawn.radius_px, active)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from aquaflow.mapping.clear_colours import restored_radiance
-from aquaflow.mapping.rendering import Shown
+from aquaflow.mapping.rendering import RenderedMap
 from aquaflow.mapping.scene import Scene
 from aquaflow.render.transfers import picture_out, water_in
 from aquaflow.render.views import View
@@ -53,7 +53,7 @@ class RestoredPicture:
 
 
 @torch.no_grad()
-def restored_picture(scene: Scene, view: View, shown: Shown) -> RestoredPicture:
+def restored_picture(scene: Scene, view: View, shown: RenderedMap) -> RestoredPicture:
     """The picture without water, at the ranges that the map ``shown`` from the view has, in the
     white balance that the camera had for what was nearest (see water/white_balance.py).
 
@@ -92,7 +92,7 @@ def _with_soft_edge(
 
 
 @torch.no_grad()
-def drawn_without_water(scene: Scene, view: View, shown: Shown) -> RestoredPicture:
+def drawn_without_water(scene: Scene, view: View, shown: RenderedMap) -> RestoredPicture:
     """The map's own radiance from the view in place of a picture, as bounded as one; nothing of it
     was restored from one."""
     solid, image = shown.alpha > SOLID, _own_colours(scene, view, shown)
@@ -102,7 +102,7 @@ def drawn_without_water(scene: Scene, view: View, shown: Shown) -> RestoredPictu
     return RestoredPicture(image, torch.zeros_like(shown.alpha), opaque, None)
 
 
-def _own_colours(scene: Scene, view: View, shown: Shown) -> Tensor:
+def _own_colours(scene: Scene, view: View, shown: RenderedMap) -> Tensor:
     """[H, W, 3] the map's radiance without the view's water, premultiplied by alpha."""
     water = scene.water(view)
     if water is None:

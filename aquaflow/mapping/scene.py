@@ -15,13 +15,13 @@ from torch import Tensor
 from aquaflow.config import MediumConfig, SunlightConfig
 from aquaflow.mapping.gaussians.gaussians import GaussianMap
 from aquaflow.mapping.neural.neural import NeuralGaussians
-from aquaflow.mapping.rendering import Shown, show
+from aquaflow.mapping.rendering import RenderedMap, show
 from aquaflow.render.contract import Renderer
 from aquaflow.render.transfers import picture_out, pose_in, water_in, water_out, weights_in
 from aquaflow.render.views import View
 from aquaflow.water.exposure import gain_of, learn_gain
-from aquaflow.water.image_formation import Water
-from aquaflow.water.medium import Medium
+from aquaflow.water.image_formation import WaterParameters
+from aquaflow.water.medium import LearnedMedium
 from aquaflow.water.nearest import Nearest
 from aquaflow.water.open_water import open_water
 from aquaflow.water.shading import TERMS, gain_map
@@ -47,7 +47,7 @@ class Scene:
         self.gaussians = GaussianMap(device=self.device)
         self.neural: NeuralGaussians | None = None
         """What is added to the Gaussians by where they are seen from; None: nothing is."""
-        self.medium = weights_in(Medium(config, generator), self.device)
+        self.medium = weights_in(LearnedMedium(config, generator), self.device)
         self.shading = np.zeros(TERMS)
         """Coefficients of the log-gain over the picture."""
         self.exposes = False
@@ -65,7 +65,7 @@ class Scene:
         """Of the points' colours in the last fit, with the water and without; None before it."""
         self.gain_maps: dict[tuple[str, int, int], Tensor | None] = {}
 
-    def water(self, view: View) -> Water | None:
+    def water(self, view: View) -> WaterParameters | None:
         """The medium for this view, or None while it is switched off."""
         if not self.medium.active:
             return None
@@ -111,7 +111,7 @@ class Scene:
         viewmat: Tensor | None = None,  # [4, 4]
         learn: bool = False,
         active: Tensor | None = None,  # [rows, columns] bool, the tiles to draw
-    ) -> Shown:
+    ) -> RenderedMap:
         """The scene from ``view``; differentiable in what is given.
 
         ``parameters`` are decoded ones, where there is a decoder. With ``learn`` it is
@@ -135,7 +135,7 @@ class Scene:
         """The gain [3] of the exposure of ``view``; None where all views have the same."""
         return gain_of(view) if self.exposes else None
 
-    def _learn_light(self, view: View, shown: Shown) -> None:
+    def _learn_light(self, view: View, shown: RenderedMap) -> None:
         image = shown.image.detach()
         if self.exposes:
             learn_gain(view, image, shown.alpha)
@@ -196,7 +196,7 @@ class Scene:
                 self.neural.settle()
 
     @torch.no_grad()
-    def show(self, view: View, learn: bool = False) -> Shown:
+    def show(self, view: View, learn: bool = False) -> RenderedMap:
         """The scene from ``view``, for looking."""
         return self.draw(view, learn=learn)
 

@@ -16,7 +16,7 @@ from aquaflow.render.transfers import water_in, water_out
 from aquaflow.render.views import View
 from aquaflow.water.estimation import WaterEstimate, estimating, models_for
 from aquaflow.water.exposure import gain_of, log_gains_of, set_log_gains
-from aquaflow.water.image_formation import Water
+from aquaflow.water.image_formation import WaterParameters
 from aquaflow.water.nearest import kept_by
 from aquaflow.water.posed_picture import PosedPicture
 from aquaflow.water.shading import shading_basis
@@ -138,7 +138,7 @@ def _water_of(
     scene: Scene,
     views: Sequence[View],
     which: torch.Tensor,  # [N] int64
-) -> Water:
+) -> WaterParameters:
     """The water for N points, each seen from its own view: beta_a is [N, 3]."""
-    water: Water = scene.medium(orientations(views, scene.device))
+    water: WaterParameters = scene.medium(orientations(views, scene.device))
     return replace(water, beta_a=water.beta_a[which])

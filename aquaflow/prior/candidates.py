@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 
 from aquaflow.prior import homography as sparse
 from aquaflow.prior.fields import pixel_grid
-from aquaflow.prior.flow import Float, Flow, FlowMatcher
+from aquaflow.prior.flow import Float, FlowMatcher, ImageFlow
 from aquaflow.prior.flow_pair import FlowEncoding
 
 GOOD_SHARE = 0.5
@@ -23,7 +23,7 @@ def best_flow(
     b: FlowEncoding,
     starts: Iterable[Float | None],  # [H, W, 2] px each, a to b; None: from nothing
     near: Float | None = None,  # [H, W, 2] px, a to b
-) -> Flow:
+) -> ImageFlow:
     """The flow of the first start that explains the pair, or the one that matches most.
 
     From ``near``, where it is known well, a quicker flow comes first. ``starts`` is asked for the
@@ -33,7 +33,7 @@ def best_flow(
         flow = matcher(a.grey, b.grey, a.texture, b.texture, near, quick=True)
         if flow.share >= GOOD_SHARE:
             return flow
-    best: Flow | None = None
+    best: ImageFlow | None = None
     for start in starts:
         flow = matcher(a.grey, b.grey, a.texture, b.texture, start)
         if best is None or flow.share > best.share:

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from aquaflow.config.stage import Stage
+from aquaflow.config.stage import StageConfig
 from aquaflow.prior.contract import RangeUnit
 
 Measure = Literal["depth", "inverse_depth", "log_depth"]
@@ -29,7 +29,7 @@ UNITS: dict[Unit, RangeUnit] = {"metres": "shared", "unknown": "own", "affine": 
 """What each unit means for two pictures."""
 
 
-class DepthCard(Stage):
+class DepthCard(StageConfig):
     """Depth along the optical axis, of every pixel or of cells that cover the picture evenly."""
 
     input: str

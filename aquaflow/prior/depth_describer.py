@@ -18,7 +18,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.contract import Float
 from aquaflow.prior.depth_card import NETWORK, UNITS, DepthCard
 from aquaflow.prior.folder import CARD, read_card
-from aquaflow.prior.framing import Framing, as_input, multiple_of, resized
+from aquaflow.prior.framing import ImagePadding, as_input, multiple_of, resized
 from aquaflow.prior.learned_range import LearnedRange, cell_rays
 from aquaflow.prior.network import METRIC_SIGMA, Half, Picture
 from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
@@ -103,9 +103,9 @@ class DepthDescriber:
             variance = np.exp(2.0 * log_sigma)
         return LearnedRange(log_depth + 0.5 * np.log1p((rays**2).sum(-1)), variance)
 
-    def _framing(self, height: int, width: int) -> Framing:
+    def _framing(self, height: int, width: int) -> ImagePadding:
         assert self._frame is not None
-        return Framing.of(height, width, self._frame, self._card.multiple_px)
+        return ImagePadding.of(height, width, self._frame, self._card.multiple_px)
 
     def _normalised(
         self,

@@ -62,7 +62,7 @@ BORDER_PX = 2.0
 
 
 @dataclass(frozen=True)
-class Flow:
+class ImageFlow:
     """Displacements in pixels, both ways, and which pixels of a are valid."""
 
     forward: Float
@@ -120,7 +120,7 @@ def texture(
 
 
 def confidence(
-    flow: Flow,
+    flow: ImageFlow,
 ) -> Float:
     """[H, W] in [0, 1]: falls with the forward-backward error, and towards edges of the flow.
 
@@ -203,12 +203,12 @@ class FlowMatcher:
         texture_b: Float,  # [H, W]
         start: Float | None = None,  # [H, W, 2] px, a to b
         quick: bool = False,
-    ) -> Flow:
+    ) -> ImageFlow:
         """``quick``: in half the time, for a start that is seldom far off."""
         # Where a start is NaN, OpenCV reads outside of the picture and ends the process.
         start = None if start is None or not np.isfinite(start).all() else start
         forward, backward = self._both_ways(a, b, start, quick)
-        return Flow(forward, backward, *check(forward, backward, texture_a, texture_b))
+        return ImageFlow(forward, backward, *check(forward, backward, texture_a, texture_b))
 
     def _both_ways(
         self,

@@ -61,7 +61,7 @@ class FlowPair:
     D_a: Float | None = None
     D_b: Float | None = None
 
-    def __init__(self, a: FlowEncoding, b: FlowEncoding, flow: dense.Flow) -> None:
+    def __init__(self, a: FlowEncoding, b: FlowEncoding, flow: dense.ImageFlow) -> None:
         self._a, self._b, self.flow = a, b, flow
 
     @cached_property

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from aquaflow.prior.candidates import best_flow, from_prediction
 from aquaflow.prior.contract import Encoding, Float
-from aquaflow.prior.flow import Flow, FlowMatcher
+from aquaflow.prior.flow import FlowMatcher, ImageFlow
 from aquaflow.prior.flow_pair import FlowEncoding
 
 WARM_UP = (240, 320, 3)
@@ -46,7 +46,7 @@ class FlowPrior:
         predicted: Float | None,  # [H, W, 2] px, expected matches of a in b
         alone: bool,
         starts: Iterable[Float | None],  # [H, W, 2] px each; None: from nothing
-    ) -> Flow:
+    ) -> ImageFlow:
         """From one of ``starts``; from nothing but a prediction that stands ``alone``."""
         if alone and predicted is not None:
             starts = from_prediction(predicted)

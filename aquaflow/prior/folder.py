@@ -9,7 +9,7 @@ from typing import Any, Literal
 from pydantic import ValidationError
 
 from aquaflow.base.errors import InputError, path_of_key
-from aquaflow.config.stage import Stage
+from aquaflow.config.stage import StageConfig
 from aquaflow.prior.depth_card import DepthCard
 
 CARD = "prior.json"
@@ -20,7 +20,7 @@ READ_BYTES = 1 << 20
 """Read at a time for the checksum."""
 
 
-class PriorCard(Stage):
+class PriorCard(StageConfig):
     """What a prior is, where it comes from, and how its files are known to be whole."""
 
     name: Literal["compact", "depth", "mast3r", "oracle"]

@@ -17,7 +17,7 @@ GREY = 127
 
 
 @dataclass(frozen=True)
-class Framing:
+class ImagePadding:
     """A picture inside a larger one of fixed size: whole, and not stretched.
 
     Its sides there are whole cells of the network, so that the cells that show it cover it evenly;
@@ -33,7 +33,7 @@ class Framing:
     width: int
 
     @staticmethod
-    def of(height: int, width: int, frame: tuple[int, int], cell_px: int) -> Framing:
+    def of(height: int, width: int, frame: tuple[int, int], cell_px: int) -> ImagePadding:
         """Of a picture of ``height`` x ``width`` px in the middle of a ``frame`` (height, width),
         as large as fits."""
         scale = min(frame[0] / height, frame[1] / width)
@@ -45,7 +45,7 @@ class Framing:
             (available - side) // 2 // cell_px * cell_px
             for side, available in zip(inner, frame, strict=True)
         ]
-        return Framing(*frame, *before, *inner)
+        return ImagePadding(*frame, *before, *inner)
 
     def framed(
         self,

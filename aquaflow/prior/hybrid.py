@@ -56,7 +56,7 @@ class HybridEncoding(FlowEncoding):
             self.features = arrays["features"]
 
 
-class Comparison:
+class LazyComparison:
     """The network's view of a pair of encodings, asked for at most once."""
 
     def __init__(self, a: HybridEncoding, b: HybridEncoding) -> None:
@@ -78,7 +78,11 @@ class HybridPair(FlowPair):
     """Matches of flow; ranges and their confidence are the network's, that of matches is both's."""
 
     def __init__(
-        self, a: HybridEncoding, b: HybridEncoding, flow: dense.Flow, comparison: Comparison
+        self,
+        a: HybridEncoding,
+        b: HybridEncoding,
+        flow: dense.ImageFlow,
+        comparison: LazyComparison,
     ) -> None:
         super().__init__(a, b, flow)
         self._describer, self._comparison = a.describer, comparison
@@ -170,7 +174,7 @@ class HybridPrior(FlowPrior):
         descriptors, if the network has any, then from keypoints."""
         assert isinstance(a, HybridEncoding)
         assert isinstance(b, HybridEncoding)
-        comparison = Comparison(a, b)
+        comparison = LazyComparison(a, b)
         starts = _starts(a, b, predicted, comparison if self._learned_matches else None)
         return HybridPair(a, b, self._flow(a, b, predicted, alone, starts), comparison)
 
@@ -187,7 +191,7 @@ def _starts(
     a: HybridEncoding,
     b: HybridEncoding,
     predicted: Float | None,  # [H, W, 2] px, expected matches of a in b
-    comparison: Comparison | None,
+    comparison: LazyComparison | None,
 ) -> Iterator[Float | None]:
     if not a.describer.describes:
         yield from classical_starts(a, b, predicted)

@@ -22,7 +22,7 @@ from pydantic import Field
 from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.base.errors.plain_yaml import read_mapping
 from aquaflow.config.device import MountingConfig
-from aquaflow.config.stage import Stage, validated
+from aquaflow.config.stage import StageConfig, validated
 from aquaflow.config.telemetry import AnyDevice
 from aquaflow.recordings.telemetry_log import ByteLog
 from aquaflow.sources import (
@@ -40,7 +40,7 @@ MOST_S = 1e9
 """30 years between a log's beginning and the first picture: clocks that were never set."""
 
 
-class LogEntry(Stage):
+class LogEntry(StageConfig):
     """One telemetry log."""
 
     file: str
@@ -49,7 +49,7 @@ class LogEntry(Stage):
     """What speaks in a log of bytes; None: the usual for its kind."""
 
 
-class Manifest(Stage):
+class Manifest(StageConfig):
     """What lies in the folder."""
 
     camera: str | None = None

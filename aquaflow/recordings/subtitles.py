@@ -57,7 +57,7 @@ WHOLE_SECOND = 1.0
 """s; Cockpit cuts off the fraction."""
 
 
-class Entry(NamedTuple):
+class SubtitleEntry(NamedTuple):
     """What the screen showed."""
 
     t_s: float
@@ -93,7 +93,7 @@ class Subtitles(TelemetryLog):
         if bad:
             self.notes.append(f"{bad} entries of {self.path.name} hold no sane values")
 
-    def _entries(self) -> Iterator[Entry]:
+    def _entries(self) -> Iterator[SubtitleEntry]:
         self.notes = []
         later = _writer(self.path) == "QGroundControl"
         with self.path.open(encoding="utf-8", errors="replace") as file:
@@ -104,9 +104,9 @@ class Subtitles(TelemetryLog):
                 hours, minutes, seconds = shown[0].group(*((4, 5, 6) if later else (1, 2, 3)))
                 newest_s = max(3600 * int(hours) + 60 * int(minutes) + float(seconds), newest_s)
                 texts = [OVERRIDE.sub("", match[7]).split(r"\N") for match in shown]
-                yield Entry(newest_s, *_read(texts))
+                yield SubtitleEntry(newest_s, *_read(texts))
 
-    def _video_began(self, entries: list[Entry]) -> float | None:
+    def _video_began(self, entries: list[SubtitleEntry]) -> float | None:
         """UTC of the first picture: a time that was cut to a second is early by less than one, so
         the latest of all is the nearest. None where the clock was set on the way."""
         began_s = [entry.utc_s - entry.t_s for entry in entries if entry.utc_s is not None]

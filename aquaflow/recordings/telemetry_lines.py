@@ -73,7 +73,7 @@ class TelemetryLines:
                 yield sample
 
 
-class TelemetryLog:
+class TelemetryWriter:
     """Appends samples to a file; a full disk costs the samples that it does not take."""
 
     def __init__(self, path: Path) -> None:

@@ -20,7 +20,7 @@ COLOUR_SHARPNESS = 10.0
 """Of the softplus, which is the identity above about 0.3; kSharpness of native/activate.h."""
 
 
-class Drawn(NamedTuple):
+class RendererInputs(NamedTuple):
     """The arguments of a renderer that follow from raw parameters."""
 
     scales: Tensor
@@ -44,11 +44,11 @@ def activate_torch(
     opacity_logits: Tensor,  # [N, 1]
     raw_colours: Tensor,  # [N, 3]
     centre: Tensor,  # [3] of the camera, taken as fixed
-) -> Drawn:
+) -> RendererInputs:
     """The definition, in the inputs' dtype: oracle and fallback."""
     ranges = torch.linalg.vector_norm(means - centre.detach(), dim=-1, keepdim=True)
     colours = torch.cat([radiance(raw_colours), ranges], dim=-1)
-    return Drawn(torch.exp(log_scales), torch.sigmoid(opacity_logits[:, 0]), colours)
+    return RendererInputs(torch.exp(log_scales), torch.sigmoid(opacity_logits[:, 0]), colours)
 
 
 def activate(
@@ -58,7 +58,7 @@ def activate(
     raw_colours: Tensor,  # [N, 3]
     centre: Tensor,  # [3] of the camera, taken as fixed
     threads: int | None = None,
-) -> Drawn:
+) -> RendererInputs:
     """:func:`activate_torch`, by the kernels where there are any."""
     inputs = (means, log_scales, opacity_logits, raw_colours, centre.detach())
     library = library_or_none() if means.device.type == "cpu" else None
@@ -66,7 +66,7 @@ def activate(
         return activate_torch(*inputs)
     threads = threads if threads is not None else torch.get_num_threads()
     plain = [tensor.contiguous() for tensor in inputs]
-    return Drawn(*_Activate.apply(*plain, threads, library))  # type: ignore[no-untyped-call]
+    return RendererInputs(*_Activate.apply(*plain, threads, library))  # type: ignore[no-untyped-call]
 
 
 class _Activate(torch.autograd.Function):

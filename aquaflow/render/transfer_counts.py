@@ -6,7 +6,7 @@ import threading
 from collections import Counter
 
 
-class Counts:
+class TransferCounts:
     """Counters that several threads may use."""
 
     def __init__(self) -> None:
@@ -24,7 +24,7 @@ class Counts:
             return dict(self._counts)
 
 
-COUNTS = Counts()
+COUNTS = TransferCounts()
 """Of this process."""
 
 

@@ -16,7 +16,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.mapping.no_maps import NoMaps
 from aquaflow.mapping.work import Growth, Insertion, MapWork, OwnedMaps
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.frames import FrameClass, Tracked
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ class MapInputs:
         maps: MapWork,
         keyframes: KeyframeStore,
         config: MappingConfig,
-        frame_of: Callable[[int], MetricFrame],
+        frame_of: Callable[[int], WorldFrame],
     ) -> None:
         """``frame_of`` a sub-map, as last estimated."""
         self._maps, self._keyframes, self._config = maps, keyframes, config

@@ -18,21 +18,21 @@ from aquaflow.mapping.work import MapWork
 from aquaflow.prior.factory import make_prior
 from aquaflow.slam.finish_time import FinishTime
 from aquaflow.slam.map_inputs import MapInputs, make_maps
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.adjustment.adjuster import Adjuster
-from aquaflow.tracking.anchored import Anchored, Anchors
 from aquaflow.tracking.base.base import Base
-from aquaflow.tracking.base.in_base import InBase, LookedUp
+from aquaflow.tracking.base.in_base import BaseLookup, InBase
 from aquaflow.tracking.frame_table import FrameTable
-from aquaflow.tracking.frames import FrameClass, Link, Revisit, Step, Tracked
-from aquaflow.tracking.gate.gate import FrameGate, GateKind, Verdict
+from aquaflow.tracking.frames import FrameClass, KeyframeEdge, Revisit, Step, Tracked
+from aquaflow.tracking.gate.gate import FrameGate, GateKind, GateVerdict
 from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph, LoopsFound
-from aquaflow.tracking.initialisation.back_fill import LookedBack
+from aquaflow.tracking.initialisation.back_fill import BackFillResult
+from aquaflow.tracking.keyframe_reuse import ReuseResult
 from aquaflow.tracking.loops.relocaliser import Places
 from aquaflow.tracking.metric.learned_scales import learned_scales
-from aquaflow.tracking.metric.metric_frames import MetricFrames
+from aquaflow.tracking.metric.world_frames import WorldFrames
 from aquaflow.tracking.overlay.finder import OverlayFinder
-from aquaflow.tracking.returning import Looked
+from aquaflow.tracking.relative_poses import RelativeFrame, RelativePoses
 from aquaflow.tracking.tracker import Tracker
 from aquaflow.types import Frame
 
@@ -77,12 +77,10 @@ class Slam:
             )
         self.keyframes = KeyframeStore(work, self.prior)
         places = Places(self.keyframes, config.tracking)
-        self._anchors = Anchors(self.keyframes, self.failures)
+        self._relative_poses = RelativePoses(self.keyframes, self.failures)
         self.gate = FrameGate(config.tracking.gate)
         self.overlays = OverlayFinder()
-        self.metric = MetricFrames(
-            self.keyframes, lambda: self.frames, config.fusion, self.failures
-        )
+        self.metric = WorldFrames(self.keyframes, lambda: self.frames, config.fusion, self.failures)
         """Telemetry, and the frames in metres that it gives."""
         self.worker = worker or Worker(self.failures)
         """Looks for loops, for keyframes to return to, and for frames of before the map's start,
@@ -113,7 +111,7 @@ class Slam:
         self._latest: int | None = None
         """The row of the frame linked last, if it has a pose."""
 
-    def look_in(self, base: Base) -> None:
+    def localise_in(self, base: Base) -> None:
         """Look for this dive in an earlier one, whose frame it has once it was recognised there;
         before the first frame.
 
@@ -160,13 +158,13 @@ class Slam:
         """Loops, keyframes to return to, keyframes that the base knows, frames of the past."""
         if isinstance(found, LoopsFound):
             self.graph.close_loops(found)
-        elif isinstance(found, Looked):
+        elif isinstance(found, ReuseResult):
             revisit = self.tracker.looked(found)
             if revisit is not None:
                 self._revisit(revisit)
-        elif isinstance(found, LookedUp) and self.in_base is not None:
+        elif isinstance(found, BaseLookup) and self.in_base is not None:
             self.in_base.take(found)
-        elif isinstance(found, LookedBack):
+        elif isinstance(found, BackFillResult):
             self.tracker.looked_back(found)
 
     def catch_up(self) -> list[Tracked]:
@@ -247,11 +245,11 @@ class Slam:
         """Per sub-map, the views that were tracked but never mapped."""
         return self.maps.held_out
 
-    def metric_frame(self, sub_map: int) -> MetricFrame:
+    def metric_frame(self, sub_map: int) -> WorldFrame:
         """Where a sub-map lies in the world, as far as telemetry has shown it by now."""
         return self.metric.of(sub_map)
 
-    def metric_frames(self) -> dict[int, MetricFrame]:
+    def metric_frames(self) -> dict[int, WorldFrame]:
         """By sub-map, after ``finish``: how its world lies in n."""
         return {each.sub_map: self.metric_frame(each.sub_map) for each in self.keyframes.keyframes}
 
@@ -273,10 +271,10 @@ class Slam:
             masked = self.overlays.masked(frame)
         return masked
 
-    def _gate(self, frame: Frame) -> Verdict:
+    def _gate(self, frame: Frame) -> GateVerdict:
         """Not in the paper: frames that cannot help are skipped before anything costly; it is
         decided here which of the others are held out."""
-        verdict = Verdict(GateKind.PASS)
+        verdict = GateVerdict(GateKind.PASS)
         with self.stages("gate", frame.index):
             verdict = self.gate.judge(frame.image, frame.mask)
         if verdict.passed:
@@ -295,11 +293,11 @@ class Slam:
             self.gate.forget()
         return step
 
-    def _anchor(self, tracked: list[Tracked]) -> list[Anchored]:
+    def _anchor(self, tracked: list[Tracked]) -> list[RelativeFrame]:
         """T_kf of all frames, before a loop closure among them moves the keyframes."""
-        return [self._anchors.anchored(each) for each in tracked]
+        return [self._relative_poses.relative_pose(each) for each in tracked]
 
-    def _link(self, anchored: Anchored, links: Mapping[int, Link]) -> Anchored:
+    def _link(self, anchored: RelativeFrame, links: Mapping[int, KeyframeEdge]) -> RelativeFrame:
         """Sec. 3.2, Eq. 4: a new keyframe gets its edge, and loops to earlier ones are closed; the
         frame with its pose after that."""
         tracked, T_kf = anchored.tracked, anchored.T_kf
@@ -314,8 +312,8 @@ class Slam:
             if self.in_base is not None:
                 with self.profiler.stage("base"):
                     self.in_base.look(tracked.keyframe)
-        settled = self._anchors.settled(tracked, T_kf)
-        linked = Anchored(settled, None if settled.T_wc is None else T_kf)
+        settled = self._relative_poses.world_pose(tracked, T_kf)
+        linked = RelativeFrame(settled, None if settled.T_wc is None else T_kf)
         self._latest = None if linked.T_kf is None else len(self.frames)
         return linked
 
@@ -338,7 +336,7 @@ class Slam:
         with self.failures.contain("mapping", tracked.frame.index):
             self._map_inputs.add(tracked, self.tracker.camera or tracked.frame.camera)
 
-    def _publish(self, anchored: Anchored) -> Tracked:
+    def _publish(self, anchored: RelativeFrame) -> Tracked:
         """The frame is finished: it has a row, from which its pose follows after every later
         correction."""
         self._map_inputs.forget(anchored.tracked.frame.index)
@@ -347,17 +345,17 @@ class Slam:
 
     # --- poses --------------------------------------------------------------------------------
 
-    def _skipped(self, frame: Frame, verdict: Verdict) -> Anchored:
+    def _skipped(self, frame: Frame, verdict: GateVerdict) -> RelativeFrame:
         """A frame that the gate refused; a duplicate has the pose of the frame before it."""
         if not verdict.same_place or self._latest is None:
             sub_map = self.tracker.sub_map
-            return Anchored(Tracked(frame, FrameClass.SKIPPED, sub_map, reason=verdict.reason))
+            return RelativeFrame(Tracked(frame, FrameClass.SKIPPED, sub_map, reason=verdict.reason))
         before, T_kf = self.frames[self._latest]
         skipped = replace(
-            self._anchors.settled(before, T_kf), frame=frame, frame_class=FrameClass.SKIPPED,
-            pointmap=None, reason=verdict.reason,
+            self._relative_poses.world_pose(before, T_kf), frame=frame,
+            frame_class=FrameClass.SKIPPED, pointmap=None, reason=verdict.reason,
         )  # fmt: skip
-        return Anchored(skipped, None if skipped.T_wc is None else T_kf)
+        return RelativeFrame(skipped, None if skipped.T_wc is None else T_kf)
 
     def _follow_graph(self, at_keyframe: bool) -> None:
         """Take over what the graph's optimisation found: in step with the frames it is waited for
@@ -377,4 +375,7 @@ class Slam:
     def results(self, first: int = 0) -> list[Tracked]:
         """Finished frames from row ``first`` on, without pictures and reasons; pose and sub-map
         are those of now, after all corrections of keyframes."""
-        return [self._anchors.settled(tracked, T_kf) for tracked, T_kf in self.frames.since(first)]
+        return [
+            self._relative_poses.world_pose(tracked, T_kf)
+            for tracked, T_kf in self.frames.since(first)
+        ]

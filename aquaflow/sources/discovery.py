@@ -58,10 +58,11 @@ def discover(
 ) -> DiscoveryResult:
     """Ask every installed driver, all at once; one that fails, or does not end within
     ``patience_s``, is reported in ``problems``. Without ``hosts`` the network is left alone."""
-    looks = [_Look(entry, entry.load) for entry in _registered(DISCOVERY)]
+    looks = [_DiscoveryThread(entry, entry.load) for entry in _registered(DISCOVERY)]
     if hosts:
         looks += [
-            _Look(entry, partial(_given, entry, hosts)) for entry in _registered(NETWORK_DISCOVERY)
+            _DiscoveryThread(entry, partial(_given, entry, hosts))
+            for entry in _registered(NETWORK_DISCOVERY)
         ]
     until_s = time.monotonic() + patience_s
     for look in looks:
@@ -81,7 +82,7 @@ def _given(entry: EntryPoint, hosts: Sequence[str]) -> Discover:
     return partial(look, hosts)
 
 
-class _Look:
+class _DiscoveryThread:
     """One driver that looks for its devices, in a thread of its own."""
 
     def __init__(self, entry: EntryPoint, load: Callable[[], Discover]) -> None:

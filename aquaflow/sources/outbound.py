@@ -62,7 +62,7 @@ class BodyPose:
 
 
 @dataclass(frozen=True)
-class BodyMotion:
+class BodyPoseChange:
     """Change of the body's pose since the one before, in the axes of the body as it is now."""
 
     t_ns: int
@@ -77,7 +77,7 @@ class BodyMotion:
     """0 to 1."""
 
 
-OutboundMessage: TypeAlias = StatusText | NamedValue | BodyPose | BodyMotion
+OutboundMessage: TypeAlias = StatusText | NamedValue | BodyPose | BodyPoseChange
 
 
 @runtime_checkable

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.storage.atomic import atomic_write
-from aquaflow.dive.deliverable import Deliverable, Phase
+from aquaflow.dive.deliverable import Deliverable, DeliverablePhase
 from aquaflow.dive.dive import Dive
 from aquaflow.survey.measure.finished_dive import numbers_at_the_end
 from aquaflow.survey.measure.reef_files import write_reef_numbers
@@ -36,7 +36,7 @@ class ReefFiles(Deliverable):
     """reef_numbers.json and reef_numbers.csv; what is of the ground, for which every view is drawn,
     within the time."""
 
-    phase = Phase.MEASURE
+    phase = DeliverablePhase.MEASURE
     stage = "reef numbers"
 
     def make(self, dive: Dive, until: Deadline) -> None:
@@ -47,7 +47,7 @@ class ReefFiles(Deliverable):
 class Report(Deliverable):
     """report.html."""
 
-    phase = Phase.REPORT
+    phase = DeliverablePhase.REPORT
     stage = "report"
 
     def refresh(self, dive: Dive) -> None:

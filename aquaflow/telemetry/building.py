@@ -21,12 +21,12 @@ from aquaflow.telemetry.factors.factor import Factor
 from aquaflow.telemetry.factors.length import LengthFactor
 from aquaflow.telemetry.factors.position import PlaceFactor, PositionFactor
 from aquaflow.telemetry.factors.velocity import VelocityFactor
-from aquaflow.telemetry.metric_frame import Origin, SourceReport
-from aquaflow.telemetry.problem import ANY_TURN, OPEN_M, Carried, Problem
+from aquaflow.telemetry.problem import ANY_TURN, OPEN_M, Carried, TelemetryProblem
 from aquaflow.telemetry.sources import LEAST_SAMPLES, UsableSeries
 from aquaflow.telemetry.state import LAG, SHIFT, TURN
 from aquaflow.telemetry.telemetry import Telemetry, device_of
 from aquaflow.telemetry.utc import fit_utc
+from aquaflow.telemetry.world_frame import Origin, SourceReport
 from aquaflow.types import Attitude, Position
 
 Array = npt.NDArray[np.float64]
@@ -41,7 +41,7 @@ def problem_of(
     carried: Carried | None,
     extra: Sequence[Factor],
     rejected: Mapping[tuple[str, str], SourceReport],
-) -> Problem:
+) -> TelemetryProblem:
     """The problem of the sub-map with ``path``; arguments as of ``estimate``.
 
     ``rejected``: sources, by name and kind, that an earlier solution has shown to be wrong.
@@ -77,7 +77,7 @@ def problem_of(
 
 
 def _scaled(
-    problem: Problem, usable: UsableSeries, path: CameraPath, extra: Sequence[Factor]
+    problem: TelemetryProblem, usable: UsableSeries, path: CameraPath, extra: Sequence[Factor]
 ) -> None:
     """A rough scale, from the source that gives the best one."""
     guesses = [rough.scale_from_velocity(velocity, path) for velocity in usable.velocity]
@@ -91,7 +91,7 @@ def _scaled(
 
 
 def _add_altitudes(
-    problem: Problem, usable: UsableSeries, path: CameraPath, points: Callable[[], Array]
+    problem: TelemetryProblem, usable: UsableSeries, path: CameraPath, points: Callable[[], Array]
 ) -> None:
     if not usable.altitude:
         return
@@ -110,7 +110,7 @@ def _add_altitudes(
 
 
 def _add_positions(
-    problem: Problem,
+    problem: TelemetryProblem,
     usable: UsableSeries,
     path: CameraPath,
     origin: Origin | None,
@@ -143,7 +143,7 @@ def _add_positions(
 
 
 def _add_place(
-    problem: Problem,
+    problem: TelemetryProblem,
     path: CameraPath,
     t_s: float,
     place_n: Array,  # [2] m
@@ -162,7 +162,7 @@ def _add_place(
     problem.start = replace(problem.start, t_n=t_n)
 
 
-def _move_to_depth(problem: Problem, usable: UsableSeries, path: CameraPath) -> None:
+def _move_to_depth(problem: TelemetryProblem, usable: UsableSeries, path: CameraPath) -> None:
     """Start where the vehicle is: at its depth, and n's origin at its first pose."""
     _, p_n = problem.start.body(path.R_mc, path.p_m)
     t_n = problem.start.t_n.copy()

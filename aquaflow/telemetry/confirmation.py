@@ -15,10 +15,10 @@ from scipy.special import chdtrc, ndtr, stdtrit
 
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.contradictions import LARGEST_ALONE, MAP_SCALE_SIGMA, SCALING
-from aquaflow.telemetry.metric_frame import UNKNOWN_SIGMA
-from aquaflow.telemetry.problem import Problem
+from aquaflow.telemetry.problem import TelemetryProblem
 from aquaflow.telemetry.solve import Solution, solve
 from aquaflow.telemetry.state import SCALE
+from aquaflow.telemetry.world_frame import UNKNOWN_SIGMA
 
 SHORTEST_PART_S, MOST_PARTS = 2.5, 4
 """Of the path: an ROV's speed and depth change within some seconds."""
@@ -72,7 +72,7 @@ class Confirmation:
 
 def confirmation_of(
     path: CameraPath,
-    problem_along: Callable[[CameraPath], Problem],
+    problem_along: Callable[[CameraPath], TelemetryProblem],
 ) -> Confirmation:
     """Estimate the scale anew from every part and every kind of source.
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from aquaflow.telemetry.factors.factor import Factor
 from aquaflow.telemetry.noise import WHITE, Noise
-from aquaflow.telemetry.problem import Problem
+from aquaflow.telemetry.problem import TelemetryProblem
 from aquaflow.telemetry.solve import Solution, solve
 from aquaflow.telemetry.state import SCALE
 
@@ -62,7 +62,7 @@ class _Alone:
     """Its noise over the data sheet's."""
 
 
-def contradiction_in(problem: Problem, solution: Solution) -> Contradiction | None:
+def contradiction_in(problem: TelemetryProblem, solution: Solution) -> Contradiction | None:
     """The source that contradicts the others most; None if none does."""
     return (
         _absurd(problem, solution, DIRECTIONS)
@@ -71,7 +71,9 @@ def contradiction_in(problem: Problem, solution: Solution) -> Contradiction | No
     )
 
 
-def _absurd(problem: Problem, solution: Solution, kinds: Sequence[str]) -> Contradiction | None:
+def _absurd(
+    problem: TelemetryProblem, solution: Solution, kinds: Sequence[str]
+) -> Contradiction | None:
     """The source whose noise is furthest beyond what its kind of instrument can have."""
     worst, found = 1.0, None
     for factor, noise in zip(problem.factors, solution.noise, strict=True):
@@ -92,7 +94,7 @@ def _noise_in_words(factor: Factor, noise: Noise) -> str:
     return f"it differs from the camera's path by {said} (1 sigma): it measures something else"
 
 
-def _of_scales(problem: Problem) -> Contradiction | None:
+def _of_scales(problem: TelemetryProblem) -> Contradiction | None:
     """The source whose scale differs from those of the others; of two, the noisier one."""
     scaling = [factor for factor in problem.factors if factor.kind in SCALING]
     if len(scaling) < 2:
@@ -113,7 +115,7 @@ def _of_scales(problem: Problem) -> Contradiction | None:
     return _left_out(wrong.factor, f"its lengths are {times:.2f} times those by {named}")
 
 
-def _alone(problem: Problem, factor: Factor) -> _Alone:
+def _alone(problem: TelemetryProblem, factor: Factor) -> _Alone:
     chosen = [f for f in problem.factors if f is factor or f.kind not in SCALING]
     solution = solve(chosen, problem.start, problem.prior)
     noise = solution.noise[next(i for i, f in enumerate(chosen) if f is factor)]

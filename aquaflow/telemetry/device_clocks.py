@@ -15,9 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.telemetry.camera_path import CameraPath
-from aquaflow.telemetry.metric_frame import MetricFrame, SourceReport
 from aquaflow.telemetry.offset_search import SHORTEST_OVERLAP_S
-from aquaflow.telemetry.problem import Problem
+from aquaflow.telemetry.problem import TelemetryProblem
 from aquaflow.telemetry.telemetry import Series, Telemetry, device_of
 from aquaflow.telemetry.time_offset import (
     NotSynchronisedError,
@@ -26,6 +25,7 @@ from aquaflow.telemetry.time_offset import (
     estimate_time_offset,
 )
 from aquaflow.telemetry.turns import Turns, best_turns
+from aquaflow.telemetry.world_frame import SourceReport, WorldFrame
 from aquaflow.types import AngularRate, Attitude
 
 Array = npt.NDArray[np.float64]
@@ -56,7 +56,7 @@ shows of known size has the picture's own time."""
 
 
 @dataclass(frozen=True)
-class DeviceClock:
+class DeviceClockEstimate:
     """What the rotations of one device say of its clock."""
 
     device: str
@@ -113,7 +113,7 @@ class DeviceClock:
 class DeviceClocks:
     """Of all devices of a dive."""
 
-    own: Mapping[str, DeviceClock]
+    own: Mapping[str, DeviceClockEstimate]
     """By device, of those with a gyro or an attitude."""
 
     @staticmethod
@@ -142,16 +142,16 @@ class DeviceClocks:
         return self.reference.known
 
     @property
-    def reference(self) -> DeviceClock:
+    def reference(self) -> DeviceClockEstimate:
         """Of the device that shows most, for those that show nothing."""
-        nothing = DeviceClock("", reason="no device has a gyro or an attitude")
+        nothing = DeviceClockEstimate("", reason="no device has a gyro or an attitude")
         return max(self.own.values(), key=lambda clock: len(clock.at_s), default=nothing)
 
-    def clock_of(self, source: str) -> DeviceClock:
+    def clock_of(self, source: str) -> DeviceClockEstimate:
         """The clock of a source's device: its own, or else the reference's."""
         return self.own.get(device_of(source), self.reference)
 
-    def leave_open(self, problem: Problem) -> bool:
+    def leave_open(self, problem: TelemetryProblem) -> bool:
         """True if the scale comes from a device whose own rotations do not show its clock, and
         from nothing that shows itself whether it fits the path."""
         if any(factor.kind in SHOWN_BY_THE_PATH for factor in problem.factors):
@@ -171,7 +171,7 @@ class DeviceClocks:
         clock = self.reference
         return "some devices have no gyro or attitude" if clock.known else clock.reason
 
-    def stated(self, frame: MetricFrame) -> MetricFrame:
+    def stated(self, frame: WorldFrame) -> WorldFrame:
         """The frame with what was found of the clocks."""
         clock = self.reference
         said = "; ".join(filter(None, (frame.scale_source, clock.in_words())))
@@ -215,7 +215,7 @@ def _clock(
     body: Turns,
     pieces: Sequence[Turns],
     R_cb: Array | None,  # [3, 3]
-) -> DeviceClock:
+) -> DeviceClockEstimate:
     """A device's clock from its turns and the camera's."""
     found: list[tuple[float, TimeOffset]] = []
     unlike: list[tuple[float, float]] = []
@@ -236,12 +236,12 @@ def _clock(
             expected_s = offset.offset_s
             found.append((0.5 * (first_s + last_s) - expected_s, offset))
     if not found:
-        return DeviceClock(device, unlike=bool(unlike), reason=reason)
+        return DeviceClockEstimate(device, unlike=bool(unlike), reason=reason)
     found.sort(key=lambda each: each[0])
     at_s = np.array([at for at, _ in found])
     offset_s = np.array([offset.offset_s for _, offset in found])
     sigma_s = np.array([offset.sigma_s for _, offset in found])
-    return DeviceClock(
+    return DeviceClockEstimate(
         device, at_s, offset_s, sigma_s, _unknown(at_s, offset_s, unlike), bool(unlike)
     )
 

@@ -14,8 +14,7 @@ from aquaflow.telemetry import start as rough
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.factors.attitude import ForceFactor, HeadingFactor, TiltFactor
 from aquaflow.telemetry.factors.constant_depth import ConstantDepthFactor
-from aquaflow.telemetry.metric_frame import SourceReport
-from aquaflow.telemetry.problem import ANY_TURN, FIXED, Carried, Problem
+from aquaflow.telemetry.problem import ANY_TURN, FIXED, Carried, TelemetryProblem
 from aquaflow.telemetry.sources import UsableSeries
 from aquaflow.telemetry.state import (
     CAMERA,
@@ -26,10 +25,11 @@ from aquaflow.telemetry.state import (
     SCALE,
     SHIFT,
     TURN,
+    MetricState,
     P,
-    State,
 )
 from aquaflow.telemetry.telemetry import Series
+from aquaflow.telemetry.world_frame import SourceReport
 
 SCALE_SIGMA = 3.0
 """Log: a start's median depth may be 5 cm or 20 m."""
@@ -43,7 +43,7 @@ def oriented(
     mounting: MountingConfig | None,
     carried: Carried | None,
     declination: float | None,
-) -> Problem:
+) -> TelemetryProblem:
     """The problem with what says how the body and the map are turned; ``compasses`` are the
     attitudes whose heading counts, and ``declination`` what to add to it, rad."""
     problem = _as_mounted(usable, path, config, mounting)
@@ -78,7 +78,7 @@ def oriented(
 
 def _as_mounted(
     usable: UsableSeries, path: CameraPath, config: FusionConfig, mounting: MountingConfig | None
-) -> Problem:
+) -> TelemetryProblem:
     """The problem with nothing but the camera's place in the body."""
     R_bc, c_b, sigma = BODY_FROM_CAMERA, np.zeros(3), np.radians(config.mounting_sigma_deg)
     mounted = mounting is not None
@@ -95,12 +95,12 @@ def _as_mounted(
     prior[DVL_SCALE] = max(config.dvl_scale_sigma, 1e-6)
     prior[HEADING] = np.radians(config.heading_sigma_deg)
     prior[LAG] = max(config.position_lag_sigma_s, 1e-6)
-    state = State(0.0, np.eye(3), np.zeros(3), R_bc, c_b, np.eye(3))
-    return Problem(state, prior, mounted=mounted)
+    state = MetricState(0.0, np.eye(3), np.zeros(3), R_bc, c_b, np.eye(3))
+    return TelemetryProblem(state, prior, mounted=mounted)
 
 
 def _add_directions(
-    problem: Problem, usable: UsableSeries, compasses: Sequence[Series], path: CameraPath
+    problem: TelemetryProblem, usable: UsableSeries, compasses: Sequence[Series], path: CameraPath
 ) -> None:
     """Down and north, from the best source there is."""
     state = problem.start
@@ -131,7 +131,7 @@ def _add_directions(
 
 
 def _add_directions_of_fixes(
-    problem: Problem, usable: UsableSeries, path: CameraPath, depth_change_sigma_m: float
+    problem: TelemetryProblem, usable: UsableSeries, path: CameraPath, depth_change_sigma_m: float
 ) -> None:
     """Where nothing else does: down from where fixes lie in the map, at their depths or else at a
     constant one."""

@@ -16,12 +16,12 @@ from aquaflow.telemetry.confirmation import confirmation_of
 from aquaflow.telemetry.contradictions import contradiction_in
 from aquaflow.telemetry.device_clocks import DeviceClocks
 from aquaflow.telemetry.factors.factor import Factor
-from aquaflow.telemetry.metric_frame import MetricFrame, SourceReport
-from aquaflow.telemetry.problem import Carried, Problem
+from aquaflow.telemetry.problem import Carried, TelemetryProblem
 from aquaflow.telemetry.solution_frame import frame_of
 from aquaflow.telemetry.solve import Solution, solve
 from aquaflow.telemetry.start import camera_in_body
 from aquaflow.telemetry.telemetry import Telemetry
+from aquaflow.telemetry.world_frame import SourceReport, WorldFrame
 
 Array = npt.NDArray[np.float64]
 
@@ -33,8 +33,8 @@ LEAST_POSES = 5
 class Estimate:
     """The frame of a sub-map, and how it came about."""
 
-    frame: MetricFrame
-    problem: Problem | None = None
+    frame: WorldFrame
+    problem: TelemetryProblem | None = None
     solution: Solution | None = None
     """None where no telemetry could be used."""
 
@@ -64,21 +64,21 @@ def estimate(
         ArithmeticError: the residuals are not finite.
     """
     if len(path) < LEAST_POSES:
-        return Estimate(MetricFrame.unknown(f"the sub-map has only {len(path)} poses"))
+        return Estimate(WorldFrame.unknown(f"the sub-map has only {len(path)} poses"))
     if not telemetry and not extra:
-        return Estimate(MetricFrame.unknown())
+        return Estimate(WorldFrame.unknown())
     R_cb = None if mounting is None else camera_in_body(mounting).R.T
     clocks = DeviceClocks.of(telemetry, path, R_cb)
     telemetry = clocks.corrected(telemetry)
     rejected = clocks.unlike(telemetry)
 
-    def problem_along(path: CameraPath, points: Callable[[], Array]) -> Problem:
+    def problem_along(path: CameraPath, points: Callable[[], Array]) -> TelemetryProblem:
         return problem_of(telemetry, path, config, mounting, points, carried, extra, rejected)
 
     while True:
         problem = problem_along(path, points)
         if not problem.factors:
-            unused = MetricFrame.unknown("no telemetry could be used")
+            unused = WorldFrame.unknown("no telemetry could be used")
             return Estimate(replace(unused, sources=tuple(problem.reports)))
         solution = solve(problem.factors, problem.start, problem.prior)
         wrong = contradiction_in(problem, solution)

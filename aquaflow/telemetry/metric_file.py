@@ -17,7 +17,7 @@ from aquaflow.base.errors import DamagedError, InputError, reason_of
 from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.base.storage.atomic import write_json
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.telemetry.metric_frame import MetricFrame, North, Origin, SourceReport
+from aquaflow.telemetry.world_frame import North, Origin, SourceReport, WorldFrame
 
 NAME = "metric.json"
 FORMAT = 1
@@ -26,7 +26,7 @@ ROTATION_TOLERANCE = 1e-6
 """Largest difference of R^T R from the identity: rounding of 17 digits is far below."""
 
 
-def write_metric_file(folder: Path, frames: Mapping[int, MetricFrame], main: int) -> None:
+def write_metric_file(folder: Path, frames: Mapping[int, WorldFrame], main: int) -> None:
     """Write the frames by sub-map; ``main`` is the sub-map of ``map.aqf``.
 
     Raises:
@@ -40,7 +40,7 @@ def write_metric_file(folder: Path, frames: Mapping[int, MetricFrame], main: int
     write_json(folder / NAME, {"format": FORMAT, "main": main, "sub_maps": sub_maps})
 
 
-def read_metric_file(folder: Path) -> dict[int, MetricFrame]:
+def read_metric_file(folder: Path) -> dict[int, WorldFrame]:
     """The frames by sub-map; empty for a dive without the file: of a peer, or an older one.
 
     Raises:
@@ -58,21 +58,21 @@ def read_main(folder: Path) -> int:
     return next((number for number, (name, _) in _read(folder).items() if name == "map.aqf"), 0)
 
 
-def read_frame_of_map(map_file: Path) -> MetricFrame:
+def read_frame_of_map(map_file: Path) -> WorldFrame:
     """The frame of the sub-map in ``map_file``, ``map.aqf`` or ``map_N.aqf`` of a dive folder.
 
     Raises:
         InputError: the dive's ``metric.json`` is damaged, or of a newer AquaFlow.
     """
     found = [frame for name, frame in _read(map_file.parent).values() if name == map_file.name]
-    return found[0] if found else MetricFrame.unknown()
+    return found[0] if found else WorldFrame.unknown()
 
 
 def _map_name(number: int, main: int) -> str:
     return "map.aqf" if number == main else f"map_{number}.aqf"
 
 
-def frame_to_json(frame: MetricFrame) -> dict[str, Any]:
+def frame_to_json(frame: WorldFrame) -> dict[str, Any]:
     """The frame as plain values, for this file and for checkpoints."""
     T, T_bc = frame.T_nm, frame.T_bc
     return {
@@ -96,7 +96,7 @@ def _of_sim3(T: Sim3) -> dict[str, Any]:
     return {"scale": float(T.scale), "rotation": T.R.tolist(), "translation": T.t.tolist()}
 
 
-def _read(folder: Path) -> dict[int, tuple[str, MetricFrame]]:
+def _read(folder: Path) -> dict[int, tuple[str, WorldFrame]]:
     """Map file and frame by sub-map."""
     path = folder / NAME
     if not path.is_file():
@@ -118,7 +118,7 @@ def _read(folder: Path) -> dict[int, tuple[str, MetricFrame]]:
     )
 
 
-def frame_of_json(stated: dict[str, Any]) -> MetricFrame:
+def frame_of_json(stated: dict[str, Any]) -> WorldFrame:
     """The frame that :func:`frame_to_json` made.
 
     Raises:
@@ -130,7 +130,7 @@ def frame_of_json(stated: dict[str, Any]) -> MetricFrame:
     if stated["north"] not in get_args(North):
         raise DamagedError("north is none of the words that the format has")
     origin, T_bc = stated["origin"], stated["T_bc"]
-    return MetricFrame(
+    return WorldFrame(
         T_nm=_to_sim3(stated["T_nm"]),
         covariance=covariance,
         metric=bool(stated["metric"]),

@@ -16,7 +16,7 @@ from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from aquaflow.geometry.robust import MAD_TO_SIGMA
-from aquaflow.telemetry.offset_search import COVERED, Cells, Peak
+from aquaflow.telemetry.offset_search import COVERED, OffsetPeak, RateSeries
 from aquaflow.telemetry.turns import Turns, smoothing
 
 Array: TypeAlias = npt.NDArray[np.float64]
@@ -50,7 +50,7 @@ LONGEST_CORRELATION_S = 2.0
 
 
 @dataclass(frozen=True)
-class Fit:
+class OffsetFit:
     """The model at its optimum."""
 
     x: Array
@@ -101,12 +101,12 @@ class Refinement:
         )
         self._change = (later - earlier) / (2.0 * DERIVATIVE_S)
         self._smooth, _ = smoothing(camera, self.at_s, np.sqrt(sigma_s**2 - own_s**2))
-        self._camera, self._body = camera, Cells.of(body, own_s, 0.5 * own_s).turns()
+        self._camera, self._body = camera, RateSeries.of(body, own_s, 0.5 * own_s).turns()
         turn = MOUNTING_SIGMA_RAD if mounting_known else FREE_SIGMA
         sigmas = [FREE_SIGMA, DRIFT_SIGMA, *[turn] * 3, *[BIAS_SIGMA_RAD_S] * 3, LOG_SCALE_SIGMA]
         self._prior = np.diag(1.0 / np.square(sigmas))
 
-    def fit(self, peak: Peak) -> Fit | None:
+    def fit(self, peak: OffsetPeak) -> OffsetFit | None:
         """The optimum near ``peak``; None where too little is measured there."""
         used = self._used(peak.offset_s)
         if 3 * used.sum() <= 2 * PARAMETERS:
@@ -135,7 +135,7 @@ class Refinement:
         covariance = covariance_of(J, weight * residual, H, self._prior, sigma, used, self._step_s)
         whole = np.zeros((len(used), 3))
         whole[used] = residual
-        return Fit(x, covariance, R_cb, middle_s, used, whole, self._seen)
+        return OffsetFit(x, covariance, R_cb, middle_s, used, whole, self._seen)
 
     def _used(self, offset_s: float) -> Mask:
         """[G] grid points whose surroundings were measured by both."""

@@ -36,7 +36,7 @@ MOST_PEAKS = 8
 
 
 @dataclass(frozen=True)
-class Cells:
+class RateSeries:
     """Smoothed rates on a uniform grid of times."""
 
     start_s: float
@@ -48,7 +48,7 @@ class Cells:
     """[L] 1 or 0."""
 
     @staticmethod
-    def of(turns: Turns, sigma_s: float, cell_s: float = CELL_S) -> Cells:
+    def of(turns: Turns, sigma_s: float, cell_s: float = CELL_S) -> RateSeries:
         """Mean rates over the cells, smoothed by a Gaussian."""
         count = int(np.ceil((turns.end_s[-1] - turns.start_s[0]) / cell_s))
         start_s = turns.start_s[0] + cell_s * np.arange(count)
@@ -60,7 +60,7 @@ class Cells:
         weight = gaussian_filter1d(known, width, mode="constant")
         measured = (weight >= COVERED).astype(float)
         rate = smooth / np.maximum(weight, COVERED)[:, None] * measured[:, None]
-        return Cells(float(start_s[0]), cell_s, rate, measured)
+        return RateSeries(float(start_s[0]), cell_s, rate, measured)
 
     def turns(self) -> Turns:
         """The smoothed rates as turns over the cells."""
@@ -71,7 +71,7 @@ class Cells:
 
 
 @dataclass(frozen=True)
-class Peak:
+class OffsetPeak:
     """An offset at which the telemetry explains the camera's turns better than just beside it."""
 
     offset_s: float
@@ -82,7 +82,7 @@ class Peak:
     """Share of the camera's turning, all of it, that the telemetry predicts; at most 1."""
 
 
-def peaks(camera: Cells, body: Cells, R_cb: Array | None) -> list[Peak]:  # [3, 3]
+def peaks(camera: RateSeries, body: RateSeries, R_cb: Array | None) -> list[OffsetPeak]:  # [3, 3]
     """The best offset and its rivals, best first; empty where none explains anything."""
     from scipy.signal import find_peaks  # half a second, for the dives that have logs
 
@@ -97,21 +97,24 @@ def peaks(camera: Cells, body: Cells, R_cb: Array | None) -> list[Peak]:  # [3, 
         nearest_rotation(H[found]) if R_cb is None else np.broadcast_to(R_cb, (len(found), 3, 3))
     )
     return [
-        Peak(float(offsets_s[i]), rotation[n], float(explained[i])) for n, i in enumerate(found)
+        OffsetPeak(float(offsets_s[i]), rotation[n], float(explained[i]))
+        for n, i in enumerate(found)
     ]
 
 
-def peak_at(camera: Cells, body: Cells, R_cb: Array | None, offset_s: float) -> Peak:  # [3, 3]
+def peak_at(
+    camera: RateSeries, body: RateSeries, R_cb: Array | None, offset_s: float
+) -> OffsetPeak:  # [3, 3]
     """One offset, however much it explains."""
     explained, H, offsets_s = explained_at_all_offsets(camera, body, R_cb)
     near = int(np.argmin(np.abs(offsets_s - offset_s)))
     R = nearest_rotation(H[near]) if R_cb is None else R_cb
-    return Peak(offset_s, R, float(explained[near]))
+    return OffsetPeak(offset_s, R, float(explained[near]))
 
 
 def explained_at_all_offsets(
-    camera: Cells,
-    body: Cells,
+    camera: RateSeries,
+    body: RateSeries,
     R_cb: Array | None,  # [3, 3]
 ) -> tuple[Array, Array, Array]:
     """Share explained [L] (-inf where the overlap is short), H [L, 3, 3], offsets [L] in s."""

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.telemetry.factors.factor import Factor
-from aquaflow.telemetry.metric_frame import Origin, SourceReport
-from aquaflow.telemetry.state import State
+from aquaflow.telemetry.state import MetricState
+from aquaflow.telemetry.world_frame import Origin, SourceReport
 
 Array = npt.NDArray[np.float64]
 
@@ -23,7 +23,7 @@ ANY_TURN = np.pi
 class Carried:
     """What an earlier sub-map of the dive has shown, for the next one."""
 
-    state: State
+    state: MetricState
     """Mountings and the compass's constant error are the same."""
     heading_sigma: float
     """rad, 1 sigma of the compass's error against ``state``'s."""
@@ -35,10 +35,10 @@ class Carried:
 
 
 @dataclass
-class Problem:
+class TelemetryProblem:
     """One sub-map's sources as factors, the state to start from, and what is known before."""
 
-    start: State
+    start: MetricState
     prior: Array
     """[P] 1 sigma of each parameter."""
     factors: list[Factor] = field(default_factory=list)

@@ -11,17 +11,17 @@ from aquaflow.geometry.similarity import Sim3, hat
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.contradictions import SCALING
 from aquaflow.telemetry.factors.factor import Factor
-from aquaflow.telemetry.metric_frame import (
+from aquaflow.telemetry.problem import TelemetryProblem
+from aquaflow.telemetry.solve import Solution, inverse_of
+from aquaflow.telemetry.state import SCALE, SHIFT, TURN
+from aquaflow.telemetry.world_frame import (
     LARGEST_SCALE_SIGMA,
     LARGEST_TILT_SIGMA,
     MAP_UNIT,
-    MetricFrame,
     North,
     SourceReport,
+    WorldFrame,
 )
-from aquaflow.telemetry.problem import Problem
-from aquaflow.telemetry.solve import Solution, inverse_of
-from aquaflow.telemetry.state import SCALE, SHIFT, TURN
 
 Array = npt.NDArray[np.float64]
 
@@ -32,7 +32,7 @@ WORTH_NAMING = 5.0
 """A source whose own scale is less sure than the result's by more than this is not named."""
 
 
-def frame_of(problem: Problem, solution: Solution, path: CameraPath) -> MetricFrame:
+def frame_of(problem: TelemetryProblem, solution: Solution, path: CameraPath) -> WorldFrame:
     """The frame, in metres and level only as far as its covariance allows."""
     state, covariance = solution.state, _left_tangent(solution)
     if any(factor.kind == "depth" for factor in problem.factors):
@@ -46,7 +46,7 @@ def frame_of(problem: Problem, solution: Solution, path: CameraPath) -> MetricFr
         T_nm = Sim3(state.R_nm, np.zeros(3), 1.0)
     if not level:
         T_nm = Sim3(np.eye(3), np.zeros(3), T_nm.scale)
-    return MetricFrame(
+    return WorldFrame(
         T_nm,
         covariance,
         metric=metric,
@@ -75,13 +75,13 @@ def _left_tangent(solution: Solution) -> Array:
     return np.asarray(J @ covariance @ J.T)
 
 
-def _north(problem: Problem, kinds: set[str]) -> North:
+def _north(problem: TelemetryProblem, kinds: set[str]) -> North:
     if "position" in kinds or (problem.compass and problem.declination_known):
         return "true north"
     return "magnetic north" if problem.compass else "initial heading"
 
 
-def _reports(problem: Problem, solution: Solution) -> list[SourceReport]:
+def _reports(problem: TelemetryProblem, solution: Solution) -> list[SourceReport]:
     """Of every factor; tilt and heading of one attitude are one source."""
     found: dict[tuple[str, str], SourceReport] = {}
     for factor, kept in zip(problem.factors, solution.kept, strict=True):
@@ -94,7 +94,7 @@ def _reports(problem: Problem, solution: Solution) -> list[SourceReport]:
 
 
 def _scale_source(
-    problem: Problem, solution: Solution, path: CameraPath, scale_sigma: float
+    problem: TelemetryProblem, solution: Solution, path: CameraPath, scale_sigma: float
 ) -> str:
     """The sources that the scale comes from, with what each would give alone; or why none does."""
     alone = {
@@ -122,7 +122,7 @@ def _scale_source(
     return f"{said}; {MAP_UNIT}"
 
 
-def _alone(problem: Problem, solution: Solution, factor: Factor) -> float:
+def _alone(problem: TelemetryProblem, solution: Solution, factor: Factor) -> float:
     """Relative 1 sigma of the scale from one factor and what measures directions."""
     A = np.diag(problem.prior**-2.0)
     for other, information in zip(problem.factors, solution.information, strict=True):

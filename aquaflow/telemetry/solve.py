@@ -17,7 +17,7 @@ from scipy.linalg import cho_solve, cholesky, solve_triangular
 from aquaflow.geometry.robust import MAD_TO_SIGMA
 from aquaflow.telemetry.factors.factor import Factor
 from aquaflow.telemetry.noise import Noise, likeliest
-from aquaflow.telemetry.state import P, State
+from aquaflow.telemetry.state import MetricState, P
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -43,7 +43,7 @@ LONGEST_TURN = 0.5
 class Solution:
     """The likeliest state."""
 
-    state: State
+    state: MetricState
     covariance: Array
     """[P, P] of a step from ``state``."""
     kept: tuple[Mask, ...]
@@ -56,7 +56,7 @@ class Solution:
 
 def solve(
     factors: Sequence[Factor],
-    start: State,
+    start: MetricState,
     prior: Array,  # [P] 1 sigma of each parameter around ``start``
 ) -> Solution:
     """Solve from ``start``; parameters that no factor measures keep their prior.
@@ -98,7 +98,7 @@ class _Derivatives:
         self._found: list[Array] = []
         self._moved = np.inf
 
-    def at(self, state: State) -> list[Array]:
+    def at(self, state: MetricState) -> list[Array]:
         """[N, D, P] of each factor."""
         if self._moved > RELINEARISE:
             self._found, self._moved = [factor.jacobian(state) for factor in self.factors], 0.0
@@ -155,15 +155,15 @@ class _Correlated:
 def _descend(
     derivatives: _Derivatives,
     whitening: Sequence[Callable[[Array], Array]],
-    state: State,
+    state: MetricState,
     departed: Array,  # [P] from the start, in the parameters' own units
     prior: Array,  # [P]
-) -> tuple[State, Array, Array]:
+) -> tuple[MetricState, Array, Array]:
     """The state at the least cost, how far it went from the start, and the covariance there."""
 
     factors = derivatives.factors
 
-    def cost(at: State, away: Array) -> float:
+    def cost(at: MetricState, away: Array) -> float:
         parts = (w(f.residuals(at)[..., None]) for f, w in zip(factors, whitening, strict=True))
         return float(sum((part**2).sum() for part in parts) + ((away / prior) ** 2).sum())
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from aquaflow.telemetry.camera_path import CameraPath
-from aquaflow.telemetry.metric_frame import SourceReport
 from aquaflow.telemetry.telemetry import Series, Telemetry
+from aquaflow.telemetry.world_frame import SourceReport
 from aquaflow.types import KINDS
 
 LEAST_SAMPLES = 5

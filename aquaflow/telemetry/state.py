@@ -21,7 +21,7 @@ P = 16
 
 
 @dataclass(frozen=True)
-class State:
+class MetricState:
     """Parameters; a step [P] changes them as :meth:`moved` says."""
 
     log_scale: float
@@ -51,7 +51,7 @@ class State:
     def moved(
         self,
         step: Array,  # [P]
-    ) -> State:
+    ) -> MetricState:
         """The state after a step."""
         return replace(
             self,

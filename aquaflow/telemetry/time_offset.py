@@ -21,10 +21,10 @@ from aquaflow.telemetry.offset_refinement import (
     OFFSET,
     OWN_INTERVALS,
     TURN,
-    Fit,
+    OffsetFit,
     Refinement,
 )
-from aquaflow.telemetry.offset_search import SHORTEST_OVERLAP_S, Cells, peak_at, peaks
+from aquaflow.telemetry.offset_search import SHORTEST_OVERLAP_S, RateSeries, peak_at, peaks
 from aquaflow.telemetry.turns import Turns, turns_of_telemetry
 from aquaflow.types import TelemetrySample
 
@@ -131,7 +131,7 @@ def estimate_time_offset(
             )
     intervals = [float(np.median(turns.end_s - turns.start_s)) for turns in (camera, body)]
     sigma_s = max(SMOOTHING_S, intervals[0], 1.5 * OWN_INTERVALS * intervals[1])
-    cells = Cells.of(camera, sigma_s), Cells.of(body, sigma_s)
+    cells = RateSeries.of(camera, sigma_s), RateSeries.of(body, sigma_s)
     for cell, whose in zip(cells, ("camera", "vehicle"), strict=True):
         if _rms(cell) < LEAST_MOTION_RAD_S:
             raise NotSynchronisedError(
@@ -152,11 +152,11 @@ def estimate_time_offset(
 
 
 def _as_expected(
-    cells: tuple[Cells, Cells],
+    cells: tuple[RateSeries, RateSeries],
     R_cb: Array | None,  # [3, 3]
     expected_s: float,
     refinement: Refinement,
-    fits: Sequence[Fit],
+    fits: Sequence[OffsetFit],
     step_s: float,
 ) -> TimeOffset | None:
     """The offset near the expected one; None where it explains nothing, or another one more."""
@@ -174,7 +174,7 @@ def _as_expected(
 
 
 def _judged(
-    best: Fit, rivals: list[Fit], step_s: float, chance: float = CHANCE_OF_NOTHING
+    best: OffsetFit, rivals: list[OffsetFit], step_s: float, chance: float = CHANCE_OF_NOTHING
 ) -> TimeOffset:
     """The best fit as a result.
 
@@ -218,7 +218,7 @@ def _judged(
     )
 
 
-def _rms(cells: Cells) -> float:
+def _rms(cells: RateSeries) -> float:
     """Of the rates about their mean, rad/s."""
     rates = cells.rate_rad_s[cells.measured > 0.0]
     return (
@@ -228,14 +228,14 @@ def _rms(cells: Cells) -> float:
     )
 
 
-def _unexplained(fit: Fit) -> Array:
+def _unexplained(fit: OffsetFit) -> Array:
     """[G, 3] what is left of the camera's rates if the telemetry explains nothing."""
     return np.asarray(fit.seen - fit.seen[fit.used].mean(axis=0))
 
 
 def _chance(
     other: Array,  # [G, 3] rad/s
-    best: Fit,
+    best: OffsetFit,
     where: npt.NDArray[np.bool_],  # [G]
     step_s: float,
 ) -> float:

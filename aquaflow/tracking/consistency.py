@@ -49,7 +49,7 @@ class Cause(str, Enum):
 
 
 @dataclass(frozen=True)
-class Finding:
+class InconsistentKeyframe:
     """A keyframe that is not consistent."""
 
     frame: int
@@ -68,7 +68,7 @@ class Finding:
 
 
 @dataclass
-class Counts:
+class ConsistencyCounts:
     """What the monitor did in a dive; written by tracking, read by anyone."""
 
     checks: int = 0
@@ -81,10 +81,10 @@ class Counts:
     """Times that tracking went on at an earlier keyframe."""
     unrepaired: int = 0
     """Findings of which no earlier keyframe could be matched."""
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[InconsistentKeyframe, ...] = ()
     """The latest."""
 
-    def add(self, finding: Finding) -> None:
+    def add(self, finding: InconsistentKeyframe) -> None:
         """A finding that was confirmed."""
         self.found += 1
         self.findings = (*self.findings, finding)[-REMEMBERED:]
@@ -130,17 +130,17 @@ class ConsistencyMonitor:
         self._inliers: deque[float] = deque(maxlen=USUAL_FRAMES)
         self._since, self._suspected = 0, False
         self._frames_since = SHOWN_FRAMES
-        self.counts = Counts()
+        self.counts = ConsistencyCounts()
 
     @property
-    def trouble(self) -> Finding | None:
+    def trouble(self) -> InconsistentKeyframe | None:
         """The last finding, for some seconds."""
         recent = self._frames_since < SHOWN_FRAMES and self.counts.findings
         return self.counts.findings[-1] if recent else None
 
     def after(
         self, keyframe: Keyframe, frame: int, solved: Matched | None, camera: CameraModel
-    ) -> Finding | None:
+    ) -> InconsistentKeyframe | None:
         """To be called after every frame with a pose; a finding that two checks in a row had.
 
         ``solved``: the frame at the keyframe, or None if it has become the keyframe itself.
@@ -164,7 +164,7 @@ class ConsistencyMonitor:
         finding = self._check(keyframe, frame)
         if finding is None and solved is not None and self._misfits(keyframe, solved, camera):
             share = solved.estimate.inlier_share
-            finding = Finding(frame, keyframe.number, Cause.MATCHES, share)
+            finding = InconsistentKeyframe(frame, keyframe.number, Cause.MATCHES, share)
         confirmed = self._suspected and finding is not None
         self._suspected = finding is not None and not confirmed
         if finding is None or not confirmed:
@@ -173,14 +173,14 @@ class ConsistencyMonitor:
         self.counts.add(finding)
         return finding
 
-    def _check(self, keyframe: Keyframe, frame: int) -> Finding | None:
+    def _check(self, keyframe: Keyframe, frame: int) -> InconsistentKeyframe | None:
         monitor, number = self._config.monitor, keyframe.number
         own = self._change(keyframe)
         if own is not None and _is_off(own, monitor.max_change, monitor.sigmas):
-            return Finding(frame, number, Cause.DEPTHS, float(np.exp(own.log)))
+            return InconsistentKeyframe(frame, number, Cause.DEPTHS, float(np.exp(own.log)))
         gap = self._gap(keyframe)
         if gap is not None:
-            return Finding(frame, number, Cause.POSE, float(np.exp(gap.log)))
+            return InconsistentKeyframe(frame, number, Cause.POSE, float(np.exp(gap.log)))
         return None
 
     def _misfits(self, keyframe: Keyframe, solved: Matched, camera: CameraModel) -> bool:

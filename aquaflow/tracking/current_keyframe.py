@@ -233,7 +233,7 @@ class KeyframeTracker:
 
     # --- keyframes left behind ----------------------------------------------------------------
 
-    def leave(self, at: CurrentKeyframe) -> None:
+    def release(self, at: CurrentKeyframe) -> None:
         """Register the keyframe, so that tracking may return to it."""
         self.neighbours.add(at.keyframe)
         self._recent.append(at.keyframe)
@@ -251,7 +251,7 @@ class KeyframeTracker:
                 solved = self._wide_steps.shown_by(keyframe, encoding, camera)
                 if solved is None:
                     continue
-                self._keyframes.hold(keyframe.number)
+                self._keyframes.load(keyframe.number)
             except InputError:
                 continue  # a keyframe that cannot be read back is skipped
             return CurrentKeyframe(keyframe, T_fk=solved.estimate.T, matches=solved.pair.matches)
@@ -259,7 +259,7 @@ class KeyframeTracker:
 
     def take_up(self, back: CurrentKeyframe) -> None:
         """Hold an earlier keyframe in memory: tracking goes on there."""
-        self._keyframes.hold(back.keyframe.number)
+        self._keyframes.load(back.keyframe.number)
 
     def shows(self, solved: Matched) -> bool:
         """True if enough was matched to go on at a keyframe."""

@@ -36,7 +36,7 @@ class Quality:
 
 
 @dataclass(frozen=True)
-class Link:
+class KeyframeEdge:
     """Relative-pose edge from a new keyframe to its parent."""
 
     keyframe: int
@@ -94,7 +94,7 @@ class Step:
 
     frames: list[Tracked] = field(default_factory=list)
     """Finished by it, each with its pose or why it has none: that frame, and some before it."""
-    links: dict[int, Link] = field(default_factory=dict)
+    links: dict[int, KeyframeEdge] = field(default_factory=dict)
     """Of the new keyframes that continue a sub-map, by their numbers."""
     revisits: list[Revisit] = field(default_factory=list)
 

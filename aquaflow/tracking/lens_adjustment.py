@@ -12,11 +12,11 @@ import numpy as np
 
 from aquaflow.geometry.lens_error import LENS_PRIOR_SIGMA, TERMS
 from aquaflow.tracking.lens_equations import (
-    Adjusted,
     Array,
     Indices,
     LensEquations,
     LensObservations,
+    LensUnknowns,
     Weighting,
     residuals,
     triangulated,
@@ -43,7 +43,7 @@ MIN_SIGMA = 1e-6
 class LensAdjustment:
     """The solution and its uncertainty."""
 
-    adjusted: Adjusted
+    adjusted: LensUnknowns
     covariance: Array
     """[2, 2] of u and k, from the scatter between the views: matches of one view share errors."""
     sigma_held: float
@@ -66,7 +66,7 @@ def adjust_lens(
         numpy.linalg.LinAlgError: the matches determine nothing at all.
     """
     lens = np.zeros(TERMS) if start is None else start
-    state = Adjusted(R_wc, centres, np.ones(len(observations.points)), lens)
+    state = LensUnknowns(R_wc, centres, np.ones(len(observations.points)), lens)
     sigmas: list[float] = []
     weighting = Weighting(1.0, np.zeros(0, dtype=bool))
     for number in range(ROUNDS):
@@ -83,8 +83,8 @@ def adjust_lens(
 
 
 def _solve(
-    observations: LensObservations, state: Adjusted, weighting: Weighting, terms: int
-) -> Adjusted:
+    observations: LensObservations, state: LensUnknowns, weighting: Weighting, terms: int
+) -> LensUnknowns:
     """Levenberg-Marquardt with the weighting's scale held."""
     damping, cost = 1e-4, _cost(observations, state, weighting)
     equations = LensEquations(observations, state, weighting)
@@ -102,13 +102,13 @@ def _solve(
     return state
 
 
-def _cost(observations: LensObservations, state: Adjusted, weighting: Weighting) -> float:
+def _cost(observations: LensObservations, state: LensUnknowns, weighting: Weighting) -> float:
     prior = 0.5 * float(np.sum((state.lens / LENS_PRIOR_SIGMA) ** 2))
     return weighting.cost(residuals(observations, state)) + prior
 
 
 def _covariance(
-    observations: LensObservations, state: Adjusted, weighting: Weighting, terms: int
+    observations: LensObservations, state: LensUnknowns, weighting: Weighting, terms: int
 ) -> Array:
     """[2, 2] of the lens: the sandwich estimator over the clusters of the points."""
     clusters = clusters_of(observations)

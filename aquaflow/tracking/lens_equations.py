@@ -46,7 +46,7 @@ class LensObservations:
 
 
 @dataclass(frozen=True)
-class Adjusted:
+class LensUnknowns:
     """The unknowns; V views."""
 
     R_wc: Array
@@ -92,7 +92,7 @@ class LensEquations:
     """The normal equations at one state: 6 columns a view (centre, rotation), then the lens."""
 
     def __init__(
-        self, observations: LensObservations, state: Adjusted, weighting: Weighting
+        self, observations: LensObservations, state: LensUnknowns, weighting: Weighting
     ) -> None:
         self._observations, self._state = observations, state
         error, J, along = _derivatives(observations, state)
@@ -140,7 +140,7 @@ class LensEquations:
         extra[-TERMS:] += LENS_PRIOR_SIGMA**-2.0
         return H + np.diag(extra)
 
-    def stepped(self, damping: float, terms: int) -> Adjusted:
+    def stepped(self, damping: float, terms: int) -> LensUnknowns:
         """The state after a damped step in which only the first ``terms`` of the lens move."""
         state = self._state
         H, gradient = self.hessian, self.gradient(np.ones(len(state.rho), dtype=bool))
@@ -152,7 +152,7 @@ class LensEquations:
         moves = step[:-TERMS].reshape(-1, 6)
         R = np.stack([R @ so3_exp(move[3:]) for R, move in zip(state.R_wc, moves, strict=True)])
         rho = state.rho - (self._g_p + self._H_pc @ step) / self._H_pp
-        return Adjusted(R, state.centres + moves[:, :3], rho, state.lens + step[-TERMS:])
+        return LensUnknowns(R, state.centres + moves[:, :3], rho, state.lens + step[-TERMS:])
 
 
 def _columns(observations: LensObservations, views: int) -> Indices:
@@ -173,7 +173,7 @@ def _summed(
 
 
 def _transformed(
-    observations: LensObservations, state: Adjusted
+    observations: LensObservations, state: LensUnknowns
 ) -> tuple[Array, Array, Array, Array]:
     """Of every match: its point's ray [M, 3], rotation into the view [M, 3, 3], the way between
     the views there [M, 3], and the point in the view [M, 3], scaled to depth 1 in the reference."""
@@ -187,13 +187,13 @@ def _transformed(
     return rays, R, way, _applied(R, rays) + state.rho[point, None] * way
 
 
-def residuals(observations: LensObservations, state: Adjusted) -> Array:
+def residuals(observations: LensObservations, state: LensUnknowns) -> Array:
     """[M, 2] of the normalised plane as it was seen."""
     Y = _transformed(observations, state)[-1]
     return seen_at(Y[:, :2] / np.maximum(Y[:, 2:], MIN_Z), state.lens) - observations.matches
 
 
-def _derivatives(observations: LensObservations, state: Adjusted) -> tuple[Array, Array, Array]:
+def _derivatives(observations: LensObservations, state: LensUnknowns) -> tuple[Array, Array, Array]:
     """Residuals [M, 2], their derivatives [M, 2, 12 + TERMS] by the columns of ``_columns``, and
     [M, 2] by rho."""
     rays, R, way, Y = _transformed(observations, state)
@@ -212,7 +212,7 @@ def _derivatives(observations: LensObservations, state: Adjusted) -> tuple[Array
     return error, np.concatenate(parts, axis=2), _applied(D, way)
 
 
-def triangulated(observations: LensObservations, state: Adjusted) -> Array:
+def triangulated(observations: LensObservations, state: LensUnknowns) -> Array:
     """[P] inverse depths, linear least squares."""
     rays, R, way, _ = _transformed(observations, state)
     at_infinity, match = _applied(R, rays), rays_of(observations.matches, state.lens)

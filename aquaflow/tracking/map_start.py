@@ -33,7 +33,7 @@ class PosedFrame:
 
 
 @dataclass(frozen=True)
-class Started:
+class NewMap:
     """The first keyframe of a map, and the frames after it that are followed from there."""
 
     reference: Frame
@@ -87,7 +87,7 @@ class MapStart:
         """True if the newest frame is the better reference (:attr:`Initialiser.turned_back`)."""
         return self._initialiser is not None and self._initialiser.turned_back
 
-    def solve(self) -> Started | None:
+    def solve(self) -> NewMap | None:
         """Initialise a map from the waiting frames; None if no geometry is good enough."""
         initialiser, started = self._initialiser, None
         if initialiser is None or not initialiser.waiting:
@@ -96,7 +96,7 @@ class MapStart:
             started = self._solve(initialiser)
         return self._taken(started)
 
-    def begin_learned(self) -> Started | None:
+    def begin_learned(self) -> NewMap | None:
         """A map from the reference and the picture after it, by the prior's ranges; None where it
         knows none, or not well enough (docs/prior.md#start)."""
         initialiser, started = self._initialiser, None
@@ -106,16 +106,16 @@ class MapStart:
             started = self._begun(initialiser)
         return self._taken(started)
 
-    def _begun(self, initialiser: Initialiser) -> Started | None:
+    def _begun(self, initialiser: Initialiser) -> NewMap | None:
         reference, second = initialiser.frame, initialiser.waiting[0]
         camera = initialiser.reference.camera
         found = learned_start(second.pair, camera, self._config)
         if found is None:
             return None
         posed = [PosedFrame(second.frame, found.T_fk, second.pair)]
-        return Started(reference, initialiser.reference, found.pointmap, camera, 0.0, posed)
+        return NewMap(reference, initialiser.reference, found.pointmap, camera, 0.0, posed)
 
-    def _taken(self, started: Started | None) -> Started | None:
+    def _taken(self, started: NewMap | None) -> NewMap | None:
         """The frames of a map that starts are in hand, and no reference is waited for."""
         if started is not None:
             frames = [started.reference, *(posed.frame for posed in started.posed)]
@@ -123,7 +123,7 @@ class MapStart:
             self.end()
         return started
 
-    def _solve(self, initialiser: Initialiser) -> Started | None:
+    def _solve(self, initialiser: Initialiser) -> NewMap | None:
         solution = initialiser.solve()
         if solution is None:
             return None
@@ -138,7 +138,7 @@ class MapStart:
             PosedFrame(waiting.frame, T, waiting.pair)
             for waiting, T in zip(solution.waiting, solution.T, strict=True)
         ]
-        start = Started(reference, encoding, pointmap, camera, solution.focal_sigma, posed)
+        start = NewMap(reference, encoding, pointmap, camera, solution.focal_sigma, posed)
         if not self._in_step:
             return replace(start, posed=posed[-1:], T_waiting=solution.T[-1])
         thinned = [PosedFrame(frame) for frame in self._waiting.of(Wait.THINNED)]

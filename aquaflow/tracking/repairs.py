@@ -10,7 +10,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
 from aquaflow.prior.contract import Encoding
-from aquaflow.tracking.consistency import Cause, ConsistencyMonitor, Finding
+from aquaflow.tracking.consistency import Cause, ConsistencyMonitor, InconsistentKeyframe
 from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
 from aquaflow.tracking.frames import Revisit
 from aquaflow.tracking.pose.depth_fusion import MOST_FUSED
@@ -48,7 +48,9 @@ class Repairs:
         self._doubted: set[int] = set()
         """Numbers of the keyframes that were triangulated anew once: it need not help."""
 
-    def __call__(self, finding: Finding, at: CurrentKeyframe, frame: LastFrame) -> Repaired | None:
+    def __call__(
+        self, finding: InconsistentKeyframe, at: CurrentKeyframe, frame: LastFrame
+    ) -> Repaired | None:
         """None if nothing could be done."""
         counts = self._monitor.counts
         if finding.cause is Cause.DEPTHS:

@@ -18,14 +18,14 @@ from aquaflow.keyframes import Keyframe, KeyframeStore
 from aquaflow.prior.contract import Encoding, PairGeometry, Prior
 from aquaflow.tracking.consistency import ConsistencyMonitor
 from aquaflow.tracking.current_keyframe import CurrentKeyframe, KeyframeTracker
-from aquaflow.tracking.frames import FrameClass, Link, Quality, Revisit, Step, Tracked
-from aquaflow.tracking.initialisation.back_fill import BackFills, LookedBack
+from aquaflow.tracking.frames import FrameClass, KeyframeEdge, Quality, Revisit, Step, Tracked
+from aquaflow.tracking.initialisation.back_fill import BackFillResult, BackFills
+from aquaflow.tracking.keyframe_reuse import STAGE as RETURN
+from aquaflow.tracking.keyframe_reuse import KeyframeReuse, ReuseResult, carry
 from aquaflow.tracking.loops.relocaliser import Places
-from aquaflow.tracking.map_start import MapStart, Started
+from aquaflow.tracking.map_start import MapStart, NewMap
 from aquaflow.tracking.pose.matcher import Matched
 from aquaflow.tracking.repairs import LastFrame, Repairs
-from aquaflow.tracking.returning import STAGE as RETURN
-from aquaflow.tracking.returning import Looked, Returning, carry
 from aquaflow.tracking.revisits import revisited
 from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
 from aquaflow.types import Frame
@@ -75,7 +75,7 @@ class Tracker:
         self._origin = Sim3.identity()
         self.monitor = ConsistencyMonitor(self._keyframe_tracker.neighbours, config)
         self._repair = Repairs(self.monitor, self._keyframe_tracker)
-        self._returning = Returning(self._keyframe_tracker, config, worker, self._failures)
+        self._returning = KeyframeReuse(self._keyframe_tracker, config, worker, self._failures)
         self._solved: Matched | None = None
         """The last frame at the keyframe in use; None if it has become a keyframe itself."""
         self._joined: set[tuple[int, int]] = set()
@@ -101,7 +101,7 @@ class Tracker:
         while it is looked for."""
         return self._step("back-filling", self.past, self._back_fills.step)
 
-    def looked_back(self, found: LookedBack) -> None:
+    def looked_back(self, found: BackFillResult) -> None:
         """The worker has looked for :attr:`past`, which the next :meth:`back_fill` finishes."""
         self._back_fills.take(found)
 
@@ -124,7 +124,7 @@ class Tracker:
 
     def recall(self, keyframe: Keyframe) -> None:
         """Register a keyframe of an earlier run for relocalisation."""
-        self._keyframe_tracker.leave(CurrentKeyframe(keyframe))
+        self._keyframe_tracker.release(CurrentKeyframe(keyframe))
 
     def _step(self, stage: str, frame: Frame | None, decide: Callable[[], list[Tracked]]) -> Step:
         """The frames that leave with what ``decide`` decides, and the edges that it found; where it
@@ -177,7 +177,7 @@ class Tracker:
             return []
         return tracked if matched else tracked + self._track(frame)
 
-    def _begin(self, started: Started | None = None) -> list[Tracked]:
+    def _begin(self, started: NewMap | None = None) -> list[Tracked]:
         """Make the first keyframe from the initial geometry, and pose the frames that waited."""
         started = started or self._start.solve()
         if started is None:
@@ -244,7 +244,7 @@ class Tracker:
                 self._note(self.looked(found))
         return self._returning.was_in_vain(at)
 
-    def looked(self, found: Looked) -> Revisit | None:
+    def looked(self, found: ReuseResult) -> Revisit | None:
         """Go on at an earlier keyframe that shows the frame of a look, unless tracking has left
         the one that was in use then; what that says of the two keyframes."""
         look, at = found.look, found.look.at
@@ -255,7 +255,7 @@ class Tracker:
             return None
         back, solved_back = found.back
         self._keyframe_tracker.take_up(back)
-        self._keyframe_tracker.leave(at)
+        self._keyframe_tracker.release(at)
         revisit = self._join(at, look.solved, back, solved_back, look.camera)
         moved_on = at.T_fk is not look.T_fk
         if moved_on:
@@ -291,7 +291,7 @@ class Tracker:
         assert self._at is not None
         self._origin = self._at.T_wc
         self.sub_map, self.sub_maps = self.sub_maps, self.sub_maps + 1
-        self._keyframe_tracker.leave(self._at)
+        self._keyframe_tracker.release(self._at)
         self._at = None
         lost = self._waiting.move(Wait.LOST, Wait.IN_HAND)
         return [tracked for frame in lost for tracked in self._track(frame)]
@@ -308,7 +308,7 @@ class Tracker:
             there = self._keyframe_tracker.recent(before, encoding, self.camera)
             found = None if there else self._places.of_frame(encoding, self.camera)
             if found is not None:
-                keyframe = self._keyframes.hold(found.keyframe.number)
+                keyframe = self._keyframes.load(found.keyframe.number)
                 there = CurrentKeyframe(keyframe, T_fk=found.estimate.T)
         if there is None:
             return []
@@ -317,10 +317,10 @@ class Tracker:
         if tracked is None:
             self._at = before
             if before is not None:
-                self._keyframes.hold(before.keyframe.number)
+                self._keyframes.load(before.keyframe.number)
             return []
         if before is not None:
-            self._keyframe_tracker.leave(before)
+            self._keyframe_tracker.release(before)
         self._start.end()
         return [*self._back_fill(), tracked]
 
@@ -373,9 +373,9 @@ class Tracker:
             at.mapped_parallax_px = solved.parallax_px
             return at.tracked(frame, frame_class, solved.quality, pointmap.copy())
         estimate = solved.estimate
-        link = Link(at.keyframe.number, estimate.T, estimate.covariance, solved.pair)
+        link = KeyframeEdge(at.keyframe.number, estimate.T, estimate.covariance, solved.pair)
         self.sub_map = at.keyframe.sub_map
-        keyframe_tracker.leave(at)
+        keyframe_tracker.release(at)
         self._solved = None
         self._joined.add((len(self._keyframes), at.keyframe.number))
         new = keyframe_tracker.at_new_keyframe

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.water.parameters import RATE_ROWS, rate_rows
-from aquaflow.water.solver import Fit
+from aquaflow.water.solver import WaterFit
 
 Array = npt.NDArray[np.float64]
 
@@ -32,7 +32,7 @@ LEAST_INFORMATION = 1e-6
 
 
 def log_odds_clear(
-    fit: Fit,  # with water
+    fit: WaterFit,  # with water
 ) -> float:
     """Of clear water against the water of the fit's prior: what the observations say of log beta_a
     under the prior of the one and of the other, all as normal distributions."""
@@ -49,7 +49,7 @@ def log_odds_clear(
 
 
 def attenuation_covariance(
-    fit: Fit,  # with water
+    fit: WaterFit,  # with water
 ) -> Array:
     """[3, 3] of log beta_a: by the observations' errors, and by CONTRAST_SIGMA."""
     depth = np.maximum(np.exp(fit.x[:3]) * fit.problem.median_range, LEAST_DEPTH)

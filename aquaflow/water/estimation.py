@@ -33,7 +33,7 @@ from aquaflow.water.open_sightings import with_open_water
 from aquaflow.water.parameters import Model
 from aquaflow.water.posed_picture import PosedPicture
 from aquaflow.water.selection import fit_likeliest
-from aquaflow.water.solver import Fit
+from aquaflow.water.solver import WaterFit
 from aquaflow.water.white_balance import WhiteBalance
 
 Array = npt.NDArray[np.float64]
@@ -136,7 +136,10 @@ def estimating(
 
 
 def _estimate(
-    observations: Observations, best: Fit, odds: float | None, pictures: Sequence[PosedPicture] = ()
+    observations: Observations,
+    best: WaterFit,
+    odds: float | None,
+    pictures: Sequence[PosedPicture] = (),
 ) -> Generator[None, None, WaterEstimate]:
     """What the fit, perhaps to open water too, says of the observations of the surface."""
     seen, trial, water = observations, best.prediction.trial, best.problem
@@ -165,18 +168,18 @@ def _estimate(
     )
 
 
-def _is_clear(wet: Fit, odds: float) -> bool:
+def _is_clear(wet: WaterFit, odds: float) -> bool:
     """Clear needs evidence, and that the likeliest water would not show; water that takes next to
     nothing is as good as clear, however sure it is."""
     depth = float((np.exp(wet.x[:3]) * wet.problem.median_range).max())
     return depth < NEGLIGIBLE_DEPTH or (odds + WATER_IS_USUAL < 0.0 and depth < VISIBLE_DEPTH)
 
 
-def log_odds_of_water(dry: Fit, wet: Fit) -> float:
+def log_odds_of_water(dry: WaterFit, wet: WaterFit) -> float:
     """Against a scene without any, and one that looks no more like water than clear scenes do."""
     return min(wet.log_evidence - dry.log_evidence, -log_odds_clear(wet))
 
 
-def _beta_a_sigma(fit: Fit) -> list[float]:
+def _beta_a_sigma(fit: WaterFit) -> list[float]:
     variance = np.maximum(np.diag(attenuation_covariance(fit)), 0.0)
     return list(np.sqrt(variance).tolist())

@@ -22,7 +22,7 @@ MAX_RESTORED = 2.0
 
 
 @dataclass(frozen=True)
-class Water:
+class WaterParameters:
     """The medium's parameters for one picture, each [3] RGB; rates per map unit.
 
     For points that were seen from several views, beta_a is [N, 3].

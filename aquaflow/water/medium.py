@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from aquaflow.config import MediumConfig
 from aquaflow.render.encoding import BANDS, sinusoidal_encoding
-from aquaflow.water.image_formation import Water
+from aquaflow.water.image_formation import WaterParameters
 from aquaflow.water.shading import TERMS
 
 MIN_RATE = 1e-4
@@ -28,7 +28,7 @@ MAX_LOG_FACTOR = 0.7
 """Log of the attenuation in one orientation over its mean; judgement: a factor of two."""
 
 
-class Medium(nn.Module):
+class LearnedMedium(nn.Module):
     """beta_a by MLP_a(gamma(vec R)); B_inf, b, B_res, d learnable RGB (paper, Eq. 13 to 15)."""
 
     def __init__(self, config: MediumConfig, generator: torch.Generator) -> None:
@@ -61,13 +61,13 @@ class Medium(nn.Module):
     def forward(
         self,
         R_wc: Tensor,  # [3, 3] or [V, 3, 3] camera to world
-    ) -> Water:
+    ) -> WaterParameters:
         """The water as seen by a camera with this orientation; beta_a [V, 3] for V of them."""
         beta_a = F.softplus(self.output.bias).expand(*R_wc.shape[:-2], 3)
         if self.directional:
             log_factor = (self._log_factor(R_wc) - self.mean_log_factor) / MAX_LOG_FACTOR
             beta_a = beta_a * torch.exp(MAX_LOG_FACTOR * torch.tanh(log_factor))
-        return Water(
+        return WaterParameters(
             beta_a,
             torch.sigmoid(self.B_inf_logit),
             F.softplus(self.b_raw),

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from aquaflow.config import WaterPriorsConfig
 from aquaflow.water.observations import Observations
-from aquaflow.water.parameters import Model, Parameters, Trial
+from aquaflow.water.parameters import Model, Trial, WaterUnknowns
 from aquaflow.water.priors import beliefs
 from aquaflow.water.regions import RegionalColours
 from aquaflow.water.shading import shading_basis
@@ -64,7 +64,7 @@ class Derivatives:
     """[k + V, P] of the J; 0 where J is held at black."""
 
 
-class WaterModel(Parameters):
+class WaterModel(WaterUnknowns):
     """Errors and their derivatives for one ``Model`` of the same sightings."""
 
     def __init__(

@@ -106,7 +106,7 @@ class Trial:
     views."""
 
 
-class Parameters:
+class WaterUnknowns:
     """Where each number of a ``Model`` lies in the vector, what it stands for, and its prior.
 
     In the order log beta_a, log b, logit B_inf, unevenness, shading, exposures.
@@ -155,7 +155,7 @@ class Parameters:
 
     def adopt(
         self,
-        other: Parameters,
+        other: WaterUnknowns,
         x: Array,  # [K] parameters
     ) -> Array:
         """The start, with the parameters of ``other``'s fit where both models have them."""

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.water.model import WaterModel
-from aquaflow.water.solver import Fit, descend
+from aquaflow.water.solver import WaterFit, descend
 
 Array = npt.NDArray[np.float64]
 
@@ -27,7 +27,7 @@ FEWEST_REPEATS, MOST_REPEATS = 1.0, 100.0
 """Bounds of how often the same error is counted (solver.py)."""
 
 
-def fit_likeliest(problems: Sequence[WaterModel]) -> Generator[None, None, list[Fit]]:
+def fit_likeliest(problems: Sequence[WaterModel]) -> Generator[None, None, list[WaterFit]]:
     """Of those with water and those without the likeliest each; pauses every few milliseconds.
 
     The richest model comes first: it says how large the errors are, and where the others start.
@@ -48,9 +48,9 @@ def fit_likeliest(problems: Sequence[WaterModel]) -> Generator[None, None, list[
 
 def _likeliest(
     problems: Sequence[WaterModel],
-    first: Fit,
+    first: WaterFit,
     noise: float,
-) -> Generator[None, None, Fit]:
+) -> Generator[None, None, WaterFit]:
     """The likeliest of the problems, fitted."""
     best: tuple[float, WaterModel, Array] | None = None
     for rich in _richest(problems):
@@ -81,7 +81,7 @@ def _contains(rich: WaterModel, poor: WaterModel) -> bool:
     return all(has <= may for has, may in pairs)
 
 
-def without(fit: Fit, problem: WaterModel) -> tuple[float, WaterModel, Array]:
+def without(fit: WaterFit, problem: WaterModel) -> tuple[float, WaterModel, Array]:
     """Log evidence of a smaller problem by a richer one's fit, and its parameters then."""
     kept = np.zeros(fit.problem.size, bool)
     for mine, theirs in zip(problem.parts, fit.problem.parts, strict=True):

@@ -26,7 +26,7 @@ DAMPING = 1e-3, 1e6
 
 
 @dataclass(frozen=True)
-class Fit:
+class WaterFit:
     """The best parameters of one model, at a stated noise of the observations."""
 
     problem: WaterModel
@@ -98,7 +98,7 @@ def descend(
     problem: WaterModel,
     x: Array,  # [K] parameters
     noise: float,
-) -> Generator[None, None, Fit]:
+) -> Generator[None, None, WaterFit]:
     """Levenberg-Marquardt on the robust cost; pauses every few steps."""
     damping, give_up = DAMPING
     problem = problem.expecting(x)
@@ -121,7 +121,7 @@ def descend(
             yield
         if before - best < LEAST_GAIN * before:
             break
-    return Fit(problem, x, noise, weight)
+    return WaterFit(problem, x, noise, weight)
 
 
 def cost(

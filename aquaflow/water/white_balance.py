@@ -38,7 +38,7 @@ import torch
 from torch import Tensor
 
 from aquaflow.render.transfers import water_in
-from aquaflow.water.image_formation import MAX_RESTORED, Water
+from aquaflow.water.image_formation import MAX_RESTORED, WaterParameters
 
 PICTURE_NOISE = 0.01
 """Deviation of a pixel's value: two grey levels and a half, as in compressed video."""
@@ -81,7 +81,7 @@ class WhiteBalance:
         self,
         image: Tensor,  # [H, W, 3] evenly lit
         z: Tensor,  # [H, W] range, map units
-        water: Water,
+        water: WaterParameters,
         uneven: Tensor | None = None,  # [H, W] gain of the backscatter
     ) -> Recovered:
         """The balanced picture without water; the module's text derives it."""

@@ -35,7 +35,7 @@ LARGEST_MESSAGE = 65_536
 
 
 @dataclass(frozen=True)
-class Request:
+class HttpRequest:
     """What a client asks."""
 
     method: str
@@ -51,7 +51,7 @@ class Request:
 
 
 @dataclass(frozen=True)
-class Answer:
+class HttpResponse:
     """What a client gets."""
 
     status: int
@@ -61,9 +61,9 @@ class Answer:
     headers: Sequence[tuple[str, str]] = ()
 
 
-Application: TypeAlias = Callable[[Request], Answer]
+Application: TypeAlias = Callable[[HttpRequest], HttpResponse]
 """Called in a thread of its own; may block."""
-Watcher: TypeAlias = Callable[[Request, dict[str, Any], Any, Any], Awaitable[None]]
+Watcher: TypeAlias = Callable[[HttpRequest, dict[str, Any], Any, Any], Awaitable[None]]
 """Serves one websocket in the server's thread: its request; scope, receive and send of ASGI."""
 
 
@@ -167,31 +167,33 @@ class WebServer:
         connection.known = connection.known or self._access.shows_token(target, headers)
         if scope["type"] == "websocket":
             assert self._watcher is not None
-            await self._watcher(Request("GET", target, headers, peer), scope, receive, send)
+            await self._watcher(HttpRequest("GET", target, headers, peer), scope, receive, send)
             return
         ambiguous = "transfer-encoding" in headers and "content-length" in headers
         if ambiguous or not target.startswith("/"):
-            await _send(send, Answer(400, "text/plain", b"This is no request\n"), last=True)
+            await _send(send, HttpResponse(400, "text/plain", b"This is no request\n"), last=True)
             return
         method = "GET" if scope["method"] == "HEAD" else scope["method"]
         body = await _body(receive, self._most_bytes)
         if method not in ("GET", "POST"):
-            answer = Answer(405, "text/plain", b"GET, HEAD or POST\n", [("Allow", "GET, POST")])
+            answer = HttpResponse(
+                405, "text/plain", b"GET, HEAD or POST\n", [("Allow", "GET, POST")]
+            )
         else:
-            answer = await self._in_thread(Request(method, target, headers, peer, body))
+            answer = await self._in_thread(HttpRequest(method, target, headers, peer, body))
         await _send(send, answer, last=body is None)
 
-    async def _in_thread(self, request: Request) -> Answer:
+    async def _in_thread(self, request: HttpRequest) -> HttpResponse:
         """The answer, made where it may block; of daemon threads, for which no exit waits."""
         async with self._threads:
-            made: asyncio.Future[Answer] = self.loop.create_future()
+            made: asyncio.Future[HttpResponse] = self.loop.create_future()
 
             def work() -> None:
                 try:
                     answer = self._reply(request)
                 except Exception:  # whatever a client asked for, the dive goes on
                     log.exception("a request could not be answered")
-                    answer = Answer(500, "text/plain", b"That failed; the log says why\n")
+                    answer = HttpResponse(500, "text/plain", b"That failed; the log says why\n")
                 with suppress(RuntimeError):  # the server has stopped meanwhile
                     self.loop.call_soon_threadsafe(_hand_over, made, answer)
 
@@ -199,7 +201,7 @@ class WebServer:
             return await made
 
 
-def _hand_over(made: asyncio.Future[Answer], answer: Answer) -> None:
+def _hand_over(made: asyncio.Future[HttpResponse], answer: HttpResponse) -> None:
     if not made.done():
         made.set_result(answer)
 
@@ -226,7 +228,7 @@ async def _body(receive: Any, most: int) -> bytes | None:
             return bytes(body)
 
 
-async def _send(send: Any, answer: Answer, last: bool) -> None:
+async def _send(send: Any, answer: HttpResponse, last: bool) -> None:
     """``last``: the connection is closed behind it."""
     headers = [("Content-Type", answer.kind), *answer.headers]
     if answer.status != 304:

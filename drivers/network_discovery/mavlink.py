@@ -74,7 +74,7 @@ def _sent_here(dialect: Any, port: int) -> list[FoundDevice]:
     if listener is None:
         detail = "another program listens there, such as a ground station or this service: no look"
         return [FoundDevice("mavlink", f"udp:{port}", f"UDP port {port}", detail)]
-    heard = Heartbeats(dialect)
+    heard = AutopilotHeartbeats(dialect)
     with listener:
         senders = [sender for data, sender in datagrams(listener) if heard.feed(data)]
     link = {"kind": "udp", "port": port}
@@ -82,8 +82,8 @@ def _sent_here(dialect: Any, port: int) -> list[FoundDevice]:
 
 
 def _served(dialect: Any, address: Address) -> list[FoundDevice]:
-    heard = Heartbeats(dialect)
-    heard.feed(said(address, enough=lambda data: bool(Heartbeats(dialect).feed(data))))
+    heard = AutopilotHeartbeats(dialect)
+    heard.feed(said(address, enough=lambda data: bool(AutopilotHeartbeats(dialect).feed(data))))
     host, port = address
     link = {"kind": "tcp", "host": host, "port": port}
     return _found(heard.autopilots, f"at {host}", f"tcp:{host}:{port}", link)
@@ -103,7 +103,7 @@ def _by_rest(address: Address) -> list[FoundDevice]:
     return []
 
 
-class Heartbeats:
+class AutopilotHeartbeats:
     """The autopilots in a stream of bytes."""
 
     def __init__(self, dialect: Any) -> None:

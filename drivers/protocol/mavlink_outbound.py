@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from aquaflow.sources.outbound import (
     LONGEST_NAME,
     LONGEST_TEXT,
-    BodyMotion,
     BodyPose,
+    BodyPoseChange,
     NamedValue,
     OutboundMessage,
     StatusText,
@@ -58,7 +58,7 @@ def messages_of(
 
 
 def _message_of(
-    dialect: Any, outbound: NamedValue | BodyPose | BodyMotion, receiver: Receiver
+    dialect: Any, outbound: NamedValue | BodyPose | BodyPoseChange, receiver: Receiver
 ) -> Any | None:
     """The message of a value, a pose or a motion.
 
@@ -72,12 +72,12 @@ def _message_of(
         return dialect.MAVLink_named_value_float_message(boot_ms, name, outbound.value)
     if boot_ns is None:
         return None
-    if isinstance(outbound, BodyMotion):
+    if isinstance(outbound, BodyPoseChange):
         return _delta(dialect, outbound, boot_ns)
     return _odometry(dialect, outbound, boot_ns, receiver.autopilot)
 
 
-def _delta(dialect: Any, motion: BodyMotion, boot_ns: int) -> Any | None:
+def _delta(dialect: Any, motion: BodyPoseChange, boot_ns: int) -> Any | None:
     if not (np.isfinite(motion.rotation).all() and np.isfinite(motion.translation_m).all()):
         return None
     return dialect.MAVLink_vision_position_delta_message(

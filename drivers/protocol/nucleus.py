@@ -60,7 +60,7 @@ Values: TypeAlias = Callable[[str, int], tuple[float, ...]]
 """Unpacks from behind the beginning of the values."""
 
 
-class Stamp(NamedTuple):
+class NucleusTime(NamedTuple):
     """The first three fields of every sample."""
 
     t_ns: int
@@ -68,7 +68,7 @@ class Stamp(NamedTuple):
     source: str
 
 
-Convert: TypeAlias = Callable[[bytes, Values, int, Stamp], list[TelemetrySample]]
+Convert: TypeAlias = Callable[[bytes, Values, int, NucleusTime], list[TelemetrySample]]
 
 
 class NucleusFraming(Framing):
@@ -130,7 +130,7 @@ class NucleusDecoder(PacketDecoder):
         _, begin, _, seconds, microseconds, status = COMMON.unpack_from(data)
         t_ns = self.clock.stamp(seconds * 10**9 + microseconds * 1000, arrival_ns)
         values = partial(_unpacked, data, begin)
-        return convert(data, values, status, Stamp(t_ns, arrival_ns, self.source(name)))
+        return convert(data, values, status, NucleusTime(t_ns, arrival_ns, self.source(name)))
 
     def outgoing(self, now_ns: int) -> bytes:
         """The password where it was asked for, and the command to start, if it is due."""
@@ -147,7 +147,7 @@ class NucleusDecoder(PacketDecoder):
         self._said, self._start_at_ns = b"", None
 
     def _bottom_track(
-        self, data: bytes, values: Values, status: int, stamp: Stamp
+        self, data: bytes, values: Values, status: int, stamp: NucleusTime
     ) -> list[TelemetrySample]:
         if status & VELOCITY_VALID != VELOCITY_VALID or status & MERIT_VALID != MERIT_VALID:
             raise ValueError("the bottom track is invalid")
@@ -155,14 +155,14 @@ class NucleusDecoder(PacketDecoder):
         return [Velocity(*stamp, (vx, vy, vz), max(merits))]
 
     def _altimeter(
-        self, data: bytes, values: Values, status: int, stamp: Stamp
+        self, data: bytes, values: Values, status: int, stamp: NucleusTime
     ) -> list[TelemetrySample]:
         if not status & VALID:
             raise ValueError("the altimeter sees no bottom")
         return [Altitude(*stamp, float(struct.unpack_from("<f", data, DISTANCE_AT)[0]))]
 
     def _ahrs(
-        self, data: bytes, values: Values, status: int, stamp: Stamp
+        self, data: bytes, values: Values, status: int, stamp: NucleusTime
     ) -> list[TelemetrySample]:
         roll, pitch, heading = (math.radians(angle) for angle in values("<3f", 0))
         samples: list[TelemetrySample] = [Attitude(*stamp, from_euler(roll, pitch, heading))]
@@ -170,14 +170,16 @@ class NucleusDecoder(PacketDecoder):
             samples.append(Depth(*stamp, values("<f", DEPTH_AT)[0]))
         return samples
 
-    def _imu(self, data: bytes, values: Values, status: int, stamp: Stamp) -> list[TelemetrySample]:
+    def _imu(
+        self, data: bytes, values: Values, status: int, stamp: NucleusTime
+    ) -> list[TelemetrySample]:
         if not status & VALID:
             raise ValueError("the IMU is invalid")
         ax, ay, az, wx, wy, wz = values("<6f", 0)
         return [Acceleration(*stamp, (ax, ay, az)), AngularRate(*stamp, (wx, wy, wz))]
 
     def _fast_pressure(
-        self, data: bytes, values: Values, status: int, stamp: Stamp
+        self, data: bytes, values: Values, status: int, stamp: NucleusTime
     ) -> list[TelemetrySample]:
         over_surface_pa = values("<f", 0)[0] * DECIBAR_PA - self._config.surface_pressure_pa
         depth_m = over_surface_pa / (self._config.water_density_kg_m3 * GRAVITY_M_S2)

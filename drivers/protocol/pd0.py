@@ -17,7 +17,7 @@ from aquaflow.drivers.events import about
 from aquaflow.drivers.protocol.packets import INCOMPLETE, NO_PACKET, Framing, PacketDecoder
 from aquaflow.drivers.protocol.pd0_axes import (
     BAD_VELOCITY,
-    Head,
+    Pd0Head,
     UnusableError,
     from_beams,
     from_earth,
@@ -114,13 +114,13 @@ class Pd0Decoder(PacketDecoder):
         one, two, three, four = struct.unpack_from("<4h", parts[BOTTOM_TRACK], 24)
         coordinates = _coordinates(parts[FIXED_LEADER])
         if coordinates == "beam":
-            head = Head.of(parts[FIXED_LEADER])
+            head = Pd0Head.of(parts[FIXED_LEADER])
             return from_beams((one, two, three, four), head, self._beam_angle_deg)
         if BAD_VELOCITY in (one, two, three):
             raise ValueError("no velocity over ground")
         error = 0.0 if four == BAD_VELOCITY else float(four)
         if coordinates == "earth":
-            head, leader = Head.of(parts[FIXED_LEADER]), parts[VARIABLE_LEADER]
+            head, leader = Pd0Head.of(parts[FIXED_LEADER]), parts[VARIABLE_LEADER]
             return (*from_earth((one, two, three), head, leader), error)
         return one, two, three, error
 

@@ -32,7 +32,7 @@ class UnusableError(ValueError):
     """Why velocities cannot be brought into instrument axes, and what to set."""
 
 
-class Head(NamedTuple):
+class Pd0Head(NamedTuple):
     """What the fixed leader says of the head."""
 
     configuration: int
@@ -41,7 +41,7 @@ class Head(NamedTuple):
     """EA: from beam 3 to the ship's bow."""
 
     @classmethod
-    def of(cls, leader: bytes) -> Head:
+    def of(cls, leader: bytes) -> Pd0Head:
         """From the fixed leader, 29 bytes of it at least."""
         (configuration,) = struct.unpack_from("<H", leader, 4)
         (alignment,) = struct.unpack_from("<h", leader, 26)
@@ -63,7 +63,7 @@ class Head(NamedTuple):
 
 
 def from_beams(
-    beams: tuple[int, int, int, int], head: Head, known_deg: float | None
+    beams: tuple[int, int, int, int], head: Pd0Head, known_deg: float | None
 ) -> tuple[float, float, float, float]:
     """x, y, z and error velocity from those towards beams 1 to 4, all in their unit; the error is
     0 where one beam is bad and the three others tell the velocity.
@@ -80,7 +80,7 @@ def from_beams(
     return c * a * (one - two), c * a * (four - three), b * (one + two + three + four), error
 
 
-def from_earth(velocity: Vector, head: Head, leader: bytes) -> Vector:
+def from_earth(velocity: Vector, head: Pd0Head, leader: bytes) -> Vector:
     """x, y, z from east, north, up, by the heading and tilts of the variable leader, with which
     the DVL turned them: what is wrong with its compass cancels.
 

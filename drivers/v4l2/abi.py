@@ -146,7 +146,7 @@ class Buffer(ctypes.Structure):
     )
 
 
-class Control(ctypes.Structure):
+class V4l2Control(ctypes.Structure):
     """``struct v4l2_control``."""
 
     _fields_ = (("id", c_uint32), ("value", c_int32))
@@ -212,8 +212,8 @@ DQBUF = _request(3, 17, Buffer)
 STREAMON = _request(1, 18, c_int32)
 STREAMOFF = _request(1, 19, c_int32)
 S_PARM = _request(3, 22, StreamParameters)
-G_CTRL = _request(3, 27, Control)
-S_CTRL = _request(3, 28, Control)
+G_CTRL = _request(3, 27, V4l2Control)
+S_CTRL = _request(3, 28, V4l2Control)
 QUERYCTRL = _request(3, 36, QueryControl)
 ENUM_FRAMESIZES = _request(3, 74, FrameSize)
 """VIDIOC_*: requests of ioctl."""

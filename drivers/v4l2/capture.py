@@ -19,7 +19,7 @@ from aquaflow.drivers.capture import RawPicture, UnusablePictureError
 from aquaflow.drivers.v4l2 import abi
 from aquaflow.drivers.v4l2.discovery import capabilities
 from aquaflow.drivers.v4l2.pixels import JPEG_PIXELS, STREAMED, to_rgb
-from aquaflow.drivers.v4l2.planes import Layout, SinglePlanar, layout_of
+from aquaflow.drivers.v4l2.planes import BufferLayout, SinglePlanar, layout_of
 from aquaflow.drivers.v4l2.system import KernelInterface, call, supported
 from aquaflow.types import CameraModel, EncodedPicture
 
@@ -44,7 +44,7 @@ class V4l2Capture:
         self._system = system
         self._now_ns = now_ns
         self._lock = threading.Lock()
-        self._layout: Layout = SinglePlanar()
+        self._layout: BufferLayout = SinglePlanar()
         self._fd = system.open(path)
         self._open = True
         try:
@@ -197,7 +197,7 @@ def apply_controls(system: KernelInterface, fd: int, config: V4l2Config) -> Fixe
 
     def fix(what: str, automatic: tuple[int, int], control: int, wanted: int) -> int | None:
         # A camera without the automatic may still have the value, so its absence says nothing.
-        supported(system, fd, abi.S_CTRL, abi.Control(*automatic))
+        supported(system, fd, abi.S_CTRL, abi.V4l2Control(*automatic))
         value = _set(system, fd, control, wanted)
         if value is None:
             notes.append(f"the camera has no fixed {what}; it decides for itself")
@@ -229,7 +229,7 @@ def _set(system: KernelInterface, fd: int, control: int, wanted: int) -> int | N
     limits = abi.QueryControl(id=control)
     if not supported(system, fd, abi.QUERYCTRL, limits):
         return None
-    setting = abi.Control(control, max(limits.minimum, min(limits.maximum, wanted)))
+    setting = abi.V4l2Control(control, max(limits.minimum, min(limits.maximum, wanted)))
     if not supported(system, fd, abi.S_CTRL, setting):
         return None
     call(system, fd, abi.G_CTRL, setting)

@@ -27,7 +27,7 @@ class PictureFormat:
     """Bytes from row to row, for each piece of memory."""
 
 
-class Layout(Protocol):
+class BufferLayout(Protocol):
     """One of the two sets of structures."""
 
     kind: int
@@ -50,7 +50,7 @@ class Layout(Protocol):
         ...
 
 
-def layout_of(capabilities: int) -> Layout:
+def layout_of(capabilities: int) -> BufferLayout:
     """By what a node says that it can."""
     single = capabilities & abi.CAP_VIDEO_CAPTURE
     return SinglePlanar() if single else MultiPlanar()

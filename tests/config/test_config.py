@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.base.storage.atomic import write_yaml
-from aquaflow.config import Config, Stage, load_config, parse_config
+from aquaflow.config import Config, StageConfig, load_config, parse_config
 
 
 def nested(path: str, value: object) -> dict[str, Any]:
@@ -86,7 +86,7 @@ def test_a_stage_that_is_no_mapping_is_named() -> None:
 
 
 @pytest.mark.parametrize("stage", MODELS)
-def test_every_stage_refuses_unknown_keys_and_changes(stage: type[Stage]) -> None:
+def test_every_stage_refuses_unknown_keys_and_changes(stage: type[StageConfig]) -> None:
     with pytest.raises(ValidationError, match="Extra inputs"):
         stage.model_validate({"misspelt": 1})
     built = stage()
@@ -96,7 +96,7 @@ def test_every_stage_refuses_unknown_keys_and_changes(stage: type[Stage]) -> Non
 
 
 @pytest.mark.parametrize("stage", MODELS)
-def test_every_default_passes_its_own_check(stage: type[Stage]) -> None:
+def test_every_default_passes_its_own_check(stage: type[StageConfig]) -> None:
     assert stage.model_validate(stage().model_dump()) == stage()
 
 

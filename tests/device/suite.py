@@ -21,7 +21,7 @@ import torch
 
 from aquaflow.base.errors import NotMappedError
 from aquaflow.lab.bench.ci_suite import ci_scenes
-from aquaflow.lab.bench.job import Job
+from aquaflow.lab.bench.job import BenchJob
 from aquaflow.lab.bench.scene import BenchmarkScene
 from aquaflow.lab.bench.worker import perform
 from aquaflow.render.contract import CPU
@@ -66,7 +66,7 @@ def map_scene(scene: BenchmarkScene, variant: str, place: str, out: Path) -> Map
     """As ``aquaflow bench`` does in its worker, but in this process."""
     name = "".join(letter if letter.isalnum() else "_" for letter in scene.name)
     folder = out / f"{name}-{variant}-{place.replace(' ', '_')}"
-    job = Job(scene, PRESET, str(folder), overrides=VARIANTS[variant])
+    job = BenchJob(scene, PRESET, str(folder), overrides=VARIANTS[variant])
     before, row = Counter(transfers()), dict.fromkeys(NUMBERS)
     with _in(place) as strays:
         try:

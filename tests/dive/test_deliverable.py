@@ -12,12 +12,12 @@ from aquaflow.base.clocks.deadline import Deadline
 from aquaflow.base.errors.failures import Failures
 from aquaflow.config import Config
 from aquaflow.dive import deliverable as module
-from aquaflow.dive.deliverable import Deliverable, Phase, deliverables_of
+from aquaflow.dive.deliverable import Deliverable, DeliverablePhase, deliverables_of
 from aquaflow.dive.dive import Dive
 
 
 class Late(Deliverable):
-    phase, stage = Phase.REPORT, "the last"
+    phase, stage = DeliverablePhase.REPORT, "the last"
 
 
 class Early(Deliverable):

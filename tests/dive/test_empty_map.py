@@ -9,7 +9,7 @@ import pytest
 
 from aquaflow.config import Config
 from aquaflow.dive.run import shortcomings
-from aquaflow.lab.bench.job import Job
+from aquaflow.lab.bench.job import BenchJob
 from aquaflow.lab.bench.runner import in_process
 from aquaflow.lab.bench.scene import BenchmarkScene
 from tests.command_line import run_aquaflow
@@ -53,7 +53,7 @@ def test_a_live_run_says_so(settings: Path, small_recording: Path, tmp_path: Pat
 @pytest.mark.ci
 def test_a_benchmark_counts_it_as_failed(small_recording: Path, tmp_path: Path) -> None:
     scene = BenchmarkScene("reef", str(small_recording), refine_share=0.01)
-    row = in_process(Job(scene, "balanced", str(tmp_path / "dive"), overrides=THE_PAPERS))
+    row = in_process(BenchJob(scene, "balanced", str(tmp_path / "dive"), overrides=THE_PAPERS))
     assert row["failed"] == f"reef: {SAID}"
 
 

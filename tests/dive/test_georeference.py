@@ -7,7 +7,7 @@ import pytest
 
 from aquaflow.dive.georeference import georeference, to_geodetic
 from aquaflow.dive.utm_grid import utm_epsg
-from aquaflow.telemetry.metric_frame import MetricFrame, Origin
+from aquaflow.telemetry.world_frame import Origin, WorldFrame
 from tests.metric_scenes import TRONDHEIM, metric_frame
 
 A, F = 6378137.0, 1.0 / 298.257223563
@@ -92,7 +92,7 @@ def test_the_convergence_is_that_of_the_meridian() -> None:
 def test_the_file_is_there_only_where_a_position_was_heard() -> None:
     assert georeference({0: metric_frame(origin=None)}, 0) is None
     assert georeference({}, 0) is None
-    frames = {0: MetricFrame.unknown(), 1: metric_frame(depth_known=False)}
+    frames = {0: WorldFrame.unknown(), 1: metric_frame(depth_known=False)}
     content = georeference(frames, main=0)
     assert content is not None
     assert content["origin"]["depth_m"] is None

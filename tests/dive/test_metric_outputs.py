@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import aquaflow
 from aquaflow.base.storage.dive_status import DiveState, DiveStatus
 from aquaflow.config import Config, load_config
-from aquaflow.dive.deliverable import Phase, deliverables_of
+from aquaflow.dive.deliverable import DeliverablePhase, deliverables_of
 from aquaflow.dive.deliverables import Deliverables
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.metric_outputs import (
@@ -29,8 +29,8 @@ from aquaflow.lab.evaluation.trajectory import read_tum
 from aquaflow.slam import Slam
 from aquaflow.sources import open_recording
 from aquaflow.sources.preprocessing import Preparation
-from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.telemetry.telemetry import Telemetry
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.types import Frame, UtcTime
 from tests.metric_scenes import SCALE, SHIFT, TURN, metric_frame
 
@@ -63,10 +63,10 @@ def written(slam: Slam, path: Path, outputs: MetricOutputs | None) -> Path:
     made = Deliverables("dive", folder, slam, slam.results(), None, outputs, others=others)
     made.summarise()
     made.write()
-    made.make(Phase.WRITE)
+    made.make(DeliverablePhase.WRITE)
     made.evaluate()
     made.write_evaluation()
-    made.make(Phase.REPORT, metrics=NUMBERS)
+    made.make(DeliverablePhase.REPORT, metrics=NUMBERS)
     folder.write_json("metrics.json", NUMBERS)
     folder.close()
     DiveStatus(DiveState.FINISHED).write(path)
@@ -212,7 +212,7 @@ def test_the_map_read_again_shows_the_same_in_metres(plain: Path, metric: Path) 
 
 
 def test_sub_maps_without_a_common_scale_are_called_so_only_if_that_is_true() -> None:
-    known, unknown = metric_frame(), MetricFrame.unknown()
+    known, unknown = metric_frame(), WorldFrame.unknown()
     assert sub_maps_in_words([known, unknown]) == "2 sub-maps without a common scale"
     assert "all in metres and level" in sub_maps_in_words([known, known])
     assert "how they lie to one another is not known" in sub_maps_in_words(
@@ -221,7 +221,7 @@ def test_sub_maps_without_a_common_scale_are_called_so_only_if_that_is_true() ->
 
 
 def test_worlds_that_differ_are_named_for_each_sub_map() -> None:
-    lines = worlds_in_words({0: metric_frame(), 3: MetricFrame.unknown()}).splitlines()
+    lines = worlds_in_words({0: metric_frame(), 3: WorldFrame.unknown()}).splitlines()
     assert [line.split(":")[0] for line in lines] == [
         "camera to world; sub-map 0", "camera to world; sub-map 3",
     ]  # fmt: skip

@@ -14,8 +14,8 @@ from aquaflow.dive.path_rows import path_rows
 from aquaflow.dive.trajectory_csv import PoseRow
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.telemetry.telemetry import Telemetry
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.frames import FrameClass, Tracked
 from aquaflow.types import Depth, Frame, UtcTime
 from tests.metric_scenes import SIGMAS, TRONDHEIM, metric_frame
@@ -36,7 +36,7 @@ def tracked(index: int, sub_map: int = 0) -> Tracked:
 
 
 def rows(
-    frame: MetricFrame, R_nc: np.ndarray = STRAIGHT, navigation: Navigation | None = None
+    frame: WorldFrame, R_nc: np.ndarray = STRAIGHT, navigation: Navigation | None = None
 ) -> list[PoseRow]:
     """Twenty poses at 10 Hz, at a speed of half a metre a second."""
     outputs = MetricOutputs({0: frame}, navigation or Navigation())
@@ -107,14 +107,14 @@ def test_what_was_measured_is_that_of_the_moment() -> None:
 
 
 def test_a_map_without_telemetry_says_positions_and_nothing_else() -> None:
-    row = rows(MetricFrame.unknown())[10]
+    row = rows(WorldFrame.unknown())[10]
     assert (row.index, row.t_s, row.unit, row.x, row.y) == (10, 1.0, "map units", 0.3, 0.4)
     known = {"index", "t_s", "sub_map", "x", "y", "z", "unit"}
     assert {name for name in vars(row) if getattr(row, name) is not None} == known
 
 
 def test_each_sub_map_has_its_own_unit_and_rows_are_in_order() -> None:
-    outputs = MetricOutputs({0: metric_frame(), 1: MetricFrame.unknown()})
+    outputs = MetricOutputs({0: metric_frame(), 1: WorldFrame.unknown()})
     results = [tracked(2, 1), tracked(0, 0), tracked(1, 0), tracked(3, 0)]
     poses = {i: Sim3.identity() for i in range(3)}  # frame 3 has none
     found = path_rows(outputs, results, poses)

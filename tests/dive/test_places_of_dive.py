@@ -14,7 +14,7 @@ from aquaflow.config import Config
 from aquaflow.dive import deliverables as places_of_dive
 from aquaflow.dive.replay import map_recording
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes.place import Place
+from aquaflow.keyframes.place import KeyframePlace
 from aquaflow.keyframes.places_file import NAME, PlacesFile, Rows
 from aquaflow.keyframes.store import Keyframe
 from aquaflow.sources import open_recording
@@ -52,7 +52,7 @@ def test_a_keyframe_that_cannot_be_read_back_costs_itself(
 ) -> None:
     whole = places_of_dive._place
 
-    def fail(keyframe: Keyframe, poses: Mapping[int, Sim3]) -> Place:
+    def fail(keyframe: Keyframe, poses: Mapping[int, Sim3]) -> KeyframePlace:
         if keyframe.number == 0:
             raise InputError("planted")
         return whole(keyframe, poses)

@@ -10,7 +10,7 @@ import pytest
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.failures import Failures
 from aquaflow.dive import views
-from aquaflow.dive.views import Showing, open_coverage
+from aquaflow.dive.views import DisplayThread, open_coverage
 from aquaflow.survey.coverage.live_coverage import LiveCoverage
 
 
@@ -26,7 +26,7 @@ def test_what_fails_is_logged_and_shown_again_until_it_is_closed(
         again.set()
 
     with caplog.at_level(logging.ERROR):
-        showing = Showing("map", show, pause_s=0.01)
+        showing = DisplayThread("map", show, pause_s=0.01)
         assert again.wait(30.0)
         showing.close()
     assert "the dive could not be shown: map" in caplog.text

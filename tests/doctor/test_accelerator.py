@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from aquaflow.doctor import Finding, MachineProbes, accelerator, print_findings, to_json
+from aquaflow.doctor import CheckResult, MachineProbes, accelerator, print_findings, to_json
 from aquaflow.doctor.attempts import Attempt
 from aquaflow.render.gpu import Gpu
 
@@ -33,7 +33,7 @@ def found_on(
     providers: list[str] = OFFERED,
     driver: bool = True,
     **attempts: Attempt,
-) -> dict[str, Finding]:
+) -> dict[str, CheckResult]:
     """The findings by name, of a machine that is pretended."""
     outcomes, tried = {**GOOD, **attempts}, list[str]()
 

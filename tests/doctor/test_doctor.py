@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from aquaflow.doctor import Finding, MachineProbes, examine, print_findings, to_json
+from aquaflow.doctor import CheckResult, MachineProbes, examine, print_findings, to_json
 from aquaflow.doctor.attempts import Attempt
 from aquaflow.doctor.computer import isa_level
 from aquaflow.doctor.machine import renderer_name
@@ -54,7 +54,7 @@ def bare(root: Path, **changes: object) -> MachineProbes:
     return MachineProbes(**{**parts, **changes})  # type: ignore[arg-type]
 
 
-def named(machine: MachineProbes, name: str) -> Finding:
+def named(machine: MachineProbes, name: str) -> CheckResult:
     return next(finding for finding in examine(machine) if finding.name == name)
 
 

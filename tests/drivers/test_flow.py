@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from aquaflow.drivers.flow import WINDOW_S, Flow
+from aquaflow.drivers.flow import WINDOW_S, DeviceState
 
 SECOND = 1_000_000_000
 
 
 def test_rate_age_and_lag_follow_what_came() -> None:
     now = [100 * SECOND]
-    flow = Flow(lambda: now[0])
+    flow = DeviceState(lambda: now[0])
     assert flow.to_json() == {"rate_hz": None, "age_s": None, "lag_ms": None}
     for tenth in range(250):
         arrival = 100 * SECOND + tenth * SECOND // 10
@@ -19,7 +19,7 @@ def test_rate_age_and_lag_follow_what_came() -> None:
 
 
 def test_a_device_that_began_just_now_has_its_rate_already() -> None:
-    flow = Flow(lambda: 103 * SECOND)
+    flow = DeviceState(lambda: 103 * SECOND)
     for quarter in range(12):
         flow.heard(0, 100 * SECOND + quarter * SECOND // 4)
     assert flow.to_json()["rate_hz"] == 4.0
@@ -27,14 +27,14 @@ def test_a_device_that_began_just_now_has_its_rate_already() -> None:
 
 def test_a_device_that_fell_silent_has_rate_zero_and_no_lag() -> None:
     now = [100 * SECOND]
-    flow = Flow(lambda: now[0])
+    flow = DeviceState(lambda: now[0])
     flow.heard(99 * SECOND, 100 * SECOND)
     now[0] = (101 + WINDOW_S) * SECOND
     assert flow.to_json() == {"rate_hz": 0.0, "age_s": 1.0 + WINDOW_S, "lag_ms": None}
 
 
 def test_memory_is_bounded() -> None:
-    flow = Flow(lambda: 0)
+    flow = DeviceState(lambda: 0)
     for second in range(10_000):
         flow.heard(0, second * SECOND)
     assert len(flow._seconds) == WINDOW_S + 1

@@ -46,7 +46,7 @@ from tests.drivers.camera_scenes import (
     ("structure", "size"),
     [
         (abi.Capability, 104), (abi.Format, 208), (abi.StreamParameters, 204),
-        (abi.RequestBuffers, 20), (abi.Buffer, 88), (abi.Control, 8), (abi.QueryControl, 68),
+        (abi.RequestBuffers, 20), (abi.Buffer, 88), (abi.V4l2Control, 8), (abi.QueryControl, 68),
         (abi.FormatDescription, 64), (abi.FrameSize, 44), (abi_planes.Plane, 64),
         (abi_planes.PlanePixFormat, 20), (abi_planes.PixFormatMplane, 192),
     ],

@@ -12,7 +12,14 @@ from hypothesis import strategies as st
 from aquaflow.base.errors import InputError
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes.place import LARGEST_ROOT, LEVELS, KeypointDepths, Place, packed, unpacked
+from aquaflow.keyframes.place import (
+    LARGEST_ROOT,
+    LEVELS,
+    KeyframePlace,
+    KeypointDepths,
+    packed,
+    unpacked,
+)
 from aquaflow.keyframes.places_file import EDGE, NAME, PlacesFile, Rows, write_places
 from aquaflow.keyframes.pointmap import UNKNOWN_VARIANCE
 from aquaflow.prior.contract import Keypoints
@@ -31,9 +38,9 @@ def seen(seed: int, count: int = 50) -> KeypointDepths:
     return KeypointDepths(CAMERA, Keypoints(pixels, descriptors.astype(np.float32)), rho, variance)
 
 
-def place(number: int, sub_map: int = 0) -> Place:
+def place(number: int, sub_map: int = 0) -> KeyframePlace:
     T_mc = Sim3.exp(np.linspace(0.0, 0.01 * number, 7))
-    return Place(number, 7 * number, sub_map, 10**8 * number, T_mc, CAMERA)
+    return KeyframePlace(number, 7 * number, sub_map, 10**8 * number, T_mc, CAMERA)
 
 
 def edges(*pairs: tuple[int, int]) -> Rows:

@@ -19,7 +19,7 @@ from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import DiveRun
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.live.control import Control
+from aquaflow.live.control import ServiceControl
 from aquaflow.live.dive_clock import Continued
 from aquaflow.live.feed import LatestSamples
 from aquaflow.live.health.degradation import Degradation
@@ -28,7 +28,7 @@ from aquaflow.live.health.state import Health
 from aquaflow.live.live_dive import LiveDive
 from aquaflow.live.loop import LiveLoop
 from aquaflow.live.map_thread import MapThread
-from aquaflow.live.vitals import Vitals
+from aquaflow.live.service_health import ServiceHealth
 from aquaflow.mapping.maps import Maps
 from aquaflow.mapping.work import Growth, Insertion
 from aquaflow.slam import Slam
@@ -150,10 +150,10 @@ class Told:
     """A live loop of which the test holds every end."""
 
     def __init__(self, folder: Path, config: Config = SETTINGS, **service: object) -> None:
-        self.clock, self.feed, self.control = Clock(), ToldFeed(), Control()
+        self.clock, self.feed, self.control = Clock(), ToldFeed(), ServiceControl()
         self.pressure = CALM
         self.config = ServiceConfig.model_validate(service)
-        self.vitals = Vitals(self.config)
+        self.vitals = ServiceHealth(self.config)
         self.vitals.health = Health(self.clock)
         self.vitals.degradation = Degradation(self.config.limits, self.clock)
         self.degradation, self.heartbeats = self.vitals.degradation, self.vitals.heartbeats

@@ -21,7 +21,7 @@ from aquaflow.config.presets import preset
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.lab.bench.growth.worker import folder_bytes
 from aquaflow.lab.bench.memory import peak_memory_mb, resident_mb
-from aquaflow.lab.synthetic.survey import FPS, Survey
+from aquaflow.lab.synthetic.survey import FPS, SurveyPictures
 from aquaflow.live.checkpoint.resume import resumed
 from aquaflow.live.feed import LiveFeed
 from aquaflow.live.live_dive import LiveDive
@@ -38,7 +38,7 @@ class SurveyCamera:
     """The survey as a device: a picture every tenth of a second, whoever is ready for it."""
 
     def __init__(self, width: int, count: int) -> None:
-        self._survey, self._count = Survey(width), count
+        self._survey, self._count = SurveyPictures(width), count
         self.camera: CameraModel | None = self._survey.camera
         self.frame_count: int | None = count
         self.notes: list[str] = []

@@ -26,7 +26,7 @@ from aquaflow.lab.stress.one_place import OnePlace
 from aquaflow.lab.stress.swim import CAMERA
 from aquaflow.live.checkpoint.resume import resumed
 from aquaflow.live.feed import _Pumps
-from aquaflow.live.health.state import State
+from aquaflow.live.health.state import ServiceState
 from aquaflow.live.live_dive import LiveDive
 from aquaflow.live.loop import LiveLoop
 from aquaflow.types import Frame
@@ -133,8 +133,8 @@ class Observer:
             slam.graph.loops,
             len(slam.graph.snapshot.edges),
             slam.tracker.sub_maps,
-            loop.health.visits[State.INCONSISTENT],
-            loop.health.visits[State.LOST],
+            loop.health.visits[ServiceState.INCONSISTENT],
+            loop.health.visits[ServiceState.LOST],
         )
 
 

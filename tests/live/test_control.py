@@ -6,25 +6,25 @@ import threading
 
 import pytest
 
-from aquaflow.live.control import Control, Phase, RefusedError, Request
+from aquaflow.live.control import DivePhase, RefusedError, ServiceControl, ServiceRequest
 
 TABLE = {
-    Phase.IDLE: {"start": "mapping", "new": "mapping"},
-    Phase.MAPPING: {"stop": "paused", "finish": "finishing", "new": "finishing"},
-    Phase.PAUSED: {"start": "mapping", "finish": "finishing", "new": "finishing"},
-    Phase.FINISHING: {},
+    DivePhase.IDLE: {"start": "mapping", "new": "mapping"},
+    DivePhase.MAPPING: {"stop": "paused", "finish": "finishing", "new": "finishing"},
+    DivePhase.PAUSED: {"start": "mapping", "finish": "finishing", "new": "finishing"},
+    DivePhase.FINISHING: {},
 }
 WAYS = {
-    Phase.IDLE: [],
-    Phase.MAPPING: [Request.START],
-    Phase.PAUSED: [Request.START, Request.STOP],
-    Phase.FINISHING: [Request.START, Request.FINISH],
+    DivePhase.IDLE: [],
+    DivePhase.MAPPING: [ServiceRequest.START],
+    DivePhase.PAUSED: [ServiceRequest.START, ServiceRequest.STOP],
+    DivePhase.FINISHING: [ServiceRequest.START, ServiceRequest.FINISH],
 }
 """From the beginning to each phase."""
 
 
-def at(phase: Phase) -> Control:
-    control = Control()
+def at(phase: DivePhase) -> ServiceControl:
+    control = ServiceControl()
     for request in WAYS[phase]:
         control.ask(request)
         control.begin()
@@ -32,9 +32,9 @@ def at(phase: Phase) -> Control:
     return control
 
 
-@pytest.mark.parametrize("request_", Request)
-@pytest.mark.parametrize("phase", Phase)
-def test_every_request_in_every_phase(phase: Phase, request_: Request) -> None:
+@pytest.mark.parametrize("request_", ServiceRequest)
+@pytest.mark.parametrize("phase", DivePhase)
+def test_every_request_in_every_phase(phase: DivePhase, request_: ServiceRequest) -> None:
     control, after = at(phase), TABLE[phase].get(request_.value)
     if after is None:
         with pytest.raises(RefusedError) as refused:
@@ -46,46 +46,46 @@ def test_every_request_in_every_phase(phase: Phase, request_: Request) -> None:
 
 
 def test_a_dive_ends_when_it_is_finished_or_the_service_stops() -> None:
-    assert not at(Phase.PAUSED).dive_ends
-    assert at(Phase.FINISHING).dive_ends
-    stopped = at(Phase.MAPPING)
+    assert not at(DivePhase.PAUSED).dive_ends
+    assert at(DivePhase.FINISHING).dive_ends
+    stopped = at(DivePhase.MAPPING)
     stopped.stopping.set()
     assert stopped.dive_ends
     with pytest.raises(RefusedError, match="the service is ending"):
-        stopped.ask(Request.STOP)
+        stopped.ask(ServiceRequest.STOP)
 
 
 def test_after_a_finished_dive_the_service_is_idle_and_after_new_it_begins_another() -> None:
-    control = at(Phase.MAPPING)
-    control.ask(Request.FINISH)
+    control = at(DivePhase.MAPPING)
+    control.ask(ServiceRequest.FINISH)
     control.ended()
-    assert control.phase is Phase.IDLE
-    control.ask(Request.START)
+    assert control.phase is DivePhase.IDLE
+    control.ask(ServiceRequest.START)
     assert not control.begin()  # what can be gone on with is
-    control.ask(Request.NEW)
+    control.ask(ServiceRequest.NEW)
     control.ended()
-    assert control.phase is Phase.MAPPING
+    assert control.phase is DivePhase.MAPPING
     assert control.begin()
-    control.ask(Request.FINISH)
+    control.ask(ServiceRequest.FINISH)
     control.ended()
-    assert control.phase is Phase.IDLE
+    assert control.phase is DivePhase.IDLE
 
 
 def test_a_new_dive_that_cannot_be_begun_is_not_tried_for_ever() -> None:
-    control = Control()
-    control.ask(Request.NEW)
+    control = ServiceControl()
+    control.ask(ServiceRequest.NEW)
     assert control.begin()
     control.ended()
-    assert control.phase is Phase.IDLE
+    assert control.phase is DivePhase.IDLE
 
 
 def test_who_waits_is_woken_by_a_request() -> None:
-    control, woken = Control(), threading.Event()
+    control, woken = ServiceControl(), threading.Event()
 
     def wait() -> None:
         control.wait(300.0)
         woken.set()
 
     threading.Thread(target=wait, daemon=True).start()
-    control.ask(Request.START)
+    control.ask(ServiceRequest.START)
     assert woken.wait(60.0)

@@ -14,11 +14,11 @@ from aquaflow.config.cameras import StreamConfig
 from aquaflow.config.service import ServiceConfig
 from aquaflow.drivers.live import CameraState
 from aquaflow.drivers.stream import StreamCamera
-from aquaflow.live.control import Control
+from aquaflow.live.control import ServiceControl
 from aquaflow.live.feed import LiveFeed
-from aquaflow.live.health.state import State
+from aquaflow.live.health.state import ServiceState
 from aquaflow.live.loop import PATIENCE_S, LiveLoop
-from aquaflow.live.vitals import Vitals
+from aquaflow.live.service_health import ServiceHealth
 from aquaflow.sim_drivers.camera_feed import CameraFeed
 from aquaflow.sim_drivers.rtp_camera import RtpCamera, RtspCamera
 from tests.drivers.camera_scenes import Pictures, free_port
@@ -47,24 +47,24 @@ def test_a_dead_stream_is_waited_for_and_comes_back_without_flapping(
     camera = StreamCamera("front", StreamConfig.model_validate(asked))
     feed = LiveFeed("front", {"front": camera}, None, SourceConfig())
     told = Told(tmp_path)
-    control, vitals = Control(), Vitals(ServiceConfig())
+    control, vitals = ServiceControl(), ServiceHealth(ServiceConfig())
     loop = LiveLoop(
         told.run, feed, told.maps, ServiceConfig(), vitals, control, lambda: told.pressure
     )
     thread = threading.Thread(target=loop.run, daemon=True)
     with server:
         thread.start()
-        until(lambda: loop.health.state is State.TRACKING, loop)
+        until(lambda: loop.health.state is ServiceState.TRACKING, loop)
         server.sending.clear()
         until(lambda: camera.state is not CameraState.STREAMING, loop)
-        assert loop.health.state is State.WAITING
+        assert loop.health.state is ServiceState.WAITING
         assert "no picture for" in loop.health.reason
         server.sending.set()
-        until(lambda: loop.health.state is State.TRACKING, loop)
+        until(lambda: loop.health.state is ServiceState.TRACKING, loop)
         control.stopping.set()
         thread.join()
         feed.close()
     vitals.close()
     told.close()
     states = [change.after for change in loop.health.changes]
-    assert states == [State.TRACKING, State.WAITING, State.TRACKING]
+    assert states == [ServiceState.TRACKING, ServiceState.WAITING, ServiceState.TRACKING]

@@ -30,7 +30,7 @@ from aquaflow.drivers.telemetry import LinkTelemetry
 from aquaflow.drivers.v4l2 import V4l2Camera
 from aquaflow.live.checkpoint.resume import resumed
 from aquaflow.live.feed import LiveFeed
-from aquaflow.live.health.state import State
+from aquaflow.live.health.state import ServiceState
 from aquaflow.live.live_dive import LiveDive
 from aquaflow.live.loop import PATIENCE_S
 from aquaflow.sim_drivers.camera_feed import CameraFeed
@@ -84,11 +84,11 @@ class Fate(threading.Thread):
 
     def run(self) -> None:
         try:
-            self._until(State.TRACKING)
+            self._until(ServiceState.TRACKING)
             self._wire.unplug()
-            self._told.reason["link away"] = self._until(State.DEGRADED)
+            self._told.reason["link away"] = self._until(ServiceState.DEGRADED)
             self._wire.plug()
-            self._told.reason["link back"] = self._until(State.TRACKING)
+            self._told.reason["link back"] = self._until(ServiceState.TRACKING)
             self._flood()
             self._told.clock_set = self._shown()
             self._kernel.feed.set_clock_on(JUMP_S)
@@ -105,9 +105,9 @@ class Fate(threading.Thread):
         self._kernel.unplug()
         self._wait(lambda: self._camera.state is not CameraState.STREAMING, "camera lost")
         self._clock.pass_(2.0 * PATIENCE_S)
-        self._told.reason["camera away"] = self._until(State.WAITING)
+        self._told.reason["camera away"] = self._until(ServiceState.WAITING)
         self._kernel.plug_in()
-        self._told.reason["camera back"] = self._until(State.TRACKING)
+        self._told.reason["camera back"] = self._until(ServiceState.TRACKING)
         self._told.reconnects = self._camera.counters.reconnects
 
     def _shown(self) -> int:
@@ -117,7 +117,7 @@ class Fate(threading.Thread):
         seen = self._shown()
         self._wait(lambda: self._shown() >= seen + PICTURES, "more pictures")
 
-    def _until(self, state: State) -> str:
+    def _until(self, state: ServiceState) -> str:
         self._wait(lambda: self._loop.health.state is state, f"'{state.value}'")
         return self._loop.health.reason
 
@@ -127,7 +127,7 @@ class Fate(threading.Thread):
             self._wire.send(noise.randbytes(1000))
         self._wait(lambda: self._garbage() > GARBAGE_BYTES // 2, "garbage to be counted")
         self._told.garbage_bytes = self._garbage()
-        self._told.reason["flooded"] = self._until(State.TRACKING)
+        self._told.reason["flooded"] = self._until(ServiceState.TRACKING)
 
     def _garbage(self) -> int:
         return int(str(self._feed.describe()["autopilot"]["garbage_bytes"]))

@@ -19,10 +19,10 @@ from aquaflow.lab.evaluation.trajectory import read_tum
 from aquaflow.live.checkpoint.resume import resumed
 from aquaflow.live.checkpoint.set_aside import SetAside
 from aquaflow.live.checkpoint.telemetry import cut_at_checkpoint
+from aquaflow.live.clock_reading import ClockReading
 from aquaflow.live.live_dive import LiveDive
-from aquaflow.live.moment import Moment
 from aquaflow.recordings.playback import Event, Playback
-from aquaflow.recordings.telemetry_lines import TelemetryLines, TelemetryLog
+from aquaflow.recordings.telemetry_lines import TelemetryLines, TelemetryWriter
 from aquaflow.sources import mounting_of, open_recording
 from aquaflow.sources.telemetry_input import TelemetryInput, open_telemetry
 from aquaflow.telemetry.metric_file import read_metric_file
@@ -192,10 +192,10 @@ def test_after_another_boot_telemetry_ends_where_the_checkpoint_was_taken(
     tmp_path: Path, boot: str, left: int
 ) -> None:
     path = tmp_path / "telemetry.jsonl"
-    log = TelemetryLog(path)
+    log = TelemetryWriter(path)
     log.add([Depth(t_ns, t_ns, "d", 1.0) for t_ns in (10, 20, 30, 40, 50)])
     log.close()
-    taken, now = Moment(25, 0, "same", dive_shift_ns=7), Moment(60, 0, boot)
+    taken, now = ClockReading(25, 0, "same", dive_shift_ns=7), ClockReading(60, 0, boot)
     cut_at_checkpoint(tmp_path, taken, now, SetAside(tmp_path))
     assert len(list(TelemetryLines(path).samples())) == left
     aside = tmp_path / "set-aside-1" / "telemetry.jsonl"
@@ -206,7 +206,7 @@ def test_after_another_boot_telemetry_ends_where_the_checkpoint_was_taken(
 
 def test_a_new_dive_in_the_same_folder_begins_without_the_old_telemetry(tmp_path: Path) -> None:
     folder = DiveFolder(tmp_path, Config())
-    log = TelemetryLog(tmp_path / "telemetry.jsonl")
+    log = TelemetryWriter(tmp_path / "telemetry.jsonl")
     log.add([Depth(1, 1, "d", 1.0)])
     log.close()
     folder.close()
@@ -217,5 +217,7 @@ def test_a_new_dive_in_the_same_folder_begins_without_the_old_telemetry(tmp_path
 
 
 def test_a_dive_without_telemetry_so_far_has_none_to_cut(tmp_path: Path) -> None:
-    cut_at_checkpoint(tmp_path, Moment(1, 0, "a"), Moment(1, 0, "b"), SetAside(tmp_path))
+    cut_at_checkpoint(
+        tmp_path, ClockReading(1, 0, "a"), ClockReading(1, 0, "b"), SetAside(tmp_path)
+    )
     assert list(tmp_path.iterdir()) == []

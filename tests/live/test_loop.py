@@ -10,8 +10,8 @@ import pytest
 
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.live.health.degradation import DegradationLevel
-from aquaflow.live.health.state import State
-from aquaflow.tracking.consistency import SHOWN_FRAMES, Cause, Finding
+from aquaflow.live.health.state import ServiceState
+from aquaflow.tracking.consistency import SHOWN_FRAMES, Cause, InconsistentKeyframe
 from aquaflow.types import Dropped
 from tests.live.live_scenes import CALM, Told, frame_of, rows_of, visited
 
@@ -31,7 +31,7 @@ def test_a_dive_goes_from_starting_over_initialising_to_tracking(told: Told) -> 
 
 def test_systemd_hears_nothing_of_ready_until_the_camera_answers_or_is_missed(told: Told) -> None:
     told.idle(1.0, turns=4)
-    assert told.loop.health.state is State.STARTING
+    assert told.loop.health.state is ServiceState.STARTING
     told.idle(2.0, turns=8)
     assert visited(told) == ["starting", "waiting for camera"]
 
@@ -40,49 +40,49 @@ def test_an_unplugged_camera_is_waited_for_and_the_dive_goes_on(told: Told) -> N
     told.feed.devices = {"front": {"kind": "camera", "state": "lost", "reason": "No such device"}}
     told.frames("pp")
     told.idle(10.0, turns=40)
-    assert told.loop.health.state is State.WAITING
+    assert told.loop.health.state is ServiceState.WAITING
     assert "No such device" in told.loop.health.reason
     told.frames("pp", first=100)
     assert visited(told)[-3:] == ["tracking", "waiting for camera", "tracking"]
-    assert told.loop.health.visits[State.WAITING] == 1
+    assert told.loop.health.visits[ServiceState.WAITING] == 1
 
 
 def test_lost_frames_make_it_lost_and_one_alone_does_not(told: Told) -> None:
     told.frames("pplpp")
-    assert State.LOST not in told.loop.health.visits
+    assert ServiceState.LOST not in told.loop.health.visits
     told.frames("lll", first=10)
-    assert told.loop.health.state is State.LOST
+    assert told.loop.health.state is ServiceState.LOST
     told.frames("p", first=20)
-    assert told.loop.health.state is State.TRACKING
+    assert told.loop.health.state is ServiceState.TRACKING
 
 
 def test_skipped_frames_say_nothing_about_being_lost(told: Told) -> None:
     told.frames("p" + "s" * 20)
-    assert told.loop.health.state is State.TRACKING
+    assert told.loop.health.state is ServiceState.TRACKING
 
 
 def test_a_silent_link_degrades_with_its_name_and_comes_back(told: Told) -> None:
     link = {"kind": "link", "state": "no byte for 10 s", "reason": ""}
     told.feed.devices = {"autopilot": link}
     told.frames("pp")
-    assert told.loop.health.state is State.DEGRADED
+    assert told.loop.health.state is ServiceState.DEGRADED
     assert "autopilot" in told.loop.health.reason
     link["state"] = "connected"
     told.frames("p", first=5)
-    assert told.loop.health.state is State.TRACKING
+    assert told.loop.health.state is ServiceState.TRACKING
 
 
 def test_a_finding_of_the_monitor_is_a_state_with_its_reason_and_ends(told: Told) -> None:
     told.frames("pp")
     monitor = told.loop.dive_run.slam.tracker.monitor
-    monitor.counts.add(Finding(1, 0, Cause.POSE, 1.2))
+    monitor.counts.add(InconsistentKeyframe(1, 0, Cause.POSE, 1.2))
     monitor._frames_since = 0
     told.frames("p", first=5)
-    assert told.loop.health.state is State.INCONSISTENT
+    assert told.loop.health.state is ServiceState.INCONSISTENT
     assert "+20 %" in told.loop.health.reason
     monitor._frames_since = SHOWN_FRAMES
     told.frames("p", first=6)
-    assert told.loop.health.state is State.TRACKING
+    assert told.loop.health.state is ServiceState.TRACKING
 
 
 def test_memory_pressure_goes_down_the_stated_steps_and_climbs_back(told: Told) -> None:
@@ -102,7 +102,7 @@ def test_memory_pressure_goes_down_the_stated_steps_and_climbs_back(told: Told) 
     assert told.degradation.level is DegradationLevel.FULL
     assert (told.degradation.steps_down, told.degradation.steps_up) == (4, 4)
     told.frames("p", first=60)
-    assert told.loop.health.state is State.TRACKING
+    assert told.loop.health.state is ServiceState.TRACKING
 
 
 @pytest.mark.parametrize(
@@ -132,7 +132,7 @@ def test_work_that_found_the_gpu_full_is_asked_for_less_at_once_and_tracking_goe
         told.frames("p", first=turn, every_s=0.01)
         assert told.degradation.level is DegradationLevel[level]
     assert told.degradation.steps_down == 3
-    assert told.loop.health.state is State.DEGRADED
+    assert told.loop.health.state is ServiceState.DEGRADED
     assert "the GPU's memory was full" in told.loop.health.reason
     told.idle(told.config.limits.calm_s)
     assert told.degradation.level is DegradationLevel.SMALLER_IMAGES
@@ -158,19 +158,19 @@ def test_a_full_disk_degrades_but_costs_no_degradation_level(told: Told) -> None
     told.pressure = replace(CALM, disk_free_mb=3.0)
     told.idle(told.config.limits.look_s)
     told.frames("p", first=5)
-    assert told.loop.health.state is State.DEGRADED
+    assert told.loop.health.state is ServiceState.DEGRADED
     assert "disk full: 3 MB" in told.loop.health.reason
     assert told.degradation.level is DegradationLevel.FULL
     told.pressure = CALM
     told.idle(told.config.limits.look_s)
     told.frames("p", first=6)
-    assert told.loop.health.state is State.TRACKING
+    assert told.loop.health.state is ServiceState.TRACKING
 
 
 def test_a_frame_that_raises_costs_itself(told: Told) -> None:
     told.frames("ppxp")
     assert told.loop.counters.failures == 1
-    assert told.loop.health.state is State.TRACKING
+    assert told.loop.health.state is ServiceState.TRACKING
     assert [row for row in rows_of(told.dive.path) if "failed: told so" in row]
 
 
@@ -189,7 +189,7 @@ def test_a_source_that_fails_ends_the_loop_with_its_reason(told: Told) -> None:
 def test_a_missing_picture_is_a_row_and_no_silence(told: Told) -> None:
     told.loop.take(Dropped(7, 0, "front#7 is damaged"))
     assert "front#7 is damaged" in "".join(rows_of(told.dive.path))
-    assert told.loop.health.state is not State.WAITING
+    assert told.loop.health.state is not ServiceState.WAITING
 
 
 def test_after_the_end_there_is_no_other_state(told: Told) -> None:
@@ -197,7 +197,7 @@ def test_after_the_end_there_is_no_other_state(told: Told) -> None:
     told.loop.end()
     told.vitals.stop("stop requested", 1.0)
     told.loop.take(frame_of(9))
-    assert told.loop.health.state is State.STOPPING
+    assert told.loop.health.state is ServiceState.STOPPING
 
 
 def test_frames_that_a_newer_one_overtook_are_counted(told: Told) -> None:

@@ -17,13 +17,13 @@ from aquaflow.base.signals import stop_on_signals
 from aquaflow.base.storage.dive_status import DiveState, DiveStatus
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.live import onboard as module
-from aquaflow.live.control import Control, Phase, Request
+from aquaflow.live.clock_reading import ClockReading
+from aquaflow.live.control import DivePhase, ServiceControl, ServiceRequest
 from aquaflow.live.live_dive import STAGE
-from aquaflow.live.moment import Moment
-from aquaflow.live.onboard import Asked, Onboard, map_live
-from aquaflow.live.station import Station
-from aquaflow.live.vitals import Vitals
-from aquaflow.live.watched import Watched
+from aquaflow.live.onboard import Onboard, OnboardSettings, map_live
+from aquaflow.live.service_frontends import ServiceFrontends
+from aquaflow.live.service_health import ServiceHealth
+from aquaflow.live.service_status import ServiceStatus
 from tests.live.live_scenes import VEHICLE, ToldFeed
 from tests.live.unfinished_dives import unfinished
 
@@ -53,7 +53,7 @@ def vehicle(dives: Path, begin: str = "on_command") -> VehicleConfig:
 class FakeDive:
     """A dive without a map: it ends when the pilot wants it to."""
 
-    control: Control
+    control: ServiceControl
     does: Callable[[FakeDive], None]
     was_paused: bool = False
     finished: list[str] = field(default_factory=list)
@@ -79,34 +79,34 @@ class Service:
     """Onboard with dives that the test makes, and turns of its idle time that the test sees."""
 
     def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch, begin: str) -> None:
-        self.feed, self.control = LastingFeed(), Control()
+        self.feed, self.control = LastingFeed(), ServiceControl()
         self.vehicle = vehicle(root / "dives", begin)
-        self.vitals = Vitals(self.vehicle.service)
-        self.station = Station(self.feed, self.vehicle, self.control, self.vitals)
+        self.vitals = ServiceHealth(self.vehicle.service)
+        self.station = ServiceFrontends(self.feed, self.vehicle, self.control, self.vitals)
         self.onboard = Onboard(self.feed, self.vehicle, self.control, self.station)
-        self.begun: list[Asked] = []
+        self.begun: list[OnboardSettings] = []
         self.dives: list[FakeDive] = []
         self.idle: list[Callable[[], None]] = [self.control.stopping.set]
         """What happens in the turns without a dive, one after the other."""
         monkeypatch.setattr(module, "begun", self._begin)
-        monkeypatch.setattr(Station, "show", lambda station, dive: None)
-        monkeypatch.setattr("aquaflow.live.standby.TURN_S", 0.01)
+        monkeypatch.setattr(ServiceFrontends, "show", lambda station, dive: None)
+        monkeypatch.setattr("aquaflow.live.idle_loop.TURN_S", 0.01)
         self.station.standby.watchers.append(self._turn)
 
-    def _begin(self, feed: object, vehicle: object, asked: Asked, *_: object) -> FakeDive:
+    def _begin(self, feed: object, vehicle: object, asked: OnboardSettings, *_: object) -> FakeDive:
         self.begun.append(asked)
         return self.dives[len(self.begun) - 1]
 
     def start(self) -> None:
-        self.control.ask(Request.START)
+        self.control.ask(ServiceRequest.START)
 
-    def _turn(self, standby: Watched) -> None:
-        if self.control.phase is Phase.IDLE and self.idle:
+    def _turn(self, standby: ServiceStatus) -> None:
+        if self.control.phase is DivePhase.IDLE and self.idle:
             self.idle.pop(0)()
 
-    def serve(self, asked: Asked | None = None) -> Any:
+    def serve(self, asked: OnboardSettings | None = None) -> Any:
         try:
-            return self.onboard.serve(asked or Asked())
+            return self.onboard.serve(asked or OnboardSettings())
         finally:
             self.station.close()
             self.vitals.close()
@@ -117,7 +117,7 @@ def service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Service:
     return Service(tmp_path, monkeypatch, "on_command")
 
 
-def asking(request: Request = Request.FINISH) -> Callable[[FakeDive], None]:
+def asking(request: ServiceRequest = ServiceRequest.FINISH) -> Callable[[FakeDive], None]:
     """A dive during which the pilot asks for something."""
 
     def ask(dive: FakeDive) -> None:
@@ -131,7 +131,7 @@ def test_nothing_begins_before_the_pilot_asks_and_then_dives_follow_each_other(
 ) -> None:
     service.dives = [
         FakeDive(service.control, asking()),
-        FakeDive(service.control, asking(Request.NEW)),
+        FakeDive(service.control, asking(ServiceRequest.NEW)),
         FakeDive(service.control, asking()),
     ]
     seen: list[int] = []
@@ -150,27 +150,27 @@ def test_nothing_begins_before_the_pilot_asks_and_then_dives_follow_each_other(
 def test_a_folder_by_name_is_the_first_dives_and_the_others_are_beside(service: Service) -> None:
     service.dives = [FakeDive(service.control, asking()) for _ in range(2)]
     service.idle = [service.start, service.start, service.control.stopping.set]
-    service.serve(Asked(Path("here")))
-    assert service.begun == [Asked(Path("here")), Asked(Path("here"), new=True)]
+    service.serve(OnboardSettings(Path("here")))
+    assert service.begun == [OnboardSettings(Path("here")), OnboardSettings(Path("here"), new=True)]
 
 
 def test_a_dive_that_cannot_be_begun_leaves_the_service_idle_with_the_reason(
     tmp_path: Path,
 ) -> None:
     (tmp_path / "dives").write_text("not a folder")
-    control, feed, reasons = Control(), LastingFeed(), list[str]()
-    with Vitals(VEHICLE.service) as vitals:
-        station = Station(feed, vehicle(tmp_path / "dives"), control, vitals)
+    control, feed, reasons = ServiceControl(), LastingFeed(), list[str]()
+    with ServiceHealth(VEHICLE.service) as vitals:
+        station = ServiceFrontends(feed, vehicle(tmp_path / "dives"), control, vitals)
 
-        def look(standby: Watched) -> None:
+        def look(standby: ServiceStatus) -> None:
             reasons.append(standby.health.reason)
             if len(reasons) == 1:
-                control.ask(Request.START)
+                control.ask(ServiceRequest.START)
             elif "came to nothing" in reasons[-1]:
                 control.stopping.set()
 
         station.standby.watchers.append(look)
-        Onboard(feed, vehicle(tmp_path / "dives"), control, station).serve(Asked())
+        Onboard(feed, vehicle(tmp_path / "dives"), control, station).serve(OnboardSettings())
         station.close()
     assert "cannot make the dive folder" in reasons[-1]
 
@@ -219,7 +219,7 @@ def test_a_camera_that_is_gone_for_good_ends_the_service_also_while_it_is_idle(
 def test_a_dive_that_a_crash_cut_off_goes_on_without_the_pilots_word(
     service: Service, tmp_path: Path, state: DiveState | None, begins: bool
 ) -> None:
-    dives, now = tmp_path / "dives", Moment.now()
+    dives, now = tmp_path / "dives", ClockReading.now()
     dives.mkdir()
     if state is not None:
         unfinished(dives, taken=now, state=state)
@@ -233,32 +233,32 @@ def test_a_paused_dive_is_paused_again_in_the_next_process(
     service: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Onboard, "_begins_by_itself", lambda *_: True)
-    seen: list[Phase] = []
+    seen: list[DivePhase] = []
 
     def look(dive: FakeDive) -> None:
         seen.append(dive.control.phase)
-        dive.control.ask(Request.FINISH)
+        dive.control.ask(ServiceRequest.FINISH)
 
     service.dives = [FakeDive(service.control, look, was_paused=True)]
     service.serve()
-    assert seen == [Phase.PAUSED]
+    assert seen == [DivePhase.PAUSED]
 
 
 def test_a_paused_dive_that_the_pilot_starts_is_not_paused(service: Service) -> None:
-    seen: list[Phase] = []
+    seen: list[DivePhase] = []
 
     def look(dive: FakeDive) -> None:
         seen.append(dive.control.phase)
-        dive.control.ask(Request.FINISH)
+        dive.control.ask(ServiceRequest.FINISH)
 
     service.dives = [FakeDive(service.control, look, was_paused=True)]
     service.idle = [service.start, service.control.stopping.set]
     service.serve()
-    assert seen == [Phase.MAPPING]
+    assert seen == [DivePhase.MAPPING]
 
 
 def test_a_finishing_that_takes_far_longer_than_its_time_is_hung() -> None:
-    with Vitals(VEHICLE.service) as vitals:
+    with ServiceHealth(VEHICLE.service) as vitals:
         now = vitals.heartbeats._now_s()
         vitals.heartbeats.beat(STAGE, ahead_s=100.0)
         assert vitals.heartbeats.hung(60.0) is None

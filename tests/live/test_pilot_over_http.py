@@ -30,7 +30,7 @@ from aquaflow.dive.ply import read_ply
 from aquaflow.drivers.v4l2 import V4l2Camera
 from aquaflow.lab.evaluation.trajectory import read_tum
 from aquaflow.live.checkpoint.generations import state_file
-from aquaflow.live.control import Control
+from aquaflow.live.control import ServiceControl
 from aquaflow.live.feed import LiveFeed
 from aquaflow.live.onboard import map_live
 from aquaflow.sim_drivers.camera_feed import CameraFeed
@@ -112,7 +112,7 @@ class Story:
 class Told(threading.Thread):
     """The story, in its own thread; ends the service in any case."""
 
-    def __init__(self, pilot: Pilot, control: Control, story: Story) -> None:
+    def __init__(self, pilot: Pilot, control: ServiceControl, story: Story) -> None:
         super().__init__(name="pilot", daemon=True)
         self._pilot, self._control, self._story = pilot, control, story
 
@@ -193,7 +193,7 @@ def story(small_recording: Path, tmp_path_factory: pytest.TempPathFactory) -> It
         "front", V4l2Config.model_validate(asked | {"stall_s": 3600.0}), kernel, root
     )
     feed = LiveFeed("front", {"front": camera}, None, SourceConfig())
-    control, story = Control(), Story(dives=root / "dives")
+    control, story = ServiceControl(), Story(dives=root / "dives")
     told = Told(Pilot(port), control, story)
     told.start()
     map_live(feed, vehicle_at(port, root), control=control)

@@ -11,7 +11,7 @@ import pytest
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.live.plan_view import MOST_POINTS, PlanView
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 NORTH_UP = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """n from a first camera that looks north: its z is n's x."""
@@ -24,7 +24,7 @@ class Clock:
         return self.now
 
 
-def scene(paths: dict[int, np.ndarray], frame: MetricFrame, latest: Any = None) -> Any:
+def scene(paths: dict[int, np.ndarray], frame: WorldFrame, latest: Any = None) -> Any:
     """What the view reads of a dive: ``paths`` [N, 3] of keyframes by sub-map."""
     keyframes = [
         SimpleNamespace(sub_map=number, T_wc=Sim3(np.eye(3), centre))
@@ -47,7 +47,7 @@ def straight(count: int, axis: int) -> np.ndarray:
 
 
 LEVEL = replace(
-    MetricFrame.unknown(),
+    WorldFrame.unknown(),
     T_nm=Sim3(NORTH_UP, np.zeros(3), 2.0),
     metric=True,
     level=True,
@@ -80,7 +80,7 @@ def test_a_camera_that_looks_straight_down_looks_to_no_side() -> None:
 def test_without_gravity_the_plane_is_the_one_that_the_camera_moves_in(
     axis: int, up: str, last: list[float]
 ) -> None:
-    said = PlanView(lambda: scene({0: straight(3, axis)}, MetricFrame.unknown())).to_json()
+    said = PlanView(lambda: scene({0: straight(3, axis)}, WorldFrame.unknown())).to_json()
     [plan] = said["sub_maps"]
     assert (plan["unit"], plan["up"], plan["points"][-1]) == ("map units", up, last)
     assert said["now"] is None
@@ -88,7 +88,7 @@ def test_without_gravity_the_plane_is_the_one_that_the_camera_moves_in(
 
 def test_a_long_path_is_thinned_and_keeps_its_ends() -> None:
     paths = {0: straight(20_000, 2), 1: straight(1, 2)}
-    first, second = PlanView(lambda: scene(paths, MetricFrame.unknown())).to_json()["sub_maps"]
+    first, second = PlanView(lambda: scene(paths, WorldFrame.unknown())).to_json()["sub_maps"]
     assert len(first["points"]) == MOST_POINTS
     assert (first["points"][0], first["points"][-1]) == ([0.0, 0.0], [0.0, 19_999.0])
     assert (second["number"], len(second["points"])) == (1, 1)

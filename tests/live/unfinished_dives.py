@@ -11,17 +11,20 @@ from aquaflow.base.storage.dive_status import DiveState, DiveStatus
 from aquaflow.geometry.arrays import of_camera
 from aquaflow.geometry.camera import guess_camera
 from aquaflow.live.checkpoint.generations import FORMAT, state_file, write_state
-from aquaflow.live.moment import Moment
+from aquaflow.live.clock_reading import ClockReading
 from aquaflow.tracking.frame_table import FRAME
 
 H = 3_600_000_000_000
 """Nanoseconds of an hour."""
-YESTERDAY = Moment(100 * H, 20_000 * 24 * H, "yesterday's boot")
+YESTERDAY = ClockReading(100 * H, 20_000 * 24 * H, "yesterday's boot")
 """When the last checkpoint was taken."""
 
 
 def unfinished(
-    dives: Path, name: str = "old", taken: Moment = YESTERDAY, state: DiveState = DiveState.OPEN
+    dives: Path,
+    name: str = "old",
+    taken: ClockReading = YESTERDAY,
+    state: DiveState = DiveState.OPEN,
 ) -> Path:
     """A dive with a checkpoint of nothing, and files that bear its time."""
     dive = dives / name

@@ -23,7 +23,7 @@ from aquaflow.render import select_renderer
 from aquaflow.render.contract import Renderer
 from aquaflow.render.views import View
 from aquaflow.water.estimation import WaterEstimate
-from aquaflow.water.image_formation import Water
+from aquaflow.water.image_formation import WaterParameters
 from aquaflow.water.pauses import finished
 
 Array = npt.NDArray[np.float64]
@@ -86,7 +86,7 @@ def floor(seed: int = 0, columns: int = 20, rows: int = 15, scale: float = 0.09)
 def picture(
     gaussians: GaussianMap,
     T_wc: Sim3,
-    water: Water | None = None,
+    water: WaterParameters | None = None,
     camera: CameraModel = CAMERA,
 ) -> npt.NDArray[np.uint8]:
     """[H, W, 3] what a camera at ``T_wc`` sees of them."""
@@ -114,7 +114,9 @@ def path(count: int) -> list[Sim3]:
     ]
 
 
-def filmed(gaussians: GaussianMap, poses: list[Sim3], water: Water | None = None) -> list[View]:
+def filmed(
+    gaussians: GaussianMap, poses: list[Sim3], water: WaterParameters | None = None
+) -> list[View]:
     return [view_of(picture(gaussians, T, water), T, i) for i, T in enumerate(poses)]
 
 
@@ -126,10 +128,12 @@ def flat_pointmap(
     return Pointmap(camera, rho, (relative_sigma * rho) ** 2)
 
 
-def water(beta: float = 0.2, B_inf: float = 0.3, b: float = 0.25, B_res: float = 0.01) -> Water:
+def water(
+    beta: float = 0.2, B_inf: float = 0.3, b: float = 0.25, B_res: float = 0.01
+) -> WaterParameters:
     """Water that differs a little from channel to channel."""
     tint = torch.tensor([1.5, 1.0, 0.8])
-    return Water(
+    return WaterParameters(
         beta * tint,
         B_inf / tint,
         b * tint,

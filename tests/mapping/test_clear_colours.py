@@ -17,7 +17,7 @@ from aquaflow.mapping.map_copy import copied
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import drawn_without_water
 from aquaflow.render.activation import radiance
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.water.white_balance import WhiteBalance
 from tests.mapping.mapping_scenes import CAMERA, floor, pose, renderer, view_of
 
@@ -94,7 +94,7 @@ def test_ply_viewer_and_frames_show_the_same_bounded_colours(tmp_path: Path) -> 
     assert np.abs(expected - (J * torch.tensor(BALANCE.gain)).numpy()).max() > 0.02
     np.testing.assert_allclose(copied(mapper).clear, expected, atol=1e-6)
     folder = DiveFolder(tmp_path / "dive", Config())
-    folder.write_splats(mapper, summarise_water(mapper), MetricFrame.unknown())
+    folder.write_splats(mapper, summarise_water(mapper), WorldFrame.unknown())
     np.testing.assert_allclose(read_ply(folder.path / "map_clear.ply").colours, expected, atol=1e-5)
     view = mapper.views[0]
     shown = mapper.show(view)

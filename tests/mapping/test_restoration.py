@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from aquaflow.config import MediumConfig
-from aquaflow.mapping.rendering import Shown
+from aquaflow.mapping.rendering import RenderedMap
 from aquaflow.mapping.restoration import (
     common_exposure,
     drawn_without_water,
@@ -74,7 +74,7 @@ def test_what_was_not_mapped_stays_as_the_camera_saw_it() -> None:
     torch.testing.assert_close(restored[12:20], view.target()[12:20])
 
 
-def with_open_water(choice: str) -> tuple[Scene, View, Shown]:
+def with_open_water(choice: str) -> tuple[Scene, View, RenderedMap]:
     """The floor, in a picture whose upper rows show open water, where the map has Gaussians."""
     scene, view = submerged()
     scene.config = scene.config.model_copy(update={"open_water": choice})

@@ -8,8 +8,8 @@ import pytest
 from aquaflow.prior.fields import pixel_grid, sample
 from aquaflow.prior.flow import (
     BORDER_PX,
-    Flow,
     FlowMatcher,
+    ImageFlow,
     check,
     check_by_numpy,
     confidence,
@@ -31,7 +31,7 @@ from tests.prior.textured_pictures import (
 )
 
 
-def flow_between(a: Picture, b: Picture, start: np.ndarray | None = None) -> Flow:
+def flow_between(a: Picture, b: Picture, start: np.ndarray | None = None) -> ImageFlow:
     grey_a, grey_b = normalised_grey(a), normalised_grey(b)
     return FlowMatcher()(grey_a, grey_b, texture_of(grey_a), texture_of(grey_b), start)
 
@@ -180,10 +180,10 @@ def test_inside_of_these_tests_agrees_with_the_matcher_border() -> None:
     assert not (flow.valid & ~inside(target, BORDER_PX)).any()
 
 
-def perfect(forward: np.ndarray) -> Flow:
+def perfect(forward: np.ndarray) -> ImageFlow:
     shape = forward.shape[:2]
     everywhere = np.ones(shape, dtype=bool)
-    return Flow(forward, -forward, np.zeros(shape, np.float32), everywhere)
+    return ImageFlow(forward, -forward, np.zeros(shape, np.float32), everywhere)
 
 
 def test_a_match_is_less_certain_beside_an_edge_of_the_flow() -> None:

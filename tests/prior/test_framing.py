@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aquaflow.prior.framing import GREY, Framing
+from aquaflow.prior.framing import GREY, ImagePadding
 
 CELL = 8
 
@@ -22,7 +22,7 @@ CELL = 8
 def test_a_picture_is_as_large_as_fits_in_whole_cells(
     shape: tuple[int, int], frame: tuple[int, int], inner: tuple[int, int]
 ) -> None:
-    framing = Framing.of(*shape, frame, CELL)
+    framing = ImagePadding.of(*shape, frame, CELL)
     assert (framing.height, framing.width) == inner
     assert framing.top % CELL == framing.left % CELL == 0
     image = np.full((*shape, 3), 200, np.uint8)
@@ -36,7 +36,7 @@ def test_a_picture_is_as_large_as_fits_in_whole_cells(
 
 @pytest.mark.parametrize("scale", [1, 2, 8])
 def test_what_shows_the_picture_is_cut_out_at_any_resolution(scale: int) -> None:
-    framing = Framing.of(270, 480, (384, 512), CELL)
+    framing = ImagePadding.of(270, 480, (384, 512), CELL)
     framed = framing.framed(np.full((270, 480, 3), 200, np.uint8))[..., 0]
     cut = framing.cut(framed[scale // 2 :: scale, scale // 2 :: scale])
     assert cut.shape == (framing.height // scale, framing.width // scale)

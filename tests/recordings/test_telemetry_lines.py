@@ -8,7 +8,12 @@ import pytest
 
 from aquaflow.recordings import telemetry_lines
 from aquaflow.recordings.dive_telemetry import DiveTelemetry
-from aquaflow.recordings.telemetry_lines import LONGEST_LINE, TelemetryLines, TelemetryLog, of_line
+from aquaflow.recordings.telemetry_lines import (
+    LONGEST_LINE,
+    TelemetryLines,
+    TelemetryWriter,
+    of_line,
+)
 from aquaflow.types import (
     Acceleration,
     Altitude,
@@ -39,7 +44,7 @@ SAMPLES: list[TelemetrySample] = [
 
 
 def written(path: Path, samples: list[TelemetrySample]) -> Path:
-    log = TelemetryLog(path)
+    log = TelemetryWriter(path)
     log.add(samples)
     log.close()
     return path
@@ -51,7 +56,7 @@ def test_samples_of_every_kind_come_back_with_every_bit(tmp_path: Path) -> None:
 
 
 def test_samples_are_on_the_disk_before_the_file_is_closed(tmp_path: Path) -> None:
-    log = TelemetryLog(tmp_path / "t.jsonl")
+    log = TelemetryWriter(tmp_path / "t.jsonl")
     log.add(SAMPLES)
     assert list(TelemetryLines(log.path).samples()) == SAMPLES
     log.close()
@@ -96,7 +101,7 @@ def test_a_full_disk_costs_samples_and_is_counted(
 ) -> None:
     full = Path("/dev/full").open("ab")  # noqa: SIM115 - the log closes it
     monkeypatch.setattr(telemetry_lines, "open_to_append", lambda path: full)
-    log = TelemetryLog(tmp_path / "telemetry.jsonl")
+    log = TelemetryWriter(tmp_path / "telemetry.jsonl")
     for _ in range(100):  # more than waits in memory
         log.add(SAMPLES)
     assert 0 < log.lost < 100 * len(SAMPLES)

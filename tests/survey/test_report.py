@@ -23,7 +23,7 @@ from aquaflow.survey.report import (
     render_report,
     write_report,
 )
-from aquaflow.telemetry.metric_frame import SourceReport
+from aquaflow.telemetry.world_frame import SourceReport
 
 CAMERA = CameraSummary(640, 360, 544.0, "guessed")
 VOID = {"br", "meta", "img", "path", "use", "rect"}

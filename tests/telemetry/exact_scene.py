@@ -18,7 +18,7 @@ from aquaflow.telemetry.factors.factor import Factor
 from aquaflow.telemetry.factors.length import LengthFactor
 from aquaflow.telemetry.factors.position import PlaceFactor, PositionFactor
 from aquaflow.telemetry.factors.velocity import VelocityFactor
-from aquaflow.telemetry.state import State
+from aquaflow.telemetry.state import MetricState
 from aquaflow.telemetry.telemetry import Series
 
 Array = npt.NDArray[np.float64]
@@ -33,7 +33,7 @@ DIFFERENCE_S = 1e-5
 class ExactScene:
     """The true state, and the camera's motion in the map."""
 
-    state: State
+    state: MetricState
     flat: bool
     """True if the vehicle keeps its depth and its attitude."""
     t_s: Array
@@ -44,7 +44,7 @@ class ExactScene:
     def drawn(seed: int, flat: bool = False) -> ExactScene:
         """A random one."""
         rng = np.random.default_rng(seed)
-        state = State(
+        state = MetricState(
             log_scale=float(rng.uniform(-1.0, 1.0)),
             R_nm=Rotation.random(rng=rng).as_matrix(),
             t_n=rng.normal(size=3),
@@ -125,7 +125,7 @@ class ExactScene:
         return AltitudeFactor(series, path, np.tile(rock_m, (40, 1)), s)
 
 
-def disturbed(state: State, seed: int, size: float) -> State:
+def disturbed(state: MetricState, seed: int, size: float) -> MetricState:
     """A state near another, in every parameter."""
     step = size * np.random.default_rng(seed).normal(size=16)
     return state.moved(step)

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow.lab.synthetic import SyntheticConfig
 from aquaflow.telemetry.estimator import Estimate
-from aquaflow.telemetry.metric_frame import SourceReport
 from aquaflow.telemetry.telemetry import Telemetry
+from aquaflow.telemetry.world_frame import SourceReport
 from aquaflow.types import KIND_OF, Altitude, Attitude, Depth, TelemetrySample, Velocity
 from tests.telemetry.simulated_dives import Swum, estimated, swum
 

@@ -15,9 +15,9 @@ from aquaflow.lab.synthetic import SyntheticConfig
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.dead_reckoning import carried_from
 from aquaflow.telemetry.estimator import Estimate, estimate
-from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.telemetry.problem import Carried
 from aquaflow.telemetry.telemetry import Telemetry
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.types import Velocity
 from tests.telemetry.simulated_dives import (
     NOTHING,
@@ -158,7 +158,7 @@ def test_nothing_is_carried_from_a_sub_map_without_metres() -> None:
     made = dive(0)
     first, second = parts(made)
     before = one(made, first, heading=True)
-    for frame in (MetricFrame.unknown(), replace(before.frame, level=False)):
+    for frame in (WorldFrame.unknown(), replace(before.frame, level=False)):
         assert carried_from(replace(before, frame=frame), first, made.telemetry, second) is None
     nothing = CameraPath(np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 3)))
     assert carried_from(before, first, made.telemetry, nothing) is None

@@ -16,8 +16,8 @@ from aquaflow.lab.synthetic import SyntheticConfig
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.dead_reckoning import carried_from
 from aquaflow.telemetry.estimator import Estimate, estimate
-from aquaflow.telemetry.metric_frame import SourceReport
 from aquaflow.telemetry.telemetry import Telemetry
+from aquaflow.telemetry.world_frame import SourceReport
 from aquaflow.types import (
     Acceleration,
     Altitude,

@@ -14,7 +14,7 @@ from aquaflow.telemetry.factors.attitude import ForceFactor, HeadingFactor, Tilt
 from aquaflow.telemetry.factors.factor import Factor, axes_along
 from aquaflow.telemetry.factors.position import PositionFactor
 from aquaflow.telemetry.factors.velocity import VelocityFactor
-from aquaflow.telemetry.state import LAG, SCALE, P, State
+from aquaflow.telemetry.state import LAG, SCALE, MetricState, P
 from aquaflow.telemetry.telemetry import Series
 from tests.telemetry.exact_scene import ExactScene, disturbed
 
@@ -31,7 +31,7 @@ def every(scene: ExactScene) -> list[Factor]:
     return [*scene.factors(), *([scene.altitude()] if scene.flat else [])]
 
 
-def full_jacobian(factor: Factor, state: State) -> Array:
+def full_jacobian(factor: Factor, state: MetricState) -> Array:
     """[N, D, P] by the five-point stencil, of every parameter."""
     columns = []
     for k in range(P):
@@ -95,7 +95,7 @@ def test_a_fix_that_is_older_than_it_says_shows_as_lag() -> None:
     t = np.arange(0.0, 20.0)
     way = np.column_stack([0.5 * t, 0.2 * t, np.zeros_like(t)])
     path = CameraPath(t, np.tile(np.eye(3), (len(t), 1, 1)), way)
-    state = State(0.0, np.eye(3), np.zeros(3), np.eye(3), np.zeros(3), np.eye(3))
+    state = MetricState(0.0, np.eye(3), np.zeros(3), np.eye(3), np.zeros(3), np.eye(3))
     fixes = way[5:15, :2] - 0.8 * np.array([0.5, 0.2])
     factor = PositionFactor("usbl", t[5:15], fixes, np.full(10, 0.1), path)
     step = np.zeros(P)
@@ -130,7 +130,7 @@ def test_an_error_of_the_scale_keeps_its_sign_when_the_vehicle_turns_round() -> 
     path = CameraPath(t, np.tile(np.eye(3), (len(t), 1, 1)), way)
     v = np.gradient(x, t)
     series = Series("dvl", t, np.column_stack([v, 0.0 * t, 0.0 * t, 0.01 + 0.0 * t]))
-    state = State(0.01, np.eye(3), np.zeros(3), np.eye(3), np.zeros(3), np.eye(3))
+    state = MetricState(0.01, np.eye(3), np.zeros(3), np.eye(3), np.zeros(3), np.eye(3))
     along = VelocityFactor(series, path).residuals(state)[:, 0]
     apart_from_the_turn = np.delete(along, [len(along) // 2 - 1, len(along) // 2])
     assert (apart_from_the_turn > 0.005).all()

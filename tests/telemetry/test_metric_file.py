@@ -15,12 +15,12 @@ from aquaflow.telemetry.metric_file import (
     read_metric_file,
     write_metric_file,
 )
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from tests.metric_scenes import metric_frame
 
 
-def written(folder: Path) -> dict[int, MetricFrame]:
-    frames = {0: MetricFrame.unknown(), 2: metric_frame()}
+def written(folder: Path) -> dict[int, WorldFrame]:
+    frames = {0: WorldFrame.unknown(), 2: metric_frame()}
     write_metric_file(folder, frames, main=2)
     return frames
 

@@ -11,13 +11,13 @@ from aquaflow.telemetry.factors.factor import Factor
 from aquaflow.telemetry.factors.length import LengthFactor
 from aquaflow.telemetry.noise import Process, SlowPart
 from aquaflow.telemetry.solve import Solution, solve
-from aquaflow.telemetry.state import HEADING, SCALE, SHIFT, TURN, P, State
+from aquaflow.telemetry.state import HEADING, SCALE, SHIFT, TURN, MetricState, P
 from tests.telemetry.exact_scene import ExactScene, disturbed
 
 Array = npt.NDArray[np.float64]
 
 PRIOR = np.full(P, 1e3)
-START = State(0.0, np.eye(3), np.zeros(3), np.eye(3), np.zeros(3), np.eye(3))
+START = MetricState(0.0, np.eye(3), np.zeros(3), np.eye(3), np.zeros(3), np.eye(3))
 SIGMA = 0.02
 
 
@@ -33,22 +33,24 @@ class Points(Factor):
         self.sigma = np.full(len(points_m), SIGMA)
         self._m, self._n = points_m, points_n
 
-    def residuals(self, state: State) -> Array:
+    def residuals(self, state: MetricState) -> Array:
         """[N, 3] m."""
         return np.asarray(state.scale * self._m @ state.R_nm.T + state.t_n - self._n)
 
 
-def truth(seed: int) -> State:
+def truth(seed: int) -> MetricState:
     return disturbed(START, seed, 0.4)
 
 
-def points(state: State, rng: np.random.Generator, count: int = 40, noise: float = 1.0) -> Points:
+def points(
+    state: MetricState, rng: np.random.Generator, count: int = 40, noise: float = 1.0
+) -> Points:
     m = rng.normal(size=(count, 3))
     n = state.scale * m @ state.R_nm.T + state.t_n
     return Points(m, n + noise * SIGMA * rng.normal(size=n.shape))
 
 
-def error(solution: Solution, true: State) -> Array:
+def error(solution: Solution, true: MetricState) -> Array:
     """[7] of log-scale, turn and shift, as a step from the solution to the truth."""
     found = solution.state
     turn = Rotation.from_matrix(true.R_nm @ found.R_nm.T).as_rotvec()

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from aquaflow.render.water import compose_water
-from aquaflow.water.image_formation import MAX_RESTORED, MIN_TRANSMISSION, Water
+from aquaflow.water.image_formation import MAX_RESTORED, MIN_TRANSMISSION, WaterParameters
 from tests.mapping.mapping_scenes import water
 
 
@@ -37,7 +37,7 @@ def test_pixels_behind_too_much_water_are_flagged_in_any_channel() -> None:
 
 
 def test_thick_water_far_away_overflows_nothing() -> None:
-    thick = Water(*(torch.full((3,), value) for value in (50.0, 0.3, 50.0, 0.1, 50.0)))
+    thick = WaterParameters(*(torch.full((3,), value) for value in (50.0, 0.3, 50.0, 0.1, 50.0)))
     z = torch.full((4, 5), 1e3, requires_grad=True)
     restored, recoverable = thick.restore(torch.rand(4, 5, 3), z)
     restored.sum().backward()
@@ -57,7 +57,7 @@ def test_a_range_below_zero_counts_as_no_water() -> None:
 
 
 def test_restored_radiance_stays_between_black_and_the_cap() -> None:
-    clear_far = Water(*(torch.full((3,), value) for value in (1.0, 0.0, 1.0, 0.0, 1.0)))
+    clear_far = WaterParameters(*(torch.full((3,), value) for value in (1.0, 0.0, 1.0, 0.0, 1.0)))
     bright, _ = clear_far.restore(torch.ones(2, 2, 3), torch.full((2, 2), 2.5))
     assert torch.equal(bright, torch.full((2, 2, 3), MAX_RESTORED))
     dark, _ = water(B_inf=0.5).restore(torch.zeros(2, 2, 3), torch.full((2, 2), 2.5))

@@ -6,14 +6,14 @@ import pytest
 import torch
 
 from aquaflow.config import MediumConfig
-from aquaflow.water.medium import MAX_LOG_FACTOR, Medium, inverse_softplus
+from aquaflow.water.medium import MAX_LOG_FACTOR, LearnedMedium, inverse_softplus
 from tests.mapping.mapping_scenes import pose
 
 AHEAD, DOWN = torch.eye(3), torch.from_numpy(pose((0, 0, 0), (1.3, 0, 0)).R).float()
 
 
-def medium(**keys: float | bool) -> Medium:
-    return Medium(MediumConfig.model_validate(keys), torch.Generator().manual_seed(0))
+def medium(**keys: float | bool) -> LearnedMedium:
+    return LearnedMedium(MediumConfig.model_validate(keys), torch.Generator().manual_seed(0))
 
 
 @pytest.mark.parametrize("raw", [-100.0, 100.0, None])
@@ -95,7 +95,7 @@ def test_the_factor_stays_within_its_limit() -> None:
 
 def test_each_part_of_the_medium_learns_at_its_own_rate() -> None:
     config = MediumConfig(rate=1e-4, directional_rate=1e-2, directional=True)
-    learning = Medium(config, torch.Generator().manual_seed(0))
+    learning = LearnedMedium(config, torch.Generator().manual_seed(0))
     groups = learning.learned_at(config)
     rates = {id(p): group["lr"] for group in groups for p in group["params"]}
     assert rates == {

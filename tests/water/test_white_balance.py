@@ -11,7 +11,7 @@ import torch
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.render.views import View
-from aquaflow.water.image_formation import Water
+from aquaflow.water.image_formation import WaterParameters
 from aquaflow.water.nearest import GAINS, Nearest, kept_by, nearest_of
 from aquaflow.water.parameters import Trial
 from aquaflow.water.pauses import finished
@@ -19,7 +19,7 @@ from aquaflow.water.posed_picture import PosedPicture
 from aquaflow.water.white_balance import WhiteBalance
 from tests.water.water_observations import B_INF, B_RES, BETA, B, D, fitted, sighted
 
-WATER = Water(
+WATER = WaterParameters(
     torch.tensor([0.8, 0.3, 0.2]),
     torch.tensor([0.05, 0.3, 0.4]),
     torch.tensor([0.8, 0.4, 0.3]),
@@ -83,7 +83,7 @@ def test_the_confidence_counts_the_channels_that_were_seen() -> None:
         beta_a = torch.full((3,), 20.0)
         beta_a[:seen_channels] = 0.0
         clear = torch.zeros(3)
-        water = Water(beta_a, clear, clear, clear, clear)
+        water = WaterParameters(beta_a, clear, clear, clear, clear)
         found = balance.recover(torch.full((1, 1, 3), 0.3), torch.ones(1, 1), water)
         assert float(found.confidence) == pytest.approx(seen_channels / 3.0, abs=0.03)
 
@@ -141,7 +141,7 @@ def test_what_was_seen_nearest_has_on_the_mean_the_colour_that_the_camera_saw() 
     estimate = fitted(seen)
     balance = estimate.balance
     assert balance is not None
-    water = Water(
+    water = WaterParameters(
         *(torch.from_numpy(v).float() for v in (estimate.beta_a, estimate.B_inf, estimate.b)),
         torch.from_numpy(B_RES).float(),
         torch.from_numpy(D).float(),

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from aquaflow.config.service import ListenConfig
-from aquaflow.web import Answer, Request, WebServer, connection
+from aquaflow.web import HttpRequest, HttpResponse, WebServer, connection
 from aquaflow.web.access import Access
 from tests.small_recording import GIVE_UP_S
 
@@ -31,9 +31,9 @@ class Told:
         self.asked: list[tuple[str, str, bytes | None]] = []
         self.server = WebServer(config, Access(config), self.answer, "test", most_bytes=100)
 
-    def answer(self, request: Request) -> Answer:
+    def answer(self, request: HttpRequest) -> HttpResponse:
         self.asked.append((request.method, request.target, request.body))
-        return Answer(200, "text/plain", LARGE if request.target == "/large" else b"yes\n")
+        return HttpResponse(200, "text/plain", LARGE if request.target == "/large" else b"yes\n")
 
 
 @pytest.fixture

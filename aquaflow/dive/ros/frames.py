@@ -16,7 +16,7 @@ import numpy as np
 
 from aquaflow.dive.placement import Placement
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 MAP, BODY, CAMERA, OPTICAL = "map", "base_link", "camera", "camera_optical"
 
@@ -27,7 +27,7 @@ BODY_FROM_FRD = np.diag([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True)
-class Link:
+class FrameTransform:
     """A frame in its parent; ``T`` takes coordinates of ``child`` to those of ``parent``, rigid."""
 
     parent: str
@@ -38,22 +38,22 @@ class Link:
 class FrameTree:
     """From ``map`` down to ``camera_optical``; every frame has one parent."""
 
-    def __init__(self, frame: MetricFrame, where: Placement) -> None:
+    def __init__(self, frame: WorldFrame, where: Placement) -> None:
         """``frame`` is that of the sub-map, ``where`` how it is placed upright."""
         self._T_un = where.T_un
-        camera = Link(CAMERA, OPTICAL, Sim3(CAMERA_FROM_OPTICAL, np.zeros(3)))
+        camera = FrameTransform(CAMERA, OPTICAL, Sim3(CAMERA_FROM_OPTICAL, np.zeros(3)))
         self._moving, self.fixed = CAMERA, [camera]
         if frame.T_bc is not None:
             # Lengths of the mounting are metres; of a map in map units its place is unknown.
             t = frame.T_bc.t if frame.metric else np.zeros(3)
             T_bo = Sim3(BODY_FROM_FRD @ frame.T_bc.R, BODY_FROM_FRD @ t)
             self._moving = BODY
-            self.fixed = [Link(BODY, CAMERA, T_bo @ camera.T.inverse()), camera]
+            self.fixed = [FrameTransform(BODY, CAMERA, T_bo @ camera.T.inverse()), camera]
 
-    def moving(self, T_nc: Sim3) -> Link:
+    def moving(self, T_nc: Sim3) -> FrameTransform:
         """The link that moves, for a pose of the camera in n."""
         T_uo = self._T_un @ Sim3(T_nc.R, T_nc.t)
         T = T_uo
         for link in reversed(self.fixed):
             T = T @ link.T.inverse()
-        return Link(MAP, self._moving, T)
+        return FrameTransform(MAP, self._moving, T)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from aquaflow.base.errors import InputError
 from aquaflow.dive.point_cloud import PointCloud
 from aquaflow.dive.ros.definitions import constant, message
-from aquaflow.dive.ros.frames import Link
+from aquaflow.dive.ros.frames import FrameTransform
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 
@@ -54,7 +54,7 @@ def _pose(T: Sim3) -> Any:
     )
 
 
-def transforms(t_ns: int, links: Iterable[Link]) -> Any:
+def transforms(t_ns: int, links: Iterable[FrameTransform]) -> Any:
     """tf2_msgs/TFMessage; the links are rigid."""
     stamped = [
         message(
@@ -74,7 +74,7 @@ def transforms(t_ns: int, links: Iterable[Link]) -> Any:
 
 def pose(
     t_ns: int,
-    link: Link,
+    link: FrameTransform,
     sigma_m: float | None,
     heading_sigma_rad: float | None,
     tilt_sigma_rad: float | None,

@@ -20,7 +20,7 @@ from aquaflow.base.storage.folder_lock import FolderLock
 from aquaflow.base.storage.whole_folder import remove_abandoned
 from aquaflow.config import Config
 from aquaflow.config.batch import BatchConfig
-from aquaflow.lab.batch.job import WRITTEN, Job
+from aquaflow.lab.batch.job import WRITTEN, BatchJob
 from aquaflow.lab.batch.journal import JOURNAL, Journal
 from aquaflow.lab.batch.membership import Sites, add_members, make_site
 from aquaflow.lab.batch.object_store import ObjectStore, is_url
@@ -40,7 +40,7 @@ GIGABYTE_MB = 1000.0
 class Batched:
     """A batch that is over."""
 
-    jobs: list[Job]
+    jobs: list[BatchJob]
     season: Season
     notes: list[str]
     """Sentences about dives that are there, but are no members of the site."""
@@ -116,7 +116,7 @@ def _jobs(
     calibration: str | None,
     cache: str,
     progress: Progress,
-) -> list[Job]:
+) -> list[BatchJob]:
     """The jobs, with the number of threads fixed: another number gives other bytes."""
     fixed = settings.model_copy(update={"threads": settings.threads or 1})
     content = fixed.model_dump(mode="json")
@@ -127,7 +127,7 @@ def _jobs(
             source = each.source if is_url(each.source) else str(Path(each.source).resolve())
             memory = memory_mb(examiner.look(source), each.size_bytes, fixed)
             jobs.append(
-                Job(
+                BatchJob(
                     each.name, source, each.size_bytes, where, cache, content, calibration,
                     content["threads"], memory,
                 )

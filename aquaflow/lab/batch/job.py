@@ -19,7 +19,7 @@ WRITTEN = ("done", "poor")
 
 
 @dataclass(frozen=True)
-class Job:
+class BatchJob:
     """A dive to be made; goes to another process or machine as JSON."""
 
     name: str
@@ -52,13 +52,13 @@ class Job:
         return asdict(self)
 
     @classmethod
-    def of_json(cls, content: dict[str, Any]) -> Job:
+    def of_json(cls, content: dict[str, Any]) -> BatchJob:
         """The job that :meth:`to_json` described."""
         return cls(**content)
 
 
 @dataclass(frozen=True)
-class Outcome:
+class BatchOutcome:
     """What came of one attempt."""
 
     state: State
@@ -82,6 +82,6 @@ class Outcome:
         return asdict(self)
 
     @classmethod
-    def of_json(cls, content: dict[str, Any]) -> Outcome:
+    def of_json(cls, content: dict[str, Any]) -> BatchOutcome:
         """The outcome that :meth:`to_json` described."""
         return cls(**content)

@@ -15,12 +15,12 @@ from aquaflow import __version__
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import sha256_regular
 from aquaflow.base.storage.atomic import is_part, write_json
-from aquaflow.lab.batch.job import Job, Outcome
+from aquaflow.lab.batch.job import BatchJob, BatchOutcome
 
 MANIFEST = "manifest.json"
 
 
-def write_manifest(dive: Path, job: Job, outcome: Outcome) -> None:
+def write_manifest(dive: Path, job: BatchJob, outcome: BatchOutcome) -> None:
     """Write the manifest of the finished ``dive``.
 
     Raises:
@@ -56,7 +56,7 @@ def files_of(dive: Path) -> list[Path]:
     )
 
 
-def earlier_outcome(manifest: dict[str, Any], job: Job, where: str) -> Outcome:
+def earlier_outcome(manifest: dict[str, Any], job: BatchJob, where: str) -> BatchOutcome:
     """What came of ``job`` when the dive with this manifest was written.
 
     Raises:
@@ -64,7 +64,7 @@ def earlier_outcome(manifest: dict[str, Any], job: Job, where: str) -> Outcome:
     """
     try:
         same = manifest["job"] == job.digest()
-        found = Outcome.of_json(manifest["outcome"] | {"earlier": True})
+        found = BatchOutcome.of_json(manifest["outcome"] | {"earlier": True})
     except (KeyError, TypeError) as error:
         raise InputError(f"{where}/{MANIFEST} is damaged; remove that dive") from error
     if not same:

@@ -19,7 +19,7 @@ class StoreError(InputError):
 
 
 @dataclass(frozen=True)
-class Entry:
+class StoredObject:
     """A file or folder in an object store."""
 
     name: str
@@ -51,7 +51,7 @@ class ObjectStore:
             self._system, root = fsspec.core.url_to_fs(self.url, use_listings_cache=False)
             self._root = str(root).rstrip("/")
 
-    def entries(self) -> list[Entry]:
+    def entries(self) -> list[StoredObject]:
         """What lies right in the URL, by name; hidden names are left out.
 
         Raises:
@@ -67,7 +67,7 @@ class ObjectStore:
                     url = f"{self.url}/{name}"
                     folder = each["type"] == "directory"
                     size = self._system.du(path) if folder else each["size"]
-                    found.append(Entry(name, url, folder, int(size)))
+                    found.append(StoredObject(name, url, folder, int(size)))
         return sorted(found, key=lambda entry: entry.name)
 
     def size_bytes(self) -> int:

@@ -13,7 +13,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from aquaflow.base.errors import InputError
-from aquaflow.lab.batch.job import Job, Outcome
+from aquaflow.lab.batch.job import BatchJob, BatchOutcome
 
 PROGRAM = "aquaflow.lab.batch.ray_driver"
 JOIN_S = 90.0
@@ -55,12 +55,12 @@ class RayWorkers:
             self.close()
             raise
 
-    def takes(self, job: Job) -> bool:
+    def takes(self, job: BatchJob) -> bool:
         """True until the cluster has some more than it can work on: it packs them itself."""
         most = max(1, int(self._cores)) * (1 + QUEUED_PER_CORE)
         return len(self._running) < (most if self._most is None else min(most, self._most))
 
-    def start(self, job: Job) -> None:
+    def start(self, job: BatchJob) -> None:
         """Hand the job to the cluster."""
         assert self._process.stdin is not None
         self._running.add(job.name)
@@ -70,7 +70,7 @@ class RayWorkers:
         except OSError as error:
             raise self._gone("its driver ended") from error
 
-    def wait(self, timeout_s: float) -> tuple[str, Outcome] | None:
+    def wait(self, timeout_s: float) -> tuple[str, BatchOutcome] | None:
         """The next job that ends."""
         deadline_s = time.monotonic() + timeout_s
         while True:
@@ -89,7 +89,7 @@ class RayWorkers:
             self._cores = message.get("cores", self._cores)
             if "done" in message:
                 self._running.discard(message["done"])
-                return message["done"], Outcome.of_json(message["outcome"])
+                return message["done"], BatchOutcome.of_json(message["outcome"])
 
     def close(self) -> None:
         """Leave the cluster, which then stops what it works on for us."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from aquaflow.base.errors import AquaFlowError, InputError, printable, reason_of
-from aquaflow.lab.batch.object_store import Entry, ObjectStore, is_url
+from aquaflow.lab.batch.object_store import ObjectStore, StoredObject, is_url
 from aquaflow.sources import camera_reader
 
 ANY_FOLDER = 1
@@ -50,7 +50,7 @@ def find_recordings(dives: str) -> list[Recording]:
     return sorted(made, key=lambda recording: recording.name)
 
 
-def _may_be(entry: Entry) -> bool:
+def _may_be(entry: StoredObject) -> bool:
     return entry.is_folder or PurePosixPath(entry.name).suffix.lower() not in NO_RECORDINGS
 
 

@@ -16,12 +16,12 @@ from typing import Any
 from aquaflow import __version__
 from aquaflow.base.errors import InputError
 from aquaflow.base.storage.whole_folder import working_folder
-from aquaflow.lab.batch.job import WRITTEN, Job, Outcome
+from aquaflow.lab.batch.job import WRITTEN, BatchJob, BatchOutcome
 from aquaflow.lab.batch.manifest import write_manifest
 from aquaflow.lab.batch.mapping_process import outcome_of_failure
 from aquaflow.lab.batch.object_store import ObjectStore, StoreError, is_url
-from aquaflow.lab.batch.site import Site, open_site
-from aquaflow.lab.batch.started import Started
+from aquaflow.lab.batch.site import DiveStore, open_site
+from aquaflow.lab.batch.started import RunningProcesses
 
 PROGRAM = "aquaflow.lab.batch.mapping_process"
 KILOBYTE = 1024
@@ -30,24 +30,24 @@ MEGABYTE = 1e6
 """Bytes."""
 
 
-def run_job(job: Job, started: Started | None = None) -> Outcome:
+def run_job(job: BatchJob, started: RunningProcesses | None = None) -> BatchOutcome:
     """Make the dive of ``job`` if it is not there yet; raises nothing.
 
     ``started`` is told of the process, so that it can be stopped.
     """
     begin_s = time.monotonic()
     try:
-        outcome = _attempt(job, started or Started())
+        outcome = _attempt(job, started or RunningProcesses())
     except StoreError as error:
-        outcome = Outcome("lost", str(error))
+        outcome = BatchOutcome("lost", str(error))
     except Exception as error:
-        outcome = Outcome(**outcome_of_failure(error))
+        outcome = BatchOutcome(**outcome_of_failure(error))
     if outcome.earlier:
         return outcome
     return replace(outcome, node=socket.gethostname(), wall_s=round(time.monotonic() - begin_s, 3))
 
 
-def _attempt(job: Job, started: Started) -> Outcome:
+def _attempt(job: BatchJob, started: RunningProcesses) -> BatchOutcome:
     if job.version != __version__:
         raise InputError(
             f"{socket.gethostname()} has AquaFlow {__version__}, the batch is of {job.version}; "
@@ -61,7 +61,7 @@ def _attempt(job: Job, started: Started) -> Outcome:
         return _make(job, site, work, started)
 
 
-def _make(job: Job, site: Site, work: Path, started: Started) -> Outcome:
+def _make(job: BatchJob, site: DiveStore, work: Path, started: RunningProcesses) -> BatchOutcome:
     source = job.source
     if is_url(source):
         source = str(ObjectStore(source).fetch(work / "recording"))
@@ -73,7 +73,9 @@ def _make(job: Job, site: Site, work: Path, started: Started) -> Outcome:
     return outcome
 
 
-def _map(job: Job, source: str, work: Path, dive: Path, started: Started) -> Outcome:
+def _map(
+    job: BatchJob, source: str, work: Path, dive: Path, started: RunningProcesses
+) -> BatchOutcome:
     """Map in a new process, and wait for it."""
     calibration = None
     if job.calibration is not None:
@@ -99,7 +101,7 @@ def _environment(threads: int) -> dict[str, str]:
     return dict(os.environ) | dict.fromkeys(fixed, str(threads))
 
 
-def _answer(process: subprocess.Popen[bytes], asked: bytes, memory_mb: int) -> Outcome:
+def _answer(process: subprocess.Popen[bytes], asked: bytes, memory_mb: int) -> BatchOutcome:
     assert process.stdin is not None
     assert process.stdout is not None
     try:
@@ -116,9 +118,9 @@ def _answer(process: subprocess.Popen[bytes], asked: bytes, memory_mb: int) -> O
         "peak_mb": round(usage.ru_maxrss * KILOBYTE / MEGABYTE, 1),
     }
     try:
-        return Outcome(**json.loads(text), **measured)
+        return BatchOutcome(**json.loads(text), **measured)
     except (ValueError, TypeError):
-        return Outcome("lost", _died(process.returncode, memory_mb), **measured)
+        return BatchOutcome("lost", _died(process.returncode, memory_mb), **measured)
 
 
 def _died(code: int, memory_mb: int) -> str:

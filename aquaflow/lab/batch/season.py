@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from aquaflow.base.errors import AquaFlowError
-from aquaflow.lab.batch.job import WRITTEN, Job, Outcome
+from aquaflow.lab.batch.job import WRITTEN, BatchJob, BatchOutcome
 from aquaflow.lab.batch.journal import Journal
 from aquaflow.lab.batch.workers import Workers
 
@@ -29,7 +29,7 @@ class End(Enum):
 class Season:
     """What came of each dive."""
 
-    outcomes: dict[str, Outcome] = field(default_factory=dict)
+    outcomes: dict[str, BatchOutcome] = field(default_factory=dict)
     """By name; of a dive that was not tried to its end, none."""
     end: End = End.ALL
     reason: str = ""
@@ -40,13 +40,13 @@ class Season:
 class _Queue:
     """Jobs that wait, and how often each was tried."""
 
-    waiting: deque[Job]
+    waiting: deque[BatchJob]
     attempts: dict[str, int] = field(default_factory=dict)
-    running: dict[str, Job] = field(default_factory=dict)
+    running: dict[str, BatchJob] = field(default_factory=dict)
 
 
 def run_season(
-    jobs: Sequence[Job],
+    jobs: Sequence[BatchJob],
     workers: Workers,
     journal: Journal,
     retries: int,
@@ -89,7 +89,7 @@ def _start(queue: _Queue, workers: Workers, journal: Journal) -> None:
 
 
 def _settle(
-    name: str, outcome: Outcome, queue: _Queue, season: Season, journal: Journal, retries: int
+    name: str, outcome: BatchOutcome, queue: _Queue, season: Season, journal: Journal, retries: int
 ) -> None:
     """Note what came of an attempt; what was lost waits again, unless it was tried often enough."""
     job = queue.running.pop(name)
@@ -105,7 +105,7 @@ def _settle(
     season.outcomes[name] = outcome
 
 
-def failed(season: Season, jobs: Sequence[Job]) -> list[Job]:
+def failed(season: Season, jobs: Sequence[BatchJob]) -> list[BatchJob]:
     """Jobs without a dive."""
     outcomes = season.outcomes
     return [j for j in jobs if j.name not in outcomes or outcomes[j.name].state not in WRITTEN]

@@ -7,17 +7,17 @@ from typing import Protocol
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import read_regular
-from aquaflow.lab.batch.job import Job, Outcome
+from aquaflow.lab.batch.job import BatchJob, BatchOutcome
 from aquaflow.lab.batch.manifest import MANIFEST, earlier_outcome, files_of, read_manifest
 from aquaflow.lab.batch.object_store import ObjectStore, is_url
 
 DIVES = "dives"
 
 
-class Site(Protocol):
+class DiveStore(Protocol):
     """Takes finished dives."""
 
-    def finished(self, job: Job) -> Outcome | None:
+    def finished(self, job: BatchJob) -> BatchOutcome | None:
         """What came of ``job`` if its dive is there already, else None.
 
         Raises:
@@ -25,11 +25,11 @@ class Site(Protocol):
         """
         ...
 
-    def work_parent(self, job: Job) -> Path:
+    def work_parent(self, job: BatchJob) -> Path:
         """The local folder in which the dive's working folder is made."""
         ...
 
-    def publish(self, dive: Path, job: Job) -> None:
+    def publish(self, dive: Path, job: BatchJob) -> None:
         """Let the finished local folder ``dive`` be a dive of the site, whole or not at all.
 
         Raises:
@@ -38,7 +38,7 @@ class Site(Protocol):
         ...
 
 
-def open_site(where: str) -> Site:
+def open_site(where: str) -> DiveStore:
     """The site at a path or URL; makes nothing."""
     return StoreSite(where) if is_url(where) else FolderSite(Path(where))
 
@@ -49,7 +49,7 @@ class FolderSite:
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def finished(self, job: Job) -> Outcome | None:
+    def finished(self, job: BatchJob) -> BatchOutcome | None:
         dive = self.path / DIVES / job.name
         if not dive.exists():
             return None
@@ -61,10 +61,10 @@ class FolderSite:
             ) from error
         return earlier_outcome(read_manifest(text, str(dive)), job, str(dive))
 
-    def work_parent(self, job: Job) -> Path:
+    def work_parent(self, job: BatchJob) -> Path:
         return self.path / DIVES
 
-    def publish(self, dive: Path, job: Job) -> None:
+    def publish(self, dive: Path, job: BatchJob) -> None:
         target = self.path / DIVES / job.name
         try:
             dive.rename(target)
@@ -80,15 +80,15 @@ class StoreSite:
     def __init__(self, url: str) -> None:
         self.store = ObjectStore(url)
 
-    def finished(self, job: Job) -> Outcome | None:
+    def finished(self, job: BatchJob) -> BatchOutcome | None:
         where = f"{self.store.url}/{DIVES}/{job.name}"
         text = self.store.read(f"{DIVES}/{job.name}/{MANIFEST}")
         return None if text is None else earlier_outcome(read_manifest(text, where), job, where)
 
-    def work_parent(self, job: Job) -> Path:
+    def work_parent(self, job: BatchJob) -> Path:
         return Path(job.cache)
 
-    def publish(self, dive: Path, job: Job) -> None:
+    def publish(self, dive: Path, job: BatchJob) -> None:
         if self.finished(job) is not None:  # another machine, thought dead, was first
             return
         to = f"{DIVES}/{job.name}"

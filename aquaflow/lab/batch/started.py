@@ -10,7 +10,7 @@ import threading
 from collections.abc import Iterator
 
 
-class Started:
+class RunningProcesses:
     """Processes that run now. Of any thread."""
 
     def __init__(self) -> None:

@@ -6,19 +6,19 @@ import queue
 import threading
 from typing import Protocol
 
-from aquaflow.lab.batch.job import Job, Outcome
+from aquaflow.lab.batch.job import BatchJob, BatchOutcome
 from aquaflow.lab.batch.run_job import run_job
-from aquaflow.lab.batch.started import Started
+from aquaflow.lab.batch.started import RunningProcesses
 
 
 class Workers(Protocol):
     """Make dives, several at once; each by :func:`aquaflow.lab.batch.run_job.run_job`."""
 
-    def takes(self, job: Job) -> bool:
+    def takes(self, job: BatchJob) -> bool:
         """True if ``job`` may be started now."""
         ...
 
-    def start(self, job: Job) -> None:
+    def start(self, job: BatchJob) -> None:
         """Begin ``job``; returns at once.
 
         Raises:
@@ -26,7 +26,7 @@ class Workers(Protocol):
         """
         ...
 
-    def wait(self, timeout_s: float) -> tuple[str, Outcome] | None:
+    def wait(self, timeout_s: float) -> tuple[str, BatchOutcome] | None:
         """Name and outcome of a job that has ended; None if none does in time.
 
         Raises:
@@ -45,12 +45,12 @@ class LocalWorkers:
     def __init__(self, cores: int, memory_mb: int, most: int | None = None) -> None:
         """Use ``cores`` and ``memory_mb`` (1e6 bytes) for at ``most`` so many dives at once."""
         self._cores, self._memory_mb, self._most = cores, memory_mb, most
-        self._jobs: dict[str, Job] = {}
-        self._ended: queue.SimpleQueue[tuple[str, Outcome]] = queue.SimpleQueue()
-        self._started = Started()
+        self._jobs: dict[str, BatchJob] = {}
+        self._ended: queue.SimpleQueue[tuple[str, BatchOutcome]] = queue.SimpleQueue()
+        self._started = RunningProcesses()
         self._threads: list[threading.Thread] = []
 
-    def takes(self, job: Job) -> bool:
+    def takes(self, job: BatchJob) -> bool:
         """True if its cores and memory are free; one alone is always taken."""
         if not self._jobs:
             return True
@@ -62,7 +62,7 @@ class LocalWorkers:
             and sum(each.memory_mb for each in taken) + job.memory_mb <= self._memory_mb
         )
 
-    def start(self, job: Job) -> None:
+    def start(self, job: BatchJob) -> None:
         """Begin in a thread that waits for the process."""
         self._jobs[job.name] = job
         self._threads = [each for each in self._threads if each.is_alive()]
@@ -70,10 +70,10 @@ class LocalWorkers:
         self._threads.append(thread)
         thread.start()
 
-    def _run(self, job: Job) -> None:
+    def _run(self, job: BatchJob) -> None:
         self._ended.put((job.name, run_job(job, self._started)))
 
-    def wait(self, timeout_s: float) -> tuple[str, Outcome] | None:
+    def wait(self, timeout_s: float) -> tuple[str, BatchOutcome] | None:
         """The next that ends."""
         try:
             name, outcome = self._ended.get(timeout=timeout_s)

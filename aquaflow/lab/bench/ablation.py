@@ -15,7 +15,7 @@ from rich.table import Table
 from aquaflow.base.errors import AquaFlowError, InputError
 from aquaflow.config.presets import merged
 from aquaflow.lab.bench import machine
-from aquaflow.lab.bench.job import Job
+from aquaflow.lab.bench.job import BenchJob
 from aquaflow.lab.bench.runner import Perform, Progress, Row, in_process, row_of
 from aquaflow.lab.bench.scene import BenchmarkScene
 from aquaflow.lab.evaluation.oracle_views import make_oracle
@@ -193,7 +193,7 @@ def ablate(
             overrides = part.overrides
             if part.oracle:
                 overrides = merged(overrides, {"prior": {"folder": str(_oracle(scene, out))}})
-            job = Job(scene, PRESET, folder, overrides=overrides)
+            job = BenchJob(scene, PRESET, folder, overrides=overrides)
             found[part.name].append(row_of(job, machine.load(), perform(job)))
             done += 1
             progress("runs", done, total)

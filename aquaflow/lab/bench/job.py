@@ -15,7 +15,7 @@ RENDERERS = {"cpu": "cpu", "cuda": "gsplat"}
 
 
 @dataclass(frozen=True)
-class Job:
+class BenchJob:
     """One contender on one scene."""
 
     scene: BenchmarkScene
@@ -45,7 +45,7 @@ class Job:
         return json.dumps(asdict(self))
 
     @staticmethod
-    def from_text(text: str) -> Job:
+    def from_text(text: str) -> BenchJob:
         """The job that :meth:`to_text` wrote."""
         data = json.loads(text)
-        return Job(**{**data, "scene": BenchmarkScene(**data["scene"])})
+        return BenchJob(**{**data, "scene": BenchmarkScene(**data["scene"])})

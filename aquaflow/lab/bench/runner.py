@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from aquaflow.lab.bench import machine
-from aquaflow.lab.bench.job import Job
+from aquaflow.lab.bench.job import BenchJob
 from aquaflow.lab.bench.scene import BenchmarkScene
 from aquaflow.lab.evaluation.water_peers.contract import NAMES
 
@@ -38,7 +38,7 @@ KEYS = (
 """In every row; null where the run has no such thing."""
 
 Row = dict[str, Any]
-Perform = Callable[[Job], Row]
+Perform = Callable[[BenchJob], Row]
 Progress = Callable[[str, int, int | None], None]
 
 
@@ -61,7 +61,7 @@ def jobs_for(
     repeats: int,
     out: Path,
     device: str | None = None,
-) -> list[Job]:
+) -> list[BenchJob]:
     """All runs in the order of running.
 
     Repeats are the outermost loop and every scene sees its contenders in another order, so that a
@@ -74,7 +74,7 @@ def jobs_for(
             for contender in [*contenders[turn:], *contenders[:turn]]:
                 name, peer = f"{_file_name(scene.name)}_{contender.name}_{repeat}", contender.peer
                 folder = str(out / "dives" / name)
-                jobs.append(Job(scene, contender.preset, folder, peer, None, repeat, device))
+                jobs.append(BenchJob(scene, contender.preset, folder, peer, None, repeat, device))
     return jobs
 
 
@@ -82,7 +82,9 @@ def _file_name(name: str) -> str:
     return "".join(letter if letter.isalnum() else "_" for letter in name)
 
 
-def run_all(jobs: Sequence[Job], progress: Progress, perform: Perform | None = None) -> list[Row]:
+def run_all(
+    jobs: Sequence[BenchJob], progress: Progress, perform: Perform | None = None
+) -> list[Row]:
     """One row a job, in their order; never raises for a run that fails."""
     rows = []
     for done, job in enumerate(jobs, 1):
@@ -91,7 +93,7 @@ def run_all(jobs: Sequence[Job], progress: Progress, perform: Perform | None = N
     return rows
 
 
-def row_of(job: Job, load: float | None, result: Row) -> Row:
+def row_of(job: BenchJob, load: float | None, result: Row) -> Row:
     """The stable keys of a row (docs/formats.md#json-output), then all else that it measured."""
     return {
         "scene": job.scene.name,
@@ -105,7 +107,7 @@ def row_of(job: Job, load: float | None, result: Row) -> Row:
     }
 
 
-def in_process(job: Job) -> Row:
+def in_process(job: BenchJob) -> Row:
     """The worker's answer, or why there is none."""
     return answer_of(WORKER, job.to_text(), LIMIT_S)
 

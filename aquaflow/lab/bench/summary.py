@@ -36,7 +36,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Line:
+class SummaryLine:
     """All repeats of one contender on one scene."""
 
     scene: str
@@ -67,7 +67,7 @@ def contender_of(row: Row) -> str:
     return str(row["peer"] or row["preset"])
 
 
-def lines_of(rows: Sequence[Row]) -> list[Line]:
+def lines_of(rows: Sequence[Row]) -> list[SummaryLine]:
     """One line for each scene and contender; scenes in the order of running, peers last."""
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     lines = []
@@ -75,7 +75,9 @@ def lines_of(rows: Sequence[Row]) -> list[Line]:
         here = [row for row in rows if row["scene"] == scene]
         first_seen = list(dict.fromkeys(contender_of(row) for row in here))
         for name in sorted(first_seen, key=_rank):
-            lines.append(Line(scene, name, [row for row in here if contender_of(row) == name]))
+            lines.append(
+                SummaryLine(scene, name, [row for row in here if contender_of(row) == name])
+            )
     return lines
 
 

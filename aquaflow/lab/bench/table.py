@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from aquaflow.lab.bench.summary import COLUMNS, NOTES, TOTAL_MS, Column, Line, lines_of
+from aquaflow.lab.bench.summary import COLUMNS, NOTES, TOTAL_MS, Column, SummaryLine, lines_of
 
 Row = dict[str, Any]
 
@@ -42,7 +42,7 @@ def measured_columns(rows: Sequence[Row]) -> list[Column]:
     ]
 
 
-def _cells(line: Line, columns: Sequence[Column]) -> list[str]:
+def _cells(line: SummaryLine, columns: Sequence[Column]) -> list[str]:
     if len(line.failures) == len(line.rows):
         return ["failed" if column is TOTAL_MS else "-" for column in columns]
     return [line.cell(column) for column in columns]

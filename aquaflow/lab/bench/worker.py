@@ -14,7 +14,7 @@ import numpy as np
 from aquaflow.base.errors import InputError, NotMappedError
 from aquaflow.geometry.camera import load_camera
 from aquaflow.lab.bench.answer import answer
-from aquaflow.lab.bench.job import Job
+from aquaflow.lab.bench.job import BenchJob
 from aquaflow.lab.bench.memory import peak_memory_mb
 from aquaflow.lab.bench.peers import run_peer
 from aquaflow.lab.bench.scene import BenchmarkScene
@@ -25,7 +25,7 @@ from aquaflow.lab.evaluation.water_peers.contract import NAMES
 from aquaflow.sources import open_recording
 
 
-def perform(job: Job) -> dict[str, Any]:
+def perform(job: BenchJob) -> dict[str, Any]:
     """Run the job and measure what it wrote; a map that ends with 0 Gaussians has failed.
 
     No run hears telemetry, also where the recording has it: the table compares monocular methods,
@@ -59,7 +59,7 @@ def perform(job: Job) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    answer(Job.from_text, perform)
+    answer(BenchJob.from_text, perform)
 
 
 # --------------------------------------------------------------------------------------------------

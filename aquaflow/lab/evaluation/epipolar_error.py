@@ -70,7 +70,7 @@ class EpipolarError:
 
 
 @dataclass(frozen=True)
-class _Moment:
+class _PosedKeypoints:
     """One picture's keypoints and the poses of that moment."""
 
     t_s: float
@@ -115,7 +115,7 @@ def evaluate_epipolar(dive: Path, recording: Path, truth: Path | None) -> Epipol
 
 def _moments(
     dive: Path, recording: Path, estimate: Trajectory, true: Trajectory | None
-) -> Iterator[_Moment]:
+) -> Iterator[_PosedKeypoints]:
     """The recording's pictures at the times of the poses, prepared as the dive's but wider."""
     read = Dive(dive)
     source, calibration = read.config.source, read.calibration
@@ -134,7 +134,7 @@ def _moments(
             camera = prepared.camera
             if calibration is None:  # what the dive found
                 camera = read.camera.scaled(camera.width, camera.height)
-            yield _Moment(
+            yield _PosedKeypoints(
                 float(estimate.t_s[row]),
                 camera,
                 detect(normalised_grey(prepared.image)),
@@ -149,7 +149,7 @@ def _pose(trajectory: Trajectory, row: int) -> Sim3:
     return Sim3(trajectory.R_wc[row], trajectory.positions[row])
 
 
-def _gap(moments: list[_Moment], apart: int) -> GapError | None:
+def _gap(moments: list[_PosedKeypoints], apart: int) -> GapError | None:
     """All pairs that are ``apart`` moments apart; None if no pair has enough matches."""
     pairs = [
         pair
@@ -171,7 +171,7 @@ def _gap(moments: list[_Moment], apart: int) -> GapError | None:
     )
 
 
-def _distances(a: _Moment, b: _Moment) -> tuple[Array, Array, Array] | None:
+def _distances(a: _PosedKeypoints, b: _PosedKeypoints) -> tuple[Array, Array, Array] | None:
     """[M] px each: under the dive's relative pose, under the best one, and under the truth's (NaN
     without one); None where too few keypoints match."""
     in_a, in_b = match_keypoints(a.keypoints, b.keypoints)

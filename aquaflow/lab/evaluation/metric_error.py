@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from aquaflow.lab.evaluation.trajectory import Trajectory
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 Array = npt.NDArray[np.float64]
 
@@ -45,7 +45,7 @@ class MetricError:
 
 
 def metric_error(
-    frame: MetricFrame,
+    frame: WorldFrame,
     alignment_scale: float,
     ate_rmse_m: float,
     level: tuple[Trajectory, Trajectory] | None = None,

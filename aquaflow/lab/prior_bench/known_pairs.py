@@ -15,14 +15,14 @@ from aquaflow.lab.evaluation.matching import HEIGHT, LEVELS, WIDTH, homography_p
 from aquaflow.lab.prior_bench.pair import KnownPair, Picture
 from aquaflow.lab.training.correspondences import correspondences, overlap
 from aquaflow.lab.training.held_out import LEAST_OVERLAP, SEED
-from aquaflow.lab.training.pair_generator.cameras import WIDE, WIDER, Motion
+from aquaflow.lab.training.pair_generator.cameras import WIDE, WIDER, PairMotion
 from aquaflow.lab.training.pair_generator.draw import Draw
 from aquaflow.lab.training.pair_generator.drawing import through_water
 from aquaflow.lab.training.pair_generator.pool import Pool
 from aquaflow.lab.training.pair_generator.stored_pairs import SHARD
 from aquaflow.lab.training.pairs import Pair, ViewBatch
 
-GENERATED: dict[str, Motion] = {"generated, wide": WIDE, "generated, wider": WIDER}
+GENERATED: dict[str, PairMotion] = {"generated, wide": WIDE, "generated, wider": WIDER}
 """The held-out motions, by the name of their group."""
 SIDES = (320, 240)
 """Width and height of generated pictures. Training looks at windows of 128 x 96: networks of others

@@ -17,7 +17,7 @@ ROTATION_ERROR = 1e-9
 
 
 @dataclass(frozen=True)
-class Outcome:
+class StressOutcome:
     """What one case did."""
 
     worst: float
@@ -35,7 +35,7 @@ class Case:
     family: str
     guard: str
     """The function or constant that must catch it, as ``module.name``."""
-    run: Callable[[int], Outcome]
+    run: Callable[[int], StressOutcome]
     """From the seed of all random draws."""
     long: bool
     """True if it takes minutes and belongs to the long form only."""
@@ -51,7 +51,7 @@ def case(
     """Register a function (check, seed) under its own name."""
 
     def register(body: Callable[[Check, int], None]) -> Callable[[Check, int], None]:
-        def run(seed: int) -> Outcome:
+        def run(seed: int) -> StressOutcome:
             check = Check()
             body(check, seed)
             return check.outcome()
@@ -110,10 +110,10 @@ class Check:
         length = float(np.linalg.norm(T.quaternion))
         self.below(f"{what}: quaternion length - 1", abs(length - 1.0), ROTATION_ERROR)
 
-    def outcome(self) -> Outcome:
+    def outcome(self) -> StressOutcome:
         """Passed, or the first failure and how many more there are."""
         if self._failures:
             more = len(self._failures) - 1
             detail = self._failures[0] + (f" (and {more} more)" if more else "")
-            return Outcome(self._worst if self._ratio > 1.0 else math.inf, False, detail)
-        return Outcome(self._worst, True, self._measured)
+            return StressOutcome(self._worst if self._ratio > 1.0 else math.inf, False, detail)
+        return StressOutcome(self._worst, True, self._measured)

@@ -20,7 +20,7 @@ COUNT = 24
 
 
 @dataclass
-class Cloud:
+class RandomGaussians:
     """Renderer inputs, in the order of its arguments."""
 
     means: Tensor
@@ -34,12 +34,12 @@ class Cloud:
         return [self.means, self.quats, self.scales, self.opacities, self.colours]
 
 
-def cloud(seed: int, count: int = COUNT) -> Cloud:
+def cloud(seed: int, count: int = COUNT) -> RandomGaussians:
     """Sound Gaussians 1 to 3 m before a camera at the origin."""
     rng = torch.Generator().manual_seed(seed)
     depth = 1.0 + 2.0 * torch.rand(count, 1, generator=rng)
     across = (torch.rand(count, 2, generator=rng) - 0.5) * torch.tensor([1.0, 0.7])
-    return Cloud(
+    return RandomGaussians(
         torch.cat([across, torch.ones(count, 1)], 1) * depth,
         torch.randn(count, 4, generator=rng),
         0.05 + 0.1 * torch.rand(count, 3, generator=rng),
@@ -50,7 +50,7 @@ def cloud(seed: int, count: int = COUNT) -> Cloud:
 
 def _drawn(
     check: Check,
-    gaussians: Cloud,
+    gaussians: RandomGaussians,
     culled: Tensor | None = None,  # [N] bool
 ) -> None:
     """Both renderers: finite forward and backward, alpha in [0, 1], ``culled`` [N] without trace.
@@ -89,7 +89,7 @@ def _half() -> Tensor:
     return torch.arange(COUNT) % 2 == 0
 
 
-def _spoiled(seed: int, change: Callable[[Cloud, Tensor], None]) -> Cloud:
+def _spoiled(seed: int, change: Callable[[RandomGaussians, Tensor], None]) -> RandomGaussians:
     gaussians = cloud(seed)
     change(gaussians, _half())
     return gaussians
@@ -111,7 +111,7 @@ def tiny_scales(check: Check, seed: int) -> None:
 def huge_scales(check: Check, seed: int) -> None:
     """Scales of 100 km and more, whose determinants leave float32."""
 
-    def change(g: Cloud, i: Tensor) -> None:
+    def change(g: RandomGaussians, i: Tensor) -> None:
         g.scales[i] = 1e12
         g.scales[2] = 1e5
 
@@ -122,7 +122,7 @@ def huge_scales(check: Check, seed: int) -> None:
 def zero_and_denormal_quaternions(check: Check, seed: int) -> None:
     """Quaternions without a direction."""
 
-    def change(g: Cloud, i: Tensor) -> None:
+    def change(g: RandomGaussians, i: Tensor) -> None:
         g.quats[i] = 0.0
         g.quats[0], g.quats[2] = 1e-40, 1e-13
 
@@ -133,7 +133,7 @@ def zero_and_denormal_quaternions(check: Check, seed: int) -> None:
 def opacity_0_and_1(check: Check, seed: int) -> None:
     """Fully opaque ones before others, and ones that are not there."""
 
-    def change(g: Cloud, i: Tensor) -> None:
+    def change(g: RandomGaussians, i: Tensor) -> None:
         g.opacities[:] = 1.0
         g.opacities[i] = 0.0
 
@@ -150,7 +150,7 @@ def behind_the_camera(check: Check, seed: int) -> None:
 def on_the_camera_centre(check: Check, seed: int) -> None:
     """At range zero, where the projection divides by zero, and a centimetre away."""
 
-    def change(g: Cloud, i: Tensor) -> None:
+    def change(g: RandomGaussians, i: Tensor) -> None:
         g.means[i] = 0.0
         g.means[2, 2] = 0.01
 
@@ -161,7 +161,7 @@ def on_the_camera_centre(check: Check, seed: int) -> None:
 def not_finite(check: Check, seed: int) -> None:
     """NaN and infinity in every input."""
 
-    def change(g: Cloud, i: Tensor) -> None:
+    def change(g: RandomGaussians, i: Tensor) -> None:
         bad = (float("nan"), float("inf"), float("-inf"))
         for n, row in enumerate(torch.nonzero(i)[:, 0].tolist()):
             g.tensors()[n % 5][row] = bad[n % 3]
@@ -185,7 +185,7 @@ def one_gaussian(check: Check, seed: int) -> None:
 def all_identical(check: Check, seed: int) -> None:
     """Every Gaussian in the same place: their order is undefined, transmittance reaches 0."""
     first = cloud(seed, 1)
-    _drawn(check, Cloud(*(tensor.repeat(500, *[1] * (tensor.dim() - 1)) for tensor in
+    _drawn(check, RandomGaussians(*(tensor.repeat(500, *[1] * (tensor.dim() - 1)) for tensor in
                           first.tensors())))  # fmt: skip
 
 

@@ -15,7 +15,7 @@ import cv2
 import torch
 
 from aquaflow.base.errors import InputError
-from aquaflow.lab.stress.case import REGISTRY, Case, Outcome
+from aquaflow.lab.stress.case import REGISTRY, Case, StressOutcome
 
 FAMILIES = (
     "images", "motion", "time", "water", "gaussians", "solvers", "precision", "soak",
@@ -34,7 +34,7 @@ class Result:
 
     case: Case
     seed: int
-    outcome: Outcome
+    outcome: StressOutcome
 
     @property
     def command(self) -> str:
@@ -99,7 +99,7 @@ def run_case(case: Case, seed: int) -> Result:
             outcome = case.run(seed)
     except Exception as error:
         said = " ".join(str(error).split())[:160]
-        outcome = Outcome(math.inf, False, f"raised {type(error).__name__}: {said}")
+        outcome = StressOutcome(math.inf, False, f"raised {type(error).__name__}: {said}")
     finally:
         logging.getLogger("aquaflow").removeHandler(quiet)
     return Result(case, seed, outcome)

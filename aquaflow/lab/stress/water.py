@@ -13,8 +13,8 @@ from aquaflow.mapping.gaussians.gaussians import raw_colour
 from aquaflow.render.activation import radiance
 from aquaflow.render.view_loss import depth_loss
 from aquaflow.render.water import compose_water, compose_water_torch
-from aquaflow.water.image_formation import Water
-from aquaflow.water.medium import Medium
+from aquaflow.water.image_formation import WaterParameters
+from aquaflow.water.medium import LearnedMedium
 
 RATES = (0.0, 1e-8, 0.01, 0.5, 5.0, 50.0)
 """1/m"""
@@ -24,9 +24,11 @@ LARGEST_ATTENUATION = 3.0e3
 """exp(8): what the clamped optical depth allows."""
 
 
-def _water(beta: float, B_inf: float = 0.3) -> Water:
+def _water(beta: float, B_inf: float = 0.3) -> WaterParameters:
     rate = torch.full((3,), beta, requires_grad=True)
-    return Water(rate, torch.full((3,), B_inf), rate, torch.full((3,), 0.01), torch.full((3,), 1.0))
+    return WaterParameters(
+        rate, torch.full((3,), B_inf), rate, torch.full((3,), 0.01), torch.full((3,), 1.0)
+    )
 
 
 def _ranges() -> Tensor:
@@ -75,7 +77,7 @@ def transmission_to_0(check: Check, seed: int) -> None:
 def B_inf_at_0_and_1(check: Check, seed: int) -> None:
     """Water that scatters nothing, and water that is white: the learnable medium takes both."""
     for B_inf in (0.0, 1.0):
-        medium = Medium(MediumConfig(), torch.Generator().manual_seed(seed))
+        medium = LearnedMedium(MediumConfig(), torch.Generator().manual_seed(seed))
         medium.set_water(torch.full((3,), 0.5), torch.full((3,), B_inf), torch.full((3,), 0.5))
         _medium_is_sound(check, medium)
         check.below("error of B_inf", _off(medium(torch.eye(3)).B_inf, B_inf), 0.02)
@@ -85,7 +87,7 @@ def B_inf_at_0_and_1(check: Check, seed: int) -> None:
 def rates_at_0_and_50(check: Check, seed: int) -> None:
     """The learnable medium starts from clear water and from ink."""
     for rate in (0.0, 50.0):
-        medium = Medium(MediumConfig(), torch.Generator().manual_seed(seed))
+        medium = LearnedMedium(MediumConfig(), torch.Generator().manual_seed(seed))
         medium.set_water(torch.full((3,), rate), torch.full((3,), 0.3), torch.full((3,), rate))
         _medium_is_sound(check, medium)
         check.below("error of beta_a", _off(medium(torch.eye(3)).beta_a, rate), 1e-3)
@@ -142,7 +144,7 @@ def _off(
     return float((values.detach() - wanted).abs().max())
 
 
-def _medium_is_sound(check: Check, medium: Medium) -> None:
+def _medium_is_sound(check: Check, medium: LearnedMedium) -> None:
     water = medium(torch.eye(3))
     total = water.transmission(_ranges()).sum() + water.backscatter(_ranges()).sum()
     total.backward()  # type: ignore[no-untyped-call]

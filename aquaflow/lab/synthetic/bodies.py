@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.lab.synthetic.config import SyntheticConfig
-from aquaflow.lab.synthetic.objects import Rgb, Shape
+from aquaflow.lab.synthetic.objects import Rgb, Solid
 from aquaflow.lab.synthetic.streams import stream
 
 __all__ = ["Bodies"]
@@ -35,7 +35,7 @@ CLIMB = 0.15
 SCALES: tuple[Rgb, ...] = ((0.45, 0.42, 0.30), (0.55, 0.52, 0.50), (0.25, 0.30, 0.38))
 STRIPES: Rgb = (0.08, 0.08, 0.10)
 STRIPED = 0.55
-"""How much of a fish the dark pattern covers (`Shape.covered`)."""
+"""How much of a fish the dark pattern covers (`Solid.covered`)."""
 ARM_CENTRE_M = (0.12, 0.22, 0.5)
 """Right, down, forward of the camera: a manipulator below the dome, its hand in the picture."""
 ARM_AXIS = (-0.35, -0.45, 0.82)
@@ -62,7 +62,7 @@ class Bodies:
         self._arm = Arm(rng.uniform(0.0, 2.0 * np.pi, 3)) if config.arm else None
         self._fish = draw_fish(config.fish, times_s, self._R, self._centres, rng)
 
-    def at(self, k: int) -> list[Shape]:
+    def at(self, k: int) -> list[Solid]:
         """Those of picture ``k``."""
         fish = [each.shape(float(self._t[k])) for each in self._fish]
         if self._arm is None:
@@ -83,13 +83,13 @@ class Fish:
     scales: Rgb
     pattern_m: float
 
-    def shape(self, t_s: float) -> Shape:
+    def shape(self, t_s: float) -> Solid:
         """The fish at a time of the dive."""
         along = self.velocity / np.linalg.norm(self.velocity)
         R = _axes(along, np.array([0.0, 0.0, 1.0]))
         a, b, c = (self.half_length_m * part for part in SLENDER)
         centre = self.at + self.velocity * (t_s - self.t_s)
-        return Shape(
+        return Solid(
             "ellipsoid", centre, R, (a, b, c), self.scales, STRIPES, STRIPED,
             pattern_m=self.pattern_m,
         )  # fmt: skip
@@ -130,7 +130,7 @@ class Arm:
         t_s: float,
         R: Array,  # [3, 3] camera axes
         centre: Array,  # [3] m, of the camera
-    ) -> list[Shape]:
+    ) -> list[Solid]:
         """The tube and the grip at its end."""
         turn = 2.0 * np.pi * t_s / np.array(ARM_PERIOD_S) + self.phase
         middle = np.array(ARM_CENTRE_M) + np.array(ARM_SWAY_M) * np.sin(turn)
@@ -140,8 +140,8 @@ class Arm:
         grip = (2.0 * ARM_RADIUS_M, 2.0 * ARM_RADIUS_M, 0.8 * ARM_RADIUS_M)
         end = centre + R @ (middle + ARM_HALF_M * axis)
         return [
-            Shape("cylinder", centre + R @ middle, axes, tube, METAL, METAL, 0.0, pattern_m=0.3),
-            Shape("ellipsoid", end, axes, grip, GRIP, METAL, 0.3, pattern_m=0.9),
+            Solid("cylinder", centre + R @ middle, axes, tube, METAL, METAL, 0.0, pattern_m=0.3),
+            Solid("ellipsoid", end, axes, grip, GRIP, METAL, 0.3, pattern_m=0.9),
         ]
 
 

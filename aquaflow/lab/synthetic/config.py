@@ -7,7 +7,7 @@ from typing import Any, Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from aquaflow.geometry.port_file import PortFile
-from aquaflow.lab.synthetic.planted_config import Bleached, Placed
+from aquaflow.lab.synthetic.planted_config import Bleached, PlantedObject
 from aquaflow.lab.synthetic.telemetry_noise import TelemetryNoise
 
 __all__ = [
@@ -188,7 +188,7 @@ class SyntheticConfig(BaseModel):
     )
     arm: bool = Field(False, description="true: an arm of the vehicle reaches into the picture")
     telemetry: TelemetryNoise = TelemetryNoise.model_validate({})
-    placed: tuple[Placed, ...] = Field((), description="objects besides those of the scene")
+    placed: tuple[PlantedObject, ...] = Field((), description="objects besides those of the scene")
     bleached: tuple[Bleached, ...] = Field((), description="patches without colour")
     margin_m: float | None = Field(
         None, gt=0, le=20, description="m of sea floor beyond what is seen, for visits; None: 0"

@@ -21,10 +21,10 @@ from aquaflow.lab.synthetic import path as paths
 from aquaflow.lab.synthetic.bodies import Bodies
 from aquaflow.lab.synthetic.config import SyntheticConfig
 from aquaflow.lab.synthetic.display import burn_in
-from aquaflow.lab.synthetic.march import HeightField
+from aquaflow.lab.synthetic.march import RayHeightField
 from aquaflow.lab.synthetic.planted import bleach
 from aquaflow.lab.synthetic.sensor import Snow, expose, quantised, vignette
-from aquaflow.lab.synthetic.site import Site, camera_of, site_of
+from aquaflow.lab.synthetic.site import SurveySite, camera_of, site_of
 from aquaflow.lab.synthetic.streams import stream
 from aquaflow.lab.synthetic.telemetry.constants import Constants, draw_constants
 from aquaflow.lab.synthetic.telemetry.measurement import measure
@@ -51,7 +51,7 @@ def build(config: SyntheticConfig) -> tuple[render.SyntheticScene, paths.Path]:
     return _scene(config, site), site.path
 
 
-def _scene(config: SyntheticConfig, site: Site) -> render.SyntheticScene:
+def _scene(config: SyntheticConfig, site: SurveySite) -> render.SyntheticScene:
     """The site with its colours."""
     home = config.home
     colours = stream(home.seed, "colours")
@@ -59,7 +59,7 @@ def _scene(config: SyntheticConfig, site: Site) -> render.SyntheticScene:
     bleach(floor, site.relief.area, config.bleached)
     return render.SyntheticScene(
         site.relief.area,
-        HeightField(site.relief.area, site.relief.height),
+        RayHeightField(site.relief.area, site.relief.height),
         MipAtlas(floor, MIP_LEVELS),
         site.shapes,
         objects.object_texture(colours),
@@ -97,7 +97,7 @@ def write_dive(
         ) from error
 
 
-def _write_tables(out: Path, config: SyntheticConfig, site: Site) -> None:
+def _write_tables(out: Path, config: SyntheticConfig, site: SurveySite) -> None:
     t, path = np.arange(config.frames) / config.fps, site.path
     save_camera(camera_of(config), out / "camera.yaml")
     save_medium(WATER_TYPES[config.water], out / "medium.yaml")
@@ -112,7 +112,7 @@ def _write_tables(out: Path, config: SyntheticConfig, site: Site) -> None:
     (out / MARKER).write_text(yaml.safe_dump(_stated(config, site, constants), sort_keys=False))
 
 
-def _stated(config: SyntheticConfig, site: Site, constants: Constants) -> dict[str, Any]:
+def _stated(config: SyntheticConfig, site: SurveySite, constants: Constants) -> dict[str, Any]:
     """What synth.yaml says."""
     mountings = site.motion.mountings
     place = mountings.p_bc.tolist()

@@ -19,7 +19,7 @@ from torch.nn import functional
 from aquaflow.lab.synthetic.noise import FloatMap
 from aquaflow.lab.synthetic.relief import Area
 
-__all__ = ["HeightField"]
+__all__ = ["RayHeightField"]
 
 COARSE = 2
 """The highest points are kept on cells this many times larger."""
@@ -37,7 +37,7 @@ SECANT_STEPS = 5
 """Illinois steps that refine where a ray meets the surface."""
 
 
-class HeightField:
+class RayHeightField:
     """A height map that rays can be shot at. Heights and positions in metres, z up here."""
 
     def __init__(

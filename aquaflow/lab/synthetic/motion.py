@@ -11,7 +11,7 @@ import numpy.typing as npt
 from aquaflow.lab.synthetic.mounting import Mountings
 from aquaflow.lab.synthetic.path import Path
 
-__all__ = ["GRAVITY_M_S2", "BodyMotion"]
+__all__ = ["GRAVITY_M_S2", "TrueBodyMotion"]
 
 Array: TypeAlias = npt.NDArray[np.float64]
 
@@ -22,7 +22,7 @@ HALF_STEP_S = 1e-3
 
 
 @dataclass(frozen=True)
-class BodyMotion:
+class TrueBodyMotion:
     """The body's true motion as a function of time; the world has z down, 0 at the surface."""
 
     path: Path

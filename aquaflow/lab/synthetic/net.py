@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.lab.synthetic.objects import Shape
+from aquaflow.lab.synthetic.objects import Solid
 
 __all__ = ["BEHIND_M", "netting"]
 
@@ -29,7 +29,7 @@ def netting(
     low: Array,  # [2] m
     high: Array,  # [2] m
     rng: np.random.Generator,
-) -> Shape:
+) -> Solid:
     """The net in the plane z = 0, round the way from ``low`` to ``high``, a little askew."""
     mesh = float(rng.uniform(*MESHES_M))
     turn = float(rng.uniform(-0.1, 0.1))
@@ -38,6 +38,6 @@ def netting(
     half = 0.5 * (high - low) + MARGIN_M
     centre = np.array([*(0.5 * (low + high)), 0.0])
     size = (float(half[0]), float(half[1]), 0.01)
-    return Shape(
+    return Solid(
         "net", centre, R, size, TWINE, FOULING, 0.35, mesh_m=mesh, twine_m=TWINE_SHARE * mesh
     )

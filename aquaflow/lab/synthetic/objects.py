@@ -20,7 +20,7 @@ from aquaflow.lab.synthetic.radiance import AMBIENT, SUN, SUN_DIRECTION
 from aquaflow.lab.synthetic.relief import Area, Relief
 from aquaflow.lab.synthetic.texture import MipAtlas
 
-__all__ = ["TEXEL_M", "Rgb", "Shape", "casters", "hit", "object_texture", "radiance"]
+__all__ = ["TEXEL_M", "Rgb", "Solid", "casters", "hit", "object_texture", "radiance"]
 
 Array: TypeAlias = npt.NDArray[np.float64]
 Rgb: TypeAlias = tuple[float, float, float]
@@ -34,7 +34,7 @@ GRAIN, GLAZE_GRAIN = 0.16, 0.04
 
 
 @dataclass(frozen=True)
-class Shape:
+class Solid:
     """One solid; its axes are the columns of ``R``."""
 
     kind: Literal["cylinder", "box", "sphere", "ellipsoid", "net"]
@@ -70,7 +70,7 @@ class Shape:
 
 
 def _local(
-    shape: Shape,
+    shape: Solid,
     origin: torch.Tensor,  # [3] m, or [3, N] of each ray
     rays: torch.Tensor,  # [3, N] unit vectors
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -92,7 +92,7 @@ def _turned(
 
 
 def hit(
-    shape: Shape,
+    shape: Solid,
     origin: torch.Tensor,  # [3] m, or [3, N] of each ray
     rays: torch.Tensor,  # [3, N] unit vectors
 ) -> torch.Tensor:
@@ -118,7 +118,7 @@ def hit(
 
 
 def _as_ball(
-    shape: Shape,
+    shape: Solid,
     vectors: torch.Tensor,  # [3] or [3, N] m, in the shape's axes
 ) -> torch.Tensor:
     """The same where the ellipsoid is a ball of radius 1."""
@@ -127,7 +127,7 @@ def _as_ball(
 
 
 def _meet_twine(
-    shape: Shape,
+    shape: Solid,
     o: torch.Tensor,  # [3] or [3, N] m, in the shape's axes
     d: torch.Tensor,  # [3, N]
 ) -> torch.Tensor:
@@ -178,7 +178,7 @@ def _slabs(
 
 
 def radiance(
-    shape: Shape,
+    shape: Solid,
     texture: MipAtlas,
     origin: torch.Tensor,  # [3] m, or [3, N] of each ray
     rays: torch.Tensor,  # [3, N]
@@ -209,7 +209,7 @@ def radiance(
 
 
 def _surface(
-    shape: Shape,
+    shape: Solid,
     p: torch.Tensor,  # [3, N] m
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Outward normal [3, N] and texture position u, v [N] (m) of local points [3, N]."""
@@ -246,7 +246,7 @@ def object_texture(rng: np.random.Generator) -> MipAtlas:
     return MipAtlas(np.stack([grain, patches], axis=-1), levels=6)
 
 
-def casters(relief: Relief, shapes: list[Shape]) -> FloatMap:
+def casters(relief: Relief, shapes: list[Solid]) -> FloatMap:
     """The relief with the tops of the shapes [H, W] (m): what throws shade on the ground."""
     area: Area = relief.area
     height = relief.height.copy()
@@ -268,7 +268,7 @@ def casters(relief: Relief, shapes: list[Shape]) -> FloatMap:
 
 
 def _tops(
-    shape: Shape,
+    shape: Solid,
     x: Array,  # [H, W] m
     y: Array,  # [H, W] m
     down: torch.Tensor,  # [3] unit vector
@@ -286,7 +286,7 @@ def _tops(
     return np.asarray(top.numpy().reshape(x.shape), np.float32)
 
 
-def _bounds(shape: Shape) -> tuple[float, float, float]:
+def _bounds(shape: Solid) -> tuple[float, float, float]:
     """Half sizes of a box that throws about the same shade."""
     if shape.kind == "sphere":
         return (0.8 * shape.size[0],) * 3

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from aquaflow.lab.synthetic import pool
 from aquaflow.lab.synthetic.config import SceneKind
 from aquaflow.lab.synthetic.net import netting
-from aquaflow.lab.synthetic.objects import Rgb, Shape
+from aquaflow.lab.synthetic.objects import Rgb, Solid
 from aquaflow.lab.synthetic.relief import Relief
 
 __all__ = ["place_objects"]
@@ -28,14 +28,14 @@ def place_objects(
     relief: Relief,
     loop: Array,  # [N, 2] m
     rng: np.random.Generator,
-) -> list[Shape]:
+) -> list[Solid]:
     """The objects of a scene, next to the vehicle's path and in view of its camera."""
     low, high = loop.min(axis=0), loop.max(axis=0)
 
     def ground(x: float, y: float) -> float:
         return float(relief.area.sample(relief.height, np.array([[x, y]]))[0])
 
-    shapes: list[Shape] = []
+    shapes: list[Solid] = []
     if kind == "pipe":
         shapes = _pipeline(low, high, ground, rng)
     elif kind == "flat_sand":
@@ -58,7 +58,7 @@ def _on_reef(
     high: Array,  # [2] m
     ground: Callable[[float, float], float],
     rng: np.random.Generator,
-) -> list[Shape]:
+) -> list[Solid]:
     """A crate, a mooring, a pipe and a ball, ahead of the lanes and beside them."""
     x, y = high[0] + rng.uniform(0.5, 0.9), low[1] - rng.uniform(0.6, 0.8)
     shapes = [_crate(x, y, ground(x, y), 0.22, rng)]
@@ -77,7 +77,7 @@ def _in_pool(
     low: Array,  # [2] m
     high: Array,  # [2] m
     rng: np.random.Generator,
-) -> list[Shape]:
+) -> list[Solid]:
     """Crates and a mooring on the tiles, on both sides of the way, and a rope across."""
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     shapes = []
@@ -93,7 +93,7 @@ def _in_pool(
 def _frame_of_net(
     low: Array,  # [2] m
     high: Array,  # [2] m
-) -> list[Shape]:
+) -> list[Solid]:
     """Ropes up and across, on which the net hangs."""
     ends = low - NET_ROPES_M, high + 2.0 * NET_ROPES_M
     up = [
@@ -109,7 +109,7 @@ def _pipeline(
     high: Array,  # [2] m
     ground: Callable[[float, float], float],
     rng: np.random.Generator,
-) -> list[Shape]:
+) -> list[Solid]:
     y = float(0.5 * (low[1] + high[1]))
     radius = 0.17
     drift = float(rng.uniform(0.2, 0.5))
@@ -134,7 +134,7 @@ def _cylinder(
     paint: Rgb,
     growth: Rgb,
     covered: float,
-) -> Shape:
+) -> Solid:
     start, end = np.asarray(a, float), np.asarray(b, float)
     along = end - start
     length = float(np.linalg.norm(along))
@@ -144,14 +144,14 @@ def _cylinder(
     y /= np.linalg.norm(y)
     R = np.stack([x, y, np.cross(x, y)], axis=1)
     size = (0.5 * length, radius, radius)
-    return Shape("cylinder", 0.5 * (start + end), R, size, paint, growth, covered)
+    return Solid("cylinder", 0.5 * (start + end), R, size, paint, growth, covered)
 
 
-def _rope(a: tuple[float, float, float], b: tuple[float, float, float]) -> Shape:
+def _rope(a: tuple[float, float, float], b: tuple[float, float, float]) -> Solid:
     return _cylinder(a, b, 0.014, (0.60, 0.52, 0.34), (0.28, 0.26, 0.16), 0.4)
 
 
-def _crate(x: float, y: float, ground: float, half: float, rng: np.random.Generator) -> Shape:
+def _crate(x: float, y: float, ground: float, half: float, rng: np.random.Generator) -> Solid:
     turn, lean = rng.uniform(0.3, 1.2), rng.uniform(-0.12, 0.12)
     c, s = math.cos(turn), math.sin(turn)
     tilt = np.array(
@@ -160,22 +160,22 @@ def _crate(x: float, y: float, ground: float, half: float, rng: np.random.Genera
     R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ tilt
     size = (half * 1.4, half, half * 0.9)
     centre = np.array([x, y, ground + 0.65 * half])
-    return Shape("box", centre, R, size, (0.55, 0.40, 0.18), (0.26, 0.24, 0.15), 0.45)
+    return Solid("box", centre, R, size, (0.55, 0.40, 0.18), (0.26, 0.24, 0.15), 0.45)
 
 
-def _ball(x: float, y: float, z: float, radius: float, rng: np.random.Generator) -> Shape:
+def _ball(x: float, y: float, z: float, radius: float, rng: np.random.Generator) -> Solid:
     paint = (0.78, 0.36 + 0.1 * float(rng.uniform()), 0.10)
-    return Shape(
+    return Solid(
         "sphere", np.array([x, y, z]), np.eye(3), (radius,) * 3, paint, (0.30, 0.32, 0.2), 0.35
     )
 
 
-def _mooring(x: float, y: float, ground: float, rng: np.random.Generator) -> list[Shape]:
+def _mooring(x: float, y: float, ground: float, rng: np.random.Generator) -> list[Solid]:
     """A concrete block with a rope up to a float."""
     turn = rng.uniform(0.0, 1.5)
     c, s = math.cos(turn), math.sin(turn)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    block = Shape(
+    block = Solid(
         "box", np.array([x, y, ground + 0.1]), R, (0.2, 0.2, 0.14), (0.60, 0.58, 0.54),
         (0.34, 0.34, 0.2), 0.5,
     )  # fmt: skip

@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 
 from aquaflow.lab.synthetic.noise import FloatMap
-from aquaflow.lab.synthetic.objects import Shape
-from aquaflow.lab.synthetic.planted_config import Bleached, Placed
+from aquaflow.lab.synthetic.objects import Solid
+from aquaflow.lab.synthetic.planted_config import Bleached, PlantedObject
 from aquaflow.lab.synthetic.relief import Area, Relief
 
 __all__ = ["bleach", "placed_shapes"]
@@ -24,12 +24,12 @@ WHITE, PALE = 1.7, 0.85
 shows the white skeleton (judgement, from pictures of bleached Acropora)."""
 
 
-def placed_shapes(placed: Sequence[Placed], relief: Relief) -> list[Shape]:
+def placed_shapes(placed: Sequence[PlantedObject], relief: Relief) -> list[Solid]:
     """The objects, standing on the relief."""
     return [_shape(each, relief) for each in placed]
 
 
-def _shape(placed: Placed, relief: Relief) -> Shape:
+def _shape(placed: PlantedObject, relief: Relief) -> Solid:
     x, y = placed.at_m
     ground = float(relief.area.sample(relief.height, np.array([[x, y]]))[0])
     c, s = (f(math.radians(placed.turn_deg)) for f in (math.cos, math.sin))
@@ -38,7 +38,7 @@ def _shape(placed: Placed, relief: Relief) -> Shape:
     growth = (0.26, 0.24, 0.15)
     kind: Literal["box", "sphere"] = "box" if placed.kind == "box" else "sphere"
     size = (placed.half_m,) * 3
-    return Shape(
+    return Solid(
         kind, centre, R, size, placed.paint, growth, 0.35, pattern_m=placed.pattern_m
     )  # fmt: skip
 

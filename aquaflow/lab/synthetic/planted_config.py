@@ -6,10 +6,10 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["Bleached", "Placed"]
+__all__ = ["Bleached", "PlantedObject"]
 
 
-class Placed(BaseModel):
+class PlantedObject(BaseModel):
     """An object that stands on the floor besides those of the scene: added, removed or moved where
     two days differ in it."""
 

@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.lab.synthetic.objects import Rgb, Shape
+from aquaflow.lab.synthetic.objects import Rgb, Solid
 
 __all__ = ["DEPTH_M", "corners", "tiled_basin"]
 
@@ -26,7 +26,7 @@ FLOOR, WALL = (0.52, 0.66, 0.70), (0.66, 0.74, 0.74)
 DIRT = (0.38, 0.42, 0.36)
 """Albedo of algae and stains, RGB."""
 DIRTY = -0.3
-"""``Shape.covered``: algae and stains darken some 3 % of the tiles."""
+"""``Solid.covered``: algae and stains darken some 3 % of the tiles."""
 
 
 def corners(
@@ -40,7 +40,7 @@ def tiled_basin(
     low: Array,  # [2] m
     high: Array,  # [2] m
     rng: np.random.Generator,
-) -> list[Shape]:
+) -> list[Solid]:
     """Floor and four walls between two corners [2] (m); the floor's top is at z = 0."""
     tile = float(rng.uniform(*TILES_M))
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
@@ -55,5 +55,5 @@ def tiled_basin(
 
 def _slab(
     centre: tuple[float, float, float], size: tuple[float, float, float], paint: Rgb, tile: float
-) -> Shape:
-    return Shape("box", np.array(centre), np.eye(3), size, paint, DIRT, DIRTY, tile_m=tile)
+) -> Solid:
+    return Solid("box", np.array(centre), np.eye(3), size, paint, DIRT, DIRTY, tile_m=tile)

@@ -16,7 +16,7 @@ import torch
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.optics import rays_of_pixels
 from aquaflow.lab.synthetic import objects
-from aquaflow.lab.synthetic.march import HeightField
+from aquaflow.lab.synthetic.march import RayHeightField
 from aquaflow.lab.synthetic.radiance import TEXELS_PER_CELL
 from aquaflow.lab.synthetic.relief import Area
 from aquaflow.lab.synthetic.texture import MipAtlas
@@ -37,10 +37,10 @@ class SyntheticScene:
     """Everything that a ray can meet."""
 
     area: Area
-    field: HeightField
+    field: RayHeightField
     floor: MipAtlas
     """Radiance of the floor over the area, and its steepness (radiance.bake)."""
-    shapes: list[objects.Shape]
+    shapes: list[objects.Solid]
     object_texture: MipAtlas
     max_range_m: float
 
@@ -67,7 +67,7 @@ def render(
     centre: Array,  # [3] m, survey frame (z down)
     medium: Medium,
     supersampling: int,
-    bodies: Sequence[objects.Shape] = (),
+    bodies: Sequence[objects.Solid] = (),
 ) -> RenderedView:
     """Render with ``supersampling`` x ``supersampling`` rays per pixel; ``bodies`` move by
     themselves, and are where they are now."""
@@ -177,7 +177,7 @@ def _ranges(
 
 
 def _may_meet(
-    shape: objects.Shape,
+    shape: objects.Solid,
     origin: torch.Tensor,  # [3] m, or [3, N] of each ray
     axes: torch.Tensor,  # [3, N] unit vectors
     spread: float,

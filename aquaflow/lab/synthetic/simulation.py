@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from aquaflow.config.device import MountingConfig
 from aquaflow.lab.synthetic.config import SyntheticConfig
-from aquaflow.lab.synthetic.motion import BodyMotion
+from aquaflow.lab.synthetic.motion import TrueBodyMotion
 from aquaflow.lab.synthetic.site import site_of
 from aquaflow.lab.synthetic.telemetry.constants import Constants, draw_constants
 from aquaflow.lab.synthetic.telemetry.measurement import measure
@@ -44,7 +44,7 @@ class SimulatedDive:
     """[3, 3] axes of the DVL's samples to the body, in truth; the identity is stated."""
     constants: Constants
     """Errors of the instruments that were drawn once."""
-    motion: BodyMotion
+    motion: TrueBodyMotion
     """The body's true pose, velocity, rate and specific force at any time of the dive."""
     samples: list[TelemetrySample]
     """In order of arrival; times are ns since the first picture. They are those of the body's

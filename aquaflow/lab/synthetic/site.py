@@ -15,7 +15,7 @@ from aquaflow.geometry.port_file import port_of
 from aquaflow.lab.synthetic import objects, pool
 from aquaflow.lab.synthetic import path as paths
 from aquaflow.lab.synthetic.config import SyntheticConfig
-from aquaflow.lab.synthetic.motion import BodyMotion
+from aquaflow.lab.synthetic.motion import TrueBodyMotion
 from aquaflow.lab.synthetic.mounting import mountings_of
 from aquaflow.lab.synthetic.placement import place_objects
 from aquaflow.lab.synthetic.planted import placed_shapes
@@ -25,7 +25,7 @@ from aquaflow.lab.synthetic.streams import stream
 from aquaflow.lab.synthetic.terrain import build_relief
 from aquaflow.lab.synthetic.ways import way_of
 
-__all__ = ["Site", "camera_of", "site_of"]
+__all__ = ["SurveySite", "camera_of", "site_of"]
 
 Array: TypeAlias = npt.NDArray[np.float64]
 
@@ -39,15 +39,15 @@ LOOKS_PER_S = 4.0
 
 
 @dataclass(frozen=True)
-class Site:
+class SurveySite:
     """What a dive passes over, and how it passes."""
 
     relief: Relief
-    shapes: list[objects.Shape]
+    shapes: list[objects.Solid]
     crests: npt.NDArray[np.float32]
     """[rows, columns] m up, the relief with the tops of the shapes, at the relief's cells."""
     path: paths.Path
-    motion: BodyMotion
+    motion: TrueBodyMotion
 
 
 def camera_of(config: SyntheticConfig) -> CameraModel:
@@ -66,7 +66,7 @@ def camera_of(config: SyntheticConfig) -> CameraModel:
     )
 
 
-def site_of(config: SyntheticConfig, least_cell_m: float = 0.0) -> Site:
+def site_of(config: SyntheticConfig, least_cell_m: float = 0.0) -> SurveySite:
     """The site of a dive.
 
     Cells of ``least_cell_m`` that are larger than the pictures need make another relief with the
@@ -88,8 +88,8 @@ def site_of(config: SyntheticConfig, least_cell_m: float = 0.0) -> Site:
     followed = np.zeros(area.shape, np.float32) if config.scene == "net" else relief.height
     below = area.sample(followed, way_of(config).points)
     path = paths.plan_path(config, stream(config.seed, "sway"), below)
-    motion = BodyMotion(path, mountings_of(config))
-    return Site(relief, shapes, objects.casters(relief, shapes), path, motion)
+    motion = TrueBodyMotion(path, mountings_of(config))
+    return SurveySite(relief, shapes, objects.casters(relief, shapes), path, motion)
 
 
 def _seen(config: SyntheticConfig, flat: paths.Path) -> tuple[Array, Array]:

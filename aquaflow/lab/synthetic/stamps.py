@@ -31,7 +31,7 @@ LOW_M = 0.22
 
 
 @dataclass(frozen=True)
-class Stamp:
+class StampShape:
     """A shape in its own coordinates."""
 
     radius: float
@@ -41,7 +41,7 @@ class Stamp:
     colour: tuple[float, float, float]
 
 
-Maker: TypeAlias = Callable[[np.random.Generator], Stamp]
+Maker: TypeAlias = Callable[[np.random.Generator], StampShape]
 
 
 def scatter(
@@ -65,7 +65,7 @@ def scatter(
 
 def _set(
     relief: Relief,
-    stamp: Stamp,
+    stamp: StampShape,
     place: np.ndarray[tuple[int], np.dtype[np.float64]],  # [2] m from the area's corner
     rough: FloatMap,  # [rows, columns] noise of the area
     tallest: float,
@@ -92,18 +92,18 @@ def _set(
     relief.cover[window][mask] = 1.0
 
 
-def boulder(rng: np.random.Generator) -> Stamp:
+def boulder(rng: np.random.Generator) -> StampShape:
     """A broken stone: the space under a few random planes, with cracks."""
     radius = float(np.clip(rng.lognormal(-1.6, 0.5), 0.07, 0.5))
     return _stone(rng, radius, cracked=True)
 
 
-def pebble(rng: np.random.Generator) -> Stamp:
+def pebble(rng: np.random.Generator) -> StampShape:
     """A stone of 1.5 to 6 cm."""
     return _stone(rng, float(rng.uniform(0.015, 0.06)), cracked=False)
 
 
-def _stone(rng: np.random.Generator, radius: float, cracked: bool) -> Stamp:
+def _stone(rng: np.random.Generator, radius: float, cracked: bool) -> StampShape:
     count = 7
     turn = rng.uniform(0.0, 2.0 * math.pi) + np.arange(count) * (2.0 * math.pi / count)
     turn += rng.uniform(-0.35, 0.35, count)
@@ -128,10 +128,10 @@ def _stone(rng: np.random.Generator, radius: float, cracked: bool) -> Stamp:
 
     grey = rng.uniform(0.22, 0.55)
     warm = rng.uniform(-0.05, 0.07)
-    return Stamp(radius * 1.2, shape, (grey + warm, grey, grey - 0.6 * warm))
+    return StampShape(radius * 1.2, shape, (grey + warm, grey, grey - 0.6 * warm))
 
 
-def brain_coral(rng: np.random.Generator) -> Stamp:
+def brain_coral(rng: np.random.Generator) -> StampShape:
     """A dome with winding grooves."""
     radius = float(rng.uniform(0.08, 0.3))
     flat = rng.uniform(0.5, 0.9)
@@ -146,10 +146,10 @@ def brain_coral(rng: np.random.Generator) -> Stamp:
         winding = np.sin(2.0 * math.pi * (x + 0.02 * rough) / 0.035 + 5.0 * np.sin(y / 0.02))
         return np.asarray(np.where(rho < 1.0, dome + 0.004 * winding, -1.0), np.float32)
 
-    return Stamp(radius, shape, _pick(rng, ((0.55, 0.47, 0.22), (0.45, 0.52, 0.28))))
+    return StampShape(radius, shape, _pick(rng, ((0.55, 0.47, 0.22), (0.45, 0.52, 0.28))))
 
 
-def table_coral(rng: np.random.Generator) -> Stamp:
+def table_coral(rng: np.random.Generator) -> StampShape:
     """A plate that stands above the ground, with a lobed edge."""
     radius = float(rng.uniform(0.18, 0.42))
     height = rng.uniform(0.12, 0.28)
@@ -165,10 +165,10 @@ def table_coral(rng: np.random.Generator) -> Stamp:
         plate = height + 0.05 * rho + 0.008 * rough
         return np.asarray(np.where(rho < edge, plate, -1.0), np.float32)
 
-    return Stamp(radius, shape, _pick(rng, ((0.50, 0.38, 0.26), (0.35, 0.42, 0.40))))
+    return StampShape(radius, shape, _pick(rng, ((0.50, 0.38, 0.26), (0.35, 0.42, 0.40))))
 
 
-def branching_coral(rng: np.random.Generator) -> Stamp:
+def branching_coral(rng: np.random.Generator) -> StampShape:
     """A thicket of fingers."""
     radius = float(rng.uniform(0.1, 0.28))
     count = int(rng.integers(12, 36))
@@ -189,10 +189,10 @@ def branching_coral(rng: np.random.Generator) -> Stamp:
         return np.asarray(height + 0.004 * rough, np.float32)
 
     colours = ((0.62, 0.40, 0.36), (0.45, 0.40, 0.60), (0.66, 0.56, 0.36))
-    return Stamp(radius * 1.7, shape, _pick(rng, colours))
+    return StampShape(radius * 1.7, shape, _pick(rng, colours))
 
 
-def sponge(rng: np.random.Generator) -> Stamp:
+def sponge(rng: np.random.Generator) -> StampShape:
     """A barrel with an open top."""
     radius = float(rng.uniform(0.05, 0.14))
     height = radius * rng.uniform(1.0, 1.8)
@@ -207,7 +207,7 @@ def sponge(rng: np.random.Generator) -> Stamp:
         barrel = height * (1.0 - 0.8 * np.exp(-((rho / 0.45) ** 2))) * (1.0 + ribs)
         return np.asarray(np.where(rho < 1.0 + ribs, barrel + 0.005 * rough, -1.0), np.float32)
 
-    return Stamp(radius * 1.1, shape, _pick(rng, ((0.70, 0.42, 0.18), (0.60, 0.22, 0.20))))
+    return StampShape(radius * 1.1, shape, _pick(rng, ((0.70, 0.42, 0.18), (0.60, 0.22, 0.20))))
 
 
 def _pick(

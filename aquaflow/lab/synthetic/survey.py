@@ -25,7 +25,7 @@ from aquaflow.lab.synthetic.sensor import quantised
 from aquaflow.lab.synthetic.water import WATER_TYPES
 from aquaflow.types import Frame
 
-__all__ = ["Survey", "survey_camera"]
+__all__ = ["SurveyPictures", "survey_camera"]
 
 Map: TypeAlias = npt.NDArray[np.float32]
 Lattice: TypeAlias = npt.NDArray[np.uint32]
@@ -115,7 +115,7 @@ Fields: TypeAlias = list[tuple[_Noise, float]]
 """Noises and their amplitudes."""
 
 
-class Survey:
+class SurveyPictures:
     """The pictures of a survey in the order in which they are taken; the area grows with them."""
 
     def __init__(self, width: int, seed: int = 0, water: WaterType = "coastal_1C") -> None:

@@ -76,7 +76,7 @@ def _wall(rng: np.random.Generator, area: Area) -> FloatMap:
 
 
 @dataclass(frozen=True)
-class _Plan:
+class _TerrainPlan:
     rock_cover: float
     rock_level: float
     """Threshold, in sigmas of the patch noise, above which there is rock."""
@@ -99,7 +99,7 @@ _BASES = {
     "survey": _reef, "hull": hull.plated_side, "net": _open_water,
 }  # fmt: skip
 """Large shapes of each scene."""
-_REEF = _Plan(
+_REEF = _TerrainPlan(
     1.0,
     -0.1,
     (
@@ -115,11 +115,11 @@ _REEF = _Plan(
 _PLANS = {
     "reef": _REEF,
     "survey": _REEF,
-    "pool": _Plan(0.0, 0.0, ()),
-    "hull": _Plan(0.0, 0.0, ()),
-    "net": _Plan(0.0, 0.0, ()),
-    "flat_sand": _Plan(0.0, 0.0, ((stamps.boulder, 0.03), (stamps.pebble, 6.0))),
-    "wall": _Plan(
+    "pool": _TerrainPlan(0.0, 0.0, ()),
+    "hull": _TerrainPlan(0.0, 0.0, ()),
+    "net": _TerrainPlan(0.0, 0.0, ()),
+    "flat_sand": _TerrainPlan(0.0, 0.0, ((stamps.boulder, 0.03), (stamps.pebble, 6.0))),
+    "wall": _TerrainPlan(
         1.0,
         -3.0,
         (
@@ -129,6 +129,8 @@ _PLANS = {
             (stamps.sponge, 1.2),
         ),
     ),
-    "pipe": _Plan(0.0, 0.0, ((stamps.boulder, 0.12), (stamps.sponge, 0.1), (stamps.pebble, 7.0))),
+    "pipe": _TerrainPlan(
+        0.0, 0.0, ((stamps.boulder, 0.12), (stamps.sponge, 0.1), (stamps.pebble, 7.0))
+    ),
 }
 """What lies on the large shapes of each scene."""

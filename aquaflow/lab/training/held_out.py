@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from aquaflow.lab.training.correspondences import overlap
-from aquaflow.lab.training.pair_generator.cameras import TRAINING, WIDE, WIDER, Motion
+from aquaflow.lab.training.pair_generator.cameras import TRAINING, WIDE, WIDER, PairMotion
 from aquaflow.lab.training.pair_generator.conditions import CALM, Conditions
 from aquaflow.lab.training.pair_generator.draw import Draw
 from aquaflow.lab.training.pair_generator.drawing import WindowVariation, through_water, windows
@@ -40,7 +40,7 @@ class HeldOutSet:
 
     folder: str
     """Of the run, that keeps them."""
-    motion: Motion
+    motion: PairMotion
     detail: Detail = field(default_factory=Detail)
     conditions: Conditions = CALM
     seed: int = SEED

@@ -23,7 +23,7 @@ from aquaflow.tracking.base.links import BaseLink
 from aquaflow.tracking.base.opening import base_of
 
 
-def look_in_base(slam: Slam, asked: Path | None, checkpoint: Checkpoint | None) -> list[str]:
+def localise_in_base(slam: Slam, asked: Path | None, checkpoint: Checkpoint | None) -> list[str]:
     """Look for a new dive in the earlier one that is ``asked`` for, and for one that goes on in the
     one of its ``checkpoint``. One that cannot be used costs itself, not the dive; notes say so."""
     known = None if checkpoint is None else checkpoint.facts["tracking"].get("in_site")
@@ -31,13 +31,13 @@ def look_in_base(slam: Slam, asked: Path | None, checkpoint: Checkpoint | None) 
     if folder is None:
         return []
     try:
-        slam.look_in(base_of(folder))
+        slam.localise_in(base_of(folder))
     except InputError as error:
         said = f"the dive is not looked for in {folder}"
         if known is None:
             return [f"{said}: {error}"]
         frames = {int(number): frame_of_json(each) for number, each in known["frames"].items()}
-        slam.look_in(Base(folder, slam.prior.name, (), unreadable, frames))
+        slam.localise_in(Base(folder, slam.prior.name, (), unreadable, frames))
         return [f"{said} any more, and keeps its place there: {error}"]
     return []
 

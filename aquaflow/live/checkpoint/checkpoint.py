@@ -29,8 +29,8 @@ from aquaflow.live.checkpoint.generations import (
     state_file,
     write_state,
 )
+from aquaflow.live.clock_reading import ClockReading
 from aquaflow.live.map_thread import MapCorrection, MapThread
-from aquaflow.live.moment import Moment
 from aquaflow.mapping.work import MapWork, OwnedMaps
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
 from aquaflow.slam import Slam
@@ -100,7 +100,7 @@ class Checkpointer:
             except OSError as error:  # what it would name is not there
                 self._failed(error)
                 return
-        moment = replace(Moment.now(), dive_shift_ns=self._shift_ns())
+        moment = replace(ClockReading.now(), dive_shift_ns=self._shift_ns())
         head = {"format": FORMAT, "version": __version__, "moment": moment.to_json()}
         head |= {"tracking": facts, "clocks": self._clocks()}
         arrays = prefixed("tracking", arrays)

@@ -19,7 +19,7 @@ from aquaflow.base.storage.atomic import make_subfolder
 from aquaflow.base.storage.dive_status import CHECKPOINT
 from aquaflow.base.storage.facts_file import read_facts_file, write_facts_file
 from aquaflow.geometry.arrays import Arrays
-from aquaflow.live.moment import Moment
+from aquaflow.live.clock_reading import ClockReading
 
 STATE, PREVIOUS = "state.npz", "previous.npz"
 """The newest checkpoint, and the one before it."""
@@ -55,9 +55,9 @@ class Checkpoint:
     arrays: Arrays
 
     @property
-    def moment(self) -> Moment:
+    def moment(self) -> ClockReading:
         """When it was taken."""
-        return Moment(**self.facts["moment"])
+        return ClockReading(**self.facts["moment"])
 
     @property
     def clocks(self) -> dict[str, Learned]:

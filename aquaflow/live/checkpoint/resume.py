@@ -22,7 +22,7 @@ from aquaflow.config.service import CheckpointConfig
 from aquaflow.dive.folder import MARKER, WORK
 from aquaflow.dive.frames_csv import header
 from aquaflow.live.checkpoint.generations import Checkpoint, generations, read_state
-from aquaflow.live.moment import Moment
+from aquaflow.live.clock_reading import ClockReading
 from aquaflow.recordings.telemetry_lines import NAME as TELEMETRY
 
 log = logging.getLogger(__name__)
@@ -44,7 +44,7 @@ def choose(
     dives: Path,
     config: CheckpointConfig,
     new: bool,
-    now: Moment,
+    now: ClockReading,
     is_set: Callable[[], bool] = clock_is_set,
 ) -> Choice:
     """The newest dive in ``dives`` that can be resumed, unless ``new``; else a new folder.
@@ -159,7 +159,7 @@ def _why_left(
     folder: Path,
     checkpoint: Checkpoint,
     resume_h: float,
-    now: Moment,
+    now: ClockReading,
     is_set: Callable[[], bool],
 ) -> str | None:
     """Why an unfinished dive is not gone on with, as a clause; None: it is."""
@@ -204,7 +204,7 @@ class Age:
 
 
 def age_of(
-    dive: Path, taken: Moment, now: Moment, is_set: Callable[[], bool] = clock_is_set
+    dive: Path, taken: ClockReading, now: ClockReading, is_set: Callable[[], bool] = clock_is_set
 ) -> Age:
     """The age of ``dive``, whose newest checkpoint was ``taken`` then.
 

@@ -8,11 +8,11 @@ from aquaflow.base.errors import InputError
 from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.dive.run import DiveRun
 from aquaflow.live.checkpoint.set_aside import SetAside
-from aquaflow.live.moment import Moment
+from aquaflow.live.clock_reading import ClockReading
 from aquaflow.recordings.telemetry_lines import NAME, TelemetryLines, to_line
 
 
-def cut_at_checkpoint(dive: Path, taken: Moment, now: Moment, aside: SetAside) -> None:
+def cut_at_checkpoint(dive: Path, taken: ClockReading, now: ClockReading, aside: SetAside) -> None:
     """Take the samples of after the checkpoint out of the dive's telemetry, if the machine was
     started anew: without a clock that runs on, the dive's time of now may be theirs.
 

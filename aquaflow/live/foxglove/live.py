@@ -12,7 +12,7 @@ from aquaflow.dive.path_rows import attitude_of
 from aquaflow.dive.placement import placement
 from aquaflow.dive.ros import messages, topics
 from aquaflow.dive.ros.frames import MAP, OPTICAL, FrameTree
-from aquaflow.dive.views import LOOK_S, DiveView, RunningDive, Showing
+from aquaflow.dive.views import LOOK_S, DisplayThread, DiveView, RunningDive
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.live.foxglove.map_moment import MapMoment, cloud_of, taken, water_status
 from aquaflow.live.foxglove.server import FoxgloveServer
@@ -20,7 +20,7 @@ from aquaflow.live.report import GOOD
 from aquaflow.mapping.work import OwnedMaps
 from aquaflow.sources.newest import Newest
 from aquaflow.sources.preprocessing import Preparation
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.frames import Tracked
 from aquaflow.types import Frame
 
@@ -38,13 +38,13 @@ WELL = frozenset(state.value for state in GOOD)
 
 
 @dataclass(frozen=True)
-class _Moment:
+class _PosedMessage:
     """A posed frame, handed over by the loop."""
 
     t_ns: int
     tracked: Tracked
     picture: Frame | None
-    frame: MetricFrame
+    frame: WorldFrame
     preparation: Preparation
 
 
@@ -56,10 +56,10 @@ class LiveFoxglove(DiveView):
         self._config, self._report = config, report
         self._server = FoxgloveServer(config, "AquaFlow")
         self.port = self._server.port
-        self._moments: Newest[_Moment] = Newest()
+        self._moments: Newest[_PosedMessage] = Newest()
         self._maps: Newest[MapMoment] = Newest()
         self._forget()
-        self._showing = Showing("foxglove", self._show, config.refresh_s)
+        self._showing = DisplayThread("foxglove", self._show, config.refresh_s)
 
     def _forget(self) -> None:
         self._path: list[tuple[int, int, Sim3]] = []
@@ -103,17 +103,17 @@ class LiveFoxglove(DiveView):
         self._showing.close()
         self._server.close()
 
-    def _hand_over(self, dive: RunningDive, latest: Tracked, t_ns: int, frame: MetricFrame) -> None:
+    def _hand_over(self, dive: RunningDive, latest: Tracked, t_ns: int, frame: WorldFrame) -> None:
         run = dive.dive_run
         if self._preparation is None:  # of its own: the loop's prepares the next frame meanwhile
             self._preparation = Preparation(run.config.source, run.preparation.calibration)
         picture = dive.picture
         same = picture is not None and picture.index == latest.frame.index
-        moment = _Moment(t_ns, latest, picture if same else None, frame, self._preparation)
+        moment = _PosedMessage(t_ns, latest, picture if same else None, frame, self._preparation)
         self._moments.put(moment)
 
     def _take(
-        self, maps: OwnedMaps, sub_map: int, frame: MetricFrame, points: bool, drawn: bool
+        self, maps: OwnedMaps, sub_map: int, frame: WorldFrame, points: bool, drawn: bool
     ) -> None:
         """In the mapping thread."""
         self._asked = False
@@ -131,7 +131,7 @@ class LiveFoxglove(DiveView):
         if shown is not None:
             self._show_map(shown)
 
-    def _show_pose(self, moment: _Moment) -> None:
+    def _show_pose(self, moment: _PosedMessage) -> None:
         tracked, frame, t_ns, send = moment.tracked, moment.frame, moment.t_ns, self._server.send
         assert tracked.T_wc is not None
         tree = FrameTree(frame, placement(frame))
@@ -158,14 +158,14 @@ class LiveFoxglove(DiveView):
             send(topics.TF_STATIC, t_ns, messages.transforms(t_ns, tree.fixed))
             self._show_path(t_ns, tracked.sub_map, frame, tree)
 
-    def _show_path(self, t_ns: int, sub_map: int, frame: MetricFrame, tree: FrameTree) -> None:
+    def _show_path(self, t_ns: int, sub_map: int, frame: WorldFrame, tree: FrameTree) -> None:
         """All poses so far, where the dive's metric frame, which changes, has them now."""
         if self._server.wanted(topics.PATH):
             own = [(at_ns, T) for at_ns, number, T in self._path if number == sub_map]
             poses = [(at_ns, tree.moving(frame.pose(T)).T) for at_ns, T in own]
             self._server.send(topics.PATH, t_ns, messages.path(t_ns, MAP, poses))
 
-    def _show_picture(self, moment: _Moment) -> None:
+    def _show_picture(self, moment: _PosedMessage) -> None:
         if moment.picture is None or not self._server.wanted(topics.CAMERA):
             return
         t_ns, prepared = moment.t_ns, moment.preparation(moment.picture)
@@ -174,7 +174,7 @@ class LiveFoxglove(DiveView):
             info = messages.camera_info(t_ns, OPTICAL, prepared.camera)
             self._server.send(topics.CAMERA_INFO, t_ns, info)
 
-    def _statuses(self, report: dict[str, Any], frame: MetricFrame) -> list[Any]:
+    def _statuses(self, report: dict[str, Any], frame: WorldFrame) -> list[Any]:
         level = messages.OK if report["state"] in WELL else messages.WARN
         values = {"unit": frame.unit, "scale": frame.scale_source, "level": report["level"]}
         said = f"{report['state']}: {report['reason']}"

@@ -19,8 +19,8 @@ from aquaflow.mapping.map_copy import MapCopy, copied
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import common_exposure, drawn_without_water, to_bytes
 from aquaflow.render.transfers import picture_out
-from aquaflow.telemetry.metric_frame import MetricFrame
-from aquaflow.water.image_formation import Water
+from aquaflow.telemetry.world_frame import WorldFrame
+from aquaflow.water.image_formation import WaterParameters
 
 Picture = npt.NDArray[np.uint8]
 
@@ -37,17 +37,17 @@ class MapMoment:
     """None where nobody looks at points."""
     views: list[PosedView]
     """In the upright frame of ``frame``."""
-    frame: MetricFrame
+    frame: WorldFrame
     frame_index: int
     """Of the newest view, whose pictures follow."""
     rendered: Picture | None
     restored: Picture | None
-    water: Water | None
+    water: WaterParameters | None
 
 
 @torch.no_grad()
 def taken(
-    mapper: Mapper, sub_map: int, frame: MetricFrame, points: bool, pictures: bool
+    mapper: Mapper, sub_map: int, frame: WorldFrame, points: bool, pictures: bool
 ) -> MapMoment:
     """In the mapping thread: copies for ``points``, and ``pictures`` of the newest view; as long as
     one step of the optimiser."""
@@ -80,7 +80,7 @@ def cloud_of(moment: MapMoment, budget: int) -> npt.NDArray[np.void] | None:
     return points[:: -(-len(points) // budget)] if len(points) else points
 
 
-def water_status(water: Water | None, frame: MetricFrame) -> Any:
+def water_status(water: WaterParameters | None, frame: WorldFrame) -> Any:
     """diagnostic_msgs/DiagnosticStatus with the parameters of the image formation; rates per metre,
     or per map unit."""
     name = "aquaflow: water"

@@ -28,7 +28,7 @@ from aquaflow.dive.ros.definitions import (
     require_rosbags,
 )
 from aquaflow.dive.ros.topics import OF_FINISHED_DIVES, TYPES
-from aquaflow.web import Answer, Request, WebServer
+from aquaflow.web import HttpRequest, HttpResponse, WebServer
 from aquaflow.web.access import Access
 
 log = logging.getLogger(__name__)
@@ -116,7 +116,7 @@ class FoxgloveServer:
         return json.dumps({"op": "advertise", "channels": channels})
 
     async def _watch(
-        self, request: Request, scope: dict[str, Any], receive: Any, send: Any
+        self, request: HttpRequest, scope: dict[str, Any], receive: Any, send: Any
     ) -> None:
         """One client, in the thread of the web server."""
         await receive()  # that it wants to be connected
@@ -214,5 +214,5 @@ def _server_info(name: str) -> str:
     return json.dumps(said)
 
 
-def _no_page(_: Request) -> Answer:
-    return Answer(426, "text/plain", b"Open this address in Foxglove, as ws://\n")
+def _no_page(_: HttpRequest) -> HttpResponse:
+    return HttpResponse(426, "text/plain", b"Open this address in Foxglove, as ws://\n")

@@ -12,13 +12,13 @@ from urllib.parse import parse_qs
 
 from aquaflow import __version__
 from aquaflow.config.service import ListenConfig
-from aquaflow.live.control import Control
+from aquaflow.live.control import ServiceControl
 from aquaflow.live.health.exposition import TYPE, head, labelled, sample
 from aquaflow.live.health.page import page_file
 from aquaflow.live.health.pilot_requests import MOST_BYTES, answered
 from aquaflow.live.health.prometheus_devices import device_lines
-from aquaflow.live.health.state import State
-from aquaflow.web import Answer, Request, WebServer
+from aquaflow.live.health.state import ServiceState
+from aquaflow.web import HttpRequest, HttpResponse, WebServer
 from aquaflow.web.access import GUESSES_S, Access, name_of, path_of
 
 JSON, JPEG, PNG = "application/json", "image/jpeg", "image/png"
@@ -72,7 +72,7 @@ class HealthServer:
         config: ListenConfig,
         report: Say,
         path: Say | None = None,
-        control: Control | None = None,
+        control: ServiceControl | None = None,
         picture: Callable[[], bytes | None] = lambda: None,
         coverage: CoveragePictures | None = None,
     ) -> None:
@@ -89,7 +89,7 @@ class HealthServer:
             ConfigError: the token will not do.
         """
         access = Access(config)
-        answers = _Answers(access, report, path, control or Control(), picture, coverage)
+        answers = _Answers(access, report, path, control or ServiceControl(), picture, coverage)
         self._server = WebServer(config, access, answers, "service.health", MOST_BYTES)
         self.port = self._server.port
 
@@ -115,11 +115,11 @@ class _Answers:
     access: Access
     report: Say
     plan: Say | None
-    control: Control
+    control: ServiceControl
     picture: Callable[[], bytes | None]
     coverage: CoveragePictures | None
 
-    def __call__(self, request: Request) -> Answer:
+    def __call__(self, request: HttpRequest) -> HttpResponse:
         """The answer with the headers that all have."""
         posted = request.method == "POST"
         answer = self.posted(request) if posted else self.looked(request)
@@ -129,7 +129,7 @@ class _Answers:
             headers.append(("Set-Cookie", self.access.cookie()))
         return replace(answer, headers=headers)
 
-    def looked(self, request: Request) -> Answer:
+    def looked(self, request: HttpRequest) -> HttpResponse:
         """To a GET."""
         path = path_of(request.target)
         if path is None:
@@ -140,7 +140,7 @@ class _Answers:
             return _json(403, NOT_ALLOWED)
         return self.data(path)
 
-    def posted(self, request: Request) -> Answer:
+    def posted(self, request: HttpRequest) -> HttpResponse:
         """To a POST."""
         if request.body is None:
             return _json(413, {"error": "a request holds a token at most"})
@@ -150,7 +150,7 @@ class _Answers:
         name, target, headers = dive.get("name"), request.target, request.headers
         return _json(*answered(self.control, self.access, target, headers, name, request.peer))
 
-    def log_in(self, request: Request) -> Answer:
+    def log_in(self, request: HttpRequest) -> HttpResponse:
         """The cookie for a form with the token; a minute without an answer after ten others."""
         shown = request.headers, request.peer
         tokens = parse_qs((request.body or b"").decode("ascii", "replace")).get("token", [""])
@@ -160,30 +160,30 @@ class _Answers:
             return _json(403, WRONG_TOKEN)
         return replace(_json(200, {"ok": True}), headers=[("Set-Cookie", self.access.cookie())])
 
-    def open_to_all(self, path: str) -> Answer | None:
+    def open_to_all(self, path: str) -> HttpResponse | None:
         """The page holds no data, and BlueOS asks for both without a token."""
         if path == "/register_service":
             return _json(200, REGISTRATION)
         file = page_file(path)
-        return None if file is None else Answer(200, file.kind, file.text.encode())
+        return None if file is None else HttpResponse(200, file.kind, file.text.encode())
 
-    def data(self, path: str) -> Answer:
+    def data(self, path: str) -> HttpResponse:
         """What only those may have who are let in."""
         if path == "/health":
             return _json(200, self.report())
         if path == "/path.json" and self.plan is not None:
             return _json(200, self.plan())
         if path == "/metrics":
-            return Answer(200, TYPE, exposition(self.report()).encode())
+            return HttpResponse(200, TYPE, exposition(self.report()).encode())
         if path == "/picture.jpg" and (jpeg := self.picture()) is not None:
-            return Answer(200, JPEG, jpeg)
+            return HttpResponse(200, JPEG, jpeg)
         if (png := _coverage_picture(path, self.coverage)) is not None:
-            return Answer(200, PNG, png)
+            return HttpResponse(200, PNG, png)
         return _json(404, {"error": "there is nothing here"})
 
 
-def _json(code: int, said: dict[str, Any]) -> Answer:
-    return Answer(code, JSON, json.dumps(said, default=str).encode())
+def _json(code: int, said: dict[str, Any]) -> HttpResponse:
+    return HttpResponse(code, JSON, json.dumps(said, default=str).encode())
 
 
 # --------------------------------------------------------------------------------------------------
@@ -244,7 +244,7 @@ def exposition(report: Mapping[str, Any]) -> str:
 
 
 def _lines(report: Mapping[str, Any]) -> Iterator[str]:
-    states = {state.value: int(report["state"] == state.value) for state in State}
+    states = {state.value: int(report["state"] == state.value) for state in ServiceState}
     yield from labelled(
         "state", "state", states, "1 for the state that the service is in.", "gauge"
     )

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any
 
-from aquaflow.live.control import Control, RefusedError, Request
+from aquaflow.live.control import RefusedError, ServiceControl, ServiceRequest
 from aquaflow.web.access import Access, path_of
 
-PATHS = {f"/dive/{request.value}": request for request in Request}
+PATHS = {f"/dive/{request.value}": request for request in ServiceRequest}
 """The address of each request."""
 MOST_BYTES = 4096
 """Of a request's body, which means nothing and is read only to be rid of it."""
@@ -22,7 +22,7 @@ NOT_ALLOWED = {
 
 
 def answered(
-    control: Control,
+    control: ServiceControl,
     access: Access,
     target: str,
     headers: Mapping[str, str],

@@ -8,22 +8,22 @@ from __future__ import annotations
 
 from aquaflow.live.health.degradation import DegradationLevel
 from aquaflow.live.health.pressure import Shortage
-from aquaflow.live.health.state import State
+from aquaflow.live.health.state import ServiceState
 from aquaflow.sources.outbound import LONGEST_TEXT
 from aquaflow.tracking.consistency import Cause
 
 OF_STATE = {
-    State.STARTING: "AquaFlow starts.",
-    State.WAITING: "AquaFlow: no picture from the camera.",
-    State.INITIALISING: "AquaFlow: move sideways over texture to start.",
-    State.TRACKING: "AquaFlow is tracking.",
-    State.LOST: "AquaFlow is lost: go back to a mapped place.",
-    State.DEGRADED: "AquaFlow works with less than everything.",
-    State.INCONSISTENT: "AquaFlow: the map contradicts itself.",
-    State.STOPPING: "AquaFlow stops.",
-    State.IDLE: "AquaFlow waits for a dive to begin.",
-    State.PAUSED: "AquaFlow is paused.",
-    State.FINISHING: "AquaFlow finishes the dive.",
+    ServiceState.STARTING: "AquaFlow starts.",
+    ServiceState.WAITING: "AquaFlow: no picture from the camera.",
+    ServiceState.INITIALISING: "AquaFlow: move sideways over texture to start.",
+    ServiceState.TRACKING: "AquaFlow is tracking.",
+    ServiceState.LOST: "AquaFlow is lost: go back to a mapped place.",
+    ServiceState.DEGRADED: "AquaFlow works with less than everything.",
+    ServiceState.INCONSISTENT: "AquaFlow: the map contradicts itself.",
+    ServiceState.STOPPING: "AquaFlow stops.",
+    ServiceState.IDLE: "AquaFlow waits for a dive to begin.",
+    ServiceState.PAUSED: "AquaFlow is paused.",
+    ServiceState.FINISHING: "AquaFlow finishes the dive.",
 }
 """Of a state by itself."""
 OF_CAUSE = {
@@ -53,7 +53,7 @@ NOT_RECORDING = "AquaFlow does not record any more."
 
 def no_picture(camera: str) -> str:
     """Of a camera that sends nothing."""
-    return _fitting(f"AquaFlow: no picture from camera {camera}.", OF_STATE[State.WAITING])
+    return _fitting(f"AquaFlow: no picture from camera {camera}.", OF_STATE[ServiceState.WAITING])
 
 
 def silent_link(name: str, heard_before: bool) -> str:

@@ -16,7 +16,7 @@ KEPT = 50
 """Changes of state that are remembered."""
 
 
-class State(str, Enum):
+class ServiceState(str, Enum):
     """What the service does at the moment."""
 
     STARTING = "starting"
@@ -34,7 +34,7 @@ class State(str, Enum):
     @property
     def number(self) -> int:
         """For NAMED_VALUE_FLOAT and Prometheus."""
-        return list(State).index(self)
+        return list(ServiceState).index(self)
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,8 @@ class Change:
 
     t_s: float
     """CLOCK_MONOTONIC."""
-    before: State
-    after: State
+    before: ServiceState
+    after: ServiceState
     reason: str
 
 
@@ -52,18 +52,18 @@ class Health:
     """The state machine; to be written by the loop alone, read by anyone."""
 
     def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
-        self.state = State.STARTING
+        self.state = ServiceState.STARTING
         self.reason = "the service starts"
         self.sentences: tuple[str, ...] = ()
         """What the pilot shall hear of the reason; none: the state alone."""
         self.changes: deque[Change] = deque(maxlen=KEPT)
-        self.visits: Counter[State] = Counter({State.STARTING: 1})
+        self.visits: Counter[ServiceState] = Counter({ServiceState.STARTING: 1})
         self._now_s = now_s
         self.since_s = now_s()
 
-    def set(self, state: State, reason: str, sentences: tuple[str, ...] = ()) -> bool:
+    def set(self, state: ServiceState, reason: str, sentences: tuple[str, ...] = ()) -> bool:
         """Set the state; True if it changed. A new reason alone is no change."""
-        if self.state is State.STOPPING:  # nothing comes after the end
+        if self.state is ServiceState.STOPPING:  # nothing comes after the end
             return False
         before, self.reason, self.sentences = self.state, reason, sentences
         if state is before:
@@ -82,7 +82,7 @@ class Health:
         self.visits[self.state] = 1
 
 
-class Trouble(NamedTuple):
+class ServiceWarning(NamedTuple):
     """Why something does not work."""
 
     reason: str
@@ -94,7 +94,7 @@ class Trouble(NamedTuple):
 class Judgement(NamedTuple):
     """The arguments of :meth:`Health.set`."""
 
-    state: State
+    state: ServiceState
     reason: str
     sentences: tuple[str, ...] = ()
 
@@ -109,14 +109,14 @@ class Facts:
     """Longest time without a frame before the state is WAITING."""
     pictured: bool
     """A frame came since the start."""
-    camera: Trouble
+    camera: ServiceWarning
     """Why the camera sends nothing, as its driver says."""
     posed: bool
     """The newest frame has a pose."""
     ever_posed: bool
-    inconsistent: Trouble | None
+    inconsistent: ServiceWarning | None
     """Why the poses of the last seconds are doubtful, by the monitor of scale."""
-    troubles: list[Trouble]
+    troubles: list[ServiceWarning]
     """Why the service works with less than everything."""
 
 
@@ -125,18 +125,18 @@ def judged(facts: Facts) -> Judgement:
     if facts.frame_age_s > facts.patience_s:
         said = f": {facts.camera.reason}" if facts.camera.reason else ""
         reason = f"no picture for {facts.frame_age_s:.0f} s{said}"
-        return Judgement(State.WAITING, reason, (facts.camera.sentence,))
+        return Judgement(ServiceState.WAITING, reason, (facts.camera.sentence,))
     if not facts.pictured:
-        return Judgement(State.STARTING, "no picture yet")
+        return Judgement(ServiceState.STARTING, "no picture yet")
     if not facts.ever_posed:
         reason = "no pose yet: the camera must move sideways over texture"
-        return Judgement(State.INITIALISING, reason)
+        return Judgement(ServiceState.INITIALISING, reason)
     if not facts.posed:
         reason = "the newest frames have no pose; the place is being looked for"
-        return Judgement(State.LOST, reason)
+        return Judgement(ServiceState.LOST, reason)
     troubles = [each for each in (facts.inconsistent, *facts.troubles) if each is not None]
     if not troubles:
-        return Judgement(State.TRACKING, "every frame has a pose")
-    state = State.DEGRADED if facts.inconsistent is None else State.INCONSISTENT
+        return Judgement(ServiceState.TRACKING, "every frame has a pose")
+    state = ServiceState.DEGRADED if facts.inconsistent is None else ServiceState.INCONSISTENT
     reason = "; ".join(each.reason for each in troubles)
     return Judgement(state, reason, tuple(each.sentence for each in troubles))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.types import KIND_OF, VALUES, Attitude, Position, TelemetrySample, UtcTime
 
 UNITS = {
@@ -59,7 +59,7 @@ def _value(sample: TelemetrySample) -> float | list[float] | str:
     return round(float(value), DIGITS)
 
 
-def metric_frame_numbers(frame: MetricFrame) -> dict[str, Any]:
+def metric_frame_numbers(frame: WorldFrame) -> dict[str, Any]:
     """Whether scale, gravity and north are known, how well, and why sources are not used."""
     return {
         "metric": frame.metric,

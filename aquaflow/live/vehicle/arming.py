@@ -10,8 +10,8 @@ from aquaflow.base.errors import ConfigError
 from aquaflow.config.service import DiveConfig
 from aquaflow.config.telemetry import MavlinkConfig
 from aquaflow.config.vehicle import VehicleConfig
-from aquaflow.live.control import Control, Phase, RefusedError, Request
-from aquaflow.live.watched import Watched
+from aquaflow.live.control import DivePhase, RefusedError, ServiceControl, ServiceRequest
+from aquaflow.live.service_status import ServiceStatus
 from aquaflow.sources.pilot import HearsPilot, PilotRequest
 
 log = logging.getLogger(__name__)
@@ -42,7 +42,7 @@ def refuse_without_autopilot(vehicle: VehicleConfig) -> None:
 class Arming:
     """A watcher of the service; construct it to have commands obeyed as well."""
 
-    def __init__(self, config: DiveConfig, control: Control, pilot: HearsPilot) -> None:
+    def __init__(self, config: DiveConfig, control: ServiceControl, pilot: HearsPilot) -> None:
         self._config, self._control, self._pilot = config, control, pilot
         self._armed = False
         """In the turn before."""
@@ -56,13 +56,13 @@ class Arming:
     def asked(self, request: PilotRequest) -> bool:
         """Pass a command on; False where it makes no sense now. For any thread."""
         try:
-            self._control.ask(Request(request))
+            self._control.ask(ServiceRequest(request))
         except RefusedError as refused:
             log.warning("a command by MAVLink to %s: %s", request, refused)
             return False
         return True
 
-    def update(self, service: Watched, now_s: float | None = None) -> None:
+    def update(self, service: ServiceStatus, now_s: float | None = None) -> None:
         """Called after every turn; asks for what arming and disarming mean."""
         now, armed = time.monotonic() if now_s is None else now_s, self._pilot.armed
         if armed is None:
@@ -73,20 +73,20 @@ class Arming:
         elif self._armed:
             self._begun, self._disarmed_s = False, now
         self._armed = armed
-        if self._control.phase in (Phase.IDLE, Phase.FINISHING):
+        if self._control.phase in (DivePhase.IDLE, DivePhase.FINISHING):
             self._disarmed_s = None  # a dive begun from here on is none of that arming's
         if self._disarmed_s is not None and now - self._disarmed_s >= self._config.disarmed_s:
             self._disarmed_s = None
             if self._config.finish == "when_disarmed":
-                self._ask(Request.FINISH)
+                self._ask(ServiceRequest.FINISH)
 
     def _begin(self) -> None:
-        if self._begun or self._control.phase is Phase.FINISHING:
+        if self._begun or self._control.phase is DivePhase.FINISHING:
             return  # which is waited for: the dive of this arming comes after it
         self._begun = True
-        if self._config.begin == "when_armed" and self._control.phase is Phase.IDLE:
-            self._ask(Request.START)
+        if self._config.begin == "when_armed" and self._control.phase is DivePhase.IDLE:
+            self._ask(ServiceRequest.START)
 
-    def _ask(self, request: Request) -> None:
+    def _ask(self, request: ServiceRequest) -> None:
         with contextlib.suppress(RefusedError):  # the pilot was faster
             self._control.ask(request)

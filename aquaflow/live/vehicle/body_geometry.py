@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.telemetry.metric_frame import MetricFrame, moved_by_frame
+from aquaflow.telemetry.world_frame import WorldFrame, moved_by_frame
 
 Array = npt.NDArray[np.float64]
 
@@ -18,7 +18,7 @@ LEAST_COSINE = 0.1
 
 
 @dataclass(frozen=True)
-class Pose:
+class BodyPoseInWorld:
     """Of the body in the world n: north-east-down, or along the initial heading."""
 
     R: Array
@@ -26,21 +26,21 @@ class Pose:
     t_m: Array
     """[3]"""
 
-    def to(self, later: Pose) -> tuple[Array, Array]:
+    def to(self, later: BodyPoseInWorld) -> tuple[Array, Array]:
         """Rotation vector [3], rad, and translation [3], m, to ``later``, in its axes."""
         turn = Rotation.from_matrix(self.R.T @ later.R).as_rotvec()
         return np.asarray(turn), later.R.T @ (later.t_m - self.t_m)
 
 
-def body_pose(frame: MetricFrame, T_bc: Sim3, T_mc: Sim3) -> Pose:
+def body_pose(frame: WorldFrame, T_bc: Sim3, T_mc: Sim3) -> BodyPoseInWorld:
     """The body's pose for a camera pose ``T_mc`` in the sub-map that ``frame`` places."""
     R = frame.T_nm.R @ T_mc.R @ T_bc.R.T
-    return Pose(R, frame.T_nm.apply(T_mc.t) - R @ T_bc.t)
+    return BodyPoseInWorld(R, frame.T_nm.apply(T_mc.t) - R @ T_bc.t)
 
 
 def pose_covariance(
-    frame: MetricFrame,
-    pose: Pose,
+    frame: WorldFrame,
+    pose: BodyPoseInWorld,
     own: Array,  # [6, 6] of the pose in the map: position, m, and rotation vector, rad, in n
 ) -> Array:
     """[6, 6] of x, y, z (m) and roll, pitch, yaw (rad): the frame's own, and the pose's in it."""

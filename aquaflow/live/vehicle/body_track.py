@@ -12,11 +12,11 @@ import numpy.typing as npt
 from scipy.linalg import block_diag
 
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.live.vehicle.body_geometry import Pose
+from aquaflow.live.vehicle.body_geometry import BodyPoseInWorld
 
 Array = npt.NDArray[np.float64]
 
-Place: TypeAlias = Callable[[Sim3], Pose]
+Place: TypeAlias = Callable[[Sim3], BodyPoseInWorld]
 """The body's pose for a camera pose in the sub-map, as the map's place in the world is known."""
 
 WINDOW = 3
@@ -33,7 +33,7 @@ MOST_ACCELERATION_M_S2, MOST_TURN_RAD_S2 = 2.0, 4.0
 
 
 @dataclass(frozen=True)
-class Motion:
+class BodyRates:
     """Velocity and angular rate of the body, along its own axes."""
 
     velocity_m_s: Array
@@ -60,7 +60,7 @@ class BodyTrack:
     def __init__(self, jump_m: float, jump_rad: float) -> None:
         self._jump_m, self._jump_rad = jump_m, jump_rad
         self._sightings: deque[Sighting] = deque(maxlen=WINDOW)
-        self._poses: list[Pose] = []
+        self._poses: list[BodyPoseInWorld] = []
 
     def add(self, sighting: Sighting, place: Place) -> bool:
         """Take the next pose; True if it jumped, or the place of the map did."""
@@ -73,7 +73,7 @@ class BodyTrack:
         return jumped
 
     @property
-    def pose(self) -> Pose:
+    def pose(self) -> BodyPoseInWorld:
         """The newest pose."""
         return self._poses[-1]
 
@@ -85,7 +85,7 @@ class BodyTrack:
         since_ns = self._sightings[-1].t_ns - self._sightings[-2].t_ns
         return (since_ns, *self._poses[-2].to(self._poses[-1]))
 
-    def motion(self, sigma_m: float, sigma_rad: float) -> Motion | None:
+    def motion(self, sigma_m: float, sigma_rad: float) -> BodyRates | None:
         """The mean motion of the window; None while there are too few poses.
 
         ``sigma_m`` and ``sigma_rad`` are of one pose against the next. What the window's steps
@@ -100,7 +100,7 @@ class BodyTrack:
         noise = np.diag(np.repeat([sigma_m, sigma_rad], 3) * np.sqrt(2.0) / t_s[-1]) ** 2
         scatter = (rates - mean).T @ (rates - mean) / (len(rates) * (len(rates) - 1))
         covariance = noise + block_diag(scatter[:3, :3], scatter[3:, 3:])
-        return Motion(mean[:3], mean[3:], covariance)
+        return BodyRates(mean[:3], mean[3:], covariance)
 
     def _continues(self, sighting: Sighting) -> bool:
         """True if the motion since the newest pose is one of the same map, without a gap."""
@@ -110,7 +110,7 @@ class BodyTrack:
         since_s = 1e-9 * (sighting.t_ns - newest.t_ns)
         return newest.sub_map == sighting.sub_map and 0.0 < since_s <= LONGEST_GAP_S
 
-    def _jumped(self, sighting: Sighting, pose: Pose, place: Place) -> bool:
+    def _jumped(self, sighting: Sighting, pose: BodyPoseInWorld, place: Place) -> bool:
         if not self._sightings:
             return False
         newest, before = self._sightings[-1], self.pose
@@ -130,16 +130,18 @@ class BodyTrack:
             slack_m, slack_rad = MOST_SPEED_M_S * since_s, MOST_RATE_RAD_S * since_s
         else:
             R = before.R @ so3_exp(motion.rate_rad_s * since_s)
-            before = Pose(R, before.t_m + before.R @ motion.velocity_m_s * since_s)
+            before = BodyPoseInWorld(R, before.t_m + before.R @ motion.velocity_m_s * since_s)
         return self._differ(before, pose, slack_m, slack_rad)
 
-    def _differ(self, a: Pose, b: Pose, slack_m: float, slack_rad: float) -> bool:
+    def _differ(
+        self, a: BodyPoseInWorld, b: BodyPoseInWorld, slack_m: float, slack_rad: float
+    ) -> bool:
         turn, moved = a.to(b)
         too_far = float(np.linalg.norm(moved)) > self._jump_m + slack_m
         return bool(too_far or float(np.linalg.norm(turn)) > self._jump_rad + slack_rad)
 
 
-def _mid_step(a: Pose, b: Pose) -> Array:
+def _mid_step(a: BodyPoseInWorld, b: BodyPoseInWorld) -> Array:
     """[6] translation in the axes halfway between the poses, and rotation vector."""
     turn, moved_b = a.to(b)
     return np.concatenate([so3_exp(0.5 * turn) @ moved_b, turn])

@@ -9,8 +9,8 @@ from typing import Literal
 from aquaflow.config.service import VehicleReportConfig
 from aquaflow.live.feed import Feed
 from aquaflow.live.health.sentences import OF_STATE
-from aquaflow.live.health.state import Health, State
-from aquaflow.live.watched import Watched
+from aquaflow.live.health.state import Health, ServiceState
+from aquaflow.live.service_status import ServiceStatus
 from aquaflow.sources.outbound import NamedValue, StatusText
 
 EVERY_S = 1.0
@@ -21,16 +21,16 @@ REPEAT_S = 15.0
 """Least time until the same sentence comes again: a state that flaps must not fill the pilot's
 screen."""
 
-HINTED_IN = (State.TRACKING, State.DEGRADED)
+HINTED_IN = (ServiceState.TRACKING, ServiceState.DEGRADED)
 """States in which a pilot has time for what could be better."""
 
-SEVERITY: dict[State, Literal["error", "warning", "notice", "info"]] = {
-    State.WAITING: "error",
-    State.LOST: "warning",
-    State.DEGRADED: "warning",
-    State.INCONSISTENT: "warning",
-    State.TRACKING: "notice",
-    State.PAUSED: "notice",
+SEVERITY: dict[ServiceState, Literal["error", "warning", "notice", "info"]] = {
+    ServiceState.WAITING: "error",
+    ServiceState.LOST: "warning",
+    ServiceState.DEGRADED: "warning",
+    ServiceState.INCONSISTENT: "warning",
+    ServiceState.TRACKING: "notice",
+    ServiceState.PAUSED: "notice",
 }
 """How urgent each state is to the pilot."""
 
@@ -52,7 +52,7 @@ class PilotMessages:
         """When each sentence of the last ``REPEAT_S`` was said."""
         self._told_s = -EVERY_S
 
-    def update(self, loop: Watched, now_s: float | None = None) -> None:
+    def update(self, loop: ServiceStatus, now_s: float | None = None) -> None:
         """Called after every turn of the loop; sends what is new or due."""
         now = time.monotonic() if now_s is None else now_s
         if self._config.status_text:
@@ -75,7 +75,7 @@ class PilotMessages:
         holding = (*own, *hints)
         self._standing &= set(holding)
         soon = now - max(self._said_s.values(), default=-SPACING_S) < SPACING_S
-        if soon and health.state is not State.STOPPING:  # which has no later
+        if soon and health.state is not ServiceState.STOPPING:  # which has no later
             return
         self._said_s = {each: at for each, at in self._said_s.items() if now - at < REPEAT_S}
         for sentence in holding:

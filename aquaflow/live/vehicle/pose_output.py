@@ -24,9 +24,9 @@ from aquaflow.live.feed import Feed
 from aquaflow.live.loop import LiveLoop
 from aquaflow.live.vehicle.body_geometry import body_pose, pose_covariance
 from aquaflow.live.vehicle.body_track import BodyTrack, Sighting
-from aquaflow.sources.outbound import BodyMotion, BodyPose, OutboundMessage
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.sources.outbound import BodyPose, BodyPoseChange, OutboundMessage
 from aquaflow.telemetry.start import camera_in_body
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.frames import Tracked
 
 Array = npt.NDArray[np.float64]
@@ -67,7 +67,7 @@ class PoseOutput:
     """A watcher of the loop."""
 
     def __init__(
-        self, config: PoseConfig, feed: Feed, frame_of: Callable[[int], MetricFrame]
+        self, config: PoseConfig, feed: Feed, frame_of: Callable[[int], WorldFrame]
     ) -> None:
         """``frame_of`` gives a sub-map's place in the world, as it is known at that moment."""
         self.sent = 0
@@ -133,7 +133,7 @@ class PoseOutput:
             return message
         return None if self._feed.send(message) else Withheld.NO_RECEIVER
 
-    def _missing(self, frame: MetricFrame) -> Withheld | None:
+    def _missing(self, frame: WorldFrame) -> Withheld | None:
         if not frame.metric:
             return Withheld.NO_SCALE
         if not frame.scale_sigma <= self._config.max_scale_sigma:
@@ -154,7 +154,7 @@ class PoseOutput:
         moved = 0.0 if before is None or jumped else float(np.linalg.norm(place - before))
         self._way_m = 0.0 if jumped else self._way_m + moved
 
-    def _pose(self, frame: MetricFrame, t_ns: int, quality: float) -> OutboundMessage | Withheld:
+    def _pose(self, frame: WorldFrame, t_ns: int, quality: float) -> OutboundMessage | Withheld:
         worse = 1.0 / max(quality, LEAST_QUALITY)
         sigma_m, sigma_rad = worse * LEAST_SIGMA_M, worse * LEAST_SIGMA_RAD
         motion = self._track.motion(sigma_m, sigma_rad)
@@ -179,7 +179,7 @@ class PoseOutput:
 
     def _motion(self, t_ns: int, quality: float) -> OutboundMessage | Withheld:
         step = self._track.step()
-        return Withheld.NO_VELOCITY if step is None else BodyMotion(t_ns, *step, quality)
+        return Withheld.NO_VELOCITY if step is None else BodyPoseChange(t_ns, *step, quality)
 
     def _rate_hz(self) -> float:
         """Rate of the last poses; 0 while there are too few."""

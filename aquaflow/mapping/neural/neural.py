@@ -47,7 +47,7 @@ class NeuralGaussians:
         self.field = NeuralField(config, gaussians, generator, threads)
         self.optimisers = FeatureOptimisers(self.field, betas)
         self._expected: list[View] = []
-        self._window: Window | None = None
+        self._window: DecodedWindow | None = None
         self._looked: tuple[View, Tensor, Trunk] | None = None
         """View, camera centre and trunk of ``seen_from``'s last look, while nothing has changed."""
 
@@ -78,7 +78,7 @@ class NeuralGaussians:
         window = self._window
         if window is None or not window.has(view):
             self.settle()
-            window = self._window = Window.opened(self.field, self._next_views(view))
+            window = self._window = DecodedWindow.opened(self.field, self._next_views(view))
         seen = window.go_on_to(view)
         return self.field.decoded(window.trunk, seen, parameters, viewmat)
 
@@ -337,7 +337,7 @@ class FeatureOptimisers:
         groups = {name: (features, self.field.config.feature_rate)}
         return SelectiveAdam(groups, self._betas, threads=self.field.threads)
 
-    def step(self, window: Window) -> None:
+    def step(self, window: DecodedWindow) -> None:
         """One step with the gradient of the window's views."""
         assert window.local.grad is not None
         assert window.shared.grad is not None
@@ -389,7 +389,7 @@ class FeatureOptimisers:
 
 
 @dataclass
-class Window:
+class DecodedWindow:
     """A trunk, and the views that still have to be decoded from it."""
 
     whole: Trunk
@@ -404,7 +404,7 @@ class Window:
     """Each with the Gaussians [N] bool that it shows."""
 
     @staticmethod
-    def opened(field: NeuralField, views: Sequence[View]) -> Window:
+    def opened(field: NeuralField, views: Sequence[View]) -> DecodedWindow:
         """The window of ``views``; if the trunk takes an observation, it is the first one's."""
         means = field.gaussians.means
         seen = [in_picture(means, each, each.viewmat()) for each in views]
@@ -413,7 +413,7 @@ class Window:
         centre = camera_centre(views[0].viewmat())
         trunk = field.trunk(field.context(seen), centre, (local, shared))
         hidden = trunk.hidden.detach().requires_grad_()
-        return Window(trunk, hidden, local, shared, list(zip(views, seen, strict=True)))
+        return DecodedWindow(trunk, hidden, local, shared, list(zip(views, seen, strict=True)))
 
     def has(self, view: View) -> bool:
         """True if ``view`` still has to be decoded."""

@@ -16,7 +16,7 @@ from aquaflow.config import MappingConfig, OptimiserConfig
 from aquaflow.mapping.neural.decode import DECODED
 from aquaflow.mapping.optimisation.objective import Objective
 from aquaflow.mapping.optimisation.schedule import Rates
-from aquaflow.mapping.rendering import Shown
+from aquaflow.mapping.rendering import RenderedMap
 from aquaflow.mapping.scene import Scene
 from aquaflow.render.adam import SelectiveAdam
 from aquaflow.render.contract import TILE_PX
@@ -152,7 +152,7 @@ class MapOptimiser:
             self.adam.keep(mask)
             self.adam.bind(self.scene.gaussians.parameters)
 
-    def _prune(self, shown: Shown, view: View) -> None:
+    def _prune(self, shown: RenderedMap, view: View) -> None:
         """Drop Gaussians that are almost transparent, or that fill the picture."""
         opaque = self.scene.gaussians.opacities > self.config.optimiser.prune_opacity
         widest = self.config.optimiser.prune_radius_widths * view.camera.width

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from aquaflow.config import LossConfig
 from aquaflow.mapping.optimisation.losses import radial_weight, scale_loss
-from aquaflow.mapping.rendering import Shown
+from aquaflow.mapping.rendering import RenderedMap
 from aquaflow.render.activity import active_pixels
 from aquaflow.render.photometric import photometric_loss
 from aquaflow.render.view_loss import depth_loss, outlier_mask
@@ -25,7 +25,7 @@ class Objective:
     def total(
         self,
         view: View,
-        shown: Shown,
+        shown: RenderedMap,
         parameters: Mapping[str, Tensor],  # of a GaussianMap
     ) -> Tensor:
         """L1, SSIM, depth and scale terms of ``shown``, the map drawn from ``view``."""
@@ -52,7 +52,7 @@ class Objective:
     def _pictures(
         self,
         view: View,
-        shown: Shown,
+        shown: RenderedMap,
         target: Tensor,  # [H, W, 3]
         mask: Tensor,  # [H, W] bool
     ) -> Tensor:

@@ -85,7 +85,7 @@ def _aligned(picture: _Picture, most_steps: int) -> Array:
 
 
 @dataclass(frozen=True)
-class _Fit:
+class _Registration:
     """The map drawn from one pose, against the picture."""
 
     viewmat: Array
@@ -114,7 +114,7 @@ class _Picture:
     def fit(
         self,
         viewmat: Array,  # [4, 4]
-    ) -> _Fit:
+    ) -> _Registration:
         """The map from this pose."""
         image = self._draw(viewmat)
         residual = image - self._target
@@ -122,7 +122,7 @@ class _Picture:
         beyond = ROBUST / size.clamp_min(ROBUST)  # 1 where it is not beyond
         loss = torch.where(size > ROBUST, ROBUST * (size - 0.5 * ROBUST), 0.5 * size * size)
         cost = float(registration_out((self._weight * loss).sum(dtype=torch.float64)))
-        return _Fit(viewmat, image, residual, self._weight * beyond, cost)
+        return _Registration(viewmat, image, residual, self._weight * beyond, cost)
 
     def trial(self) -> Array:
         """[6] steps of the tangent that each move the picture by about ``TRIAL_PX``."""
@@ -135,7 +135,7 @@ class _Picture:
     @torch.no_grad()
     def derivatives(
         self,
-        fit: _Fit,
+        fit: _Registration,
         trial: Array,  # [6]
     ) -> Tensor:
         """[6, P, 3] how each trial step of the tangent changes the drawing."""
@@ -152,7 +152,7 @@ class _Picture:
 
 
 def _gauss_newton_step(
-    fit: _Fit,
+    fit: _Registration,
     derivatives: Tensor,  # [6, P, 3]
 ) -> Array:
     """[6] of the tangent, in units of the trial steps."""

@@ -43,7 +43,7 @@ INPUTS = ("Dc_a", "Dc_b", "rays_a", "rays_b")
 Progress = Callable[[str, int, int], None]
 
 
-class DecoderGraph(nn.Module):
+class CompactDecoderGraph(nn.Module):
     """``Comparison`` with its outputs side by side."""
 
     def __init__(self, network: CompactPrior) -> None:
@@ -177,7 +177,7 @@ def _write_decoder(network: CompactPrior, path: Path) -> None:
     descriptors = torch.zeros(2, 1, network.size.coarse, *cells)
     rays = _random_rays(HEIGHT, WIDTH)
     example = (descriptors[0], descriptors[1], rays[0], rays[1])
-    write_onnx(DecoderGraph(network), example, INPUTS, OUTPUTS, path, (*shapes, *shapes))
+    write_onnx(CompactDecoderGraph(network), example, INPUTS, OUTPUTS, path, (*shapes, *shapes))
 
 
 def _random_rays(height: int, width: int) -> Tensor:

@@ -73,7 +73,7 @@ class CompactPrior(nn.Module):
         size = size or NetworkSize()
         self.size = size
         self.encoder = Encoder(size)
-        self.comparison = Comparison(size)
+        self.comparison = CompactDecoder(size)
         self.fine_sharpness = nn.Parameter(torch.tensor(2.6))
 
     def encode(
@@ -115,7 +115,7 @@ class Encoder(nn.Module):
         return Encoded(D, Dc, torch.sigmoid(self.trust(merged_2.detach()).float())[:, 0])
 
 
-class Comparison(nn.Module):
+class CompactDecoder(nn.Module):
     """Coarse matches of a pair, and from them and the rays a rough range."""
 
     def __init__(self, size: NetworkSize) -> None:

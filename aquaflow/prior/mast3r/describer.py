@@ -17,7 +17,7 @@ import numpy as np
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.contract import Float, RangeUnit
 from aquaflow.prior.folder import DECODER, ENCODER, read_card
-from aquaflow.prior.framing import Framing, as_input
+from aquaflow.prior.framing import ImagePadding, as_input
 from aquaflow.prior.learned_range import LearnedRange
 from aquaflow.prior.network import METRIC_SIGMA, SHORTEST, Half, Picture
 from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
@@ -81,8 +81,8 @@ class Mast3rDescriber:
         tokens = {"tokens_a": a.astype(np.float32), "tokens_b": b.astype(np.float32)}
         return self._decoder.outputs_of(tokens)
 
-    def _framing(self, height: int, width: int) -> Framing:
-        return Framing.of(height, width, self._size, CELL_PX)
+    def _framing(self, height: int, width: int) -> ImagePadding:
+        return ImagePadding.of(height, width, self._size, CELL_PX)
 
 
 @dataclass
@@ -94,8 +94,8 @@ class Mast3rPair:
     """[1, N, D]"""
     b: Half
     """[1, N, D]"""
-    framing_a: Framing
-    framing_b: Framing
+    framing_a: ImagePadding
+    framing_b: ImagePadding
 
     @property
     def cells(self) -> tuple[Float, Float]:
@@ -130,7 +130,7 @@ class Mast3rPair:
 
 def _at_cells(
     field: Float,  # [1, h, w, ...] of the frame's pixels
-    framing: Framing,
+    framing: ImagePadding,
 ) -> Float:
     """[h', w', ...] at the centres of the cells that show the picture."""
     return framing.cut(field[0, MIDDLE, MIDDLE])
@@ -138,7 +138,7 @@ def _at_cells(
 
 def _range_of_points(
     found: Mapping[str, Float],  # outputs of the decoder by name
-    framing: Framing,
+    framing: ImagePadding,
 ) -> LearnedRange:
     """Distances of the first picture's points, in metres. Their confidence Q weighed errors in
     training, so that the network expects an error of POINTS_ALPHA / Q metres."""

@@ -43,7 +43,7 @@ class EncoderGraph(nn.Module):
         return self.network.encode(image)
 
 
-class DecoderGraph(nn.Module):
+class Mast3rDecoderGraph(nn.Module):
     """``Mast3r.decode`` at one picture size, its outputs side by side."""
 
     def __init__(self, network: Mast3r, rows: int, columns: int) -> None:
@@ -121,6 +121,6 @@ def verify_tiny(folder: Path, progress: Progress) -> dict[str, float]:
     return export(Mast3r(TINY), folder, *TINY_PX, licence="none", progress=progress).parity
 
 
-def _graphs(network: Mast3r, width: int, height: int) -> tuple[EncoderGraph, DecoderGraph]:
+def _graphs(network: Mast3r, width: int, height: int) -> tuple[EncoderGraph, Mast3rDecoderGraph]:
     network = network.eval()
-    return EncoderGraph(network), DecoderGraph(network, height // PATCH_PX, width // PATCH_PX)
+    return EncoderGraph(network), Mast3rDecoderGraph(network, height // PATCH_PX, width // PATCH_PX)

@@ -54,7 +54,7 @@ class PatchEmbed(nn.Module):
         return self.proj(image).flatten(2).transpose(1, 2)  # type: ignore[no-any-return]
 
 
-class Head(nn.Module):
+class PointHead(nn.Module):
     """Dense head for the points, an MLP on the tokens for the descriptors."""
 
     def __init__(self, size: Mast3rSize) -> None:
@@ -109,8 +109,8 @@ class Mast3r(nn.Module):
         self.dec_blocks2 = nn.ModuleList(
             DecoderBlock(narrow, heads, ratio) for _ in range(size.decoder_depth)
         )
-        self.downstream_head1 = Head(size)
-        self.downstream_head2 = Head(size)
+        self.downstream_head1 = PointHead(size)
+        self.downstream_head2 = PointHead(size)
 
     def encode(
         self,

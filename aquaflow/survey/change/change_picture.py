@@ -17,7 +17,7 @@ from aquaflow.survey.change.comparison import (
     MOVED_HERE,
     NOT_SEEN,
     UNCHANGED,
-    Comparison,
+    SurfaceComparison,
 )
 from aquaflow.survey.change.patches import NAMES, Patch
 from aquaflow.survey.change.surface import Surface
@@ -39,7 +39,7 @@ SHOWN_LEVELS = 3.0
 
 
 def change_png(
-    compared: Comparison, patches: list[Patch], first: Surface, second: Surface, unit: str
+    compared: SurfaceComparison, patches: list[Patch], first: Surface, second: Surface, unit: str
 ) -> bytes:
     """A PNG file."""
     from matplotlib.colors import BoundaryNorm, ListedColormap

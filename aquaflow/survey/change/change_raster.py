@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.survey.change.comparison import NOT_SEEN, Comparison
+from aquaflow.survey.change.comparison import NOT_SEEN, SurfaceComparison
 from aquaflow.survey.export.ortho.geotiff import writing_raster
-from aquaflow.survey.export.ortho.grid import Grid, Tile
+from aquaflow.survey.export.ortho.grid import Grid, GridTile
 from aquaflow.survey.export.ortho.ground import Ground
 from aquaflow.survey.export.ortho.layers import NODATA, RasterFile
 
@@ -30,14 +30,14 @@ CHANGE = RasterFile(
 )
 
 
-def grid_of(compared: Comparison) -> Grid:
+def grid_of(compared: SurfaceComparison) -> Grid:
     """Pixels that each hold a core point where there is surface."""
     places = compared.places[:, :2]
     low, high = places.min(axis=0), places.max(axis=0)
     return Grid.around(low, high, compared.scales.apart, np.zeros(2))
 
 
-def bands_of(compared: Comparison, grid: Grid) -> npt.NDArray[np.float32]:
+def bands_of(compared: SurfaceComparison, grid: Grid) -> npt.NDArray[np.float32]:
     """[bands, h, w] of the highest core point in each pixel; NODATA where nothing is known."""
     column = np.floor((compared.places[:, 0] - grid.left) / grid.pixel).astype(np.intp)
     row = np.floor((grid.top - compared.places[:, 1]) / grid.pixel).astype(np.intp)
@@ -60,7 +60,7 @@ def bands_of(compared: Comparison, grid: Grid) -> npt.NDArray[np.float32]:
 
 
 def write_change_raster(
-    folder: Path, compared: Comparison, ground: Ground, tags: Mapping[str, str]
+    folder: Path, compared: SurfaceComparison, ground: Ground, tags: Mapping[str, str]
 ) -> None:
     """Write the file into ``folder``.
 
@@ -74,7 +74,7 @@ def write_change_raster(
             raster.write(tile, bands[(slice(None), *_part(tile))])
 
 
-def _part(tile: Tile) -> tuple[slice, slice]:
+def _part(tile: GridTile) -> tuple[slice, slice]:
     return (
         slice(tile.row, tile.row + tile.height),
         slice(tile.column, tile.column + tile.width),

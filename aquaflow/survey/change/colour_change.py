@@ -34,7 +34,7 @@ LEAST_POINTS = 5
 
 
 @dataclass(frozen=True)
-class Shown:
+class PlaceColours:
     """The colour of places on one day."""
 
     mean: Array
@@ -68,7 +68,7 @@ def shown_at(
     surface: Surface,
     places: Array,  # [N, 3] on the surface; NaN: none
     radius: float,
-) -> Shown:
+) -> PlaceColours:
     """The colour of a surface around places."""
     mean, sigma = np.full((len(places), 3), np.nan), np.full(len(places), np.nan)
     usable = np.flatnonzero(np.isfinite(places).all(axis=1))
@@ -88,10 +88,10 @@ def shown_at(
         mean[which] = np.where(enough[:, None], middle, np.nan)
         relative = np.sqrt(spread / independent / brightness**2 + left**2)
         sigma[which] = np.where(enough, relative, np.nan)
-    return Shown(mean, sigma)
+    return PlaceColours(mean, sigma)
 
 
-def colour_change(first: Shown, second: Shown) -> ColourChange:
+def colour_change(first: PlaceColours, second: PlaceColours) -> ColourChange:
     """From the first day to the second."""
     both = np.isfinite(first.mean).all(axis=1) & np.isfinite(second.mean).all(axis=1)
     lit = both & (first.mean > DARKEST).all(axis=1) & (second.mean > DARKEST).all(axis=1)

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.survey.change.colour_change import ColourChange, colour_change, shown_at
-from aquaflow.survey.change.m3c2 import Cloud, Distances, Scales, m3c2, normals_at
+from aquaflow.survey.change.m3c2 import DayPoints, Scales, SurfaceDistances, m3c2, normals_at
 from aquaflow.survey.change.registration import Registration
 from aquaflow.survey.change.significance import discoveries, null_spread, two_sided
 from aquaflow.survey.change.surface import Progress, Surface
@@ -34,14 +34,14 @@ REACH_RESOLUTIONS = 18.0
 
 
 @dataclass(frozen=True)
-class Comparison:
+class SurfaceComparison:
     """What is known of each core point, a place on the first day's surface."""
 
     places: Array
     """[N, 3] ground axes of the first dive."""
     area: float
     """Of the surface that each stands for."""
-    distances: Distances
+    distances: SurfaceDistances
     """With sigmas that cover the spread of the unchanged."""
     colours: ColourChange
     kinds: Classes
@@ -71,7 +71,7 @@ def compare(
     cylinder: float | None,
     reach: float | None,
     progress: Progress,
-) -> Comparison:
+) -> SurfaceComparison:
     """Compare two surfaces that lie in one frame.
 
     Args:
@@ -87,8 +87,8 @@ def compare(
     places = thinned(first.points, resolution)
     normals = normals_at(places, first.points, first.normals, scales.normal)
     stated = m3c2(
-        Cloud(first.points, first.sigma, first.normals),
-        Cloud(second.points, second.sigma, second.normals),
+        DayPoints(first.points, first.sigma, first.normals),
+        DayPoints(second.points, second.sigma, second.normals),
         places, normals, scales, registration.sigma_along(places, normals), of_surfaces=True,
         progress=partial(progress, "distances"),
     )  # fmt: skip
@@ -101,7 +101,7 @@ def compare(
     )
     kinds = classes(distances, colours, false_discoveries)
     kinds[hidden(first, second, places, there, kinds)] = NOT_SEEN
-    return Comparison(
+    return SurfaceComparison(
         places, first.area / max(len(places), 1), distances, colours, kinds, (middle, wider), scales
     )
 
@@ -122,7 +122,7 @@ def hidden(
     return found
 
 
-def classes(distances: Distances, colours: ColourChange, rate: float) -> Classes:
+def classes(distances: SurfaceDistances, colours: ColourChange, rate: float) -> Classes:
     """[N] of each place; ``rate``: of false discoveries, of distances and of colours each."""
     kinds = np.full(len(distances.distance), NOT_SEEN, np.int8)
     kinds[distances.seen] = UNCHANGED

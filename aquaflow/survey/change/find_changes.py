@@ -20,7 +20,7 @@ from aquaflow.dive.dive import Dive
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.change.change_picture import change_png
 from aquaflow.survey.change.change_raster import write_change_raster
-from aquaflow.survey.change.comparison import NOT_SEEN, UNCHANGED, Comparison, compare
+from aquaflow.survey.change.comparison import NOT_SEEN, UNCHANGED, SurfaceComparison, compare
 from aquaflow.survey.change.moved import with_moves
 from aquaflow.survey.change.patches import NAMES, Patch, find_patches
 from aquaflow.survey.change.registration import Registration, register
@@ -37,7 +37,7 @@ where a picture shows 1.9 m; a merged site's dives lie within some centimetres."
 
 
 @dataclass(frozen=True)
-class Asked:
+class ChangeSettings:
     """What is compared, and how."""
 
     first: Path
@@ -55,10 +55,10 @@ class Asked:
 class Changes:
     """What was found."""
 
-    asked: Asked
+    asked: ChangeSettings
     ground: Ground
     registration: Registration
-    compared: Comparison
+    compared: SurfaceComparison
     patches: list[Patch]
     surfaces: tuple[Surface, Surface]
 
@@ -96,7 +96,7 @@ class Changes:
         return [row_of(n, patch, self.ground) for n, patch in enumerate(self.patches, 1)]
 
 
-def find_changes(asked: Asked, work: Path, progress: Progress) -> Changes:
+def find_changes(asked: ChangeSettings, work: Path, progress: Progress) -> Changes:
     """Compare two dives.
 
     Args:

@@ -14,7 +14,7 @@ from aquaflow.geometry.earth import north_east
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.site.manifest import SiteDive, read_site
 from aquaflow.survey.site.merged_file import PlacedSubMap, merge_of
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 ROTATION_TOLERANCE = 1e-6
 """Largest difference of R^T R from the identity, as in metric.json."""
@@ -71,7 +71,7 @@ def between(first: Path, second: Path, transform: Path | None) -> Sim3:
     return one.T_nm.inverse() @ T_nn @ other.T_nm
 
 
-def on_earth(first: MetricFrame, second: MetricFrame) -> Sim3:
+def on_earth(first: WorldFrame, second: WorldFrame) -> Sim3:
     """From n of the second dive to n of the first; the identity where either has no place."""
     if not (first.georeferenced and second.georeferenced and first.origin and second.origin):
         return Sim3.identity()

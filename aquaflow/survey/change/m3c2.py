@@ -43,7 +43,7 @@ MAD_TO_SIGMA = 1.4826
 
 
 @dataclass(frozen=True)
-class Cloud:
+class DayPoints:
     """Points of one day."""
 
     points: Array
@@ -69,7 +69,7 @@ class Scales:
 
 
 @dataclass(frozen=True)
-class Distances:
+class SurfaceDistances:
     """Of each core point; NaN where one of the clouds has too few points in the cylinder."""
 
     distance: Array
@@ -119,15 +119,15 @@ def normals_at(
 
 
 def m3c2(
-    first: Cloud,
-    second: Cloud,
+    first: DayPoints,
+    second: DayPoints,
     cores: Array,  # [N, 3]
     normals: Array,  # [N, 3] unit; NaN: none
     scales: Scales,
     registration: Array | None = None,  # [N] 1 sigma along the normals
     of_surfaces: bool = False,
     progress: Progress | None = None,
-) -> Distances:
+) -> SurfaceDistances:
     """Distances from ``first`` to ``second`` at ``cores``.
 
     Args:
@@ -155,7 +155,7 @@ def m3c2(
         freedom = np.where(less > 0.0, (total + shared) ** 2 / less, np.inf)
     distance = np.where(seen, b.middle - a.middle, np.nan)
     sigma = np.where(seen, np.sqrt(total + shared), np.nan)
-    return Distances(distance, sigma, freedom, normals, a.count, b.count)
+    return SurfaceDistances(distance, sigma, freedom, normals, a.count, b.count)
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ class _Side:
 
 
 def _along(
-    cloud: Cloud,
+    cloud: DayPoints,
     cores: Array,  # [N, 3]
     normals: Array,  # [N, 3]
     scales: Scales,

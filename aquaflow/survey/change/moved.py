@@ -9,10 +9,16 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from aquaflow.survey.change.colour_change import DARKEST, shown_at
-from aquaflow.survey.change.comparison import GAINED, LOST, MOVED_AWAY, MOVED_HERE, Comparison
+from aquaflow.survey.change.comparison import (
+    GAINED,
+    LOST,
+    MOVED_AWAY,
+    MOVED_HERE,
+    SurfaceComparison,
+)
 from aquaflow.survey.change.patches import Patch, heights_of, window_of
 from aquaflow.survey.change.registration import Registration
-from aquaflow.survey.change.relief import Window, best_shift, hull_of
+from aquaflow.survey.change.relief import ReliefWindow, best_shift, hull_of
 from aquaflow.survey.change.surface import Surface
 
 Array = npt.NDArray[np.float64]
@@ -41,11 +47,11 @@ class _Pair:
 
 def with_moves(
     patches: list[Patch],
-    compared: Comparison,
+    compared: SurfaceComparison,
     first: Surface,
     second: Surface,
     registration: Registration,
-) -> tuple[list[Patch], Comparison]:
+) -> tuple[list[Patch], SurfaceComparison]:
     """The patches with those that are one thing called so; each belongs to one pair at most."""
     pairs = [
         pair
@@ -78,7 +84,7 @@ def _matched(
     b: int,
     lost: Patch,
     gained: Patch,
-    compared: Comparison,
+    compared: SurfaceComparison,
     first: Surface,
     second: Surface,
     registration: Registration,
@@ -102,7 +108,7 @@ def _matched(
     return _Pair(a, b, 1.0 - move.likeness, across, sigma)
 
 
-def _thing(window: Window, lost: Patch, gained: Patch, compared: Comparison) -> Flags:
+def _thing(window: ReliefWindow, lost: Patch, gained: Patch, compared: SurfaceComparison) -> Flags:
     """[h, w] cells that the thing covered on the first day.
 
     Where the patches are neighbours it covered what lies between them on both days, where no height
@@ -117,8 +123,8 @@ def _thing(window: Window, lost: Patch, gained: Patch, compared: Comparison) -> 
 
 
 def _layers(
-    window: Window,
-    compared: Comparison,
+    window: ReliefWindow,
+    compared: SurfaceComparison,
     surface: Surface,
     gains: Array,  # [3] that are taken off
 ) -> Array:
@@ -140,7 +146,7 @@ def _gap(
 
 
 def _same_colour(
-    lost: Patch, gained: Patch, compared: Comparison, first: Surface, second: Surface
+    lost: Patch, gained: Patch, compared: SurfaceComparison, first: Surface, second: Surface
 ) -> bool:
     """True if what was there looks like what is here now, in the first day's light."""
     radius = compared.scales.cylinder

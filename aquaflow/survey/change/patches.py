@@ -19,10 +19,10 @@ from aquaflow.survey.change.comparison import (
     MOVED_AWAY,
     MOVED_HERE,
     UNCHANGED,
-    Comparison,
+    SurfaceComparison,
 )
 from aquaflow.survey.change.neighbours import pairs_within
-from aquaflow.survey.change.relief import Window, filled
+from aquaflow.survey.change.relief import ReliefWindow, filled
 from aquaflow.survey.change.surface import Surface
 
 Array = npt.NDArray[np.float64]
@@ -69,10 +69,10 @@ class Patch:
 
 
 def find_patches(
-    compared: Comparison,
+    compared: SurfaceComparison,
     first: Surface,
     second: Surface,
-) -> tuple[list[Patch], Comparison]:
+) -> tuple[list[Patch], SurfaceComparison]:
     """The patches that are large enough, the largest first, and the comparison without others."""
     found, kinds = [], np.where(compared.kinds > UNCHANGED, UNCHANGED, compared.kinds)
     for kind in (GAINED, LOST, BLEACHED):
@@ -107,7 +107,7 @@ def connected(
 def _patch(
     kind: int,
     which: npt.NDArray[np.intp],  # [M]
-    compared: Comparison,
+    compared: SurfaceComparison,
     first: Surface,
     second: Surface,
 ) -> Patch:
@@ -127,7 +127,7 @@ def _patch(
 
 def _volume(
     which: npt.NDArray[np.intp],  # [M]
-    compared: Comparison,
+    compared: SurfaceComparison,
     first: Surface,
     second: Surface,
 ) -> float:
@@ -143,8 +143,8 @@ def _volume(
 
 def window_of(
     which: npt.NDArray[np.intp],  # [M]
-    compared: Comparison,
-) -> Window:
+    compared: SurfaceComparison,
+) -> ReliefWindow:
     """The raster over some core points, in the plane of what is unchanged around them."""
     places = np.vstack([compared.places[which], compared.after[which]])
     middle = places.mean(axis=0)
@@ -153,10 +153,10 @@ def window_of(
     near = np.linalg.norm(compared.places - middle, axis=1) < around
     same = near & (compared.kinds == UNCHANGED) & np.isfinite(compared.distances.normals[:, 0])
     normals = compared.distances.normals[same if same.any() else which]
-    return Window.around(places, normals.mean(axis=0), compared.scales.apart)
+    return ReliefWindow.around(places, normals.mean(axis=0), compared.scales.apart)
 
 
-def heights_of(window: Window, compared: Comparison, surface: Surface) -> Array:
+def heights_of(window: ReliefWindow, compared: SurfaceComparison, surface: Surface) -> Array:
     """[h, w] upper side of a surface over a window, with holes interpolated."""
     level = float(((compared.places - window.origin) @ window.axes[:, 2]).mean())
     reach = 4.0 * compared.scales.reach

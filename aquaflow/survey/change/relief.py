@@ -18,7 +18,7 @@ MARGIN_CELLS = 4
 
 
 @dataclass(frozen=True)
-class Window:
+class ReliefWindow:
     """A raster in a plane; heights are along the plane's normal."""
 
     origin: Array
@@ -33,7 +33,7 @@ class Window:
         places: Array,  # [N, 3]
         normal: Array,  # [3]
         cell: float,
-    ) -> Window:
+    ) -> ReliefWindow:
         """The raster that holds ``places`` with a margin."""
         up = normal / np.linalg.norm(normal)
         helper = np.eye(3)[int(np.argmin(np.abs(up)))]
@@ -44,7 +44,7 @@ class Window:
         low, high = local.min(axis=0) - margin, local.max(axis=0) + margin
         sides = np.maximum(np.ceil((high - low)[:2] / cell), 1).astype(int)
         corner = np.array([low[0], low[1], 0.0])
-        return Window(axes @ corner, axes, cell, (int(sides[1]), int(sides[0])))
+        return ReliefWindow(axes @ corner, axes, cell, (int(sides[1]), int(sides[0])))
 
     def cells(
         self,

@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 
 from aquaflow.dive.ply import PlyGaussians
 from aquaflow.survey.change.colour_change import DARKEST
-from aquaflow.survey.change.visibility import Look, look_at_places
+from aquaflow.survey.change.visibility import ViewLookup, look_at_places
 from aquaflow.survey.export.mesh.view_surfaces import ViewSurfaces
 from aquaflow.survey.measure.drawn_heights import MATCH_PX
 
@@ -111,7 +111,7 @@ def _look(
     day: DayMap,
     places: Array,  # [M, 3]
     resolution: float,
-) -> Look:
+) -> ViewLookup:
     margin = np.full(len(places), MARGIN_RESOLUTIONS * resolution)
     return look_at_places(day.views, places, margin)
 

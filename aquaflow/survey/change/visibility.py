@@ -22,7 +22,7 @@ LEAST_VIEWS = 2
 
 
 @dataclass(frozen=True)
-class Look:
+class ViewLookup:
     """What the views of a dive show at places."""
 
     there: Count
@@ -47,12 +47,12 @@ def look_at_places(
     views: ViewSurfaces,
     places: Array,  # [N, 3]
     margin: Array,  # [N] distance across the surface behind, from which it is another one
-) -> Look:
+) -> ViewLookup:
     """What all views show at the places."""
     past, there = np.zeros(len(places), np.int32), np.zeros(len(places), np.int32)
     footprint = np.full(len(places), np.inf)
     if len(places) == 0:
-        return Look(there, past, footprint)
+        return ViewLookup(there, past, footprint)
     reach = margin.max()  # what lies a little below all that a view shows is there, too
     for number in views.around(places.min(axis=0) - reach, places.max(axis=0) + reach):
         view, layers = views.views[number], views.surface(number)
@@ -69,4 +69,4 @@ def look_at_places(
         there[ahead] += shown
         near = ahead[shown]
         footprint[near] = np.minimum(footprint[near], away[shown] / view.camera.fx)
-    return Look(there, past, footprint)
+    return ViewLookup(there, past, footprint)

@@ -1,6 +1,6 @@
 """What the camera has seen, in a plan view: how well each place, along which lines, what next."""
 
-from aquaflow.survey.coverage.classes import COLOURS, WORDS, Seen
+from aquaflow.survey.coverage.classes import COLOURS, WORDS, CoverageClass
 from aquaflow.survey.coverage.dive_coverage import DiveCoverage
 from aquaflow.survey.coverage.footprint import Footprint
 from aquaflow.survey.coverage.next_line import LineState, Suggestion
@@ -12,12 +12,12 @@ from aquaflow.survey.coverage.water_range import mapping_range, visibility
 __all__ = [
     "COLOURS",
     "WORDS",
+    "CoverageClass",
     "CoveragePlan",
     "DiveCoverage",
     "Footprint",
     "LineState",
     "PageView",
-    "Seen",
     "SubMapCoverage",
     "Suggestion",
     "mapping_range",

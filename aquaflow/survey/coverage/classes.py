@@ -14,7 +14,7 @@ from aquaflow.survey.coverage.tiles import Counts, Sides
 Classes = npt.NDArray[np.uint8]
 
 
-class Seen(IntEnum):
+class CoverageClass(IntEnum):
     """Classes in the order of how much is known."""
 
     NOT = 0
@@ -26,16 +26,16 @@ class Seen(IntEnum):
 
 
 COLOURS = {
-    Seen.TOO_FAR: (191, 75, 52),
-    Seen.SPARSE: (233, 189, 62),
-    Seen.WELL: (22, 148, 125),
+    CoverageClass.TOO_FAR: (191, 75, 52),
+    CoverageClass.SPARSE: (233, 189, 62),
+    CoverageClass.WELL: (22, 148, 125),
 }
 """RGB of each class that is drawn; brick, yellow and teal differ for the colour-blind, too."""
 WORDS = {
-    Seen.NOT: "not seen",
-    Seen.TOO_FAR: "too far for this water",
-    Seen.SPARSE: "seen sparsely",
-    Seen.WELL: "seen well",
+    CoverageClass.NOT: "not seen",
+    CoverageClass.TOO_FAR: "too far for this water",
+    CoverageClass.SPARSE: "seen sparsely",
+    CoverageClass.WELL: "seen well",
 }
 """As legends say it."""
 
@@ -57,12 +57,12 @@ def classified(
     near: int,
     config: CoverageConfig,
 ) -> Classes:
-    """[...] a :class:`Seen` for each cell; ``near`` as from :func:`near_bins`."""
+    """[...] a :class:`CoverageClass` for each cell; ``near`` as from :func:`near_bins`."""
     views = by_range[..., :near].sum(axis=-1, dtype=np.int64)
     sides = (by_direction > 0).sum(axis=-1)
     well = (views >= config.least_views) & (sides >= config.least_directions)
-    found = np.full(views.shape, int(Seen.NOT), np.uint8)
-    found[by_range.any(axis=-1)] = Seen.TOO_FAR
-    found[views > 0] = Seen.SPARSE
-    found[well] = Seen.WELL
+    found = np.full(views.shape, int(CoverageClass.NOT), np.uint8)
+    found[by_range.any(axis=-1)] = CoverageClass.TOO_FAR
+    found[views > 0] = CoverageClass.SPARSE
+    found[well] = CoverageClass.WELL
     return found

@@ -15,12 +15,12 @@ from aquaflow.base.errors import DamagedError, InputError, reason_of
 from aquaflow.base.errors.regular_file import LARGEST_JSON_BYTES
 from aquaflow.base.storage.archive import UNREADABLE, read_arrays_of
 from aquaflow.base.storage.atomic import atomic_write
-from aquaflow.survey.coverage.classes import Seen
+from aquaflow.survey.coverage.classes import CoverageClass
 from aquaflow.survey.coverage.next_line import LineState, Suggestion
 from aquaflow.survey.coverage.page_view import PageView
 from aquaflow.survey.coverage.plan import CoveragePlan
 from aquaflow.survey.coverage.raster import GridFrame
-from aquaflow.survey.coverage.survey_lines import Line
+from aquaflow.survey.coverage.survey_lines import SurveyLine
 
 NAME = "coverage.npz"
 """In a dive's folder (docs/formats.md#coverage)."""
@@ -97,10 +97,10 @@ def _view(
     plan = CoveragePlan(
         GridFrame(array("R_gm"), values["grid_cell"], values["reference"]), (x, y), values["cell"],
         array("classes"), array("views"), array("directions"), array("nearest"), values["limit"],
-        {Seen[name]: int(count) for name, count in values["cells"].items()},
+        {CoverageClass[name]: int(count) for name, count in values["cells"].items()},
     )  # fmt: skip
     lines = [
-        Line(np.array(each["start"]), np.array(each["end"]), each["first"], each["last"])
+        SurveyLine(np.array(each["start"]), np.array(each["end"]), each["first"], each["last"])
         for each in values["lines"]
     ]
     line = values["next_line"]

@@ -11,7 +11,7 @@ from aquaflow.base.storage.atomic import atomic_write, write_json
 from aquaflow.dive.deliverable import Deliverable
 from aquaflow.dive.dive import Dive
 from aquaflow.slam import Slam
-from aquaflow.survey.coverage import DiveCoverage, PageView, Seen, mapping_range
+from aquaflow.survey.coverage import CoverageClass, DiveCoverage, PageView, mapping_range
 from aquaflow.survey.coverage.coverage_file import NAME, write_coverage_file
 from aquaflow.survey.coverage.picture import coverage_png
 
@@ -76,7 +76,11 @@ def numbers(view: PageView) -> dict[str, Any]:
     state, limit = view.state, view.plan.limit
     return {
         "unit": view.unit,
-        "area": {seen.name.lower(): view.area(seen) for seen in Seen if seen is not Seen.NOT},
+        "area": {
+            seen.name.lower(): view.area(seen)
+            for seen in CoverageClass
+            if seen is not CoverageClass.NOT
+        },
         "cell": view.plan.frame.cell * view.scale,
         "range_limit": None if limit is None else limit * view.scale,
         "swath": state.swath,

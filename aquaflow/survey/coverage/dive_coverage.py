@@ -17,7 +17,7 @@ from aquaflow.keyframes import Keyframe, KeyframeStore
 from aquaflow.survey.coverage.footprint import Footprint
 from aquaflow.survey.coverage.page_view import PageView, page_view
 from aquaflow.survey.coverage.sub_map_coverage import REDRAWN, SubMapCoverage
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 Array = npt.NDArray[np.float64]
 
@@ -47,7 +47,7 @@ class DiveCoverage:
     def look(
         self,
         store: KeyframeStore,
-        frame_of: Callable[[int], MetricFrame],
+        frame_of: Callable[[int], WorldFrame],
         everything: bool = False,
     ) -> None:
         """Take in what is new of ``store``; ``everything``, or as much as a turn is for.
@@ -94,7 +94,7 @@ class DiveCoverage:
     def views(
         self,
         store: KeyframeStore,
-        frame_of: Callable[[int], MetricFrame],
+        frame_of: Callable[[int], WorldFrame],
         limits: Mapping[int, float | None],
     ) -> dict[int, PageView]:
         """What is shown of each sub-map; ``limits``: ranges that its water allows, map units."""
@@ -156,7 +156,7 @@ def _path(keyframes: Sequence[Keyframe], sub_map: int) -> Array:
     return np.array([each.T_wc.t for each in chosen]).reshape(-1, 3)
 
 
-def _rotation(keyframes: Sequence[Keyframe], sub_map: int, frame: MetricFrame) -> Array:
+def _rotation(keyframes: Sequence[Keyframe], sub_map: int, frame: WorldFrame) -> Array:
     """[3, 3] page from the sub-map's world."""
     path = _path(keyframes, sub_map)
     centres = frame.T_nm.apply(path if len(path) else np.zeros((1, 3)))

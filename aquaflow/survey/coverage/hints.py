@@ -36,7 +36,7 @@ SENTENCES = {hint: f"AquaFlow: {hint.value}." for hint in Hint}
 
 
 @dataclass(frozen=True)
-class Place:
+class TrackedPlace:
     """Where the camera was when a picture was tracked."""
 
     t_s: float
@@ -46,7 +46,7 @@ class Place:
 
 
 @dataclass
-class Measured:
+class CoverageFigures:
     """What hints are judged by; None: not known."""
 
     forward_overlap: float | None = None
@@ -64,7 +64,7 @@ class Hints:
     config: CoverageConfig
     holding: set[Hint] = field(default_factory=set)
 
-    def judge(self, measured: Measured) -> tuple[Hint, ...]:
+    def judge(self, measured: CoverageFigures) -> tuple[Hint, ...]:
         """The hints that hold now."""
         wanted, line, share = self.config.forward_overlap, self.config.overlap, measured.range_share
         room = None if share is None else 1.0 - share
@@ -82,7 +82,7 @@ class Hints:
 
 
 def forward_steps(
-    places: deque[Place],
+    places: deque[TrackedPlace],
 ) -> Array:
     """[K, 3] the ways from each picture of the newest seconds to the next, in the world of the
     newest one's sub-map; none where there are too few."""

@@ -11,7 +11,7 @@ Sight = tuple[Footprint, Sim3]
 """A footprint and T_mc."""
 
 
-class Layer:
+class CoverageLayer:
     """Counts that are at any time those of the keyframes in ``drawn``, whatever came before."""
 
     def __init__(self, frame: GridFrame) -> None:

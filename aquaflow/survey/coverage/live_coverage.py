@@ -24,10 +24,10 @@ from aquaflow.survey.coverage import DiveCoverage, PageView, mapping_range
 from aquaflow.survey.coverage.coverage_files import CoverageFiles
 from aquaflow.survey.coverage.hints import (
     SENTENCES,
+    CoverageFigures,
     Hint,
     Hints,
-    Measured,
-    Place,
+    TrackedPlace,
     forward_steps,
 )
 from aquaflow.survey.coverage.picture import cells_affine, cells_png, coverage_png
@@ -65,8 +65,8 @@ class LiveCoverage(CoverageView):
         self._dive: RunningDive | None = None
         self._views: Mapping[int, PageView] = NO_VIEWS
         self._hints: Hints | None = None
-        self._measured = Measured()
-        self._places: deque[Place] = deque(maxlen=PLACES)
+        self._measured = CoverageFigures()
+        self._places: deque[TrackedPlace] = deque(maxlen=PLACES)
         self._limits: dict[int, float | None] = {}
         self._water_s = -WATER_S
         self._closing = threading.Event()
@@ -86,7 +86,7 @@ class LiveCoverage(CoverageView):
     def hide(self) -> None:
         """From here on, none."""
         self._dive, self._hints, self._views, self.hints = None, None, NO_VIEWS, ()
-        self._measured, self._limits, self._water_s = Measured(), {}, -WATER_S
+        self._measured, self._limits, self._water_s = CoverageFigures(), {}, -WATER_S
         self._places.clear()
 
     def update(self, dive: RunningDive) -> None:
@@ -96,7 +96,7 @@ class LiveCoverage(CoverageView):
             return
         t_s = latest.frame.t_ns * 1e-9
         if not self._places or self._places[-1].t_s != t_s:
-            self._places.append(Place(t_s, latest.sub_map, latest.T_wc.t))
+            self._places.append(TrackedPlace(t_s, latest.sub_map, latest.T_wc.t))
 
     def close(self) -> None:
         """End the thread."""
@@ -173,17 +173,17 @@ class LiveCoverage(CoverageView):
             self._views, self._measured = views, measured
             self.hints = hints.judge(measured)
 
-    def _judged(self, coverage: DiveCoverage, views: Mapping[int, PageView]) -> Measured:
+    def _judged(self, coverage: DiveCoverage, views: Mapping[int, PageView]) -> CoverageFigures:
         """The newest values of what hints are about."""
         if not self._places:
-            return Measured()
+            return CoverageFigures()
         sub_map, ways = self._places[-1].sub_map, forward_steps(self._places)
         view, own = views.get(sub_map), coverage.sub_maps.get(sub_map)
         if view is None or own is None:
-            return Measured()
+            return CoverageFigures()
         with coverage.lock:
             newest = [own.seen[number] for number in sorted(own.seen)[-MOST_SIGHTS:]]
-        measured = Measured(line_overlap=view.state.overlap)
+        measured = CoverageFigures(line_overlap=view.state.overlap)
         limit = self._limits.get(sub_map)
         if newest and limit:
             footprint, T_mc = newest[-1]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.survey.coverage.survey_lines import Line
+from aquaflow.survey.coverage.survey_lines import SurveyLine
 
 Array = npt.NDArray[np.float64]
 
@@ -41,7 +41,7 @@ class Suggestion:
 class LineState:
     """The newest line and what follows from it."""
 
-    lines: list[Line]
+    lines: list[SurveyLine]
     swath: float
     """Width that a picture shows across the path."""
     overlap: float | None
@@ -52,7 +52,7 @@ class LineState:
 
 
 def line_state(
-    lines: list[Line],  # as from survey_lines
+    lines: list[SurveyLine],  # as from survey_lines
     swath: float,
     overlap: float,
     covered: Covered,
@@ -68,7 +68,7 @@ def line_state(
     return LineState(lines, swath, found, suggestion)
 
 
-def _neighbour(line: Line, earlier: list[Line], swath: float) -> Line | None:
+def _neighbour(line: SurveyLine, earlier: list[SurveyLine], swath: float) -> SurveyLine | None:
     """The last parallel line beside it."""
     for other in reversed(earlier):
         aside = abs(line.aside(0.5 * (other.start + other.end)))
@@ -78,7 +78,8 @@ def _neighbour(line: Line, earlier: list[Line], swath: float) -> Line | None:
 
 
 def _suggested(
-    newest: Line, before: Line | None, aside: float | None, swath: float, overlap: float,
+    newest: SurveyLine, before: SurveyLine | None, aside: float | None, swath: float,
+    overlap: float,
     covered: Covered,
 ) -> Suggestion | None:  # fmt: skip
     if before is not None and aside is not None and abs(aside) > swath:
@@ -94,7 +95,7 @@ def _suggested(
 
 
 def _strip(
-    newest: Line, aside: float, before: Line | None, swath: float, covered: Covered
+    newest: SurveyLine, aside: float, before: SurveyLine | None, swath: float, covered: Covered
 ) -> Suggestion:
     """A line parallel to the newest, ``aside`` to its right, as long as that and the last one
     beside it, begun at the end where the vehicle is."""

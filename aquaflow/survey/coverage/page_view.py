@@ -9,13 +9,13 @@ import numpy.typing as npt
 
 from aquaflow.config.coverage import CoverageConfig
 from aquaflow.dive.page_axes import names_of, page_axes
-from aquaflow.survey.coverage.classes import Seen
+from aquaflow.survey.coverage.classes import CoverageClass
 from aquaflow.survey.coverage.next_line import LineState, line_state
 from aquaflow.survey.coverage.plan import CoveragePlan, plan_of
 from aquaflow.survey.coverage.sub_map_coverage import SubMapCoverage
 from aquaflow.survey.coverage.survey_lines import survey_lines
 from aquaflow.survey.coverage.swath import MOST_SIGHTS, extent
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 Array = npt.NDArray[np.float64]
 
@@ -39,7 +39,7 @@ class PageView:
     """[N, 2] camera centres, in time."""
     state: LineState
 
-    def area(self, seen: Seen) -> float:
+    def area(self, seen: CoverageClass) -> float:
         """Of a class, in the square of ``unit``."""
         return self.plan.area(seen) * self.scale**2
 
@@ -61,7 +61,7 @@ class PageView:
         self,
         places: Array,  # [..., 2] on the page
     ) -> npt.NDArray[np.uint8]:
-        """[...] the :class:`Seen` there."""
+        """[...] the :class:`CoverageClass` there."""
         back = np.linalg.inv(self.to_page[:, :2])
         return self.plan.classes_at((places - self.to_page[:, 2]) @ back.T)
 
@@ -70,7 +70,7 @@ def page_view(
     sub_map: int,
     coverage: SubMapCoverage,
     centres: Array,  # [N, 3] of all keyframes in the sub-map's world, in time
-    frame: MetricFrame,
+    frame: WorldFrame,
     limit: float | None,
     config: CoverageConfig,
 ) -> PageView | None:
@@ -105,7 +105,7 @@ def _lines(
     def covered(
         places: Array,  # [..., 2] on the page
     ) -> npt.NDArray[np.bool_]:
-        return np.asarray(view.classes_at(places) == Seen.WELL)
+        return np.asarray(view.classes_at(places) == CoverageClass.WELL)
 
     newest = [coverage.seen[number] for number in sorted(coverage.seen)[-MOST_SIGHTS:]]
     side = swath = view.scale * coverage.side

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.survey.coverage.classes import COLOURS, WORDS, Seen
+from aquaflow.survey.coverage.classes import COLOURS, WORDS, CoverageClass
 from aquaflow.survey.coverage.page_view import PageView
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ TEXT_PX = 13
 
 
 @dataclass(frozen=True)
-class _Fit:
+class _PageTransform:
     """From the page to pixels."""
 
     scale: float
@@ -75,7 +75,7 @@ def cells_png(view: PageView) -> bytes:
 
     image = Image.fromarray(np.ascontiguousarray(view.plan.classes[::-1]), mode="P")
     image.putpalette(_palette().ravel().tolist())
-    return _png(image, transparency=int(Seen.NOT))
+    return _png(image, transparency=int(CoverageClass.NOT))
 
 
 def cells_affine(view: PageView) -> Array:
@@ -91,10 +91,10 @@ def cells_affine(view: PageView) -> Array:
 
 def _palette() -> Rgb:
     """[4, 3] by class."""
-    return np.array([COLOURS.get(seen, PAPER) for seen in Seen], np.uint8)
+    return np.array([COLOURS.get(seen, PAPER) for seen in CoverageClass], np.uint8)
 
 
-def _fitted(view: PageView) -> _Fit:
+def _fitted(view: PageView) -> _PageTransform:
     rows, columns = view.plan.classes.shape
     corners = np.array([[0, 0, 1], [columns, 0, 1], [0, rows, 1], [columns, rows, 1]])
     places = [corners @ cells_affine(view).T, view.path]
@@ -104,10 +104,10 @@ def _fitted(view: PageView) -> _Fit:
     low, high = every.min(axis=0), every.max(axis=0)
     room = np.array([WIDTH - 2 * MARGIN, HEIGHT - FOOT - 2 * MARGIN])
     scale = float((room / np.maximum(high - low, SMALLEST)).min())
-    return _Fit(scale, 0.5 * (low + high), np.array([0.5 * WIDTH, 0.5 * (HEIGHT - FOOT)]))
+    return _PageTransform(scale, 0.5 * (low + high), np.array([0.5 * WIDTH, 0.5 * (HEIGHT - FOOT)]))
 
 
-def _path(draw: ImageDraw, view: PageView, fit: _Fit) -> None:
+def _path(draw: ImageDraw, view: PageView, fit: _PageTransform) -> None:
     points = [tuple(point) for point in fit.px(view.path).tolist()]
     if len(points) > 1:
         draw.line(points, fill=PATH, width=2)
@@ -127,11 +127,11 @@ def _path(draw: ImageDraw, view: PageView, fit: _Fit) -> None:
     draw.ellipse([x - 4, y - 4, x + 4, y + 4], fill=NEXT)
 
 
-def _foot(draw: ImageDraw, view: PageView, fit: _Fit) -> None:
+def _foot(draw: ImageDraw, view: PageView, fit: _PageTransform) -> None:
     """Legend with areas, and a scale bar."""
     x, y = float(MARGIN), HEIGHT - FOOT + 8
     unit = " sq m" if view.unit == "m" else ""
-    for seen in (Seen.WELL, Seen.SPARSE, Seen.TOO_FAR):
+    for seen in (CoverageClass.WELL, CoverageClass.SPARSE, CoverageClass.TOO_FAR):
         text = f"{WORDS[seen]}: {view.area(seen):.3g}{unit}"
         draw.rectangle([x, y + 2, x + 11, y + 13], fill=COLOURS[seen])
         draw.text((x + 16, y), text, fill=INK, font_size=TEXT_PX)

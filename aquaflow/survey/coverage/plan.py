@@ -9,8 +9,8 @@ import numpy.typing as npt
 
 from aquaflow.config.coverage import CoverageConfig
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.survey.coverage.classes import Classes, Seen, classified, near_bins
-from aquaflow.survey.coverage.layer import Layer
+from aquaflow.survey.coverage.classes import Classes, CoverageClass, classified, near_bins
+from aquaflow.survey.coverage.layer import CoverageLayer
 from aquaflow.survey.coverage.raster import GridFrame
 from aquaflow.survey.coverage.tiles import TILE
 
@@ -36,7 +36,7 @@ class CoveragePlan:
     """Side of the plan's cells, map units; where it is not ``frame.cell``, each cell is one of
     several."""
     classes: Classes
-    """[H, W] of :class:`Seen`."""
+    """[H, W] of :class:`CoverageClass`."""
     views: npt.NDArray[np.uint16]
     """[H, W] keyframes that see the cell, from any range."""
     directions: npt.NDArray[np.uint8]
@@ -45,10 +45,10 @@ class CoveragePlan:
     """[H, W] map units; range of the nearest view, to 19 %; infinite where there is none."""
     limit: float | None
     """Range beyond which the water is too much, map units; None where no water is known."""
-    cells: dict[Seen, int]
+    cells: dict[CoverageClass, int]
     """Cells of side ``frame.cell`` of each class, of the whole grid."""
 
-    def area(self, seen: Seen) -> float:
+    def area(self, seen: CoverageClass) -> float:
         """Of a class, in square map units."""
         return self.cells.get(seen, 0) * self.frame.cell**2
 
@@ -63,14 +63,14 @@ class CoveragePlan:
         self,
         points_m: Array,  # [..., 3] in the sub-map's world
     ) -> Classes:
-        """[...] the :class:`Seen` of the cells that points lie above or below."""
+        """[...] the :class:`CoverageClass` of the cells that points lie above or below."""
         return self.classes_at(self.places(points_m))
 
     def classes_at(
         self,
         places: Array,  # [..., 2] in the grid's frame
     ) -> Classes:
-        """[...] the :class:`Seen` at places of the plane; what is off the plan was not seen."""
+        """[...] the :class:`CoverageClass` at places of the plane; NOT where they are off it."""
         j, i = np.moveaxis(np.floor((places - self.corner) / self.cell).astype(np.int64), -1, 0)
         rows, columns = self.classes.shape
         inside = (i >= 0) & (j >= 0) & (i < rows) & (j < columns)
@@ -84,7 +84,9 @@ class CoveragePlan:
         return np.column_stack([T_nm.scale * turn[:, :2], axes @ T_nm.t])
 
 
-def plan_of(layer: Layer, limit: float | None, config: CoverageConfig) -> CoveragePlan | None:
+def plan_of(
+    layer: CoverageLayer, limit: float | None, config: CoverageConfig
+) -> CoveragePlan | None:
     """The plan of a grid, with ``limit``, map units, as the water's range; None of an empty one."""
     tiles, frame = dict(layer.tiles.tiles), layer.frame
     if not tiles:
@@ -100,14 +102,14 @@ def plan_of(layer: Layer, limit: float | None, config: CoverageConfig) -> Covera
     nearest = np.full(classes.shape, np.inf, np.float32)
     near, ends = near_bins(frame, limit), frame.bin_ends().astype(np.float32)
     ends[-1] = ends[-2] * 2.0**0.25  # a range that is stated, of what has no bound
-    counts = np.zeros(len(Seen), np.int64)
+    counts = np.zeros(len(CoverageClass), np.int64)
     for first in range(0, len(places), AT_ONCE):
         some = places[first : first + AT_ONCE]
         chosen = [tiles[int(x), int(y)] for x, y in some]
         by_range = np.stack([tile.by_range for tile in chosen])
         by_direction = np.stack([tile.by_direction for tile in chosen])
         whole = classified(by_range, by_direction, near, config)
-        counts += np.bincount(whole.ravel(), minlength=len(Seen))
+        counts += np.bincount(whole.ravel(), minlength=len(CoverageClass))
         by_range = by_range[:, ::step, ::step]
         count = by_range.sum(axis=3, dtype=np.uint16)
         sides = (by_direction[:, ::step, ::step] > 0).sum(axis=3, dtype=np.uint8)
@@ -116,9 +118,9 @@ def plan_of(layer: Layer, limit: float | None, config: CoverageConfig) -> Covera
             at = np.s_[i : i + per_tile, j : j + per_tile]
             classes[at], views[at] = whole[k, ::step, ::step].T, count[k].T
             directions[at], nearest[at] = sides[k].T, smallest[k].T
-    counts[Seen.NOT] = 0  # of a plane without bounds
+    counts[CoverageClass.NOT] = 0  # of a plane without bounds
     corner = low * TILE * frame.cell
     return CoveragePlan(
         frame, (float(corner[0]), float(corner[1])), step * frame.cell, classes, views, directions,
-        nearest, limit, {seen: int(counts[seen]) for seen in Seen},
+        nearest, limit, {seen: int(counts[seen]) for seen in CoverageClass},
     )  # fmt: skip

@@ -62,7 +62,7 @@ class GridFrame:
 
 
 @dataclass(frozen=True)
-class Cells:
+class KeyframeCells:
     """What one keyframe adds to a grid."""
 
     ij: Numbers
@@ -73,14 +73,14 @@ class Cells:
     """[M] of the direction from which it was seen there."""
 
 
-def cells_seen(footprint: Footprint, T_mc: Sim3, frame: GridFrame) -> Cells:
+def cells_seen(footprint: Footprint, T_mc: Sim3, frame: GridFrame) -> KeyframeCells:
     """The cells of which a keyframe sees at least half."""
     corners, _ = footprint.patches()
     T_gc = Sim3(frame.R_gm @ T_mc.R, frame.R_gm @ T_mc.t, T_mc.scale)
     points, areas = _samples(T_gc.apply(corners), frame.cell)
     if len(points) == 0:
         empty = np.zeros(0, np.int64)
-        return Cells(np.zeros((0, 2), np.int64), empty, empty)
+        return KeyframeCells(np.zeros((0, 2), np.int64), empty, empty)
     offset = T_gc.t - points
     ranges = np.linalg.norm(offset, axis=1)
     ij = np.floor(points[:, :2] / frame.cell).astype(np.int64)
@@ -90,7 +90,9 @@ def cells_seen(footprint: Footprint, T_mc: Sim3, frame: GridFrame) -> Cells:
     first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
     enough = np.add.reduceat(ordered, first) >= LEAST_SHARE * frame.cell**2
     chosen = order[first[enough]]  # the nearest sample of each cell
-    return Cells(ij[chosen], _range_bins(ranges[chosen], frame), direction_bins(offset[chosen]))
+    return KeyframeCells(
+        ij[chosen], _range_bins(ranges[chosen], frame), direction_bins(offset[chosen])
+    )
 
 
 def _samples(

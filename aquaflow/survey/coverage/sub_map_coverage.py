@@ -19,7 +19,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.survey.coverage.footprint import Footprint
-from aquaflow.survey.coverage.layer import Layer, Sight
+from aquaflow.survey.coverage.layer import CoverageLayer, Sight
 from aquaflow.survey.coverage.raster import GridFrame
 
 Array = npt.NDArray[np.float64]
@@ -59,11 +59,11 @@ class SubMapCoverage:
         self._coarser = 1.0
         self._judged = 0
         """Keyframes when it was last judged whether the grid fits their sizes."""
-        self._shown: Layer | None = None
-        self._next: Layer | None = None
+        self._shown: CoverageLayer | None = None
+        self._next: CoverageLayer | None = None
 
     @property
-    def layer(self) -> Layer | None:
+    def layer(self) -> CoverageLayer | None:
         """The grid that is shown; None until the first keyframe."""
         return self._shown
 
@@ -153,13 +153,13 @@ class SubMapCoverage:
         if not self._sizes or self._next is not None:
             return
         if shown is None:
-            self._shown = Layer(self._frame())
+            self._shown = CoverageLayer(self._frame())
             return
         if len(shown.tiles) > MOST_TILES:
             self._coarser *= 2.0
         elif not self._outgrown(shown.frame):
             return
-        self._next = Layer(self._frame())
+        self._next = CoverageLayer(self._frame())
 
     def _outgrown(self, frame: GridFrame) -> bool:
         turn = Sim3(self._R_pm @ frame.R_gm.T, np.zeros(3)).log()[3:6]
@@ -176,7 +176,7 @@ class SubMapCoverage:
         cell = self._coarser * float(sides) / self._cells
         return GridFrame(self._R_pm.copy(), cell, float(ranges))
 
-    def _draw_missing(self, layer: Layer, most: int) -> list[int]:
+    def _draw_missing(self, layer: CoverageLayer, most: int) -> list[int]:
         """Keyframes of before, newest first; when none is left, the new grid is shown."""
         missing = [n for n in reversed(self._seen) if n not in layer.drawn][: max(most, 0)]
         for number in missing:
@@ -187,7 +187,7 @@ class SubMapCoverage:
             self._shown, self._next = layer, None
         return missing
 
-    def _moved(self, layer: Layer, numbers: list[int]) -> Array:
+    def _moved(self, layer: CoverageLayer, numbers: list[int]) -> Array:
         """[K] cells by which the view of each has moved since it was drawn: the most of a point on
         the camera's axis and of two beside it."""
         now = Sim3Batch.of([self._seen[n][1] for n in numbers])

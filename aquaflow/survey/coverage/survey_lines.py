@@ -25,7 +25,7 @@ MOST_POINTS = 2000
 
 
 @dataclass(frozen=True)
-class Line:
+class SurveyLine:
     """A straight stretch of the path."""
 
     start: Array
@@ -52,11 +52,11 @@ class Line:
         x, y = self.direction
         return np.array([y, -x])
 
-    def is_parallel(self, other: Line) -> bool:
+    def is_parallel(self, other: SurveyLine) -> bool:
         """True also if the other was swum the other way."""
         return bool(abs(self.direction @ other.direction) >= np.cos(PARALLEL_RAD))
 
-    def beside(self, other: Line) -> bool:
+    def beside(self, other: SurveyLine) -> bool:
         """True if a part of the other lies beside this one."""
         along = [float((point - self.start) @ self.direction) for point in (other.start, other.end)]
         return max(along) > 0.0 and min(along) < self.length
@@ -73,7 +73,7 @@ def survey_lines(
     path: Array,  # [N, 2] camera centres on the page, in time
     swath: float,
     alone: float | None = None,
-) -> list[Line]:
+) -> list[SurveyLine]:
     """The straight stretches, the earliest first; ``swath``: width that a picture shows.
 
     A path without any turn is no way between two lines: it is one from the length ``alone`` on, if
@@ -90,7 +90,7 @@ def survey_lines(
     for first, last in pairwise(corners):
         start, end = _fitted(points[first : last + 1])
         if float(np.linalg.norm(end - start)) >= least:
-            lines.append(Line(start, end, int(kept[first]), int(kept[last])))
+            lines.append(SurveyLine(start, end, int(kept[first]), int(kept[last])))
     return lines
 
 

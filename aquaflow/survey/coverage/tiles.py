@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.survey.coverage.raster import DIRECTION_BINS, RANGE_BINS, Cells
+from aquaflow.survey.coverage.raster import DIRECTION_BINS, RANGE_BINS, KeyframeCells
 
 Counts = npt.NDArray[np.uint16]
 Sides = npt.NDArray[np.uint8]
@@ -20,7 +20,7 @@ TILE_BYTES = TILE * TILE * (2 * RANGE_BINS + DIRECTION_BINS)
 
 
 @dataclass
-class Tile:
+class CoverageTile:
     """Keyframes that see each cell, counted twice."""
 
     by_range: Counts
@@ -32,10 +32,10 @@ class Tile:
     """That see any cell of it."""
 
     @staticmethod
-    def empty() -> Tile:
+    def empty() -> CoverageTile:
         """One that nothing sees."""
         shape = (TILE, TILE)
-        return Tile(
+        return CoverageTile(
             np.zeros((*shape, RANGE_BINS), np.uint16), np.zeros((*shape, DIRECTION_BINS), np.uint8)
         )
 
@@ -44,16 +44,16 @@ class Tile:
 class Tiles:
     """Tiles by their place; what was added can be taken out."""
 
-    tiles: dict[tuple[int, int], Tile] = field(default_factory=dict)
+    tiles: dict[tuple[int, int], CoverageTile] = field(default_factory=dict)
 
-    def add(self, cells: Cells) -> None:
+    def add(self, cells: KeyframeCells) -> None:
         """Count what one keyframe sees."""
         for place, inside in _by_tile(cells):
-            tile = self.tiles.setdefault(place, Tile.empty())
+            tile = self.tiles.setdefault(place, CoverageTile.empty())
             tile.keyframes += 1
             self._count(tile, cells, inside, 1)
 
-    def remove(self, cells: Cells) -> None:
+    def remove(self, cells: KeyframeCells) -> None:
         """Undo :meth:`add` of the same cells."""
         for place, inside in _by_tile(cells):
             tile = self.tiles[place]
@@ -65,8 +65,8 @@ class Tiles:
 
     @staticmethod
     def _count(
-        tile: Tile,
-        cells: Cells,
+        tile: CoverageTile,
+        cells: KeyframeCells,
         inside: npt.NDArray[np.bool_],  # [M]
         by: int,
     ) -> None:
@@ -84,7 +84,7 @@ class Tiles:
         return len(self.tiles) * TILE_BYTES
 
 
-def _by_tile(cells: Cells) -> Iterator[tuple[tuple[int, int], npt.NDArray[np.bool_]]]:
+def _by_tile(cells: KeyframeCells) -> Iterator[tuple[tuple[int, int], npt.NDArray[np.bool_]]]:
     """Each tile that holds some of the cells, and which of them [M]."""
     places = cells.ij // TILE
     for x, y in sorted({(int(x), int(y)) for x, y in places}):

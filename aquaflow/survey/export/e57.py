@@ -19,7 +19,7 @@ import numpy.typing as npt
 from aquaflow.base.errors import InputError, first_line
 from aquaflow.base.errors.extra import load
 from aquaflow.base.storage.atomic import fresh_file
-from aquaflow.dive.point_cloud import CHUNK, PointCloud, Points
+from aquaflow.dive.point_cloud import CHUNK, CloudPoints, PointCloud
 
 Progress = Callable[[int, int], None]
 
@@ -83,7 +83,7 @@ def _fill(libe57: Any, file: Any, cloud: PointCloud, progress: Progress | None) 
 
 def _values(
     cloud: PointCloud,
-    points: Points,
+    points: CloudPoints,
     origin: npt.NDArray[np.float64],  # [3]
 ) -> dict[str, npt.NDArray[np.generic]]:
     positions = cloud.placement.on_grid(points.positions) - origin

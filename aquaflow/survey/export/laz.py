@@ -14,7 +14,7 @@ import numpy as np
 
 from aquaflow.base.errors.extra import load
 from aquaflow.base.storage.atomic import atomic_write
-from aquaflow.dive.point_cloud import PointCloud, Points
+from aquaflow.dive.point_cloud import CloudPoints, PointCloud
 
 Progress = Callable[[int, int], None]
 
@@ -76,7 +76,7 @@ def _header(laspy: Any, cloud: PointCloud) -> Any:
     return header
 
 
-def _record(laspy: Any, header: Any, cloud: PointCloud, points: Points) -> Any:
+def _record(laspy: Any, header: Any, cloud: PointCloud, points: CloudPoints) -> Any:
     record = laspy.ScaleAwarePointRecord.zeros(len(points.positions), header=header)
     record.x, record.y, record.z = cloud.placement.on_grid(points.positions).T
     record.red, record.green, record.blue = points.colours.T.astype(np.uint16) * COLOUR_16_BIT

@@ -28,7 +28,7 @@ from aquaflow.dive.ros.mcap_file import RosFile, ros_file
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import to_bytes
 from aquaflow.render.transfers import picture_out
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 Progress = Callable[[int, int], None]
 
@@ -185,7 +185,7 @@ def _write_frame(file: RosFile, source: _Source, frame: FinishedFrame) -> None:
 
 
 def _sigmas(
-    finished: FinishedFrame, frame: MetricFrame
+    finished: FinishedFrame, frame: WorldFrame
 ) -> tuple[float | None, float | None, float | None]:
     """Of a pose: position (m), heading and tilt (rad)."""
     known = finished.known

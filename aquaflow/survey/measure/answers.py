@@ -14,16 +14,16 @@ from aquaflow.dive.dive import Dive
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.transfers import picture_out
 from aquaflow.survey.export.ortho.ground import Ground, ground_of
-from aquaflow.survey.measure.asked import Asked, Place, located
+from aquaflow.survey.measure.asked import Asked, GeodeticPoint, located
 from aquaflow.survey.measure.drawn_heights import Progress, draw_heights
 from aquaflow.survey.measure.height_field import HeightField
-from aquaflow.survey.measure.points import Points
-from aquaflow.survey.measure.profile import Profile, profile
+from aquaflow.survey.measure.points import MeasuredPoints
+from aquaflow.survey.measure.profile import GroundProfile, profile
 from aquaflow.survey.measure.quantity import Quantity
 from aquaflow.survey.measure.roughness import MATCH_SIGMA, surface_ratio
 from aquaflow.survey.measure.scale import Scale, scale_of
 from aquaflow.survey.measure.shapes import LEAST_CORNERS, area, path_length, plan_area
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.water.posed_picture import SOLID
 
 Array = npt.NDArray[np.float64]
@@ -36,7 +36,7 @@ REACH_VIEWS = 10
 
 
 @dataclass(frozen=True)
-class Answer:
+class PointMeasurements:
     """Measurements of one set of points."""
 
     shape: Shape
@@ -44,7 +44,7 @@ class Answer:
     """[N, 3] of the points, in n."""
     quantities: dict[str, Quantity]
     """By name."""
-    profile: Profile | None = None
+    profile: GroundProfile | None = None
     notes: list[str] = field(default_factory=list)
     """What was left out, and why."""
 
@@ -85,7 +85,7 @@ def answer(
     work: Path,
     cell: float | None = None,
     progress: Progress | None = None,
-) -> Answer:
+) -> PointMeasurements:
     """Measure between points of a finished dive's largest sub-map.
 
     Args:
@@ -103,23 +103,25 @@ def answer(
     mapper, frame = dive.filled_map(), dive.frame
     drawn: HeightField | None = None
     ground: Ground | None = None
-    if chosen != "line" or any(isinstance(each, Place) for each in asked):
+    if chosen != "line" or any(isinstance(each, GeodeticPoint) for each in asked):
         ground = ground_of(frame, mapper.views)
         drawn = draw_heights(mapper, ground, work, cell, progress)
     reach = drawn.reach if drawn is not None else _reach(mapper, frame)
     points = located(asked, mapper, frame, dive, drawn, ground, reach)
     scale = scale_of(frame)
     if chosen == "line" or drawn is None or ground is None:
-        return Answer("line", points.places, {"length": path_length(points, scale)})
+        return PointMeasurements("line", points.places, {"length": path_length(points, scale)})
     R_gn = ground.T_gm.R @ frame.T_nm.R.T
     if chosen == "profile":
         found = profile(_line(drawn, R_gn, points), R_gn[2], scale)
         length = path_length(points, scale)
-        return Answer("profile", points.places, {"length": length, "drop": found.drop}, found)
+        return PointMeasurements(
+            "profile", points.places, {"length": length, "drop": found.drop}, found
+        )
     return _area(drawn, R_gn, points, scale)
 
 
-def _reach(mapper: Mapper, frame: MetricFrame) -> float:
+def _reach(mapper: Mapper, frame: WorldFrame) -> float:
     """Width of what a picture shows, median over some views, in n's unit."""
     step = max(1, len(mapper.views) // REACH_VIEWS)
     widths = []
@@ -136,8 +138,8 @@ def _reach(mapper: Mapper, frame: MetricFrame) -> float:
 def _line(
     drawn: HeightField,
     R_gn: Array,  # [3, 3]
-    ends: Points,
-) -> Points:
+    ends: MeasuredPoints,
+) -> MeasuredPoints:
     """Points of the ground between two ends, in n; raises InputError if there are none."""
     start, end = (R_gn @ place for place in ends.places)
     length = float(np.linalg.norm((end - start)[:2]))
@@ -150,15 +152,15 @@ def _line(
     places = np.column_stack([flat, heights])[known] @ R_gn
     up = np.outer(R_gn[2], R_gn[2])
     shared = sigma[known, None, None] ** 2 * up
-    return Points(places, MATCH_SIGMA**2 * shared, shared, ends.reach)
+    return MeasuredPoints(places, MATCH_SIGMA**2 * shared, shared, ends.reach)
 
 
 def _area(
     drawn: HeightField,
     R_gn: Array,  # [3, 3]
-    points: Points,
+    points: MeasuredPoints,
     scale: Scale,
-) -> Answer:
+) -> PointMeasurements:
     plan = plan_area(points, R_gn[2], scale)
     found, notes = {"area": area(points, scale), "plan_area": plan}, []
     try:
@@ -174,7 +176,7 @@ def _area(
         )
     except InputError as error:
         notes.append(f"no surface with relief: {error}")
-    return Answer("area", points.places, found, notes=notes)
+    return PointMeasurements("area", points.places, found, notes=notes)
 
 
 def _within(

@@ -20,9 +20,9 @@ from aquaflow.geometry.earth import north_east
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.survey.export.ortho.ground import Ground
 from aquaflow.survey.measure.height_field import HeightField
-from aquaflow.survey.measure.picked import Picked, of_map, of_pixel, view_of_frame
-from aquaflow.survey.measure.points import Points
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.survey.measure.picked import PickedPoint, of_map, of_pixel, view_of_frame
+from aquaflow.survey.measure.points import MeasuredPoints
+from aquaflow.telemetry.world_frame import WorldFrame
 
 _ON_EARTH = re.compile(r"([\d.]+)([NS]),([\d.]+)([EW])")
 
@@ -46,14 +46,14 @@ class MapPoint:
 
 
 @dataclass(frozen=True)
-class Place:
+class GeodeticPoint:
     """On the earth, degrees."""
 
     latitude: float
     longitude: float
 
 
-Asked: TypeAlias = Pixel | MapPoint | Place
+Asked: TypeAlias = Pixel | MapPoint | GeodeticPoint
 
 
 def parse_point(text: str) -> Asked:
@@ -68,7 +68,9 @@ def parse_point(text: str) -> Asked:
             latitude, longitude = float(found[1]), float(found[3])
             if latitude <= 90.0 and longitude <= 180.0:
                 south, west = found[2] == "S", found[4] == "W"
-                return Place(-latitude if south else latitude, -longitude if west else longitude)
+                return GeodeticPoint(
+                    -latitude if south else latitude, -longitude if west else longitude
+                )
         frame, _, rest = text.rpartition(":")
         numbers = [float(part) for part in rest.split(",")]
         if all(map(math.isfinite, numbers)):
@@ -87,23 +89,23 @@ def parse_point(text: str) -> Asked:
 def located(
     asked: list[Asked],
     mapper: Mapper,
-    frame: MetricFrame,
+    frame: WorldFrame,
     dive: Dive,
     field: HeightField | None,
     ground: Ground | None,
     reach: float,
-) -> Points:
+) -> MeasuredPoints:
     """The points in n, with their errors.
 
     Args:
         field, ground: are needed by places on the earth alone, in n's unit.
-        reach: see :class:`Points`.
+        reach: see :class:`MeasuredPoints`.
 
     Raises:
         InputError: a point is outside of its picture, of the map, or of the ground.
     """
     picked = [_located(each, mapper, frame, dive, field, ground) for each in asked]
-    return Points(
+    return MeasuredPoints(
         np.array([each.place for each in picked]), np.array([each.own for each in picked]),
         np.array([each.shared for each in picked]), reach,
     )  # fmt: skip
@@ -112,11 +114,11 @@ def located(
 def _located(
     asked: Asked,
     mapper: Mapper,
-    frame: MetricFrame,
+    frame: WorldFrame,
     dive: Dive,
     field: HeightField | None,
     ground: Ground | None,
-) -> Picked:
+) -> PickedPoint:
     if isinstance(asked, Pixel):
         view = view_of_frame(mapper, asked.frame, dive)
         return of_pixel(mapper, frame, view, np.array([asked.u, asked.v]))
@@ -139,4 +141,4 @@ def _located(
     place = R_gn.T @ np.array([x, y, height[0]])
     up = R_gn.T @ np.array([0.0, 0.0, 1.0])
     # Where on the cell the ground was asked for does not matter to what is read off a chart.
-    return Picked(place, (sigma[0] ** 2) * np.outer(up, up), np.zeros((3, 3)))
+    return PickedPoint(place, (sigma[0] ** 2) * np.outer(up, up), np.zeros((3, 3)))

@@ -13,8 +13,8 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from aquaflow.base.errors import InputError
 from aquaflow.mapping.mapper import Mapper
-from aquaflow.survey.export.ortho.drawing import MOST_FINER, Splats
-from aquaflow.survey.export.ortho.grid import Grid, Tile
+from aquaflow.survey.export.ortho.drawing import MOST_FINER, GroundSplats
+from aquaflow.survey.export.ortho.grid import Grid, GridTile
 from aquaflow.survey.export.ortho.ground import LEAST_VIEWS, Ground
 from aquaflow.survey.export.ortho.sightings import PICTURE_SIGMA_PX, ViewRanges
 from aquaflow.survey.measure.height_field import Array, Counts, HeightField, Held
@@ -59,7 +59,7 @@ def draw_heights(
             written to.
     """
     ranges = ViewRanges(mapper, ground, work, progress and partial(progress, "views"))
-    splats = Splats(mapper, ground)
+    splats = GroundSplats(mapper, ground)
     resolution = max(_spacing(splats.places, ranges), MATCH_PX * ranges.footprint)
     reach = ranges.median_range * float(
         np.median([view.camera.width / view.camera.fx for view in mapper.views])
@@ -112,7 +112,7 @@ def _spacing(
 
 
 def _drawn(
-    splats: Splats, grid: Grid, footprint: float, resolution: float, progress: Progress | None
+    splats: GroundSplats, grid: Grid, footprint: float, resolution: float, progress: Progress | None
 ) -> tuple[Array, Array]:
     """[h, w] heights and blurred heights; NaN where the map does not cover half a cell."""
     fine = Grid(grid.left, grid.top, grid.pixel / PARTS, PARTS * grid.width, PARTS * grid.height)
@@ -209,7 +209,7 @@ def _held(
     )  # fmt: skip
 
 
-def _part(tile: Tile) -> tuple[slice, slice]:
+def _part(tile: GridTile) -> tuple[slice, slice]:
     return (
         slice(tile.row, tile.row + tile.height),
         slice(tile.column, tile.column + tile.width),

@@ -14,7 +14,7 @@ from aquaflow.dive.dive import Dive
 from aquaflow.dive.medium import NAME as MEDIUM
 from aquaflow.survey.export.ortho.ground import Ground, ground_of
 from aquaflow.survey.measure.height_field import HeightField
-from aquaflow.survey.measure.reef_numbers import ReefNumbers, Water, reef_numbers
+from aquaflow.survey.measure.reef_numbers import DiveWater, ReefNumbers, reef_numbers
 from aquaflow.survey.measure.scale import scale_of
 
 if TYPE_CHECKING:
@@ -79,14 +79,14 @@ def _places(dive: Dive) -> npt.NDArray[np.float64]:
     return np.array([(row.x, row.y, row.z) for row in rows]).reshape(-1, 3)
 
 
-def _water(dive: Dive) -> Water | None:
+def _water(dive: Dive) -> DiveWater | None:
     facts = dive.medium_facts
     try:
         if not facts or not facts["active"]:
             return None
         rates = [float(each) for each in facts["attenuation_per_unit"]]
         sigma = facts["attenuation_relative_sigma"]
-        return Water(rates, None if sigma is None else [float(each) for each in sigma])
+        return DiveWater(rates, None if sigma is None else [float(each) for each in sigma])
     except (ValueError, KeyError, TypeError) as error:
         path = dive.file(MEDIUM)
         raise InputError(f"cannot read {path}: {reason_of(error)}; map the dive again") from error

@@ -21,7 +21,7 @@ from aquaflow.base.errors import DamagedError, InputError, reason_of
 from aquaflow.base.errors.regular_file import read_regular_json
 from aquaflow.base.storage.atomic import write_json
 from aquaflow.geometry.earth import from_geodetic, geodetic
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 Array = npt.NDArray[np.float64]
 Shape = Literal["Point", "LineString", "Polygon"]
@@ -56,7 +56,7 @@ class Note:
         }  # fmt: skip
 
 
-def write_notes(dive: Path, notes: Sequence[Note], frame: MetricFrame) -> None:
+def write_notes(dive: Path, notes: Sequence[Note], frame: WorldFrame) -> None:
     """Write all notes of a dive, whose largest sub-map lies in ``frame``; replaces the file.
 
     Raises:
@@ -80,7 +80,7 @@ def write_notes(dive: Path, notes: Sequence[Note], frame: MetricFrame) -> None:
     write_json(dive / NAME, data)
 
 
-def read_notes(dive: Path, frame: MetricFrame) -> list[Note]:
+def read_notes(dive: Path, frame: WorldFrame) -> list[Note]:
     """The notes of a dive, whose largest sub-map lies in ``frame``; none without such a file.
 
     Raises:
@@ -161,7 +161,7 @@ def _problem(note: Note) -> str | None:
     return None
 
 
-def _to_feature(note: Note, frame: MetricFrame) -> dict[str, Any]:
+def _to_feature(note: Note, frame: WorldFrame) -> dict[str, Any]:
     properties = note.properties | {"text": note.text}
     feature: dict[str, Any] = {"type": "Feature", "id": note.key}
     origin = frame.origin
@@ -188,7 +188,7 @@ def _geometry(
     return {"type": note.shape, "coordinates": [[*coordinates, coordinates[0]]]}
 
 
-def _to_note(feature: dict[str, Any], number: int, frame: MetricFrame, unit: str) -> Note:
+def _to_note(feature: dict[str, Any], number: int, frame: WorldFrame, unit: str) -> Note:
     """Raises ValueError, KeyError or TypeError for what is none."""
     origin = frame.origin
     located = feature.get("geometry") is not None

@@ -16,7 +16,7 @@ from aquaflow.dive.dive import Dive
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.transfers import map_out, picture_out
 from aquaflow.render.views import View
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 Array = npt.NDArray[np.float64]
 
@@ -36,7 +36,7 @@ not of this map."""
 
 
 @dataclass(frozen=True)
-class Seen:
+class PixelMeasurement:
     """A point of a picture in the map."""
 
     place: Array
@@ -51,7 +51,7 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Picked:
+class PickedPoint:
     """A place with what it errs alone and together with its neighbours, in n."""
 
     place: Array
@@ -66,7 +66,7 @@ def seen(
     mapper: Mapper,
     view: View,
     pixels: Array,  # [N, 2] px of the mapped picture
-) -> list[Seen]:
+) -> list[PixelMeasurement]:
     """Where the rays of pixels meet the map.
 
     Raises:
@@ -87,7 +87,7 @@ def seen(
         sigma = float(np.hypot(RANGE_SIGMA * distance, around))
         ray = view.T_wc.R @ view.camera.unproject(np.array([u, v]))
         ray /= np.linalg.norm(ray)
-        points.append(Seen(view.T_wc.t + distance * ray, ray, distance, sigma, around))
+        points.append(PixelMeasurement(view.T_wc.t + distance * ray, ray, distance, sigma, around))
     return points
 
 
@@ -122,10 +122,10 @@ def refuse_outside(
 
 def of_pixel(
     mapper: Mapper,
-    frame: MetricFrame,
+    frame: WorldFrame,
     view: View,
     pixel: Array,  # [2] px
-) -> Picked:
+) -> PickedPoint:
     """A point of a mapped picture.
 
     Raises:
@@ -139,9 +139,9 @@ def of_pixel(
 
 def of_map(
     mapper: Mapper,
-    frame: MetricFrame,
+    frame: WorldFrame,
     place: Array,  # [3] in n, as map.ply and the viewer have it
-) -> Picked:
+) -> PickedPoint:
     """A point of the map; its range error lies along the ray from the nearest mapped view.
 
     Raises:
@@ -166,16 +166,18 @@ def of_map(
 
 
 def _picked(
-    frame: MetricFrame,
+    frame: WorldFrame,
     place: Array,  # [3] in the sub-map's world
     ray: Array,  # [3] unit, in the same
     across: float,
     along: float,
     shared: float,
-) -> Picked:
+) -> PickedPoint:
     """Sigmas across and along the ray, of the point alone, and along it, of its neighbourhood."""
     T = frame.T_nm
     direction = T.R @ ray
     along_ray = np.outer(direction, direction)
     own = across**2 * (np.eye(3) - along_ray) + along**2 * along_ray
-    return Picked(T.apply(place[None])[0], T.scale**2 * own, (T.scale * shared) ** 2 * along_ray)
+    return PickedPoint(
+        T.apply(place[None])[0], T.scale**2 * own, (T.scale * shared) ** 2 * along_ray
+    )

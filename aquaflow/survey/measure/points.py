@@ -23,7 +23,7 @@ MOST_POINTS = 1000
 
 
 @dataclass(frozen=True)
-class Points:
+class MeasuredPoints:
     """Places in one frame of reference: n, as map.ply and notes have it, or the ground's."""
 
     places: Array
@@ -56,13 +56,13 @@ class Points:
         own_sigma: Array,  # [N] 1 sigma along each axis
         shared_sigma: Array,  # [N] the same of the shared error
         reach: float,
-    ) -> Points:
+    ) -> MeasuredPoints:
         """Points whose errors are as large in all directions."""
         own, shared = (
             np.asarray(sigma, np.float64)[:, None, None] ** 2 * np.eye(3)
             for sigma in (own_sigma, shared_sigma)
         )
-        return Points(np.asarray(places, np.float64), own, shared, reach)
+        return MeasuredPoints(np.asarray(places, np.float64), own, shared, reach)
 
     def covariance(self) -> Array:
         """[3 N, 3 N] of all coordinates, point by point."""

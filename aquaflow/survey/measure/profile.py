@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
-from aquaflow.survey.measure.points import Points
+from aquaflow.survey.measure.points import MeasuredPoints
 from aquaflow.survey.measure.quantity import NORMAL_95, Quantity
 from aquaflow.survey.measure.scale import Scale
 
@@ -16,7 +16,7 @@ Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Profile:
+class GroundProfile:
     """The ground along a line."""
 
     along: Array
@@ -43,10 +43,10 @@ class Profile:
 
 
 def profile(
-    points: Points,
+    points: MeasuredPoints,
     up: Array,  # [3] unit, in the points' frame; (0, 0, -1) in a level n
     scale: Scale,
-) -> Profile:
+) -> GroundProfile:
     """The heights of points on a line, in its order.
 
     Raises:
@@ -70,7 +70,7 @@ def profile(
     drop = float(height[-1] - height[0])
     of_drop = C[0, 0] + C[-1, -1] - 2.0 * C[0, -1]
     of_drop += (scale.tilt_sigma_rad * length) ** 2 + (scale.sigma * drop) ** 2
-    return Profile(
+    return GroundProfile(
         along, height, np.sqrt(np.maximum(variance, 0.0)),
         Quantity.normal(drop, float(np.sqrt(max(of_drop, 0.0))), scale.unit, -np.inf),
         scale.unit,

@@ -44,7 +44,7 @@ class ReefNumber:
 
 
 @dataclass(frozen=True)
-class Water:
+class DiveWater:
     """What is known of a dive's water, in the unit of its lengths."""
 
     attenuation: list[float]
@@ -90,7 +90,7 @@ class ReefNumbers:
 def reef_numbers(
     draw: Callable[[], tuple[HeightField, Ground]],
     places: Array,  # [N, 3] camera centres in n, in order of time
-    water: Water | None,
+    water: DiveWater | None,
     scale: Scale,
 ) -> ReefNumbers:
     """The numbers of a dive.

@@ -36,7 +36,7 @@ from aquaflow.survey.coverage.coverage_files import write_coverage
 from aquaflow.survey.measure.notes import read_notes, scaled, write_notes
 from aquaflow.telemetry.known_lengths.known_length import KnownLength, LengthScale
 from aquaflow.telemetry.metric_file import write_metric_file
-from aquaflow.telemetry.metric_frame import LARGEST_SCALE_SIGMA, MetricFrame, SourceReport
+from aquaflow.telemetry.world_frame import LARGEST_SCALE_SIGMA, SourceReport, WorldFrame
 
 Array = npt.NDArray[np.float64]
 
@@ -44,7 +44,7 @@ MARKED = "marked by hand"
 """Reason in the report of a length that this module used: it may be replaced by better ones."""
 
 
-def why_not(frame: MetricFrame | None, scale: LengthScale) -> str | None:
+def why_not(frame: WorldFrame | None, scale: LengthScale) -> str | None:
     """Why marked lengths do not rescale a sub-map's files, in a sentence; None if they do."""
     if frame is None:
         return "The dive has no metric.json that names this sub-map; its files keep their unit."
@@ -106,7 +106,7 @@ def rescale(dive: Dive, sub_map: int, lengths: Sequence[KnownLength], scale: Len
         write_metric_file(folder, frames, main)
 
 
-def _metric(frame: MetricFrame, lengths: Sequence[KnownLength], scale: LengthScale) -> MetricFrame:
+def _metric(frame: WorldFrame, lengths: Sequence[KnownLength], scale: LengthScale) -> WorldFrame:
     """The frame in metres; its origin stays the start, by convention."""
     covariance = np.zeros((7, 7))
     covariance[3:6, 3:6] = frame.covariance[3:6, 3:6]
@@ -129,7 +129,7 @@ def _scaled(splats: PlyGaussians, times: float) -> PlyGaussians:
     return splats.transformed(Sim3(np.eye(3), np.zeros(3), times))
 
 
-def _rows(rows: Sequence[PoseRow], sub_map: int, frame: MetricFrame, times: float) -> list[PoseRow]:
+def _rows(rows: Sequence[PoseRow], sub_map: int, frame: WorldFrame, times: float) -> list[PoseRow]:
     """The table with the sub-map's places in metres, their speeds and sigmas."""
     places = {row.index: times * np.array([row.x, row.y, row.z]) for row in rows}
     members = [row for row in rows if row.sub_map == sub_map]
@@ -149,7 +149,7 @@ def _rows(rows: Sequence[PoseRow], sub_map: int, frame: MetricFrame, times: floa
     return found
 
 
-def _medium(data: dict[str, Any], frame: MetricFrame, times: float) -> dict[str, Any]:
+def _medium(data: dict[str, Any], frame: WorldFrame, times: float) -> dict[str, Any]:
     """medium.json with rates per metre and ranges in metres."""
     data |= {"scale_source": frame.scale_source, "unit": frame.unit}
     if not data["active"]:

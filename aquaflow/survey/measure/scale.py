@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Scale:
         return "m\u00b2" if self.unit == "m" else f"square {self.unit}"
 
 
-def scale_of(frame: MetricFrame) -> Scale:
+def scale_of(frame: WorldFrame) -> Scale:
     """Of the lengths in n of a sub-map."""
     return Scale(
         frame.unit,

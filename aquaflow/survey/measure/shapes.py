@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
 from aquaflow.geometry.similarity import hat
-from aquaflow.survey.measure.points import Points
+from aquaflow.survey.measure.points import MeasuredPoints
 from aquaflow.survey.measure.quantity import Quantity
 from aquaflow.survey.measure.scale import Scale
 
@@ -22,7 +22,7 @@ LEAST_CORNERS = 3
 """Of an area."""
 
 
-def distance(points: Points, scale: Scale) -> Quantity:
+def distance(points: MeasuredPoints, scale: Scale) -> Quantity:
     """The straight length between two points.
 
     Raises:
@@ -33,7 +33,7 @@ def distance(points: Points, scale: Scale) -> Quantity:
     return path_length(points, scale)
 
 
-def path_length(points: Points, scale: Scale) -> Quantity:
+def path_length(points: MeasuredPoints, scale: Scale) -> Quantity:
     """The length of the line from point to point.
 
     Raises:
@@ -56,7 +56,7 @@ def path_length(points: Points, scale: Scale) -> Quantity:
     return _with_scale(float(lengths.sum()), J, points, bias, scale, 1)
 
 
-def area(points: Points, scale: Scale) -> Quantity:
+def area(points: MeasuredPoints, scale: Scale) -> Quantity:
     """What an outline encloses, in the plane that fits it best; exact for a triangle.
 
     It is the length of the vector area, half the sum of the products p_i x p_i+1: of a curved
@@ -77,7 +77,7 @@ def area(points: Points, scale: Scale) -> Quantity:
 
 
 def plan_area(
-    points: Points,
+    points: MeasuredPoints,
     up: Array,  # [3] unit, in the points' frame
     scale: Scale,
 ) -> Quantity:
@@ -95,7 +95,7 @@ def plan_area(
 def _with_scale(
     value: float,
     J: Array,  # [N, 3]
-    points: Points,
+    points: MeasuredPoints,
     bias: float,
     scale: Scale,
     dimensions: int,
@@ -118,7 +118,7 @@ def _lengthened(
     return float(np.sqrt(length**2 + across) - length)
 
 
-def _vector_area(points: Points) -> Array:
+def _vector_area(points: MeasuredPoints) -> Array:
     """[3] half the sum of the corners' products; its length is the area.
 
     Raises:

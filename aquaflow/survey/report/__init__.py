@@ -2,12 +2,12 @@
 
 from aquaflow.survey.report.data import (
     CameraSummary,
+    DepthProfile,
     HeldOutExample,
     LeftOut,
     Measures,
     MediumCurves,
     PathPlot,
-    Profile,
     ReefRow,
     ReportData,
 )
@@ -15,12 +15,12 @@ from aquaflow.survey.report.page import render_report, write_report
 
 __all__ = [
     "CameraSummary",
+    "DepthProfile",
     "HeldOutExample",
     "LeftOut",
     "Measures",
     "MediumCurves",
     "PathPlot",
-    "Profile",
     "ReefRow",
     "ReportData",
     "render_report",

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.survey.coverage import PageView
-from aquaflow.telemetry.metric_frame import SourceReport
+from aquaflow.telemetry.world_frame import SourceReport
 
 FocalSource = Literal["calibrated", "guessed", "refined"]
 
@@ -108,7 +108,7 @@ class MediumCurves:
 
 
 @dataclass(frozen=True)
-class Profile:
+class DepthProfile:
     """Depth and altitude over time; NaN where unknown."""
 
     t_s: npt.NDArray[np.floating]
@@ -153,7 +153,7 @@ class ReportData:
     """Of the largest sub-map."""
     overview: bytes | None = None
     """PNG file of the map from above."""
-    profile: Profile | None = None
+    profile: DepthProfile | None = None
     left_out: Sequence[LeftOut] = ()
     stages: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Stage -> ``count``, ``total``, ``p50``, ``p95``; times in ms."""

@@ -6,7 +6,7 @@ import html
 from collections.abc import Sequence
 
 from aquaflow.survey.report.data import Measures, ReefRow
-from aquaflow.telemetry.metric_frame import SourceReport
+from aquaflow.telemetry.world_frame import SourceReport
 
 
 def measures(data: Measures | None) -> str:

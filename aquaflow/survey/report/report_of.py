@@ -22,16 +22,16 @@ from aquaflow.survey.measure.quantity import Quantity
 from aquaflow.survey.measure.reef_files import JSON as REEF
 from aquaflow.survey.report import (
     CameraSummary,
+    DepthProfile,
     HeldOutExample,
     LeftOut,
     Measures,
     MediumCurves,
     PathPlot,
-    Profile,
     ReefRow,
     ReportData,
 )
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 OVERVIEW = "overview.png"
 """The map from straight above, in a dive's folder."""
@@ -169,7 +169,7 @@ NUMBER = re.compile(r"\d+(\.\d+)?")
 """What makes one reason look like many."""
 
 
-def profile(rows: Sequence[PoseRow], frame: MetricFrame) -> Profile | None:
+def profile(rows: Sequence[PoseRow], frame: WorldFrame) -> DepthProfile | None:
     """Depth and altitude of the dive in metres; None where neither is known.
 
     Without a depth sensor the depth is that of the path, where the metric frame knows the surface.
@@ -185,7 +185,7 @@ def profile(rows: Sequence[PoseRow], frame: MetricFrame) -> Profile | None:
         said = "depth of the camera" if frame.depth_known else "camera, down from the dive's start"
     if not (np.isfinite(depth).any() or np.isfinite(altitude).any()):
         return None
-    return Profile(np.array([row.t_s for row in chosen]), depth, altitude, said)
+    return DepthProfile(np.array([row.t_s for row in chosen]), depth, altitude, said)
 
 
 def left_out(rows: Iterable[FrameRow]) -> list[LeftOut]:
@@ -204,7 +204,7 @@ def left_out(rows: Iterable[FrameRow]) -> list[LeftOut]:
 # The report's lengths and directions in words, each with 1 sigma where it is known.
 
 
-def measures(path: PathPlot, frame: MetricFrame, water: MediumCurves | None) -> Measures:
+def measures(path: PathPlot, frame: WorldFrame, water: MediumCurves | None) -> Measures:
     """Of the path in n, the largest sub-map's ``frame``, and the water in its unit."""
     rows = [
         ("unit of length", _unit(frame)),
@@ -220,19 +220,19 @@ def measures(path: PathPlot, frame: MetricFrame, water: MediumCurves | None) -> 
     return Measures(rows, frame.sources)
 
 
-def _unit(frame: MetricFrame) -> str:
+def _unit(frame: WorldFrame) -> str:
     if not frame.metric:
         return "map units"
     return f"metres, \u00b1 {100.0 * frame.scale_sigma:.2g} %"
 
 
-def _gravity(frame: MetricFrame) -> str:
+def _gravity(frame: WorldFrame) -> str:
     if not frame.level:
         return "unknown: the world is turned as the first keyframe's camera"
     return f"z points down, \u00b1 {np.degrees(frame.tilt_sigma_rad):.2g} degrees"
 
 
-def _north(frame: MetricFrame) -> str:
+def _north(frame: WorldFrame) -> str:
     if not frame.level:
         return "to the right in the first keyframe"
     if frame.north in {"true north", "magnetic north"}:
@@ -240,7 +240,7 @@ def _north(frame: MetricFrame) -> str:
     return f"to {frame.north}; where north is, is unknown"
 
 
-def _place(frame: MetricFrame) -> list[tuple[str, str]]:
+def _place(frame: WorldFrame) -> list[tuple[str, str]]:
     origin = frame.origin
     if origin is None:
         return []
@@ -248,7 +248,7 @@ def _place(frame: MetricFrame) -> list[tuple[str, str]]:
     return [("origin", f"{where} \u00b1 {origin.sigma_m:.2g} m, from {origin.source}")]
 
 
-def _lengths(path: PathPlot, frame: MetricFrame) -> list[tuple[str, str]]:
+def _lengths(path: PathPlot, frame: WorldFrame) -> list[tuple[str, str]]:
     """Of the largest sub-map's path alone, unless all lie in one frame."""
     positions = path.positions[np.isfinite(path.positions).all(axis=1)].reshape(-1, 3)
     if len(set(path.sub_maps)) > 1 or len(positions) < 2:
@@ -266,7 +266,7 @@ def _lengths(path: PathPlot, frame: MetricFrame) -> list[tuple[str, str]]:
 
 def _heights(
     z: npt.NDArray[np.floating],  # [N] n
-    frame: MetricFrame,
+    frame: WorldFrame,
 ) -> tuple[str, str]:
     if frame.metric and frame.depth_known:
         sigma = float(np.sqrt(frame.position_covariance(np.array([0.0, 0.0, z.mean()]))[2, 2]))
@@ -274,7 +274,7 @@ def _heights(
     return "height difference", _length(float(np.ptp(z)), frame)
 
 
-def _length(value: float, frame: MetricFrame) -> str:
+def _length(value: float, frame: WorldFrame) -> str:
     """With the digits that its sigma leaves."""
     if not frame.metric:
         return f"{value:.4g} {frame.unit}"

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from aquaflow.survey.coverage import COLOURS, WORDS, PageView, Seen
+from aquaflow.survey.coverage import COLOURS, WORDS, CoverageClass, PageView
 from aquaflow.survey.coverage.picture import cells_affine
-from aquaflow.survey.report.data import Profile
+from aquaflow.survey.report.data import DepthProfile
 from aquaflow.survey.report.figures import INK, SUB_MAP_COLOURS, drawn, svg_of
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ def coverage_svg(view: PageView) -> str:
     return svg_of(drawn(9.0, 4.6, coverage_axes, view), "coverage")
 
 
-def profile_svg(profile: Profile) -> str:
+def profile_svg(profile: DepthProfile) -> str:
     """Depth and altitude over the time of the dive."""
     return svg_of(drawn(9.0, 3.0, profile_axes, profile), "profile")
 
@@ -37,7 +37,7 @@ def coverage_axes(figure: Figure, view: PageView) -> None:
     from matplotlib.transforms import Affine2D
 
     axes = figure.subplots()
-    colours = np.zeros((len(Seen), 4), np.uint8)
+    colours = np.zeros((len(CoverageClass), 4), np.uint8)
     for seen, colour in COLOURS.items():
         colours[seen] = (*colour, 255)
     rows, columns = view.plan.classes.shape
@@ -60,7 +60,7 @@ def coverage_axes(figure: Figure, view: PageView) -> None:
     axes.set_ylabel(f"{view.up}, {view.unit}")
     patches = [
         Patch(color="#{:02x}{:02x}{:02x}".format(*COLOURS[seen]), label=WORDS[seen])
-        for seen in (Seen.WELL, Seen.SPARSE, Seen.TOO_FAR)
+        for seen in (CoverageClass.WELL, CoverageClass.SPARSE, CoverageClass.TOO_FAR)
     ]
     handles, _ = axes.get_legend_handles_labels()
     figure.legend(handles=[*patches, *handles], loc="outside lower center", ncols=3)
@@ -75,7 +75,7 @@ def _lines(axes: Axes, view: PageView) -> None:
         axes.plot(*ends.T, "--", color=NEXT_COLOUR, lw=2.0, label="next line")
 
 
-def profile_axes(figure: Figure, profile: Profile) -> None:
+def profile_axes(figure: Figure, profile: DepthProfile) -> None:
     """Draw depth and altitude over time into an empty figure, as far as they are known."""
     known = [
         (values, name, down)

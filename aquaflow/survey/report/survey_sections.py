@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from aquaflow.survey.coverage import WORDS, PageView, Seen, visibility
-from aquaflow.survey.report.data import LeftOut, MediumCurves, Profile, ReportData
+from aquaflow.survey.coverage import WORDS, CoverageClass, PageView, visibility
+from aquaflow.survey.report.data import DepthProfile, LeftOut, MediumCurves, ReportData
 from aquaflow.survey.report.survey_figures import coverage_svg, profile_svg
 
 Rows = list[tuple[str, ...]]
@@ -39,10 +39,10 @@ def coverage_words(view: PageView) -> str:
 def coverage_rows(view: PageView) -> Rows:
     """Areas, lines and overlap."""
     unit = "m\u00b2" if view.unit == "m" else "square map units"
-    total = sum(view.area(seen) for seen in Seen)
+    total = sum(view.area(seen) for seen in CoverageClass)
     rows: Rows = [
         (WORDS[seen], f"{view.area(seen):.3g} {unit} ({100.0 * view.area(seen) / total:.0f} %)")
-        for seen in (Seen.WELL, Seen.SPARSE, Seen.TOO_FAR)
+        for seen in (CoverageClass.WELL, CoverageClass.SPARSE, CoverageClass.TOO_FAR)
         if total > 0.0
     ]
     state, limit = view.state, view.plan.limit
@@ -72,7 +72,7 @@ def overview(png: bytes | None) -> str:
     )
 
 
-def profile(data: Profile | None) -> str:
+def profile(data: DepthProfile | None) -> str:
     """Depth and altitude over time."""
     if data is None:
         return ""

@@ -9,7 +9,7 @@ from pathlib import Path
 from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes.place import KeypointDepths, Place
+from aquaflow.keyframes.place import KeyframePlace, KeypointDepths
 from aquaflow.keyframes.places_file import PlacesFile
 from aquaflow.survey.site.frames import frame_of
 from aquaflow.survey.site.manifest import check_unchanged, is_site, read_site
@@ -61,7 +61,7 @@ def _unchanged(dive: Path, before: str) -> PlacesFile:
 
 def _places(
     merged: MergedSite, files: dict[int, PlacesFile]
-) -> tuple[list[Place], dict[int, tuple[int, int]]]:
+) -> tuple[list[KeyframePlace], dict[int, tuple[int, int]]]:
     """Keyframes in their component's world, and the dive and number of each there."""
     places, origins = [], {}
     for number, row in enumerate(merged.keyframes):

@@ -12,14 +12,14 @@ import numpy as np
 from aquaflow.dive.dive import Dive
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 
 @dataclass(frozen=True)
 class Component:
     """Sub-maps that met, and the world that they are expressed in."""
 
-    frame: MetricFrame
+    frame: WorldFrame
     """Of the world s; ``T_nm`` is the identity. Its axes and origin are those of the sub-map that
     knows most, its scale is the mean of all that are metric."""
     reference: int
@@ -32,7 +32,7 @@ class Component:
 
 def component_of(
     sub_maps: Sequence[int],
-    frames: Sequence[MetricFrame],
+    frames: Sequence[WorldFrame],
     growth: Sequence[float],
 ) -> tuple[Component, float]:
     """The world of the sub-maps ``sub_maps``, the first of which gives the axes.
@@ -62,7 +62,7 @@ def component_of(
     return Component(frame, sub_maps[0], tuple(sub_maps), chi), float(np.exp(log_scale))
 
 
-def frame_of(stated: Mapping[str, Any], dives: Mapping[str, Path]) -> MetricFrame:
+def frame_of(stated: Mapping[str, Any], dives: Mapping[str, Path]) -> WorldFrame:
     """The world of a component as ``merged.json`` states it: the axes and origin of one dive's
     sub-map, the scale of all. ``dives``: their folders by name.
 
@@ -72,7 +72,7 @@ def frame_of(stated: Mapping[str, Any], dives: Mapping[str, Path]) -> MetricFram
     axes = stated["axes_of"]
     folder = dives.get(axes["dive"])
     number = int(axes["sub_map"])
-    first = MetricFrame.unknown() if folder is None else Dive(folder).frame_of(number)
+    first = WorldFrame.unknown() if folder is None else Dive(folder).frame_of(number)
     covariance = first.covariance.copy()
     if stated["metric"]:
         covariance[6, 6] = float(stated["scale_sigma"]) ** 2

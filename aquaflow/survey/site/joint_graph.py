@@ -14,9 +14,9 @@ from itertools import pairwise
 import numpy as np
 
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes.place import Place
+from aquaflow.keyframes.place import KeyframePlace
 from aquaflow.keyframes.places_file import PlacesFile
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph
 
 LEAST_TRUST = 0.5
@@ -35,21 +35,21 @@ class SubMap:
     """Index of the dive."""
     number: int
     """Of the sub-map in its dive."""
-    frame: MetricFrame
-    places: tuple[Place, ...]
+    frame: WorldFrame
+    places: tuple[KeyframePlace, ...]
     """In order."""
 
-    def start(self, place: Place) -> Sim3:
+    def start(self, place: KeyframePlace) -> Sim3:
         """T_nc of a keyframe, with the scale that takes its unit to that of n."""
         return self.frame.T_nm @ place.T_mc
 
 
-def sub_maps_of(dive: int, file: PlacesFile, frames: dict[int, MetricFrame]) -> list[SubMap]:
+def sub_maps_of(dive: int, file: PlacesFile, frames: dict[int, WorldFrame]) -> list[SubMap]:
     """The sub-maps of a dive that have keyframes."""
     numbers = sorted({place.sub_map for place in file.places})
     return [
         SubMap(
-            dive, number, frames.get(number, MetricFrame.unknown()),
+            dive, number, frames.get(number, WorldFrame.unknown()),
             tuple(place for place in file.places if place.sub_map == number),
         )
         for number in numbers

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from aquaflow.config import RetrievalConfig, VerificationConfig
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes.place import Place
+from aquaflow.keyframes.place import KeyframePlace
 from aquaflow.keyframes.places_file import PlacesFile
 from aquaflow.tracking.graph.pose_graph import edge_information
 from aquaflow.tracking.loops.retrieval import Retrieval
@@ -77,7 +77,7 @@ def find_links(
 
 
 def _of_keyframe(
-    a: PlacesFile, retrieval: Retrieval, b: PlacesFile, place: Place
+    a: PlacesFile, retrieval: Retrieval, b: PlacesFile, place: KeyframePlace
 ) -> Iterator[CrossLink]:
     own = b.keypoints(place.number)
     for candidate in retrieval.candidates(own, exclude=lambda _: False):

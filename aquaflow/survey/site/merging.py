@@ -30,7 +30,7 @@ from aquaflow.survey.site.merged_file import MergedSite, remove_merged, write_me
 from aquaflow.survey.site.placing import placed
 from aquaflow.survey.site.site_log import say
 from aquaflow.survey.site.site_paths import write_paths
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 Progress = Callable[[str, int, int | None], None]
 
@@ -42,7 +42,7 @@ class Taking:
     dive: SiteDive
     folder: Path
     places: PlacesFile
-    frames: dict[int, MetricFrame]
+    frames: dict[int, WorldFrame]
 
 
 def merge(site: Path, progress: Progress = lambda *_: None) -> MergedSite:

@@ -24,7 +24,7 @@ MOST_FPS = 240.0
 """Pictures a second; no camera of a vehicle has more."""
 
 
-class VideoFile:
+class VideoEncoder:
     """Appends pictures of one size."""
 
     def __init__(self, path: Path, fps: float) -> None:
@@ -100,7 +100,7 @@ def check_name(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def video_file(path: Path, fps: float) -> Iterator[VideoFile]:
+def video_file(path: Path, fps: float) -> Iterator[VideoEncoder]:
     """A video that becomes ``path`` when the block ends without an exception.
 
     Raises:
@@ -108,7 +108,7 @@ def video_file(path: Path, fps: float) -> Iterator[VideoFile]:
     """
     check_name(path)
     with fresh_file(path) as part:  # FFmpeg takes the container from the ending
-        file = VideoFile(part, min(fps, MOST_FPS))
+        file = VideoEncoder(part, min(fps, MOST_FPS))
         try:
             yield file
             file.finish()

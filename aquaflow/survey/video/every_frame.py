@@ -42,7 +42,7 @@ class EveryFrame:
     restored: int
 
 
-class Poses:
+class CameraPoses:
     """Poses of the camera at any time of the dive, in the world of its map."""
 
     def __init__(self, frames: Sequence[FinishedFrame], T_nm: Sim3) -> None:
@@ -100,7 +100,7 @@ def restore_every_frame(
     first, last = frames[0].row.index, frames[-1].row.index
     indices = np.array([frame.row.index for frame in frames])
     fps = usual_fps(np.array([frame.row.t_s for frame in frames]), indices)
-    poses, light = Poses(frames, dive.frame.T_nm), _Light(mapper)
+    poses, light = CameraPoses(frames, dive.frame.T_nm), _Light(mapper)
     restored, count = 0, 0
     with video_file(path, fps) as file:
         timeline = Timeline(file, fps)

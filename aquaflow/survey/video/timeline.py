@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.survey.video.encoder import VideoFile
+from aquaflow.survey.video.encoder import VideoEncoder
 
 Picture = npt.NDArray[np.uint8]
 
@@ -16,7 +16,7 @@ class Timeline:
     Where two fall into one interval the later one is shown, so that times never drift.
     """
 
-    def __init__(self, file: VideoFile, fps: float) -> None:
+    def __init__(self, file: VideoEncoder, fps: float) -> None:
         self._file, self._fps = file, fps
         self._begun_s: float | None = None
         self._shown: tuple[int, Picture] | None = None

@@ -11,10 +11,10 @@ import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
 from aquaflow.dive.dive import Dive
-from aquaflow.survey.coverage.classes import COLOURS, WORDS, Seen
+from aquaflow.survey.coverage.classes import COLOURS, WORDS, CoverageClass
 from aquaflow.survey.coverage.coverage_file import NAME, read_coverage_file
 from aquaflow.survey.viewer.levels import Palette
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 log = logging.getLogger(__name__)
 
@@ -24,15 +24,15 @@ UNSEEN = (60, 60, 66)
 """RGB of what was not seen: dark, as it is missing."""
 CLASSES = Palette(
     "by coverage",
-    tuple(COLOURS.get(seen, UNSEEN) for seen in Seen),
-    tuple(WORDS[seen] for seen in Seen),
+    tuple(COLOURS.get(seen, UNSEEN) for seen in CoverageClass),
+    tuple(WORDS[seen] for seen in CoverageClass),
 )
 
 
 def coverage_of_dive(
     dive: Dive,
     centres: npt.NDArray[np.floating],  # [N, 3] in n
-    frame: MetricFrame,
+    frame: WorldFrame,
 ) -> npt.NDArray[np.uint8] | None:
     """[N] a :class:`aquaflow.survey.coverage.Seen` for each; None where the dive keeps no
     coverage."""

@@ -12,15 +12,15 @@ from aquaflow.dive.dive import Dive
 from aquaflow.dive.ply import read_ply
 from aquaflow.survey.viewer.dive_coverage import CLASSES, COVERAGE, coverage_of_dive
 from aquaflow.survey.viewer.levels import RANGE, Palette, range_level
-from aquaflow.survey.viewer.splats import Splats, splats
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.survey.viewer.splats import ViewerSplats, splats
+from aquaflow.telemetry.world_frame import WorldFrame
 
 
 @dataclass(frozen=True)
 class DiveMap:
     """What is shown of a map."""
 
-    splats: Splats
+    splats: ViewerSplats
     palettes: dict[str, Palette]
     total: int
     """Gaussians of the whole map."""
@@ -30,7 +30,7 @@ def read_map(
     dive: Dive,
     ply: Path,
     cameras: npt.NDArray[np.float64],  # [M, 3] of the path
-    frame: MetricFrame,
+    frame: WorldFrame,
     budget: int,
 ) -> DiveMap:
     """The Gaussians in ``ply``, at most ``budget``, of ``dive``.

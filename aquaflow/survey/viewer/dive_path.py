@@ -20,8 +20,8 @@ from aquaflow.dive.trajectory_csv import NAME as PATH_TABLE
 from aquaflow.dive.trajectory_csv import PoseRow
 from aquaflow.geometry.similarity import Sim3, rotation_from_quaternion
 from aquaflow.recordings.kept_pictures import kept_pictures
-from aquaflow.survey.viewer.exhibit import POSE_NUMBERS
 from aquaflow.survey.viewer.moments import Float, moments
+from aquaflow.survey.viewer.viewer_content import POSE_NUMBERS
 
 LONGEST_PATH = 5000
 """Most poses that a page gets, as of a live dive: 52 bytes each, on their way before the map."""

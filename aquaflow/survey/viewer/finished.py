@@ -19,14 +19,14 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.survey.viewer.dive_map import DiveMap, read_map
 from aquaflow.survey.viewer.dive_path import DivePath, read_path
 from aquaflow.survey.viewer.levels import Palette
-from aquaflow.survey.viewer.measuring import Asked, Frame, vector
+from aquaflow.survey.viewer.measuring import Asked, LengthUnit, vector
 from aquaflow.survey.viewer.packed_file import PackedFile, key_of, read_packed, write_packed
 from aquaflow.survey.viewer.page import ViewerPage
 from aquaflow.survey.viewer.pinned_notes import PinnedNotes
 from aquaflow.survey.viewer.seen_water import SeenWater, water_of
-from aquaflow.survey.viewer.splats import Splats
+from aquaflow.survey.viewer.splats import ViewerSplats
 from aquaflow.survey.viewer.tools import SCALE, Tools
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 log = logging.getLogger(__name__)
 
@@ -50,10 +50,10 @@ class FinishedDive:
     water: SeenWater | None
     path: DivePath
     camera: CameraModel
-    frame: MetricFrame
+    frame: WorldFrame
 
     @property
-    def splats(self) -> Splats:
+    def splats(self) -> ViewerSplats:
         """The Gaussians that are shown."""
         return self.map().splats
 
@@ -74,7 +74,7 @@ class FinishedDive:
         return "\n\n".join(filter(None, (said, note_unfinished(self.folder))))
 
 
-def frame_in_words(frame: MetricFrame) -> str:
+def frame_in_words(frame: WorldFrame) -> str:
     """Unit and axes."""
     unit = "Lengths are map units"
     if frame.metric:
@@ -130,7 +130,7 @@ def show_folder(folder: Path, config: ViewerConfig) -> ViewerPage:
 def fill(page: ViewerPage, dive: FinishedDive) -> None:
     """Show ``dive`` on ``page``, in place of what was there."""
     page.set_frame(
-        Frame.of(dive.frame), up="-z" if dive.frame.level else "-y", north=dive.frame.north
+        LengthUnit.of(dive.frame), up="-z" if dive.frame.level else "-y", north=dive.frame.north
     )
     page.show_health(dive.summary)
     if dive.packed is not None:

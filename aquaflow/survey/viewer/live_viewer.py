@@ -15,21 +15,21 @@ import numpy.typing as npt
 
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.dive.path_rows import attitude_of
-from aquaflow.dive.views import LOOK_S, DiveView, RunningDive, Showing
+from aquaflow.dive.views import LOOK_S, DisplayThread, DiveView, RunningDive
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.work import OwnedMaps
 from aquaflow.sources.newest import Newest
 from aquaflow.survey.coverage.plan import CoveragePlan
 from aquaflow.survey.measure.scale import Scale
 from aquaflow.survey.viewer.dive_coverage import CLASSES, COVERAGE
-from aquaflow.survey.viewer.exhibit import POSE_NUMBERS
 from aquaflow.survey.viewer.levels import RANGE, Palette, range_level, steps_level
-from aquaflow.survey.viewer.measuring import Frame
+from aquaflow.survey.viewer.measuring import LengthUnit
 from aquaflow.survey.viewer.moments import moments
 from aquaflow.survey.viewer.page import ViewerPage
 from aquaflow.survey.viewer.seen_water import SeenWater, seen_water
-from aquaflow.survey.viewer.splats import Splats, splats
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.survey.viewer.splats import ViewerSplats, splats
+from aquaflow.survey.viewer.viewer_content import POSE_NUMBERS
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.frames import Tracked
 from aquaflow.types import CameraModel
 
@@ -50,14 +50,14 @@ class LiveViewer(DiveView):
         self._config, self._report, self._plan = config, report, plan
         self._page = ViewerPage(config, "AquaFlow")
         self.address = self._page.address
-        self._poses: Newest[Pose] = Newest()
+        self._poses: Newest[ViewerPose] = Newest()
         self._copies: Newest[tuple[int, MapCopy]] = Newest()
         """With their sub-maps."""
         self._path = LivePath()
         self._pictures: Mapping[int, Path] = {}
         self._pose_s = self._map_s = 0.0
         self._asked = False
-        self._showing = Showing("viewer", self._show, config.refresh_s)
+        self._showing = DisplayThread("viewer", self._show, config.refresh_s)
 
     @property
     def splats_shown(self) -> int:
@@ -97,7 +97,7 @@ class LiveViewer(DiveView):
         self._pictures = {} if kept is None else kept.paths
         step = max(1, image.shape[1] // self._config.picture_width)
         small = np.ascontiguousarray(image[::step, ::step])
-        self._poses.put(Pose(latest.T_wc, latest.frame.camera, small))
+        self._poses.put(ViewerPose(latest.T_wc, latest.frame.camera, small))
 
     def _copy(self, maps: OwnedMaps, sub_map: int) -> None:
         """In the mapping thread."""
@@ -128,13 +128,13 @@ class LiveViewer(DiveView):
         self._page.show_health(in_words(report))
 
 
-def frame_of(report: dict[str, Any]) -> Frame:
+def frame_of(report: dict[str, Any]) -> LengthUnit:
     """How lengths are said: the map is in its own units, and metres may be known by now."""
     known = report.get("metric_frame") or {}
     metres = known.get("metres_per_map_unit")
     if metres is None:
-        return Frame.of(MetricFrame.unknown())
-    return Frame(Scale("m", known.get("scale_sigma") or 0.0, 0.0), metres)
+        return LengthUnit.of(WorldFrame.unknown())
+    return LengthUnit(Scale("m", known.get("scale_sigma") or 0.0, 0.0), metres)
 
 
 def in_words(report: dict[str, Any]) -> str:
@@ -177,7 +177,7 @@ class LivePath:
         self._rows: list[_Row] = []
         self._depth_m = math.nan
 
-    def add(self, tracked: Tracked, frame: MetricFrame) -> None:
+    def add(self, tracked: Tracked, frame: WorldFrame) -> None:
         """A posed frame, in the metric ``frame`` of its sub-map as it is known by now."""
         T_wc = tracked.T_wc
         assert T_wc is not None
@@ -223,7 +223,7 @@ OFTEN = 200.0
 
 
 @dataclass(frozen=True)
-class Pose:
+class ViewerPose:
     """Where the camera is, and what it sees."""
 
     T_wc: Sim3
@@ -233,12 +233,16 @@ class Pose:
 
 
 def shown(
-    copy: MapCopy, budget: int, frame: Frame | None = None, plan: CoveragePlan | None = None
-) -> tuple[Splats, SeenWater | None, dict[str, Palette]]:
+    copy: MapCopy, budget: int, frame: LengthUnit | None = None, plan: CoveragePlan | None = None
+) -> tuple[ViewerSplats, SeenWater | None, dict[str, Palette]]:
     """In the viewer's thread: what a browser gets, the water before it, and the palettes of what
     each Gaussian is coloured by: how often it was seen, from how far away, and, by the ``plan`` of
     its sub-map's coverage, how well."""
-    plain, water, unit = copy.parameters, _water(copy), frame or Frame.of(MetricFrame.unknown())
+    plain, water, unit = (
+        copy.parameters,
+        _water(copy),
+        frame or LengthUnit.of(WorldFrame.unknown()),
+    )
     with np.errstate(over="ignore"):
         opacities = (1.0 / (1.0 + np.exp(-plain["opacity_logits"][:, 0]))).astype(np.float32)
         scales = np.exp(plain["log_scales"])

@@ -11,14 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
-from aquaflow.survey.measure.points import Points
+from aquaflow.survey.measure.points import MeasuredPoints
 from aquaflow.survey.measure.profile import profile
 from aquaflow.survey.measure.quantity import Quantity
 from aquaflow.survey.measure.scale import Scale, scale_of
 from aquaflow.survey.measure.shapes import area, path_length, plan_area
-from aquaflow.survey.viewer.picking import Picked, pick, within_reach
-from aquaflow.survey.viewer.splats import Splats
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.survey.viewer.picking import PickedGaussian, pick, within_reach
+from aquaflow.survey.viewer.splats import ViewerSplats
+from aquaflow.telemetry.world_frame import WorldFrame
 
 Array = npt.NDArray[np.float64]
 Asked = dict[str, Any]
@@ -32,7 +32,7 @@ LEAST_SIGMA = 1e-9
 
 
 @dataclass(frozen=True)
-class Frame:
+class LengthUnit:
     """How lengths on the page are said."""
 
     scale: Scale
@@ -42,26 +42,26 @@ class Frame:
     """Up is against gravity."""
 
     @staticmethod
-    def of(frame: MetricFrame) -> Frame:
+    def of(frame: WorldFrame) -> LengthUnit:
         """Of a finished dive, whose files are in n."""
-        return Frame(scale_of(frame), level=frame.level)
+        return LengthUnit(scale_of(frame), level=frame.level)
 
 
 @dataclass(frozen=True)
-class Scene:
+class MeasuringScene:
     """Where points are measured."""
 
-    splats: Splats
+    splats: ViewerSplats
     cameras: Array
     """[M, 3] of the path."""
     width: float
     """Of what a picture shows, as a share of the range."""
     up: Array
     """[3] unit."""
-    frame: Frame
+    frame: LengthUnit
 
 
-def measured(what: str, asked: Sequence[Asked], scene: Scene) -> Asked:
+def measured(what: str, asked: Sequence[Asked], scene: MeasuringScene) -> Asked:
     """``words`` and ``quantities`` by name: distance, area or profile of what a browser asked.
 
     Raises:
@@ -123,8 +123,8 @@ def _positive(given: Any) -> float:
 def _points(
     places: Array,  # [N, 3]
     sigmas: Array,  # [N]
-    scene: Scene,
-) -> Points:
+    scene: MeasuringScene,
+) -> MeasuredPoints:
     """In the unit of the dive's lengths. What the map errs, it errs by its cameras' ranges."""
     ranges = np.ones(len(places))
     if len(scene.cameras):
@@ -133,7 +133,7 @@ def _points(
     metres = scene.frame.metres
     reach = max(metres * scene.width * float(np.median(ranges)), LEAST_SIGMA)
     own = metres * np.maximum(sigmas, LEAST_SIGMA)
-    return Points.round(metres * places, own, metres * RANGE_SIGMA * ranges, reach)
+    return MeasuredPoints.round(metres * places, own, metres * RANGE_SIGMA * ranges, reach)
 
 
 def _said(quantities: dict[str, Quantity]) -> Asked:
@@ -149,7 +149,7 @@ def _profile(
     asked: Sequence[Asked],
     ends: Array,  # [N, 3]
     sigmas: Array,  # [N]
-    scene: Scene,
+    scene: MeasuringScene,
 ) -> Asked:
     """Heights of the map between the first point and the last."""
     found = [_found(*ray) for ray in _rays(asked, ends, scene)]
@@ -171,8 +171,8 @@ def _profile(
 def _rays(
     asked: Sequence[Asked],
     ends: Array,  # [N, 3]
-    scene: Scene,
-) -> list[tuple[Splats, Array, Array, float, float]]:
+    scene: MeasuringScene,
+) -> list[tuple[ViewerSplats, Array, Array, float, float]]:
     """From straight above where up is against gravity; else from the eye that saw the first end.
     Each is as wide as half the way to the next."""
     shares = np.linspace(0.0, 1.0, PROFILE_POINTS)[:, None]
@@ -191,12 +191,12 @@ def _rays(
 
 
 def _found(
-    near: Splats,
+    near: ViewerSplats,
     origin: Array,  # [3]
     direction: Array,  # [3]
     pixel_rad: float,
     beam_rad: float,
-) -> Picked | None:
+) -> PickedGaussian | None:
     """None where nothing is mapped."""
     try:
         return pick(near, origin, direction, pixel_rad, beam_rad)

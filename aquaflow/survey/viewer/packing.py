@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.survey.viewer.splats import Float, Splats
+from aquaflow.survey.viewer.splats import Float, ViewerSplats
 
 FIRST_CHUNK = 16_384
 """Gaussians of the first chunk: 0.25 MB, 0.2 s at 10 Mbit/s. Each further one doubles what is
@@ -48,7 +48,7 @@ class _Code:
     brightest: float
 
     @staticmethod
-    def of(splats: Splats) -> _Code:
+    def of(splats: ViewerSplats) -> _Code:
         """For these Gaussians."""
         middle, half = _box(splats.centres)
         return _Code(middle, half, _log_scales(splats.scales), _brightest(splats.colours))
@@ -57,7 +57,7 @@ class _Code:
 class Packed:
     """Splats as a description and chunks of bytes, which are packed when first asked for."""
 
-    def __init__(self, splats: Splats) -> None:
+    def __init__(self, splats: ViewerSplats) -> None:
         self._splats = splats
         self._ends = chunk_ends(len(splats))
         self._chunks: dict[int, bytes] = {}
@@ -183,7 +183,7 @@ def _brightest(
     return float(np.clip(np.percentile(colours, 99.9), 1.0, 2.0)) if colours.size else 1.0
 
 
-def _digest(splats: Splats) -> str:
+def _digest(splats: ViewerSplats) -> str:
     digest = hashlib.blake2b(digest_size=8)
     arrays = (splats.centres, splats.wxyz, splats.scales, splats.opacities, splats.colours)
     for each in (*arrays, *splats.levels.values()):

@@ -13,16 +13,22 @@ import numpy.typing as npt
 
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.survey.viewer.exhibit import POSE_NUMBERS, Exhibit, PathPart, ShownCamera, ShownMap
 from aquaflow.survey.viewer.levels import Palette
-from aquaflow.survey.viewer.measuring import Frame
+from aquaflow.survey.viewer.measuring import LengthUnit
 from aquaflow.survey.viewer.moments import unknown
 from aquaflow.survey.viewer.packed_file import PackedFile
 from aquaflow.survey.viewer.packing import Packed
 from aquaflow.survey.viewer.seen_water import SeenWater
 from aquaflow.survey.viewer.server import ViewerServer
-from aquaflow.survey.viewer.splats import Splats
+from aquaflow.survey.viewer.splats import ViewerSplats
 from aquaflow.survey.viewer.tools import Tools
+from aquaflow.survey.viewer.viewer_content import (
+    POSE_NUMBERS,
+    PathPart,
+    ShownCamera,
+    ShownMap,
+    ViewerContent,
+)
 from aquaflow.types import CameraModel
 
 Float = npt.NDArray[np.floating[Any]]
@@ -52,7 +58,7 @@ class ViewerPage:
             InputError: the address is taken.
             ConfigError: the token will not do.
         """
-        self._exhibit = Exhibit(title, UP["-y"], live)
+        self._exhibit = ViewerContent(title, UP["-y"], live)
         self._tools = tools or Tools()
         self._tools.exhibit = self._exhibit
         self._exhibit.can = self._tools.can()
@@ -82,7 +88,7 @@ class ViewerPage:
 
     def show_splats(
         self,
-        splats: Splats,
+        splats: ViewerSplats,
         water: SeenWater | None = None,
         palettes: dict[str, Palette] | None = None,
     ) -> None:
@@ -92,7 +98,7 @@ class ViewerPage:
     def show_packed(
         self,
         packed: PackedFile,
-        splats: Callable[[], Splats],
+        splats: Callable[[], ViewerSplats],
         water: SeenWater | None,
         palettes: dict[str, Palette],
     ) -> None:
@@ -134,7 +140,7 @@ class ViewerPage:
         """The panel's text: paragraphs."""
         self._exhibit.health = text
 
-    def set_frame(self, frame: Frame, up: Literal["-y", "-z"] = "-y", north: str = "") -> None:
+    def set_frame(self, frame: LengthUnit, up: Literal["-y", "-z"] = "-y", north: str = "") -> None:
         """The unit of lengths, how well it is known, and which axis of the world points up: by
         default the first camera's, whose y points down. ``north``: what headings begin at."""
         self._exhibit.north = north

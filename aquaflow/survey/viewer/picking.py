@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.base.errors import InputError
-from aquaflow.survey.viewer.splats import Splats, covariances
+from aquaflow.survey.viewer.splats import ViewerSplats, covariances
 
 Array = npt.NDArray[np.float64]
 
@@ -31,7 +31,7 @@ CLICK_PX = 1.0
 
 
 @dataclass(frozen=True)
-class Picked:
+class PickedGaussian:
     """A point of the map, and how well it is known."""
 
     place: Array
@@ -44,12 +44,12 @@ class Picked:
 
 
 def pick(
-    splats: Splats,
+    splats: ViewerSplats,
     origin: Array,  # [3]
     direction: Array,  # [3] of any length
     pixel_rad: float,
     beam_rad: float | None = None,
-) -> Picked:
+) -> PickedGaussian:
     """The point that a person means who points along a ray.
 
     Args:
@@ -77,15 +77,15 @@ def pick(
     stopped = np.cumsum(share)
     low, middle, high = np.interp(np.array(ONE_SIGMA) * stopped[-1], stopped, ranges).tolist()
     sigma = float(np.hypot(0.5 * (high - low), CLICK_PX * pixel_rad * middle))
-    return Picked(np.asarray(origin) + middle * ray, middle, sigma)
+    return PickedGaussian(np.asarray(origin) + middle * ray, middle, sigma)
 
 
 def within_reach(
-    splats: Splats,
+    splats: ViewerSplats,
     origin: Array,  # [3]
     spanning: Array,  # [2, 3] two directions of a plane
     width: float,
-) -> Splats:
+) -> ViewerSplats:
     """Those that a ray, 1 sigma of ``width``, within the plane through ``origin`` can cross: far
     fewer, for many rays."""
     normal = np.cross(spanning[0], spanning[1])
@@ -97,7 +97,7 @@ def within_reach(
 
 
 def _near(
-    splats: Splats,
+    splats: ViewerSplats,
     origin: Array,  # [3]
     ray: Array,  # [3] unit
     beam: float,
@@ -114,7 +114,7 @@ def _near(
 
 
 def _crossed(
-    splats: Splats,
+    splats: ViewerSplats,
     near: npt.NDArray[np.intp],  # [M]
     origin: Array,  # [3]
     ray: Array,  # [3] unit

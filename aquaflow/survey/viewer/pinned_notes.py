@@ -15,7 +15,7 @@ from aquaflow.dive.dive import Dive
 from aquaflow.survey.measure.notes import MOST_NOTES, Note, Shape, read_notes, write_notes
 from aquaflow.survey.viewer.measuring import Asked, is_finite, vector
 from aquaflow.survey.viewer.tools import NOTES
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 LONGEST = 1000
 """Characters of a note's text."""
@@ -77,7 +77,7 @@ class PinnedNotes:
         write_notes(self.dive, left, frame)
         return {}
 
-    def _frame(self) -> MetricFrame:
+    def _frame(self) -> WorldFrame:
         return Dive(self.dive).frame
 
 

@@ -13,8 +13,8 @@ from typing import Any, TypeAlias
 from aquaflow.base.errors import InputError
 from aquaflow.config.viewer import ViewerConfig
 from aquaflow.survey.viewer.client import ClientFile, client_file
-from aquaflow.survey.viewer.exhibit import Exhibit
-from aquaflow.web import Answer, Request, WebServer
+from aquaflow.survey.viewer.viewer_content import ViewerContent
+from aquaflow.web import HttpRequest, HttpResponse, WebServer
 from aquaflow.web.access import Access, path_of
 
 log = logging.getLogger(__name__)
@@ -52,7 +52,7 @@ Ask: TypeAlias = Callable[[str, dict[str, Any]], dict[str, Any]]
 class ViewerServer:
     """Serves an exhibit and its tools at the configured address."""
 
-    def __init__(self, config: ViewerConfig, exhibit: Exhibit, ask: Ask) -> None:
+    def __init__(self, config: ViewerConfig, exhibit: ViewerContent, ask: Ask) -> None:
         """Listen at once.
 
         Raises:
@@ -67,10 +67,10 @@ class ViewerServer:
         """Stop listening."""
         self._server.close()
 
-    def _answer(self, request: Request) -> Answer:
+    def _answer(self, request: HttpRequest) -> HttpResponse:
         return self._tool(request) if request.method == "POST" else self._looked(request)
 
-    def _looked(self, request: Request) -> Answer:
+    def _looked(self, request: HttpRequest) -> HttpResponse:
         path = path_of(request.target) or ""
         shown = request.target, request.headers, request.peer
         if not self._access.allows(*shown):
@@ -84,7 +84,7 @@ class ViewerServer:
             return _said(200, self._exhibit.scene())
         return self._data(path.split("/")[1:]) or _said(404, {"error": "there is nothing here"})
 
-    def _tool(self, request: Request) -> Answer:
+    def _tool(self, request: HttpRequest) -> HttpResponse:
         """Its name is the path, its arguments the JSON object in the body."""
         given = _given(request.body)
         if not self._access.may_change(request.headers, request.peer):
@@ -99,7 +99,7 @@ class ViewerServer:
             log.exception("the viewer could not answer a request")
             return _said(500, {"error": "that failed; the log of the viewer says why"})
 
-    def _data(self, parts: list[str]) -> Answer | None:
+    def _data(self, parts: list[str]) -> HttpResponse | None:
         """None if there is nothing by this name."""
         name, rest = parts[0], parts[1:]
         if name == "map" and len(rest) == 2 and _is_number(rest[1]):
@@ -116,7 +116,7 @@ class ViewerServer:
         return None
 
 
-def _file(file: ClientFile, known: str | None) -> Answer:
+def _file(file: ClientFile, known: str | None) -> HttpResponse:
     """``known``: the tag that the browser has."""
     headers = [("ETag", file.tag)]
     if known == file.tag:
@@ -133,13 +133,15 @@ def _given(body: bytes | None) -> dict[str, Any] | None:
     return given if isinstance(given, dict) else None
 
 
-def _said(code: int, said: dict[str, Any]) -> Answer:
+def _said(code: int, said: dict[str, Any]) -> HttpResponse:
     return _of(code, JSON, json.dumps(said).encode())
 
 
-def _of(code: int, kind: str, data: bytes, headers: Headers = (), keep: str = NO_STORE) -> Answer:
+def _of(
+    code: int, kind: str, data: bytes, headers: Headers = (), keep: str = NO_STORE
+) -> HttpResponse:
     always = [("Cache-Control", keep), *POLICIES]
-    return Answer(code, kind, data, [*always, *headers])
+    return HttpResponse(code, kind, data, [*always, *headers])
 
 
 def _own(path: str) -> str:

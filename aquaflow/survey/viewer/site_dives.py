@@ -17,7 +17,7 @@ from aquaflow.survey.site.paths import sub_maps_of_frames
 from aquaflow.survey.site.site_map_file import SiteMapPart, parts_of
 from aquaflow.survey.viewer.dive_path import DivePath
 from aquaflow.survey.viewer.finished import FinishedDive, finished_dive
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ class ShownSite:
     components: int
     """How many there are."""
     dives: tuple[PlacedDive, ...]
-    frame: MetricFrame
+    frame: WorldFrame
     left_out: Mapping[str, str]
     """Dives of the component that cannot be shown: name and reason."""
     one_map: list[SiteMapPart] | None

@@ -18,15 +18,15 @@ from aquaflow.survey.site.site_map_file import joined, read_site_map
 from aquaflow.survey.viewer.dive_coverage import CLASSES, COVERAGE, coverage_of_dive
 from aquaflow.survey.viewer.dive_map import DiveMap
 from aquaflow.survey.viewer.dive_path import LONGEST_PATH
-from aquaflow.survey.viewer.exhibit import PathPart
 from aquaflow.survey.viewer.finished import frame_in_words, prepare
 from aquaflow.survey.viewer.levels import RANGE, RGB, Palette, range_level
-from aquaflow.survey.viewer.measuring import Frame
+from aquaflow.survey.viewer.measuring import LengthUnit
 from aquaflow.survey.viewer.moments import HEADING, PICTURE
 from aquaflow.survey.viewer.packed_file import read_packed
 from aquaflow.survey.viewer.page import ViewerPage
 from aquaflow.survey.viewer.site_dives import PlacedDive, ShownSite, read_shown
 from aquaflow.survey.viewer.splats import Levels, splats
+from aquaflow.survey.viewer.viewer_content import PathPart
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ def open_site(site: Path, config: ViewerConfig, component: int | None = None) ->
     whole = cache(partial(map_of_site, shown, config.splats))
     page = ViewerPage(config, "AquaFlow", live=False)
     frame = shown.frame
-    page.set_frame(Frame.of(frame), up="-z" if frame.level else "-y", north=frame.north)
+    page.set_frame(LengthUnit.of(frame), up="-z" if frame.level else "-y", north=frame.north)
     if packed is not None:
         page.show_packed(packed, lambda: whole().splats, None, packed.palettes)
         count, total = packed.count, packed.total

@@ -12,7 +12,7 @@ Levels = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class Splats:
+class ViewerSplats:
     """N Gaussians in the world; those whose opacity and area are largest come first."""
 
     centres: Float
@@ -34,9 +34,9 @@ class Splats:
     def among(
         self,
         chosen: npt.NDArray[np.bool_],  # [N]
-    ) -> Splats:
+    ) -> ViewerSplats:
         """Only those."""
-        return Splats(
+        return ViewerSplats(
             self.centres[chosen], self.wxyz[chosen], self.scales[chosen], self.opacities[chosen],
             self.colours[chosen], {name: values[chosen] for name, values in self.levels.items()},
         )  # fmt: skip
@@ -54,7 +54,7 @@ def splats(
     colours: Float,  # [N, 3]
     budget: int,
     levels: dict[str, Levels] | None = None,  # [N] each
-) -> Splats:
+) -> ViewerSplats:
     """At most ``budget`` of them: those that cover most, by opacity and area. The others' share of
     the surface goes to them, so that no holes open.
 
@@ -68,7 +68,7 @@ def splats(
     share = float(weight[chosen].sum() / max(float(weight.sum()), 1e-12))
     # Areas grow by the root of what was left out: twice the gaps, no mud.
     grown = 1.0 if len(chosen) == sound.sum() else min(max(share, 0.25), 1.0) ** -0.25
-    return Splats(
+    return ViewerSplats(
         means[chosen].astype(np.float32),
         _unit(quats[chosen]),
         (grown * scales[chosen]).astype(np.float32),

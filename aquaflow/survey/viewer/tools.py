@@ -10,10 +10,10 @@ import numpy as np
 
 from aquaflow.base.errors import InputError
 from aquaflow.survey.measure.points import MOST_POINTS
-from aquaflow.survey.viewer.exhibit import Exhibit, ShownMap
-from aquaflow.survey.viewer.measuring import Asked, Frame, Scene, measured, ray_of
+from aquaflow.survey.viewer.measuring import Asked, LengthUnit, MeasuringScene, measured, ray_of
 from aquaflow.survey.viewer.picking import pick
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.survey.viewer.viewer_content import ShownMap, ViewerContent
+from aquaflow.telemetry.world_frame import WorldFrame
 
 NOTES, SCALE = ("notes/list", "notes/add", "notes/remove"), "scale"
 """Names of the tools that a finished dive has besides."""
@@ -25,9 +25,9 @@ BUSY_S = 20.0
 class Tools:
     """Answers browsers, one at a time; ``others`` are a dive's own tools by name."""
 
-    frame: Frame = field(default_factory=lambda: Frame.of(MetricFrame.unknown()))
+    frame: LengthUnit = field(default_factory=lambda: LengthUnit.of(WorldFrame.unknown()))
     others: dict[str, Callable[[Asked], Asked]] = field(default_factory=dict)
-    exhibit: Exhibit | None = None
+    exhibit: ViewerContent | None = None
     _turn: threading.Lock = field(default_factory=threading.Lock)
 
     def can(self) -> tuple[str, ...]:
@@ -66,7 +66,7 @@ class Tools:
         camera = exhibit.camera
         width = 1.0 if camera is None else camera.camera.width / camera.camera.fx
         cameras = exhibit.path[:, :3].astype(np.float64)
-        scene = Scene(shown.splats(), cameras, width, np.array(exhibit.up), self.frame)
+        scene = MeasuringScene(shown.splats(), cameras, width, np.array(exhibit.up), self.frame)
         return measured(str(given.get("what")), asked, scene)
 
     def _map(self) -> ShownMap:

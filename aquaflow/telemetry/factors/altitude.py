@@ -10,7 +10,7 @@ from aquaflow.geometry.similarity import so3_exp, so3_log
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.factors.factor import Array, Factor
 from aquaflow.telemetry.noise import Process, SlowPart
-from aquaflow.telemetry.state import CAMERA, SCALE, State
+from aquaflow.telemetry.state import CAMERA, SCALE, MetricState
 from aquaflow.telemetry.telemetry import Series
 
 MOST_BEAMS = 100
@@ -44,7 +44,7 @@ class AltitudeFactor(Factor):
         altitude: Series,
         path: CameraPath,
         points_m: Array,  # [K, 3] of the map
-        state: State,
+        state: MetricState,
     ) -> None:
         """Keeps the samples whose beam meets the map at the body's pose in ``state``; the beam
         looks along the body's z. ``path`` covers all samples."""
@@ -71,16 +71,16 @@ class AltitudeFactor(Factor):
         """Of metres per map unit, from the median of the ratios."""
         return float(np.log(np.median(self._altitude_m / self._range)))
 
-    def residuals(self, state: State) -> Array:
+    def residuals(self, state: MetricState) -> Array:
         """[N, 1] m."""
         return np.asarray((state.scale * self._ranges(state) - self._altitude_m)[:, None])
 
-    def scale_misfit(self, state: State) -> tuple[Array, Array]:
+    def scale_misfit(self, state: MetricState) -> tuple[Array, Array]:
         """Logarithm of the scale that each range alone gives, over the state's; 1 sigma."""
         ranges = state.scale * self._ranges(state)
         return -self.residuals(state)[:, 0] / ranges, self.sigma / ranges
 
-    def _ranges(self, state: State) -> Array:
+    def _ranges(self, state: MetricState) -> Array:
         """[N] map units, with the mounting of ``state``: to first order."""
         return np.asarray(self._range + self._by_turn @ so3_log(state.R_bc @ self._R_bc.T))
 
@@ -89,7 +89,7 @@ def _beams(
     R_mc: Array,  # [3, 3]
     p_m: Array,  # [3]
     mountings: Sequence[Array],  # [3, 3] each, R_bc
-    state: State,
+    state: MetricState,
 ) -> tuple[Array, Array]:
     """Origins and directions [J, 3] of the beam in the map, for each mounting of the camera."""
     R_mb = np.stack([R_mc @ R_bc.T for R_bc in mountings])

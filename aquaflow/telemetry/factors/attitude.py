@@ -9,7 +9,7 @@ from aquaflow.geometry.similarity import rotation_from_quaternion
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.factors.factor import MOST, Array, Factor, axes_along
 from aquaflow.telemetry.noise import Process, SlowPart
-from aquaflow.telemetry.state import CAMERA, HEADING, TURN, State
+from aquaflow.telemetry.state import CAMERA, HEADING, TURN, MetricState
 from aquaflow.telemetry.telemetry import Series
 
 TILT_SIGMA = np.radians(0.5)
@@ -52,14 +52,14 @@ class TiltFactor(Factor):
         R_nb = rotation_from_quaternion(attitude.values)
         return TiltFactor(attitude.source, attitude.t_s, R_nb[:, 2, :], path, TILT_SIGMA)
 
-    def residuals(self, state: State) -> Array:
+    def residuals(self, state: MetricState) -> Array:
         """[N, 2] rad, across the body's down axis."""
         R_nb, _ = state.body(self._R_mc, self._p_m)
         turn = np.cross(self.down_b, R_nb[:, 2, :])
         axes = axes_along(self.down_b)[:, 1:]
         return np.asarray(np.einsum("nij,nj->ni", axes, turn))
 
-    def turn_wanted(self, state: State) -> Array:
+    def turn_wanted(self, state: MetricState) -> Array:
         """[N, 3] rad, the turn in the axes of n after which down is where it was measured."""
         R_nb, _ = state.body(self._R_mc, self._p_m)
         measured = np.einsum("nij,nj->ni", R_nb, self.down_b)
@@ -101,7 +101,7 @@ class HeadingFactor(Factor):
         self._R_bn = np.swapaxes(rotation_from_quaternion(attitude.values), 1, 2)
         self._R_mc, self._p_m = path.at(attitude.t_s)
 
-    def residuals(self, state: State) -> Array:
+    def residuals(self, state: MetricState) -> Array:
         """[N, 1] rad."""
         R_nb, _ = state.body(self._R_mc, self._p_m)
         about = Rotation.from_matrix(R_nb @ self._R_bn).as_rotvec()[:, 2:]

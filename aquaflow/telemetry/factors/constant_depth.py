@@ -7,7 +7,7 @@ import numpy as np
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.factors.factor import MOST, Array, Factor
 from aquaflow.telemetry.noise import Process, SlowPart
-from aquaflow.telemetry.state import CAMERA, SCALE, TURN, State
+from aquaflow.telemetry.state import CAMERA, SCALE, TURN, MetricState
 
 
 class ConstantDepthFactor(Factor):
@@ -24,7 +24,7 @@ class ConstantDepthFactor(Factor):
         self.sigma = np.full(len(self.t_s), sigma_m)
         self._R_mc, self._p_m = path.R_mc[::step], path.p_m[::step]
 
-    def residuals(self, state: State) -> Array:
+    def residuals(self, state: MetricState) -> Array:
         """[N, 1] m."""
         _, p_n = state.body(self._R_mc, self._p_m)
         return np.asarray(p_n[:, 2:] - p_n[:, 2:].mean())

@@ -7,7 +7,7 @@ import numpy as np
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.factors.factor import MOST, Array, Factor
 from aquaflow.telemetry.noise import Process, SlowPart
-from aquaflow.telemetry.state import CAMERA, SCALE, SHIFT, TURN, State
+from aquaflow.telemetry.state import CAMERA, SCALE, SHIFT, TURN, MetricState
 from aquaflow.telemetry.telemetry import Series
 
 SIGMA_M = 0.01
@@ -37,7 +37,7 @@ class DepthFactor(Factor):
         self._depth_m = depth.values[:, 0]
         self._R_mc, self._p_m = path.at(depth.t_s)
 
-    def residuals(self, state: State) -> Array:
+    def residuals(self, state: MetricState) -> Array:
         """[N, 1] m."""
         _, p_n = state.body(self._R_mc, self._p_m)
         return np.asarray(p_n[:, 2:] - self._depth_m[:, None])

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.telemetry.noise import SlowPart
-from aquaflow.telemetry.state import P, State
+from aquaflow.telemetry.state import MetricState, P
 
 Array = npt.NDArray[np.float64]
 
@@ -37,10 +37,10 @@ class Factor(ABC):
     """[N] white noise, 1 sigma of each component."""
 
     @abstractmethod
-    def residuals(self, state: State) -> Array:
+    def residuals(self, state: MetricState) -> Array:
         """[N, D]"""
 
-    def jacobian(self, state: State) -> Array:
+    def jacobian(self, state: MetricState) -> Array:
         """[N, D, P] derivatives by a step of the state, by central differences."""
         found = np.zeros((*self.residuals(state).shape, P))
         for span in self.spans:

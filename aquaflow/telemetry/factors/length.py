@@ -9,7 +9,7 @@ import numpy as np
 from aquaflow.telemetry.factors.factor import Array, Factor
 from aquaflow.telemetry.known_lengths.known_length import KnownLength
 from aquaflow.telemetry.noise import Process, SlowPart
-from aquaflow.telemetry.state import SCALE, State
+from aquaflow.telemetry.state import SCALE, MetricState
 
 APART_S, LASTING_S = 100.0, 1e9
 """Stated moments of measurements, each of which errs on its own, and the correlation time of what
@@ -36,7 +36,7 @@ class LengthFactor(Factor):
         self.sigma = self.rough_scale * map_sigma
         self.slow = SlowPart(sigma_m, LASTING_S, (Process(1.0),))
 
-    def residuals(self, state: State) -> Array:
+    def residuals(self, state: MetricState) -> Array:
         """[N, 1] m."""
         return np.asarray((state.scale * self._map - self._m)[:, None])
 

@@ -7,7 +7,7 @@ import numpy as np
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.factors.factor import MOST, Array, Factor
 from aquaflow.telemetry.noise import Process, SlowPart
-from aquaflow.telemetry.state import CAMERA, LAG, SCALE, SHIFT, TURN, State
+from aquaflow.telemetry.state import CAMERA, LAG, SCALE, SHIFT, TURN, MetricState
 
 
 class PositionFactor(Factor):
@@ -34,7 +34,7 @@ class PositionFactor(Factor):
         self._R_mc, self._p_m = path.at(self.t_s)
         self._v_m = path.velocity(self.t_s)
 
-    def residuals(self, state: State) -> Array:
+    def residuals(self, state: MetricState) -> Array:
         """[N, 2] m."""
         _, p_n = state.body(self._R_mc, self._p_m - state.lag_s * self._v_m)
         return np.asarray(p_n[:, :2] - self._fixes_n)

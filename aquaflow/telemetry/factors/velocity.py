@@ -8,7 +8,7 @@ from scipy.integrate import cumulative_trapezoid
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.factors.factor import MOST, Array, Factor, axes_along
 from aquaflow.telemetry.noise import Process, SlowPart
-from aquaflow.telemetry.state import CAMERA, DVL, DVL_SCALE, SCALE, State
+from aquaflow.telemetry.state import CAMERA, DVL, DVL_SCALE, SCALE, MetricState
 from aquaflow.telemetry.telemetry import Series
 
 INTERVAL_S = 1.0
@@ -50,7 +50,7 @@ class VelocityFactor(Factor):
         means = np.array([merit[i : j + 1].mean() for i, j in zip(first, last, strict=True)])
         self.sigma = means * np.sqrt(spacing * (end - begin))
 
-    def residuals(self, state: State) -> Array:
+    def residuals(self, state: MetricState) -> Array:
         """[N, 3] m."""
         R_cb = state.R_bc.T
         v_c = np.exp(state.log_dvl) * self._v @ (R_cb @ state.R_bd).T
@@ -61,7 +61,7 @@ class VelocityFactor(Factor):
         apart = state.scale * self._moved_m - body - arm
         return np.asarray(np.einsum("nij,nj->ni", self._axes, apart))
 
-    def scale_misfit(self, state: State) -> tuple[Array, Array]:
+    def scale_misfit(self, state: MetricState) -> tuple[Array, Array]:
         """Logarithm of the scale that each displacement alone gives, over the state's; 1 sigma."""
         moved = np.maximum(state.scale * np.linalg.norm(self._moved_m, axis=1), 1e-6)
         return -self.residuals(state)[:, 0] / moved, self.sigma / moved

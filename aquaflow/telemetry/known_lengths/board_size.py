@@ -60,7 +60,7 @@ class PixelDepths:
 
 
 @dataclass(frozen=True)
-class PosedView:
+class BoardView:
     """A picture's place in a sub-map, and its depth at a board's corners where it is known."""
 
     camera: CameraModel
@@ -89,13 +89,13 @@ class PosedView:
 
 
 def board_lengths(
-    sightings: Iterable[BoardSighting], view_of: Callable[[int], PosedView | None]
+    sightings: Iterable[BoardSighting], view_of: Callable[[int], BoardView | None]
 ) -> list[KnownLength]:
     """One length for each board in each sub-map; boards that cannot be measured give none.
 
     ``view_of`` gives a frame's place by its index; None for a frame without a pose.
     """
-    groups: dict[tuple[int, int | None, int], list[tuple[BoardSighting, PosedView]]] = {}
+    groups: dict[tuple[int, int | None, int], list[tuple[BoardSighting, BoardView]]] = {}
     for sighting in sightings:
         view = view_of(sighting.frame_index)
         if view is not None:
@@ -105,7 +105,7 @@ def board_lengths(
     return [length for length in lengths if length is not None]
 
 
-def _length(group: Sequence[tuple[BoardSighting, PosedView]], sub_map: int) -> KnownLength | None:
+def _length(group: Sequence[tuple[BoardSighting, BoardView]], sub_map: int) -> KnownLength | None:
     step = max(1.0, (len(group) - 1) / (MOST_VIEWS - 1))
     chosen = [group[round(k * step)] for k in range(min(len(group), MOST_VIEWS))]
     fitted = _fitted([_Seen(*each) for each in chosen])
@@ -128,7 +128,7 @@ def _extent(sighting: BoardSighting) -> float:
 class _Seen:
     """One view of the board, with what of it does not change during the fit."""
 
-    def __init__(self, sighting: BoardSighting, view: PosedView) -> None:
+    def __init__(self, sighting: BoardSighting, view: BoardView) -> None:
         self.camera, self.T_wc, self.T_cw = view.camera, view.T_wc, view.T_wc.inverse()
         self.points, self.pixels = sighting.points_m, sighting.pixels
         self.rho, variance = view.depth_at(self.pixels)

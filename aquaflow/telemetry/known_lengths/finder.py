@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.fusion import FusionConfig
-from aquaflow.telemetry.known_lengths.board_size import PosedView, board_lengths
+from aquaflow.telemetry.known_lengths.board_size import BoardView, board_lengths
 from aquaflow.telemetry.known_lengths.boards import BoardDetector, BoardSighting
 from aquaflow.telemetry.known_lengths.known_length import KnownLength
 from aquaflow.telemetry.known_lengths.laser_dots import DotCandidates, find_dots
@@ -57,7 +57,7 @@ class KnownLengthFinder:
         other._boards, other._dots = list(self._boards), list(self._dots)
         return other
 
-    def lengths(self, view_of: Callable[[int], PosedView | None]) -> list[KnownLength]:
+    def lengths(self, view_of: Callable[[int], BoardView | None]) -> list[KnownLength]:
         """What was seen until now, measured in the map as it is now.
 
         ``view_of`` gives a frame's place by its index; None for a frame without a pose.
@@ -67,7 +67,7 @@ class KnownLengthFinder:
             lengths += laser_lengths(self._dots, view_of, self._lasers)
         return lengths
 
-    def seen(self, view_of: Callable[[int], PosedView | None]) -> Counter[tuple[int, str]]:
+    def seen(self, view_of: Callable[[int], BoardView | None]) -> Counter[tuple[int, str]]:
         """Pictures with a pose that show each object, by sub-map and name."""
         found: Counter[tuple[int, str]] = Counter()
         names = [(each.frame_index, each.name) for each in self._boards]

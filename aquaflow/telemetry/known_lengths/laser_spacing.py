@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.config.known_lengths import LasersConfig
-from aquaflow.telemetry.known_lengths.board_size import PosedView
+from aquaflow.telemetry.known_lengths.board_size import BoardView
 from aquaflow.telemetry.known_lengths.known_length import KnownLength
 from aquaflow.telemetry.known_lengths.laser_dots import DotCandidates
 
@@ -64,7 +64,7 @@ class _Dot:
 
 def laser_lengths(
     pictures: Sequence[DotCandidates],
-    view_of: Callable[[int], PosedView | None],
+    view_of: Callable[[int], BoardView | None],
     lasers: LasersConfig,
 ) -> list[KnownLength]:
     """One length for each picture that shows both dots; none where the beams are not found.
@@ -84,7 +84,7 @@ def laser_lengths(
 
 
 def _dots(
-    number: int, picture: DotCandidates, view_of: Callable[[int], PosedView | None]
+    number: int, picture: DotCandidates, view_of: Callable[[int], BoardView | None]
 ) -> list[_Dot]:
     view = view_of(picture.frame_index)
     if view is None or not len(picture.pixels):
@@ -162,7 +162,7 @@ def _length(
     a: _Dot,
     b: _Dot,
     lasers: LasersConfig,
-    view_of: Callable[[int], PosedView | None],
+    view_of: Callable[[int], BoardView | None],
 ) -> KnownLength:
     view = view_of(frame_index)
     assert view is not None

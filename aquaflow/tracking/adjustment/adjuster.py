@@ -35,7 +35,7 @@ from aquaflow.tracking.adjustment.window import (
     poses_at,
     problem_of,
 )
-from aquaflow.tracking.frames import Link
+from aquaflow.tracking.frames import KeyframeEdge
 from aquaflow.tracking.graph.improvement import Improvement
 from aquaflow.tracking.graph.pose_graph import Edge
 from aquaflow.tracking.graph.table import Snapshot
@@ -73,7 +73,7 @@ class Tally:
 
 
 @dataclass(frozen=True)
-class Job:
+class AdjustmentJob:
     """An adjustment to be done in any thread."""
 
     numbers: Sequence[int]
@@ -87,7 +87,7 @@ class Job:
     certain: bool
     """Whether edges get the covariance that the adjustment finds."""
 
-    def within(self, known: Container[int]) -> Job:
+    def within(self, known: Container[int]) -> AdjustmentJob:
         """The part of it that is ``known``: a keyframe may be missing from the graph, and what was
         linked to it is held."""
         numbers = [number for number in self.numbers if number in known]
@@ -97,7 +97,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class AdjustmentOutcome:
     """What a job found."""
 
     points: dict[int, AnchoredPoints]
@@ -116,10 +116,10 @@ class Adjuster:
         self._pairs = KeyframePairs()
         self._loops: list[tuple[int, int]] = []
         """Earlier and later keyframe of loops that were not matched yet."""
-        self._outcome: Outcome | None = None
+        self._outcome: AdjustmentOutcome | None = None
         """Set in the thread of the last job."""
 
-    def keyframe(self, keyframe: Keyframe, link: Link | None, edge: Edge | None) -> None:
+    def keyframe(self, keyframe: Keyframe, link: KeyframeEdge | None, edge: Edge | None) -> None:
         """Take the points of a new keyframe, and the matches that its link was solved from.
 
         Raises:
@@ -175,13 +175,13 @@ class Adjuster:
         held: frozenset[int],
         pairs: Sequence[tuple[int, int]],
         certain: bool,
-    ) -> Job:
+    ) -> AdjustmentJob:
         points = {n: copied(self._points[n]) for n in numbers if n in self._points}
         links = {n: self._links[n] for n in numbers if n in self._links}
         views = {n: self._view(n) for n in {n for pair in pairs for n in pair}}
         found = [(views[a], views[b]) for a, b in pairs]
         seen = [(a, b) for a, b in found if a is not None and b is not None]
-        return Job(numbers, held, points, links, seen, certain)
+        return AdjustmentJob(numbers, held, points, links, seen, certain)
 
     def _view(self, number: int) -> KeyframeView | None:
         keyframe = self._keyframes[number]
@@ -190,7 +190,7 @@ class Adjuster:
         except InputError:
             return None
 
-    def _run(self, job: Job, snapshot: Snapshot) -> Improvement:
+    def _run(self, job: AdjustmentJob, snapshot: Snapshot) -> Improvement:
         """Match and adjust, in any thread.
 
         Raises:
@@ -211,10 +211,10 @@ class Adjuster:
         if adjusted.better:
             found = improvement_of(snapshot, nodes, problem, adjusted, job.certain)
         spent = 1e3 * (thread_time() - began)
-        self._outcome = Outcome(job.points, adjusted.better, spent)
+        self._outcome = AdjustmentOutcome(job.points, adjusted.better, spent)
         return found
 
-    def _match(self, job: Job, poses: dict[int, Sim3]) -> None:
+    def _match(self, job: AdjustmentJob, poses: dict[int, Sim3]) -> None:
         for earlier, later in job.pairs:
             T_ba = poses[later.number].inverse() @ poses[earlier.number]
             pair = self._pairs.match(earlier, later, T_ba)

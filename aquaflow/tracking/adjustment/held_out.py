@@ -29,7 +29,7 @@ def held_out_errors(matches: Sequence[AnchorMatches], poses: Sim3Batch) -> list[
 
 
 @dataclass(frozen=True)
-class Verdict:
+class HeldOutVerdict:
     """What points that took no part say of two sets of poses."""
 
     before: float
@@ -43,7 +43,7 @@ class Verdict:
 
 def verdict(
     matches: Sequence[AnchorMatches], before: Sim3Batch, after: Sim3Batch, grown: float = 1.0
-) -> Verdict:
+) -> HeldOutVerdict:
     """Compare poses [K] by the matches of points held out of the adjustment; errors in common make
     their standard error ``grown`` times that of independent ones."""
     falls, costs, count = [], np.zeros(2), 0
@@ -57,9 +57,11 @@ def verdict(
         count += int(seen.sum())
     fall = np.concatenate(falls) if falls else np.zeros(0)
     if len(fall) < 2:
-        return Verdict(float("nan"), float("nan"), 0.0, len(fall))
+        return HeldOutVerdict(float("nan"), float("nan"), 0.0, len(fall))
     spread = max(grown * float(fall.std()) / np.sqrt(len(fall)), 1e-12)
-    return Verdict(costs[0] / count, costs[1] / count, float(fall.mean()) / spread, len(fall))
+    return HeldOutVerdict(
+        costs[0] / count, costs[1] / count, float(fall.mean()) / spread, len(fall)
+    )
 
 
 def triangulated(matches: AnchorMatches, poses: Sim3Batch) -> Array:

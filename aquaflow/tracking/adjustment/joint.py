@@ -9,10 +9,10 @@ import numpy as np
 
 from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.tracking.adjustment.equations import AnchorMatches, Array, Mask, projected
-from aquaflow.tracking.adjustment.held_out import Verdict, only, triangulated, verdict
+from aquaflow.tracking.adjustment.held_out import HeldOutVerdict, only, triangulated, verdict
 from aquaflow.tracking.adjustment.links import Links
 from aquaflow.tracking.adjustment.robust import sigma_of
-from aquaflow.tracking.adjustment.solver import State, descend
+from aquaflow.tracking.adjustment.solver import BundleState, descend
 from aquaflow.tracking.adjustment.uncertainty import inflation
 
 ROUNDS = 3
@@ -30,7 +30,7 @@ LEAST_GAIN = 3.0
 
 
 @dataclass(frozen=True)
-class Problem:
+class JointProblem:
     """What is to be adjusted."""
 
     matches: Sequence[AnchorMatches]
@@ -44,13 +44,13 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Adjusted:
+class JointAdjustmentResult:
     """What came of it."""
 
-    state: State
+    state: BundleState
     matches: Sequence[AnchorMatches]
     """Without held-out points and outliers; their noise as found, grown for errors in common."""
-    verdict: Verdict
+    verdict: HeldOutVerdict
 
     @property
     def better(self) -> bool:
@@ -59,7 +59,7 @@ class Adjusted:
         return enough and self.verdict.gain_sigmas > LEAST_GAIN
 
 
-def adjust(problem: Problem, iterations: int) -> Adjusted:
+def adjust(problem: JointProblem, iterations: int) -> JointAdjustmentResult:
     """Adjust poses and depths; ``iterations`` bounds each of ``ROUNDS`` descents.
 
     Raises:
@@ -71,7 +71,7 @@ def adjust(problem: Problem, iterations: int) -> Adjusted:
     matches = [
         only(each, ~held) for each, held in zip(problem.matches, problem.held_out, strict=True)
     ]
-    state = State(problem.poses, [_started(each, problem.poses) for each in matches])
+    state = BundleState(problem.poses, [_started(each, problem.poses) for each in matches])
     matches = [_with_noise(each, state.poses, rho) for each, rho in _each(matches, state)]
     for number in range(ROUNDS):
         used = matches if number == 0 else [
@@ -84,10 +84,12 @@ def adjust(problem: Problem, iterations: int) -> Adjusted:
     grown = float(np.sqrt(inflation(used, problem.links, state, problem.free)))
     used = [replace(each, sigma=grown * each.sigma) for each in used]
     state = descend(used, problem.links, state, problem.free, iterations)
-    return Adjusted(state, used, verdict(judges, problem.poses, state.poses, grown))
+    return JointAdjustmentResult(state, used, verdict(judges, problem.poses, state.poses, grown))
 
 
-def _each(matches: Sequence[AnchorMatches], state: State) -> list[tuple[AnchorMatches, Array]]:
+def _each(
+    matches: Sequence[AnchorMatches], state: BundleState
+) -> list[tuple[AnchorMatches, Array]]:
     return list(zip(matches, state.rho, strict=True))
 
 

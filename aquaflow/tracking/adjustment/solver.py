@@ -35,7 +35,7 @@ equations did."""
 
 
 @dataclass(frozen=True)
-class State:
+class BundleState:
     """What is solved for."""
 
     poses: Sim3Batch
@@ -44,7 +44,7 @@ class State:
     """[P] of each anchor."""
 
 
-def cost_of(matches: Sequence[AnchorMatches], links: Links, state: State) -> float:
+def cost_of(matches: Sequence[AnchorMatches], links: Links, state: BundleState) -> float:
     """Robust cost of all matches, and of the depths' departure from the pointmaps."""
     total = links.cost(state.poses)
     for anchor, rho in zip(matches, state.rho, strict=True):
@@ -58,10 +58,10 @@ def cost_of(matches: Sequence[AnchorMatches], links: Links, state: State) -> flo
 def descend(
     matches: Sequence[AnchorMatches],
     links: Links,
-    state: State,
+    state: BundleState,
     free: Mask,  # [K] which poses may move
     iterations: int,
-) -> State:
+) -> BundleState:
     """The state of least cost, or the best that ``iterations`` steps find."""
     damping, cost = FIRST_DAMPING, cost_of(matches, links, state)
     pattern, system = None, None
@@ -97,7 +97,7 @@ class System:
 
 
 def linearised(
-    matches: Sequence[AnchorMatches], links: Links, state: State, pattern: BlockPattern
+    matches: Sequence[AnchorMatches], links: Links, state: BundleState, pattern: BlockPattern
 ) -> System:
     """The equations of all anchors and links, summed anchor by anchor."""
     total, kept, room = pattern.zero(), list[AnchorEquations](), KEPT_BYTES
@@ -115,11 +115,11 @@ def linearised(
 
 def _stepped(
     matches: Sequence[AnchorMatches],
-    state: State,
+    state: BundleState,
     system: System,
     free: Mask,  # [K]
     damping: float,
-) -> State | None:
+) -> BundleState | None:
     """The state after a damped step; None if the equations have no solution."""
     step = np.zeros((len(state.poses), 7))
     step[free] = solved(system.H, system.gradient, damping)
@@ -131,7 +131,7 @@ def _stepped(
         kept = i < len(system.parts)
         part = system.parts[i] if kept else anchor_equations(anchor, state.poses, depths)
         rho.append(depths + part.depth_steps(step[anchor.places].ravel()))
-    return State(poses, rho)
+    return BundleState(poses, rho)
 
 
 def solved(

@@ -16,7 +16,7 @@ from aquaflow.tracking.adjustment.equations import (
     equations_and_scores,
 )
 from aquaflow.tracking.adjustment.links import Links
-from aquaflow.tracking.adjustment.solver import State, linearised
+from aquaflow.tracking.adjustment.solver import BundleState, linearised
 
 CLUSTER = 4
 """Consecutive points of an anchor, row by row, whose errors count as one draw: neighbouring matches
@@ -30,7 +30,7 @@ USUAL_INFLATION = 1.8
 def covariance(
     matches: Sequence[AnchorMatches],
     links: Links,
-    state: State,
+    state: BundleState,
     free: Mask,  # [K]
 ) -> Array:
     """[7 F, 7 F] of the steps of the free poses, seen from those that are held.
@@ -45,7 +45,7 @@ def covariance(
 def inflation(
     matches: Sequence[AnchorMatches],
     links: Links,
-    state: State,
+    state: BundleState,
     free: Mask,  # [K]
 ) -> float:
     """Factor of the variance by which matches that err together are worth less than independent

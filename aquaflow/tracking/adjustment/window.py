@@ -11,7 +11,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.tracking.adjustment.anchored_points import AnchoredPoints
 from aquaflow.tracking.adjustment.equations import AnchorMatches, Array, Index, Mask
-from aquaflow.tracking.adjustment.joint import Adjusted, Problem
+from aquaflow.tracking.adjustment.joint import JointAdjustmentResult, JointProblem
 from aquaflow.tracking.adjustment.links import Links
 from aquaflow.tracking.adjustment.uncertainty import covariance, of_edge
 from aquaflow.tracking.graph.equations import poses_of
@@ -40,13 +40,13 @@ def problem_of(
     links: Mapping[int, MeasuredLink],
     poses: Sim3Batch,  # [K] of ``numbers``
     held: Mask,  # [K]
-) -> Problem:
+) -> JointProblem:
     """Everything that is known between the keyframes ``numbers``."""
     place = {number: i for i, number in enumerate(numbers)}
     anchors = [points[number] for number in numbers if number in points]
     matches = [_matches_of(each, place) for each in anchors]
     inside = [n for n in numbers if n in links and links[n].parent in place]
-    return Problem(
+    return JointProblem(
         matches,
         [each.held_out for each in anchors],
         Links(
@@ -83,8 +83,8 @@ def _matches_of(points: AnchoredPoints, place: Mapping[int, int]) -> AnchorMatch
 def improvement_of(
     snapshot: Snapshot,
     nodes: Index,  # [K] rows of the adjusted keyframes
-    problem: Problem,
-    adjusted: Adjusted,
+    problem: JointProblem,
+    adjusted: JointAdjustmentResult,
     certain: bool,
 ) -> Improvement:
     """The adjustment's poses, and the edges between them; ``certain``: with their covariance.

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from aquaflow.base.errors import InputError
-from aquaflow.keyframes.place import KeypointDepths, Place
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.keyframes.place import KeyframePlace, KeypointDepths
+from aquaflow.telemetry.world_frame import WorldFrame
 
 
 @dataclass(frozen=True)
@@ -18,10 +18,10 @@ class Base:
     folder: Path
     prior: str
     """That described its keypoints; empty where that is not known."""
-    places: Sequence[Place]
+    places: Sequence[KeyframePlace]
     keypoints: Callable[[int], KeypointDepths]
     """Of a keyframe, by its number; raises InputError where they cannot be read."""
-    frames: Mapping[int, MetricFrame]
+    frames: Mapping[int, WorldFrame]
     """By sub-map: where it lies in n, as the dive's files have it."""
 
     @property
@@ -29,9 +29,9 @@ class Base:
         """Of its folder."""
         return self.folder.resolve().name
 
-    def frame(self, sub_map: int) -> MetricFrame:
+    def frame(self, sub_map: int) -> WorldFrame:
         """Of a sub-map; the unknown one where there is none."""
-        return self.frames.get(sub_map, MetricFrame.unknown())
+        return self.frames.get(sub_map, WorldFrame.unknown())
 
     def refuse_other_prior(self, prior: str) -> None:
         """Check that its keypoints can be compared with those of ``prior``.

@@ -19,11 +19,11 @@ from aquaflow.config import TrackingConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.keyframes import KeyframeStore, Pointmap
-from aquaflow.keyframes.place import Place, depths_at
+from aquaflow.keyframes.place import KeyframePlace, depths_at
 from aquaflow.prior.contract import Encoding
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.base.base import Base
-from aquaflow.tracking.base.links import BaseLink, Placed, agree, link_covariance, placed
+from aquaflow.tracking.base.links import BaseLink, SubMapInBase, agree, link_covariance, placed
 from aquaflow.tracking.graph.table import Snapshot
 from aquaflow.tracking.loops.retrieval import Retrieval
 from aquaflow.tracking.loops.verification import Verified, verify_keypoints
@@ -42,7 +42,7 @@ WAITING = 32
 
 
 @dataclass(frozen=True)
-class LookedUp:
+class BaseLookup:
     """A keyframe that was looked up, and where it lies in the base, if it was recognised."""
 
     keyframe: int
@@ -80,7 +80,7 @@ class InBase:
         self._keyframes, self._worker, self._failures = keyframes, worker, failures
         self._waiting: list[BaseLink] = []
         self._news = False
-        self._placed: dict[int, Placed] | None = None
+        self._placed: dict[int, SubMapInBase] | None = None
 
     @property
     def recognised(self) -> bool:
@@ -100,8 +100,8 @@ class InBase:
             for found in self._worker.ask(STAGE, keyframe.frame_index, look_up):
                 self.take(found)
 
-    def _look_up(self, number: int, encoding: Encoding, pointmap: Pointmap) -> LookedUp:
-        return LookedUp(number, self._places.of(encoding, pointmap))
+    def _look_up(self, number: int, encoding: Encoding, pointmap: Pointmap) -> BaseLookup:
+        return BaseLookup(number, self._places.of(encoding, pointmap))
 
     def has_news(self) -> bool:
         """True once after links were added: the graph should take them in."""
@@ -123,7 +123,7 @@ class InBase:
 
     # --- what is believed ---------------------------------------------------------------------
 
-    def take(self, found: LookedUp) -> None:
+    def take(self, found: BaseLookup) -> None:
         """What a look-up found of a keyframe."""
         where = found.recognised
         if where is None:
@@ -197,7 +197,7 @@ class InBase:
             found[sub_map] = [link for link in links if link.base_sub_map == most]
         return found
 
-    def places(self) -> Mapping[int, Placed]:
+    def places(self) -> Mapping[int, SubMapInBase]:
         """Where each sub-map that was recognised lies in the base."""
         if self._placed is None:
             self._placed = {
@@ -206,7 +206,7 @@ class InBase:
             }
         return self._placed
 
-    def frame(self, sub_map: int, own: MetricFrame) -> MetricFrame:
+    def frame(self, sub_map: int, own: WorldFrame) -> WorldFrame:
         """The base's frame with the place of ``sub_map`` in it; ``own``, by the dive's telemetry,
         where that was not recognised."""
         where = self.places().get(sub_map)
@@ -262,7 +262,7 @@ KEPT = 32
 class Recognised:
     """A picture of this dive at a keyframe of the base."""
 
-    place: Place
+    place: KeyframePlace
     proof: Verified
     """``proof.estimate.T`` is T_kb, from the base's keyframe to this dive's, with scale."""
 
@@ -279,7 +279,7 @@ class KnownPlaces:
         """A keyframe that cannot be read is left out."""
         self._config = config.verification
         self._retrieval = Retrieval(config.retrieval)
-        self._places: list[Place] = []
+        self._places: list[KeyframePlace] = []
         self.damaged = 0
         """Keyframes of the base that could not be read."""
         self._keypoints = lru_cache(KEPT)(base.keypoints)

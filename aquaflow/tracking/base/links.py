@@ -78,7 +78,7 @@ def agree(a: BaseLink, T_ma: Sim3, b: BaseLink, T_mb: Sim3, travelled: float) ->
 
 
 @dataclass(frozen=True)
-class Placed:
+class SubMapInBase:
     """Where a sub-map of the dive lies in the base."""
 
     T_sm: Sim3
@@ -86,7 +86,7 @@ class Placed:
     """[7, 7] of its left tangent."""
 
 
-def placed(links: Sequence[BaseLink], poses: Sequence[Sim3]) -> Placed:
+def placed(links: Sequence[BaseLink], poses: Sequence[Sim3]) -> SubMapInBase:
     """The similarity that fits all links best; ``poses``: T_mk of their keyframes, as they are now.
 
     Its covariance is that of the links, more where they scatter more than they state; links of
@@ -106,4 +106,4 @@ def placed(links: Sequence[BaseLink], poses: Sequence[Sim3]) -> Placed:
         step = -np.linalg.solve(H, (weighted @ residual[:, :, None]).sum(axis=0)[:, 0])
         T_sm = (Sim3Batch.exp(step[None]) @ T_sm).on_group()
     scatter = float((weight * chi2).sum()) / max(7 * (len(links) - 1), 1)
-    return Placed(T_sm.element(0), np.linalg.inv(H) * max(1.0, scatter))
+    return SubMapInBase(T_sm.element(0), np.linalg.inv(H) * max(1.0, scatter))

@@ -33,7 +33,7 @@ class GateKind(str, Enum):
 
 
 @dataclass(frozen=True)
-class Verdict:
+class GateVerdict:
     """Whether a frame is tracked, and the measure that decided it."""
 
     kind: GateKind
@@ -68,7 +68,7 @@ class FrameGate:
         self,
         image: npt.NDArray[np.uint8],  # [H, W, 3] RGB
         mask: Mask | None = None,  # [H, W] True where the scene is seen
-    ) -> Verdict:
+    ) -> GateVerdict:
         """The verdict on the next frame of the stream.
 
         Of frames that show nothing, only ``longest_run`` in a row are skipped; the following ones
@@ -89,16 +89,16 @@ class FrameGate:
         """Call when tracking lost the frame: later frames are no duplicates of it."""
         self._reference = None
 
-    def _useless(self, thumbnail: Thumbnail) -> Verdict | None:
+    def _useless(self, thumbnail: Thumbnail) -> GateVerdict | None:
         """Dark, blinded or blurred; None for a picture that shows something."""
         config = self._config
         if thumbnail.usable < config.min_usable:
             says = f"texture above the noise in {100 * thumbnail.usable:.0f} % of the picture"
             dark = thumbnail.level < config.dark_level
             if dark and config.skip_dark:
-                return Verdict(GateKind.DARK, f"dark: {says}", thumbnail.usable)
+                return GateVerdict(GateKind.DARK, f"dark: {says}", thumbnail.usable)
             if not dark and config.skip_blinded:
-                return Verdict(GateKind.BLINDED, f"blinded: {says}", thumbnail.usable)
+                return GateVerdict(GateKind.BLINDED, f"blinded: {says}", thumbnail.usable)
             return None
         if not config.skip_blurred or len(self._levels) < FIRST_LEVELS:
             return None
@@ -106,11 +106,11 @@ class FrameGate:
         left = float((thumbnail.sharpness / np.maximum(usual, 1e-6)).min())
         if left >= config.blur_loss:
             return None
-        return Verdict(
+        return GateVerdict(
             GateKind.BLURRED, f"blurred: {100 * left:.0f} % of the usual sharpness", left
         )
 
-    def _bounded(self, verdict: Verdict) -> Verdict:
+    def _bounded(self, verdict: GateVerdict) -> GateVerdict:
         self._run += 1
         if self._run <= self._config.longest_run:
             return verdict
@@ -118,14 +118,14 @@ class FrameGate:
         self._reference = None
         self._levels.clear()
         reason = f"{verdict.reason}; {self._config.longest_run} such frames were skipped before it"
-        return Verdict(GateKind.PASS, reason, verdict.measure)
+        return GateVerdict(GateKind.PASS, reason, verdict.measure)
 
-    def _compared(self, thumbnail: Thumbnail) -> Verdict:
+    def _compared(self, thumbnail: Thumbnail) -> GateVerdict:
         """Against the last frame that passed, so that slow drift adds up until it is seen."""
         if not self._config.skip_duplicates or self._reference is None:
-            return Verdict(GateKind.PASS)
+            return GateVerdict(GateKind.PASS)
         motion = motion_widths(self._reference, thumbnail, self._config.static_share)
         if motion >= self._config.duplicate_widths:
-            return Verdict(GateKind.PASS, measure=motion)
+            return GateVerdict(GateKind.PASS, measure=motion)
         reason = f"duplicate: moved by {100 * motion:.3f} % of the width since the last frame used"
-        return Verdict(GateKind.DUPLICATE, reason, motion)
+        return GateVerdict(GateKind.DUPLICATE, reason, motion)

@@ -25,7 +25,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.keyframes import Keyframe, KeyframeStore, Pointmap
 from aquaflow.prior.contract import Encoding
-from aquaflow.tracking.frames import Link, Revisit
+from aquaflow.tracking.frames import KeyframeEdge, Revisit
 from aquaflow.tracking.graph.improvement import Improvement
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph, edge_information, solve
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
@@ -78,7 +78,7 @@ class Measurements(Protocol):
 class Adjustments(Protocol):
     """Poses and depths of several keyframes solved together (``tracking/adjustment``)."""
 
-    def keyframe(self, keyframe: Keyframe, link: Link | None, edge: Edge | None) -> None:
+    def keyframe(self, keyframe: Keyframe, link: KeyframeEdge | None, edge: Edge | None) -> None:
         """A new keyframe, how it was linked, and the edge made of that."""
         ...
 
@@ -150,7 +150,7 @@ class KeyframeGraph:
         """True if an optimisation was started and its correction has not been taken yet."""
         return self._optimisation is not None
 
-    def add(self, number: int, link: Link | None) -> None:
+    def add(self, number: int, link: KeyframeEdge | None) -> None:
         """Add a keyframe and its relative-pose edge to the keyframe it was tracked against.
 
         If it proves to close a loop, an optimisation starts, after one that is running.

@@ -25,7 +25,7 @@ STAGE = "back-fill"
 
 
 @dataclass(frozen=True)
-class Placed:
+class BackFilledFrame:
     """A frame that got its pose."""
 
     frame: Frame
@@ -67,19 +67,19 @@ class BackFill:
         self._indices = frozenset(frame.index for frame in frames)
         self._at, self._camera = replace(at, motion=at.motion.inverse()), camera
         self._prior, self._keyframe_tracker, self._failures = prior, keyframe_tracker, failures
-        self._last: Placed | None = None
+        self._last: BackFilledFrame | None = None
 
     def left(self, waiting: Sequence[Frame]) -> list[Frame]:
         """Those of its frames that still wait."""
         return [frame for frame in waiting if frame.index in self._indices]
 
-    def place(self, frame: Frame) -> Placed | None:
+    def place(self, frame: Frame) -> BackFilledFrame | None:
         """Look for the newest frame that is left; in any thread, one frame at a time."""
         with self._failures.contain("pose", frame.index):
             return self._place(frame)
         return None
 
-    def take(self, frame: Frame, placed: Placed | None) -> Tracked:
+    def take(self, frame: Frame, placed: BackFilledFrame | None) -> Tracked:
         """The frame, with its pose if it was ``placed``."""
         at = self._at
         if placed is None:
@@ -91,19 +91,19 @@ class BackFill:
         at.moved_to(placed.T_fk, matches)
         return at.tracked(frame, FrameClass.COMMON, placed.solved.quality)
 
-    def _place(self, frame: Frame) -> Placed | None:
+    def _place(self, frame: Frame) -> BackFilledFrame | None:
         """At the keyframe; where the frame no longer shows that, at the frame placed before."""
         encoding = self._prior.encode(frame.image, self._camera, frame.mask)
         solved = self._keyframe_tracker.place(self._at, encoding, self._camera)
         if solved is not None:
-            return Placed(frame, encoding, solved, self._at, solved.estimate.T)
+            return BackFilledFrame(frame, encoding, solved, self._at, solved.estimate.T)
         if self._last is None:
             return None
         at, T_ak = self._last.as_keyframe(self._keyframe_tracker, self._camera)
         solved = self._keyframe_tracker.place(at, encoding, self._camera)
         if solved is None:
             return None
-        return Placed(frame, encoding, solved, at, solved.estimate.T @ T_ak)
+        return BackFilledFrame(frame, encoding, solved, at, solved.estimate.T @ T_ak)
 
     def all(self, frames: Sequence[Frame], until: Deadline | None = None) -> list[Tracked]:
         """Every one of ``frames``, those that are left; the oldest first. Where the time does not
@@ -117,12 +117,12 @@ class BackFill:
 
 
 @dataclass(frozen=True)
-class LookedBack:
+class BackFillResult:
     """A frame of the past that was looked for, and its pose, if one was found."""
 
     fill: BackFill
     frame: Frame
-    placed: Placed | None
+    placed: BackFilledFrame | None
 
 
 class BackFills:
@@ -141,7 +141,7 @@ class BackFills:
         self._failures, self._worker = failures, worker
         self._left: list[BackFill] = []
         """The frames left for idle time, in processing order."""
-        self._answer: LookedBack | None = None
+        self._answer: BackFillResult | None = None
         """Of the last frame that was looked for."""
 
     def start(self, at: CurrentKeyframe, camera: CameraModel) -> list[Tracked]:
@@ -188,7 +188,7 @@ class BackFills:
             for found in self._worker.ask(STAGE, frame.index, partial(_look_back, fill, frame)):
                 self.take(found)
 
-    def take(self, found: LookedBack) -> None:
+    def take(self, found: BackFillResult) -> None:
         """What was found of a frame; :meth:`step` finishes it."""
         self._answer = found
 
@@ -201,5 +201,5 @@ class BackFills:
         return [tracked for fill in fills for tracked in fill.all(fill.left(waiting), until)]
 
 
-def _look_back(fill: BackFill, frame: Frame) -> LookedBack:
-    return LookedBack(fill, frame, fill.place(frame))
+def _look_back(fill: BackFill, frame: Frame) -> BackFillResult:
+    return BackFillResult(fill, frame, fill.place(frame))

@@ -25,7 +25,7 @@ from aquaflow.keyframes import KeyframeStore
 from aquaflow.tracking.graph.equations import Rows, poses_of
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
 from aquaflow.tracking.metric.straightening import solve_with_worlds
-from aquaflow.tracking.metric.world_edges import Measured, World, WorldEdge, world_edge
+from aquaflow.tracking.metric.world_edges import KeyframeMeasurements, World, WorldEdge, world_edge
 
 Array = npt.NDArray[np.float64]
 
@@ -150,7 +150,7 @@ def _world(
     first = int(np.flatnonzero(nodes["number"] == component)[0])
     T_first = (to_n @ poses_of(nodes[first : first + 1])).element(0)
     held = HELD * T_first.scale
-    gauge = Measured(
+    gauge = KeyframeMeasurements(
         depth_m=(float(T_first.t[2]), held),
         place_m=(T_first.t[:2], held),
         turn=np.zeros(3),
@@ -161,7 +161,9 @@ def _world(
     T_nk = to_n @ poses_of(nodes[scales.rows])
     for k, row in enumerate(scales.rows.tolist()):
         T, excess = T_nk.element(k), scales.excess[k] - scales.middle
-        measured = Measured(scale=(T.scale * float(np.exp(-excess)), float(scales.sigma[k])))
+        measured = KeyframeMeasurements(
+            scale=(T.scale * float(np.exp(-excess)), float(scales.sigma[k]))
+        )
         edge = world_edge(int(nodes["number"][row]), T, measured)
         edges += [] if edge is None else [edge]
     return World(component, T_mn, edges)

@@ -17,11 +17,11 @@ from aquaflow.telemetry.factors.depth import DepthFactor
 from aquaflow.telemetry.factors.factor import Factor
 from aquaflow.telemetry.factors.position import PositionFactor
 from aquaflow.telemetry.factors.velocity import VelocityFactor
-from aquaflow.telemetry.state import State
-from aquaflow.tracking.metric.world_edges import Measured, WorldEdge, world_edge
+from aquaflow.telemetry.state import MetricState
+from aquaflow.tracking.metric.world_edges import KeyframeMeasurements, WorldEdge, world_edge
 
 Array = npt.NDArray[np.float64]
-Wanted = Callable[[Factor, State], tuple[Array, Array]]
+Wanted = Callable[[Factor, MetricState], tuple[Array, Array]]
 
 NEAR_S = 0.5
 """s; a measurement belongs to keyframes no further away in time. What it adds is the difference to
@@ -100,10 +100,10 @@ def _measured(
     scale: Corrections | None,
     tilt: Corrections | None,
     north: Corrections | None,
-) -> Measured:
+) -> KeyframeMeasurements:
     deeper, moved, larger = _near(depth, t_s), _near(place, t_s), _near(scale, t_s)
     turned, swung = _near(tilt, t_s), _near(north, t_s)
-    measured = Measured()
+    measured = KeyframeMeasurements()
     if deeper is not None:
         measured = replace(measured, depth_m=(float(T_nk.t[2] + deeper[0][0]), deeper[1]))
     if moved is not None:
@@ -118,7 +118,9 @@ def _measured(
     return measured
 
 
-def _held(measured: Measured, T_nk: Sim3, place: bool, depth: bool, north: bool) -> Measured:
+def _held(
+    measured: KeyframeMeasurements, T_nk: Sim3, place: bool, depth: bool, north: bool
+) -> KeyframeMeasurements:
     """What nothing measures anywhere is held at the first keyframe, or the world would drift."""
     if place:
         measured = replace(measured, place_m=(T_nk.t[:2].copy(), HELD))
@@ -153,12 +155,12 @@ def _of(
     return None
 
 
-def _turn(factor: Factor, state: State) -> tuple[Array, Array]:
+def _turn(factor: Factor, state: MetricState) -> tuple[Array, Array]:
     assert isinstance(factor, TiltFactor)
     return factor.turn_wanted(state), factor.sigma
 
 
-def _scale(factor: Factor, state: State) -> tuple[Array, Array]:
+def _scale(factor: Factor, state: MetricState) -> tuple[Array, Array]:
     assert isinstance(factor, (VelocityFactor, AltitudeFactor))
     misfit, sigma = factor.scale_misfit(state)
     return misfit[:, None], sigma

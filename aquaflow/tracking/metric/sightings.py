@@ -13,10 +13,10 @@ from aquaflow.config import FusionConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
-from aquaflow.telemetry.known_lengths.board_size import PixelDepths, PosedView
+from aquaflow.telemetry.known_lengths.board_size import BoardView, PixelDepths
 from aquaflow.telemetry.known_lengths.finder import KnownLengthFinder
 from aquaflow.telemetry.known_lengths.known_length import KnownLength
-from aquaflow.telemetry.metric_frame import SourceReport
+from aquaflow.telemetry.world_frame import SourceReport
 
 Array = npt.NDArray[np.float64]
 PlaceOf = Callable[[int], tuple[Sim3, int] | None]
@@ -32,7 +32,7 @@ class SeenLengths:
     """Of objects that were seen, but could not be measured."""
 
 
-class Sightings:
+class LengthSightings:
     """Grows with the pictures; a kilobyte for each that shows something."""
 
     def __init__(self, config: FusionConfig) -> None:
@@ -62,10 +62,10 @@ class Sightings:
         pixels = self._pixels.get(frame_index)
         if pixels is not None:
             found = pointmap()
-            view = PosedView(found.camera, Sim3.identity(), 0, found.rho, found.variance)
+            view = BoardView(found.camera, Sim3.identity(), 0, found.rho, found.variance)
             self._depths[frame_index] = PixelDepths(pixels, *view.depth_at(pixels))
 
-    def copy(self) -> Sightings:
+    def copy(self) -> LengthSightings:
         """What was seen until now, to be measured by another thread."""
         other = copy(self)
         other._finder = self._finder.copy()
@@ -75,11 +75,11 @@ class Sightings:
     def measured(self, place_of: PlaceOf) -> dict[int, SeenLengths]:
         """What was seen, by component, measured with the poses of now."""
 
-        def view_of(frame_index: int) -> PosedView | None:
+        def view_of(frame_index: int) -> BoardView | None:
             place, camera = place_of(frame_index), self._cameras.get(frame_index)
             if place is None or camera is None:
                 return None
-            return PosedView(camera, *place, depths=self._depths.get(frame_index))
+            return BoardView(camera, *place, depths=self._depths.get(frame_index))
 
         lengths = self._finder.lengths(view_of)
         known = {(length.sub_map, length.source) for length in lengths}

@@ -13,17 +13,17 @@ from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.dead_reckoning import carried_from
 from aquaflow.telemetry.estimator import Estimate, estimate
 from aquaflow.telemetry.factors.length import length_factors
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.graph.equations import Rows, poses_of
 from aquaflow.tracking.graph.optimisation import Optimisation
 from aquaflow.tracking.graph.table import EDGE, NODE, TRUST, GraphResult, Snapshot
 from aquaflow.tracking.metric.measured import world_edges
 from aquaflow.tracking.metric.sightings import SeenLengths
-from aquaflow.tracking.metric.survey import Survey
+from aquaflow.tracking.metric.survey import TrackingSnapshot
 from aquaflow.tracking.metric.world_edges import World
 
 
-def estimates_of(survey: Survey) -> dict[int, Estimate]:
+def estimates_of(survey: TrackingSnapshot) -> dict[int, Estimate]:
     """The metric frame of every component of the graph, by its first keyframe."""
     found: dict[int, Estimate] = {}
     before: tuple[Estimate, CameraPath] | None = None
@@ -58,12 +58,15 @@ class Straightened:
     """Keyframes as loops and telemetry want them, and the worlds that they lie in then."""
 
     result: GraphResult
-    frames: dict[int, MetricFrame]
+    frames: dict[int, WorldFrame]
     """By component."""
 
 
 def straightened(
-    snapshot: Snapshot, survey: Survey, t_s: Mapping[int, float], bases: Sequence[World] = ()
+    snapshot: Snapshot,
+    survey: TrackingSnapshot,
+    t_s: Mapping[int, float],
+    bases: Sequence[World] = (),
 ) -> Straightened:
     """Optimise a snapshot together with what telemetry says of its keyframes.
 

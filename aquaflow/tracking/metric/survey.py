@@ -18,7 +18,7 @@ from aquaflow.keyframes import Pointmap
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.telemetry import Telemetry
 from aquaflow.tracking.graph.equations import Rows, poses_of
-from aquaflow.tracking.metric.sightings import SeenLengths, Sightings
+from aquaflow.tracking.metric.sightings import LengthSightings, SeenLengths
 
 Array = npt.NDArray[np.float64]
 
@@ -31,7 +31,7 @@ KNOWN_SIGMA = 0.1
 
 
 @dataclass(frozen=True)
-class Survey:
+class TrackingSnapshot:
     """Read-only: keyframes and frames as they are now, and all telemetry until now."""
 
     nodes: Rows
@@ -43,7 +43,7 @@ class Survey:
     """[n, 3] of each keyframe by its number, in its own camera frame; empty for some."""
     mounting: MountingConfig | None
     config: FusionConfig
-    sightings: Sightings
+    sightings: LengthSightings
 
     @cached_property
     def frames(self) -> Rows:

@@ -16,13 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Measured:
+class KeyframeMeasurements:
     """What telemetry says of one keyframe; None where it says nothing."""
 
     depth_m: tuple[float, float] | None = None
@@ -54,7 +54,7 @@ class WorldEdge:
 def world_edge(
     keyframe: int,
     T_nk: Sim3,
-    measured: Measured,
+    measured: KeyframeMeasurements,
 ) -> WorldEdge | None:
     """The edge to a keyframe that is at ``T_nk`` now; None if nothing was measured.
 
@@ -115,6 +115,6 @@ class World:
         return sum(e.chi2 for e in self.edges) / max(sum(e.count for e in self.edges), 1)
 
     @staticmethod
-    def at(component: int, frame: MetricFrame, edges: Sequence[WorldEdge]) -> World:
+    def at(component: int, frame: WorldFrame, edges: Sequence[WorldEdge]) -> World:
         """At the frame that the estimator found."""
         return World(component, frame.T_nm.inverse(), edges)

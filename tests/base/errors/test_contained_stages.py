@@ -16,7 +16,7 @@ from aquaflow.base.errors.failures import Failures
 from aquaflow.base.stages import Stages
 from aquaflow.config import Config
 from aquaflow.dive import replay
-from aquaflow.dive.deliverable import Phase, deliverables_of
+from aquaflow.dive.deliverable import DeliverablePhase, deliverables_of
 from aquaflow.dive.deliverables import Deliverables
 from aquaflow.dive.folder import DiveFolder
 from aquaflow.dive.run import Finished
@@ -229,11 +229,11 @@ def test_a_file_that_cannot_be_written_leaves_the_others(
     made = Deliverables("planted", folder, slam, slam.results(), None, others=others)
     made.summarise()
     made.write()
-    made.make(Phase.WRITE)
+    made.make(DeliverablePhase.WRITE)
     made.evaluate()
-    made.make(Phase.MEASURE)
+    made.make(DeliverablePhase.MEASURE)
     made.write_evaluation()
-    made.make(Phase.REPORT, metrics={"stage_ms": {}, "warnings": []})
+    made.make(DeliverablePhase.REPORT, metrics={"stage_ms": {}, "warnings": []})
     folder.close()
     stage, missing = WRITERS[broken]
     assert [kind.stage for kind in slam.failures.kinds] == [stage]

@@ -10,7 +10,7 @@ import fsspec
 import pytest
 
 from aquaflow.base.errors import InputError
-from aquaflow.lab.batch.job import Job, Outcome
+from aquaflow.lab.batch.job import BatchJob, BatchOutcome
 from aquaflow.lab.batch.manifest import MANIFEST, write_manifest
 from aquaflow.lab.batch.object_store import ObjectStore, StoreError
 from aquaflow.lab.batch.recordings import find_recordings
@@ -28,15 +28,15 @@ def memory() -> Iterator[fsspec.AbstractFileSystem]:
     system.rm("/", recursive=True)
 
 
-def job(site: str, cache: Path, name: str = "d") -> Job:
-    return Job(name, "x", 1, site, str(cache), {"threads": 1}, None, 1, 100)
+def job(site: str, cache: Path, name: str = "d") -> BatchJob:
+    return BatchJob(name, "x", 1, site, str(cache), {"threads": 1}, None, 1, 100)
 
 
-def a_dive(folder: Path, made_for: Job) -> Path:
+def a_dive(folder: Path, made_for: BatchJob) -> Path:
     (folder / "heldout").mkdir(parents=True)
     (folder / "frames.csv").write_text("frame\n")
     (folder / "heldout" / "1.png").write_bytes(b"png")
-    write_manifest(folder, made_for, Outcome("done", frames=3))
+    write_manifest(folder, made_for, BatchOutcome("done", frames=3))
     return folder
 
 
@@ -105,7 +105,7 @@ def test_a_second_machine_that_ends_later_changes_nothing(
     assert found is not None
     assert found.frames == 3
     with pytest.raises(InputError, match="other settings"):
-        site.finished(Job(**{**made_for.to_json(), "settings": {"threads": 2}}))
+        site.finished(BatchJob(**{**made_for.to_json(), "settings": {"threads": 2}}))
 
 
 def test_a_damaged_manifest_is_told(memory: fsspec.AbstractFileSystem, tmp_path: Path) -> None:

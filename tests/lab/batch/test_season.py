@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 
 from aquaflow.base.errors import InputError
-from aquaflow.lab.batch.job import Job, Outcome
+from aquaflow.lab.batch.job import BatchJob, BatchOutcome
 from aquaflow.lab.batch.journal import Journal
 from aquaflow.lab.batch.season import End, Season, failed, run_season
 from aquaflow.lab.batch.workers import LocalWorkers
 from tests.lab.batch.seasons import read_journal
 
 
-def job(name: str, size_bytes: int = 1, memory_mb: int = 100, threads: int = 1) -> Job:
-    return Job(name, f"/{name}", size_bytes, "/site", "/cache", {}, None, threads, memory_mb)
+def job(name: str, size_bytes: int = 1, memory_mb: int = 100, threads: int = 1) -> BatchJob:
+    return BatchJob(name, f"/{name}", size_bytes, "/site", "/cache", {}, None, threads, memory_mb)
 
 
 class Scripted:
@@ -28,21 +28,21 @@ class Scripted:
         self.begun: list[str] = []
         self.closed = False
 
-    def takes(self, job: Job) -> bool:
+    def takes(self, job: BatchJob) -> bool:
         return len(self.running) < self.at_once
 
-    def start(self, job: Job) -> None:
+    def start(self, job: BatchJob) -> None:
         self.running.append(job.name)
         self.begun.append(job.name)
 
-    def wait(self, timeout_s: float) -> tuple[str, Outcome] | None:
+    def wait(self, timeout_s: float) -> tuple[str, BatchOutcome] | None:
         name = self.running.pop(0)
         state = self.script[name].pop(0)
         if state == "Ctrl-C":
             raise KeyboardInterrupt
         if state == "gone":
             raise InputError("the cluster is gone")
-        return name, Outcome(state, f"{state} it was")  # type: ignore[arg-type]
+        return name, BatchOutcome(state, f"{state} it was")  # type: ignore[arg-type]
 
     def close(self) -> None:
         self.closed = True
@@ -50,7 +50,7 @@ class Scripted:
 
 @pytest.fixture
 def run(tmp_path: Path) -> Callable[..., Season]:
-    def run_it(workers: Scripted, *jobs: Job, retries: int = 2) -> Season:
+    def run_it(workers: Scripted, *jobs: BatchJob, retries: int = 2) -> Season:
         journal = Journal(tmp_path / "batch.jsonl")
         season = run_season(jobs, workers, journal, retries, lambda done, total: None)
         journal.close()

@@ -19,7 +19,7 @@ from aquaflow.cli import app
 from aquaflow.config.presets import FOR_A_GPU
 from aquaflow.lab.bench import machine, meter, worker
 from aquaflow.lab.bench.benchmark import benchmark, contenders_of
-from aquaflow.lab.bench.job import Job
+from aquaflow.lab.bench.job import BenchJob
 from aquaflow.lab.bench.meter import OnCuda, meter_of, require
 from aquaflow.lab.bench.readme import section
 from aquaflow.lab.bench.render import benchmark as bm
@@ -196,14 +196,16 @@ def test_a_dive_on_a_device_is_the_row_that_one_on_the_cpu_is(
 ) -> None:
     without_kernels(monkeypatch)
     scene = scene_at(small_recording)
-    job = Job(scene, "fast", str(tmp_path / "dive"), overrides=FEW, device="cuda")
+    job = BenchJob(scene, "fast", str(tmp_path / "dive"), overrides=FEW, device="cuda")
     assert job.config().mapping.renderer == "gsplat"
     assert job.config().prior.device == "cuda"
     rows = {}
     for where in (CPU, PRETENDED):
         renderer = SinglePrecision(where)
         monkeypatch.setattr("aquaflow.render.select_renderer", lambda *_, r=renderer: r)
-        on = Job(scene, "fast", job.out, overrides=FEW, device="cuda" if where != CPU else None)
+        on = BenchJob(
+            scene, "fast", job.out, overrides=FEW, device="cuda" if where != CPU else None
+        )
         with pretended_device():
             rows[where] = worker.perform(on)
     assert rows[PRETENDED].keys() == rows[CPU].keys()
@@ -220,7 +222,7 @@ def test_a_run_that_went_on_on_the_cpu_has_failed(
 ) -> None:
     finished = SimpleNamespace(metrics={"device": "cpu", "gaussians": 100})
     monkeypatch.setattr("aquaflow.dive.replay.map_recording", lambda *_, **__: finished)
-    job = Job(scene_at(small_recording), "fast", str(tmp_path), device="cuda")
+    job = BenchJob(scene_at(small_recording), "fast", str(tmp_path), device="cuda")
     with pytest.raises(NotMappedError, match="the GPU failed, and the map went on on the CPU"):
         worker.perform(job)
 
@@ -230,7 +232,7 @@ def test_the_gpu_is_named_and_its_memory_is_a_column(
 ) -> None:
     devices = []
 
-    def pretended(job: Job) -> dict[str, Any]:
+    def pretended(job: BenchJob) -> dict[str, Any]:
         devices.append(job.device)
         return {
             "frames": 10,

@@ -13,7 +13,7 @@ import pytest
 from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.lab.bench import ablation
 from aquaflow.lab.bench.benchmark import benchmark, contenders_of, scenes_of
-from aquaflow.lab.bench.job import Job
+from aquaflow.lab.bench.job import BenchJob
 from aquaflow.lab.bench.picture import pareto_front
 from aquaflow.lab.bench.readme import BEGIN, END, section, write_readme
 from aquaflow.lab.bench.runner import KEYS, Contender, in_process, jobs_for
@@ -35,7 +35,7 @@ def quiet(stage: str, done: int, total: int | None) -> None:
     """Progress that nobody looks at."""
 
 
-def pretended(job: Job) -> dict[str, Any]:
+def pretended(job: BenchJob) -> dict[str, Any]:
     """Runs that take no time; on the wall they fail."""
     if job.scene.name == "wall":
         return {"failed": "none of 10 frames could be placed."}
@@ -73,8 +73,8 @@ def test_runs_are_interleaved() -> None:
 
 
 def test_a_job_survives_its_way_to_the_worker_and_makes_its_config() -> None:
-    job = Job(REEF, "accurate", "out", overrides={"mapping": {"medium": {"enabled": False}}})
-    assert Job.from_text(job.to_text()) == job
+    job = BenchJob(REEF, "accurate", "out", overrides={"mapping": {"medium": {"enabled": False}}})
+    assert BenchJob.from_text(job.to_text()) == job
     config = job.config()
     assert config.mapping.optimiser.refine_steps == 400
     assert not config.mapping.medium.enabled
@@ -103,7 +103,7 @@ def test_a_benchmark_writes_all_its_results_and_marks_failures(tmp_path: Path) -
 
 
 def test_what_a_peer_matched_is_said_below_the_table(tmp_path: Path) -> None:
-    def colmap(job: Job) -> dict[str, Any]:
+    def colmap(job: BenchJob) -> dict[str, Any]:
         return pretended(job) | ({"features": "SIFT"} if job.peer else {})
 
     contenders = [Contender("fast"), Contender("balanced", "colmap")]
@@ -136,9 +136,9 @@ def test_a_page_gets_the_section_between_its_markers(tmp_path: Path, name: str) 
 
 @pytest.mark.ci
 def test_a_worker_that_fails_or_crashes_is_a_row(tmp_path: Path) -> None:
-    gone = Job(BenchmarkScene("gone", str(tmp_path / "gone")), "fast", str(tmp_path / "dive"))
+    gone = BenchJob(BenchmarkScene("gone", str(tmp_path / "gone")), "fast", str(tmp_path / "dive"))
     assert "there is nothing at" in in_process(gone)["failed"]
-    broken = Job(REEF, "no such preset", str(tmp_path / "dive"))
+    broken = BenchJob(REEF, "no such preset", str(tmp_path / "dive"))
     assert "no preset 'no such preset'" in in_process(broken)["failed"]
 
 
@@ -185,7 +185,7 @@ def test_an_oracle_is_written_once_for_each_scene(
         (folder / CARD).write_text("{}")
         written.append((recording, sigma))
 
-    def noted(job: Job) -> dict[str, object]:
+    def noted(job: BenchJob) -> dict[str, object]:
         folders.append(job.config().prior.folder)
         return pretended(job)
 
@@ -198,9 +198,9 @@ def test_an_oracle_is_written_once_for_each_scene(
 
 
 def test_every_part_that_is_built_changes_the_config() -> None:
-    full = Job(REEF, "balanced", "out").config()
+    full = BenchJob(REEF, "balanced", "out").config()
     for part in ablation.PARTS[1:]:
-        changed = Job(REEF, "balanced", "out", overrides=part.overrides).config() != full
+        changed = BenchJob(REEF, "balanced", "out", overrides=part.overrides).config() != full
         assert changed == part.built
 
 
@@ -216,8 +216,8 @@ def test_bench_on_a_small_dive(small_recording: Path, tmp_path: Path) -> None:
     out, scene = tmp_path / "bench", scene_at(small_recording)
     few = {"mapping": {"optimiser": {"refine_steps": 20, "heldout_steps": 5}}}
 
-    def briefly(job: Job) -> dict[str, Any]:
-        return in_process(Job(job.scene, job.preset, job.out, job.peer, few, job.repeat))
+    def briefly(job: BenchJob) -> dict[str, Any]:
+        return in_process(BenchJob(job.scene, job.preset, job.out, job.peer, few, job.repeat))
 
     contenders = [Contender("fast"), Contender("fast", "two-view")]
     ours, peer = benchmark([scene], contenders, 1, out, quiet, briefly)["runs"]

@@ -16,7 +16,7 @@ from aquaflow.lab.evaluation.protocol import evaluate_dive
 from aquaflow.lab.evaluation.summary import in_words
 from aquaflow.lab.evaluation.trajectory import Trajectory
 from aquaflow.telemetry.metric_file import write_metric_file
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from tests.metric_scenes import SIGMAS, metric_frame
 
 COUNT = 40
@@ -35,7 +35,7 @@ def wrong(tilt: float = TILT, yaw: float = YAW, scale: float = STRETCH) -> Traje
     return TRUTH.transformed(Sim3(turn.as_matrix(), np.array([3.0, -2.0, 1.0]), scale))
 
 
-def found(frame: MetricFrame, estimate: Trajectory) -> MetricError:
+def found(frame: WorldFrame, estimate: Trajectory) -> MetricError:
     error = metric_error(frame, 1.0 / STRETCH, 0.1, (estimate, TRUTH))
     assert error is not None
     return error
@@ -75,7 +75,7 @@ def test_the_level_error_forgives_yaw_and_translation_and_nothing_else() -> None
 
 
 def test_what_the_dive_does_not_state_has_no_error() -> None:
-    assert metric_error(MetricFrame.unknown(), 1.0, 0.1, (wrong(), TRUTH)) is None
+    assert metric_error(WorldFrame.unknown(), 1.0, 0.1, (wrong(), TRUTH)) is None
     not_level = found(metric_frame(level=False), wrong())
     assert not_level.gravity_error_deg is not_level.ate_rmse_m_level is None
     assert not_level.scale_error_pct == pytest.approx(2.0)

@@ -195,7 +195,7 @@ def test_the_worst_value_is_the_one_nearest_to_its_bound() -> None:
 
 
 def test_an_exception_is_a_failure_with_its_seed() -> None:
-    def breaks(seed: int) -> suite.Outcome:
+    def breaks(seed: int) -> suite.StressOutcome:
         raise RuntimeError("out\nof range")
 
     result = suite.run_case(suite.Case("broken", "solvers", "a.b", breaks, long=False), seed=7)

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.lab.synthetic import SyntheticConfig
-from aquaflow.lab.synthetic.motion import BodyMotion
+from aquaflow.lab.synthetic.motion import TrueBodyMotion
 from aquaflow.lab.synthetic.mounting import mountings_of
 from aquaflow.lab.synthetic.path import plan_path
 from aquaflow.lab.synthetic.telemetry.constants import Constants, draw_constants
@@ -21,9 +21,9 @@ HOUR = SyntheticConfig(frames=3600, fps=1.0, speed_m_s=0.02)
 
 
 @cache
-def motion_of_an_hour() -> BodyMotion:
+def motion_of_an_hour() -> TrueBodyMotion:
     """Over a flat floor, without a relief to follow."""
-    return BodyMotion(plan_path(HOUR, np.random.default_rng(0)), mountings_of(HOUR))
+    return TrueBodyMotion(plan_path(HOUR, np.random.default_rng(0)), mountings_of(HOUR))
 
 
 def only(**errors: float) -> TelemetryNoise:

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from aquaflow.geometry.earth import north_east
-from aquaflow.lab.synthetic.motion import BodyMotion
+from aquaflow.lab.synthetic.motion import TrueBodyMotion
 from aquaflow.lab.synthetic.relief import Area
 from aquaflow.lab.synthetic.telemetry.altitude import altitude
 from aquaflow.lab.synthetic.telemetry.position import position, utc_time
@@ -20,11 +20,13 @@ Array = npt.NDArray[np.float64]
 
 
 @pytest.fixture(scope="module")
-def motion() -> BodyMotion:
+def motion() -> TrueBodyMotion:
     return motion_of_an_hour()
 
 
-def test_dvl_noise_is_as_large_as_its_figure_of_merit_says_on_average(motion: BodyMotion) -> None:
+def test_dvl_noise_is_as_large_as_its_figure_of_merit_says_on_average(
+    motion: TrueBodyMotion,
+) -> None:
     noise = only(dvl_sigma_m_s=0.02, dvl_merit_spread=0.3)
     t = times(5.0)
     measured = velocity(t, motion, constants_of(noise), noise, np.random.default_rng(0))
@@ -34,7 +36,7 @@ def test_dvl_noise_is_as_large_as_its_figure_of_merit_says_on_average(motion: Bo
     assert np.log(measured[:, 3]).std() == pytest.approx(0.3, rel=0.05)
 
 
-def test_dvl_is_out_of_scale_by_one_constant(motion: BodyMotion) -> None:
+def test_dvl_is_out_of_scale_by_one_constant(motion: TrueBodyMotion) -> None:
     noise = only(dvl_scale_sigma=0.1)
     t = times(1.0)
     scale = constants_of(noise).dvl_scale
@@ -42,7 +44,7 @@ def test_dvl_is_out_of_scale_by_one_constant(motion: BodyMotion) -> None:
     np.testing.assert_allclose(measured[:, :3], (1.0 + scale) * motion.velocity_b(t), atol=1e-12)
 
 
-def test_dvl_drops_samples_and_loses_the_bottom(motion: BodyMotion) -> None:
+def test_dvl_drops_samples_and_loses_the_bottom(motion: TrueBodyMotion) -> None:
     t = times(5.0)
     for noise, share, in_a_row in (
         (only(dvl_dropout_share=0.1), 0.1, 1.1),
@@ -61,14 +63,14 @@ def flat() -> Sonar:
     return Sonar(area, np.zeros(area.shape, np.float32))
 
 
-def heard(motion: BodyMotion, flat: Sonar, noise: TelemetryNoise) -> tuple[Array, Array]:
+def heard(motion: TrueBodyMotion, flat: Sonar, noise: TelemetryNoise) -> tuple[Array, Array]:
     """[N] measured altitudes, and true ones."""
     t = times(1.0)
     measured = altitude(t, motion, flat, noise, np.random.default_rng(5))[:, 0]
     return measured, HOUR.floor_depth_m - motion.origin_w(t)[:, 2]
 
 
-def test_altimeter_has_noise_and_a_resolution(motion: BodyMotion, flat: Sonar) -> None:
+def test_altimeter_has_noise_and_a_resolution(motion: TrueBodyMotion, flat: Sonar) -> None:
     measured, true = heard(motion, flat, only(altitude_sigma_m=0.03))
     assert (measured - true).std() == pytest.approx(0.03, rel=0.05)
     measured, true = heard(motion, flat, only(altitude_resolution_m=0.05))
@@ -76,7 +78,9 @@ def test_altimeter_has_noise_and_a_resolution(motion: BodyMotion, flat: Sonar) -
     assert np.abs(measured - true).max() < 0.026
 
 
-def test_altimeter_hears_second_echoes_and_nothing_too_far(motion: BodyMotion, flat: Sonar) -> None:
+def test_altimeter_hears_second_echoes_and_nothing_too_far(
+    motion: TrueBodyMotion, flat: Sonar
+) -> None:
     measured, true = heard(motion, flat, only(altitude_multipath_share=0.1))
     twice = measured > 1.5 * true
     assert twice.mean() == pytest.approx(0.1, rel=0.15)
@@ -95,7 +99,7 @@ def metres(fixes: Array, noise: TelemetryNoise) -> Array:
     return north_east(fixes[:, 0], fixes[:, 1], origin)
 
 
-def test_fixes_have_their_sigma_their_lag_and_their_outliers(motion: BodyMotion) -> None:
+def test_fixes_have_their_sigma_their_lag_and_their_outliers(motion: TrueBodyMotion) -> None:
     t = times(1.0)
     noise = only(position_sigma_m=0.5, position_lag_s=5.0)
     fixes = position(t, motion, noise, np.random.default_rng(6))
@@ -112,13 +116,13 @@ def test_fixes_have_their_sigma_their_lag_and_their_outliers(motion: BodyMotion)
     assert (np.abs(error).max(axis=1) > 1.0).mean() == pytest.approx(0.1, rel=0.2)
 
 
-def test_fixes_without_noise_are_where_the_vehicle_is(motion: BodyMotion) -> None:
+def test_fixes_without_noise_are_where_the_vehicle_is(motion: TrueBodyMotion) -> None:
     t, noise = times(0.1), only(position_lag_s=0.0)
     fixes = position(t, motion, noise, np.random.default_rng(0))
     np.testing.assert_allclose(metres(fixes, noise), motion.origin_w(t)[:, :2], atol=1e-6)
 
 
-def test_a_degree_is_as_long_as_on_the_earth(motion: BodyMotion) -> None:
+def test_a_degree_is_as_long_as_on_the_earth(motion: TrueBodyMotion) -> None:
     t = np.array([100.0])
     where = motion.origin_w(t)[0]
     for latitude, north_m, east_m in ((0.0, 110_574.0, 111_320.0), (60.0, 111_412.0, 55_800.0)):

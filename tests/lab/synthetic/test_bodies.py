@@ -20,9 +20,9 @@ def written(out: Path, **asked: object) -> Truth:
     return read_truth(out)
 
 
-def ellipsoid(*size: float) -> objects.Shape:
+def ellipsoid(*size: float) -> objects.Solid:
     grey, half, centre = (0.3, 0.3, 0.3), (size[0], size[1], size[2]), np.array([0.0, 0.0, 5.0])
-    return objects.Shape("ellipsoid", centre, np.eye(3), half, grey, grey, 0.0)
+    return objects.Solid("ellipsoid", centre, np.eye(3), half, grey, grey, 0.0)
 
 
 @pytest.fixture(scope="module")

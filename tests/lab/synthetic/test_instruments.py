@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from aquaflow.lab.synthetic.motion import BodyMotion
+from aquaflow.lab.synthetic.motion import TrueBodyMotion
 from aquaflow.lab.synthetic.telemetry.constants import Constants
 from aquaflow.lab.synthetic.telemetry.inertial import acceleration, angular_rate, attitude
 from aquaflow.lab.synthetic.telemetry.pressure import depth, tide, wave
@@ -22,7 +22,7 @@ Rng = np.random.Generator
 
 
 @pytest.fixture(scope="module")
-def motion() -> BodyMotion:
+def motion() -> TrueBodyMotion:
     return motion_of_an_hour()
 
 
@@ -30,11 +30,11 @@ def correlation(series: Array, lag: int) -> float:
     return float((series[lag:] * series[:-lag]).mean() / series.var())
 
 
-Instrument = Callable[[Array, BodyMotion, Constants, TelemetryNoise, Rng], Array]
+Instrument = Callable[[Array, TrueBodyMotion, Constants, TelemetryNoise, Rng], Array]
 
 
 def error_of(
-    instrument: Instrument, motion: BodyMotion, hz: float, noise: TelemetryNoise
+    instrument: Instrument, motion: TrueBodyMotion, hz: float, noise: TelemetryNoise
 ) -> tuple[Array, Array]:
     """Times [N] and measurement minus truth [N, K]."""
     t, constants = times(hz), constants_of(noise)
@@ -42,7 +42,7 @@ def error_of(
     return t, instrument(t, motion, constants, noise, np.random.default_rng(1)) - true
 
 
-def test_without_errors_every_instrument_measures_the_truth(motion: BodyMotion) -> None:
+def test_without_errors_every_instrument_measures_the_truth(motion: TrueBodyMotion) -> None:
     t, rng = np.linspace(10.0, 20.0, 50), np.random.default_rng(0)
     known = (motion, constants_of(only()), only(), rng)
     np.testing.assert_allclose(depth(t, *known)[:, 0], motion.origin_w(t)[:, 2])
@@ -53,7 +53,7 @@ def test_without_errors_every_instrument_measures_the_truth(motion: BodyMotion) 
     np.testing.assert_allclose(measured.as_matrix(), motion.R_wb(t), atol=1e-12)
 
 
-def test_depth_noise_is_white_and_comes_in_steps(motion: BodyMotion) -> None:
+def test_depth_noise_is_white_and_comes_in_steps(motion: TrueBodyMotion) -> None:
     _, white = error_of(depth, motion, 5.0, only(depth_sigma_m=0.01))
     assert white.std() == pytest.approx(0.01, rel=0.03)
     assert abs(correlation(white[:, 0], 1)) < 0.05
@@ -63,7 +63,7 @@ def test_depth_noise_is_white_and_comes_in_steps(motion: BodyMotion) -> None:
     assert len(np.unique(np.round(steps))) > 100
 
 
-def test_depth_keeps_its_offset_and_rises_with_the_tide(motion: BodyMotion) -> None:
+def test_depth_keeps_its_offset_and_rises_with_the_tide(motion: TrueBodyMotion) -> None:
     noise = only(depth_offset_sigma_m=0.1, tide_amplitude_m=1.5)
     t, error = error_of(depth, motion, 1.0, noise)
     constants = constants_of(noise)
@@ -75,7 +75,7 @@ def test_depth_keeps_its_offset_and_rises_with_the_tide(motion: BodyMotion) -> N
     assert 0.0 < np.ptp(error) < 0.8
 
 
-def test_wave_pressure_has_its_period_and_fades_with_depth(motion: BodyMotion) -> None:
+def test_wave_pressure_has_its_period_and_fades_with_depth(motion: TrueBodyMotion) -> None:
     noise = only(wave_height_m=0.5, wave_period_s=6.0)
     constants = constants_of(noise)
     t = np.linspace(0.0, 60.0, 6001)
@@ -88,7 +88,7 @@ def test_wave_pressure_has_its_period_and_fades_with_depth(motion: BodyMotion) -
     assert error.std() == pytest.approx(0.25 / np.sqrt(2) * np.exp(-k * 10.5), rel=0.15)
 
 
-def turn_of(motion: BodyMotion, noise: TelemetryNoise, hz: float = 2.0) -> tuple[Array, Array]:
+def turn_of(motion: TrueBodyMotion, noise: TelemetryNoise, hz: float = 2.0) -> tuple[Array, Array]:
     """[N, 3] degrees: attitude errors about the body's axes, and about the world's."""
     t = times(hz)
     measured = attitude(t, motion, constants_of(noise), noise, np.random.default_rng(2))
@@ -97,13 +97,13 @@ def turn_of(motion: BodyMotion, noise: TelemetryNoise, hz: float = 2.0) -> tuple
     return (true.inv() * R).as_rotvec(degrees=True), (R * true.inv()).as_rotvec(degrees=True)
 
 
-def test_attitude_noise_is_white_about_each_axis(motion: BodyMotion) -> None:
+def test_attitude_noise_is_white_about_each_axis(motion: TrueBodyMotion) -> None:
     error, _ = turn_of(motion, only(attitude_sigma_deg=0.4))
     np.testing.assert_allclose(error.std(axis=0), 0.4, rtol=0.05)
     assert abs(correlation(error[:, 0], 1)) < 0.05
 
 
-def test_roll_and_pitch_wander_and_heading_does_not_with_them(motion: BodyMotion) -> None:
+def test_roll_and_pitch_wander_and_heading_does_not_with_them(motion: TrueBodyMotion) -> None:
     error, _ = turn_of(motion, only(tilt_wander_sigma_deg=0.5, tilt_wander_s=5.0))
     np.testing.assert_allclose(error[:, :2].std(axis=0), 0.5, rtol=0.15)
     for axis in (0, 1):
@@ -111,7 +111,7 @@ def test_roll_and_pitch_wander_and_heading_does_not_with_them(motion: BodyMotion
     np.testing.assert_allclose(error[:, 2], 0.0, atol=1e-9)
 
 
-def test_compass_has_an_offset_and_a_wandering_disturbance(motion: BodyMotion) -> None:
+def test_compass_has_an_offset_and_a_wandering_disturbance(motion: TrueBodyMotion) -> None:
     noise = only(heading_offset_sigma_deg=4.0, heading_wander_sigma_deg=2.0, heading_wander_s=5.0)
     _, error = turn_of(motion, noise)
     np.testing.assert_allclose(error[:, :2], 0.0, atol=1e-9)
@@ -121,7 +121,7 @@ def test_compass_has_an_offset_and_a_wandering_disturbance(motion: BodyMotion) -
     assert correlation(varying, 10) == pytest.approx(np.exp(-1.0), abs=0.12)
 
 
-def test_gyro_has_noise_a_bias_and_a_bias_that_walks(motion: BodyMotion) -> None:
+def test_gyro_has_noise_a_bias_and_a_bias_that_walks(motion: TrueBodyMotion) -> None:
     _, white = error_of(angular_rate, motion, 5.0, only(rate_sigma_rad_s=0.002))
     np.testing.assert_allclose(white.std(axis=0), 0.002, rtol=0.05)
     noise = only(rate_bias_sigma_rad_s=0.01)
@@ -132,7 +132,7 @@ def test_gyro_has_noise_a_bias_and_a_bias_that_walks(motion: BodyMotion) -> None
     assert np.abs(walk[-1]).max() < 4e-3 * np.sqrt(t[-1])
 
 
-def test_accelerometer_has_noise_and_a_bias(motion: BodyMotion) -> None:
+def test_accelerometer_has_noise_and_a_bias(motion: TrueBodyMotion) -> None:
     noise = only(acceleration_sigma_m_s2=0.1, acceleration_bias_sigma_m_s2=0.5)
     _, error = error_of(acceleration, motion, 5.0, noise)
     np.testing.assert_allclose(error.std(axis=0), 0.1, rtol=0.05)

@@ -13,7 +13,7 @@ from aquaflow.lab.synthetic.survey import (
     FPS,
     LINE_M,
     SPEED_M_S,
-    Survey,
+    SurveyPictures,
 )
 
 WIDTH = 96
@@ -23,11 +23,11 @@ ROUND = round((LINE_M + BETWEEN_LINES_M) / SPEED_M_S * FPS)
 
 
 @pytest.fixture(scope="module")
-def survey() -> Survey:
-    return Survey(WIDTH)
+def survey() -> SurveyPictures:
+    return SurveyPictures(WIDTH)
 
 
-def grey(survey: Survey, index: int) -> npt.NDArray[np.float32]:
+def grey(survey: SurveyPictures, index: int) -> npt.NDArray[np.float32]:
     return survey.frame(index).image.astype(np.float32).mean(axis=-1)
 
 
@@ -35,14 +35,16 @@ def correlation(a: npt.NDArray[np.float32], b: npt.NDArray[np.float32]) -> float
     return float(np.corrcoef(a.ravel(), b.ravel())[0, 1])
 
 
-def test_a_picture_depends_on_its_index_alone(survey: Survey) -> None:
+def test_a_picture_depends_on_its_index_alone(survey: SurveyPictures) -> None:
     *_, last = survey.frames(12)
     assert last.index == 11
-    assert (Survey(WIDTH).frame(11).image == last.image).all()
-    assert not (Survey(WIDTH, seed=1).frame(11).image == last.image).all()
+    assert (SurveyPictures(WIDTH).frame(11).image == last.image).all()
+    assert not (SurveyPictures(WIDTH, seed=1).frame(11).image == last.image).all()
 
 
-def test_frames_come_at_the_surveys_rate_with_the_camera_of_their_size(survey: Survey) -> None:
+def test_frames_come_at_the_surveys_rate_with_the_camera_of_their_size(
+    survey: SurveyPictures,
+) -> None:
     frames = list(survey.frames(3))
     assert [frame.t_ns for frame in frames] == [0, 100_000_000, 200_000_000]
     assert frames[0].image.shape == (survey.camera.height, survey.camera.width, 3)
@@ -50,7 +52,9 @@ def test_frames_come_at_the_surveys_rate_with_the_camera_of_their_size(survey: S
 
 
 @pytest.mark.parametrize("apart", [3, 8])
-def test_poses_and_camera_say_where_a_place_is_seen_again(survey: Survey, apart: int) -> None:
+def test_poses_and_camera_say_where_a_place_is_seen_again(
+    survey: SurveyPictures, apart: int
+) -> None:
     first, second = 40, 40 + apart
     x, y, ahead, _ = survey._met(survey.T_wc(first))
     rays = survey.camera.unproject(survey.camera.pixel_centres())
@@ -66,28 +70,28 @@ def test_poses_and_camera_say_where_a_place_is_seen_again(survey: Survey, apart:
     assert correlation(grey(survey, first)[inside], again[inside]) > 0.97
 
 
-def test_rays_end_on_the_relief(survey: Survey) -> None:
+def test_rays_end_on_the_relief(survey: SurveyPictures) -> None:
     x, y, ahead, box = survey._met(survey.T_wc(70))
     assert box[0] <= x.min() <= x.max() <= box[2]
     assert box[1] <= y.min() <= y.max() <= box[3]
     assert 0.8 * ALTITUDE_M < ahead.min() < ahead.max() < 1.3 * ALTITUDE_M
 
 
-def test_a_line_overlaps_with_the_one_before_it(survey: Survey) -> None:
+def test_a_line_overlaps_with_the_one_before_it(survey: SurveyPictures) -> None:
     there, back = survey.T_wc(100), survey.T_wc(ROUND + ON_A_LINE - 100)
     height_m = ALTITUDE_M * survey.camera.height / survey.camera.fy
     assert abs(there.t[0] - back.t[0]) < 0.2
     assert 0.3 * height_m < back.t[1] - there.t[1] < 0.7 * height_m
 
 
-def test_the_area_grows_with_the_frames(survey: Survey) -> None:
+def test_the_area_grows_with_the_frames(survey: SurveyPictures) -> None:
     length_m = 10_000 / FPS * SPEED_M_S
     lines = int(length_m / (LINE_M + BETWEEN_LINES_M))
     assert survey.T_wc(10_000).t[1] == pytest.approx(lines * BETWEEN_LINES_M, abs=0.2)
     assert np.linalg.norm(survey.T_wc(10_000).t - survey.T_wc(9_999).t) < 0.1
 
 
-def test_nothing_repeats(survey: Survey) -> None:
+def test_nothing_repeats(survey: SurveyPictures) -> None:
     pictures = [grey(survey, 2 * ROUND * line) for line in range(8)]
     alike = [
         abs(correlation(a, b)) for i, a in enumerate(pictures) for b in pictures[i + 1 :]

@@ -11,14 +11,14 @@ import pytest
 
 from aquaflow.lab.synthetic import SyntheticConfig
 from aquaflow.lab.synthetic.dive import build, write_dive
-from aquaflow.lab.synthetic.site import Site, site_of
+from aquaflow.lab.synthetic.site import SurveySite, site_of
 
 SITE = {"frames": 12, "width": 96, "height": 72, "fps": 6.0, "margin_m": 1.0}
 VISIT = {"over": SITE, "offset_m": (0.2, -0.1), "heading_deg": 30.0}
 BOX = {"kind": "box", "at_m": (1.5, 0.2), "half_m": 0.1}
 
 
-def site(**settings: object) -> Site:
+def site(**settings: object) -> SurveySite:
     return site_of(SyntheticConfig.model_validate(SITE | settings))
 
 

@@ -29,7 +29,7 @@ from aquaflow.lab.training.compact_run import (
 )
 from aquaflow.lab.training.correspondences import overlap
 from aquaflow.lab.training.held_out import SETS, held_out_pairs, turned_pictures
-from aquaflow.lab.training.pair_generator.cameras import TRAINING, Motion
+from aquaflow.lab.training.pair_generator.cameras import TRAINING, PairMotion
 from aquaflow.lab.training.pair_generator.pool import Pool
 from aquaflow.lab.training.pair_generator.scene import Detail
 from aquaflow.prior.compact import network as compact_network
@@ -44,7 +44,9 @@ SMALL = NetworkSize(levels=(8, 8, 12, 16), merged=(16, 12, 8), fine=8, coarse=16
 WIDE = SETS["wide"]
 
 
-def small_pool(folder: Path, seed: int, motion: Motion = TRAINING, detail: Detail = PLAIN) -> Pool:
+def small_pool(
+    folder: Path, seed: int, motion: PairMotion = TRAINING, detail: Detail = PLAIN
+) -> Pool:
     """With scenes and pictures of a size that takes seconds."""
     detail = Detail(terrain=64, texture=128, regular=detail.regular)
     return Pool(folder, seed, 96, 64, motion, detail)

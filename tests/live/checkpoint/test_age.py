@@ -13,21 +13,21 @@ from aquaflow.base.storage.dive_status import DiveState
 from aquaflow.base.storage.folder_lock import FolderLock
 from aquaflow.config.service import CheckpointConfig
 from aquaflow.live.checkpoint.resume import Choice, age_of, choose
-from aquaflow.live.moment import Moment
+from aquaflow.live.clock_reading import ClockReading
 from tests.live.unfinished_dives import YESTERDAY, H, unfinished
 
 
-def chosen(dives: Path, now: Moment, is_set: bool, resume_h: float = 12.0) -> Choice:
+def chosen(dives: Path, now: ClockReading, is_set: bool, resume_h: float = 12.0) -> Choice:
     config = CheckpointConfig(resume_h=resume_h)
     return choose(dives, config, False, now, lambda: is_set)
 
 
-def after(hours: float, boot: str, wall_h: float) -> Moment:
+def after(hours: float, boot: str, wall_h: float) -> ClockReading:
     """The monotonic clock ``hours`` after YESTERDAY, or after another ``boot``; the wall clock."""
     monotonic_ns = round(hours * H)
     if boot == YESTERDAY.boot:
         monotonic_ns += YESTERDAY.monotonic_ns
-    return Moment(monotonic_ns, YESTERDAY.wall_ns + round(wall_h * H), boot)
+    return ClockReading(monotonic_ns, YESTERDAY.wall_ns + round(wall_h * H), boot)
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def after(hours: float, boot: str, wall_h: float) -> Moment:
     ],
 )
 def test_an_age_is_of_a_clock_that_ran_on_or_was_set(
-    tmp_path: Path, now: Moment, is_set: bool, hours: float | None
+    tmp_path: Path, now: ClockReading, is_set: bool, hours: float | None
 ) -> None:
     age = age_of(unfinished(tmp_path), YESTERDAY, now, lambda: is_set)
     assert age.hours == (None if hours is None else pytest.approx(hours))
@@ -86,7 +86,7 @@ def test_a_limit_of_zero_goes_on_whatever_the_age(tmp_path: Path) -> None:
 
 def test_a_dive_of_this_boot_goes_before_one_whose_files_look_newer(tmp_path: Path) -> None:
     unfinished(tmp_path, "yesterday")
-    taken = Moment(H, YESTERDAY.wall_ns - 5 * H, "today's boot")  # the clock was behind
+    taken = ClockReading(H, YESTERDAY.wall_ns - 5 * H, "today's boot")  # the clock was behind
     today = unfinished(tmp_path, "today", taken)
     now = replace(taken, monotonic_ns=taken.monotonic_ns + H)
     assert chosen(tmp_path, now, False).folder == today
@@ -115,7 +115,7 @@ def test_a_dive_that_another_process_holds_is_not_gone_on_with(tmp_path: Path) -
 
 
 def test_now_is_of_this_boot_and_runs_on() -> None:
-    first = Moment.now()
+    first = ClockReading.now()
     assert first.boot
-    assert first.is_of_the_boot_of(Moment.now())
+    assert first.is_of_the_boot_of(ClockReading.now())
     assert abs(first.wall_ns - time.time_ns()) < H

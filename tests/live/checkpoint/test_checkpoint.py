@@ -21,10 +21,10 @@ from aquaflow.dive.ply import read_ply
 from aquaflow.lab.evaluation.trajectory import read_tum
 from aquaflow.live.checkpoint.generations import read_state, state_file
 from aquaflow.live.checkpoint.resume import choose, is_begun, resumed
+from aquaflow.live.clock_reading import ClockReading
 from aquaflow.live.dive_clock import Continued
 from aquaflow.live.health.http import exposition
 from aquaflow.live.live_dive import LiveDive
-from aquaflow.live.moment import Moment
 from aquaflow.live.report import report
 from aquaflow.sources import open_recording
 from aquaflow.survey.viewer.live_viewer import LiveViewer, in_words
@@ -152,7 +152,7 @@ def test_the_dive_goes_on_at_its_old_place_and_ends_as_one(cut: Cut, back: LiveD
 def test_the_newest_unfinished_dive_is_chosen_unless_it_is_old_or_new_is_asked_for(
     cut: Cut,
 ) -> None:
-    dives, config, now = cut.folder.parent, CheckpointConfig(), Moment.now()
+    dives, config, now = cut.folder.parent, CheckpointConfig(), ClockReading.now()
     assert choose(dives, config, False, now).folder == cut.folder
     assert choose(dives, config, True, now).folder != cut.folder
     later = replace(now, monotonic_ns=now.monotonic_ns + round(13 * 3.6e12))
@@ -231,19 +231,19 @@ def test_the_deliverables_of_a_dive_that_goes_on_are_those_of_one_moment(cut: Cu
 def test_the_dives_clock_goes_on_over_restarts_and_jumps(
     boot: str, later_ns: int, wall_ns: int, shift_ns: int
 ) -> None:
-    before = Moment(1_000_000, 10**18, "a")
-    now = Moment(1_000_000 + later_ns, 10**18 + wall_ns, boot)
+    before = ClockReading(1_000_000, 10**18, "a")
+    now = ClockReading(1_000_000 + later_ns, 10**18 + wall_ns, boot)
     assert before.shift_ns(now) == shift_ns
 
 
 def test_the_dives_clock_goes_on_over_two_boots_and_a_restart() -> None:
-    first = Moment(5_000, 10**18, "a")
-    second = Moment(100, 10**18 + 2 * 10**9, "b")
+    first = ClockReading(5_000, 10**18, "a")
+    second = ClockReading(100, 10**18 + 2 * 10**9, "b")
     second = replace(second, dive_shift_ns=first.shift_ns(second))
     assert second.dive_ns == 5_000 + 2 * 10**9
-    restarted = Moment(700, 10**18 + 3 * 10**9, "b")
+    restarted = ClockReading(700, 10**18 + 3 * 10**9, "b")
     assert second.shift_ns(restarted) == second.dive_shift_ns
-    third = Moment(50, second.wall_ns + 4 * 10**9, "c")
+    third = ClockReading(50, second.wall_ns + 4 * 10**9, "c")
     assert third.monotonic_ns + second.shift_ns(third) == second.dive_ns + 4 * 10**9
 
 
@@ -251,7 +251,7 @@ def test_a_devices_clock_is_known_after_a_restart_but_not_after_another_boot(
     cut: Cut, back: LiveDive
 ) -> None:
     assert back.feed.continued.clocks == CLOCKS  # type: ignore[attr-defined]
-    before, rebooted = Moment(1_000_000, 10**18, "a"), Moment(900, 10**18, "b")
+    before, rebooted = ClockReading(1_000_000, 10**18, "a"), ClockReading(900, 10**18, "b")
     assert Continued.after(before, [], CLOCKS, rebooted).clocks == {}
 
 

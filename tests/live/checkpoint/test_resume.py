@@ -24,8 +24,8 @@ from aquaflow.live.checkpoint.generations import (
     write_state,
 )
 from aquaflow.live.checkpoint.resume import Choice, choose, resumed, tidy
+from aquaflow.live.clock_reading import ClockReading
 from aquaflow.live.live_dive import LiveDive
-from aquaflow.live.moment import Moment
 from aquaflow.live.onboard import map_live
 from aquaflow.tracking.frame_table import FRAME
 from tests.live.live_scenes import VEHICLE, ToldFeed
@@ -37,7 +37,7 @@ def write_numbered(dive: Path, number: int) -> None:
     camera = of_camera(guess_camera(64, 48))
     tracking = {"camera": camera, "source": {"width": None, "crop": None}}
     facts = {"format": FORMAT, "version": "0", "tracking": tracking, "clocks": {}}
-    moment = Moment(number, time.time_ns(), "boot").to_json()
+    moment = ClockReading(number, time.time_ns(), "boot").to_json()
     write_state(dive, facts | {"moment": moment}, frames)
 
 
@@ -109,7 +109,7 @@ def test_a_damaged_checkpoint_is_left_alone_and_the_next_dive_is_beside(
     file.parent.mkdir(parents=True)
     file.write_bytes(damage)
     assert resumed(tmp_path / "old", new=False).folder == tmp_path / "old-2"
-    choice = choose(tmp_path, CheckpointConfig(), new=False, now=Moment.now())
+    choice = choose(tmp_path, CheckpointConfig(), new=False, now=ClockReading.now())
     assert choice.checkpoint is None
     assert choice.folder != tmp_path / "old"
 

@@ -30,14 +30,14 @@ from aquaflow.dive.placement import placement
 from aquaflow.dive.ros import messages, topics
 from aquaflow.dive.ros.definitions import encoded
 from aquaflow.live.checkpoint.resume import resumed
-from aquaflow.live.control import Control
+from aquaflow.live.control import ServiceControl
 from aquaflow.live.foxglove.live import LiveFoxglove
 from aquaflow.live.foxglove.map_moment import cloud_of, taken
 from aquaflow.live.foxglove.server import BACKLOG, FoxgloveServer
 from aquaflow.live.live_dive import LiveDive
 from aquaflow.live.report import report
-from aquaflow.live.station import Station
-from aquaflow.live.vitals import Vitals
+from aquaflow.live.service_frontends import ServiceFrontends
+from aquaflow.live.service_health import ServiceHealth
 from aquaflow.sources import open_recording
 from aquaflow.types import Frame
 from tests.dive.ros.published import HASHES, hash_of
@@ -304,7 +304,10 @@ def test_a_service_shows_its_dives_where_it_is_asked_to_and_stops_listening(
     dive: Any = SimpleNamespace(parts=SimpleNamespace(loop=loop))
     for service, count in ((VEHICLE.service, 0), (changed, 1)):
         vehicle = VEHICLE.model_copy(update={"service": service})
-        with Vitals(service) as vitals, Station(ToldFeed(), vehicle, Control(), vitals) as station:
+        with (
+            ServiceHealth(service) as vitals,
+            ServiceFrontends(ToldFeed(), vehicle, ServiceControl(), vitals) as station,
+        ):
             station.show(dive)
             station.hide()
         assert len(made) == count

@@ -7,7 +7,7 @@ import re
 from prometheus_client.parser import text_string_to_metric_families
 
 from aquaflow.live.health.http import exposition
-from aquaflow.live.health.state import State
+from aquaflow.live.health.state import ServiceState
 from tests.live.health.reports import REPORT
 
 Read = dict[tuple[str, frozenset[tuple[str, str]]], float]
@@ -46,8 +46,8 @@ def test_every_metric_has_a_help_and_a_type_that_fits_its_name() -> None:
 
 def test_one_state_is_1_and_numbers_keep_all_their_digits() -> None:
     metrics = read(exposition(REPORT))
-    states = {state: value(metrics, "state", state=state.value) for state in State}
-    assert states == {state: float(state is State.TRACKING) for state in State}
+    states = {state: value(metrics, "state", state=state.value) for state in ServiceState}
+    assert states == {state: float(state is ServiceState.TRACKING) for state in ServiceState}
     assert value(metrics, "device_received_total", device=FRONT, what="received") == 123456789
 
 

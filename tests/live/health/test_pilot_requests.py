@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from aquaflow.config.service import ListenConfig
-from aquaflow.live.control import Control, Phase
+from aquaflow.live.control import DivePhase, ServiceControl
 from aquaflow.live.health.http import HealthServer
 from aquaflow.live.health.pilot_requests import MOST_BYTES
 from tests.live.health.reports import REPORT
@@ -25,7 +25,7 @@ class Asked:
 
     def __init__(self, token_file: Path | None) -> None:
         config = ListenConfig.model_construct(host="127.0.0.1", port=0, token_file=token_file)
-        self.control, self.jpeg = Control(), None
+        self.control, self.jpeg = ServiceControl(), None
         report = {**REPORT, "dive": {"name": "dive-1"}}
         self.server = HealthServer(
             config, lambda: report, control=self.control, picture=lambda: self.jpeg
@@ -78,7 +78,7 @@ def test_without_a_token_in_header_or_cookie_nothing_changes(guarded: Asked) -> 
     assert guarded.post("start") == 403
     assert guarded.post("start", Authorization="Bearer wrong") == 403
     assert guarded.post(f"start?token={TOKEN}") == 403  # an address may be a link
-    assert guarded.control.phase is Phase.IDLE
+    assert guarded.control.phase is DivePhase.IDLE
     assert guarded.post("start", **COOKIE) == 202
 
 
@@ -93,7 +93,7 @@ def test_another_sites_page_changes_nothing_even_with_the_cookie(guarded: Asked)
         {"Sec_Fetch_Site": "cross-site", "Origin": f"http://{own}"},
     ):
         assert guarded.post("start", **COOKIE, **foreign) == 403
-    assert guarded.control.phase is Phase.IDLE
+    assert guarded.control.phase is DivePhase.IDLE
     page = {"Origin": f"http://{own}", "Sec_Fetch_Site": "same-origin"}
     assert guarded.post("start", **COOKIE, **page) == 202
 
@@ -109,13 +109,13 @@ def test_other_addresses_and_long_bodies_are_refused(guarded: Asked) -> None:
     assert guarded.send("POST", "/health", **BEARER)[0] == 404
     assert guarded.send("POST", "/dive/start", b"x" * (MOST_BYTES + 1), **BEARER)[0] == 413
     assert guarded.send("POST", "/dive/start", Content_Length="-1", **BEARER)[0] == 400
-    assert guarded.control.phase is Phase.IDLE
+    assert guarded.control.phase is DivePhase.IDLE
     assert guarded.send("POST", "/dive/start", b"{}", **BEARER)[0] == 202
 
 
 def test_a_get_changes_nothing(guarded: Asked) -> None:
     assert guarded.send("GET", "/dive/start", **BEARER)[0] == 404
-    assert guarded.control.phase is Phase.IDLE
+    assert guarded.control.phase is DivePhase.IDLE
 
 
 def test_there_is_no_picture_before_the_first(guarded: Asked) -> None:

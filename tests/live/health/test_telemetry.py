@@ -10,7 +10,7 @@ from aquaflow.live.feed import LatestSamples
 from aquaflow.live.health.telemetry import metric_frame_numbers, newest_values
 from aquaflow.live.live_dive import LiveDive
 from aquaflow.live.report import report
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.types import (
     Acceleration,
     Altitude,
@@ -69,7 +69,7 @@ def test_the_metric_frame_is_shown_with_its_sigmas_and_why_a_source_is_not_used(
 
 
 def test_an_unknown_frame_says_why_and_states_no_number() -> None:
-    shown = metric_frame_numbers(MetricFrame.unknown("no telemetry could be used"))
+    shown = metric_frame_numbers(WorldFrame.unknown("no telemetry could be used"))
     assert (shown["metric"], shown["level"]) == (False, False)
     assert shown["metres_per_map_unit"] is shown["scale_sigma"] is shown["gravity_sigma_deg"]
     assert "no telemetry could be used" in shown["scale_source"]

@@ -13,7 +13,7 @@ import numpy as np
 from aquaflow.survey.coverage import PageView
 from aquaflow.survey.coverage.live_coverage import described
 from aquaflow.survey.coverage.picture import cells_png, coverage_png
-from aquaflow.web import Answer, Request
+from aquaflow.web import HttpRequest, HttpResponse
 from tests.live.health.reports import REPORT
 from tests.survey.coverage.surveys import survey_of
 
@@ -130,17 +130,17 @@ def with_buttons(answers: type[Any], dive: SimulatedDive) -> type[Any]:
     """The server's answers with the requests that control a dive, and its newest picture."""
 
     class Controlled(answers):  # type: ignore[misc]
-        def data(self, path: str) -> Answer:
+        def data(self, path: str) -> HttpResponse:
             if path == "/picture.jpg":
-                return Answer(200, "image/jpeg", dive.picture())
+                return HttpResponse(200, "image/jpeg", dive.picture())
             return super().data(path)
 
-        def posted(self, request: Request) -> Answer:
+        def posted(self, request: HttpRequest) -> HttpResponse:
             if not request.target.startswith("/dive/"):
                 return super().posted(request)
             if not self.access.allows(request.target, request.headers, request.peer):
-                return Answer(403, "application/json", b'{"error": "give the token"}')
+                return HttpResponse(403, "application/json", b'{"error": "give the token"}')
             code, said = dive.act(request.target.rpartition("/")[2])
-            return Answer(code, "application/json", json.dumps(said).encode())
+            return HttpResponse(code, "application/json", json.dumps(said).encode())
 
     return Controlled

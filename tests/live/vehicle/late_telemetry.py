@@ -22,8 +22,8 @@ from aquaflow.lab.synthetic import SyntheticConfig
 from aquaflow.live.vehicle.pose_output import PoseOutput
 from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.estimator import estimate
-from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.telemetry.telemetry import Telemetry
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.frames import FrameClass, Quality, Tracked
 from aquaflow.types import KIND_OF, TelemetrySample
 from tests.live.live_scenes import ToldFeed, frame_of
@@ -174,7 +174,7 @@ class Dive:
             moved = replace(sample, t_ns=stamp_ns, arrival_ns=stamp_ns + late_ns, source=device)
             self.samples.append((1e-9 * moved.arrival_ns, moved))
 
-    def frame_at(self, t_s: float) -> tuple[MetricFrame, float]:
+    def frame_at(self, t_s: float) -> tuple[WorldFrame, float]:
         """The metric frame as it is known then, and the true scale of the path until then."""
         telemetry = Telemetry()
         for arrives_s, sample in self.samples:
@@ -189,7 +189,7 @@ class Dive:
 
 def outcome_of(case: Case, until_sent: bool = False) -> Outcome:
     """Swim the dive with the pose output switched on, or until the first pose was sent."""
-    dive, feed, frame, true = Dive(case), ToldFeed(), MetricFrame.unknown(), 1.0
+    dive, feed, frame, true = Dive(case), ToldFeed(), WorldFrame.unknown(), 1.0
     out = PoseOutput(PoseConfig(enabled=True), feed, lambda sub_map: frame)
     worst = worst_relative = stated = 0.0
     first_s, due = np.inf, list(ESTIMATES_S)

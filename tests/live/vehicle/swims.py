@@ -9,10 +9,10 @@ import numpy as np
 
 from aquaflow.config.device import MountingConfig
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.live.vehicle.body_geometry import Pose
+from aquaflow.live.vehicle.body_geometry import BodyPoseInWorld
 from aquaflow.live.vehicle.pose_output import PoseOutput
-from aquaflow.telemetry.metric_frame import MetricFrame, North
 from aquaflow.telemetry.start import camera_in_body
+from aquaflow.telemetry.world_frame import North, WorldFrame
 from aquaflow.tracking.frames import FrameClass, Quality, Tracked
 from tests.live.live_scenes import Told, frame_of
 
@@ -25,34 +25,34 @@ T_NM = Sim3(so3_exp(np.array([0.4, -1.1, 0.7])), np.array([3.0, -2.0, 1.5]), 2.0
 """A map whose unit is 2.05 m, and whose axes are anything but level."""
 
 
-def frame(mounting: str | None = "forward", scale_sigma: float = 0.01) -> MetricFrame:
+def frame(mounting: str | None = "forward", scale_sigma: float = 0.01) -> WorldFrame:
     """The map's place in the world, well known."""
     sigmas = np.array([0.05, 0.05, 0.02, 0.005, 0.005, 0.02, scale_sigma])
     T_bc = None if mounting is None else camera_in_body(MOUNTINGS[mounting])
     north: North = "magnetic north"
-    return MetricFrame(
+    return WorldFrame(
         T_NM, np.diag(sigmas**2), metric=True, level=True, north=north, T_bc=T_bc,
         scale_source="autopilot",
     )  # fmt: skip
 
 
-def turned(known: MetricFrame, xi: Sequence[float]) -> MetricFrame:
+def turned(known: WorldFrame, xi: Sequence[float]) -> WorldFrame:
     """The same with a place that a new estimate moved by a tangent vector."""
     return replace(known, T_nm=Sim3.exp(np.array(xi)) @ known.T_nm)
 
 
-def diving(seconds: np.ndarray) -> list[Pose]:
+def diving(seconds: np.ndarray) -> list[BodyPoseInWorld]:
     """A vehicle that swims ahead at 0.5 m/s, turns at 0.3 rad/s and descends at 0.275 m/s."""
     poses = []
     for s in seconds:
         heading = 0.8 + 0.3 * s
         R = so3_exp(np.array([0.0, 0.0, heading]))
         ahead = 0.5 / 0.3 * np.array([np.sin(heading) - np.sin(0.8), np.cos(0.8) - np.cos(heading)])
-        poses.append(Pose(R, np.array([*ahead, 0.275 * s])))
+        poses.append(BodyPoseInWorld(R, np.array([*ahead, 0.275 * s])))
     return poses
 
 
-def seen(pose: Pose, known: MetricFrame, mounting: str = "forward") -> Sim3:
+def seen(pose: BodyPoseInWorld, known: WorldFrame, mounting: str = "forward") -> Sim3:
     """The camera's pose in the map."""
     T_nb = Sim3(pose.R, pose.t_m)
     return known.T_nm.inverse() @ T_nb @ camera_in_body(MOUNTINGS[mounting])

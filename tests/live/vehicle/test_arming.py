@@ -12,10 +12,10 @@ import pytest
 from aquaflow.base.errors import ConfigError
 from aquaflow.config.service import DiveConfig
 from aquaflow.config.vehicle import VehicleConfig
-from aquaflow.live.control import Control, Phase, RefusedError, Request
+from aquaflow.live.control import DivePhase, RefusedError, ServiceControl, ServiceRequest
 from aquaflow.live.onboard import map_live
+from aquaflow.live.service_status import ServiceStatus
 from aquaflow.live.vehicle.arming import Arming, refuse_without_autopilot
-from aquaflow.live.watched import Watched
 from aquaflow.sources.pilot import Obey
 from tests.live.live_scenes import ToldFeed
 
@@ -27,7 +27,7 @@ class LastingFeed(ToldFeed):
 
 
 BOTH = DiveConfig(begin="when_armed", finish="when_disarmed", disarmed_s=10.0, commands=True)
-SERVICE = cast(Watched, SimpleNamespace())
+SERVICE = cast(ServiceStatus, SimpleNamespace())
 
 
 class Autopilot:
@@ -45,10 +45,10 @@ class Vehicle:
     """A service, without dives, whose turns come once a second."""
 
     def __init__(self, config: DiveConfig = BOTH) -> None:
-        self.control, self.autopilot, self.now_s = Control(), Autopilot(), 0.0
+        self.control, self.autopilot, self.now_s = ServiceControl(), Autopilot(), 0.0
         self.arming = Arming(config, self.control, self.autopilot)
 
-    def seconds(self, count: int, armed: bool | None) -> list[Phase]:
+    def seconds(self, count: int, armed: bool | None) -> list[DivePhase]:
         """The phases after each turn."""
         self.autopilot.armed = armed
         phases = []
@@ -61,12 +61,12 @@ class Vehicle:
 
 def test_arming_begins_a_dive_and_disarming_finishes_it_after_a_while() -> None:
     vehicle = Vehicle()
-    assert set(vehicle.seconds(3, None) + vehicle.seconds(3, armed=False)) == {Phase.IDLE}
-    assert set(vehicle.seconds(5, armed=True)) == {Phase.MAPPING}
-    assert set(vehicle.seconds(10, armed=False)) == {Phase.MAPPING}
-    assert set(vehicle.seconds(3, armed=False)) == {Phase.FINISHING}
+    assert set(vehicle.seconds(3, None) + vehicle.seconds(3, armed=False)) == {DivePhase.IDLE}
+    assert set(vehicle.seconds(5, armed=True)) == {DivePhase.MAPPING}
+    assert set(vehicle.seconds(10, armed=False)) == {DivePhase.MAPPING}
+    assert set(vehicle.seconds(3, armed=False)) == {DivePhase.FINISHING}
     vehicle.control.ended()
-    assert set(vehicle.seconds(30, armed=False)) == {Phase.IDLE}
+    assert set(vehicle.seconds(30, armed=False)) == {DivePhase.IDLE}
 
 
 def test_a_short_disarming_belongs_to_the_dive() -> None:
@@ -74,56 +74,56 @@ def test_a_short_disarming_belongs_to_the_dive() -> None:
     vehicle.seconds(5, armed=True)
     for _ in range(3):
         vehicle.seconds(9, armed=False)
-        assert set(vehicle.seconds(9, armed=True)) == {Phase.MAPPING}
+        assert set(vehicle.seconds(9, armed=True)) == {DivePhase.MAPPING}
 
 
 def test_a_dive_that_the_pilot_finished_is_not_begun_anew_before_the_next_arming() -> None:
     vehicle = Vehicle()
     vehicle.seconds(2, armed=True)
-    vehicle.control.ask(Request.FINISH)
+    vehicle.control.ask(ServiceRequest.FINISH)
     vehicle.control.ended()
-    assert set(vehicle.seconds(5, armed=True) + vehicle.seconds(1, armed=False)) == {Phase.IDLE}
-    assert set(vehicle.seconds(2, armed=True)) == {Phase.MAPPING}
+    assert set(vehicle.seconds(5, armed=True) + vehicle.seconds(1, armed=False)) == {DivePhase.IDLE}
+    assert set(vehicle.seconds(2, armed=True)) == {DivePhase.MAPPING}
 
 
 def test_who_is_armed_while_a_dive_is_being_finished_gets_the_next_one() -> None:
     vehicle = Vehicle()
     vehicle.seconds(2, armed=True)
     vehicle.seconds(12, armed=False)
-    assert set(vehicle.seconds(3, armed=True)) == {Phase.FINISHING}
+    assert set(vehicle.seconds(3, armed=True)) == {DivePhase.FINISHING}
     vehicle.control.ended()
-    assert set(vehicle.seconds(3, armed=True)) == {Phase.MAPPING}
+    assert set(vehicle.seconds(3, armed=True)) == {DivePhase.MAPPING}
 
 
 def test_a_dive_begun_before_the_arming_is_not_finished_until_that_ended() -> None:
     vehicle = Vehicle()
-    vehicle.control.ask(Request.START)
-    assert set(vehicle.seconds(30, armed=False)) == {Phase.MAPPING}
+    vehicle.control.ask(ServiceRequest.START)
+    assert set(vehicle.seconds(30, armed=False)) == {DivePhase.MAPPING}
     vehicle.seconds(1, armed=True)
-    assert vehicle.seconds(20, armed=False)[-1] is Phase.FINISHING
+    assert vehicle.seconds(20, armed=False)[-1] is DivePhase.FINISHING
 
 
 def test_a_dive_begun_after_the_disarming_is_not_finished_by_it() -> None:
     vehicle = Vehicle()
     vehicle.seconds(2, armed=True)
-    vehicle.control.ask(Request.FINISH)
+    vehicle.control.ask(ServiceRequest.FINISH)
     vehicle.control.ended()
     vehicle.seconds(3, armed=False)
-    vehicle.control.ask(Request.START)
-    assert set(vehicle.seconds(30, armed=False)) == {Phase.MAPPING}
+    vehicle.control.ask(ServiceRequest.START)
+    assert set(vehicle.seconds(30, armed=False)) == {DivePhase.MAPPING}
 
 
 def test_a_service_that_is_ending_takes_no_orders_of_the_arming() -> None:
     vehicle = Vehicle()
     vehicle.control.stopping.set()
-    assert set(vehicle.seconds(3, armed=True)) == {Phase.IDLE}
+    assert set(vehicle.seconds(3, armed=True)) == {DivePhase.IDLE}
 
 
 def test_by_default_arming_means_nothing_and_commands_are_not_heard() -> None:
     vehicle = Vehicle(DiveConfig())
-    assert set(vehicle.seconds(5, armed=True)) == {Phase.IDLE}
-    vehicle.control.ask(Request.START)
-    assert set(vehicle.seconds(100, armed=False)) == {Phase.MAPPING}
+    assert set(vehicle.seconds(5, armed=True)) == {DivePhase.IDLE}
+    vehicle.control.ask(ServiceRequest.START)
+    assert set(vehicle.seconds(100, armed=False)) == {DivePhase.MAPPING}
     assert vehicle.autopilot.asked is None
 
 
@@ -132,7 +132,7 @@ def test_commands_are_obeyed_where_they_make_sense() -> None:
     ask = vehicle.autopilot.asked
     assert ask is not None
     assert [ask("finish"), ask("start"), ask("start"), ask("stop")] == [False, True, False, True]
-    assert vehicle.control.phase is Phase.PAUSED
+    assert vehicle.control.phase is DivePhase.PAUSED
 
 
 # --- the config -----------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from aquaflow.config.service import PoseConfig
 from aquaflow.geometry.similarity import so3_log
 from aquaflow.live.vehicle.pose_output import PoseOutput
 from aquaflow.sim_drivers.devices.visual_odometry import VisualOdometry
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from tests.drivers.simulated_links import (
     Rig,
     Running,
@@ -48,7 +48,7 @@ def introduced(session: Running) -> None:
 
 
 def swum(
-    session: Running, told: Told, out: PoseOutput, mounting: str, known: MetricFrame
+    session: Running, told: Told, out: PoseOutput, mounting: str, known: WorldFrame
 ) -> tuple[int, int]:
     """Swim the way; the autopilot's clock at its first and last frame."""
     told.feed.send = session.telemetry.send  # type: ignore[method-assign]
@@ -115,7 +115,7 @@ def test_an_ardusub_hears_of_a_jump_by_its_reset_counter(told: Told, tmp_path: P
     rig, corrected = mavlink_udp(tmp_path), turned(frame(), [0.5, 0, 0, 0, 0, 0, 0])
     asked: list[int] = []
 
-    def frame_of(sub_map: int) -> MetricFrame:
+    def frame_of(sub_map: int) -> WorldFrame:
         asked.append(sub_map)
         return frame() if len(asked) <= 10 else corrected
 
@@ -130,7 +130,7 @@ def test_an_ardusub_hears_of_a_jump_by_its_reset_counter(told: Told, tmp_path: P
 
 def test_an_ardusub_gets_no_pose_from_a_map_without_metres(told: Told, tmp_path: Path) -> None:
     rig = mavlink_udp(tmp_path)
-    out = PoseOutput(PoseConfig(), told.feed, lambda sub_map: MetricFrame.unknown())
+    out = PoseOutput(PoseConfig(), told.feed, lambda sub_map: WorldFrame.unknown())
     with running(rig, motion(), speed=1.0) as session:
         introduced(session)
         swum(session, told, out, "forward", frame())

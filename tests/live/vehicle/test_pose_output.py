@@ -23,8 +23,8 @@ from aquaflow.live.onboard import map_live
 from aquaflow.live.report import report
 from aquaflow.live.vehicle.pose_output import PoseOutput, Withheld
 from aquaflow.live.vehicle.scale_sources import refuse_without_scale
-from aquaflow.sources.outbound import BodyMotion, BodyPose
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.sources.outbound import BodyPose, BodyPoseChange
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.frames import FrameClass, Tracked
 from tests.live.health.reports import REPORT
 from tests.live.live_scenes import VEHICLE, Told, ToldFeed, frame_of
@@ -42,11 +42,11 @@ def told(tmp_path: Path) -> Iterator[Told]:
     told.close()
 
 
-def output(told: Told, known: MetricFrame, **settings: Any) -> PoseOutput:
+def output(told: Told, known: WorldFrame, **settings: Any) -> PoseOutput:
     return PoseOutput(PoseConfig(enabled=True, **settings), told.feed, lambda sub_map: known)
 
 
-def dive(told: Told, out: PoseOutput, known: MetricFrame, mounting: str = "forward") -> None:
+def dive(told: Told, out: PoseOutput, known: WorldFrame, mounting: str = "forward") -> None:
     for pose in diving(SECONDS):
         show(told, out, seen(pose, known, mounting))
 
@@ -79,7 +79,7 @@ def test_the_stated_mounting_counts_where_the_frame_knows_none(told: Told) -> No
 
 
 UNUSABLE = {
-    Withheld.NO_SCALE: MetricFrame.unknown(),
+    Withheld.NO_SCALE: WorldFrame.unknown(),
     Withheld.VAGUE_SCALE: frame(scale_sigma=0.06),
     Withheld.NOT_LEVEL: replace(frame(), level=False),
     Withheld.NO_MOUNTING: frame(None),
@@ -108,7 +108,7 @@ def test_a_sigma_that_is_not_a_number_sends_nothing(told: Told) -> None:
 
 
 def test_poses_begin_when_the_scale_becomes_known_during_the_dive(told: Told) -> None:
-    known = MetricFrame.unknown()
+    known = WorldFrame.unknown()
     out = PoseOutput(PoseConfig(), told.feed, lambda sub_map: known)
     path = diving(SECONDS)
     for k, pose in enumerate(path):
@@ -271,7 +271,7 @@ def test_motions_are_in_the_axes_of_the_body_and_never_span_a_jump(told: Told) -
     for k, pose in enumerate(path):
         T = seen(pose, known, "down")
         show(told, out, Sim3(T.R, T.t + ASIDE, T.scale) if k >= 10 else T)
-    motions = [word for word in told.feed.told if isinstance(word, BodyMotion)]
+    motions = [word for word in told.feed.told if isinstance(word, BodyPoseChange)]
     assert len(motions) == len(path) - 2
     step = path[4].R.T @ (path[4].t_m - path[3].t_m)
     for motion in motions:
@@ -285,7 +285,7 @@ def test_motions_need_metres_too_but_no_gravity(told: Told) -> None:
     out = output(told, known, message="vision_position_delta")
     dive(told, out, known)
     assert out.sent == len(SECONDS) - 1
-    blind = output(told, MetricFrame.unknown(), message="vision_position_delta")
+    blind = output(told, WorldFrame.unknown(), message="vision_position_delta")
     dive(told, blind, known)
     assert blind.withheld == {Withheld.NO_SCALE: len(SECONDS)}
 

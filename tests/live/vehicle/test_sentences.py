@@ -14,11 +14,11 @@ import pytest
 from aquaflow.live.health import sentences
 from aquaflow.live.health.degradation import DegradationLevel, deepest
 from aquaflow.live.health.pressure import Shortage
-from aquaflow.live.health.state import State
+from aquaflow.live.health.state import ServiceState
 from aquaflow.live.vehicle.pilot_messages import REPEAT_S, SEVERITY, SPACING_S, PilotMessages
 from aquaflow.sources.outbound import LONGEST_TEXT, StatusText
 from aquaflow.survey.coverage.hints import SENTENCES
-from aquaflow.tracking.consistency import Cause, Finding
+from aquaflow.tracking.consistency import Cause, InconsistentKeyframe
 from tests.live.live_scenes import CALM, Told
 
 NAMES = ["a", "dvl", "front", "usb_camera_2", *("n" * length for length in range(10, 61, 3))]
@@ -46,7 +46,7 @@ def told(tmp_path: Path) -> Iterator[Told]:
 
 
 def test_every_state_and_every_cause_has_its_sentence() -> None:
-    assert set(sentences.OF_STATE) == set(State)
+    assert set(sentences.OF_STATE) == set(ServiceState)
     assert set(sentences.OF_CAUSE) == set(Cause)
     assert set(sentences.OF_LEVEL) == set(LEVELS)
     assert set(sentences.OF_SHORTAGE) == set(Shortage)
@@ -73,7 +73,7 @@ def link(state: str, reason: str = "no byte for 10 s") -> dict[str, object]:
     return {"kind": "link", "state": state, "reason": reason}
 
 
-def heard_in(told: Told, said: str = "pp", first: int = 0) -> tuple[State, tuple[str, ...]]:
+def heard_in(told: Told, said: str = "pp", first: int = 0) -> tuple[ServiceState, tuple[str, ...]]:
     """State and sentences after some frames; each is one of those that are tested above."""
     told.frames(said, first=first)
     health = told.loop.health
@@ -84,7 +84,7 @@ def heard_in(told: Told, said: str = "pp", first: int = 0) -> tuple[State, tuple
 def test_links_are_named_and_said_to_be_lost_or_never_heard(told: Told) -> None:
     told.feed.devices = {"dvl": link("lost"), "front": link("waiting"), LONG: link("lost")}
     assert heard_in(told) == (
-        State.DEGRADED,
+        ServiceState.DEGRADED,
         ("AquaFlow: link dvl is lost.", "AquaFlow: nothing heard of front.",
          "AquaFlow: a link is lost."),
     )  # fmt: skip
@@ -96,7 +96,7 @@ def test_the_camera_that_is_silent_is_named(told: Told) -> None:
     told.idle(10.0)
     health = told.loop.health
     assert (health.state, health.sentences) == (
-        State.WAITING,
+        ServiceState.WAITING,
         ("AquaFlow: no picture from camera front.",),
     )
 
@@ -132,7 +132,7 @@ def test_disk_recorder_map_and_stages_are_told(told: Told) -> None:
     for _ in range(3):
         told.slam.failures.record("water fit", ValueError("odd"))
     state, heard = heard_in(told, first=5)
-    assert state is State.DEGRADED
+    assert state is ServiceState.DEGRADED
     assert heard == (
         sentences.DISK_FULL, sentences.MAPPING_FAILS, sentences.STAGE_FAILS,
         sentences.NOT_RECORDING,
@@ -143,9 +143,9 @@ def test_disk_recorder_map_and_stages_are_told(told: Told) -> None:
 def test_every_finding_of_the_monitor_is_told(told: Told, cause: Cause) -> None:
     told.frames("pp")
     monitor = told.slam.tracker.monitor
-    monitor.counts.add(Finding(1, 0, cause, 1.2))
+    monitor.counts.add(InconsistentKeyframe(1, 0, cause, 1.2))
     monitor._frames_since = 0
-    assert heard_in(told, "p", 5) == (State.INCONSISTENT, (sentences.OF_CAUSE[cause],))
+    assert heard_in(told, "p", 5) == (ServiceState.INCONSISTENT, (sentences.OF_CAUSE[cause],))
 
 
 # --- how often ------------------------------------------------------------------------------------
@@ -156,9 +156,13 @@ def said(told: Told) -> list[StatusText]:
 
 
 def test_the_urgency_is_that_of_the_state() -> None:
-    assert SEVERITY[State.WAITING] == "error"
-    assert SEVERITY[State.LOST] == SEVERITY[State.DEGRADED] == "warning"
-    assert SEVERITY.get(State.STOPPING, "info") == SEVERITY.get(State.STARTING, "info") == "info"
+    assert SEVERITY[ServiceState.WAITING] == "error"
+    assert SEVERITY[ServiceState.LOST] == SEVERITY[ServiceState.DEGRADED] == "warning"
+    assert (
+        SEVERITY.get(ServiceState.STOPPING, "info")
+        == SEVERITY.get(ServiceState.STARTING, "info")
+        == "info"
+    )
 
 
 def test_each_trouble_is_told_once_while_it_lasts_and_a_second_one_is_not_hidden(
@@ -185,8 +189,10 @@ def test_a_state_that_flaps_repeats_no_sentence_too_soon(told: Told) -> None:
     report, draw = PilotMessages(told.config.report, told.feed), random.Random(0)
     health, when = told.loop.health, {}
     for tenth in range(6000):
-        state = draw.choice([State.TRACKING, State.LOST, State.DEGRADED, State.WAITING])
-        troubles = ("AquaFlow: link dvl is lost.",) if state is State.DEGRADED else ()
+        state = draw.choice(
+            [ServiceState.TRACKING, ServiceState.LOST, ServiceState.DEGRADED, ServiceState.WAITING]
+        )
+        troubles = ("AquaFlow: link dvl is lost.",) if state is ServiceState.DEGRADED else ()
         health.set(state, "it flaps", troubles)
         before = len(said(told))
         report.update(told.loop, tenth / 10)
@@ -202,12 +208,19 @@ def test_a_state_that_flaps_repeats_no_sentence_too_soon(told: Told) -> None:
 
 def test_a_state_that_came_back_too_soon_is_told_when_it_may_be(told: Told) -> None:
     report, health = PilotMessages(told.config.report, told.feed), told.loop.health
-    for second, state in ((0, State.LOST), (2, State.TRACKING), (4, State.LOST)):
+    for second, state in (
+        (0, ServiceState.LOST),
+        (2, ServiceState.TRACKING),
+        (4, ServiceState.LOST),
+    ):
         health.set(state, "it flaps")
         report.update(told.loop, float(second))
     for second in range(5, 30):
         report.update(told.loop, float(second))
-    lost, tracking = sentences.OF_STATE[State.LOST], sentences.OF_STATE[State.TRACKING]
+    lost, tracking = (
+        sentences.OF_STATE[ServiceState.LOST],
+        sentences.OF_STATE[ServiceState.TRACKING],
+    )
     assert [word.text for word in said(told)] == [lost, tracking, lost]
 
 
@@ -217,7 +230,7 @@ def test_the_end_of_the_service_is_told(told: Told) -> None:
     told.frames("pp")
     told.loop.vitals.stop("stop requested", 1.0)
     told.loop.tell_watchers()
-    assert [word.text for word in said(told)][-1] == sentences.OF_STATE[State.STOPPING]
+    assert [word.text for word in said(told)][-1] == sentences.OF_STATE[ServiceState.STOPPING]
 
 
 def test_nothing_is_told_where_the_config_says_so(tmp_path: Path) -> None:

@@ -18,8 +18,8 @@ from aquaflow.geometry.similarity import so3_exp
 from aquaflow.live.vehicle.pilot_messages import PilotMessages
 from aquaflow.sources.outbound import (
     LONGEST_TEXT,
-    BodyMotion,
     BodyPose,
+    BodyPoseChange,
     NamedValue,
     OutboundMessage,
     StatusText,
@@ -84,7 +84,9 @@ def body(R: np.ndarray | None = None, x: float = 1.5, north: bool = False) -> Bo
     )  # fmt: skip
 
 
-MOTION = BodyMotion(4_900_000_000, 100_000_000, np.array([0, 0, 0.1]), np.array([1.0, 0, 0]), 0.5)
+MOTION = BodyPoseChange(
+    4_900_000_000, 100_000_000, np.array([0, 0, 0.1]), np.array([1.0, 0, 0]), 0.5
+)
 
 
 def test_every_word_arrives_as_its_message() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.survey.change.m3c2 import Cloud, Distances, Scales, m3c2, normals_at
+from aquaflow.survey.change.m3c2 import DayPoints, Scales, SurfaceDistances, m3c2, normals_at
 
 Array = npt.NDArray[np.float64]
 
@@ -13,12 +13,12 @@ SCALES = Scales(normal=0.2, cylinder=0.06, reach=0.5, apart=0.001)
 """Points of these clouds err independently."""
 
 
-def ground(seed: int, noise: float, height: float = 0.0, count: int = 6000) -> Cloud:
+def ground(seed: int, noise: float, height: float = 0.0, count: int = 6000) -> DayPoints:
     """A level square of 2 m with white noise."""
     random = np.random.default_rng(seed)
     xy = random.uniform(-1.0, 1.0, (count, 2))
     z = height + noise * random.standard_normal(count)
-    return Cloud(np.column_stack([xy, z]), np.zeros(count))
+    return DayPoints(np.column_stack([xy, z]), np.zeros(count))
 
 
 def cores(seed: int = 9, count: int = 400) -> Array:
@@ -28,8 +28,8 @@ def cores(seed: int = 9, count: int = 400) -> Array:
 
 
 def compared(
-    first: Cloud, second: Cloud, places: Array, up: Array, of_surfaces: bool = False
-) -> Distances:
+    first: DayPoints, second: DayPoints, places: Array, up: Array, of_surfaces: bool = False
+) -> SurfaceDistances:
     """M3C2 with normals of the first cloud, towards ``up``."""
     towards = np.tile(up, (len(first.points), 1))
     normals = normals_at(places, first.points, towards, SCALES.normal)

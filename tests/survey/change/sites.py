@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.survey.change.comparison import Comparison, compare
+from aquaflow.survey.change.comparison import SurfaceComparison, compare
 from aquaflow.survey.change.moved import with_moves
 from aquaflow.survey.change.patches import Patch, find_patches
 from aquaflow.survey.change.registration import Registration
@@ -89,7 +89,7 @@ KNOWN = Registration(Sim3.identity(), np.diag(np.full(7, 1e-8)), np.zeros(3), 0.
 """Days in one frame."""
 
 
-def changes(first: Surface, second: Surface) -> tuple[list[Patch], Comparison]:
+def changes(first: Surface, second: Surface) -> tuple[list[Patch], SurfaceComparison]:
     """All that changed."""
     found = compare(first, second, KNOWN, 0.05, None, 0.4, lambda what, done, total: None)
     patches, found = find_patches(found, first, second)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from aquaflow.survey.change.m3c2 import LEAST_POINTS, Cloud, m3c2, normals_at
+from aquaflow.survey.change.m3c2 import LEAST_POINTS, DayPoints, m3c2, normals_at
 from tests.survey.change.clouds import SCALES, compared, cores, ground
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -59,7 +59,9 @@ def test_registration_widens_the_level_and_moves_nothing() -> None:
 
 def test_a_place_that_one_day_alone_shows_has_no_distance() -> None:
     first, second = ground(1, 0.005), ground(2, 0.005)
-    half = Cloud(second.points[second.points[:, 0] < 0.0], second.sigma[second.points[:, 0] < 0.0])
+    half = DayPoints(
+        second.points[second.points[:, 0] < 0.0], second.sigma[second.points[:, 0] < 0.0]
+    )
     places = cores()
     found = compared(first, half, places, UP)
     assert found.seen[places[:, 0] < -0.1].all()
@@ -77,7 +79,7 @@ def test_a_surface_that_is_still_there_counts_before_another_behind_it() -> None
     """An overhang: the second day also shows what is 0.3 below."""
     below = ground(3, 0.002, -0.3, 20000)
     both = ground(2, 0.002)
-    layers = Cloud(np.vstack([both.points, below.points]), np.zeros(26000))
+    layers = DayPoints(np.vstack([both.points, below.points]), np.zeros(26000))
     nearest = compared(ground(1, 0.002), layers, cores(), UP, of_surfaces=True)
     assert np.abs(nearest.distance).max() < 0.01
     mixed = compared(ground(1, 0.002), layers, cores(), UP)

@@ -14,7 +14,7 @@ from aquaflow.survey.change.frames import in_site, on_earth, read_transform
 from aquaflow.survey.change.registration import register
 from aquaflow.survey.change.relief import best_shift, filled, hull_of
 from aquaflow.survey.change.significance import discoveries, measured_spread, null_spread, two_sided
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 
 def relief(seed: int, noise: float) -> np.ndarray:
@@ -117,7 +117,7 @@ def test_holes_of_heights_are_filled_and_hulls_hold_their_cells() -> None:
 
 
 def test_dives_without_a_place_on_earth_lie_in_one_frame() -> None:
-    assert on_earth(MetricFrame.unknown(), MetricFrame.unknown()).scale == 1.0
+    assert on_earth(WorldFrame.unknown(), WorldFrame.unknown()).scale == 1.0
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.survey.coverage import PageView, page_view
 from aquaflow.survey.coverage.footprint import BLOCKS, Footprint
 from aquaflow.survey.coverage.sub_map_coverage import SubMapCoverage
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 Array = npt.NDArray[np.float64]
 
@@ -85,11 +85,11 @@ def sides_at(
     return np.asarray(sum(((side == each) & seen).any(axis=-1) for each in kinds))
 
 
-def metric(scale: float = 1.0, heading: float = 0.0) -> MetricFrame:
+def metric(scale: float = 1.0, heading: float = 0.0) -> WorldFrame:
     """A level frame in metres for worlds whose page is x, y: n is north-east-down."""
     to_ned = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     turn = so3_exp(np.array([0.0, 0.0, heading]))
-    return MetricFrame(
+    return WorldFrame(
         Sim3(turn @ to_ned, np.array([5.0, -3.0, 1.0]), scale), 1e-4 * np.eye(7), metric=True,
         level=True, north="true north",
     )  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from aquaflow.base.errors import InputError
-from aquaflow.survey.coverage.classes import Seen
+from aquaflow.survey.coverage.classes import CoverageClass
 from aquaflow.survey.coverage.coverage_file import read_coverage_file, write_coverage_file
 from tests.survey.coverage.surveys import lawnmower, survey_of
 
@@ -22,7 +22,7 @@ def test_a_view_comes_back_as_it_was(tmp_path: Path) -> None:
     for name in ("classes", "views", "nearest", "directions"):
         assert np.array_equal(getattr(again.plan, name), getattr(view.plan, name))
     assert (again.unit, again.up, again.state.overlap) == (view.unit, view.up, view.state.overlap)
-    assert again.area(Seen.WELL) == view.area(Seen.WELL)
+    assert again.area(CoverageClass.WELL) == view.area(CoverageClass.WELL)
     places = view.path + np.array([0.3, 0.4])
     assert np.array_equal(again.classes_at(places), view.classes_at(places))
     assert again.state.suggestion is not None

@@ -9,11 +9,11 @@ import pytest
 
 from aquaflow.config.coverage import CoverageConfig
 from aquaflow.survey.coverage import page_view
-from aquaflow.survey.coverage.classes import Seen
+from aquaflow.survey.coverage.classes import CoverageClass
 from aquaflow.survey.coverage.next_line import LineState, line_state
 from aquaflow.survey.coverage.page_view import PageView
 from aquaflow.survey.coverage.survey_lines import MOST_POINTS, survey_lines
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from tests.survey.coverage.surveys import HEIGHT, WIDTH, lawnmower, metric, surveyed
 
 CONFIG = CoverageConfig()
@@ -33,7 +33,7 @@ def state(path: np.ndarray, overlap: float = 0.6, covered: object = nothing) -> 
 
 
 def viewed(
-    path: np.ndarray, frame: MetricFrame | None = None, limit: float | None = None
+    path: np.ndarray, frame: WorldFrame | None = None, limit: float | None = None
 ) -> PageView:
     centres = np.column_stack([path, np.full(len(path), 2.0)])
     view = page_view(0, surveyed(path), centres, frame or metric(), limit, CONFIG)
@@ -122,24 +122,28 @@ def test_the_page_shows_lines_and_areas_in_the_dives_unit(scale: float, heading:
     assert view.state.swath == pytest.approx(scale * WIDTH, rel=0.01)
     assert view.state.overlap == pytest.approx(0.6, abs=0.02)
     assert [each.length for each in view.state.lines] == pytest.approx([scale * 9.9] * 3, rel=0.03)
-    area = sum(view.area(seen) for seen in Seen)
+    area = sum(view.area(seen) for seen in CoverageClass)
     assert area == pytest.approx(scale**2 * (9.9 + HEIGHT) * (1.92 + WIDTH), rel=0.01)
 
 
 def test_places_of_the_page_have_the_class_of_the_cell_there() -> None:
     view = viewed(lawnmower(1, 6.0, 1.0, 0.45), metric(0.5, 0.7))
     on, off = view.path.mean(axis=0), view.path.mean(axis=0) + 3.0
-    assert view.classes_at(np.array([on, off])).tolist() == [Seen.WELL, Seen.NOT]
+    assert view.classes_at(np.array([on, off])).tolist() == [CoverageClass.WELL, CoverageClass.NOT]
 
 
 def test_points_of_the_map_have_the_class_of_the_cell_below_them() -> None:
     plan = viewed(lawnmower(1, 6.0, 1.0, 0.45)).plan
     points = np.array([[0.0, 3.0, -0.4], [0.0, 3.0, 0.2], [5.0, 3.0, 0.0]])
-    assert plan.classes_of(points).tolist() == [Seen.WELL, Seen.WELL, Seen.NOT]
+    assert plan.classes_of(points).tolist() == [
+        CoverageClass.WELL,
+        CoverageClass.WELL,
+        CoverageClass.NOT,
+    ]
 
 
 def test_without_gravity_the_page_is_in_map_units() -> None:
-    unknown = replace(MetricFrame.unknown(), scale_source="none")
+    unknown = replace(WorldFrame.unknown(), scale_source="none")
     view = viewed(lawnmower(2, 6.0, 1.0, 0.45), unknown)
     assert view.unit == "map units"
     assert view.state.swath > 0.0

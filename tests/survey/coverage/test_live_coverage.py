@@ -13,7 +13,7 @@ from PIL import Image
 from aquaflow.config.service import ListenConfig
 from aquaflow.live.health.http import HealthServer
 from aquaflow.live.plan_view import PlanView
-from aquaflow.survey.coverage.classes import Seen
+from aquaflow.survey.coverage.classes import CoverageClass
 from aquaflow.survey.coverage.hints import Hint
 from aquaflow.survey.coverage.picture import HEIGHT, WIDTH
 from tests.live.health.reports import REPORT
@@ -44,7 +44,7 @@ def test_a_survey_is_shown_with_its_lines_areas_and_the_waters_range(dive: Cover
     assert said["next_line"]["new_share"] > 0.3
     plan = dive.live.plan(0)
     assert plan is not None
-    assert plan.cells[Seen.WELL] * (plan.frame.cell**2) > 0.0
+    assert plan.cells[CoverageClass.WELL] * (plan.frame.cell**2) > 0.0
     assert dive.live.plan(7) is None
     page = PlanView(lambda: dive.parts, coverage=dive.live).to_json()
     assert page["hints"] == []

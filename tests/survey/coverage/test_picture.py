@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from aquaflow.survey.coverage.classes import COLOURS, Seen
+from aquaflow.survey.coverage.classes import COLOURS, CoverageClass
 from aquaflow.survey.coverage.picture import (  # fmt: skip
     HEIGHT,
     NEXT,
@@ -40,7 +40,7 @@ def test_each_pixel_of_the_plan_has_the_class_of_its_place() -> None:
     corner, off = VIEW.path[0] + [0.4, 0.2], VIEW.path[0] - [4.0, 0.0]
     for place in (corner, off):
         x, y = fit.px(place).astype(int)
-        seen = Seen(int(VIEW.classes_at(place)))
+        seen = CoverageClass(int(VIEW.classes_at(place)))
         if 0 <= x < WIDTH:
             assert tuple(pixels[y, x, :3]) == COLOURS.get(seen, (250, 251, 251))
 
@@ -52,7 +52,7 @@ def test_the_cells_lie_on_the_page_where_they_were_seen() -> None:
     places = np.dstack([u, v, np.ones_like(u)]) @ affine.T
     classes = VIEW.classes_at(places)
     assert (classes == VIEW.plan.classes[::-1]).all()
-    assert ((pixels[..., 3] == 0) == (classes == Seen.NOT)).all()
+    assert ((pixels[..., 3] == 0) == (classes == CoverageClass.NOT)).all()
     for seen, colour in COLOURS.items():
         assert (pixels[classes == seen][:, :3] == colour).all()
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from aquaflow.config.coverage import CoverageConfig
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.survey.coverage import sub_map_coverage
-from aquaflow.survey.coverage.classes import Seen
+from aquaflow.survey.coverage.classes import CoverageClass
 from aquaflow.survey.coverage.footprint import BLOCKS, Footprint
-from aquaflow.survey.coverage.layer import Layer
+from aquaflow.survey.coverage.layer import CoverageLayer
 from aquaflow.survey.coverage.plan import CoveragePlan, plan_of
 from aquaflow.survey.coverage.raster import cells_seen
 from aquaflow.survey.coverage.sub_map_coverage import REDRAWN, SubMapCoverage
@@ -47,7 +47,7 @@ def centres(plan: CoveragePlan) -> np.ndarray:
     return np.dstack([x, y]) * plan.cell + plan.corner
 
 
-def same(left: Layer, right: Layer) -> bool:
+def same(left: CoverageLayer, right: CoverageLayer) -> bool:
     a, b = left.tiles.tiles, right.tiles.tiles
     return a.keys() == b.keys() and all(
         np.array_equal(a[key].by_range, b[key].by_range)
@@ -72,27 +72,30 @@ def test_areas_are_those_of_the_rectangles() -> None:
     path = lawnmower(4, 8.0, 1.0, 0.45)
     plan = shown(surveyed(path))
     whole = (8.0 - 8.0 % 0.45 + HEIGHT) * (3 * 1.0 + WIDTH)
-    area = sum(plan.area(seen) for seen in Seen)
+    area = sum(plan.area(seen) for seen in CoverageClass)
     assert area == pytest.approx(whole, rel=0.01)
     fine = np.dstack(np.meshgrid(np.arange(-1.3, 4.4, 0.05), np.arange(-1.0, 9.0, 0.05)))
     enough = views_at(fine, path) >= CONFIG.least_views
     well = (enough & (sides_at(fine, path) >= CONFIG.least_directions)).mean() * 5.7 * 10.0
-    assert plan.area(Seen.WELL) == pytest.approx(well, rel=0.03)
+    assert plan.area(CoverageClass.WELL) == pytest.approx(well, rel=0.03)
 
 
 def test_one_pass_without_overlap_is_seen_sparsely_and_beyond_it_nothing() -> None:
     path = lawnmower(1, 9.0, 1.0, HEIGHT)
     plan = shown(surveyed(path))
-    assert set(np.unique(plan.classes)) == {Seen.NOT, Seen.SPARSE}
+    assert set(np.unique(plan.classes)) == {CoverageClass.NOT, CoverageClass.SPARSE}
     assert plan.classes_at(np.array([[0.0, 3.0], [0.0, 14.0], [WIDTH, 3.0]])).tolist() == [2, 0, 0]
 
 
 def test_what_only_views_from_beyond_the_waters_range_show_is_too_far() -> None:
     coverage = surveyed(lawnmower(1, 4.0, 1.0, 0.4))
     near, far = shown(coverage, 1.4 * ALTITUDE), shown(coverage, 0.5 * ALTITUDE)
-    assert near.area(Seen.TOO_FAR) == 0.0
-    assert near.area(Seen.WELL) > 0.0
-    assert {Seen(each) for each in np.unique(far.classes)} == {Seen.NOT, Seen.TOO_FAR}
+    assert near.area(CoverageClass.TOO_FAR) == 0.0
+    assert near.area(CoverageClass.WELL) > 0.0
+    assert {CoverageClass(each) for each in np.unique(far.classes)} == {
+        CoverageClass.NOT,
+        CoverageClass.TOO_FAR,
+    }
 
 
 def test_the_nearest_range_is_known_to_a_bin() -> None:
@@ -117,7 +120,7 @@ def test_views_from_one_side_alone_are_one_direction() -> None:
     plan = shown(coverage)
     directions = plan.directions[centres_are_near(plan, 0.2)]
     assert (directions == 1).all()
-    assert (plan.classes[centres_are_near(plan, 0.2)] == Seen.SPARSE).all()
+    assert (plan.classes[centres_are_near(plan, 0.2)] == CoverageClass.SPARSE).all()
 
 
 MOVES = st.lists(
@@ -143,7 +146,7 @@ def test_after_similarities_of_keyframes_the_counts_are_those_of_a_grid_made_ane
         coverage.update(most)
     coverage.settle()
     assert coverage.layer is not None
-    anew = Layer(coverage.layer.frame)
+    anew = CoverageLayer(coverage.layer.frame)
     for number, sight in coverage.seen.items():
         anew.draw(number, sight)
     assert same(coverage.layer, anew)
@@ -157,11 +160,11 @@ def test_another_unit_of_the_whole_map_changes_shares_by_no_more_than_the_cells_
 ) -> None:
     path = lawnmower(2, 4.0, 1.0, 0.45)
     coverage = surveyed(path)
-    before = shown(coverage).area(Seen.WELL)
+    before = shown(coverage).area(CoverageClass.WELL)
     larger = Sim3(np.eye(3), np.zeros(3), scale)
     coverage.move({number: larger @ T for number, (_, T) in coverage.seen.items()})
     coverage.settle()
-    assert shown(coverage).area(Seen.WELL) == pytest.approx(scale**2 * before, rel=0.1)
+    assert shown(coverage).area(CoverageClass.WELL) == pytest.approx(scale**2 * before, rel=0.1)
 
 
 def test_what_moves_by_less_than_a_fraction_of_a_cell_waits_for_the_end() -> None:
@@ -208,7 +211,7 @@ def test_while_the_grid_is_made_anew_the_one_of_before_is_shown_and_grows() -> N
     assert coverage.settled
     assert coverage.layer is not before
     plan, alone = shown(coverage), shown(surveyed(path))
-    area, before = (sum(each.area(seen) for seen in Seen) for each in (plan, alone))
+    area, before = (sum(each.area(seen) for seen in CoverageClass) for each in (plan, alone))
     assert area == pytest.approx(before + WIDTH * HEIGHT, rel=0.02)
 
 
@@ -227,7 +230,7 @@ def test_a_long_dive_takes_larger_cells_and_bounded_memory(
     assert coverage.layer is not None
     assert coverage.layer.frame.cell > 1.9 * HEIGHT / 16
     assert largest <= 1.1 * 180 * TILE_BYTES
-    area = sum(shown(coverage).area(seen) for seen in Seen)
+    area = sum(shown(coverage).area(seen) for seen in CoverageClass)
     assert area == pytest.approx(WIDTH * (299 * 0.9 + HEIGHT), rel=0.1)
 
 

@@ -20,7 +20,7 @@ from aquaflow.mapping.mapper import Mapper
 from aquaflow.mapping.restoration import to_bytes
 from aquaflow.render.activation import radiance
 from aquaflow.telemetry.metric_file import write_metric_file
-from aquaflow.telemetry.metric_frame import MetricFrame, Origin
+from aquaflow.telemetry.world_frame import Origin, WorldFrame
 from tests.mapping.mapping_scenes import CAMERA, floor, pose, renderer, view_of
 
 THICKNESS, SPREAD = 0.01, 0.06
@@ -38,10 +38,10 @@ SCALE, SHIFT = 1.5, (10.0, 20.0, 0.5)
 ORIGIN = Origin(latitude_deg=59.3, longitude_deg=10.4, source="test", sigma_m=1.0)
 
 
-def north_up_frame() -> MetricFrame:
+def north_up_frame() -> WorldFrame:
     """Metric and on the earth: the first camera looks straight down, its picture's top is north."""
     R = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    return MetricFrame(
+    return WorldFrame(
         Sim3(R, np.array(SHIFT), SCALE), np.eye(7) * 1e-4, metric=True, level=True,
         north="true north", depth_known=True, origin=ORIGIN,
     )  # fmt: skip
@@ -70,7 +70,7 @@ def _waves(
     return 0.5 + 0.35 * torch.sin(torch.stack(phases, dim=1))
 
 
-def write_small_dive(folder: Path, frame: MetricFrame | None = None) -> Mapper:
+def write_small_dive(folder: Path, frame: WorldFrame | None = None) -> Mapper:
     """The dive in ``folder``, which is made; in map units unless a ``frame`` says more."""
     folder.mkdir()
     mapper = small_mapper()
@@ -79,7 +79,7 @@ def write_small_dive(folder: Path, frame: MetricFrame | None = None) -> Mapper:
     write_yaml(folder / "config.yaml", Config.model_validate(source).model_dump(mode="json"))
     if frame is not None:
         write_metric_file(folder, {0: frame}, main=0)
-    T_nm = (frame or MetricFrame.unknown()).T_nm
+    T_nm = (frame or WorldFrame.unknown()).T_nm
     for name, share in (("map_clear", 1.0), ("map", 0.5)):
         write_ply(folder / f"{name}.ply", _splats(mapper, share).transformed(T_nm))
     return mapper

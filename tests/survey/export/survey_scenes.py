@@ -18,7 +18,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.views import View
 from aquaflow.telemetry.metric_file import write_metric_file
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from tests.mapping.mapping_scenes import gaussians_at, renderer
 from tests.metric_scenes import TRONDHEIM, metric_frame
 
@@ -58,7 +58,7 @@ def colour(
     return np.stack([red, green, blue], axis=-1)
 
 
-def surveyed(frame: MetricFrame | None = None) -> Mapper:
+def surveyed(frame: WorldFrame | None = None) -> Mapper:
     """The map of the ground as an ideal survey would make it, in the world of ``frame``."""
     T_mn = (frame or metric_frame()).T_nm.inverse()
     steps = np.arange(0.5 * SPACING_M, SIDE_M, SPACING_M)
@@ -78,7 +78,7 @@ def surveyed(frame: MetricFrame | None = None) -> Mapper:
     return mapper
 
 
-def write_survey(folder: Path, mapper: Mapper, frame: MetricFrame | None = None) -> Path:
+def write_survey(folder: Path, mapper: Mapper, frame: WorldFrame | None = None) -> Path:
     """The dive folder of a map in ``frame``."""
     folder.mkdir()
     write_map_file(folder / "map.aqf", mapper)

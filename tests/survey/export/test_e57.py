@@ -16,7 +16,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.cli import app
 from aquaflow.dive import point_cloud
 from aquaflow.dive.dive import Dive
-from aquaflow.dive.point_cloud import Points, read_point_cloud
+from aquaflow.dive.point_cloud import CloudPoints, read_point_cloud
 from aquaflow.survey.export.e57 import COLOURS, NORMALS, POSITIONS, SIGMA, write_e57
 from tests.survey.export.small_dive import north_up_frame, write_small_dive
 
@@ -29,7 +29,7 @@ def dive(tmp_path: Path) -> Path:
     return tmp_path / "dive"
 
 
-def all_points(dive: Path) -> Points:
+def all_points(dive: Path) -> CloudPoints:
     (points,) = read_point_cloud(Dive(dive)).chunks()
     return points
 

@@ -21,7 +21,7 @@ from aquaflow.dive.placement import placement
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.export.mesh import export_mesh as export_module
 from aquaflow.survey.export.mesh.export_mesh import export_mesh
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from tests.metric_scenes import metric_frame
 from tests.survey.export.small_dive import WATER, small_mapper, write_small_dive
 from tests.survey.export.survey_scenes import (
@@ -164,7 +164,7 @@ def test_a_glb_is_unlit_and_its_parts_are_aligned(written: dict[str, Path]) -> N
 def test_a_dive_in_map_units_says_so_and_water_colours_it(tmp_path: Path) -> None:
     mapper = surveyed(metric_frame(T_nm=Sim3.identity()))
     mapper.medium.set_water(*(torch.tensor(values) for values in WATER))
-    dive = write_survey(tmp_path / "dive", mapper, MetricFrame.unknown())
+    dive = write_survey(tmp_path / "dive", mapper, WorldFrame.unknown())
     clear = export_mesh(Dive(dive), tmp_path / "clear.ply", "ply")
     assert clear.where.unit == "map units"
     assert clear.seen == "without water"

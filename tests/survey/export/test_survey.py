@@ -22,7 +22,7 @@ from aquaflow.dive.dive import Dive
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.export.ortho import grid as grid_module
 from aquaflow.survey.export.ortho.survey import export_survey
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from tests.metric_scenes import metric_frame
 from tests.survey.export.survey_scenes import (
     ALTITUDE_M,
@@ -204,7 +204,7 @@ def test_a_dive_without_a_place_lies_in_local_metres(local_dive: Path, tmp_path:
 
 
 def test_a_dive_without_metres_and_gravity_says_so(tmp_path: Path) -> None:
-    frame = MetricFrame.unknown()
+    frame = WorldFrame.unknown()
     upright = metric_frame(T_nm=Sim3.identity())
     survey = export_survey(
         Dive(write_survey(tmp_path / "d", surveyed(upright), frame)), tmp_path, "dem"
@@ -223,7 +223,7 @@ def test_views_that_look_all_around_have_no_vertical(tmp_path: Path) -> None:
     for number, view in enumerate(mapper.views):
         turn = Sim3.exp(np.array([0.0, 0.0, 0.0, 0.5 * np.pi * number, 0.0, 0.0, 0.0]))
         view.T_wc = Sim3(turn.R @ LOOKS_DOWN, view.T_wc.t)
-    dive = write_survey(tmp_path / "d", mapper, MetricFrame.unknown())
+    dive = write_survey(tmp_path / "d", mapper, WorldFrame.unknown())
     with pytest.raises(InputError, match="which way is up"):
         export_survey(Dive(dive), tmp_path, "dem")
 

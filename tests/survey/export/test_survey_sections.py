@@ -14,22 +14,22 @@ from PIL import Image
 
 from aquaflow.dive.frames_csv import FrameRow
 from aquaflow.dive.trajectory_csv import PoseRow
-from aquaflow.survey.coverage import Seen
+from aquaflow.survey.coverage import CoverageClass
 from aquaflow.survey.report import (
     CameraSummary,
+    DepthProfile,
     HeldOutExample,
     LeftOut,
     Measures,
     MediumCurves,
     PathPlot,
-    Profile,
     ReportData,
     render_report,
     survey_sections,
 )
 from aquaflow.survey.report.pdf import write_pdf
 from aquaflow.survey.report.report_of import MOST_REASONS, left_out, profile
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from tests.survey.coverage.surveys import lawnmower, metric, survey_of
 
 VIEW = survey_of(lawnmower(3, 6.0, 1.0, 0.45))
@@ -57,7 +57,9 @@ def survey(**changes: object) -> ReportData:
         measures=Measures([("unit of length", "metres")]),
         coverage=VIEW,
         overview=overview(),
-        profile=Profile(TIMES, 8.0 + np.sin(TIMES / 60), 2.0 + 0 * TIMES, "depth of the camera"),
+        profile=DepthProfile(
+            TIMES, 8.0 + np.sin(TIMES / 60), 2.0 + 0 * TIMES, "depth of the camera"
+        ),
         left_out=[LeftOut("lost", "few matches <N>", 2)],
         medium=WATER,
         examples=[HeldOutExample("frame 8", picture, picture, picture)] * 5,
@@ -90,7 +92,7 @@ def test_shares_of_the_classes_are_of_what_was_seen() -> None:
     shares = [int(re.findall(r"\((\d+) %\)", rows[name])[0]) for name in list(rows)[:3]]
     assert sum(shares) == pytest.approx(100, abs=2)
     assert rows["survey lines"].startswith("3, together 1")
-    assert f"{VIEW.area(Seen.WELL):.3g}" in rows["seen well"]
+    assert f"{VIEW.area(CoverageClass.WELL):.3g}" in rows["seen well"]
 
 
 def test_the_water_is_in_numbers_of_a_unit_that_is_said() -> None:
@@ -121,7 +123,7 @@ def test_the_profile_is_what_the_vehicle_measured_else_the_paths() -> None:
     assert of_path is not None
     assert (of_path.depth == 5.0).all()
     assert of_path.depth_is == "depth of the camera"
-    assert profile(rows(None, None, "map units"), MetricFrame.unknown()) is None
+    assert profile(rows(None, None, "map units"), WorldFrame.unknown()) is None
 
 
 def test_reasons_that_differ_in_numbers_are_one_and_rare_ones_are_summed() -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from aquaflow.base.errors import InputError
 from aquaflow.dive.georeference import to_geodetic
-from aquaflow.survey.measure.asked import MapPoint, Pixel, Place, parse_point
+from aquaflow.survey.measure.asked import GeodeticPoint, MapPoint, Pixel, parse_point
 from aquaflow.survey.measure.notes import Note, read_notes, write_notes
 from aquaflow.telemetry.metric_file import read_frame_of_map
 from tests.command_line import Cli
@@ -143,8 +143,8 @@ def test_a_mapped_dive_has_its_numbers_in_files_and_report(
     [
         ("120:640,360.5", Pixel(120, 640.0, 360.5)),
         ("1,-0.5,9", MapPoint(1.0, -0.5, 9.0)),
-        ("63.5N,10.25E", Place(63.5, 10.25)),
-        ("63.5s, 10.25w", Place(-63.5, -10.25)),
+        ("63.5N,10.25E", GeodeticPoint(63.5, 10.25)),
+        ("63.5s, 10.25w", GeodeticPoint(-63.5, -10.25)),
     ],
 )
 def test_points_are_read_as_they_are_typed(text: str, point: object) -> None:

@@ -12,7 +12,7 @@ import pytest
 from aquaflow.base.errors import InputError
 from aquaflow.geometry.earth import latitude_longitude
 from aquaflow.survey.measure.notes import MOST_NOTES, NAME, Note, read_notes, scaled, write_notes
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from tests.metric_scenes import TRONDHEIM, metric_frame
 
 RING = np.array([[0.0, 0.0, 9.0], [4.0, 0.0, 9.5], [4.0, 3.0, 9.2]])
@@ -38,10 +38,10 @@ def spoil(folder: Path, change: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    "frame", [metric_frame(), metric_frame(**LOCAL), MetricFrame.unknown()],
+    "frame", [metric_frame(), metric_frame(**LOCAL), WorldFrame.unknown()],
     ids=["on the earth", "local", "map units"],
 )  # fmt: skip
-def test_notes_are_read_back_as_they_were_written(frame: MetricFrame, tmp_path: Path) -> None:
+def test_notes_are_read_back_as_they_were_written(frame: WorldFrame, tmp_path: Path) -> None:
     assert read_notes(tmp_path, frame) == []
     write_notes(tmp_path, NOTES, frame)
     for read, note in zip(read_notes(tmp_path, frame), NOTES, strict=True):
@@ -76,11 +76,11 @@ def test_elsewhere_features_are_unlocated_and_keep_local_places(tmp_path: Path) 
 
 
 def test_notes_grow_with_a_dive_that_becomes_metric(tmp_path: Path) -> None:
-    write_notes(tmp_path, NOTES, MetricFrame.unknown())
+    write_notes(tmp_path, NOTES, WorldFrame.unknown())
     metric = metric_frame(**LOCAL)
     with pytest.raises(InputError, match="is in map units, and the dive in m"):
         read_notes(tmp_path, metric)
-    write_notes(tmp_path, scaled(read_notes(tmp_path, MetricFrame.unknown()), 2.5), metric)
+    write_notes(tmp_path, scaled(read_notes(tmp_path, WorldFrame.unknown()), 2.5), metric)
     np.testing.assert_allclose(read_notes(tmp_path, metric)[0].places, [[30.0, -18.75, 23.125]])
 
 

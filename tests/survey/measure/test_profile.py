@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from aquaflow.base.errors import InputError
-from aquaflow.survey.measure.points import Points
+from aquaflow.survey.measure.points import MeasuredPoints
 from aquaflow.survey.measure.profile import profile
 from aquaflow.survey.measure.scale import Scale
 
@@ -18,11 +18,11 @@ ALONG = np.linspace(0.0, 3.0, 13)
 TURN = np.radians(30.0)
 
 
-def line(own: float = 0.0, shared: float = 0.0) -> Points:
+def line(own: float = 0.0, shared: float = 0.0) -> MeasuredPoints:
     """A ground that rises by 0.1 over 3, with waves, along a bearing of 30 degrees."""
     height = ALONG / 30.0 + 0.2 * np.sin(3.0 * ALONG)
     places = np.stack([ALONG * np.cos(TURN), ALONG * np.sin(TURN), 8.0 - height], axis=1)
-    return Points.round(places, np.full(13, own), np.full(13, shared), 2.0)
+    return MeasuredPoints.round(places, np.full(13, own), np.full(13, shared), 2.0)
 
 
 def test_heights_and_distances_are_those_of_the_line() -> None:
@@ -44,7 +44,7 @@ def test_intervals_hold_the_shape_of_the_ground_as_often_as_they_say() -> None:
         tilt, factor = 0.01 * rng.standard_normal(), 1.0 + 0.02 * rng.standard_normal()
         places = exact.places + each
         places[:, 2] = factor * places[:, 2] + tilt * ALONG
-        seen = profile(Points(places, exact.own, exact.shared, exact.reach), UP, scale)
+        seen = profile(MeasuredPoints(places, exact.own, exact.shared, exact.reach), UP, scale)
         shift = truth.height.mean() - seen.height.mean()
         inside += np.mean((seen.low + shift <= truth.height) & (truth.height <= seen.high + shift))
         drops += seen.drop.low <= truth.drop.value <= seen.drop.high
@@ -54,7 +54,7 @@ def test_intervals_hold_the_shape_of_the_ground_as_often_as_they_say() -> None:
 
 def test_what_the_whole_line_errs_together_is_no_error_of_its_shape() -> None:
     count = len(ALONG)
-    together = Points.round(line().places, np.zeros(count), np.full(count, 0.5), 1e6)
+    together = MeasuredPoints.round(line().places, np.zeros(count), np.full(count, 0.5), 1e6)
     assert profile(together, UP, Scale("m", 0.0, 0.0)).sigma.max() < 1e-3
 
 
@@ -66,6 +66,6 @@ def test_what_the_whole_line_errs_together_is_no_error_of_its_shape() -> None:
     ],
 )
 def test_a_line_without_length_is_refused(places: Array, sentence: str) -> None:
-    points = Points.round(places, np.zeros(len(places)), np.zeros(len(places)), 1.0)
+    points = MeasuredPoints.round(places, np.zeros(len(places)), np.zeros(len(places)), 1.0)
     with pytest.raises(InputError, match=sentence):
         profile(points, UP, Scale("m", 0.0, 0.0))

@@ -21,7 +21,7 @@ from aquaflow.survey.measure.notes import Note, read_notes, write_notes
 from aquaflow.survey.report.report_of import report_of
 from aquaflow.telemetry.known_lengths.known_length import KnownLength
 from aquaflow.telemetry.metric_file import read_metric_file, write_metric_file
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from tests.command_line import Cli, refused
 from tests.metric_scenes import metric_frame
 
@@ -33,7 +33,7 @@ LENGTH = ("--from", "0,0,1", "--to", "0,0.5,1", "--length", 1.5)
 def dive(small_dive: Path, tmp_path: Path) -> Path:
     """Of which nothing has measured the scale."""
     folder = Path(shutil.copytree(small_dive, tmp_path / "dive"))
-    write_metric_file(folder, {0: MetricFrame.unknown()}, main=0)
+    write_metric_file(folder, {0: WorldFrame.unknown()}, main=0)
     return folder
 
 
@@ -127,7 +127,7 @@ def test_numbers_of_the_ground_that_cannot_be_measured_anew_are_taken_away(
 
 def test_notes_stay_where_they_are_in_the_map(dive: Path, command: Cli) -> None:
     place = np.array([[0.5, -0.25, 2.0]])
-    write_notes(dive, [Note("a", "crack", "Point", place)], MetricFrame.unknown())
+    write_notes(dive, [Note("a", "crack", "Point", place)], WorldFrame.unknown())
     assert command("scale", dive, *LENGTH).code == 0
     [note] = read_notes(dive, read_metric_file(dive)[0])
     np.testing.assert_allclose(note.places, 3.0 * place)

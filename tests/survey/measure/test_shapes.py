@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from aquaflow.base.errors import InputError
-from aquaflow.survey.measure.points import MOST_POINTS, Points
+from aquaflow.survey.measure.points import MOST_POINTS, MeasuredPoints
 from aquaflow.survey.measure.quantity import Quantity
 from aquaflow.survey.measure.scale import Scale, scale_of
 from aquaflow.survey.measure.shapes import area, distance, path_length, plan_area
@@ -24,13 +24,18 @@ SQUARE = np.array([[0.0, 0.0, 5.0], [2.0, 0.0, 5.0], [2.0, 2.0, 5.0], [0.0, 2.0,
 BENT = np.array([[0.0, 0.0, 5.0], [1.0, 0.2, 5.3], [1.8, 0.9, 5.1], [3.0, 1.0, 4.8]])
 
 
-def marked(places: Array, own: float = 0.0, shared: float = 0.0, reach: float = 2.0) -> Points:
+def marked(
+    places: Array, own: float = 0.0, shared: float = 0.0, reach: float = 2.0
+) -> MeasuredPoints:
     count = len(places)
-    return Points.round(places, np.full(count, own), np.full(count, shared), reach)
+    return MeasuredPoints.round(places, np.full(count, own), np.full(count, shared), reach)
 
 
 def coverage(
-    measure: Callable[[Points, Scale], Quantity], places: Array, scale: Scale, shared: float = 0.03
+    measure: Callable[[MeasuredPoints, Scale], Quantity],
+    places: Array,
+    scale: Scale,
+    shared: float = 0.03,
 ) -> float:
     """How often the 95 % interval of a measurement with errors holds the true value."""
     rng = np.random.default_rng(7)
@@ -66,13 +71,13 @@ def test_values_are_those_of_geometry() -> None:
 )
 @pytest.mark.parametrize("scale", [EXACT, METRES], ids=["exact", "1 %"])
 def test_intervals_hold_the_truth_as_often_as_they_say(
-    measure: Callable[[Points, Scale], Quantity], places: Array, scale: Scale
+    measure: Callable[[MeasuredPoints, Scale], Quantity], places: Array, scale: Scale
 ) -> None:
     assert 0.925 < coverage(measure, places, scale) < 0.98
 
 
 def test_the_area_on_a_chart_has_an_interval_that_holds() -> None:
-    def measure(points: Points, scale: Scale) -> Quantity:
+    def measure(points: MeasuredPoints, scale: Scale) -> Quantity:
         return plan_area(points, UP, scale)
 
     assert 0.925 < coverage(measure, SQUARE, METRES) < 0.98
@@ -122,7 +127,7 @@ def test_words_have_the_digits_that_sigma_leaves() -> None:
     [(distance, 3, "has 2 points"), (path_length, 1, "2 points"), (area, 2, "3 points")],
 )
 def test_too_few_or_too_many_points_are_refused(
-    measure: Callable[[Points, Scale], Quantity], count: int, sentence: str
+    measure: Callable[[MeasuredPoints, Scale], Quantity], count: int, sentence: str
 ) -> None:
     with pytest.raises(InputError, match=sentence):
         measure(marked(BENT[:count]), METRES)

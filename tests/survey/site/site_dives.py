@@ -11,11 +11,11 @@ from aquaflow.base.storage.dive_status import DiveState, DiveStatus
 from aquaflow.dive.tum import write_tum
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes.place import KeypointDepths, Place
+from aquaflow.keyframes.place import KeyframePlace, KeypointDepths
 from aquaflow.keyframes.places_file import EDGE, NAME, write_places
 from aquaflow.prior.contract import Keypoints
 from aquaflow.telemetry.metric_file import write_metric_file
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 CAMERA = CameraModel(320, 240, 270.0, 270.0, 160.0, 120.0)
 POINTS = 1500
@@ -53,7 +53,7 @@ def stated_dive(
     count: int = 6,
     world: Sim3 | None = None,
     seed: int = 0,
-    frame: MetricFrame | None = None,
+    frame: WorldFrame | None = None,
     sub_maps: Sequence[int] | None = None,
 ) -> Path:
     """A finished dive along x from ``start``; ``world``: T_ms, from the scene's world to the map's.
@@ -66,7 +66,7 @@ def stated_dive(
     ]
     seen = [scene.seen(T, rng) for T in poses]
     in_m = [T_ms @ T for T in poses]
-    places = [Place(i, i, numbers[i], 10**9 * i, in_m[i], CAMERA) for i in range(count)]
+    places = [KeyframePlace(i, i, numbers[i], 10**9 * i, in_m[i], CAMERA) for i in range(count)]
     links = [(i + 1, i) for i in range(count - 1) if numbers[i] == numbers[i + 1]]
     edges = np.zeros(len(links), EDGE)
     for row, (a, b) in zip(edges, links, strict=True):
@@ -75,7 +75,7 @@ def stated_dive(
     edges["information"], edges["trust"] = np.eye(7) / 0.003**2, 1.0
     folder.mkdir(parents=True)
     write_places(folder / NAME, zip(places, seen, strict=True), edges)
-    metric = frame or MetricFrame.unknown()
+    metric = frame or WorldFrame.unknown()
     write_metric_file(folder, dict.fromkeys(sorted(set(numbers)), metric), 0)
     in_n = [metric.T_nm @ T for T in in_m]
     write_tum(

@@ -20,7 +20,7 @@ from aquaflow.survey.site.links import CrossLink
 from aquaflow.survey.site.manifest import SiteDive
 from aquaflow.survey.site.merged_file import MergedSite, read_merged
 from aquaflow.survey.site.merging import merge
-from aquaflow.telemetry.metric_frame import MetricFrame, Origin
+from aquaflow.telemetry.world_frame import Origin, WorldFrame
 from tests.survey.site.site_dives import SPACING, Scene, stated_dive
 
 WORLD = Sim3.exp(np.array([1.0, -2.0, 0.5, 0.3, -0.2, 0.7, np.log(2.5)]))
@@ -172,11 +172,11 @@ def test_a_site_without_a_usable_dive_is_refused(dives: Path, tmp_path: Path) ->
         merge(tmp_path / "site")
 
 
-def metric_frame(T_nm: Sim3, sigma: float, origin: Origin | None = None) -> MetricFrame:
+def metric_frame(T_nm: Sim3, sigma: float, origin: Origin | None = None) -> WorldFrame:
     covariance = SIDES.copy()
     covariance[6, 6] = sigma**2
     north = "true north" if origin else "initial heading"
-    return MetricFrame(T_nm, covariance, True, True, north, origin=origin)
+    return WorldFrame(T_nm, covariance, True, True, north, origin=origin)
 
 
 def test_scale_and_place_come_from_the_dives_that_know_them(tmp_path: Path) -> None:

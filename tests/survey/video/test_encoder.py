@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from aquaflow.base.errors import InputError
-from aquaflow.survey.video.encoder import VideoFile, video_file
+from aquaflow.survey.video.encoder import VideoEncoder, video_file
 from aquaflow.survey.video.timeline import Timeline, usual_fps
 from tests.survey.video.player import stated_times
 
@@ -101,7 +101,7 @@ def test_an_interrupted_run_leaves_an_earlier_video_as_it_was(tmp_path: Path) ->
 
 def test_a_file_that_lost_pictures_is_refused(tmp_path: Path) -> None:
     part = tmp_path / "part.mp4"
-    file = VideoFile(part, 25.0)
+    file = VideoEncoder(part, 25.0)
     for level in range(10):
         file.add(grey(level * 20))
     file.abandon()

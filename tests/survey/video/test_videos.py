@@ -17,7 +17,7 @@ from aquaflow.dive.dive import Dive
 from aquaflow.dive.finished_frames import read_finished_frames
 from aquaflow.dive.restored import exposure_without_water, restored_frames, seen_frames
 from aquaflow.mapping.restoration import to_bytes
-from aquaflow.survey.video.every_frame import LONGEST_GAP_S, Poses, restore_every_frame
+from aquaflow.survey.video.every_frame import LONGEST_GAP_S, CameraPoses, restore_every_frame
 from aquaflow.survey.video.fly_through import FPS, fly_through
 from aquaflow.survey.video.overlay import GROUND
 from aquaflow.survey.video.side_by_side import side_by_side
@@ -178,7 +178,7 @@ def test_a_wider_video_shows_the_same_scene(
 def test_a_pose_in_between_lies_between_and_a_long_gap_has_none(small_dive: Path) -> None:
     frames = read_finished_frames(Dive(small_dive))
     T_nm = read_frame_of_map(small_dive / "map.aqf").T_nm
-    poses, views = Poses(frames, T_nm), Dive(small_dive).map().views
+    poses, views = CameraPoses(frames, T_nm), Dive(small_dive).map().views
     by_index = {frame.row.index: frame for frame in frames}
     for view in views:  # the map's own world
         pose = poses.at(by_index[view.frame_index].t_ns)
@@ -195,9 +195,9 @@ def test_a_pose_in_between_lies_between_and_a_long_gap_has_none(small_dive: Path
     assert poses.at(frames[-1].t_ns + 1) is None
     assert poses.at(frames[0].t_ns - 1) is None
     far = [frames[0], frames[int(LONGEST_GAP_S * 10.0) + 1]]
-    assert Poses(far, T_nm).at(frames[3].t_ns) is None
+    assert CameraPoses(far, T_nm).at(frames[3].t_ns) is None
     near = [frames[0], frames[int(LONGEST_GAP_S * 10.0)]]
-    assert Poses(near, T_nm).at(frames[3].t_ns) is not None
+    assert CameraPoses(near, T_nm).at(frames[3].t_ns) is not None
 
 
 @pytest.mark.parametrize("water", [False, True])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from aquaflow.survey.viewer.splats import Splats, splats
+from aquaflow.survey.viewer.splats import ViewerSplats, splats
 
 DEPTH = 5.0
 SIDE = 4.0
@@ -12,7 +12,7 @@ SIDE = 4.0
 
 def floor(
     step: float = 0.05, opacity: float = 0.9, rgb: tuple[float, float, float] = (0.5, 0.5, 0.5)
-) -> Splats:
+) -> ViewerSplats:
     """Gaussians each ``step`` of the square |x|, |y| <= 4 at z = 5, hardly thick."""
     at = np.arange(-SIDE, SIDE + step / 2, step)
     x, y = (each.ravel() for each in np.meshgrid(at, at))

@@ -9,7 +9,7 @@ import numpy as np
 
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.viewer.live_viewer import LONGEST_PATH, LivePath
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from tests.metric_scenes import metric_frame
 
 RATE = 4
@@ -28,7 +28,7 @@ def heard(**kinds: tuple[object, float]) -> Any:
 
 def test_poses_come_with_seconds_depth_heading_and_the_nearest_picture() -> None:
     path = LivePath()
-    path.add(tracked(8), MetricFrame.unknown())
+    path.add(tracked(8), WorldFrame.unknown())
     path.hear(heard(depth=(3.5, 0.2)))
     path.add(tracked(12), metric_frame())
     poses, moments = path.rows([8])
@@ -43,9 +43,9 @@ def test_poses_come_with_seconds_depth_heading_and_the_nearest_picture() -> None
 def test_a_depth_that_is_no_longer_measured_is_no_poses() -> None:
     path = LivePath()
     path.hear(heard(depth=(3.5, 60.0)))
-    path.add(tracked(0), MetricFrame.unknown())
+    path.add(tracked(0), WorldFrame.unknown())
     path.hear({})
-    path.add(tracked(1), MetricFrame.unknown())
+    path.add(tracked(1), WorldFrame.unknown())
     assert np.isnan(path.rows([])[1][:, 1]).all()
 
 
@@ -54,7 +54,7 @@ def test_utc_of_the_first_pose_follows_from_what_a_clock_says_now() -> None:
     path.hear(heard(utc_time=("2026-11-24T03:00:10.000Z", 0.5)))
     assert path.began is None
     for index in range(0, 5 * RATE + 1, RATE):
-        path.add(tracked(index), MetricFrame.unknown())
+        path.add(tracked(index), WorldFrame.unknown())
     path.hear(heard(utc_time=("2026-11-24T03:00:10.000Z", 0.5)))
     assert path.began is not None
     assert path.began.isoformat() == "2026-11-24T03:00:05.500000+00:00"
@@ -63,7 +63,7 @@ def test_utc_of_the_first_pose_follows_from_what_a_clock_says_now() -> None:
 def test_a_long_path_is_thinned() -> None:
     path = LivePath()
     for index in range(LONGEST_PATH + 3):
-        path.add(tracked(index), MetricFrame.unknown())
+        path.add(tracked(index), WorldFrame.unknown())
     poses, moments = path.rows([0])
     assert LONGEST_PATH // 2 <= len(poses) == len(moments) <= LONGEST_PATH
     assert moments[0, 0] == 0.0

@@ -11,12 +11,12 @@ import pytest
 from aquaflow.survey.viewer.levels import range_level
 from aquaflow.survey.viewer.packing import FIRST_CHUNK, Packed, chunk_ends, contracted
 from aquaflow.survey.viewer.seen_water import water_of
-from aquaflow.survey.viewer.splats import Splats, splats
+from aquaflow.survey.viewer.splats import ViewerSplats, splats
 
 RNG = np.random.default_rng(3)
 
 
-def random(count: int) -> Splats:
+def random(count: int) -> ViewerSplats:
     means = RNG.normal(size=(count, 3)).astype(np.float32)
     means[0] = (0.0, 0.0, 5000.0)  # one far away
     return splats(

@@ -15,11 +15,11 @@ from aquaflow.config.viewer import ViewerConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.survey.viewer.dive_coverage import CLASSES, COVERAGE
-from aquaflow.survey.viewer.exhibit import PathPart
 from aquaflow.survey.viewer.finished import open_dive
 from aquaflow.survey.viewer.levels import RANGE, range_level
 from aquaflow.survey.viewer.page import ViewerPage
 from aquaflow.survey.viewer.seen_water import seen_water
+from aquaflow.survey.viewer.viewer_content import PathPart
 from tests.browser import Browser, needs_browser
 from tests.survey.viewer.planes import floor
 

@@ -9,18 +9,18 @@ import pytest
 
 from aquaflow.base.errors import InputError
 from aquaflow.survey.measure.scale import Scale
-from aquaflow.survey.viewer.measuring import Frame, Scene, measured, ray_of
+from aquaflow.survey.viewer.measuring import LengthUnit, MeasuringScene, measured, ray_of
 from aquaflow.survey.viewer.picking import pick, within_reach
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from tests.survey.viewer.planes import DEPTH, floor
 
 EYE = np.array([0.3, -0.2, 0.0])
 UP = np.array([0.0, 0.0, -1.0])
-METRES = Frame(Scale("m", 0.0, 0.0), level=True)
+METRES = LengthUnit(Scale("m", 0.0, 0.0), level=True)
 
 
-def scene(frame: Frame = METRES) -> Scene:
-    return Scene(floor(), np.zeros((1, 3)), 1.0, UP, frame)
+def scene(frame: LengthUnit = METRES) -> MeasuringScene:
+    return MeasuringScene(floor(), np.zeros((1, 3)), 1.0, UP, frame)
 
 
 def point(x: float, y: float) -> dict[str, Any]:
@@ -99,11 +99,11 @@ def test_two_points_are_a_distance_with_its_sigma() -> None:
 
 def test_lengths_of_a_live_map_are_said_in_metres_once_they_are_known() -> None:
     ends = [point(0.0, 0.0), point(3.0, 0.0)]
-    live = Frame(Scale("m", 0.01, 0.0), metres=2.0)
+    live = LengthUnit(Scale("m", 0.01, 0.0), metres=2.0)
     assert np.isclose(
         measured("distance", ends, scene(live))["quantities"]["distance"]["value"], 6.0, atol=0.06
     )
-    unknown = measured("distance", ends, scene(Frame.of(MetricFrame.unknown())))
+    unknown = measured("distance", ends, scene(LengthUnit.of(WorldFrame.unknown())))
     assert "map units" in unknown["words"]
 
 
@@ -115,7 +115,7 @@ def test_three_points_are_an_area() -> None:
 
 @pytest.mark.parametrize("level", [True, False])
 def test_a_profile_of_a_plane_is_flat(level: bool) -> None:
-    frame = Frame(Scale("m", 0.0, 0.0), level=level)
+    frame = LengthUnit(Scale("m", 0.0, 0.0), level=level)
     said = measured("profile", [point(-2.0, 1.0), point(2.0, 1.0)], scene(frame))
     line = said["profile"]
     assert len(line["along"]) == len(line["height"]) == 64

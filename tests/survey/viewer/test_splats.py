@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from aquaflow.survey.viewer.splats import Splats, covariances, splats
+from aquaflow.survey.viewer.splats import ViewerSplats, covariances, splats
 
 RNG = np.random.default_rng(0)
 
 
-def some(count: int, budget: int, spoiled: int | None = None) -> Splats:
+def some(count: int, budget: int, spoiled: int | None = None) -> ViewerSplats:
     means = RNG.normal(size=(count, 3)).astype(np.float32)
     quats = RNG.normal(size=(count, 4)).astype(np.float32)
     scales = np.full((count, 3), 0.1, np.float32)

@@ -10,7 +10,7 @@ import numpy as np
 from aquaflow.config.known_lengths import BoardConfig, CharucoConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.telemetry.known_lengths.board_size import PosedView
+from aquaflow.telemetry.known_lengths.board_size import BoardView
 from aquaflow.telemetry.known_lengths.boards import charuco_board
 
 CAMERA = CameraModel(640, 480, 520.0, 520.0, 318.0, 243.0)
@@ -101,9 +101,9 @@ def photographed(boards: list[tuple[Printed, Sim3]], T_nc: Sim3, seed: int = 0) 
     return np.repeat(np.clip(noisy, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
 
 
-def in_map(T_nc: Sim3, rho: np.ndarray | None = None, sub_map: int = 0) -> PosedView:
+def in_map(T_nc: Sim3, rho: np.ndarray | None = None, sub_map: int = 0) -> BoardView:
     """The view as the map has it; ``rho`` [H, W] of 1 % depths."""
     T = T_NM.inverse() @ T_nc
     T_wc = Sim3(T.R, T.t)
     variance = None if rho is None else (0.01 * rho) ** 2
-    return PosedView(CAMERA, T_wc, sub_map, rho, variance)
+    return BoardView(CAMERA, T_wc, sub_map, rho, variance)

@@ -10,7 +10,7 @@ import numpy as np
 from aquaflow.config.known_lengths import LasersConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.telemetry.known_lengths.board_size import PosedView
+from aquaflow.telemetry.known_lengths.board_size import BoardView
 from aquaflow.telemetry.known_lengths.known_length import KnownLength
 from aquaflow.telemetry.known_lengths.laser_dots import find_dots
 from aquaflow.telemetry.known_lengths.laser_spacing import laser_lengths
@@ -45,7 +45,7 @@ class Swim:
 
     def __init__(self, heights_m: np.ndarray, depth_sigma: float = 0.01, seed: int = 1) -> None:
         rng = np.random.default_rng(seed)
-        self.views: list[PosedView] = []
+        self.views: list[BoardView] = []
         self.dots: list[np.ndarray] = []
         rays = CAMERA.unproject(CAMERA.pixel_centres())
         for height in heights_m:
@@ -56,7 +56,7 @@ class Swim:
             units = z * np.exp(rng.normal(0.0, depth_sigma)) / METRES_PER_UNIT
             rho = 1.0 / units
             variance = (depth_sigma * rho) ** 2
-            self.views.append(PosedView(CAMERA, Sim3.identity(), 0, rho, variance))
+            self.views.append(BoardView(CAMERA, Sim3.identity(), 0, rho, variance))
 
     def lengths(self, extra: np.ndarray | None = None) -> list[KnownLength]:
         """By pictures that also show ``extra`` [P, K, 2] spots of the colour."""

@@ -9,7 +9,7 @@ import pytest
 
 from aquaflow.config.known_lengths import BoardConfig, CharucoConfig, MarkersConfig
 from aquaflow.geometry.similarity import Sim3, so3_exp
-from aquaflow.telemetry.known_lengths.board_size import PosedView, board_lengths
+from aquaflow.telemetry.known_lengths.board_size import BoardView, board_lengths
 from aquaflow.telemetry.known_lengths.boards import BoardDetector, BoardSighting, marker_corners
 from aquaflow.telemetry.known_lengths.known_length import KnownLength
 from tests.telemetry.known_lengths.boards_in_pictures import (
@@ -41,7 +41,7 @@ def seen(
 
 
 def lengths(
-    sightings: Sequence[BoardSighting], views: Sequence[PosedView | None]
+    sightings: Sequence[BoardSighting], views: Sequence[BoardView | None]
 ) -> list[KnownLength]:
     return board_lengths(sightings, lambda index: views[index])
 
@@ -84,7 +84,7 @@ def test_a_pose_of_another_scale_changes_nothing() -> None:
     pictures = [photographed([(board, Sim3.identity())], T, k) for k, T in enumerate(cameras)]
     views = [in_map(T) for T in cameras]
     stretched = [
-        PosedView(view.camera, Sim3(view.T_wc.R, view.T_wc.t, 1.7), view.sub_map) for view in views
+        BoardView(view.camera, Sim3(view.T_wc.R, view.T_wc.t, 1.7), view.sub_map) for view in views
     ]
     (plain,), (other,) = (lengths(seen([TAG], pictures), each) for each in (views, stretched))
     assert other.metres_per_unit == pytest.approx(plain.metres_per_unit, rel=1e-6)
@@ -105,7 +105,7 @@ def test_the_stated_sigma_is_true() -> None:
             turn = so3_exp(rng.normal(0.0, unit, 3))
             shift = rng.normal(0.0, unit * 0.95 / METRES_PER_UNIT, 3)
             wrong = Sim3(view.T_wc.R @ turn, view.T_wc.t + shift)
-            views.append(PosedView(CAMERA, wrong, 0))
+            views.append(BoardView(CAMERA, wrong, 0))
         (length,) = lengths(sightings, views)
         error = np.log(length.metres_per_unit / METRES_PER_UNIT)
         squares.append((error / length.relative_sigma) ** 2)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.telemetry.known_lengths.board_size import PosedView
+from aquaflow.telemetry.known_lengths.board_size import BoardView
 from aquaflow.telemetry.known_lengths.known_length import scale_of
 from aquaflow.telemetry.known_lengths.laser_dots import find_dots
 from tests.telemetry.known_lengths.laser_scenes import (
@@ -86,7 +86,7 @@ def test_spots_that_wander_are_no_beams() -> None:
 def test_too_few_pictures_or_no_depth_give_no_length() -> None:
     assert Swim(HEIGHTS[:4]).lengths() == []
     blind = Swim(HEIGHTS)
-    blind.views = [PosedView(CAMERA, Sim3.identity(), 0) for _ in HEIGHTS]
+    blind.views = [BoardView(CAMERA, Sim3.identity(), 0) for _ in HEIGHTS]
     assert blind.lengths() == []
 
 

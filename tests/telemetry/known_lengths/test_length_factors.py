@@ -10,8 +10,8 @@ from aquaflow.telemetry.camera_path import CameraPath
 from aquaflow.telemetry.estimator import estimate
 from aquaflow.telemetry.factors.length import length_factors
 from aquaflow.telemetry.known_lengths.known_length import KnownLength
-from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.telemetry.telemetry import Telemetry
+from aquaflow.telemetry.world_frame import WorldFrame
 
 SCALE = 2.05
 
@@ -25,7 +25,7 @@ def measured(
     return [KnownLength(k, source, s, 0.001 * s, length_m, sigma_m) for k, s in enumerate(sizes)]
 
 
-def frame_by(*lengths: KnownLength) -> MetricFrame:
+def frame_by(*lengths: KnownLength) -> WorldFrame:
     t_s = np.arange(20.0)
     path = CameraPath(t_s, np.tile(np.eye(3), (20, 1, 1)), np.outer(t_s, [0.1, 0.0, 0.0]))
     factors = length_factors(lengths)

@@ -8,7 +8,7 @@ import pytest
 from aquaflow.config import FusionConfig, parse_config
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
-from aquaflow.tracking.metric.sightings import Sightings
+from aquaflow.tracking.metric.sightings import LengthSightings
 from tests.telemetry.known_lengths.boards_in_pictures import (
     CAMERA,
     METRES_PER_UNIT,
@@ -40,7 +40,7 @@ def pointmap() -> Pointmap:
 
 
 def test_one_keyframe_gives_a_length_once_its_depth_was_kept() -> None:
-    sightings = Sightings(config())
+    sightings = LengthSightings(config())
     sightings.look(3, picture(), CAMERA)
     place = in_map(VIEW).T_wc, 5
     # A larger board further away looks the same.
@@ -57,7 +57,7 @@ def test_one_keyframe_gives_a_length_once_its_depth_was_kept() -> None:
 
 
 def test_a_copy_does_not_grow() -> None:
-    sightings = Sightings(config())
+    sightings = LengthSightings(config())
     before = sightings.copy()
     sightings.look(3, picture(), CAMERA)
     assert sightings
@@ -65,13 +65,13 @@ def test_a_copy_does_not_grow() -> None:
 
 
 def test_a_picture_that_shows_nothing_leaves_nothing() -> None:
-    sightings = Sightings(config())
+    sightings = LengthSightings(config())
     sightings.look(3, photographed([], VIEW), CAMERA)
     sightings.keep_depths(3, pytest.fail)
     assert not sightings
 
 
 def test_nothing_is_looked_for_without_objects_in_the_settings_or_without_fusion() -> None:
-    assert Sightings(config()).looks_for
-    assert not Sightings(config(boards=[])).looks_for
-    assert not Sightings(config(enabled=False)).looks_for
+    assert LengthSightings(config()).looks_for
+    assert not LengthSightings(config(boards=[])).looks_for
+    assert not LengthSightings(config(enabled=False)).looks_for

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.geometry.similarity_batch import Sim3Batch
 from aquaflow.tracking.adjustment.equations import AnchorMatches
-from aquaflow.tracking.adjustment.joint import Problem
+from aquaflow.tracking.adjustment.joint import JointProblem
 from aquaflow.tracking.adjustment.links import Links
 
 Array = npt.NDArray[np.float64]
@@ -30,7 +30,7 @@ class Scene:
     rho: list[Array]
     matches: list[AnchorMatches]
 
-    def problem(self, poses: list[Sim3], relative_sigma: float = 0.01) -> Problem:
+    def problem(self, poses: list[Sim3], relative_sigma: float = 0.01) -> JointProblem:
         """From ``poses``; depths of the pointmaps are true to ``relative_sigma``."""
         rng = np.random.default_rng(1)
         matches = []
@@ -46,7 +46,7 @@ class Scene:
         held = [np.arange(len(rho)) % 5 == 4 for rho in self.rho]
         free = np.ones(len(poses), dtype=bool)
         free[0] = False
-        return Problem(matches, held, no_links(), Sim3Batch.of(poses), free)
+        return JointProblem(matches, held, no_links(), Sim3Batch.of(poses), free)
 
 
 def no_links() -> Links:

@@ -17,7 +17,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore, Pointmap
 from aquaflow.prior.classical import ClassicalPrior
 from aquaflow.tracking.adjustment.adjuster import Adjuster
-from aquaflow.tracking.frames import Link
+from aquaflow.tracking.frames import KeyframeEdge
 from aquaflow.tracking.graph.improvement import Improvement
 from aquaflow.tracking.graph.keyframe_graph import KeyframeGraph
 from aquaflow.tracking.graph.pose_graph import Edge
@@ -63,7 +63,7 @@ class Swim:
             T = self.truth[number].inverse() @ self.truth[number - 1]
             T_fk = Sim3(T.R, (1.0 + LENGTH_ERROR * (-1) ** number) * T.t)
             pair = self.prior.decode(self.store[number - 1].encoding, encoding)
-            link = Link(number - 1, T_fk, np.diag([0.02] * 3 + [0.002] * 3) ** 2, pair)
+            link = KeyframeEdge(number - 1, T_fk, np.diag([0.02] * 3 + [0.002] * 3) ** 2, pair)
         if self.wait:
             self.graph.correction(wait=True)
         self.graph.add(number, link)
@@ -162,7 +162,7 @@ def test_a_resumed_dive_adjusts_what_it_has_seen_itself(swim: Callable[..., Swim
     assert again.window(2) is None
     assert again.everything() is None
     keyframe = first.store[2]
-    link = Link(1, Sim3.identity(), np.eye(6))
+    link = KeyframeEdge(1, Sim3.identity(), np.eye(6))
     again.keyframe(keyframe, link, Edge(2, 1, Sim3.identity(), np.eye(7)))
     job = again.window(2)
     assert job is not None

@@ -17,7 +17,7 @@ from aquaflow.tracking.adjustment.equations import (
     projected,
 )
 from aquaflow.tracking.adjustment.links import Links
-from aquaflow.tracking.adjustment.solver import State, cost_of, linearised
+from aquaflow.tracking.adjustment.solver import BundleState, cost_of, linearised
 from tests.tracking.adjustment.adjustment_scenes import Array, no_links, scene, shaken
 
 STEP = 1e-6
@@ -32,7 +32,7 @@ def test_the_gradient_is_that_of_the_cost_along_poses_and_depths() -> None:
     known = scene(count=4)
     poses = shaken(known.poses, 0.01)
     matches = [stretched(each) for each in known.problem(poses).matches]
-    state = State(Sim3Batch.of(poses), [1.02 * each.rho for each in matches])
+    state = BundleState(Sim3Batch.of(poses), [1.02 * each.rho for each in matches])
     equations = [
         anchor_equations(each, state.poses, rho)
         for each, rho in zip(matches, state.rho, strict=True)
@@ -51,7 +51,7 @@ def test_the_gradient_is_that_of_the_cost_along_poses_and_depths() -> None:
             rho - size * part.gain @ step[each.places].ravel()
             for each, part, rho in zip(matches, equations, state.rho, strict=True)
         ]
-        return cost_of(matches, no_links(), State(moved, rho))
+        return cost_of(matches, no_links(), BundleState(moved, rho))
 
     # At depths that are not the best, -offset . g_p remains; it is the same at both ends.
     numeric = (cost_at(STEP) - cost_at(-STEP)) / (2 * STEP)
@@ -101,7 +101,7 @@ def test_links_pull_as_their_cost_says() -> None:
         root @ root.transpose(0, 2, 1),
     )
     free = np.ones(3, dtype=bool)
-    system = linearised([], links, State(poses, []), BlockPattern.of([], links, free))
+    system = linearised([], links, BundleState(poses, []), BlockPattern.of([], links, free))
     H, gradient = system.H, system.gradient
     step = rng.normal(size=(3, 7))
 
@@ -117,7 +117,7 @@ def test_links_pull_as_their_cost_says() -> None:
 def test_poses_that_are_held_are_no_unknowns() -> None:
     known = scene(count=4)
     problem = known.problem(known.poses)
-    state = State(problem.poses, known.rho)
+    state = BundleState(problem.poses, known.rho)
     free = np.array([False, True, False, True])
     pattern = BlockPattern.of(problem.matches, no_links(), free)
     system = linearised(problem.matches, no_links(), state, pattern)
@@ -128,7 +128,7 @@ def test_poses_that_are_held_are_no_unknowns() -> None:
 def test_sums_of_blocks_are_those_of_a_dense_matrix() -> None:
     known = scene(count=6, reach=1)
     problem = known.problem(shaken(known.poses, 0.01))
-    state, free = State(problem.poses, known.rho), np.ones(6, dtype=bool)
+    state, free = BundleState(problem.poses, known.rho), np.ones(6, dtype=bool)
     free[[0, 3]] = False
     H, gradient = np.zeros((42, 42)), np.zeros(42)
     for each, rho in zip(problem.matches, state.rho, strict=True):

@@ -15,7 +15,7 @@ from aquaflow.config import TrackingConfig
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.keyframes import KeyframeStore, Pointmap
-from aquaflow.telemetry.metric_frame import MetricFrame, Origin
+from aquaflow.telemetry.world_frame import Origin, WorldFrame
 from aquaflow.tracking.base.base import Base
 from aquaflow.tracking.base.in_base import InBase
 from aquaflow.tracking.base.links import BaseLink, agree, link_covariance, placed
@@ -36,7 +36,7 @@ def link_of(number: int, T_sm: Sim3 = T_SM, seed: int = 0, sub_map: int = 0) -> 
     return BaseLink(number, 100 + number, sub_map, T_sk, link_covariance(np.diag(NOISE**2)), 80)
 
 
-def in_base(frame: MetricFrame | None = None, count: int = 12) -> InBase:
+def in_base(frame: WorldFrame | None = None, count: int = 12) -> InBase:
     store = KeyframeStore()
     for number in range(count):
         view = KnownView(CAMERA, pose_of(number), np.ones((3, 4)))
@@ -54,7 +54,7 @@ def test_one_recognition_alone_is_not_believed() -> None:
     dive = in_base()
     dive.add(link_of(3))
     assert not dive.recognised
-    assert dive.frame(0, MetricFrame.unknown()).site == ""
+    assert dive.frame(0, WorldFrame.unknown()).site == ""
 
 
 def test_two_that_agree_place_the_dive() -> None:
@@ -66,7 +66,7 @@ def test_two_that_agree_place_the_dive() -> None:
     assert dive.has_news()
     assert not dive.has_news()
     assert apart(dive.places()[0].T_sm, T_SM) < 0.02
-    frame = dive.frame(0, MetricFrame.unknown())
+    frame = dive.frame(0, WorldFrame.unknown())
     assert frame.site == "yesterday"
     assert frame.unit == "map units"
 
@@ -137,11 +137,11 @@ def test_the_metric_frame_of_the_base_is_that_of_the_dive() -> None:
     T_ns = Sim3(so3_exp(np.array([0.0, 0.0, 0.5])), np.array([1.0, 2.0, 12.0]), 0.8)
     origin = Origin(60.0, 5.0, "gnss", 1.5)
     sigma = np.diag(np.full(7, 0.05) ** 2)
-    known = MetricFrame(T_ns, sigma, True, True, "true north", True, origin, scale_source="dvl")
+    known = WorldFrame(T_ns, sigma, True, True, "true north", True, origin, scale_source="dvl")
     dive = in_base(known)
     for number in (3, 4, 5):
         dive.add(link_of(number))
-    frame = dive.frame(0, MetricFrame.unknown())
+    frame = dive.frame(0, WorldFrame.unknown())
     assert frame.metric
     assert frame.georeferenced
     assert frame.origin == origin

@@ -50,7 +50,7 @@ def test_a_dive_in_other_light_turned_and_higher_goes_on_in_the_frame_of_the_fir
 ) -> None:
     folder, first = base
     before, slam = digest(folder), Slam(TRACKED_ONLY)
-    slam.look_in(open_base(folder))
+    slam.localise_in(open_base(folder))
     try:
         second = swum(in_other_light(filmed(FLOOR, second_way())), slam)
         assert slam.in_base is not None
@@ -72,7 +72,7 @@ def test_a_dive_elsewhere_is_what_it_would_be_without(
 ) -> None:
     elsewhere = filmed(SeaFloor(4), second_way()[:9])
     alone, looking = Slam(TRACKED_ONLY), Slam(TRACKED_ONLY)
-    looking.look_in(open_base(base[0]))
+    looking.localise_in(open_base(base[0]))
     try:
         plain, found = swum(elsewhere, alone), swum(elsewhere, looking)
         assert looking.in_base is not None

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from aquaflow.config import GateConfig
-from aquaflow.tracking.gate.gate import FrameGate, GateKind, Verdict
+from aquaflow.tracking.gate.gate import FrameGate, GateKind, GateVerdict
 from aquaflow.tracking.gate.thumbnail import TILES, _tile_means
 from tests.tracking.tracking_scenes import CAMERA, SeaFloor, lawn_path, pose
 
@@ -37,7 +37,7 @@ def swim(count: int = 6) -> list[Picture]:
     return [FLOOR.picture(T) for T in lawn_path(count)]
 
 
-def judged(pictures: list[Picture], config: GateConfig | None = None) -> list[Verdict]:
+def judged(pictures: list[Picture], config: GateConfig | None = None) -> list[GateVerdict]:
     gate = FrameGate(config or GateConfig())
     return [gate.judge(picture) for picture in pictures]
 

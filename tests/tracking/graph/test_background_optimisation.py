@@ -18,7 +18,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore, Pointmap
 from aquaflow.prior.contract import Encoding
-from aquaflow.tracking.frames import Link
+from aquaflow.tracking.frames import KeyframeEdge
 from aquaflow.tracking.graph import keyframe_graph
 from aquaflow.tracking.graph.keyframe_graph import Correction, KeyframeGraph
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
@@ -85,7 +85,7 @@ class Drifting:
         if number:
             T_fk = self.link_T[number - 1]
             T_wc = self.store[number - 1].T_wc @ T_fk.inverse()
-            link = Link(number - 1, T_fk, np.diag(SIGMA[:6] ** 2))
+            link = KeyframeEdge(number - 1, T_fk, np.diag(SIGMA[:6] ** 2))
         nothing = cast(Encoding, SimpleNamespace(camera=CAMERA, number=number))
         self.store.add(number, number, nothing, T_wc, Pointmap.unknown(CAMERA), 0)
         self.graph.add(number, link)

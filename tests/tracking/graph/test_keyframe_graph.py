@@ -13,7 +13,7 @@ from aquaflow.geometry.alignment import align
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.prior.classical import ClassicalPrior
-from aquaflow.tracking.frames import FrameClass, Link, Revisit, Step, Tracked
+from aquaflow.tracking.frames import FrameClass, KeyframeEdge, Revisit, Step, Tracked
 from aquaflow.tracking.graph.keyframe_graph import Correction, KeyframeGraph
 from aquaflow.tracking.loops.relocaliser import Places
 from aquaflow.tracking.tracker import Tracker
@@ -50,7 +50,7 @@ class Swim:
         self.tracker = Tracker(prior, self.store, self.settings, places)
         self.graph = KeyframeGraph(self.store, places, self.settings)
         self.tracked: list[Tracked] = []
-        self.links: dict[int, Link] = {}
+        self.links: dict[int, KeyframeEdge] = {}
         self.anchors: dict[int, tuple[int, Sim3]] = {}
         self.corrections: list[Correction] = []
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from aquaflow.geometry.similarity import BODY_FROM_CAMERA, Sim3
 from aquaflow.telemetry.recent_motion import RecentMotion
-from aquaflow.tracking.metric.metric_frames import LONGEST_S, motion_of_camera
+from aquaflow.tracking.metric.world_frames import LONGEST_S, motion_of_camera
 from aquaflow.types import AngularRate, Velocity
 
 T_BC = Sim3(

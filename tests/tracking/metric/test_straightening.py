@@ -12,7 +12,7 @@ from aquaflow.tracking.graph.equations import poses_of
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph
 from aquaflow.tracking.graph.table import GraphResult
 from aquaflow.tracking.metric.straightening import solve_with_worlds
-from aquaflow.tracking.metric.world_edges import Measured, World, WorldEdge, world_edge
+from aquaflow.tracking.metric.world_edges import KeyframeMeasurements, World, WorldEdge, world_edge
 from tests.tracking.graph.graph_scenes import LOOP_SIGMA, Dive
 
 Array = npt.NDArray[np.float64]
@@ -50,10 +50,10 @@ def world(graph: PoseGraph, truth: Sim3Batch, kind: str) -> World:
     for k in range(COUNT):
         T, true = graph.pose(k), truth.element(k)
         measured = {
-            "depth": Measured(depth_m=(float(true.t[2]), 0.01), turn=np.zeros(3),
+            "depth": KeyframeMeasurements(depth_m=(float(true.t[2]), 0.01), turn=np.zeros(3),
                               turn_sigma=(0.002, 0.01),
                               place_m=(true.t[:2], 1e-3) if k == 0 else None),
-            "scale": Measured(scale=(true.scale, 0.005),
+            "scale": KeyframeMeasurements(scale=(true.scale, 0.005),
                               turn=np.zeros(3), turn_sigma=(0.002, 0.01),
                               place_m=(true.t[:2], 1e-3) if k == 0 else None,
                               depth_m=(float(true.t[2]), 1e-3) if k == 0 else None),
@@ -122,7 +122,7 @@ def looped(false: bool) -> tuple[Dive, list[World]]:
     edges = []
     for k in range(dive.count):
         true = dive.truth.element(k)
-        measured = Measured(
+        measured = KeyframeMeasurements(
             depth_m=(float(true.t[2]), 0.01), place_m=(true.t[:2], 0.01), turn=np.zeros(3),
             turn_sigma=(0.1, 0.1),
         )  # fmt: skip
@@ -148,7 +148,9 @@ def test_a_chain_through_the_world_admits_no_loop_that_the_links_contradict() ->
     dive.graph.add_edge(Edge(3, 30, Sim3.identity(), np.diag(LOOP_SIGMA**-2), loop=True))
     edges = []
     for k in (3, 30):
-        measured = Measured(depth_m=(float(near.t[2]), 1e-3), place_m=(near.t[:2], 1e-3))
+        measured = KeyframeMeasurements(
+            depth_m=(float(near.t[2]), 1e-3), place_m=(near.t[:2], 1e-3)
+        )
         edge = world_edge(k, dive.graph.pose(k), measured)
         assert edge is not None
         edges.append(edge)

@@ -13,7 +13,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.telemetry.telemetry import Telemetry
 from aquaflow.tracking.frame_table import FRAME, NONE
 from aquaflow.tracking.graph.table import NODE
-from aquaflow.tracking.metric.survey import MOST_POINTS, Survey
+from aquaflow.tracking.metric.survey import MOST_POINTS, TrackingSnapshot
 
 Array = npt.NDArray[np.float64]
 
@@ -25,7 +25,7 @@ POSES = [
 STEP = Sim3(Rotation.from_rotvec([0.0, 0.05, 0.0]).as_matrix(), np.array([0.1, 0.0, 0.02]))
 
 
-def survey(frames: Array, points: tuple[Array, ...] = ()) -> Survey:
+def survey(frames: Array, points: tuple[Array, ...] = ()) -> TrackingSnapshot:
     """Keyframes 0, 1, 2 of one sub-map and 3 of another."""
     nodes = np.zeros(4, NODE)
     for k, T in enumerate(POSES):
@@ -34,8 +34,8 @@ def survey(frames: Array, points: tuple[Array, ...] = ()) -> Survey:
         "nodes": nodes, "parts": (frames,), "telemetry": Telemetry(), "points": points,
         "mounting": None, "config": FusionConfig(),
     }  # fmt: skip
-    fields = inspect.signature(Survey).parameters
-    return Survey(**values, **{name: () for name in fields if name not in values})
+    fields = inspect.signature(TrackingSnapshot).parameters
+    return TrackingSnapshot(**values, **{name: () for name in fields if name not in values})
 
 
 def rows(*entries: tuple[float, int, Sim3]) -> Array:

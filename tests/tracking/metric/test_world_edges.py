@@ -8,23 +8,25 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.tracking.metric.world_edges import Measured, World, WorldEdge, world_edge
+from aquaflow.tracking.metric.world_edges import KeyframeMeasurements, World, WorldEdge, world_edge
 from tests.metric_scenes import metric_frame
 
 Array = npt.NDArray[np.float64]
 
 T_NK = Sim3(Rotation.from_rotvec([0.4, -0.9, 1.3]).as_matrix(), np.array([3.0, -2.0, 8.0]), 1.7)
 CASES = {
-    "depth": Measured(depth_m=(8.5, 0.02)),
-    "place": Measured(place_m=(np.array([3.4, -2.2]), 0.3)),
-    "down": Measured(turn=np.array([0.01, -0.02, 9.0]), turn_sigma=(0.004, np.inf)),
-    "down and north": Measured(turn=np.array([0.01, -0.02, 0.03]), turn_sigma=(0.004, 0.05)),
-    "scale": Measured(scale=(1.72, 0.01)),
+    "depth": KeyframeMeasurements(depth_m=(8.5, 0.02)),
+    "place": KeyframeMeasurements(place_m=(np.array([3.4, -2.2]), 0.3)),
+    "down": KeyframeMeasurements(turn=np.array([0.01, -0.02, 9.0]), turn_sigma=(0.004, np.inf)),
+    "down and north": KeyframeMeasurements(
+        turn=np.array([0.01, -0.02, 0.03]), turn_sigma=(0.004, 0.05)
+    ),
+    "scale": KeyframeMeasurements(scale=(1.72, 0.01)),
 }
 RANKS = {"depth": 1, "place": 2, "down": 2, "down and north": 3, "scale": 1}
 
 
-def made(measured: Measured) -> WorldEdge:
+def made(measured: KeyframeMeasurements) -> WorldEdge:
     edge = world_edge(7, T_NK, measured)
     assert edge is not None
     assert edge.keyframe == 7
@@ -32,7 +34,7 @@ def made(measured: Measured) -> WorldEdge:
 
 
 def test_a_keyframe_of_which_nothing_was_measured_has_no_edge() -> None:
-    assert world_edge(7, T_NK, Measured()) is None
+    assert world_edge(7, T_NK, KeyframeMeasurements()) is None
 
 
 @pytest.mark.parametrize("name", CASES)

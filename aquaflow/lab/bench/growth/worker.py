@@ -28,7 +28,7 @@ from aquaflow.geometry.arrays import Arrays, of_sim3, prefixed
 from aquaflow.lab.bench.answer import answer
 from aquaflow.lab.bench.growth.job import THREADS, GrowthJob
 from aquaflow.lab.bench.memory import peak_memory_mb, resident_mb
-from aquaflow.lab.synthetic.survey import Survey
+from aquaflow.lab.synthetic.survey import SurveyPictures
 from aquaflow.mapping import state
 from aquaflow.slam import Slam
 
@@ -39,7 +39,7 @@ def perform(job: GrowthJob) -> dict[str, Any]:
     Raises:
         AquaFlowError: the run failed; the sentence says why.
     """
-    config, survey = job.config(), Survey(job.width)
+    config, survey = job.config(), SurveyPictures(job.width)
     fix_threads(THREADS, config)
     start_mb = resident_mb()
     folder = DiveFolder(Path(job.out), config, overwrite=True)
@@ -60,7 +60,7 @@ def perform(job: GrowthJob) -> dict[str, Any]:
     return row
 
 
-def _dived(run: DiveRun, survey: Survey, frames: int) -> dict[str, Any]:
+def _dived(run: DiveRun, survey: SurveyPictures, frames: int) -> dict[str, Any]:
     """What there is when the last frame is in."""
     meter = TenthsMeter(run, frames)
     for frame in survey.frames(frames):

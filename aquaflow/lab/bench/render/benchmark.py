@@ -21,7 +21,7 @@ from aquaflow.lab.bench.render.contenders import (
 )
 from aquaflow.lab.bench.render.interactions import count_interactions
 from aquaflow.lab.bench.render.parts import TimedPart, parts_of, time_parts
-from aquaflow.lab.bench.render.peak import Peak, measure_peak
+from aquaflow.lab.bench.render.peak import PeakRate, measure_peak
 from aquaflow.lab.bench.render.picture import draw
 from aquaflow.lab.bench.render.rows import Row, row_of
 from aquaflow.lab.bench.render.timing import Sample, interleaved
@@ -38,7 +38,7 @@ RuntimeError when the device is full or a kernel does not compile."""
 
 KERNELS = ("cpu", "gsplat")
 """Renderers whose gradients are held against the reference's."""
-NO_PEAK = Peak({}, "no measurement")
+NO_PEAK = PeakRate({}, "no measurement")
 """Of a GPU: what it could do at most is not estimated."""
 
 Progress = Callable[[str, int, int | None], None]
@@ -88,7 +88,7 @@ def bench_render(
     return result
 
 
-def _limits(peak: Peak, contenders: Sequence[BenchmarkedRenderer]) -> Peak:
+def _limits(peak: PeakRate, contenders: Sequence[BenchmarkedRenderer]) -> PeakRate:
     """The peak, with what the blending loops of each instruction set do at most."""
     isas = sorted({contender.isa for contender in contenders if contender.name == "cpu"})
     return replace(peak, blending={isa: measure_blend_limit(isa) for isa in isas})
@@ -105,7 +105,7 @@ def time_sizes(
     contenders: Sequence[BenchmarkedRenderer],
     sizes: Sequence[Size],
     repeats: int,
-    peak: Peak,
+    peak: PeakRate,
     notes: list[str],
     progress: Progress,
 ) -> list[Row]:

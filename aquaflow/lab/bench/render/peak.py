@@ -48,7 +48,7 @@ extern "C" __attribute__((visibility("default"))) float multiply_add(long steps)
 
 
 @dataclass(frozen=True)
-class Peak:
+class PeakRate:
     """Highest rate seen, for each number of threads, and how it was found."""
 
     flop_per_s: dict[int, float]
@@ -58,7 +58,7 @@ class Peak:
     measured."""
 
 
-def measure_peak(threads: tuple[int, ...]) -> Peak:
+def measure_peak(threads: tuple[int, ...]) -> PeakRate:
     """The fastest instruction set's peak; of matrix products where nothing can be compiled."""
     isas = build.supported_isas()
     with tempfile.TemporaryDirectory() as folder:
@@ -67,7 +67,7 @@ def measure_peak(threads: tuple[int, ...]) -> Peak:
             method = f"a compiled {isas[0]} multiply-add loop"
         except (build.BuildError, OSError, IndexError, subprocess.CalledProcessError):
             work, method = _matrix_product(), f"torch products of {MATRIX} x {MATRIX} matrices"
-        return Peak({count: _fastest(work, count) for count in threads}, method)
+        return PeakRate({count: _fastest(work, count) for count in threads}, method)
 
 
 Work = Callable[[], float]

@@ -7,7 +7,7 @@ from typing import Any
 
 from aquaflow.lab.bench.render.contenders import BenchmarkedRenderer
 from aquaflow.lab.bench.render.interactions import BACKWARD_FLOP, FORWARD_FLOP
-from aquaflow.lab.bench.render.peak import Peak
+from aquaflow.lab.bench.render.peak import PeakRate
 from aquaflow.lab.bench.render.timing import Sample, spread_of
 from aquaflow.render.example_scene import Size
 
@@ -22,7 +22,7 @@ def row_of(
     size: Size,
     samples: Sequence[Sample],
     interactions: int,
-    peak: Peak,
+    peak: PeakRate,
     load: float | None,
 ) -> Row:
     """Medians in ms; rates by the GPU's time, else by the CPU time where one thread worked, else
@@ -64,7 +64,7 @@ def _median(samples: Sequence[Sample], name: str) -> float | None:
 
 
 def _shares(
-    contender: BenchmarkedRenderer, busy_s: dict[str, float], interactions: int, peak: Peak
+    contender: BenchmarkedRenderer, busy_s: dict[str, float], interactions: int, peak: PeakRate
 ) -> dict[str, float] | None:
     """Useful operations/s over the peak's; None where no peak was measured for the device."""
     most = None if contender.isa == "cuda" else peak.flop_per_s.get(contender.threads)
@@ -76,7 +76,7 @@ def _shares(
 
 
 def _blend_shares(
-    contender: BenchmarkedRenderer, busy_s: dict[str, float], interactions: int, peak: Peak
+    contender: BenchmarkedRenderer, busy_s: dict[str, float], interactions: int, peak: PeakRate
 ) -> dict[str, float] | None:
     """Of the rate at which the kernels blend where nothing is in vain and nothing else is done."""
     limit = peak.blending.get(contender.isa)

@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.lab.synthetic.motion import BodyMotion
+from aquaflow.lab.synthetic.motion import TrueBodyMotion
 from aquaflow.lab.synthetic.telemetry.series import chosen
 from aquaflow.lab.synthetic.telemetry.sonar import Sonar
 from aquaflow.lab.synthetic.telemetry_noise import TelemetryNoise
@@ -19,7 +19,7 @@ Array: TypeAlias = npt.NDArray[np.float64]
 
 def altitude(
     t: Array,  # [N] s
-    motion: BodyMotion,
+    motion: TrueBodyMotion,
     sonar: Sonar,
     noise: TelemetryNoise,
     rng: np.random.Generator,

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from aquaflow.lab.synthetic.motion import BodyMotion
+from aquaflow.lab.synthetic.motion import TrueBodyMotion
 from aquaflow.lab.synthetic.telemetry.constants import Constants
 from aquaflow.lab.synthetic.telemetry.series import random_walk, wander
 from aquaflow.lab.synthetic.telemetry_noise import TelemetryNoise
@@ -20,7 +20,7 @@ Array: TypeAlias = npt.NDArray[np.float64]
 
 def attitude(
     t: Array,  # [N] s
-    motion: BodyMotion,
+    motion: TrueBodyMotion,
     constants: Constants,
     noise: TelemetryNoise,
     rng: np.random.Generator,
@@ -45,7 +45,7 @@ def attitude(
 
 def angular_rate(
     t: Array,  # [N] s
-    motion: BodyMotion,
+    motion: TrueBodyMotion,
     constants: Constants,
     noise: TelemetryNoise,
     rng: np.random.Generator,
@@ -58,7 +58,7 @@ def angular_rate(
 
 def acceleration(
     t: Array,  # [N] s
-    motion: BodyMotion,
+    motion: TrueBodyMotion,
     constants: Constants,
     noise: TelemetryNoise,
     rng: np.random.Generator,

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.lab.synthetic.config import SyntheticConfig
-from aquaflow.lab.synthetic.motion import BodyMotion
+from aquaflow.lab.synthetic.motion import TrueBodyMotion
 from aquaflow.lab.synthetic.streams import Instrument, instrument_stream
 from aquaflow.lab.synthetic.telemetry.altitude import altitude
 from aquaflow.lab.synthetic.telemetry.constants import Constants
@@ -34,7 +34,7 @@ SOURCE = "synthetic"
 
 
 def measure(
-    config: SyntheticConfig, motion: BodyMotion, sonar: Sonar, constants: Constants
+    config: SyntheticConfig, motion: TrueBodyMotion, sonar: Sonar, constants: Constants
 ) -> list[TelemetrySample]:
     """Samples of every instrument between the first picture and the last, by arrival.
 
@@ -59,7 +59,7 @@ def measure(
 
 
 def _instruments(
-    config: SyntheticConfig, motion: BodyMotion, sonar: Sonar, constants: Constants
+    config: SyntheticConfig, motion: TrueBodyMotion, sonar: Sonar, constants: Constants
 ) -> dict[Instrument, tuple[float, Measure]]:
     """Rate (Hz; 0: not aboard) and measurement of each kind."""
     noise = config.telemetry

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from aquaflow.geometry.earth import latitude_longitude
-from aquaflow.lab.synthetic.motion import BodyMotion
+from aquaflow.lab.synthetic.motion import TrueBodyMotion
 from aquaflow.lab.synthetic.telemetry.series import chosen
 from aquaflow.lab.synthetic.telemetry_noise import TelemetryNoise
 
@@ -19,7 +19,7 @@ Array: TypeAlias = npt.NDArray[np.float64]
 
 def position(
     t: Array,  # [N] s, at which fixes are stamped
-    motion: BodyMotion,
+    motion: TrueBodyMotion,
     noise: TelemetryNoise,
     rng: np.random.Generator,
 ) -> Array:

@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.lab.synthetic.motion import GRAVITY_M_S2, BodyMotion
+from aquaflow.lab.synthetic.motion import GRAVITY_M_S2, TrueBodyMotion
 from aquaflow.lab.synthetic.telemetry.constants import Constants
 from aquaflow.lab.synthetic.telemetry_noise import TelemetryNoise
 
@@ -22,7 +22,7 @@ Array: TypeAlias = npt.NDArray[np.float64]
 
 def depth(
     t: Array,  # [N] s
-    motion: BodyMotion,
+    motion: TrueBodyMotion,
     constants: Constants,
     noise: TelemetryNoise,
     rng: np.random.Generator,

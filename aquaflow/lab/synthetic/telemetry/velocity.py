@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from aquaflow.lab.synthetic.motion import BodyMotion
+from aquaflow.lab.synthetic.motion import TrueBodyMotion
 from aquaflow.lab.synthetic.telemetry.constants import Constants
 from aquaflow.lab.synthetic.telemetry.series import chosen, stretches
 from aquaflow.lab.synthetic.telemetry_noise import TelemetryNoise
@@ -19,7 +19,7 @@ Array: TypeAlias = npt.NDArray[np.float64]
 
 def velocity(
     t: Array,  # [N] s
-    motion: BodyMotion,
+    motion: TrueBodyMotion,
     constants: Constants,
     noise: TelemetryNoise,
     rng: np.random.Generator,

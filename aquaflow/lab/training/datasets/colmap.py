@@ -34,7 +34,7 @@ POINT_BYTES = 24
 
 
 @dataclass(frozen=True)
-class _Camera:
+class _ColmapCamera:
     width: int
     height: int
     K: Array
@@ -72,7 +72,7 @@ def _workspace(folder: Path, root: Path) -> Frames:
 def _frame(
     image: Path,
     depth: Path,
-    camera: _Camera,
+    camera: _ColmapCamera,
     T_wc: Array,  # [4, 4] in the model's unit
 ) -> Posed:
     picture, metres = read_image(image), read_depth_map(depth)
@@ -98,14 +98,14 @@ def read_depth_map(path: Path) -> Depth:
         raise InputError(f"{path} is no depth map of COLMAP's; run its stereo again") from error
 
 
-def _cameras(data: bytes) -> dict[int, _Camera]:
+def _cameras(data: bytes) -> dict[int, _ColmapCamera]:
     cameras, at = {}, 8
     for _ in range(struct.unpack_from("<Q", data)[0]):
         number, model, width, height = struct.unpack_from("<iiQQ", data, at)
         count = PARAMETERS[model]
         values = struct.unpack_from(f"<{count}d", data, at + 24)
         fx, fy, cx, cy = values if model == PINHOLE else (values[0], *values)
-        cameras[number] = _Camera(width, height, pinhole(fx, fy, cx, cy))
+        cameras[number] = _ColmapCamera(width, height, pinhole(fx, fy, cx, cy))
         at += 24 + 8 * count
     return cameras
 

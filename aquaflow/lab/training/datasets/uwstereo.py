@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from aquaflow.base.errors import ConfigError, InputError
 from aquaflow.base.errors.plain_yaml import read_mapping
-from aquaflow.config.stage import Stage
+from aquaflow.config.stage import StageConfig
 from aquaflow.lab.training.datasets.posed import (
     Depth,
     Frames,
@@ -31,7 +31,7 @@ CALIBRATION = "stereo.yaml"
 """File with the calibration of the rig."""
 
 
-class StereoRig(Stage):
+class StereoRig(StageConfig):
     """Two rectified cameras of one kind."""
 
     fx: float

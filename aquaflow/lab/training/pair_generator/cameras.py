@@ -14,7 +14,7 @@ from aquaflow.lab.training.pair_generator.scene import Terrain, rotation
 
 
 @dataclass(frozen=True)
-class Motion:
+class PairMotion:
     """How far the second camera is from the first."""
 
     baseline: float = 0.45
@@ -29,11 +29,11 @@ class Motion:
     """Share of the pairs that move along the optical axis, to the front or back."""
 
 
-TRAINING = Motion(baseline=0.8, forward=0.25)
+TRAINING = PairMotion(baseline=0.8, forward=0.25)
 """Of the pairs that are learned from: wider than what is held out, and a quarter along the axis."""
-WIDE = Motion(baseline=0.45, power=1.5, tilt=0.07, roll=0.12)
+WIDE = PairMotion(baseline=0.45, power=1.5, tilt=0.07, roll=0.12)
 """Of the held-out pairs: the motion of the prototypes' measurements (docs/measurements.md)."""
-WIDER = Motion(baseline=0.45, power=1.0, tilt=0.1, roll=0.2)
+WIDER = PairMotion(baseline=0.45, power=1.0, tilt=0.1, roll=0.2)
 """Of a second held-out set: every baseline as likely as another, and more roll."""
 
 FIELD_OF_VIEW_DEG = (40.0, 95.0)
@@ -93,7 +93,7 @@ def second_camera(
     terrain: Terrain,
     T_wc: Tensor,  # [B, 4, 4] of the first
     depth: Tensor,  # [B] m, median of what the first sees
-    motion: Motion,
+    motion: PairMotion,
 ) -> Tensor:
     """[B, 4, 4] camera to world."""
     T = moved_camera(draw, T_wc, depth, motion)
@@ -107,7 +107,7 @@ def moved_camera(
     draw: Draw,
     T_wc: Tensor,  # [B, 4, 4] of the first
     depth: Tensor,  # [B] m, median of what the first sees
-    motion: Motion,
+    motion: PairMotion,
 ) -> Tensor:
     """[B, 4, 4] camera to world, wherever that is."""
     batch = len(T_wc)

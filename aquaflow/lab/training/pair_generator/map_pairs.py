@@ -20,14 +20,19 @@ from aquaflow.base.errors import InputError, reason_of
 from aquaflow.dive.map_file import SUFFIX
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.lab.training.correspondences import overlap
-from aquaflow.lab.training.pair_generator.cameras import TRAINING, Motion, intrinsics, moved_camera
+from aquaflow.lab.training.pair_generator.cameras import (
+    TRAINING,
+    PairMotion,
+    intrinsics,
+    moved_camera,
+)
 from aquaflow.lab.training.pair_generator.draw import Draw
 from aquaflow.lab.training.pair_generator.mapped_scene import MappedScene
 from aquaflow.lab.training.pair_generator.render import BRIGHTEST, median_depth
 from aquaflow.lab.training.pair_generator.stored_pairs import SHARD, STRIDE, StoredPairs
 from aquaflow.lab.training.pairs import Pair, ViewBatch, joined
 
-NEAR = Motion(baseline=0.1, power=1.0, tilt=0.05, roll=0.15)
+NEAR = PairMotion(baseline=0.1, power=1.0, tilt=0.05, roll=0.15)
 """Of a view from a mapped one."""
 FIELD_OF_VIEW = (0.75, 1.15)
 """Of the widest that fits into a mapped picture: a wider one is covered by its neighbours."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from aquaflow.lab.training.pair_generator.cameras import TRAINING, Motion
+from aquaflow.lab.training.pair_generator.cameras import TRAINING, PairMotion
 from aquaflow.lab.training.pair_generator.draw import Draw
 from aquaflow.lab.training.pair_generator.render import render_pairs
 from aquaflow.lab.training.pair_generator.scene import Detail
@@ -19,7 +19,7 @@ class Pool(StoredPairs):
     seed: int
     width: int = 192
     height: int = 144
-    motion: Motion = TRAINING
+    motion: PairMotion = TRAINING
     detail: Detail = field(default_factory=Detail)
 
     @property

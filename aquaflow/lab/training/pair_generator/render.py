@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from aquaflow.lab.training.pair_generator.cameras import (
-    Motion,
+    PairMotion,
     first_camera,
     intrinsics,
     second_camera,
@@ -28,7 +28,7 @@ to the light at the usual range."""
 
 
 def render_pairs(
-    draw: Draw, batch: int, width: int, height: int, motion: Motion, detail: Detail
+    draw: Draw, batch: int, width: int, height: int, motion: PairMotion, detail: Detail
 ) -> Pair:
     """``batch`` scenes, each seen twice; the images are radiances without water."""
     scene = random_scenes(draw, batch, detail)

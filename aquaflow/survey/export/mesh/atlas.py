@@ -33,7 +33,7 @@ picture once, takes in no background."""
 
 
 @dataclass(frozen=True)
-class Layout:
+class AtlasLayout:
     """A mesh laid out in a picture. At seams a vertex has several places in it."""
 
     source: Integers
@@ -51,7 +51,7 @@ class Layout:
         return np.asarray(self.places / (self.width, self.height))
 
 
-def lay_out(mesh: TriangleMesh, texel: float) -> Layout:
+def lay_out(mesh: TriangleMesh, texel: float) -> AtlasLayout:
     """``mesh`` with ``texel`` as the side of a pixel, larger if the texture would be too large.
 
     Raises:
@@ -76,12 +76,12 @@ def lay_out(mesh: TriangleMesh, texel: float) -> Layout:
     corners = [each.astype(np.int64) + at for at, (_, each, _) in zip(starts, groups, strict=False)]
     size = np.array([atlas.width, atlas.height])
     places = np.concatenate([uv for _, _, uv in groups]) * size.astype(np.float64)
-    return Layout(np.concatenate(source), places, np.concatenate(corners), *size.tolist())
+    return AtlasLayout(np.concatenate(source), places, np.concatenate(corners), *size.tolist())
 
 
 def painted(
     mesh: TriangleMesh,
-    layout: Layout,
+    layout: AtlasLayout,
     colour: Colour,
     progress: Callable[[int, int], None] | None = None,
 ) -> npt.NDArray[np.uint8]:
@@ -105,7 +105,7 @@ def painted(
     return picture
 
 
-def _texels(mesh: TriangleMesh, layout: Layout) -> Iterator[tuple[Integers, Integers, Array]]:
+def _texels(mesh: TriangleMesh, layout: AtlasLayout) -> Iterator[tuple[Integers, Integers, Array]]:
     """Rows, columns and places on the mesh of pixels, some triangles at a time: those that hold the
     middle of a triangle, which may hold no pixel's, and then those whose middle it holds."""
     for first in range(0, len(mesh.faces), FACES):

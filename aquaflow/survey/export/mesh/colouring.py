@@ -27,7 +27,7 @@ SAME_SURFACE = 2.0
 
 
 @dataclass(frozen=True)
-class Seen:
+class ObservedColours:
     """Some places as the views see them."""
 
     radiance: Array
@@ -53,7 +53,7 @@ def look_at(
     surfaces: ViewSurfaces,
     places: Array,  # [M, 3]
     voxel: float,
-) -> Seen:
+) -> ObservedColours:
     """How the views see ``places`` of the surface."""
     count = len(places)
     total, weights = np.zeros((count, 3)), np.zeros(count)
@@ -84,7 +84,7 @@ def look_at(
     least = np.linalg.eigvalsh(information)[:, 0]
     with np.errstate(divide="ignore"):
         sigma = np.where(least > 0.0, 1.0 / np.sqrt(np.maximum(least, 0.0)), np.inf)
-    return Seen(total / np.maximum(weights, 1e-30)[:, None], nearest, sigma, footprint)
+    return ObservedColours(total / np.maximum(weights, 1e-30)[:, None], nearest, sigma, footprint)
 
 
 def batches(count: int) -> Iterator[slice]:
@@ -94,7 +94,7 @@ def batches(count: int) -> Iterator[slice]:
 
 
 def shown_colours(
-    colours: Colours, seen: Seen
+    colours: Colours, seen: ObservedColours
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.bool_]]:
     """RGB [M, 3] of places, and which of them [M] a view sees."""
     radiance = checkpoint_in(seen.radiance[None].astype(np.float32), colours.device)

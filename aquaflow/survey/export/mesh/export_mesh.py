@@ -74,7 +74,7 @@ class FusedSurface:
 
     mesh: TriangleMesh
     sigma: Array
-    """[N] of the vertices: :class:`aquaflow.survey.export.mesh.colouring.Seen`."""
+    """[N] of the vertices: :class:`aquaflow.survey.export.mesh.colouring.ObservedColours`."""
     views: ViewSurfaces
     voxel: float
     """Side of a voxel."""

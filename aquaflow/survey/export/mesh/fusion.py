@@ -27,7 +27,7 @@ LEAST_SHIFT = 1e-3
 
 
 @dataclass(frozen=True)
-class Distances:
+class ChunkDistances:
     """The voxels of a chunk."""
 
     values: Array
@@ -35,7 +35,7 @@ class Distances:
     too few views say anything of."""
 
 
-def fused(surfaces: ViewSurfaces, chunk: Chunk, voxel: float, least_views: int) -> Distances:
+def fused(surfaces: ViewSurfaces, chunk: Chunk, voxel: float, least_views: int) -> ChunkDistances:
     """Distances of ``chunk.voxels()``, each known to ``least_views`` views at least."""
     voxels = chunk.voxels()
     low, high = voxels.min(axis=0) * voxel, voxels.max(axis=0) * voxel
@@ -43,7 +43,7 @@ def fused(surfaces: ViewSurfaces, chunk: Chunk, voxel: float, least_views: int) 
     places = voxels.astype(np.float64) * voxel
     parts = (places[first : first + SLICE] for first in range(0, len(places), SLICE))
     found = [_fused_slice(surfaces, numbers, part, voxel, least_views) for part in parts]
-    return Distances(np.concatenate(found))
+    return ChunkDistances(np.concatenate(found))
 
 
 def _fused_slice(

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from aquaflow import __version__
 from aquaflow.dive.placement import Placement
-from aquaflow.survey.export.mesh.atlas import Layout
+from aquaflow.survey.export.mesh.atlas import AtlasLayout
 
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -21,7 +21,7 @@ Bytes = npt.NDArray[np.uint8]
 class Texture:
     """A picture of the surface, and where in it each corner of the triangles lies."""
 
-    layout: Layout
+    layout: AtlasLayout
     picture: Bytes
     """[H, W, 3] RGB."""
 
@@ -38,7 +38,7 @@ class PlacedMesh:
     faces: Integers
     """[M, 3] counter-clockwise seen from outside."""
     sigma: Array
-    """[N] as in :class:`aquaflow.survey.export.mesh.colouring.Seen`."""
+    """[N] as in :class:`aquaflow.survey.export.mesh.colouring.ObservedColours`."""
     origin: tuple[float, float, float]
     """To be added to the positions; zeros without a grid."""
     where: Placement

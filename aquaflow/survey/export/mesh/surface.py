@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from aquaflow.base.errors.extra import load
 from aquaflow.survey.export.mesh.blocks import BLOCK, CHUNK_BLOCKS, Chunk
-from aquaflow.survey.export.mesh.fusion import Distances
+from aquaflow.survey.export.mesh.fusion import ChunkDistances
 from aquaflow.survey.export.mesh.triangle_mesh import TriangleMesh
 
 Array = npt.NDArray[np.float64]
@@ -45,7 +45,7 @@ class SurfaceBuilder:
         self._faces: list[Integers] = []
         self._count = 0
 
-    def add(self, chunk: Chunk, distances: Distances) -> None:
+    def add(self, chunk: Chunk, distances: ChunkDistances) -> None:
         """The triangles of a chunk."""
         volume = np.full((SIDE, SIDE, SIDE), np.nan)
         volume[tuple((chunk.voxels() - chunk.corner).T)] = distances.values

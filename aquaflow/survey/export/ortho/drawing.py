@@ -20,7 +20,7 @@ from aquaflow.dive.map_splats import splats_of
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.contract import RADIUS_SIGMAS, Renderer
 from aquaflow.render.transfers import checkpoint_in, picture_out, pose_in
-from aquaflow.survey.export.ortho.grid import Grid, Tile
+from aquaflow.survey.export.ortho.grid import Grid, GridTile
 from aquaflow.survey.export.ortho.ground import Ground
 
 Array = npt.NDArray[np.float64]
@@ -39,7 +39,7 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True)
-class Drawn:
+class DrawnTile:
     """A tile of the map from above."""
 
     radiance: Tensor
@@ -52,7 +52,7 @@ class Drawn:
     """[h, w] standard deviation of the heights, weighted likewise: large at edges."""
 
 
-class Splats:
+class GroundSplats:
     """The Gaussians of a map on the ground."""
 
     def __init__(self, mapper: Mapper, ground: Ground) -> None:
@@ -66,7 +66,7 @@ class Splats:
         """[N, 2] x and y of the Gaussians on the ground."""
         return np.asarray(self._splats.means[:, :2], np.float64)
 
-    def reaching(self, grid: Grid, tile: Tile) -> npt.NDArray[np.intp]:
+    def reaching(self, grid: Grid, tile: GridTile) -> npt.NDArray[np.intp]:
         """[M] numbers of the Gaussians that touch a tile."""
         low, high = grid.bounds(tile)
         places, reach = self._splats.means[:, :2], self._reach[:, None] + grid.pixel
@@ -76,10 +76,10 @@ class Splats:
     def draw(
         self,
         grid: Grid,
-        tile: Tile,
+        tile: GridTile,
         chosen: npt.NDArray[np.intp],  # [M] of the Gaussians
         finer: int = 1,
-    ) -> Drawn:
+    ) -> DrawnTile:
         """A tile, of which ``finer`` x ``finer`` drawn pixels make one."""
         low, high = grid.bounds(tile)
         heights = self._splats.means[chosen, 2]
@@ -99,7 +99,7 @@ class Splats:
         image = together[..., :5] / together[..., 5:].clamp_min(LEAST_ALPHA)
         mean = picture_out(image[..., 3]).astype(np.float64)
         variance = picture_out(image[..., 4]) - mean**2
-        return Drawn(
+        return DrawnTile(
             image[..., :3],
             picture_out(together[..., 5]),
             middle[2] + unit * mean,

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from aquaflow.base.errors import InputError, first_line
 from aquaflow.base.errors.extra import load
 from aquaflow.base.storage.atomic import fresh_file, scratch_file
-from aquaflow.survey.export.ortho.grid import TILE_PX, Grid, Tile
+from aquaflow.survey.export.ortho.grid import TILE_PX, Grid, GridTile
 from aquaflow.survey.export.ortho.ground import Ground
 from aquaflow.survey.export.ortho.layers import NODATA, RasterFile
 
@@ -43,7 +43,7 @@ class Raster:
 
     def write(
         self,
-        tile: Tile,
+        tile: GridTile,
         values: npt.NDArray[Any],  # [bands, h, w]
     ) -> None:
         """Put a tile into its place."""

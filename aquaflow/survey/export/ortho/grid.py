@@ -22,7 +22,7 @@ DIGITS = 2
 
 
 @dataclass(frozen=True)
-class Tile:
+class GridTile:
     """A rectangle of pixels."""
 
     row: int
@@ -68,11 +68,11 @@ class Grid:
         left, top = start[0] + first[0] * pixel, start[1] + last[1] * pixel
         return Grid(float(left), float(top), pixel, int(sides[0]), int(sides[1]))
 
-    def tiles(self) -> Iterator[Tile]:
+    def tiles(self) -> Iterator[GridTile]:
         """From the top left, row by row."""
         for row in range(0, self.height, TILE_PX):
             for column in range(0, self.width, TILE_PX):
-                yield Tile(
+                yield GridTile(
                     row, column,
                     min(TILE_PX, self.height - row), min(TILE_PX, self.width - column),
                 )  # fmt: skip
@@ -82,14 +82,14 @@ class Grid:
         """How many :meth:`tiles` gives."""
         return math.ceil(self.height / TILE_PX) * math.ceil(self.width / TILE_PX)
 
-    def bounds(self, tile: Tile) -> tuple[Array, Array]:
+    def bounds(self, tile: GridTile) -> tuple[Array, Array]:
         """Lowest and highest x, y [2] of a tile on the ground."""
         left, top = self.left + tile.column * self.pixel, self.top - tile.row * self.pixel
         size = self.pixel * np.array([tile.width, tile.height])
         low = np.array([left, top - size[1]])
         return low, low + size
 
-    def centres(self, tile: Tile) -> Array:
+    def centres(self, tile: GridTile) -> Array:
         """[h, w, 2] x and y of the pixels' centres on the ground."""
         x = self.left + (tile.column + np.arange(tile.width) + 0.5) * self.pixel
         y = self.top - (tile.row + np.arange(tile.height) + 0.5) * self.pixel

@@ -18,7 +18,7 @@ from aquaflow.base.errors import InputError
 from aquaflow.dive.placement import UPRIGHT_FROM_DOWN
 from aquaflow.dive.utm_grid import grid_of
 from aquaflow.geometry.similarity import Sim3, nearest_rotation
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 if TYPE_CHECKING:
     from aquaflow.render.views import View
@@ -38,7 +38,7 @@ class Ground:
     """From a sub-map's world to the ground, and from there to raster coordinates."""
 
     T_gm: Sim3
-    """Its scale is that of ``MetricFrame.T_nm``."""
+    """Its scale is that of ``WorldFrame.T_nm``."""
     unit: str
     """Of lengths in g and of heights: ``m`` or ``map units``."""
     epsg: int | None
@@ -58,7 +58,7 @@ class Ground:
         return Sim3(T.R, T.t)
 
 
-def ground_of(frame: MetricFrame, views: Sequence[View]) -> Ground:
+def ground_of(frame: WorldFrame, views: Sequence[View]) -> Ground:
     """The ground of a sub-map.
 
     Raises:
@@ -100,7 +100,7 @@ def _below_views(poses: Sequence[Sim3]) -> Array:
     return nearest_rotation(np.array([np.cross(y, up), y, up]))
 
 
-def _axes_in_words(frame: MetricFrame, epsg: int | None) -> str:
+def _axes_in_words(frame: WorldFrame, epsg: int | None) -> str:
     if epsg is not None:
         return f"easting and northing of EPSG:{epsg}, m"
     if frame.level:
@@ -108,7 +108,7 @@ def _axes_in_words(frame: MetricFrame, epsg: int | None) -> str:
     return f"y up in the dive's first picture, x to the right of it, {frame.unit}"
 
 
-def _zero_in_words(frame: MetricFrame) -> str:
+def _zero_in_words(frame: WorldFrame) -> str:
     if frame.level and frame.depth_known:
         return "the water surface"
     return "the dive's start"

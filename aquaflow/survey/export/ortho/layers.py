@@ -43,7 +43,7 @@ class RasterFile:
 
 
 @dataclass(frozen=True)
-class Layer(RasterFile):
+class MapLayer(RasterFile):
     """A file of what is known of tiles."""
 
     values: Callable[[TilePixels], npt.NDArray[Any]]
@@ -77,8 +77,10 @@ def _numbers(
 
 SIGMA = "1 sigma of the height, {unit}"
 VIEWS = "views that see the pixel"
-ORTHO = Layer("ortho.tif", ("red", "green", "blue", "alpha: 255 mapped, 0 hole"), False, _colours)
-QUALITY = Layer(
+ORTHO = MapLayer(
+    "ortho.tif", ("red", "green", "blue", "alpha: 255 mapped, 0 hole"), False, _colours
+)
+QUALITY = MapLayer(
     "ortho_quality.tif", (VIEWS, SIGMA, "share of the colour restored from light"), True, _quality
 )
-DEM = Layer("dem.tif", ("height, {unit}", SIGMA, VIEWS), True, _heights)
+DEM = MapLayer("dem.tif", ("height, {unit}", SIGMA, VIEWS), True, _heights)

@@ -10,10 +10,10 @@ import numpy.typing as npt
 from aquaflow.mapping.mapper import Mapper
 from aquaflow.render.transfers import picture_out
 from aquaflow.survey.export.ortho.colours import Colours
-from aquaflow.survey.export.ortho.drawing import Splats
-from aquaflow.survey.export.ortho.grid import Grid, Tile, rounded
+from aquaflow.survey.export.ortho.drawing import GroundSplats
+from aquaflow.survey.export.ortho.grid import Grid, GridTile, rounded
 from aquaflow.survey.export.ortho.ground import Ground, ground_of
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 
 Array = npt.NDArray[np.float64]
 
@@ -30,7 +30,7 @@ SOLID_ALPHA = 0.5
 """Cover of a pixel above which the map is there."""
 
 
-def overview_png(mapper: Mapper, frame: MetricFrame) -> bytes:
+def overview_png(mapper: Mapper, frame: WorldFrame) -> bytes:
     """A PNG file, transparent where the map is not; its top is what is up on the ground's axes.
 
     Raises:
@@ -42,7 +42,7 @@ def overview_png(mapper: Mapper, frame: MetricFrame) -> bytes:
     low, high, distance = _extent(mapper, ground)
     pixel = rounded(float((high - low).max()) / LONGER_SIDE_PX)
     grid = Grid.around(low, high, pixel, low)
-    splats, colours = Splats(mapper, ground), Colours(mapper, ground.T_gm.scale, None)
+    splats, colours = GroundSplats(mapper, ground), Colours(mapper, ground.T_gm.scale, None)
     picture = np.zeros((grid.height, grid.width, 4), np.uint8)
     for tile in grid.tiles():
         chosen = splats.reaching(grid, tile)
@@ -53,7 +53,7 @@ def overview_png(mapper: Mapper, frame: MetricFrame) -> bytes:
     return buffer.getvalue()
 
 
-def _part(tile: Tile) -> tuple[slice, slice]:
+def _part(tile: GridTile) -> tuple[slice, slice]:
     return (
         slice(tile.row, tile.row + tile.height),
         slice(tile.column, tile.column + tile.width),
@@ -61,10 +61,10 @@ def _part(tile: Tile) -> tuple[slice, slice]:
 
 
 def _tile(
-    splats: Splats,
+    splats: GroundSplats,
     colours: Colours,
     grid: Grid,
-    tile: Tile,
+    tile: GridTile,
     chosen: npt.NDArray[np.intp],  # [M] of the Gaussians
     distance: float,
 ) -> npt.NDArray[np.uint8]:

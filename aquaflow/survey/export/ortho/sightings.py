@@ -38,7 +38,7 @@ bars take it (dive/scale_bar.py)."""
 
 
 @dataclass(frozen=True)
-class Sightings:
+class PointSightings:
     """Of some points, by all views."""
 
     count: npt.NDArray[np.int32]
@@ -122,7 +122,7 @@ class ViewRanges:
     def see(
         self,
         points: Array,  # [M, 3] on the ground
-    ) -> Sightings:
+    ) -> PointSightings:
         """Which views see ``points``."""
         count = np.zeros(len(points), np.int32)
         information = np.zeros((len(points), 3, 3))
@@ -136,7 +136,7 @@ class ViewRanges:
             across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
             sigma = PICTURE_SIGMA_PX / self._views[number].camera.fx * ranges
             information[seen] += across / (sigma**2)[:, None, None]
-        return Sightings(count, _height_sigma(information, count), nearest)
+        return PointSightings(count, _height_sigma(information, count), nearest)
 
     def hold(
         self,

@@ -15,13 +15,13 @@ from aquaflow import __version__
 from aquaflow.base.storage.whole_folder import whole_folder
 from aquaflow.dive.dive import Dive
 from aquaflow.survey.export.ortho.colours import Colours
-from aquaflow.survey.export.ortho.drawing import MOST_FINER, Splats
+from aquaflow.survey.export.ortho.drawing import MOST_FINER, GroundSplats
 from aquaflow.survey.export.ortho.geotiff import require_rasterio, writing_raster
-from aquaflow.survey.export.ortho.grid import Grid, Tile, rounded
+from aquaflow.survey.export.ortho.grid import Grid, GridTile, rounded
 from aquaflow.survey.export.ortho.ground import LEAST_VIEWS, Ground, ground_of
 from aquaflow.survey.export.ortho.layers import DEM, ORTHO, QUALITY, TilePixels
 from aquaflow.survey.export.ortho.sightings import PICTURE_SIGMA_PX, ViewRanges
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.water.posed_picture import SOLID
 
 Kind = Literal["ortho", "dem"]
@@ -46,7 +46,7 @@ SIGMA_IS = (
 
 
 @dataclass(frozen=True)
-class Survey:
+class SurveyFiles:
     """What was written."""
 
     files: list[Path]
@@ -69,7 +69,7 @@ def export_survey(
     resolution: float | None = None,
     water: bool = False,
     progress: Progress | None = None,
-) -> Survey:
+) -> SurveyFiles:
     """Write the ortho or the elevations of the dive's largest sub-map into the folder ``out``.
 
     Args:
@@ -91,7 +91,7 @@ def export_survey(
     grid = Grid.around(ranges.low, ranges.high, side / ground.grid_scale, start)
     through = ranges.median_range if water and mapper.medium.active else None
     colours = Colours(mapper, ground.T_gm.scale, through) if kind == "ortho" else None
-    looked = _Tiles(grid, Splats(mapper, ground), ranges, colours)
+    looked = _Tiles(grid, GroundSplats(mapper, ground), ranges, colours)
     tags = _tags(dive, frame, ground, side, through, colours is not None)
     covered = 0
     with whole_folder(out) as made, ExitStack() as files:
@@ -109,7 +109,7 @@ def export_survey(
                 progress("tiles", done + 1, grid.tile_count)
     share = covered / (grid.width * grid.height)
     paths = [out / layer.name for layer in LAYERS[kind]]
-    return Survey(paths, grid.width, grid.height, side, share, ground, through)
+    return SurveyFiles(paths, grid.width, grid.height, side, share, ground, through)
 
 
 @dataclass(frozen=True)
@@ -117,11 +117,11 @@ class _Tiles:
     """Everything that tiles are made of."""
 
     grid: Grid
-    splats: Splats
+    splats: GroundSplats
     ranges: ViewRanges
     colours: Colours | None
 
-    def at(self, tile: Tile) -> TilePixels | None:
+    def at(self, tile: GridTile) -> TilePixels | None:
         """The pixels of a tile; None where nothing is mapped."""
         chosen = self.splats.reaching(self.grid, tile)
         if len(chosen) == 0:
@@ -142,7 +142,7 @@ class _Tiles:
 
 
 def _tags(
-    dive: Dive, frame: MetricFrame, ground: Ground, side: float, through: float | None, ortho: bool
+    dive: Dive, frame: WorldFrame, ground: Ground, side: float, through: float | None, ortho: bool
 ) -> dict[str, str]:
     """What the files say of themselves, in words."""
     tags = {

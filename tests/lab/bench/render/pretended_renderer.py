@@ -9,13 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from aquaflow.lab.bench.render.peak import Peak
+from aquaflow.lab.bench.render.peak import PeakRate
 from aquaflow.lab.bench.render.timing import Clock
 from aquaflow.render.contract import CPU, Rendering
 from aquaflow.render.example_scene import Size
 
 TINY = Size(200, 52, 39)  # no multiple of a tile
-PEAK = Peak({1: 1e9, 2: 2e9}, "nothing")
+PEAK = PeakRate({1: 1e9, 2: 2e9}, "nothing")
 
 
 @dataclass

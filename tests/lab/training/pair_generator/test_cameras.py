@@ -10,7 +10,7 @@ import torch
 from aquaflow.lab.training.pair_generator.cameras import (
     MOST_FORWARD,
     WIDE,
-    Motion,
+    PairMotion,
     first_camera,
     second_camera,
 )
@@ -20,7 +20,7 @@ from aquaflow.lab.training.pair_generator.scene import Detail, random_scenes
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def steps_of(motion: Motion) -> torch.Tensor:
+def steps_of(motion: PairMotion) -> torch.Tensor:
     """[B, 3] steps of second cameras in the frames of the first, median depth 1 m, high up."""
     scene = random_scenes(Draw(1), 32, Detail(terrain=64, texture=128))
     T_a = first_camera(Draw(2), scene.terrain)
@@ -30,7 +30,7 @@ def steps_of(motion: Motion) -> torch.Tensor:
 
 
 def test_forward_motion_is_along_the_axis_both_ways_and_never_too_near() -> None:
-    steps = steps_of(Motion(baseline=0.8, forward=1.0))
+    steps = steps_of(PairMotion(baseline=0.8, forward=1.0))
     share = steps[:, 2].abs() / steps.norm(dim=-1)
     assert float(share.median()) > 0.9
     assert bool((steps[:, 2] > 0).any())

@@ -5,11 +5,11 @@ from __future__ import annotations
 from aquaflow.config.service import ServiceConfig
 from aquaflow.live.health.degradation import Degradation
 from aquaflow.live.health.heartbeats import Heartbeats, Watchdog
-from aquaflow.live.health.state import Health, State
+from aquaflow.live.health.state import Health, ServiceState
 from aquaflow.live.health.systemd import Notifier
 
 
-class Vitals:
+class ServiceHealth:
     """Close it after the last dive."""
 
     def __init__(self, config: ServiceConfig) -> None:
@@ -22,7 +22,7 @@ class Vitals:
         """Tell systemd the state; READY once a sensor answered or its absence was declared. The
         watchdog is fed only here, and only while every stage is alive."""
         state = self.health.state
-        if state not in (State.STARTING, State.STOPPING):
+        if state not in (ServiceState.STARTING, ServiceState.STOPPING):
             self.notifier.ready()
         self.notifier.status(f"{state.value}: {self.health.reason}")
         if self.heartbeats.hung(self.hang_s) is None:
@@ -30,7 +30,7 @@ class Vitals:
 
     def stop(self, reason: str, seconds: float) -> None:
         """The service ends within ``seconds``; from here on systemd's limit for stopping counts."""
-        self.health.set(State.STOPPING, reason)
+        self.health.set(ServiceState.STOPPING, reason)
         self.notifier.stopping()
         self.notifier.more_time(seconds)
         self.notify()
@@ -40,7 +40,7 @@ class Vitals:
         self._watchdog.close()
         self.notifier.close()
 
-    def __enter__(self) -> Vitals:
+    def __enter__(self) -> ServiceHealth:
         return self
 
     def __exit__(self, *_: object) -> None:

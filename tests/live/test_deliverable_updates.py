@@ -12,10 +12,10 @@ import pytest
 
 from aquaflow.base.errors import InputError
 from aquaflow.config.service import LiveMappingConfig
-from aquaflow.live import refresh as module
+from aquaflow.live import deliverable_updates as module
+from aquaflow.live.deliverable_updates import SHARE, DeliverableUpdater
 from aquaflow.live.health.heartbeats import Heartbeats
 from aquaflow.live.map_thread import MapThread
-from aquaflow.live.refresh import SHARE, Refresher
 from tests.live.live_scenes import Clock, RecordedMaps
 
 EVERY_S = 60.0
@@ -34,7 +34,7 @@ class Scene:
             slam=SimpleNamespace(frames=self.frames), check_calibration=self.check_calibration
         )
         self.check: Callable[[], None] = lambda: None
-        self.refresher = Refresher(run, self.thread, EVERY_S, self.clock, self.cpu)
+        self.refresher = DeliverableUpdater(run, self.thread, EVERY_S, self.clock, self.cpu)
 
     def check_calibration(self) -> None:
         self.check()

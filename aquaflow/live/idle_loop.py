@@ -6,12 +6,12 @@ import time
 from collections.abc import Callable
 
 from aquaflow.base.profiler import Profiler
-from aquaflow.live.control import Control
+from aquaflow.live.control import ServiceControl
 from aquaflow.live.feed import Feed
 from aquaflow.live.health.counters import Counters
-from aquaflow.live.health.state import State
-from aquaflow.live.vitals import Vitals
-from aquaflow.live.watched import Watched
+from aquaflow.live.health.state import ServiceState
+from aquaflow.live.service_health import ServiceHealth
+from aquaflow.live.service_status import ServiceStatus
 from aquaflow.types import Frame
 
 STAGE = "standby"
@@ -24,11 +24,11 @@ FINISHING = "the map is refined and the report written"
 """The reason of the state FINISHING."""
 
 
-class Standby:
+class IdleLoop:
     """To be used from the service's own thread."""
 
-    def __init__(self, feed: Feed, control: Control, vitals: Vitals) -> None:
-        self.watchers: list[Callable[[Watched], None]] = []
+    def __init__(self, feed: Feed, control: ServiceControl, vitals: ServiceHealth) -> None:
+        self.watchers: list[Callable[[ServiceStatus], None]] = []
         """Called after every turn; must not wait."""
         self.vitals = vitals
         self.health, self.degradation = vitals.health, vitals.degradation
@@ -37,7 +37,7 @@ class Standby:
         """The newest frame; no dive counted it."""
         self._feed, self._control = feed, control
 
-    def turn(self, state: State, reason: str) -> None:
+    def turn(self, state: ServiceState, reason: str) -> None:
         """Wait a little for a picture, say how the service is, and wait for the next turn."""
         began_s = time.monotonic()
         self._take()

@@ -13,16 +13,16 @@ from aquaflow.base.errors.failures import Failures
 from aquaflow.config import FusionConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Keyframe, KeyframeStore
-from aquaflow.telemetry.metric_frame import MetricFrame
 from aquaflow.telemetry.recent_motion import RecentMotion
 from aquaflow.telemetry.start import camera_in_body
 from aquaflow.telemetry.telemetry import Telemetry
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.frame_table import FrameTable
 from aquaflow.tracking.graph.pose_graph import solve
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
-from aquaflow.tracking.metric.sightings import Sightings
+from aquaflow.tracking.metric.sightings import LengthSightings
 from aquaflow.tracking.metric.straightening import estimates_of, straightened
-from aquaflow.tracking.metric.survey import Survey, sampled_points
+from aquaflow.tracking.metric.survey import TrackingSnapshot, sampled_points
 from aquaflow.tracking.metric.world_edges import World
 from aquaflow.types import TelemetrySample
 
@@ -37,7 +37,7 @@ class EarlierDive(Protocol):
         """True once this dive, or a part of it, has a place there."""
         ...
 
-    def frame(self, sub_map: int, own: MetricFrame) -> MetricFrame:
+    def frame(self, sub_map: int, own: WorldFrame) -> WorldFrame:
         """The earlier dive's frame, or ``own`` where the sub-map was not recognised."""
         ...
 
@@ -50,8 +50,8 @@ class EarlierDive(Protocol):
         ...
 
 
-class MetricFrames:
-    """Collects samples, sightings and keyframes' points; a :class:`Survey` does the rest."""
+class WorldFrames:
+    """Collects samples, sightings and points; a :class:`TrackingSnapshot` does the rest."""
 
     def __init__(
         self, keyframes: KeyframeStore, frames: Callable[[], FrameTable], config: FusionConfig,
@@ -59,17 +59,17 @@ class MetricFrames:
     ) -> None:  # fmt: skip
         self.telemetry = Telemetry()
         self._recent = RecentMotion()
-        self.sightings = Sightings(config)
+        self.sightings = LengthSightings(config)
         """Objects of known size in the pictures."""
         self.mounting = config.camera
         """Of the camera in the body; a recording that states it may set it."""
-        self.frames: dict[int, MetricFrame] = {}
+        self.frames: dict[int, WorldFrame] = {}
         """By sub-map, as last estimated."""
         self._keyframes, self._frames, self._config = keyframes, frames, config
         self._failures = failures
         self._points: list[Array] = []
         self._since = 0
-        self._solved: dict[int, MetricFrame] = {}
+        self._solved: dict[int, WorldFrame] = {}
         """By component; set in the thread of the last job."""
         self.base: EarlierDive | None = None
         """An earlier dive in which this one may be recognised."""
@@ -129,10 +129,10 @@ class MetricFrames:
         with self._failures.contain("points for the altimeter"):
             self._points[number] = sampled_points(keyframe.pointmap)
 
-    def survey(self, snapshot: Snapshot) -> Survey:
+    def survey(self, snapshot: Snapshot) -> TrackingSnapshot:
         """All that is known now, for any thread."""
         parts, telemetry = self._frames().parts(), self.telemetry.copy()
-        return Survey(
+        return TrackingSnapshot(
             snapshot.nodes, parts, telemetry, tuple(self._points), self.mounting, self._config,
             self.sightings.copy(),
         )  # fmt: skip
@@ -158,7 +158,7 @@ class MetricFrames:
             self.base.moved()
         self._take(self._solved)
 
-    def update(self, snapshot: Snapshot) -> dict[int, MetricFrame]:
+    def update(self, snapshot: Snapshot) -> dict[int, WorldFrame]:
         """Estimate the frames of all sub-maps from their poses as they are now."""
         if len(snapshot.nodes) and self.present:
             self._keep_points(len(self._keyframes) - 1)
@@ -174,15 +174,15 @@ class MetricFrames:
                 self._keep_points(keyframe.number)
         self.update(snapshot)
 
-    def _take(self, frames: Mapping[int, MetricFrame]) -> None:
+    def _take(self, frames: Mapping[int, WorldFrame]) -> None:
         self.frames = {
             self._keyframes[component].sub_map: frame for component, frame in frames.items()
         }
 
-    def of(self, sub_map: int) -> MetricFrame:
+    def of(self, sub_map: int) -> WorldFrame:
         """The frame of a sub-map, as last estimated: that of an earlier dive where this one was
         recognised in it."""
-        own = self.frames.get(sub_map, MetricFrame.unknown())
+        own = self.frames.get(sub_map, WorldFrame.unknown())
         return own if self.base is None else self.base.frame(sub_map, own)
 
 

@@ -25,7 +25,7 @@ STAGE = "return to a keyframe"
 
 
 @dataclass(frozen=True)
-class Look:
+class ReuseRequest:
     """A frame at which a keyframe is due, and the earlier ones that may show it."""
 
     frame: int
@@ -41,15 +41,15 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Looked:
+class ReuseResult:
     """What a look found."""
 
-    look: Look
+    look: ReuseRequest
     back: tuple[CurrentKeyframe, Matched] | None
     """An earlier keyframe that shows the frame, and the frame's pose there; None: there is none."""
 
 
-class Returning:
+class KeyframeReuse:
     """Decides whether a frame at which a keyframe is due becomes one."""
 
     def __init__(
@@ -73,7 +73,7 @@ class Returning:
         solved: Matched,
         encoding: Encoding,
         camera: CameraModel,
-    ) -> bool | Look:
+    ) -> bool | ReuseRequest:
         """False if no new keyframe is made: an earlier one shows the frame well, or, in a place
         that has keyframes enough, the one in use does; or that is not known yet. A look, where it
         is to be found out by :meth:`search`.
@@ -86,14 +86,14 @@ class Returning:
         if self.was_in_vain(at):
             return True
         if self._looked_already(at, solved):
-            self._keyframe_tracker.leave(at)
+            self._keyframe_tracker.release(at)
             return False
         neighbours = self._keyframe_tracker.neighbours
         around = neighbours.around(at.T_wc, camera, at.keyframe.sub_map, at.keyframe)
         if not around:
             return True
         self._looked_for = at
-        return Look(frame, at.t_ns, at, at.T_fk, solved, encoding, camera, around)
+        return ReuseRequest(frame, at.t_ns, at, at.T_fk, solved, encoding, camera, around)
 
     def was_in_vain(self, at: CurrentKeyframe) -> bool:
         """True, once, if no keyframe was found to take the place of the one in use."""
@@ -112,7 +112,7 @@ class Returning:
             and solved.share >= config.crowd_share
         )
 
-    def search(self, look: Look) -> Looked:
+    def search(self, look: ReuseRequest) -> ReuseResult:
         """The keyframe that shows the frame best, if one does well enough; in any thread."""
         config, best = self._config, None
         least = look.solved.share if self._is_crowded(look) else config.return_share
@@ -125,21 +125,21 @@ class Returning:
                     best, least = back, back[1].share
                 if least >= config.return_share:
                     break
-        return Looked(look, best)
+        return ReuseResult(look, best)
 
-    def stay(self, look: Look) -> None:
+    def stay(self, look: ReuseRequest) -> None:
         """None was found: the keyframe in use is kept in a crowded place, else a new one is due."""
         if self._is_crowded(look) and look.solved.share >= self._config.crowd_share:
             look.at.kept = look.t_ns, look.solved.share
-            self._keyframe_tracker.leave(look.at)  # its points are kept, as of one that is left
+            self._keyframe_tracker.release(look.at)  # its points are kept, as of one that is left
         else:
             self._in_vain = look.at
 
-    def _is_crowded(self, look: Look) -> bool:
+    def _is_crowded(self, look: ReuseRequest) -> bool:
         return len(look.around) >= self._config.crowd
 
 
-def carry(back: CurrentKeyframe, look: Look) -> None:
+def carry(back: CurrentKeyframe, look: ReuseRequest) -> None:
     """Move ``back``, at which the frame of ``look`` was placed, on to the last frame."""
     at = look.at
     since = at.T_fk @ look.T_fk.inverse()

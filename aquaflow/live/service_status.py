@@ -10,7 +10,7 @@ from aquaflow.live.health.state import Health
 from aquaflow.types import Frame
 
 
-class Watched(Protocol):
+class ServiceStatus(Protocol):
     """The live loop, or the standby between dives."""
 
     @property

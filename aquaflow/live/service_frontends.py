@@ -8,27 +8,27 @@ from typing import Any
 
 from aquaflow.config.vehicle import VehicleConfig
 from aquaflow.dive.views import DiveView, open_coverage, open_viewer
-from aquaflow.live.control import Control
+from aquaflow.live.control import ServiceControl
 from aquaflow.live.dive_parts import Parts
 from aquaflow.live.feed import Feed
 from aquaflow.live.health.http import HealthServer
+from aquaflow.live.idle_loop import IdleLoop
 from aquaflow.live.live_dive import LiveDive
 from aquaflow.live.picture import NewestPicture
 from aquaflow.live.plan_view import PlanView
 from aquaflow.live.report import report, report_between_dives, viewer_facts
-from aquaflow.live.standby import Standby
+from aquaflow.live.service_health import ServiceHealth
+from aquaflow.live.service_status import ServiceStatus
 from aquaflow.live.vehicle.arming import Arming
 from aquaflow.live.vehicle.pilot_messages import PilotMessages
 from aquaflow.live.vehicle.pose_output import PoseOutput
-from aquaflow.live.vitals import Vitals
-from aquaflow.live.watched import Watched
 
 
-class Station:
+class ServiceFrontends:
     """Close it after the last dive."""
 
     def __init__(
-        self, feed: Feed, vehicle: VehicleConfig, control: Control, vitals: Vitals
+        self, feed: Feed, vehicle: VehicleConfig, control: ServiceControl, vitals: ServiceHealth
     ) -> None:
         """Begin to listen.
 
@@ -37,14 +37,17 @@ class Station:
             ConfigError: a token will not do.
         """
         service = vehicle.service
-        self.standby = Standby(feed, control, vitals)
+        self.standby = IdleLoop(feed, control, vitals)
         self._feed, self._control, self._config = feed, control, service
         self._shown: tuple[Parts, PoseOutput | None] | None = None
         self._closing = contextlib.ExitStack()
         self.picture = NewestPicture()
         self._coverage = open_coverage(feed.failures) if vehicle.coverage.enabled else None
         messages = PilotMessages(service.report, feed, self._hints)
-        self._watchers: list[Callable[[Watched], None]] = [self.picture.update, messages.update]
+        self._watchers: list[Callable[[ServiceStatus], None]] = [
+            self.picture.update,
+            messages.update,
+        ]
         if feed.pilot is not None:
             self._watchers.append(Arming(service.dive, control, feed.pilot).update)
         self.standby.watchers += self._watchers
@@ -116,7 +119,7 @@ class Station:
         with self._feed.failures.contain("closing"):
             close()
 
-    def __enter__(self) -> Station:
+    def __enter__(self) -> ServiceFrontends:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -59,7 +59,7 @@ class Origin:
 
 
 @dataclass(frozen=True)
-class MetricFrame:
+class WorldFrame:
     """The similarity from a sub-map's world m to n, its covariance, and what is known of it."""
 
     T_nm: Sim3
@@ -89,12 +89,12 @@ class MetricFrame:
     """The earlier dive whose frame n is, where this one was recognised in it; empty otherwise."""
 
     @staticmethod
-    def unknown(reason: str = "") -> MetricFrame:
+    def unknown(reason: str = "") -> WorldFrame:
         """A map of which telemetry, if there is any, says nothing (``reason``: why): its own unit,
         the first keyframe's camera axes."""
         covariance = np.diag(np.full(7, UNKNOWN_SIGMA**2))
         said = f"none: {reason}; {MAP_UNIT}" if reason else f"none: {MAP_UNIT}"
-        return MetricFrame(Sim3.identity(), covariance, scale_source=said)
+        return WorldFrame(Sim3.identity(), covariance, scale_source=said)
 
     @property
     def is_identity(self) -> bool:

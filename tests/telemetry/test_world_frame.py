@@ -6,14 +6,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from tests.metric_scenes import SCALE, SHIFT, TURN, metric_frame
 
 T_MC = Sim3(Rotation.from_rotvec([0.1, 0.2, -0.3]).as_matrix(), np.array([0.5, -1.0, 2.0]), 1.25)
 
 
 def test_an_unknown_frame_leaves_every_pose_as_it_is() -> None:
-    frame = MetricFrame.unknown("the dive was level")
+    frame = WorldFrame.unknown("the dive was level")
     assert frame.is_identity
     assert frame.pose(T_MC) is T_MC
     assert (frame.unit, frame.metric, frame.level, frame.georeferenced) == (

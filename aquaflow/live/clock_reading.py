@@ -14,7 +14,7 @@ LEAST_GAP_NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
-class Moment:
+class ClockReading:
     """A moment on both clocks, and which boot it belongs to."""
 
     monotonic_ns: int
@@ -29,20 +29,20 @@ class Moment:
         return self.monotonic_ns + self.dive_shift_ns
 
     @staticmethod
-    def now(boot_id: Path = BOOT_ID) -> Moment:
+    def now(boot_id: Path = BOOT_ID) -> ClockReading:
         """Both clocks, and the boot that the monotonic one counts from."""
         try:
             boot = boot_id.read_text().strip()
         except OSError:
             boot = ""
-        return Moment(time.monotonic_ns(), time.time_ns(), boot)
+        return ClockReading(time.monotonic_ns(), time.time_ns(), boot)
 
-    def is_of_the_boot_of(self, now: Moment) -> bool:
+    def is_of_the_boot_of(self, now: ClockReading) -> bool:
         """True if the monotonic clock has run on until ``now``; False where no boot is known."""
         known = self.boot != "" and self.boot == now.boot
         return known and now.monotonic_ns >= self.monotonic_ns
 
-    def shift_ns(self, now: Moment) -> int:
+    def shift_ns(self, now: ClockReading) -> int:
         """What to add to ``now``'s monotonic clock so that the dive's clock continues from here.
 
         As before after a restart of the process. After one of the machine, what the wall clock says

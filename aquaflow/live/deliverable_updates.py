@@ -24,7 +24,7 @@ SHARE = 0.03
 """Of one core, at most, for writing deliverables: with a million Gaussians 1.7 s in every 57."""
 
 
-class Refresher:
+class DeliverableUpdater:
     """A watcher of the loop; :meth:`write_if_due` is called after every turn of it."""
 
     def __init__(

@@ -11,7 +11,7 @@ from aquaflow.tracking.frames import Tracked
 
 
 @dataclass(frozen=True)
-class Anchored:
+class RelativeFrame:
     """A tracked frame with its pose relative to its keyframe, unchanged by later corrections."""
 
     tracked: Tracked
@@ -19,7 +19,7 @@ class Anchored:
     """None for a frame without a pose."""
 
 
-class Anchors:
+class RelativePoses:
     """Computes a frame's pose relative to its keyframe from its pose in the world, and back.
 
     A frame for which this fails is lost, and counted in ``failures``.
@@ -28,16 +28,16 @@ class Anchors:
     def __init__(self, keyframes: KeyframeStore, failures: Failures) -> None:
         self._keyframes, self._failures = keyframes, failures
 
-    def anchored(self, tracked: Tracked) -> Anchored:
+    def relative_pose(self, tracked: Tracked) -> RelativeFrame:
         """The frame as tracked, with its pose relative to its keyframe."""
         if tracked.keyframe is None or tracked.T_wc is None:
-            return Anchored(tracked)
+            return RelativeFrame(tracked)
         with self._failures.contain("pose", tracked.frame.index):
             T_kf = self._keyframes[tracked.keyframe].T_wc.inverse() @ tracked.T_wc
-            return Anchored(tracked, T_kf.if_finite())
-        return Anchored(self._lost(tracked))
+            return RelativeFrame(tracked, T_kf.if_finite())
+        return RelativeFrame(self._lost(tracked))
 
-    def settled(self, tracked: Tracked, T_kf: Sim3 | None) -> Tracked:
+    def world_pose(self, tracked: Tracked, T_kf: Sim3 | None) -> Tracked:
         """The frame with the pose and sub-map that its keyframe gives it now; lost if none."""
         if tracked.keyframe is None or T_kf is None:
             return tracked

@@ -9,17 +9,17 @@ from aquaflow.base.errors.failures import Failures
 from aquaflow.config import FusionConfig
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
-from aquaflow.telemetry.metric_frame import MetricFrame
+from aquaflow.telemetry.world_frame import WorldFrame
 from aquaflow.tracking.frame_table import FrameTable
 from aquaflow.tracking.graph.pose_graph import Edge, PoseGraph
-from aquaflow.tracking.metric import metric_frames
-from aquaflow.tracking.metric.metric_frames import MetricFrames
+from aquaflow.tracking.metric import world_frames
+from aquaflow.tracking.metric.world_frames import WorldFrames
 from aquaflow.types import AngularRate, Depth
 
 
-def of_a_dive(failures: Failures) -> MetricFrames:
+def of_a_dive(failures: Failures) -> WorldFrames:
     frames = FrameTable()
-    return MetricFrames(KeyframeStore(), lambda: frames, FusionConfig(), failures)
+    return WorldFrames(KeyframeStore(), lambda: frames, FusionConfig(), failures)
 
 
 def looped() -> PoseGraph:
@@ -40,7 +40,7 @@ def test_a_failing_estimate_leaves_the_graph_its_own_optimisation(
     def fails(*_: object) -> None:
         raise ArithmeticError("not finite")
 
-    monkeypatch.setattr(metric_frames, "straightened", fails)
+    monkeypatch.setattr(world_frames, "straightened", fails)
     failures = Failures(strict=False)
     metric, graph = of_a_dive(failures), looped()
     metric.add(Depth(0, 0, "bar30", 3.0))
@@ -67,4 +67,4 @@ def test_a_sample_that_is_not_finite_is_refused_before_it_is_kept() -> None:
 def test_without_telemetry_a_frame_is_unknown_and_says_why() -> None:
     frame = of_a_dive(Failures()).of(0)
     assert not frame.metric
-    assert frame.scale_source == MetricFrame.unknown().scale_source
+    assert frame.scale_source == WorldFrame.unknown().scale_source

@@ -11,12 +11,12 @@ from pathlib import Path
 from aquaflow.base.errors.failures import Failures
 from aquaflow.base.storage.dive_status import DiveState, DiveStatus
 from aquaflow.config.device import MountingConfig
+from aquaflow.live.clock_reading import ClockReading
 from aquaflow.live.loop import LiveLoop
-from aquaflow.live.moment import Moment
 from aquaflow.sources.wall_clock import OLDEST_NS
 
 
-class Standing:
+class DiveStatusFile:
     """A watcher of the loop: the pilot pauses the dive, and goes on with it."""
 
     def __init__(
@@ -33,7 +33,7 @@ class Standing:
         stated = None if mounting is None else mounting.model_dump(mode="json")
         self.was_paused = before is not None and before.paused
         """The pilot paused it in a process before."""
-        boot = Moment.now().boot
+        boot = ClockReading.now().boot
         self.status = DiveStatus(DiveState.OPEN, self.was_paused, begun_utc, boot, stated)
         self._write()
 

@@ -28,7 +28,7 @@ from aquaflow.live.checkpoint.resume import Choice
 from aquaflow.live.checkpoint.set_aside import SetAside
 from aquaflow.live.checkpoint.telemetry import cut_at_checkpoint
 from aquaflow.live.checkpoint.tracking import lost_since, refuse_another_size
-from aquaflow.live.moment import Moment
+from aquaflow.live.clock_reading import ClockReading
 from aquaflow.mapping.work import OwnedMaps
 from aquaflow.slam import Slam
 from aquaflow.tracking.frame_table import FrameTable
@@ -38,7 +38,7 @@ MOST_NAMED = 5
 
 
 @dataclass(frozen=True)
-class Salvaged:
+class RepairedDive:
     """The rows that a resumed dive continues, and what was lost."""
 
     rows: list[FrameRow]
@@ -46,9 +46,12 @@ class Salvaged:
     """A sentence for each loss that the checkpoint's own files and the rows show."""
 
 
-def salvaged(
-    checkpoint: Checkpoint, dive: Path, name_of: Callable[[int], str], now: Moment | None = None
-) -> Salvaged:
+def repair_dive(
+    checkpoint: Checkpoint,
+    dive: Path,
+    name_of: Callable[[int], str],
+    now: ClockReading | None = None,
+) -> RepairedDive:
     """Prepare ``dive`` for resuming from ``checkpoint``; ``name_of`` gives a frame index's name.
 
     Raises:
@@ -68,12 +71,14 @@ def salvaged(
     for path in sorted((dive / WORK).glob(f"*/*{SUFFIX}")):
         _look_at(path, checkpoint.keyframes if older else None, aside)
     known = checkpoint.frames
-    cut_at_checkpoint(dive, checkpoint.moment, now or Moment.now(), aside)
+    cut_at_checkpoint(dive, checkpoint.moment, now or ClockReading.now(), aside)
     after = [or_lost(row, known) for row in rows.rows]
-    return Salvaged(after, losses + _row_losses(rows, dive / MARKER))
+    return RepairedDive(after, losses + _row_losses(rows, dive / MARKER))
 
 
-def salvaged_from(choice: Choice, config: Config, name_of: Callable[[int], str]) -> Salvaged | None:
+def salvaged_from(
+    choice: Choice, config: Config, name_of: Callable[[int], str]
+) -> RepairedDive | None:
     """The dive that goes on in the chosen folder; None for a new one.
 
     Raises:
@@ -84,7 +89,7 @@ def salvaged_from(choice: Choice, config: Config, name_of: Callable[[int], str])
         return None
     refuse_another_size(choice.folder, choice.checkpoint.facts["tracking"], config)
     refuse_held(choice.folder)
-    return salvaged(choice.checkpoint, choice.folder, name_of)
+    return repair_dive(choice.checkpoint, choice.folder, name_of)
 
 
 def lost_with_their_files(checkpoint: Checkpoint, slam: Slam, maps: OwnedMaps) -> list[str]:
@@ -138,7 +143,7 @@ def _is_whole(path: Path) -> bool:
     return True
 
 
-def _row_losses(rows: SalvagedRows, path: Path) -> list[str]:
+def _row_losses(rows: RepairedRows, path: Path) -> list[str]:
     if not path.is_file():
         return [
             f"{MARKER} was gone: {rows.rebuilt} rows were made from the checkpoint, those of "
@@ -165,7 +170,7 @@ def _named(kind: str, numbers: Iterable[int]) -> str:
 
 
 @dataclass(frozen=True)
-class SalvagedRows:
+class RepairedRows:
     """The rows salvaged from a frames.csv."""
 
     rows: list[FrameRow]
@@ -182,7 +187,7 @@ class SalvagedRows:
 
 def salvaged_rows(
     path: Path, checkpoint: Checkpoint, name_of: Callable[[int], str]
-) -> SalvagedRows:
+) -> RepairedRows:
     """The rows of ``path``, those that the checkpoint knows better from there; ``name_of`` a
     frame's index: its file, or where it is in the film."""
     try:
@@ -205,7 +210,7 @@ def salvaged_rows(
             rebuilt += 1
     there = {row.index for row in rows if row.frame_class != "dropped"}
     missing = [row for index, row in known.items() if index not in there]
-    return SalvagedRows(rows + missing, unreadable, rebuilt + len(missing))
+    return RepairedRows(rows + missing, unreadable, rebuilt + len(missing))
 
 
 def _agree(row: FrameRow, true: FrameRow) -> bool:

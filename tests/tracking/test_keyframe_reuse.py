@@ -15,7 +15,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import KeyframeStore
 from aquaflow.tracking.current_keyframe import KeyframeTracker
 from aquaflow.tracking.frames import FrameClass, Tracked
-from aquaflow.tracking.returning import STAGE, Looked
+from aquaflow.tracking.keyframe_reuse import STAGE, ReuseResult
 from aquaflow.tracking.tracker import Tracker
 from tests.tracking.tracked_clips import PLACED, QUICK, SMALL, error_share, path, told
 
@@ -58,7 +58,7 @@ class Swim:
     def answer(self) -> None:
         """Every answer is taken."""
         for each in self.worker.finished(wait=True):
-            if isinstance(each.found, Looked):
+            if isinstance(each.found, ReuseResult):
                 self.tracker.looked(each.found)
 
     @contextmanager

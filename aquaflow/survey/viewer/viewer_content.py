@@ -28,7 +28,7 @@ from aquaflow.survey.viewer.moments import MOMENT_NUMBERS
 from aquaflow.survey.viewer.packed_file import PackedFile
 from aquaflow.survey.viewer.packing import Packed
 from aquaflow.survey.viewer.seen_water import SeenWater
-from aquaflow.survey.viewer.splats import Splats
+from aquaflow.survey.viewer.splats import ViewerSplats
 from aquaflow.types import CameraModel
 
 Float = npt.NDArray[np.floating[Any]]
@@ -46,7 +46,7 @@ PATH_NUMBERS = POSE_NUMBERS + MOMENT_NUMBERS
 class ShownMap:
     """Gaussians with what is needed to see them."""
 
-    splats: Callable[[], Splats]
+    splats: Callable[[], ViewerSplats]
     """For who points at them; may take seconds when it is first called."""
     packed: Packed | PackedFile
     water: SeenWater | None
@@ -84,7 +84,7 @@ class PathPart:
 
 
 @dataclass
-class Exhibit:
+class ViewerContent:
     """Attributes are replaced as a whole; they are not changed in place."""
 
     title: str
