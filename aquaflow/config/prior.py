@@ -22,10 +22,10 @@ class PriorConfig(Stage):
     )
     folder: Path | None = Field(
         None,
-        description="what `aquaflow prior export` or `prior train` wrote; None: what ships",
+        description="what `aquaflow lab prior export` or `prior train` wrote; None: what ships",
     )
     confidence: bool = Field(
-        True, description="C weighs matches; False: all count the same (`aquaflow ablate`)"
+        True, description="C weighs matches; False: all count the same (`aquaflow lab ablate`)"
     )
     learned_matches: bool = Field(
         True,

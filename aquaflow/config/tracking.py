@@ -410,7 +410,7 @@ class TrackingConfig(Stage):
         ge=0,
         lt=1,
         description="matched share x inlier share below which the frame is lost; flow between "
-        "unrelated pictures reaches 0.08 by chance (`aquaflow stress`, teleport)",
+        "unrelated pictures reaches 0.08 by chance (`aquaflow lab stress`, teleport)",
     )
     known_sigma: float = Field(
         0.15, gt=0, description="relative depth sigma of points that poses are solved from"
