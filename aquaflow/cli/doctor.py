@@ -70,18 +70,24 @@ def config(
     file: Annotated[
         Path | None, typer.Argument(help="A config to check and complete, also a vehicle's.")
     ] = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Also the lab's switches, which no user decides.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
-    """Print the effective configuration as YAML: every key and its value, and what it opens."""
+    """Print the effective configuration as YAML: every setting and its value, and what it opens."""
     import yaml
 
     from aquaflow.config import Config
+    from aquaflow.config.stage import without_the_lab
     from aquaflow.config.vehicle import load_any
     from aquaflow.doctor import to_json
     from aquaflow.doctor.opened import opened
 
     settings = Config() if file is None else load_any(file)
     values, findings = settings.model_dump(mode="json"), opened(settings)
+    if not everything:
+        values = without_the_lab(type(settings), values)
     if as_json:
         typer.echo(json.dumps({"config": values, "opens": to_json(findings)["findings"]}))
         return

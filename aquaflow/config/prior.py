@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from aquaflow.config.stage import Stage
+from aquaflow.config.stage import Lab, Stage
 
 
 class PriorConfig(Stage):
@@ -24,10 +24,10 @@ class PriorConfig(Stage):
         None,
         description="what `aquaflow lab prior export` or `prior train` wrote; None: what ships",
     )
-    confidence: bool = Field(
+    confidence: Lab[bool] = Field(
         True, description="C weighs matches; False: all count the same (`aquaflow lab ablate`)"
     )
-    learned_matches: bool = Field(
+    learned_matches: Lab[bool] = Field(
         True,
         description="flow starts at the network's matches; False: at keypoints', as without one",
     )
