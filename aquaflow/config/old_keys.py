@@ -11,7 +11,30 @@ from aquaflow.config.stage import Stage, changed_in_the_lab
 
 log = logging.getLogger(__name__)
 
-CONSTANTS: dict[str, Any] = {}
+CONSTANTS: dict[str, Any] = {
+    "tracking.gate.duplicate_widths": 0.3 / 480.0,
+    "tracking.gate.static_share": 0.8,
+    "tracking.gate.min_snr": 2.0,
+    "tracking.gate.min_usable": 0.05,
+    "tracking.gate.dark_level": 20.0,
+    "tracking.gate.blur_loss": 0.065,
+    "tracking.gate.blur_memory": 9,
+    "tracking.monitor.witnesses": 5,
+    "tracking.monitor.sigmas": 5.0,
+    "tracking.monitor.min_inlier_share": 0.5,
+    "tracking.monitor.rigid_share": 0.8,
+    "tracking.monitor.usual_share": 0.65,
+    "tracking.crowd_look_loss": 0.05,
+    "tracking.return_share": 0.75,
+    "tracking.return_widths": 0.03,
+    "tracking.min_seen": 0.55,
+    "tracking.keyframe_overlap": 0.5,
+    "tracking.crowd_overlap": 0.6,
+    "tracking.recovered_support": 0.2,
+    "tracking.learned.least_triangulated": 0.3,
+    "tracking.graph.corroboration": 2,
+    "tracking.graph.link_scale_sigma": 0.005,
+}
 """Settings of before that are constants now, and their values."""
 GONE: dict[str, str] = {}
 """Settings of before whose code went, and why."""
