@@ -47,9 +47,9 @@ run: setup ## Map a synthetic dive, or yours: CLIP=dive.mp4 [CALIB=camera.yaml] 
 	$(BIN)/aquaflow map '$(CLIP)' $(if $(CALIB),--calib '$(CALIB)') --out '$(OUT)' --overwrite $(ARGS)
 else
 run: setup
-	$(BIN)/aquaflow synth $(SYNTHETIC) --frames 60 --width 320 --height 240
+	$(BIN)/aquaflow lab synth $(SYNTHETIC) --frames 60 --width 320 --height 240
 	$(BIN)/aquaflow map $(SYNTHETIC) --refine-steps 800 --out '$(OUT)' --overwrite $(ARGS)
-	$(BIN)/aquaflow evaluate '$(OUT)' --truth $(SYNTHETIC) --clean $(SYNTHETIC)
+	$(BIN)/aquaflow lab evaluate '$(OUT)' --truth $(SYNTHETIC) --clean $(SYNTHETIC)
 	@echo
 	@echo 'Open $(CURDIR)/$(OUT)/report.html in a browser; $(OUT)/map_clear.ply opens in any splat viewer.'
 endif

@@ -142,7 +142,7 @@ if [[ -n $config ]]; then
   install -m 0640 "$config" "$settings/aquaflow.yaml"
 elif [[ ! -f $settings/aquaflow.yaml ]]; then
   install -m 0640 "$here/config/bluerov2_usb.yaml" "$settings/aquaflow.yaml"
-  echo "install.sh: wrote an example to $settings/aquaflow.yaml; fill in what 'aquaflow devices' prints"
+  echo "install.sh: wrote an example to $settings/aquaflow.yaml; fill in what 'aquaflow doctor devices' prints"
 fi
 if [[ ! -f $settings/token ]]; then
   (umask 0077; "$program/venv/bin/python" -c 'import secrets; print(secrets.token_urlsafe(32))' >"$settings/token")
@@ -168,7 +168,7 @@ if [[ -n $start ]]; then
   systemctl daemon-reload
   systemctl enable aquaflow.service
   systemctl restart aquaflow.service
-  echo 'install.sh: started; see: systemctl status aquaflow, aquaflow status'
+  echo 'install.sh: started; see: systemctl status aquaflow, aquaflow run status'
 elif [[ -z $root ]]; then
   systemctl daemon-reload 2>/dev/null || true
 fi

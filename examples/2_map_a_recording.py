@@ -1,6 +1,6 @@
 """Map a recording and read the result: python examples/2_map_a_recording.py SOURCE DIVE
 
-SOURCE is a video, a folder of pictures, or what `aquaflow synth SOURCE` wrote.
+SOURCE is a video, a folder of pictures, or what `aquaflow lab synth SOURCE` wrote.
 """
 
 from __future__ import annotations

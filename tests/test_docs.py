@@ -180,18 +180,40 @@ def test_every_command_and_option_is_in_the_reference() -> None:
     from aquaflow.cli import app
 
     reference = (DOCS / "commands.md").read_text(encoding="utf-8")
-    sections = {text.partition("\n")[0]: text for text in reference.split("\n## ")[1:]}
+    sections = {text.partition(" {")[0]: text for text in re.split(r"\n##+ ", reference)[1:]}
     missing = []
     for path, command in leaves(typer.main.get_command(app)):
-        own = [text for heading, text in sections.items() if path[0] in re.findall(r"\w+", heading)]
+        shorter = (" ".join(path[:length]) for length in range(len(path), 0, -1))
+        own = next((sections[name] for name in shorter if name in sections), "")
         for parameter in command.params:
             names = [*parameter.opts, *parameter.secondary_opts]
             options = [name for name in names if name.startswith("--") and name != "--help"]
-            if options and not any(name in text for name in options for text in own):
+            if options and not any(name in own for name in options):
                 missing.append(f"{' '.join(path)} {options[0]}")
-        if not own:
+        if not own or " ".join(path) not in reference:
             missing.append(" ".join(path))
     assert missing == []
+
+
+def test_every_command_that_a_page_or_a_sentence_names_is_there() -> None:
+    from aquaflow.cli import COMMANDS
+
+    files = [
+        *PAGES,
+        ROOT / "Makefile",
+        *(ROOT / "deploy").rglob("*"),
+        *(ROOT / "examples").glob("*.py"),
+    ]
+    files += [*(ROOT / "aquaflow").rglob("*.py"), *(ROOT / "aquaflow").rglob("*.html")]
+    unknown = []
+    for file in files:
+        if file.is_file() and file.name != "CHANGELOG.md":
+            text = file.read_text(encoding="utf-8", errors="replace")
+            named = re.findall(r"(?:`|\bbin/|\(BIN\)/|<code>|')aquaflow ([a-z]+)", text)
+            unknown += [
+                f"{file.relative_to(ROOT)}: {name}" for name in named if name not in COMMANDS
+            ]
+    assert unknown == []
 
 
 def leaves(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
@@ -200,6 +222,8 @@ def leaves(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str
     if children is None:
         yield path, command
         return
+    if hasattr(command, "default"):  # `aquaflow export DIVE` beside `aquaflow export video DIVE`
+        yield path, command.default
     for name, child in children.items():
         yield from leaves(child, (*path, name))
 

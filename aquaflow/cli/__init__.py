@@ -8,45 +8,62 @@ from __future__ import annotations
 import json
 import logging
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from aquaflow import __version__
-from aquaflow.base.errors import printable
 from aquaflow.base.errors.crash_report import one_sentence, print_anything, refuse_unreadable
-from aquaflow.cli.batch import register as register_batch
-from aquaflow.cli.bench import register as register_bench
-from aquaflow.cli.calibrate import register as register_calibrate
-from aquaflow.cli.change import register as register_change
+from aquaflow.cli.calibrate import calibrate
+from aquaflow.cli.change import change
 from aquaflow.cli.console import (
     PRESETS,
     InSite,
     Json,
     checked_site,
     progress_bars,
-    table_console,
     unit_in_words,
 )
-from aquaflow.cli.devices import register as register_devices
-from aquaflow.cli.dive import register as register_dive
-from aquaflow.cli.export import register as register_export
-from aquaflow.cli.measure import register as register_measure
-from aquaflow.cli.prior import register as register_prior
-from aquaflow.cli.record import register as register_record
-from aquaflow.cli.report import register as register_report
-from aquaflow.cli.scale import register as register_scale
-from aquaflow.cli.service import exit_code, map_realtime, print_finished
-from aquaflow.cli.service import register as register_service
-from aquaflow.cli.site import register as register_site
-from aquaflow.cli.stress import register as register_stress
-from aquaflow.cli.video import register as register_video
+from aquaflow.cli.doctor import config, doctor_group
+from aquaflow.cli.export import export_group
+from aquaflow.cli.lab import lab_group
+from aquaflow.cli.measure import measure_group
+from aquaflow.cli.record import record
+from aquaflow.cli.service import exit_code, map_realtime, print_finished, run_group, view
+from aquaflow.cli.site import app as site_group
 
 if TYPE_CHECKING:
     from aquaflow.dive.run import Finished
 
+OLD_NAMES: dict[tuple[str, ...], tuple[str, ...]] = {
+    **{(word,): ("lab", word) for word in ("ablate", "batch", "bench", "evaluate", "prior")},
+    **{(word,): ("lab", word) for word in ("stress", "synth")},
+    ("bench", "dives"): ("lab", "bench"),
+    ("devices",): ("doctor", "devices"),
+    ("dive",): ("run", "finish"),
+    ("dive", "finish"): ("run", "finish"),
+    ("report",): ("export", "report"),
+    ("scale",): ("measure", "scale"),
+    ("status",): ("run", "status"),
+    ("video",): ("export", "video"),
+}
+"""What commands were called before they had groups; understood for one release."""
+
+
+class _InOrder(TyperGroup):
+    """Lists its commands in the order in which a dive meets them."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """The names, as the help shows them."""
+        del ctx
+        return sorted(self.commands, key=COMMANDS.index)
+
+
 app = typer.Typer(
+    cls=_InOrder,
     help="Onboard mapping for underwater robots: trajectory, Gaussian map, and the water itself.",
     no_args_is_help=True,
     add_completion=False,
@@ -61,7 +78,19 @@ def main() -> None:
     print_anything((sys.stdout, sys.stderr))
     with one_sentence():
         refuse_unreadable(sys.argv[1:])
+        sys.argv[1:] = with_new_name(sys.argv[1:])
         app()
+
+
+def with_new_name(arguments: list[str]) -> list[str]:
+    """The arguments with the command's name of today; a sentence on stderr where it was another."""
+    for length in (2, 1):
+        old = tuple(arguments[:length])
+        if len(old) == length and old in OLD_NAMES:
+            new = OLD_NAMES[old]
+            typer.echo(f"'aquaflow {' '.join(old)}' is now 'aquaflow {' '.join(new)}'", err=True)
+            return [*new, *arguments[length:]]
+    return arguments
 
 
 @app.callback(invoke_without_command=True)
@@ -74,7 +103,6 @@ def options(
         raise typer.Exit
 
 
-@app.command("map")
 def map_command(
     source: Annotated[Path, typer.Argument(help="Folder of images, video, or synthetic dive.")],
     out: Annotated[Path, typer.Option(help="Dive folder to write.")] = Path("out/dive"),
@@ -167,142 +195,6 @@ def map_command(
     raise typer.Exit(exit_code(replayed))
 
 
-@app.command()
-def synth(
-    out: Annotated[Path, typer.Argument(help="Folder to write.")],
-    scene: Annotated[
-        str, typer.Option(help="reef | flat_sand | wall | pipe | pool | survey | hull | net")
-    ] = "reef",
-    water: Annotated[str | None, typer.Option(help="Water type, such as coastal_1C.")] = None,
-    frames: Annotated[int | None, typer.Option(help="Number of pictures.")] = None,
-    width: Annotated[int | None, typer.Option(help="Pixels.")] = None,
-    height: Annotated[int | None, typer.Option(help="Pixels.")] = None,
-    seed: Annotated[int, typer.Option(help="Seed of every random draw.")] = 0,
-    display: Annotated[
-        str | None, typer.Option(help="Burned in: clock | clock_and_crosshair | panel")
-    ] = None,
-    fish: Annotated[int, typer.Option(help="Fish that cross the view, each once.")] = 0,
-    arm: Annotated[
-        bool, typer.Option("--arm", help="The vehicle's arm is in the picture.")
-    ] = False,
-    as_json: Json = False,
-) -> None:
-    """Write a synthetic dive with its ground truth."""
-    from pydantic import ValidationError
-
-    from aquaflow.base.errors import ConfigError
-    from aquaflow.lab.synthetic import SyntheticConfig, write_dive
-
-    asked = {
-        "scene": scene, "water": water, "frames": frames, "width": width, "height": height,
-        "seed": seed, "display": display, "fish": fish, "arm": arm,
-    }  # fmt: skip
-    try:
-        config = SyntheticConfig.model_validate({k: v for k, v in asked.items() if v is not None})
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise ConfigError(f"--{first['loc'][0]}: {first['msg'].lower()}") from error
-    with progress_bars(quiet=as_json) as progress:
-        write_dive(out, config, lambda done, total: progress("render", done, total))
-    if as_json:
-        typer.echo(json.dumps({"out": str(out), "frames": config.frames}))
-    else:
-        typer.echo(f"Wrote {config.frames} pictures with their truth to {out}.")
-
-
-@app.command()
-def evaluate(
-    dive: Annotated[Path, typer.Argument(help="Dive folder.")],
-    truth: Annotated[
-        Path | None, typer.Option(help="poses.tum, a synthetic dive, or a table of positions.")
-    ] = None,
-    clean: Annotated[
-        Path | None, typer.Option(help="The same recording without water, for restored views.")
-    ] = None,
-    clean_crop: Annotated[str | None, typer.Option(help="Crop of --clean, such as right.")] = None,
-    recording: Annotated[
-        Path | None, typer.Option(help="What was mapped: do its pictures agree with the poses?")
-    ] = None,
-    as_json: Json = False,
-) -> None:
-    """Measure a dive: colours of restored views, and what the truth allows to compare."""
-    from aquaflow.base.errors import InputError
-    from aquaflow.base.storage.dive_status import refuse_unfinished
-    from aquaflow.lab.evaluation.epipolar_error import evaluate_epipolar
-    from aquaflow.lab.evaluation.naturalness import evaluate_naturalness
-    from aquaflow.lab.evaluation.protocol import evaluate_dive
-    from aquaflow.lab.evaluation.restoration import evaluate_restoration
-    from aquaflow.lab.evaluation.summary import in_words
-
-    refuse_unfinished(dive)
-    natural = evaluate_naturalness(dive)
-    if truth is None and clean is None and recording is None and natural is None:
-        raise InputError(
-            f"{dive} has no restored held-out views to look at; give --truth, --clean or "
-            "--recording"
-        )
-    result: dict[str, Any] = {"naturalness": natural and natural.to_json()}
-    if truth is not None:
-        result |= evaluate_dive(dive, truth).to_json()
-    if clean is not None:
-        result["restoration"] = evaluate_restoration(dive, clean, clean_crop).to_json()
-    if recording is not None:
-        result["epipolar"] = evaluate_epipolar(dive, recording, truth).to_json()
-    if as_json:
-        typer.echo(json.dumps(result))
-    else:
-        typer.echo("\n".join(in_words(result)))
-
-
-@app.command()
-def doctor(
-    config: Annotated[
-        Path | None, typer.Option(help="Check this YAML, and only what a run with it would open.")
-    ] = None,
-    as_json: Json = False,
-) -> None:
-    """Report what this machine has, what AquaFlow will use, and what is missing."""
-    from aquaflow.doctor import examine, print_findings, to_json
-
-    if config is None:
-        findings = examine()
-    else:
-        from aquaflow.config.vehicle import load_any
-        from aquaflow.doctor.opened import opened
-
-        findings = opened(load_any(config))
-    if as_json:
-        typer.echo(json.dumps(to_json(findings)))
-    else:
-        print_findings(findings, table_console())
-
-
-@app.command("config")
-def config_command(
-    file: Annotated[
-        Path | None, typer.Argument(help="A config to check and complete, also a vehicle's.")
-    ] = None,
-    as_json: Json = False,
-) -> None:
-    """Print the effective configuration as YAML: every key and its value, and what it opens."""
-    import yaml
-
-    from aquaflow.config import Config
-    from aquaflow.config.vehicle import load_any
-    from aquaflow.doctor import to_json
-    from aquaflow.doctor.opened import opened
-
-    settings = Config() if file is None else load_any(file)
-    values, findings = settings.model_dump(mode="json"), opened(settings)
-    if as_json:
-        typer.echo(json.dumps({"config": values, "opens": to_json(findings)["findings"]}))
-        return
-    typer.echo(yaml.safe_dump(values, sort_keys=False), nl=False)
-    for each in findings:
-        advice = f" ({each.advice})" if each.advice else ""
-        typer.echo(printable(f"# {each.name}: {each.used_for}: {each.found}{advice}"))
-
-
 def _print_summary(finished: Finished) -> None:
     metrics = finished.metrics
     for warning in finished.warnings:
@@ -323,19 +215,33 @@ def _print_summary(finished: Finished) -> None:
         typer.echo(f"Note: {note}.")
 
 
-register_batch(app)
-register_bench(app)
-register_calibrate(app)
-register_change(app)
-register_devices(app)
-register_dive(app)
-register_export(app)
-register_prior(app)
-register_record(app)
-register_report(app)
-register_scale(app)
-register_measure(app)
-register_service(app)
-register_site(app)
-register_stress(app)
-register_video(app)
+HELP: dict[str, dict[str, tuple[Callable[..., None] | typer.Typer, str]]] = {
+    "Recordings and live dives": {
+        "map": (map_command, "Turn a recording into a dive: trajectory, map, water, report."),
+        "run": (run_group(), "Map live on a vehicle; ask how the service is; finish a dive."),
+        "record": (record, "Record cameras and telemetry, to map them later."),
+    },
+    "Finished dives": {
+        "view": (view, "Show a dive or a site in a browser, and measure in it."),
+        "export": (export_group(), "Write a dive for other programs, as a report, as a video."),
+        "measure": (measure_group(), "Areas, relief, lengths with their sigma; set the scale."),
+        "site": (site_group, "Bring several dives of one place into one frame and map."),
+        "change": (change, "What was gained, lost, moved or bleached between two dives."),
+    },
+    "Setting up and judging": {
+        "calibrate": (calibrate, "Calibrate a camera from pictures of a board."),
+        "doctor": (doctor_group(), "What this machine has and lacks; the devices that it finds."),
+        "config": (config, "Check a config; print every setting, and what it opens."),
+        "lab": (lab_group(), "Synthetic dives, truth, benchmarks, stress, priors, batches."),
+    },
+}
+"""The help: headings, and below each its commands, with one line on what they do."""
+COMMANDS = [name for commands in HELP.values() for name in commands]
+"""Names of the commands and groups, in the order of the help."""
+
+for _heading, _commands in HELP.items():
+    for _name, (_command, _line) in _commands.items():
+        if isinstance(_command, typer.Typer):
+            app.add_typer(_command, name=_name, rich_help_panel=_heading, help=_line)
+        else:
+            app.command(_name, rich_help_panel=_heading, short_help=_line)(_command)

@@ -1,4 +1,4 @@
-"""The command that maps many recordings: ``batch``."""
+"""The command that maps many recordings: ``lab batch``."""
 
 from __future__ import annotations
 
@@ -17,11 +17,6 @@ if TYPE_CHECKING:
 
 POOR_RESULT = 3
 """Exit status where every dive was written, and some with warnings, as of `map`."""
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to ``app``."""
-    app.command("batch")(batch)
 
 
 def batch(

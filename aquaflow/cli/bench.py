@@ -1,16 +1,22 @@
-"""The commands that measure AquaFlow itself: ``bench`` and ``ablate``. Thin, like all of cli/."""
+"""The commands that measure AquaFlow itself: ``lab bench`` and ``lab ablate``."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from typer.core import TyperGroup
 
 from aquaflow.base.errors import InputError
-from aquaflow.cli.console import PRESETS, Json, one_of, progress_bars, table_console
+from aquaflow.cli.console import (
+    PRESETS,
+    GroupWithDefault,
+    Json,
+    one_of,
+    progress_bars,
+    table_console,
+)
 
 Suite = Annotated[str | None, typer.Option(help="ci (synthetic) | real DATA_DIR")]
 Data = Annotated[Path | None, typer.Argument(help="Of --suite real: a folder for each clip.")]
@@ -20,35 +26,19 @@ Device = Annotated[
     str | None, typer.Option(help="cpu | cuda: what is drawn there alone; default: wherever.")
 ]
 
-DIVES = "dives"
-"""The command that is meant where none is named."""
 
-
-class _DivesUnlessNamed(TyperGroup):
-    """``aquaflow bench [OPTIONS] [DATA]`` is ``aquaflow bench dives [OPTIONS] [DATA]``.
-
-    A DATA argument of the group itself would swallow the names of its commands.
-    """
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        named = bool(args) and args[0] in self.commands
-        return super().parse_args(ctx, args if named else [DIVES, *args])
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands to ``app``."""
-    bench = typer.Typer(
-        cls=_DivesUnlessNamed,
-        help="Run time against error; `bench render`: of the renderer; `bench growth`: long dives.",
+def bench_group() -> typer.Typer:
+    """The group ``lab bench`` with its commands."""
+    group = typer.Typer(
+        cls=GroupWithDefault, help="Run time against error; also of the renderer and of long dives."
     )
-    bench.command(DIVES)(dives)
-    bench.command()(render)
-    bench.command()(growth)
-    app.add_typer(bench, name="bench")
-    app.command()(ablate)
+    group.command("bench")(bench)
+    group.command()(render)
+    group.command()(growth)
+    return group
 
 
-def dives(
+def bench(
     data: Data = None,
     suite: Suite = None,
     scene: Scenes = None,
@@ -64,11 +54,7 @@ def dives(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Run time against error: scenes x presets as a table, a picture and bench.json.
-
-    `aquaflow bench` alone does this too; `aquaflow bench render` times the renderer,
-    `aquaflow bench growth` measures dives of several lengths.
-    """
+    """Run time against error: scenes x presets as a table, a picture and bench.json."""
     from aquaflow.config.presets import BY_EFFORT, FOR_A_GPU
     from aquaflow.lab.bench import benchmark as bm
     from aquaflow.lab.bench.readme import around_section

@@ -15,11 +15,6 @@ if TYPE_CHECKING:
     from aquaflow.calibration.calibrate import Calibration
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to ``app``."""
-    app.command("calibrate")(calibrate)
-
-
 def calibrate(
     pictures: Annotated[
         Path | None, typer.Argument(help="Folder of pictures, or a video, of the board.")

@@ -20,11 +20,6 @@ MOST_RATE = 0.5
 """Largest --false: more than half of what is found would be nothing."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to ``app``."""
-    app.command("change")(change)
-
-
 def change(
     first: Annotated[
         str, typer.Option("--from", help="Earlier dive: its name in SITE, else its folder.")

@@ -1,4 +1,4 @@
-"""What the commands share: the --json option, progress bars, and a console for tables."""
+"""What the commands share: groups, the --json option, progress bars, and a console for tables."""
 
 from __future__ import annotations
 
@@ -10,11 +10,37 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from aquaflow.base.errors import InputError, printable_text
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+
+class GroupWithDefault(TyperGroup):
+    """A group whose own name is a command too: ``export DIVE`` beside ``export video DIVE``.
+
+    The command that is called as the group is not one of its words; a word that is none of the
+    others is its argument, and so a folder named "video" is given as ./video.
+    """
+
+    def __init__(self, *, name: str | None = None, commands: Any = None, **more: Any) -> None:
+        others = dict(commands)
+        self.default = others.pop(name)
+        super().__init__(name=name, commands=others, **more)
+        self.default.epilog = "\n\n".join(
+            f"{name} {word}: {each.get_short_help_str(200)}" for word, each in others.items()
+        )
+
+    def make_context(
+        self, info_name: str | None, args: list[str], parent: Any = None, **more: Any
+    ) -> Any:
+        """The context of a command that is named, else of the default, as if it stood alone."""
+        if args and args[0] in self.commands:
+            return super().make_context(info_name, args, parent, **more)
+        return self.default.make_context(info_name, args, parent, **more)
+
 
 Json = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON.")]
 

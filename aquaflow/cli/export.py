@@ -1,4 +1,4 @@
-"""The command that turns a dive into other formats: ``export``. Thin, like all of cli/."""
+"""The commands that make files of a dive: ``export``, ``export report``. Thin, like all of cli/."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import typer
 
 from aquaflow.base.errors import InputError
 from aquaflow.base.errors.regular_file import refuse_linked_folders
-from aquaflow.cli.console import Json, progress_bars
+from aquaflow.cli.console import GroupWithDefault, Json, progress_bars
+from aquaflow.cli.video import video
 
 if TYPE_CHECKING:
     from aquaflow.dive.dive import Dive
@@ -72,14 +73,20 @@ MESHES: dict[ExportFormat, Literal["ply", "obj", "glb"]] = {
     ExportFormat.glb: "glb",
 }
 """Formats that are triangles."""
+REPORT = "report.pdf"
+"""In the dive's folder, where no other place is given."""
 
 
 Progress = Callable[[int, int], None]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to ``app``."""
-    app.command("export")(export)
+def export_group() -> typer.Typer:
+    """The group ``export`` with its commands."""
+    group = typer.Typer(cls=GroupWithDefault)
+    group.command("export")(export)
+    group.command()(report)
+    group.command()(video)
+    return group
 
 
 def export(
@@ -152,6 +159,27 @@ def export(
         typer.echo(json.dumps({"out": str(target), **facts}))
     else:
         typer.echo(said)
+
+
+def report(
+    dive: Annotated[Path, typer.Argument(help="Dive folder.")],
+    pdf: Annotated[Path | None, typer.Option(help="File; else report.pdf in the dive.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Write the report of a finished dive as one PDF, to print or to send."""
+    if pdf is not None and pdf.suffix.lower() != ".pdf":
+        raise InputError(f"{pdf} does not end in .pdf; give the report a file of its own")
+    from aquaflow.dive.dive import FRAMES, METRICS, Dive
+    from aquaflow.survey.report.pdf import write_pdf
+    from aquaflow.survey.report.report_of import report_of
+
+    out, of = pdf or dive / REPORT, Dive(dive)
+    of.require(FRAMES, METRICS)
+    pages = write_pdf(out, report_of(of))
+    if as_json:
+        typer.echo(json.dumps({"pdf": str(out), "pages": pages}))
+        return
+    typer.echo(f"Wrote {pages} pages to {out}.")
 
 
 def _own_target(path: Path) -> Path:

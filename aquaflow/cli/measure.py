@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from aquaflow.base.errors import InputError
-from aquaflow.cli.console import Json, progress_bars
+from aquaflow.cli.console import GroupWithDefault, Json, progress_bars
+from aquaflow.cli.scale import scale
 
 if TYPE_CHECKING:
     from aquaflow.dive.dive import Dive
@@ -36,9 +37,12 @@ class Units(str, Enum):
     feet = "feet"
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to ``app``."""
-    app.command("measure")(measure)
+def measure_group() -> typer.Typer:
+    """The group ``measure`` with its commands."""
+    group = typer.Typer(cls=GroupWithDefault)
+    group.command("measure")(measure)
+    group.command()(scale)
+    return group
 
 
 def measure(
@@ -182,7 +186,8 @@ def _in_words(found: Any, unit: LengthUnit) -> str:
             )
         if found.unit != "m":
             said.append(
-                "The dive has no metres: lengths are in map units; aquaflow scale gives it some."
+                "The dive has no metres: lengths are in map units; `aquaflow measure scale` gives "
+                "it some."
             )
     named = [(name, as_read(q, unit)) for name, q in named]
     width = max((len(name) for name, _ in named), default=0)

@@ -21,8 +21,8 @@ class Exported(str, Enum):
     mast3r = "mast3r"
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to ``app``."""
+def prior_group() -> typer.Typer:
+    """The group ``lab prior`` with its commands."""
     prior = typer.Typer(
         help="The two-view prior: export, verify, bench, compare, train.", no_args_is_help=True
     )
@@ -36,7 +36,7 @@ def register(app: typer.Typer) -> None:
     train.command("mast3r")(train_mast3r)
     train.command("compact")(train_compact)
     prior.add_typer(train, name="train")
-    app.add_typer(prior, name="prior")
+    return prior
 
 
 def export(
@@ -153,7 +153,7 @@ def train_mast3r(
 ) -> None:
     """Fine-tune as in the paper; resumes from --out.
 
-    Several GPUs: torchrun --nproc-per-node 4 --no-python aquaflow prior train mast3r ...
+    Several GPUs: torchrun --nproc-per-node 4 --no-python aquaflow lab prior train mast3r ...
     """
     from aquaflow.lab.training import finetune
     from aquaflow.lab.training.distributed import joined_processes
@@ -169,7 +169,7 @@ def train_mast3r(
         network = load_checkpoint(checkpoint).requires_grad_(True)
         pairs = finetune.mined(sequences, out, settings, process, advance)
         finetune.fine_tune(network, pairs, out, settings, process, advance)
-    typer.echo(f"Export {out / finetune.WEIGHTS} with `aquaflow prior export mast3r`.")
+    typer.echo(f"Export {out / finetune.WEIGHTS} with `aquaflow lab prior export mast3r`.")
 
 
 def train_compact(

@@ -22,11 +22,6 @@ SOURCE_CAMERA = "camera"
 """Name of the camera of a recording that is recorded again."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to ``app``."""
-    app.command()(record)
-
-
 def record(
     config: Annotated[
         Path | None, typer.Option(help="The vehicle's YAML: cameras, telemetry, recording.")

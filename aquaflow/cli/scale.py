@@ -1,4 +1,4 @@
-"""The command that gives a finished dive its metres by a marked length: ``scale``."""
+"""The command that gives a finished dive its metres by a marked length: ``measure scale``."""
 
 from __future__ import annotations
 
@@ -17,16 +17,11 @@ if TYPE_CHECKING:
 RESCALED = (
     "The dive is in metres now: trajectory.tum, trajectory.csv, map.ply, map_clear.ply, "
     "medium.json, metrics.json, metric.json, coverage.*, the notes and the ranges of heldout/; "
-    "reef_numbers.* were measured anew. report.html still shows map units; `aquaflow report` does "
-    "not."
+    "reef_numbers.* were measured anew. report.html still shows map units; "
+    "`aquaflow export report` does not."
 )
 RULER_SIGMA_M = 0.001
 """1 sigma of a length measured with a ruler."""
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to ``app``."""
-    app.command("scale")(scale)
 
 
 def scale(

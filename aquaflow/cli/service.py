@@ -1,4 +1,4 @@
-"""The commands of the onboard service: ``run``, ``status`` and ``view``. Thin, like all of cli/."""
+"""The onboard service: ``run``, ``run status``, ``run finish``; ``view``. Thin, as all of cli/."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import typer
 
 from aquaflow.cli.console import (
     PRESETS,
+    GroupWithDefault,
     InSite,
     Json,
     Seconds,
@@ -39,11 +40,13 @@ MOST_SPLATS = 500_000
 0.3 MB are a picture (docs/viewer.md)."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to ``app``."""
-    app.command()(run)
-    app.command()(status)
-    app.command()(view)
+def run_group() -> typer.Typer:
+    """The group ``run`` with its commands."""
+    group = typer.Typer(cls=GroupWithDefault)
+    group.command("run")(run)
+    group.command()(status)
+    group.command()(finish)
+    return group
 
 
 def run(
@@ -116,6 +119,28 @@ def status(
     else:
         _print_status(report)
     raise typer.Exit(0 if report.get("ok") else 1)
+
+
+def finish(
+    folder: Annotated[Path, typer.Argument(help="Dive folder.", metavar="DIVE")],
+    seconds: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="Of refining; by default as in the dive's config.yaml."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Finish a live dive whose process was killed: refine, evaluate, write every file."""
+    from aquaflow.live.finish import FinishedAlreadyError, finish_dive  # loads torch
+
+    try:
+        with progress_bars(quiet=as_json) as progress:
+            finished = finish_dive(
+                folder, seconds, lambda done, total: progress("refine", done, total)
+            )
+    except FinishedAlreadyError as said:
+        typer.echo(json.dumps({"dive": str(folder)}) if as_json else f"{said}.")
+        return
+    print_finished(finished, as_json)
 
 
 def view(

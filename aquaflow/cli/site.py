@@ -18,12 +18,7 @@ if TYPE_CHECKING:
 
 Site = Annotated[Path, typer.Argument(help="Site folder.")]
 
-app = typer.Typer(help="Several dives of one place: keep them together, bring them into one frame.")
-
-
-def register(root: typer.Typer) -> None:
-    """Add the commands to ``root``."""
-    root.add_typer(app, name="site")
+app = typer.Typer()
 
 
 @app.command()

@@ -1,4 +1,4 @@
-"""The command that makes a video of a dive: ``video``. Thin, like all of cli/."""
+"""The command that makes a video of a dive: ``export video``. Thin, like all of cli/."""
 
 from __future__ import annotations
 
@@ -33,11 +33,6 @@ FLIGHT_S = 20.0
 LONGEST_FLIGHT_S = 3600.0
 WIDTHS = (64, 8192)
 """px; as of the pictures that are mapped."""
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to ``app``."""
-    app.command("video")(video)
 
 
 def video(

@@ -25,6 +25,7 @@ from aquaflow.config.mapping import (
     VoxelConfig,
     WaterPriorsConfig,
 )
+from aquaflow.config.old_keys import understood, without_old_keys
 from aquaflow.config.pictures import PicturesConfig
 from aquaflow.config.prior import PriorConfig
 from aquaflow.config.source import SourceConfig
@@ -71,6 +72,9 @@ __all__ = [
 class Config(StageConfig):
     """Everything a run depends on."""
 
+    lab: bool = Field(
+        False, description="True: the file may set the lab's switches (`aquaflow config --all`)"
+    )
     seed: int = 0
     threads: int | None = Field(None, ge=1, description="None: every core")
     prior: PriorConfig = PriorConfig()
@@ -88,18 +92,19 @@ def parse_config(data: dict[str, Any], origin: str) -> Config:
     Raises:
         ConfigError: with the path of the first key that is unknown or out of range.
     """
-    return validated(Config, data, origin)
+    return validated(Config, without_old_keys(data, origin), origin)
 
 
 def load_config(path: Path, inside: bool = False) -> Config:
-    """Read a YAML config; keys that are absent keep their defaults. ``inside``: of a folder that
-    others may have made.
+    """Read a YAML config; keys that are absent keep their defaults. ``inside``: of a dive's folder,
+    which others may have made, and which holds the lab's switches too.
 
     Raises:
         InputError: the file cannot be read, or is not YAML.
         ConfigError: a key is unknown or a value out of range.
     """
-    return parse_config(read_yaml(path, inside), str(path))
+    data = read_yaml(path, inside)
+    return parse_config(data if inside else understood(Config, data, str(path)), str(path))
 
 
 def read_yaml(path: Path, inside: bool = False) -> dict[str, Any]:

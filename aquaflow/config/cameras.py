@@ -37,8 +37,8 @@ class V4l2Config(LiveCameraConfig):
     kind: Literal["v4l2"]
     device: str | None = Field(
         None,
-        description="an id as `aquaflow devices` prints it: a name in /dev/v4l/by-id, a USB serial "
-        "number, or the bus; never videoN, which changes. None: the only camera there is",
+        description="an id as `aquaflow doctor devices` prints it: a name in /dev/v4l/by-id, a USB "
+        "serial number, or the bus; never videoN, which changes. None: the only camera there is",
     )
     width: int = Field(1280, ge=16, description="px; the camera may choose another size")
     height: int = Field(720, ge=16, description="px")

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from aquaflow.config.device import MountingConfig
 from aquaflow.config.known_lengths import BoardConfig, LasersConfig
-from aquaflow.config.stage import StageConfig
+from aquaflow.config.stage import Lab, StageConfig
 
 
 class FusionConfig(StageConfig):
@@ -49,12 +49,12 @@ class FusionConfig(StageConfig):
     position_lag_sigma_s: float = Field(
         0.3, ge=0, description="s, 1 sigma of how much older a position fix is than it states"
     )
-    depth_change_sigma_m: float = Field(
+    depth_change_sigma_m: Lab[float] = Field(
         0.2, gt=0, description="m, 1 sigma of the depth around its mean, taken as constant where "
         "positions are known and nothing measures down or depth: an AUV that follows even "
         "ground (judgement)"
     )  # fmt: skip
-    every_keyframes: int = Field(
+    every_keyframes: Lab[int] = Field(
         20, ge=1, description="keyframes after which telemetry straightens the keyframe graph"
     )
     boards: tuple[BoardConfig, ...] = Field(

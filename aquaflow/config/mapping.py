@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from aquaflow.config.stage import StageConfig
+from aquaflow.config.stage import Lab, StageConfig
 
 
 class WaterPriorsConfig(StageConfig):
@@ -29,54 +29,60 @@ class MediumConfig(StageConfig):
     """The water (paper, Sec. 3.3.2)."""
 
     enabled: bool = Field(True, description="False: the map is what the camera saw, water included")
-    directional: bool = Field(
+    directional: Lab[bool] = Field(
         False,
         description="attenuation by the camera's orientation (the paper); False: isotropic",
     )
-    directional_rate: float = Field(
+    directional_rate: Lab[float] = Field(
         1e-4, gt=0, description="Adam rate of MLP_a, where attenuation is directional"
     )
-    width: int = Field(32, ge=4, description="hidden units of MLP_a; paper silent, 32 cost nothing")
-    rate: float = Field(
+    width: Lab[int] = Field(
+        32, ge=4, description="hidden units of MLP_a; paper silent, 32 cost nothing"
+    )
+    rate: Lab[float] = Field(
         1e-5,
         gt=0,
         description="Adam rate of all medium parameters but MLP_a's; beta_a of four known waters "
         "is 14 % wrong at 5e-4, 7 % at 1e-4, 6 % at 1e-6, and no picture worse: it drifts off the "
         "fit",
     )
-    max_gradient: float = Field(
+    max_gradient: Lab[float] = Field(
         0.01, gt=0, description="gradient norm kept (WaterSplatting clips at 0.001)"
     )
-    first_fit_views: int = Field(
+    first_fit_views: Lab[int] = Field(
         12,
         ge=2,
         description="views after which water is first fitted to observations; then at every "
         "doubling, and before refining",
     )
-    fit: bool = Field(True, description="False: the water starts from the values below, no fit")
-    off_when_clear: bool = Field(
+    fit: Lab[bool] = Field(
+        True, description="False: the water starts from the values below, no fit"
+    )
+    off_when_clear: Lab[bool] = Field(
         True, description="False: stays on even where the observations show no water"
     )
-    shading: bool = Field(True, description="False: the fit knows no lamp or lens fall-off")
-    exposure: bool = Field(
+    shading: Lab[bool] = Field(True, description="False: the fit knows no lamp or lens fall-off")
+    exposure: Lab[bool] = Field(
         True, description="False: light and exposure are held to be the same in all views"
     )
-    uneven: bool = Field(
+    uneven: Lab[bool] = Field(
         True, description="False: backscatter is held to be as bright all over the picture"
     )
-    fit_views: int = Field(20, ge=4, description="views that a fit looks at, spread over the dive")
-    priors: WaterPriorsConfig = WaterPriorsConfig()
+    fit_views: Lab[int] = Field(
+        20, ge=4, description="views that a fit looks at, spread over the dive"
+    )
+    priors: Lab[WaterPriorsConfig] = WaterPriorsConfig()
     open_water: Literal["kept", "removed", "black"] = Field(
         "black",
         description="what open water is in restored pictures: as the camera saw it, transparent, "
         "or black",
     )
-    initial_attenuation: float = Field(
+    initial_attenuation: Lab[float] = Field(
         0.1, gt=0, description="1 / map unit; the median range of the first keyframe is 1 unit"
     )
-    initial_B_inf: float = Field(0.3, gt=0, lt=1, description="backscatter at infinity")
-    initial_B_res: float = Field(0.01, gt=0, lt=1, description="residual backscatter close by")
-    initial_residual_decay: float = Field(1.0, gt=0, description="1 / map unit")
+    initial_B_inf: Lab[float] = Field(0.3, gt=0, lt=1, description="backscatter at infinity")
+    initial_B_res: Lab[float] = Field(0.01, gt=0, lt=1, description="residual backscatter close by")
+    initial_residual_decay: Lab[float] = Field(1.0, gt=0, description="1 / map unit")
 
 
 class SunlightConfig(StageConfig):
@@ -98,23 +104,23 @@ class SunlightConfig(StageConfig):
 class InsertionConfig(StageConfig):
     """Where new Gaussians go (paper, Sec. 3.3.3)."""
 
-    medium_reduced: bool = Field(
+    medium_reduced: Lab[bool] = Field(
         True, description="False: structure and colours of new Gaussians from the raw picture"
     )
-    sigma_px: float = Field(1.0, gt=0, description="sigma of the Laplacian of Gaussian")
-    tau_a: float = Field(
+    sigma_px: Lab[float] = Field(1.0, gt=0, description="sigma of the Laplacian of Gaussian")
+    tau_a: Lab[float] = Field(
         0.02,
         ge=0,
         le=1,
         description="P_a above which a pixel may get a Gaussian; the paper's 1.0 "
         "never fires (docs/paper.md#deviations-mapping)",
     )
-    selection: Literal["random", "threshold"] = Field(
+    selection: Lab[Literal["random", "threshold"]] = Field(
         "random",
         description="random: pixels are drawn with probability P_a times density; threshold (the "
         "paper): every pixel with P_a above tau_a gets one, and density has no say in which",
     )
-    colour_range: Literal["tracked", "rendered"] = Field(
+    colour_range: Lab[Literal["tracked", "rendered"]] = Field(
         "tracked",
         description="range over which the water is taken out of the picture: as tracked, and the "
         "map's where nothing is; rendered (the paper): the map's, and as tracked where the map is "
@@ -127,27 +133,29 @@ class InsertionConfig(StageConfig):
         description="Gaussians per pixel of certain structure; 0.5 is 0.2 dB and 0.02 SSIM worse "
         "on the reef clip after as many steps",
     )
-    bare_probability: float = Field(
+    bare_probability: Lab[float] = Field(
         0.06, ge=0, le=1, description="least P_a where the map does not cover the picture"
     )
-    covered_alpha: float = Field(0.6, gt=0, lt=1, description="alpha that counts as covered")
-    agreement: float = Field(
+    covered_alpha: Lab[float] = Field(0.6, gt=0, lt=1, description="alpha that counts as covered")
+    agreement: Lab[float] = Field(
         0.1, gt=0, description="relative range difference up to which map and prior agree"
     )
-    recycle: float = Field(
+    recycle: Lab[float] = Field(
         0.1,
         ge=0,
         lt=1,
         description="share of a map at its hard cap that new Gaussians may replace, each time",
     )
-    known_sigma: float = Field(
+    known_sigma: Lab[float] = Field(
         0.15, gt=0, description="relative range sigma of pixels that may get a Gaussian"
     )
-    opacity: float = Field(0.5, gt=0, lt=1, description="of a new Gaussian at full confidence")
-    scale_of_spacing: float = Field(
+    opacity: Lab[float] = Field(0.5, gt=0, lt=1, description="of a new Gaussian at full confidence")
+    scale_of_spacing: Lab[float] = Field(
         0.6, gt=0, description="sigma of a new Gaussian over the expected spacing"
     )
-    max_spacing_widths: float = Field(0.1, gt=0, description="largest spacing over image width")
+    max_spacing_widths: Lab[float] = Field(
+        0.1, gt=0, description="largest spacing over image width"
+    )
 
 
 class LossConfig(StageConfig):
@@ -162,32 +170,36 @@ class LossConfig(StageConfig):
 class OptimiserConfig(StageConfig):
     """Adam rates and the number of steps."""
 
-    betas: tuple[float, float] = Field(
+    betas: Lab[tuple[float, float]] = Field(
         (0.9, 0.95),
         description="Adam's decay rates; the second at 0.99 is 0.12 dB worse on Curasao, 0.09 on a "
         "synthetic reef, 0.02 on the reef clip, at 0.999 another 0.35 on Curasao",
     )
-    means: float = Field(8e-4, gt=0, description="map units per step; 4e-4 is 0.15 dB worse")
-    means_final: float = Field(0.1, gt=0, le=1, description="factor reached at the end of refining")
-    settle_share: float = Field(
+    means: Lab[float] = Field(8e-4, gt=0, description="map units per step; 4e-4 is 0.15 dB worse")
+    means_final: Lab[float] = Field(
+        0.1, gt=0, le=1, description="factor reached at the end of refining"
+    )
+    settle_share: Lab[float] = Field(
         0.3, ge=0, le=1, description="of refining, its end, in which every rate falls to "
         "settle_final: reef clip after 375 steps 29.30 instead of 29.07 dB",
     )  # fmt: skip
-    settle_final: float = Field(0.1, gt=0, le=1, description="factor of every rate at the end")
-    quats: float = Field(4e-3, gt=0)
-    log_scales: float = Field(
+    settle_final: Lab[float] = Field(0.1, gt=0, le=1, description="factor of every rate at the end")
+    quats: Lab[float] = Field(4e-3, gt=0)
+    log_scales: Lab[float] = Field(
         0.016,
         gt=0,
         description="with half of it and of quats 0.4 to 0.5 dB worse on synthetic dives, and all "
         "rates falling by ten while refining 0.8 to 1.1: steps are too few to settle",
     )
-    opacity_logits: float = Field(0.04, gt=0)
-    raw_colours: float = Field(6e-3, gt=0)
-    poses: float = Field(1e-4, ge=0, description="rad and map units; ARTDECO: 1e-4; 0: held")
+    opacity_logits: Lab[float] = Field(0.04, gt=0)
+    raw_colours: Lab[float] = Field(6e-3, gt=0)
+    poses: Lab[float] = Field(1e-4, ge=0, description="rad and map units; ARTDECO: 1e-4; 0: held")
     steps_keyframe: int = Field(20, ge=0, description="steps after a keyframe (ARTDECO: 20)")
     steps_mapping: int = Field(20, ge=0, description="steps after a mapping frame (ARTDECO: 20)")
     steps_common: int = Field(5, ge=0, description="steps after a common frame (ARTDECO: 10)")
-    newest_share: float = Field(0.2, ge=0, le=1, description="steps on the newest view (ARTDECO)")
+    newest_share: Lab[float] = Field(
+        0.2, ge=0, le=1, description="steps on the newest view (ARTDECO)"
+    )
     refine_steps: int = Field(
         1000, ge=0, description="steps after the last frame (docs/performance.md#refining)"
     )
@@ -196,20 +208,26 @@ class OptimiserConfig(StageConfig):
         gt=0,
         description="s; limit of refining all maps together; makes runs differ from each other",
     )
-    noise_floor: float = Field(
+    noise_floor: Lab[float] = Field(
         0.006,
         ge=0,
         description="mean error of a tile, of full scale, below which steps leave it out; sensor "
         "noise and 8 bits make 0.004; 0: no tile is left out",
     )
-    skip_explained: bool = Field(
+    skip_explained: Lab[bool] = Field(
         True, description="False: a step whose view has no tile left to draw is taken all the same"
     )
-    full_look_every: int = Field(4, ge=1, description="looks at a view, of which one is at all")
-    prune_every: int = Field(200, ge=1)
-    prune_opacity: float = Field(0.02, gt=0, lt=1, description="opacity that is not worth keeping")
-    prune_radius_widths: float = Field(0.5, gt=0, description="largest radius over image width")
-    heldout_steps: int = Field(
+    full_look_every: Lab[int] = Field(
+        4, ge=1, description="looks at a view, of which one is at all"
+    )
+    prune_every: Lab[int] = Field(200, ge=1)
+    prune_opacity: Lab[float] = Field(
+        0.02, gt=0, lt=1, description="opacity that is not worth keeping"
+    )
+    prune_radius_widths: Lab[float] = Field(
+        0.5, gt=0, description="largest radius over image width"
+    )
+    heldout_steps: Lab[int] = Field(
         8, ge=0, description="Gauss-Newton steps of a held-out view's pose at most, map frozen"
     )
 
@@ -285,7 +303,7 @@ class MappingConfig(StageConfig):
     hold_out_every: int = Field(
         8, ge=0, description="i % n == 0 and i != 0 is tracked, never mapped; 0: map every frame"
     )
-    held_out_most: int = Field(
+    held_out_most: Lab[int] = Field(
         256,
         ge=2,
         description="held-out views of a sub-map, spread over it, that are kept and judged: one "
@@ -298,8 +316,8 @@ class MappingConfig(StageConfig):
         "spread over its time; the reef clip has 40 common ones at its full 30 fps, 20 at 15",
     )
     insertion: InsertionConfig = InsertionConfig()
-    loss: LossConfig = LossConfig()
+    loss: Lab[LossConfig] = LossConfig()
     optimiser: OptimiserConfig = OptimiserConfig()
     medium: MediumConfig = MediumConfig()
-    sunlight: SunlightConfig = SunlightConfig()
-    decoder: DecoderConfig = DecoderConfig()
+    sunlight: Lab[SunlightConfig] = SunlightConfig()
+    decoder: Lab[DecoderConfig] = DecoderConfig()

@@ -55,7 +55,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         },
     },
 }  # fmt: skip
-"""What each preset changes of the defaults; `aquaflow bench` shows what that buys and costs.
+"""What each preset changes of the defaults; `aquaflow lab bench` shows what that buys and costs.
 
 The width stays the same in all: errors in pictures of different widths cannot be compared.
 """

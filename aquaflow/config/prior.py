@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from aquaflow.config.stage import StageConfig
+from aquaflow.config.stage import Lab, StageConfig
 
 
 class PriorConfig(StageConfig):
@@ -22,12 +22,12 @@ class PriorConfig(StageConfig):
     )
     folder: Path | None = Field(
         None,
-        description="what `aquaflow prior export` or `prior train` wrote; None: what ships",
+        description="what `aquaflow lab prior export` or `prior train` wrote; None: what ships",
     )
-    confidence: bool = Field(
-        True, description="C weighs matches; False: all count the same (`aquaflow ablate`)"
+    confidence: Lab[bool] = Field(
+        True, description="C weighs matches; False: all count the same (`aquaflow lab ablate`)"
     )
-    learned_matches: bool = Field(
+    learned_matches: Lab[bool] = Field(
         True,
         description="flow starts at the network's matches; False: at keypoints', as without one",
     )

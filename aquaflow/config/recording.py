@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from aquaflow.config.stage import StageConfig
+from aquaflow.config.stage import Lab, StageConfig
 
 
 class RecordingConfig(StageConfig):
@@ -23,15 +23,17 @@ class RecordingConfig(StageConfig):
     jpeg_quality: int = Field(
         95, ge=1, le=100, description="OpenCV's default; 8x8 blocks would be mapped as texture"
     )
-    flush_s: float = Field(
+    flush_s: Lab[float] = Field(
         0.5, gt=0, le=1, description="every so often all is brought to the disk (fsync)"
     )
-    chunk_kb: int = Field(512, ge=16, le=16_384, description="kB; a damaged place costs one chunk")
+    chunk_kb: Lab[int] = Field(
+        512, ge=16, le=16_384, description="kB; a damaged place costs one chunk"
+    )
     file_s: float = Field(600.0, gt=0, description="a new file after this long")
     file_mb: int = Field(2000, ge=1, description="MB; a new file after this much: FAT32 holds 4 GB")
     reserve_mb: int = Field(
         1000, ge=0, description="MB; recording stops while so much of the disk is still free"
     )
-    queue_mb: int = Field(
+    queue_mb: Lab[int] = Field(
         128, ge=1, description="MB waiting for a slow disk: 4 s of 720p pictures; more is dropped"
     )

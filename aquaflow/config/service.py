@@ -10,7 +10,7 @@ from pydantic import Field, IPvAnyNetwork, model_validator
 
 from aquaflow.config.device import MountingConfig
 from aquaflow.config.link import Port
-from aquaflow.config.stage import StageConfig
+from aquaflow.config.stage import Lab, StageConfig
 
 
 def is_loopback(host: str) -> bool:
@@ -58,26 +58,28 @@ class FoxgloveConfig(ListenConfig):
         description="pages that may connect without being told the token, as a browser names them "
         "in Origin; file:// lets desktop apps in, and every page that is opened from the disk",
     )
-    pose_hz: float = Field(10.0, gt=0, le=60, description="tf, pose, camera picture, diagnostics")
-    refresh_s: float = Field(
+    pose_hz: Lab[float] = Field(
+        10.0, gt=0, le=60, description="tf, pose, camera picture, diagnostics"
+    )
+    refresh_s: Lab[float] = Field(
         3.0, gt=0, description="s between points and rendered pictures of the map, as the viewer's"
     )
-    points: int = Field(60_000, ge=100, description="of the map at most; 20 bytes each")
+    points: Lab[int] = Field(60_000, ge=100, description="of the map at most; 20 bytes each")
 
 
 class LiveMappingConfig(StageConfig):
     """How mapping runs in parallel to tracking."""
 
-    backlog: int = Field(
+    backlog: Lab[int] = Field(
         8, ge=1, description="frames that wait for mapping; then common frames come as views, "
         "without steps of their own, at three times as many mapping frames are left out, at eight "
         "times keyframes, and common frames where so many requests wait",
     )  # fmt: skip
-    steps_per_view: int = Field(
+    steps_per_view: Lab[int] = Field(
         40, ge=0, description="steps of the optimiser for each view in the end, as far as time "
         "allows: as 1500 steps of refining and 20 a frame for a clip of 75 views",
     )  # fmt: skip
-    nice: int = Field(
+    nice: Lab[int] = Field(
         0,
         ge=0,
         le=19,
@@ -147,14 +149,14 @@ class LimitsConfig(StageConfig):
     memory_share: float = Field(
         0.10, ge=0, lt=1, description="of the machine's or the unit's memory that must stay free"
     )
-    gpu_memory_share: float = Field(
+    gpu_memory_share: Lab[float] = Field(
         0.05, ge=0, lt=1, description="of the memory of the GPU that the map lives on, likewise"
     )
     temperature_c: float = Field(
         92.0, gt=0, description="degC of the hottest zone; a Jetson throttles itself at 97 to 99"
     )
-    look_s: float = Field(2.0, gt=0, description="s between looks; each may go down one step")
-    calm_s: float = Field(20.0, gt=0, description="s without need until it climbs up one step")
+    look_s: Lab[float] = Field(2.0, gt=0, description="s between looks; each may go down one step")
+    calm_s: Lab[float] = Field(20.0, gt=0, description="s without need until it climbs up one step")
 
 
 class PoseConfig(StageConfig):
@@ -171,10 +173,10 @@ class PoseConfig(StageConfig):
     max_position_sigma_m: float = Field(
         10.0, gt=0, description="m, 1 sigma of the position; beyond, no ODOMETRY is sent"
     )
-    jump_m: float = Field(
+    jump_m: Lab[float] = Field(
         0.2, gt=0, description="m; a correction that moves the pose further bumps reset_counter"
     )
-    jump_deg: float = Field(
+    jump_deg: Lab[float] = Field(
         5.0, gt=0, le=180, description="deg; so does one that turns the pose further"
     )
 
@@ -196,7 +198,7 @@ class ServiceConfig(StageConfig):
     dives: Path = Field(Path("dives"), description="folder that gets a folder for each dive")
     camera: str | None = Field(None, description="name of the camera that maps; None: the first")
     record: bool = Field(False, description="also record cameras and telemetry, as `record` does")
-    hang_s: float = Field(
+    hang_s: Lab[float] = Field(
         60.0, gt=0, description="s without a heartbeat of a stage until the process exits; "
         "one fit of the water may take 10 s on two cores",
     )  # fmt: skip

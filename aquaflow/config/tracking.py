@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from aquaflow.config.stage import StageConfig
+from aquaflow.config.stage import Lab, StageConfig
 
 PoseResidual = Literal["point", "ray", "pixel"]
 """What a pose is solved from: points against points (the paper), rays, or calibrated pixels."""
@@ -59,40 +59,7 @@ class GateConfig(StageConfig):
     skip_dark: bool = Field(True, description="skip: too little light for texture above the noise")
     skip_blurred: bool = Field(True, description="skip: detail gone, against the frames before")
     skip_blinded: bool = Field(True, description="skip: lamp glare, silt, open water: no texture")
-    duplicate_widths: float = Field(
-        0.3 / 480.0,
-        gt=0,
-        description="motion over width below which a frame is a duplicate; 0.3 px at 480 px is "
-        "what a checked DIS match is known to",
-    )
-    static_share: float = Field(
-        0.8,
-        gt=0,
-        lt=1,
-        description="part of the textured tiles that must stand still; fish move in the others",
-    )
-    min_snr: float = Field(
-        2.0,
-        gt=1,
-        description="gradient of a textured tile over that of noise alone; measured: below 1.2 to "
-        "1.8 in the median tile, flow finds no more than chance matches",
-    )
-    min_usable: float = Field(
-        0.05, ge=0, lt=1, description="textured share of the picture that a pose can come from"
-    )
-    dark_level: float = Field(
-        20.0, ge=0, le=255, description="grey level that separates dark from blinded, in the reason"
-    )
-    blur_loss: float = Field(
-        0.065,
-        ge=0,
-        lt=1,
-        description="sharpness left, of the running median; measured at 480 px: Gaussian blur of "
-        "5 px leaves 0.07 to 0.09 and still tracks, 8 px 0.04 to 0.06 and does not; good frames "
-        "keep over 0.69",
-    )
-    blur_memory: int = Field(9, ge=3, description="frames that the running sharpness is taken from")
-    longest_run: int = Field(
+    longest_run: Lab[int] = Field(
         5,
         ge=0,
         description="dark, blurred or blinded frames skipped in a row; after them all pass until "
@@ -130,12 +97,6 @@ class GraphConfig(StageConfig):
     loop_gap: int = Field(
         12, ge=1, description="keyframes between which a link is no loop (ARTDECO: 12)"
     )
-    link_scale_sigma: float = Field(
-        0.005,
-        gt=0,
-        description="relative scale that a link along the path may lose; on the reef clip 12 "
-        "keyframes lost 5 %",
-    )
     huber_sigmas: float = Field(
         3.75,
         gt=0,
@@ -158,7 +119,6 @@ class GraphConfig(StageConfig):
         description="the same for loop edges that corroborate each other; drift of monocular scale "
         "has always the same sign, so it outgrows its covariance (docs/measurements.md)",
     )
-    corroboration: int = Field(2, ge=1, description="others that must agree with a loop edge")
     corroboration_window: int = Field(
         30, ge=1, description="keyframes between the ends of loop edges that may corroborate"
     )
@@ -217,13 +177,6 @@ class LearnedConfig(StageConfig):
         description="pixels of key and mapping frames that are not triangulated, or worse, get the "
         "learned depth",
     )
-    least_triangulated: float = Field(
-        0.3,
-        ge=0,
-        le=1,
-        description="of the matches of known depth, those triangulated, below which learned depths "
-        "take part in poses",
-    )
     scale: bool = Field(
         True,
         description="the network's unit holds the map's where it drifts by more than the network "
@@ -251,7 +204,6 @@ class MonitorConfig(StageConfig):
 
     enabled: bool = Field(True, description="False: a wrong scale is not looked for")
     every: int = Field(10, ge=1, description="frames with a pose between two checks")
-    witnesses: int = Field(5, ge=1, description="keyframes around that a check asks")
     max_change: float = Field(
         0.03,
         gt=0,
@@ -263,29 +215,6 @@ class MonitorConfig(StageConfig):
         gt=0,
         description="relative difference of scale from most keyframes around; measured there: "
         "0.2 % from the keyframe before, 1.8 % over eight, 1 % at one place",
-    )
-    sigmas: float = Field(
-        5.0, gt=0, description="of the median over the points that both show, as well"
-    )
-    min_inlier_share: float = Field(
-        0.5,
-        ge=0,
-        le=1,
-        description="inliers of the matches below which the keyframe's depths do not fit; measured "
-        "on calibrated clips: 0.61 to 0.97 in every frame",
-    )
-    rigid_share: float = Field(
-        0.8,
-        ge=0,
-        le=1,
-        description="matches that one motion explains from which those that do not fit the depths "
-        "are no snow in front of the scene",
-    )
-    usual_share: float = Field(
-        0.65,
-        ge=0,
-        le=1,
-        description="the same, over the dive's median: a wrong calibration lowers that (to 0.53)",
     )
 
 
@@ -322,62 +251,26 @@ class TrackingConfig(StageConfig):
         lt=1,
         description="tau_keyframe: matched share below which a keyframe is made; paper: 0.7",
     )
-    min_seen: float = Field(
-        0.55,
-        ge=0,
-        lt=1,
-        description="of what a frame should show of its keyframe, by their poses, the share "
-        "matched as the pose says, below which something hides the scene and no keyframe is made; "
-        "measured where a keyframe falls due: reef, Curasao and surveys over 0.89, IUI3 (weak "
-        "calibration) over 0.64; snow over 40 % of the pixels of the reef clip below 0.49",
-    )
-    keyframe_overlap: float = Field(
-        0.5,
-        ge=0,
-        lt=1,
-        description="predicted share of the keyframe in view below which a new one is made even of "
-        "a frame that hides the scene; a keyframe full of flakes loses the depth under them, so "
-        "late: on the reef clip, one made at 0.8 kept the depth of 15 % of its pixels",
-    )
-    return_share: float = Field(
-        0.75,
-        gt=0,
-        le=1,
-        description="matched share from which it is used again; above keyframe_share, so that it "
-        "is not left at the next frame",
-    )
-    return_widths: float = Field(
-        0.03,
-        gt=0,
-        description="distance over width between where the graph and where the matches put its "
-        "points; further, the graph has drifted, and a new keyframe closes the loop",
-    )
-    return_candidates: int = Field(
+    return_candidates: Lab[int] = Field(
         2, ge=0, description="earlier keyframes tried, each for one more matching; 0: none"
     )
-    crowd: int = Field(
+    crowd: Lab[int] = Field(
         3,
         ge=1,
         description="earlier keyframes of a place that are enough: no more are made there while "
         "one of them, or the one in use, still shows crowd_share",
     )
-    crowd_overlap: float = Field(
-        0.6, gt=0, le=1, description="predicted share in view of a keyframe that counts as one"
-    )
-    crowd_share: float = Field(
+    crowd_share: Lab[float] = Field(
         0.4,
         gt=0,
         lt=1,
         description="matched share down to which a keyframe stays in use in a crowded place",
     )
-    crowd_look_s: float = Field(
+    crowd_look_s: Lab[float] = Field(
         1.0,
         ge=0,
         description="s; in a crowded place another keyframe is looked for so often at most; 0: at "
         "every frame, and the reef swum there and back takes 140 instead of 60 ms a frame there",
-    )
-    crowd_look_loss: float = Field(
-        0.05, gt=0, le=1, description="or when the matched share has fallen by so much"
     )
     mapping_parallax_widths: float = Field(
         30.0 / 512.0, gt=0, description="tau_mapframe over width; paper: 30 px at 512 px"
@@ -387,50 +280,52 @@ class TrackingConfig(StageConfig):
         ge=200,
         description="matches in the pose solver; more gain nothing (docs/measurements.md)",
     )
-    min_matches: int = Field(40, ge=10, description="fewer decide no pose (docs/measurements.md)")
-    min_inlier_share: float = Field(
+    min_matches: Lab[int] = Field(
+        40, ge=10, description="fewer decide no pose (docs/measurements.md)"
+    )
+    min_inlier_share: Lab[float] = Field(
         0.35, gt=0, lt=1, description="inliers below which the frame is lost"
     )
-    sure_inlier_share: float = Field(
+    sure_inlier_share: Lab[float] = Field(
         0.85,
         gt=0,
         le=1,
         description="inliers from which a pose after a wide step has no rival: flow that is a tile "
         "off leaves 0.4 to 0.8 of the matches (synthetic pool), right flow over 0.85",
     )
-    least_known_share: float = Field(
+    least_known_share: Lab[float] = Field(
         0.05,
         ge=0,
         le=1,
         description="of the matches, those of known depth, below which others are triangulated "
         "first",
     )
-    min_support: float = Field(
+    min_support: Lab[float] = Field(
         0.1,
         ge=0,
         lt=1,
         description="matched share x inlier share below which the frame is lost; flow between "
-        "unrelated pictures reaches 0.08 by chance (`aquaflow stress`, teleport)",
+        "unrelated pictures reaches 0.08 by chance (`aquaflow lab stress`, teleport)",
     )
-    known_sigma: float = Field(
+    known_sigma: Lab[float] = Field(
         0.15, gt=0, description="relative depth sigma of points that poses are solved from"
     )
-    sigma_px: float = Field(
+    sigma_px: Lab[float] = Field(
         0.2, gt=0, description="noise of a refined match; 0.15 px measured on synthetic dives"
     )
-    residual: PoseResidual = Field(
+    residual: Lab[PoseResidual] = Field(
         "pixel",
         description="what poses are solved from; point is the paper's and needs the frame's own "
         "points; RMS error of t over the baseline at 5 % depth noise: point 3.6, ray 1.9, pixel "
         "0.4 % (tests/tracking/pose/test_residuals.py); on the reef clip ray and pixel are equal",
     )
-    reuse_encodings: bool = Field(
+    reuse_encodings: Lab[bool] = Field(
         True, description="skip: a keyframe's encoding is kept; False: made again for every frame"
     )
-    seed_matching: bool = Field(
+    seed_matching: Lab[bool] = Field(
         True, description="skip: matching starts at the last frame's matches; False: from nothing"
     )
-    stop_converged: bool = Field(
+    stop_converged: Lab[bool] = Field(
         True, description="skip: the pose solver stops when it converged; False: at its last step"
     )
     mask_overlays: bool = Field(
@@ -438,23 +333,17 @@ class TrackingConfig(StageConfig):
         description="what stays in the picture while the scene moves (clock, crosshair, logo, the "
         "vehicle's own arm) is masked for tracking and map",
     )
-    recent_keyframes: int = Field(
+    recent_keyframes: Lab[int] = Field(
         3, ge=0, description="keyframes left last that a lost frame is looked for in; 0: none"
     )
-    recovered_support: float = Field(
-        0.2,
-        gt=0,
-        lt=1,
-        description="matched share x inlier share of a frame found there; twice min_support",
-    )
-    lost_after: int = Field(
+    lost_after: Lab[int] = Field(
         3, ge=1, description="consecutive lost frames after which a new sub-map starts"
     )
-    initialisation: InitialisationConfig = InitialisationConfig()
+    initialisation: Lab[InitialisationConfig] = InitialisationConfig()
     gate: GateConfig = GateConfig()
-    graph: GraphConfig = GraphConfig()
-    adjustment: AdjustmentConfig = AdjustmentConfig()
-    learned: LearnedConfig = LearnedConfig()
-    monitor: MonitorConfig = MonitorConfig()
-    retrieval: RetrievalConfig = RetrievalConfig()
-    verification: VerificationConfig = VerificationConfig()
+    graph: Lab[GraphConfig] = GraphConfig()
+    adjustment: Lab[AdjustmentConfig] = AdjustmentConfig()
+    learned: Lab[LearnedConfig] = LearnedConfig()
+    monitor: Lab[MonitorConfig] = MonitorConfig()
+    retrieval: Lab[RetrievalConfig] = RetrievalConfig()
+    verification: Lab[VerificationConfig] = VerificationConfig()

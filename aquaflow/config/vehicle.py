@@ -8,6 +8,7 @@ from pydantic import Field
 
 from aquaflow.config import Config, read_yaml
 from aquaflow.config.cameras import CameraConfig
+from aquaflow.config.old_keys import understood
 from aquaflow.config.presets import merged, preset
 from aquaflow.config.recording import RecordingConfig
 from aquaflow.config.service import ServiceConfig
@@ -33,7 +34,7 @@ def load_vehicle(path: Path | None, preset_name: str | None = None) -> VehicleCo
         InputError: the file cannot be read, or is not YAML.
         ConfigError: an unknown preset or key, or a value out of range.
     """
-    written = {} if path is None else read_yaml(path)
+    written = {} if path is None else understood(VehicleConfig, read_yaml(path), str(path))
     changed = {} if preset_name is None else preset(preset_name)
     return validated(VehicleConfig, merged(written, changed), str(path or preset_name))
 
@@ -48,7 +49,7 @@ def load_any(path: Path) -> Config:
     written = read_yaml(path)
     only_vehicles = VehicleConfig.model_fields.keys() - Config.model_fields.keys()
     model = VehicleConfig if only_vehicles & written.keys() else Config
-    return validated(model, written, str(path))
+    return validated(model, understood(model, written, str(path)), str(path))
 
 
 def looking_in(vehicle: VehicleConfig, site: Path) -> VehicleConfig:

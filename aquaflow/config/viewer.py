@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from aquaflow.config.service import ListenConfig
+from aquaflow.config.stage import Lab
 
 
 class ViewerConfig(ListenConfig):
@@ -16,6 +17,6 @@ class ViewerConfig(ListenConfig):
         60_000, ge=100, description="Gaussians shown at most of a live map, which a browser gets "
         "again as often as it changes and the link allows: 14 to 18 bytes each",
     )  # fmt: skip
-    refresh_s: float = Field(3.0, gt=0, description="s between pictures of the whole map")
-    pose_hz: float = Field(4.0, gt=0, le=30, description="frustum and trajectory")
-    picture_width: int = Field(240, ge=16, le=1920, description="px of the current picture")
+    refresh_s: Lab[float] = Field(3.0, gt=0, description="s between pictures of the whole map")
+    pose_hz: Lab[float] = Field(4.0, gt=0, le=30, description="frustum and trajectory")
+    picture_width: Lab[int] = Field(240, ge=16, le=1920, description="px of the current picture")

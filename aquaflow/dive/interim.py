@@ -37,7 +37,7 @@ WATER_VIEWS = 8
 many."""
 NOTE = (
     "this was written while the dive went on: the map is not refined and no view was held against "
-    "it; `aquaflow dive finish` does both for a dive that was cut off"
+    "it; `aquaflow run finish` does both for a dive that was cut off"
 )
 
 

@@ -25,7 +25,7 @@ PROTOCOL = {
     "ssim": "11x11 Gaussian window, sigma 1.5 px, zero-padded, mean over channels",
     "psnr": "mean over held-out frames of the PSNR of each",
     "as_tracked": "psnr and ssim before a held-out frame's pose, exposure and light were refined",
-    "ate": "see `aquaflow evaluate`, which knows the truth",
+    "ate": "see `aquaflow lab evaluate`, which knows the truth",
 }
 """How the numbers of metrics.json were measured."""
 

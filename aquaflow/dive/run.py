@@ -356,7 +356,7 @@ class DiveRun:
             self.folder.set_aside(before)
         if self.slam.failures.disk_was_full:
             dive = self.folder.path
-            again = "map again" if self.live is None else f"run `aquaflow dive finish {dive}`"
+            again = "map again" if self.live is None else f"run `aquaflow run finish {dive}`"
             raise InputError(
                 f"the disk is full: {dive} lacks some of its files, log.jsonl says which; make "
                 f"room and {again}"

@@ -50,7 +50,7 @@ def cameras(machine: MachineProbes) -> CheckResult:
     found = ", ".join(
         f"/dev/{node.name} ({name or 'no name'})" for node, name in zip(nodes, names, strict=True)
     )
-    used = "read live, driver v4l2; `aquaflow devices` prints its id"
+    used = "read live, driver v4l2; `aquaflow doctor devices` prints its id"
     return CheckResult("USB and CSI cameras", found, used, no_access(nodes, "video"))
 
 

@@ -105,7 +105,7 @@ def _v4l2(key: str, device: str | None, machine: MachineProbes) -> CheckResult:
         barred = devices.no_access(fitting[:1], "video")
         return CheckResult(key, "/" + str(fitting[0].relative_to(machine.root)), used, barred)
     there = ", ".join(each.name for each in links) or ", ".join(each.name for each in nodes)
-    advice = "plug it in, or give an id as `aquaflow devices` prints it"
+    advice = "plug it in, or give an id as `aquaflow doctor devices` prints it"
     return CheckResult(key, f"not found; there: {there or 'no camera'}", used, advice)
 
 

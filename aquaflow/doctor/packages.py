@@ -48,7 +48,7 @@ PACKAGES = (
     Package("gsplat", "gsplat", "gpu", "maps on a GPU with CUDA"),
     Package("onnx", "onnx", "export", "exporting a trained prior"),
     Package("onnxscript", "onnxscript", "export", "exporting a trained prior"),
-    Package("pycolmap", "pycolmap", "peers", "COLMAP beside AquaFlow in `aquaflow bench`"),
+    Package("pycolmap", "pycolmap", "peers", "COLMAP beside AquaFlow in `aquaflow lab bench`"),
 )  # fmt: skip
 OTHER_BUILDS = {"onnxruntime": ("onnxruntime-gpu",)}
 """Distributions that hold the same module."""

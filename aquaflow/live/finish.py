@@ -1,4 +1,4 @@
-"""``aquaflow dive finish``: the end of a live dive whose process was killed."""
+"""``aquaflow run finish``: the end of a live dive whose process was killed."""
 
 from __future__ import annotations
 

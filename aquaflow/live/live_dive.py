@@ -38,7 +38,7 @@ FINISH_MARGIN_S = 30.0
 short, and closing."""
 CUT_SHORT = (
     "the service was told to stop, and the end of the dive was kept short (service.stop_s); "
-    "`aquaflow dive finish` refines the map and evaluates more"
+    "`aquaflow run finish` refines the map and evaluates more"
 )
 
 

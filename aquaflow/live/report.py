@@ -1,4 +1,4 @@
-"""The report of a running service as one object, for /health, /metrics and `status`."""
+"""The report of a running service as one object, for /health, /metrics and `run status`."""
 
 from __future__ import annotations
 

@@ -76,7 +76,7 @@ def depth_card(
         first = error.errors()[0]
         option = "".join(f"--{part}: " for part in first["loc"][:1]).replace("_", "-")
         raise InputError(
-            f"{option}{words_of(first['msg'])}; see `aquaflow prior describe --help`"
+            f"{option}{words_of(first['msg'])}; see `aquaflow lab prior describe --help`"
         ) from error
 
 

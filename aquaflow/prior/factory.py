@@ -85,12 +85,14 @@ def _missing(folder: Path) -> str | None:
     if find_spec("onnxruntime") is None:
         return "onnxruntime is not installed; pip install 'aquaflow[prior]' for the learned one"
     if not (folder / CARD).is_file():
-        return f"there are no weights in {folder}; train them with `aquaflow prior train compact`"
+        return (
+            f"there are no weights in {folder}; train them with `aquaflow lab prior train compact`"
+        )
     return None
 
 
 # --------------------------------------------------------------------------------------------------
-# A prior without its confidence, to find out what C is worth (`aquaflow ablate`).
+# A prior without its confidence, to find out what C is worth (`aquaflow lab ablate`).
 
 
 class UnweightedPair:

@@ -1,5 +1,5 @@
-"""Tables of telemetry: what ``aquaflow synth`` writes, ``rostopic echo -p``, GoPro extracts, and
-plain tables of a survey (:mod:`aquaflow.recordings.survey_table`)."""
+"""Tables of telemetry: what ``aquaflow lab synth`` writes, ``rostopic echo -p``, GoPro extracts,
+and plain tables of a survey (:mod:`aquaflow.recordings.survey_table`)."""
 
 from __future__ import annotations
 

@@ -10,11 +10,11 @@ from aquaflow.config.device import MountingConfig
 from aquaflow.recordings.images import SUBFOLDER, ImageFolder
 
 MARK = "synth.yaml"
-"""Only ``aquaflow synth`` writes this file."""
+"""Only ``aquaflow lab synth`` writes this file."""
 
 
 class SyntheticDive(ImageFolder):
-    """A folder that ``aquaflow synth`` wrote: pictures, calibration and ground truth."""
+    """A folder that ``aquaflow lab synth`` wrote: pictures, calibration and ground truth."""
 
     specificity = 2
 

@@ -32,6 +32,19 @@ from aquaflow.tracking.pose.visibility import agreeing, predicted_matches
 from aquaflow.tracking.wide_steps import WideSteps
 from aquaflow.types import Frame
 
+RETURN_WIDTHS = 0.03
+"""Of an earlier keyframe: distance over width between where the graph and where the matches put
+its points; further, the graph has drifted, and a new keyframe closes the loop."""
+MIN_SEEN = 0.55
+"""Of what a frame should show of its keyframe, by their poses, the share matched as the pose
+says, below which something hides the scene and no keyframe is made; measured where a keyframe
+falls due: reef, Curasao and surveys over 0.89, IUI3 (weak calibration) over 0.64; snow over 40
+% of the pixels of the reef clip below 0.49."""
+KEYFRAME_OVERLAP = 0.5
+"""Predicted share of the keyframe in view below which a new one is made even of a frame that
+hides the scene; a keyframe full of flakes loses the depth under them, so late: on the reef
+clip, one made at 0.8 kept the depth of 15 % of its pixels."""
+
 
 @dataclass
 class CurrentKeyframe:
@@ -159,14 +172,14 @@ class KeyframeTracker:
 
     def hidden(self, solved: Matched) -> bool:
         """True if something in front of the scene hides the matches."""
-        return solved.visibility.seen < self._config.min_seen
+        return solved.visibility.seen < MIN_SEEN
 
     def classify(self, at: CurrentKeyframe, solved: Matched, camera: CameraModel) -> FrameClass:
         """The paper's rules, keyframe by matched share and mapping frame by parallax; but what is
         hidden is neither, unless the keyframe goes out of view."""
         config = self._config
         hidden = self.hidden(solved)
-        leaving = solved.visibility.overlap < config.keyframe_overlap
+        leaving = solved.visibility.overlap < KEYFRAME_OVERLAP
         if solved.share < config.keyframe_share and (leaving or not hidden):
             return FrameClass.KEYFRAME
         threshold = config.mapping_parallax_widths * camera.width
@@ -287,7 +300,7 @@ class KeyframeTracker:
             return None
         shift = camera.project(solved.estimate.T.apply(solved.points))
         shift = np.linalg.norm(shift - camera.project(T_fk.apply(solved.points)), axis=1)
-        if not drifted and np.median(shift) > self._config.return_widths * camera.width:
+        if not drifted and np.median(shift) > RETURN_WIDTHS * camera.width:
             return None
         back.moved_to(solved.estimate.T, solved.pair.matches)
         back.motion, back.mapped_parallax_px = at.motion, solved.parallax_px

@@ -22,6 +22,11 @@ from aquaflow.tracking.pose.matcher import Matched
 
 STAGE = "return to a keyframe"
 """Name of this work."""
+CROWD_LOOK_LOSS = 0.05
+"""Fall of the matched share from which a crowded place is searched before its time is over."""
+RETURN_SHARE = 0.75
+"""Matched share from which an earlier keyframe is used again; above ``tracking.keyframe_share``, so
+that it is not left at the next frame."""
 
 
 @dataclass(frozen=True)
@@ -108,14 +113,14 @@ class KeyframeReuse:
         config = self._config
         return (
             since_ns < 1e9 * config.crowd_look_s
-            and solved.share > share - config.crowd_look_loss
+            and solved.share > share - CROWD_LOOK_LOSS
             and solved.share >= config.crowd_share
         )
 
     def search(self, look: ReuseRequest) -> ReuseResult:
         """The keyframe that shows the frame best, if one does well enough; in any thread."""
         config, best = self._config, None
-        least = look.solved.share if self._is_crowded(look) else config.return_share
+        least = look.solved.share if self._is_crowded(look) else RETURN_SHARE
         with self._failures.contain(STAGE, look.frame):
             for neighbour in look.around[: config.return_candidates]:
                 back = self._keyframe_tracker.back_at(
@@ -123,7 +128,7 @@ class KeyframeReuse:
                 )
                 if back is not None and back[1].share >= least:
                     best, least = back, back[1].share
-                if least >= config.return_share:
+                if least >= RETURN_SHARE:
                     break
         return ReuseResult(look, best)
 

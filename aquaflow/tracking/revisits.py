@@ -17,7 +17,7 @@ RATIO_POINTS = 500
 KNOWN_SIGMA = 0.05
 """Relative sigma of depths that are compared."""
 LEAST_SCALE_SIGMA = 0.005
-"""Relative; as much as a link along the path may lose (``tracking.graph.link_scale_sigma``)."""
+"""Relative; as much as a link along the path may lose (``LINK_SCALE_SIGMA`` of tracking/graph)."""
 
 
 def revisited(

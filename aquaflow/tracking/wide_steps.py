@@ -25,6 +25,10 @@ from aquaflow.tracking.pose.pnp import pose_from_scratch
 from aquaflow.tracking.pose.problem import pose_problem
 from aquaflow.tracking.pose.turning_step import turning_step
 
+RECOVERED_SUPPORT = 0.2
+"""Matched share x inlier share of a lost frame that is found again in a keyframe left last; twice
+``tracking.min_support``."""
+
 
 class WideSteps:
     """Poses of frames that flow from the last frame's matches does not explain."""
@@ -89,7 +93,7 @@ class WideSteps:
         height, width = pointmap.rho.shape
         seed = pixel_grid(height, width) + flow_of_homography(H, height, width)
         pair = self._prior.decode(reference, encoding, seed)
-        if matched_share(keyframe.encoding, pair) < config.recovered_support:
+        if matched_share(keyframe.encoding, pair) < RECOVERED_SUPPORT:
             return None
         known = pointmap.known(config.known_sigma)
         T_fk = turning_step(pointmap, pair, known, camera, predicted)
@@ -107,7 +111,7 @@ class WideSteps:
             seed = expected_matches(keyframe.pointmap, pose, camera)
             pair = self._prior.decode(keyframe.encoding, encoding, seed)
             solved = self._matcher.pose(keyframe, camera, pair, pose, pose)
-            if solved is not None and solved.support >= self._config.recovered_support:
+            if solved is not None and solved.support >= RECOVERED_SUPPORT:
                 return solved
         return None
 

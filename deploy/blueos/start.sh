@@ -18,5 +18,5 @@ chmod 0600 /data/token
 echo "AquaFlow's page is in BlueOS's menu. It asks each browser once for this token: $(</data/token)"
 echo "Token, settings and dives: $OWN/token, $OWN/aquaflow.yaml, $OWN/dives"
 echo "What can be seen from here, with the lines for aquaflow.yaml:"
-"${as_user[@]}" /opt/aquaflow/bin/aquaflow devices || true
+"${as_user[@]}" /opt/aquaflow/bin/aquaflow doctor devices || true
 exec "${as_user[@]}" /opt/aquaflow/bin/aquaflow run --config /data/aquaflow.yaml

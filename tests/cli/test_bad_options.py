@@ -120,7 +120,7 @@ def test_an_unknown_option_is_a_usage_error(aquaflow: Cli, tmp_path: Path) -> No
 def test_a_synthetic_dive_that_does_not_exist_is_refused(
     aquaflow: Cli, tmp_path: Path, option: str, value: object
 ) -> None:
-    refused(aquaflow("synth", tmp_path / "s", f"--{option}", value), f"--{option}")
+    refused(aquaflow("lab", "synth", tmp_path / "s", f"--{option}", value), f"--{option}")
 
 
 # --- folders to write to and to read from ---------------------------------------------------------
@@ -138,7 +138,7 @@ def test_a_folder_with_other_files_is_not_written_to(
 def test_a_synthetic_dive_does_not_replace_other_pictures(aquaflow: Cli, tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
     (tmp_path / "images" / "holiday.png").write_bytes(b"irreplaceable")
-    refused(aquaflow("synth", tmp_path, "--frames", 2), tmp_path)
+    refused(aquaflow("lab", "synth", tmp_path, "--frames", 2), tmp_path)
     assert (tmp_path / "images" / "holiday.png").read_bytes() == b"irreplaceable"
 
 
@@ -166,21 +166,21 @@ def test_a_dive_is_not_written_over_the_recording(aquaflow: Cli, small_recording
 def test_evaluate_needs_restored_views_or_something_to_compare_with(
     aquaflow: Cli, tmp_path: Path
 ) -> None:
-    refused(aquaflow("evaluate", tmp_path), tmp_path, "--truth")
+    refused(aquaflow("lab", "evaluate", tmp_path), tmp_path, "--truth")
 
 
 def test_evaluate_refuses_a_folder_that_is_no_dive(
     aquaflow: Cli, small_recording: Path, tmp_path: Path
 ) -> None:
     for folder in (tmp_path / "none", tmp_path):
-        refused(aquaflow("evaluate", folder, "--truth", small_recording), folder)
-        refused(aquaflow("evaluate", folder, "--clean", small_recording), folder)
+        refused(aquaflow("lab", "evaluate", folder, "--truth", small_recording), folder)
+        refused(aquaflow("lab", "evaluate", folder, "--clean", small_recording), folder)
 
 
 def test_evaluate_refuses_a_truth_that_is_none(
     aquaflow: Cli, small_dive: Path, tmp_path: Path
 ) -> None:
     truth = tmp_path / "truth.tum"
-    refused(aquaflow("evaluate", small_dive, "--truth", truth), truth)
+    refused(aquaflow("lab", "evaluate", small_dive, "--truth", truth), truth)
     truth.write_text("0.0 1 2 three 0 0 0 1\n")
-    refused(aquaflow("evaluate", small_dive, "--truth", truth), truth)
+    refused(aquaflow("lab", "evaluate", small_dive, "--truth", truth), truth)

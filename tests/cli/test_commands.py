@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
 import yaml
 
 from aquaflow import __version__
+from aquaflow.cli import COMMANDS, HELP, OLD_NAMES
 from aquaflow.config import Config, load_config
-from tests.command_line import Cli
+from tests.command_line import Cli, refused
 from tests.small_recording import FRAMES, HASTY
 
 
@@ -29,7 +31,46 @@ def test_version_is_the_packages(aquaflow: Cli) -> None:
 def test_without_a_command_the_help_is_shown(aquaflow: Cli) -> None:
     ran = aquaflow()
     assert "map" in ran.out + ran.err
-    assert "evaluate" in ran.out + ran.err
+    assert "measure" in ran.out + ran.err
+
+
+@pytest.mark.parametrize(("old", "new"), OLD_NAMES.items(), ids=" ".join)
+def test_an_old_name_does_the_same_and_one_sentence_on_stderr_says_todays(
+    aquaflow: Cli, old: tuple[str, ...], new: tuple[str, ...]
+) -> None:
+    asked, today = aquaflow(*old, "--help"), aquaflow(*new, "--help")
+    assert (asked.code, asked.out) == (0, today.out)
+    assert asked.err == f"'aquaflow {' '.join(old)}' is now 'aquaflow {' '.join(new)}'\n"
+    assert today.err == ""
+
+
+def test_an_old_name_leaves_json_alone(aquaflow: Cli, tmp_path: Path) -> None:
+    ran = aquaflow("synth", tmp_path / "s", "--frames", 2, "--width", 64, "--height", 48, "--json")
+    assert json.loads(ran.out)["frames"] == 2
+    assert ran.err == "'aquaflow synth' is now 'aquaflow lab synth'\n"
+
+
+def test_the_help_shows_each_group_in_one_line_and_no_old_name(aquaflow: Cli) -> None:
+    shown = re.findall(r"^\W+([a-z]+) {2,}([A-Z].*?\.) *\W?$", aquaflow("--help").out, re.MULTILINE)
+    assert [name for name, _ in shown] == COMMANDS
+    lines = [line for commands in HELP.values() for _, line in commands.values()]
+    assert [line for _, line in shown] == lines
+
+
+@pytest.mark.parametrize("group", ["run", "export", "measure", "doctor", "lab bench"])
+def test_a_group_that_is_a_command_names_the_commands_below_it(aquaflow: Cli, group: str) -> None:
+    below = [" ".join(new) for new in OLD_NAMES.values() if " ".join(new[:-1]) == group]
+    shown = " ".join(aquaflow(*group.split(), "--help").out.split())
+    assert f"Usage: aquaflow {group} [OPTIONS]" in shown
+    assert all(f"{name}: " in shown for name in below)
+
+
+def test_a_folder_with_the_name_of_a_command_is_given_by_its_path(
+    aquaflow: Cli, tmp_path: Path
+) -> None:
+    (tmp_path / "video").mkdir()
+    refused(aquaflow("export", tmp_path / "video", "--format", "spz"), "video")
+    assert aquaflow("export", "video", "--format", "spz").code == 2
 
 
 def test_config_prints_yaml_that_loads_back(aquaflow: Cli, tmp_path: Path) -> None:
@@ -73,7 +114,7 @@ def test_map_as_json_prints_one_object_and_nothing_else(
 
 def test_synth_and_doctor_as_json_print_one_object(aquaflow: Cli, tmp_path: Path) -> None:
     small = ("--frames", 2, "--width", 64, "--height", 48)
-    ran = aquaflow("synth", tmp_path / "s", *small, "--json")
+    ran = aquaflow("lab", "synth", tmp_path / "s", *small, "--json")
     assert json.loads(ran.out)["frames"] == 2
     assert ran.err == ""
     assert json.loads(aquaflow("doctor", "--json").out)
@@ -118,7 +159,7 @@ def test_evaluate_prints_one_object_and_changes_nothing(
     aquaflow: Cli, small_recording: Path, small_dive: Path, truth: str
 ) -> None:
     before = contents(small_dive)
-    ran = aquaflow("evaluate", small_dive, "--truth", small_recording / truth, "--json")
+    ran = aquaflow("lab", "evaluate", small_dive, "--truth", small_recording / truth, "--json")
     assert ran.err == ""
     result = json.loads(ran.out)
     assert result["posed"] == FRAMES
@@ -136,7 +177,7 @@ def test_evaluate_against_a_table_of_positions(
     table = tmp_path / "positions.csv"
     rows = [f"{i:06d}.png,{pose[1]},{pose[2]}" for i, pose in enumerate(poses)]
     table.write_text("\n".join(["file,easting_m,northing_m", *rows]) + "\n")
-    result = json.loads(aquaflow("evaluate", small_dive, "--truth", table, "--json").out)
+    result = json.loads(aquaflow("lab", "evaluate", small_dive, "--truth", table, "--json").out)
     assert result["matched"] == FRAMES
     # The heights that the table lacks are part of what is missed.
     assert result["ate_pct_sim3"] < 10.0
@@ -145,7 +186,8 @@ def test_evaluate_against_a_table_of_positions(
 def test_evaluate_for_people_names_what_was_measured(
     aquaflow: Cli, small_recording: Path, small_dive: Path
 ) -> None:
-    ran = aquaflow("evaluate", small_dive, "--truth", small_recording, "--clean", small_recording)
+    against = ("--truth", small_recording, "--clean", small_recording)
+    ran = aquaflow("lab", "evaluate", small_dive, *against)
     assert f"{FRAMES} of {FRAMES} frames" in ran.out
     for part in ("Trajectory", "Held-out views", "Water", "What is nearest", "Without water"):
         assert part in ran.out
@@ -155,7 +197,7 @@ def test_evaluate_for_people_names_what_was_measured(
 def test_evaluate_needs_no_truth_for_the_colours_of_restored_views(
     aquaflow: Cli, small_dive: Path
 ) -> None:
-    result = json.loads(aquaflow("evaluate", small_dive, "--json").out)
+    result = json.loads(aquaflow("lab", "evaluate", small_dive, "--json").out)
     assert list(result) == ["naturalness"]
     assert result["naturalness"]["views"] == 2
-    assert "lightness ratio" in aquaflow("evaluate", small_dive).out
+    assert "lightness ratio" in aquaflow("lab", "evaluate", small_dive).out

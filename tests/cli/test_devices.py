@@ -1,4 +1,4 @@
-"""``aquaflow devices``: what is plugged in, and the lines that make a config use it."""
+"""``aquaflow doctor devices``: what is plugged in, and the lines that make a config use it."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
-import typer
 from typer.testing import CliRunner
 
-from aquaflow.cli import devices
+from aquaflow.cli import app
+from aquaflow.cli.doctor import devices
 from aquaflow.config.cameras import OakConfig, V4l2Config
 from aquaflow.config.link import CanConfig, SerialConfig
 from aquaflow.drivers import discovery as drivers
@@ -159,9 +159,8 @@ def test_the_options_say_who_is_asked(
         return DiscoveryResult([], [])
 
     monkeypatch.setattr(discovery, "discover", look)
-    app = typer.Typer()
-    devices.register(app)
-    assert CliRunner().invoke(app, [*options, "--json"]).exit_code == 0
+    words = ["doctor", "devices", *options, "--json"]
+    assert CliRunner().invoke(app, words).exit_code == 0
     assert given == [hosts]
 
 
@@ -170,7 +169,7 @@ def test_what_cannot_be_used_now_has_no_lines_to_paste(
 ) -> None:
     taken = FoundDevice("stream", "udp://0.0.0.0:5600", "UDP port 5600", "another program listens")
     monkeypatch.setattr(discovery, "discover", lambda hosts: DiscoveryResult([taken], []))
-    devices.devices()
+    devices()
     printed = capsys.readouterr().out
     assert "another program listens" in printed
     assert "{}" not in printed
@@ -182,7 +181,7 @@ def test_the_table_shows_ids_and_lines_for_the_config(
     monkeypatch.setattr(
         discovery, "discover", lambda hosts: DiscoveryResult(working(), ["oak: no library"])
     )
-    devices.devices()
+    devices()
     printed = capsys.readouterr().out
     for part in ("Camera [1]", "abc", "kind: v4l2", "device: abc", "Not looked for: oak: no lib"):
         assert part in printed
@@ -192,12 +191,12 @@ def test_nothing_plugged_in_is_a_sentence(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(discovery, "discover", lambda hosts: DiscoveryResult([], []))
-    devices.devices()
+    devices()
     assert capsys.readouterr().out.startswith("Nothing was found: ")
 
 
 def test_this_machine_is_looked_at_without_an_error(aquaflow: Cli) -> None:
-    ran = aquaflow("devices", "--local", "--json")
+    ran = aquaflow("doctor", "devices", "--local", "--json")
     assert ran.code == 0
     assert ran.err == ""
     found = json.loads(ran.out)

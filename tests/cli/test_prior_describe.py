@@ -1,5 +1,5 @@
-"""`aquaflow prior describe`: a network of the user's own becomes a prior, or a sentence says why
-not."""
+"""`aquaflow lab prior describe`: a network of the user's own becomes a prior, or a sentence says
+why not."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ USUAL = ["--measure", "inverse_depth", "--unit", "affine", "--output", "depth"]
 def run(network: Path, *options: str) -> Result:
     out = network.parent / "prior"
     return CliRunner().invoke(
-        cli.app, ["prior", "describe", str(network), "--out", str(out), *options]
+        cli.app, ["lab", "prior", "describe", str(network), "--out", str(out), *options]
     )
 
 

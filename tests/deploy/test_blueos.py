@@ -261,7 +261,7 @@ def test_the_first_start_makes_config_and_token_and_says_where(
     assert token.stat().st_mode & 0o777 == 0o600
     assert token.read_text().strip() in said
     assert "/usr/blueos/extensions/aquaflow/token" in said
-    assert "as user: aquaflow devices" in said
+    assert "as user: aquaflow doctor devices" in said
     assert said.splitlines()[-1].startswith("as user: aquaflow run --config")
 
 

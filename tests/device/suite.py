@@ -63,7 +63,7 @@ def scenes(cache: Path) -> list[BenchmarkScene]:
 
 
 def map_scene(scene: BenchmarkScene, variant: str, place: str, out: Path) -> Mapped:
-    """As ``aquaflow bench`` does in its worker, but in this process."""
+    """As ``aquaflow lab bench`` does in its worker, but in this process."""
     name = "".join(letter if letter.isalnum() else "_" for letter in scene.name)
     folder = out / f"{name}-{variant}-{place.replace(' ', '_')}"
     job = BenchJob(scene, PRESET, str(folder), overrides=VARIANTS[variant])

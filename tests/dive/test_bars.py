@@ -22,7 +22,7 @@ def mapped(aquaflow: Cli, dive: Path, *arguments: object) -> Values:
 
 
 def evaluated(aquaflow: Cli, dive: Path, *arguments: object) -> Values:
-    ran = aquaflow("evaluate", dive, *arguments, "--json")
+    ran = aquaflow("lab", "evaluate", dive, *arguments, "--json")
     assert ran.code == 0, ran.err
     return dict(json.loads(ran.out))
 
@@ -64,7 +64,7 @@ def test_survey_stills(aquaflow: Cli, shared_data: Path, tmp_path: Path) -> None
 
 def test_synthetic_dive(aquaflow: Cli, tmp_path: Path) -> None:
     truth, dive = tmp_path / "truth", tmp_path / "dive"
-    assert aquaflow("synth", truth).code == 0
+    assert aquaflow("lab", "synth", truth).code == 0
     mapped(aquaflow, dive, truth)
     result = evaluated(aquaflow, dive, "--truth", truth, "--clean", truth)
     assert result["ate_pct_sim3"] <= 0.5

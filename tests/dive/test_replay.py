@@ -150,7 +150,9 @@ def test_a_real_reef_is_tracked_from_small_pictures(
     calibration = ("--calib", clip / "camera.yaml")
     ran = aquaflow("map", clip / "reef_clip.mp4", *calibration, *options)
     assert ran.code == 0, ran.err
-    result = json.loads(aquaflow("evaluate", dive, "--truth", clip / "poses_sfm.tum", "--json").out)
+    result = json.loads(
+        aquaflow("lab", "evaluate", dive, "--truth", clip / "poses_sfm.tum", "--json").out
+    )
     assert result["posed_fraction"] > 0.9
     assert result["ate_pct_sim3"] < 1.0
 
@@ -162,6 +164,6 @@ def test_a_real_survey_of_eight_stills_is_placed(
     ran = aquaflow("map", survey, "--tracking-only", "--out", dive)
     assert ran.code == 0, ran.err
     truth = survey / "positions_geotiff.csv"
-    result = json.loads(aquaflow("evaluate", dive, "--truth", truth, "--json").out)
+    result = json.loads(aquaflow("lab", "evaluate", dive, "--truth", truth, "--json").out)
     assert (result["posed"], result["frames"], result["left_out"]) == (8, 8, 0)
     assert result["ate_pct_sim3"] <= 3.0

@@ -1,4 +1,4 @@
-"""``aquaflow devices`` on the network: real sockets, simulated devices, and what is none."""
+"""``aquaflow doctor devices`` on the network: real sockets, simulated devices, and what is none."""
 
 from __future__ import annotations
 

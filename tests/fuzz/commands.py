@@ -11,6 +11,8 @@ from typing import Any
 
 import typer
 
+from aquaflow.cli.console import GroupWithDefault
+
 OUTPUTS = frozenset({"out", "readme", "csv"})
 """Parameters whose file or folder a command may write."""
 
@@ -61,6 +63,8 @@ def _below(command: Any, words: tuple[str, ...]) -> typing.Iterator[Command]:
         kinds = typing.get_type_hints(inspect.unwrap(command.callback))
         yield Command(words, tuple(_parameter(p, kinds[p.name]) for p in command.params))
         return
+    if isinstance(command, GroupWithDefault):
+        yield from _below(command.default, words)
     for name, inner in groups.items():
         yield from _below(inner, (*words, name))
 

@@ -58,7 +58,14 @@ def make_exemplars(root: Path) -> tuple[str, ...]:
     from aquaflow.cli import main
 
     aquaflow = [
-        ["synth", "recording", f"--frames={FRAMES}", f"--width={WIDTH}", f"--height={HEIGHT}"],
+        [
+            "lab",
+            "synth",
+            "recording",
+            f"--frames={FRAMES}",
+            f"--width={WIDTH}",
+            f"--height={HEIGHT}",
+        ],
         ["map", "recording", "--out=dive", "--refine-steps=3"],
         ["record", "--source=recording", "--out=recorded", "--seconds=1"],
         ["site", "add", "site", "dive"],

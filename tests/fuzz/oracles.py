@@ -31,7 +31,7 @@ IGNORED_INTERRUPT = re.compile(
 """What Python itself prints where Ctrl-C falls into a destructor, and nobody can prevent."""
 NOTICES = ("The public MASt3R weights", "note: ")
 """Sentences that a command rightly says before it fails."""
-SILENT_FAILURES = frozenset({"site check", "status", "stress"})
+SILENT_FAILURES = frozenset({"site check", "run status", "lab stress"})
 """Commands whose exit code 1 is an answer, which stands on stdout."""
 
 FRAME = re.compile(r'File "[^"]*?(aquaflow/[^"]+)", line (\d+)')

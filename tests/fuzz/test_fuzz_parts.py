@@ -78,7 +78,9 @@ def test_options_are_known_with_their_types() -> None:
         float,
         bool,
     )
-    assert {"prior train compact", "bench render", "ablate"} <= set(commands)
+    assert {"lab prior train compact", "lab bench", "lab bench render", "lab ablate", "run"} <= set(
+        commands
+    )
 
 
 @given(st.data())

@@ -75,25 +75,26 @@ QUICK: dict[str, dict[str, str]] = {
     "run": {"--seconds": "1", "--speed": "20", "--out": "new"},
     "record": {"--seconds": "0.5", "--out": "new"},
     "view": {"--port": "0"},
-    "synth": {"--frames": "2", "--width": "64", "--height": "48"},
-    "bench dives": {"--no-peers": "", "--preset": "fast", "--out": "new"},
-    "bench render": {"--repeats": "1", "--out": "new"},
-    "bench growth": {"--frames": "50", "--preset": "fast", "--out": "new"},
-    "ablate": {"--out": "new"},
-    "prior bench": {"--repeats": "1"},
-    "prior train compact": {"--steps": "1", "--scenes": "8", "--batch": "2", "--out": "new"},
-    "stress": {"--family": "solvers"},
-    "report": {"--pdf": "new.pdf"},
-    "video": {"--out": "new.mp4"},
+    "lab synth": {"--frames": "2", "--width": "64", "--height": "48"},
+    "lab bench": {"--no-peers": "", "--preset": "fast", "--out": "new"},
+    "lab bench render": {"--repeats": "1", "--out": "new"},
+    "lab bench growth": {"--frames": "50", "--preset": "fast", "--out": "new"},
+    "lab ablate": {"--out": "new"},
+    "lab prior bench": {"--repeats": "1"},
+    "lab prior train compact": {"--steps": "1", "--scenes": "8", "--batch": "2", "--out": "new"},
+    "lab stress": {"--family": "solvers"},
+    "export report": {"--pdf": "new.pdf"},
+    "export video": {"--out": "new.mp4"},
     "change": {"--out": "new"},
-    "batch": {"--out": "new", "--retries": "0"},
+    "lab batch": {"--out": "new", "--retries": "0"},
 }
 """Given where nothing else was drawn, so that a run that works is over soon."""
 
 INTERRUPTED = frozenset(
     {
         *QUICK,
-        *("prior train mast3r", "prior verify", "prior export", "prior compare"),
+        *("lab prior train mast3r", "lab prior verify"),
+        *("lab prior export", "lab prior compare"),
         *("export", "doctor", "site merge"),
     }
 )

@@ -61,7 +61,16 @@ def test_a_benchmark_onto_a_full_disk_is_told_in_one_sentence(
 ) -> None:
     out = tmp_path / "bench"
     done = run_with_room(
-        64, "bench", "--scene", small_recording, "--preset", "fast", "--no-peers", "--out", out
+        64,
+        "lab",
+        "bench",
+        "--scene",
+        small_recording,
+        "--preset",
+        "fast",
+        "--no-peers",
+        "--out",
+        out,
     )
     assert done.returncode == 1, done.stderr
     (line,) = done.stderr.splitlines()

@@ -31,7 +31,7 @@ from tests.command_line import Cli, refused
     ],
 )
 def test_an_address_where_no_service_can_be_is_refused(command: Cli, url: str) -> None:
-    ran = command("status", "--url", url)
+    ran = command("run", "status", "--url", url)
     refused(ran)
     assert len(ran.err) < 300
 
@@ -77,10 +77,12 @@ def test_an_answer_that_is_no_report_is_refused(
     command: Cli, answering: Callable[[bytes], str], report: str
 ) -> None:
     if report.endswith("x"):
-        ran = command("status", "--url", answering(report.encode()))
+        ran = command("run", "status", "--url", answering(report.encode()))
         assert "Traceback" not in ran.err
     else:
-        refused(command("status", "--url", answering(report.encode())), "no AquaFlow service")
+        refused(
+            command("run", "status", "--url", answering(report.encode())), "no AquaFlow service"
+        )
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,16 @@ def test_a_benchmark_of_a_scene_without_frames_is_written(
 ) -> None:
     out = tmp_path / "bench"
     ran = aquaflow(
-        "bench", "--scene", pictures, "--preset", "fast", "--no-peers", "--out", out, "--json"
+        "lab",
+        "bench",
+        "--scene",
+        pictures,
+        "--preset",
+        "fast",
+        "--no-peers",
+        "--out",
+        out,
+        "--json",
     )
     assert ran.code == 0, ran.err
     assert '"failed": ' in (out / "bench.json").read_text()
@@ -39,7 +48,7 @@ def test_a_readme_without_its_section_is_refused_before_anything_runs(
     readme, out = tmp_path / "README.md", tmp_path / "bench"
     if text is not None:
         readme.write_text(text)
-    ran = command("bench", "--scene", pictures, "--readme", readme, "--out", out)
+    ran = command("lab", "bench", "--scene", pictures, "--readme", readme, "--out", out)
     refused(ran, readme)
     assert not out.exists()
     assert not (tmp_path / "docs").exists()
@@ -85,7 +94,7 @@ def test_a_broken_checkpoint_is_refused_and_nothing_is_written(
     file, out = tmp_path / "weights.pth", tmp_path / "prior"
     assert callable(make)
     make(file)
-    ran = command("prior", "export", "mast3r", "--checkpoint", file, "--out", out)
+    ran = command("lab", "prior", "export", "mast3r", "--checkpoint", file, "--out", out)
     assert ran.code == 1
     assert "Traceback" not in ran.err
     assert ran.err.splitlines()[-1].startswith(f"aquaflow: {file} ")
@@ -96,11 +105,11 @@ def test_a_broken_checkpoint_is_refused_and_nothing_is_written(
 def test_training_on_a_device_that_is_not_there_is_refused(
     command: Cli, tmp_path: Path, device: str
 ) -> None:
-    ran = command("prior", "train", "compact", "--device", device, "--out", tmp_path / "out")
+    ran = command("lab", "prior", "train", "compact", "--device", device, "--out", tmp_path / "out")
     refused(ran, f"'{device}'")
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("device", ["banana", "cuda:99"])
 def test_timing_on_a_device_that_is_not_there_is_refused(command: Cli, device: str) -> None:
-    refused(command("prior", "bench", "--device", device), "device")
+    refused(command("lab", "prior", "bench", "--device", device), "device")

@@ -55,6 +55,8 @@ def words_of(command: str, dive: Path) -> list[object]:
         return ["measure", dive, "--notes"]
     if command == "site":
         return ["site", "add", dive.parent / "site", dive]
+    if command == "report":
+        return ["export", "report", dive]
     return [command, dive]
 
 
@@ -75,7 +77,7 @@ def test_no_link_is_followed_to_a_file_outside(
 def test_a_fifo_is_not_waited_for(dive: Path, command: Cli, name: str) -> None:
     (dive / name).unlink()
     os.mkfifo(dive / name)
-    refused(command("report", dive), name, "no regular file")
+    refused(command("export", "report", dive), name, "no regular file")
 
 
 def test_a_note_is_written_through_no_link(dive: Path, command: Cli, outside: Path) -> None:
@@ -248,10 +250,10 @@ def test_a_dive_is_not_looked_for_in_places_that_unpack_to_gigabytes(
 
 
 def test_coverage_that_unpacks_to_gigabytes_takes_no_memory(dive: Path) -> None:
-    usual, code, said = peak_mb("report", dive)
+    usual, code, said = peak_mb("export", "report", dive)
     assert code == 0, said
     replaced(dive / "coverage.npz", "0.views", "u2", 1 << 29)
-    found, code, said = peak_mb("report", dive)
+    found, code, said = peak_mb("export", "report", dive)
     assert (code, said.count("\n")) == (1, 1)
     assert "coverage.npz" in said
     print(f"\npeak {usual:.0f} MB, with the bomb {found:.0f} MB")
@@ -314,4 +316,4 @@ def test_a_map_whose_header_claims_a_billion_gaussians_takes_no_memory(dive: Pat
 def test_a_long_json_file_is_refused(dive: Path, command: Cli) -> None:
     with (dive / "metrics.json").open("r+b") as stream:
         stream.truncate(1 << 33)  # a hole: it takes no room on the disk
-    refused(command("report", dive), "metrics.json", "MB")
+    refused(command("export", "report", dive), "metrics.json", "MB")

@@ -98,7 +98,7 @@ def test_a_crop_one_pixel_high_is_refused(aquaflow: Cli, pictures: Path, tmp_pat
     [
         ("map", "dive\udcff"),
         ("map", "dive", "--out", "map\udce9"),
-        ("synth", "\udcff"),
+        ("lab", "synth", "\udcff"),
         ("export", "dive\udcff", "--format", "restored"),
     ],
 )

@@ -16,6 +16,7 @@ FEW = {
     "heldout_steps": 3, "prune_every": 5,
 }  # fmt: skip
 QUICK: dict[str, Any] = {
+    "lab": True,
     "threads": 1,
     "tracking": {
         "keyframe_share": 0.9,

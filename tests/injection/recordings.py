@@ -16,8 +16,8 @@ ELSEWHERE = 3
 def write_recordings(folder: Path) -> None:
     """``pictures``, ``return`` (a loss, and the place found again), ``video.avi`` and ``mcap``."""
     size = ("--width", WIDTH, "--height", HEIGHT)
-    _aquaflow("synth", folder / "pictures", "--frames", FRAMES, *size)
-    _aquaflow("synth", folder / "wall", "--scene", "wall", "--frames", 40, *size)
+    _aquaflow("lab", "synth", folder / "pictures", "--frames", FRAMES, *size)
+    _aquaflow("lab", "synth", folder / "wall", "--scene", "wall", "--frames", 40, *size)
     here = sorted((folder / "pictures").rglob("*.png"))[:FRAMES]
     wall = sorted((folder / "wall").rglob("*.png"))[:ELSEWHERE]
     _write_return(folder / "return", [*here[:9], *wall, *here[5:9]])

@@ -44,6 +44,7 @@ while sleep 1; do
     >/dev/udp/127.0.0.1/14600
 done 2>/dev/null &
 cat >/run/vehicle.yaml <<YAML
+lab: true
 cameras:
   front: {kind: v4l2, width: 160, height: 120, pixels: YUYV, fps: 15}
 telemetry:

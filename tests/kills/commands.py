@@ -86,9 +86,9 @@ def refused(*words: object) -> None:
 
 READERS: tuple[Callable[[Path, Path], tuple[object, ...]], ...] = (
     lambda dive, out: ("export", dive, "--format", "spz", "--out", out / "x.spz"),
-    lambda dive, out: ("video", dive, "--kind", "fly-through", "--out", out / "x.mp4"),
-    lambda dive, out: ("report", dive, "--pdf", out / "x.pdf"),
-    lambda dive, _: ("evaluate", dive),
+    lambda dive, out: ("export", "video", dive, "--kind", "fly-through", "--out", out / "x.mp4"),
+    lambda dive, out: ("export", "report", dive, "--pdf", out / "x.pdf"),
+    lambda dive, _: ("lab", "evaluate", dive),
     lambda dive, _: ("measure", dive, "--notes"),
     lambda dive, out: ("change", "--from", dive, "--to", dive, "--out", out / "change"),
     lambda dive, out: ("site", "add", out / "site", dive),
@@ -182,7 +182,7 @@ class Bench:
             ends = [folder / name for name in ("dive", "other")]
             shutil.copytree(*ends)
             for end in ends:
-                to_its_end("dive", "finish", end)
+                to_its_end("run", "finish", end)
             one, other = (digests(end, OF_A_DIVE) for end in ends)
             require(one == other, f"finished twice: {differing(one, other)}")
             exported(dive, folder)
@@ -283,14 +283,14 @@ class Bench:
         folder = self.fresh()
         recordings = season(folder / "recordings", self.recording, dives=2)
         site = folder / "site"
-        words = ("batch", recordings, "--out", site, *HASTY, "--jobs", "2")
+        words = ("lab", "batch", recordings, "--out", site, *HASTY, "--jobs", "2")
 
         def dives(of: Path = site) -> dict[str, bytes]:
             return {name: text for name, text in contents(of).items() if not name.startswith(".")}
 
         def whole() -> dict[str, bytes]:
             other = self.fresh() / "site"
-            to_its_end("batch", recordings, "--out", other, *words[4:])
+            to_its_end("lab", "batch", recordings, "--out", other, *words[5:])
             return dives(other)
 
         reference = self.reference("batch", whole)

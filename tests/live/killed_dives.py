@@ -14,6 +14,7 @@ from aquaflow.dive.frames_csv import read_rows
 from aquaflow.live.checkpoint.generations import read_state, state_file
 
 CONFIG = """
+lab: true
 threads: 1
 source: {fps: 10.0}
 mapping:

@@ -78,7 +78,7 @@ def test_deliverables_of_an_earlier_moment_are_set_aside_and_the_dive_is_finishe
     at = ("--little-room-with-a-report-at", str(FULL_WITH_A_MAP_AT))
     done = paced_run(small_recording, config, dive, *at)
     assert done.returncode == 1
-    assert f"make room and run `aquaflow dive finish {dive}`" in done.stderr
+    assert f"make room and run `aquaflow run finish {dive}`" in done.stderr
     last_s = read_tum(dive / "trajectory.tum").t_s[-1]
     assert last_s == pytest.approx((FRAMES - 1) / FPS)  # it is of the end
     for name in ("map.ply", "map_clear.ply", "report.html"):
@@ -88,8 +88,8 @@ def test_deliverables_of_an_earlier_moment_are_set_aside_and_the_dive_is_finishe
     assert (dive / "map.earlier.ply").is_file()
     ran = aquaflow("export", dive, "--format", "spz")
     assert (ran.code, ran.out) == (1, "")
-    assert f"the disk was full; `aquaflow dive finish {dive}` does the rest" in ran.err
-    ran = aquaflow("dive", "finish", dive)
+    assert f"the disk was full; `aquaflow run finish {dive}` does the rest" in ran.err
+    ran = aquaflow("run", "finish", dive)
     assert ran.code in (0, 3), ran.err
     assert list(dive.rglob("*.earlier.*")) == []
     for name in ("map.aqf", "map.ply", "report.html", "metrics.json"):

@@ -1,4 +1,4 @@
-"""kill -9 in mid-dive: what is there can be read, and `aquaflow dive finish` makes the rest."""
+"""kill -9 in mid-dive: what is there can be read, and `aquaflow run finish` makes the rest."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_a_dive_that_a_process_holds_is_not_finished_and_not_touched(
 ) -> None:
     before = {path: path.stat().st_mtime_ns for path in killed.rglob("*")}
     lock = FolderLock(killed)
-    ran = aquaflow("dive", "finish", killed)
+    ran = aquaflow("run", "finish", killed)
     lock.release()
     assert ran.code == 1
     assert "held by a running aquaflow" in ran.err
@@ -75,7 +75,7 @@ def test_finishing_writes_every_file_and_marks_the_dive_and_is_done_once(
     dive = tmp_path / "dive"
     shutil.copytree(killed, dive)
     known = read_state(state_file(dive)).frames
-    ran = aquaflow("dive", "finish", dive, "--seconds", "0.5", "--json")
+    ran = aquaflow("run", "finish", dive, "--seconds", "0.5", "--json")
     assert ran.code in (0, 3), ran.err
     numbers = json.loads(ran.out)
     assert numbers["complete"] is True
@@ -92,7 +92,7 @@ def test_finishing_writes_every_file_and_marks_the_dive_and_is_done_once(
         assert (dive / name).is_file()
     assert "written while the dive went on" not in (dive / "report.html").read_text()
     before = {path: path.read_bytes() for path in dive.rglob("*") if path.is_file()}
-    ran = aquaflow("dive", "finish", dive)
+    ran = aquaflow("run", "finish", dive)
     assert (ran.code, ran.out) == (0, f"{dive} is finished already.\n")
     assert {path: path.read_bytes() for path in dive.rglob("*") if path.is_file()} == before
 
@@ -102,23 +102,23 @@ def test_a_finished_dive_whose_process_had_no_time_to_tidy_is_tidied(
 ) -> None:
     for name in ("frames.csv", "metrics.json"):
         (tmp_path / name).write_text("{}")
-    assert "finished already" in aquaflow("dive", "finish", tmp_path).out  # a replay's
+    assert "finished already" in aquaflow("run", "finish", tmp_path).out  # a replay's
     DiveStatus(DiveState.FINISHED, False, None, "", None).write(tmp_path)
     (tmp_path / "checkpoint").mkdir()
-    assert "finished already" in aquaflow("dive", "finish", tmp_path).out
+    assert "finished already" in aquaflow("run", "finish", tmp_path).out
     assert not (tmp_path / "checkpoint").exists()
 
 
 def test_what_is_no_dive_or_has_no_checkpoint_is_refused_in_a_sentence(
     aquaflow: Cli, killed: Path, tmp_path: Path
 ) -> None:
-    ran = aquaflow("dive", "finish", tmp_path)
+    ran = aquaflow("run", "finish", tmp_path)
     assert ran.code == 1
     assert "is no dive: it has no frames.csv" in ran.err
     dive = tmp_path / "dive"
     shutil.copytree(killed, dive)
     for file in (dive / "checkpoint").iterdir():
         file.write_bytes(b"damaged")
-    ran = aquaflow("dive", "finish", dive)
+    ran = aquaflow("run", "finish", dive)
     assert ran.code == 1
     assert "has no checkpoint that can be read" in ran.err

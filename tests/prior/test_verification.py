@@ -33,7 +33,7 @@ def depth(tmp_path: Path) -> Path:
 
 
 def verify(folder: Path, *options: str) -> Result:
-    return CliRunner().invoke(cli.app, ["prior", "verify", str(folder), *options])
+    return CliRunner().invoke(cli.app, ["lab", "prior", "verify", str(folder), *options])
 
 
 def pretend(monkeypatch: pytest.MonkeyPatch, fault: Fault, device: str = "cuda") -> None:
@@ -102,7 +102,7 @@ def test_what_cannot_be_compared_is_a_sentence(
 
 
 def test_a_device_without_a_prior_is_a_sentence() -> None:
-    found = CliRunner().invoke(cli.app, ["prior", "verify", "--device", "cpu"])
+    found = CliRunner().invoke(cli.app, ["lab", "prior", "verify", "--device", "cpu"])
     assert "give the folder of a prior" in str(found.exception)
 
 

@@ -35,7 +35,7 @@ def test_a_thinned_dive_is_tracked_to_a_percent(
 ) -> None:
     pytest.importorskip("onnxruntime", reason="pip install 'aquaflow[prior]'")
     if not (SHIPPED / CARD).is_file():
-        pytest.skip("aquaflow prior train compact makes the weights")
+        pytest.skip("aquaflow lab prior train compact makes the weights")
     prior = make_prior(PriorConfig(kind="compact", device="cpu"))
     assert prior.name == "compact"
     tracked = run(thinned, prior=prior).tracked

@@ -94,8 +94,9 @@ def unfinished(dive: Path) -> str | None:
         return _why_cut_off(dive, live=False) if there and not _has_metrics(dive) else None
     if status.state is DiveState.RESCALING:
         return (
-            f"`aquaflow scale` was cut off in {dive}, whose files have two units of length now; "
-            f"map its recording again: `aquaflow map RECORDING --out {dive} --overwrite`"
+            f"`aquaflow measure scale` was cut off in {dive}, whose files have two units of "
+            "length now; map its recording again: "
+            f"`aquaflow map RECORDING --out {dive} --overwrite`"
         )
     if not status.state.is_complete:
         return _why_cut_off(dive, status.is_live)
@@ -110,7 +111,7 @@ def _why_cut_off(dive: Path, live: bool) -> str:
     if any((dive / CHECKPOINT).glob("*.npz")):
         return (
             f"{dive} is not finished: its process was cut off, or the disk was full; "
-            f"`aquaflow dive finish {dive}` does the rest"
+            f"`aquaflow run finish {dive}` does the rest"
         )
     if live:
         return (

@@ -1,4 +1,4 @@
-"""`aquaflow batch`: from a folder of recordings and settings to a site of dives."""
+"""`aquaflow lab batch`: from a folder of recordings and settings to a site of dives."""
 
 from __future__ import annotations
 

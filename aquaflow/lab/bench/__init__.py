@@ -1,1 +1,1 @@
-"""``aquaflow bench`` and ``aquaflow ablate``: run time against error, and what parts are worth."""
+"""``aquaflow lab bench`` and ``lab ablate``: run time against error, and what parts are worth."""

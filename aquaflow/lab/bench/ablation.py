@@ -1,4 +1,4 @@
-"""``aquaflow ablate``: what parts and skips (docs/architecture.md#skips) cost and bring."""
+"""``aquaflow lab ablate``: what parts and skips (docs/architecture.md#skips) cost and bring."""
 
 from __future__ import annotations
 

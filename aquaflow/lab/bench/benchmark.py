@@ -1,4 +1,4 @@
-"""``aquaflow bench``: scenes times contenders, and everything that is written about them."""
+"""``aquaflow lab bench``: scenes times contenders, and everything that is written about them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,9 @@ def scenes_of(
     if suite not in (None, *SUITES):
         raise InputError(f"there is no suite '{suite}'; choose {' or '.join(SUITES)}")
     if suite == "real" and data is None:
-        raise InputError("--suite real needs a data folder: aquaflow bench --suite real DATA_DIR")
+        raise InputError(
+            "--suite real needs a data folder: aquaflow lab bench --suite real DATA_DIR"
+        )
     found = [scene_at(path) for path in paths]
     if suite == "ci":
         found += ci_scenes(out / "scenes", progress)

@@ -4,7 +4,7 @@
 
 Shown is the middle held-out view of each dive, as it lies in the dive folder: no gain is fitted to
 any truth. CLEAN is the same recording without water, or a synthetic dive; of a recording named
-``*side_by_side*`` the right half is taken, as in ``aquaflow bench --suite real``.
+``*side_by_side*`` the right half is taken, as in ``aquaflow lab bench --suite real``.
 """
 
 from __future__ import annotations

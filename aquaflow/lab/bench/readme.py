@@ -74,7 +74,7 @@ def describe_machine(machine: dict[str, Any], rows: Sequence[dict[str, Any]]) ->
     repeats = 1 + max(row["repeat"] for row in rows)
     times = "once" if repeats == 1 else f"{repeats} times, interleaved; medians ± half the range"
     return (
-        f"Written by `aquaflow bench` on {machine['date']}; every run {times}. Machine: "
+        f"Written by `aquaflow lab bench` on {machine['date']}; every run {times}. Machine: "
         f"{machine['processor']}, {machine['cores']} cores, {machine['memory_gb']} GB, "
         f"{machine['system']}.{gpu}{busy} AquaFlow {machine['aquaflow']}, Python "
         f"{machine['python']}, {packages}."

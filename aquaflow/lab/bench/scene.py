@@ -17,8 +17,7 @@ class BenchmarkScene:
     name: str
     recording: str
     truth: str | None = None
-    """What ``aquaflow evaluate --truth`` takes; None: only time and held-out quality are measured.
-    """
+    """What ``lab evaluate --truth`` takes; None: only time and held-out quality are measured."""
     calibration: str | None = None
     clean: str | None = None
     """The same recording without water."""

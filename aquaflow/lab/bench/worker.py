@@ -63,7 +63,7 @@ if __name__ == "__main__":
 
 
 # --------------------------------------------------------------------------------------------------
-# The errors of one finished run: what ``aquaflow evaluate`` says, and the depth of its map.
+# The errors of one finished run: what ``aquaflow lab evaluate`` says, and the depth of its map.
 
 TRUE_RANGE = "range"
 """A synthetic dive's folder of true ranges."""

@@ -1,4 +1,4 @@
-"""``aquaflow evaluate``: one dive against its ground truth.
+"""``aquaflow lab evaluate``: one dive against its ground truth.
 
 Only the largest sub-map is compared: sub-maps share no frame of reference, and aligning each on its
 own would hide the break between them. How many poses that leaves out is part of the result.

@@ -1,4 +1,4 @@
-"""``aquaflow prior compare``: every method on the same pairs, in turn, with what each costs."""
+"""``aquaflow lab prior compare``: every method on the same pairs, in turn, with what each costs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The results of ``aquaflow prior bench`` and ``prior compare`` on a terminal."""
+"""The results of ``aquaflow lab prior bench`` and ``prior compare`` on a terminal."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ class Result:
     def command(self) -> str:
         """What reproduces this row."""
         long = " --long" if self.case.long else ""
-        return f"aquaflow stress --case {self.case.name} --seed {self.seed}{long}"
+        return f"aquaflow lab stress --case {self.case.name} --seed {self.seed}{long}"
 
     def to_json(self) -> dict[str, Any]:
         """The stable keys of docs/formats.md#json-output; ``worst`` may be null."""
@@ -68,7 +68,7 @@ def cases(family: str | None = None, name: str | None = None, long: bool = False
         raise InputError(f"there is no family '{family}'; families are {', '.join(FAMILIES)}")
     if name is not None:
         if name not in REGISTRY:
-            raise InputError(f"there is no stress case '{name}'; `aquaflow stress` lists them")
+            raise InputError(f"there is no stress case '{name}'; `aquaflow lab stress` lists them")
         return [REGISTRY[name]]
     chosen = [case for case in REGISTRY.values() if family in {None, case.family}]
     return [case for case in chosen if long or not case.long]

@@ -122,7 +122,7 @@ def read_truth(out: Path) -> Truth:
     except (AquaFlowError, OSError, KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"{out} is not a complete synthetic dive ({reason_of(error)}); write it again with "
-            "aquaflow synth"
+            "aquaflow lab synth"
         ) from error
     T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
     T_wc[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()

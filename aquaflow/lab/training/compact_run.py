@@ -1,4 +1,4 @@
-"""`aquaflow prior train compact`: a pool of scenes, a training, and the folder that tracks."""
+"""`aquaflow lab prior train compact`: a pool of scenes, a training, and the folder that tracks."""
 
 from __future__ import annotations
 

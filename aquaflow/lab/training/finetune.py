@@ -206,7 +206,7 @@ def fine_tune(
     process: TrainingProcess,
     progress: Progress,
 ) -> list[dict[str, float]]:
-    """Train, and write ``mast3r.pth``, which `aquaflow prior export mast3r` reads.
+    """Train, and write ``mast3r.pth``, which `aquaflow lab prior export mast3r` reads.
 
     Raises:
         InputError: too few pairs, or ``out`` holds the checkpoint of another network.

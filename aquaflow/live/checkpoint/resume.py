@@ -165,7 +165,7 @@ def _why_left(
     """Why an unfinished dive is not gone on with, as a clause; None: it is."""
     status = read_status(folder)
     if status is not None and status.state is DiveState.FINISHING:
-        return f"it was being finished; `aquaflow dive finish {folder}` does the rest"
+        return f"it was being finished; `aquaflow run finish {folder}` does the rest"
     age = age_of(folder, checkpoint.moment, now, is_set)
     if not resume_h or (age.hours is not None and age.hours <= resume_h):
         return None

@@ -138,7 +138,8 @@ def load_checkpoint(path: Path) -> CompactPrior:
         network.load_state_dict(torch.load(path, weights_only=True, map_location="cpu")["network"])
     except Exception as error:  # the unpickler lets through whatever damaged bytes make it do
         raise InputError(
-            f"{path} is no checkpoint of `prior train compact` ({reason_of(error)}); give another"
+            f"{path} is no checkpoint of `lab prior train compact` ({reason_of(error)}); "
+            "give another"
         ) from error
     return network.eval()
 

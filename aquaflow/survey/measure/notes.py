@@ -144,7 +144,7 @@ def scaled(
     notes: Sequence[Note],
     times: float,
 ) -> list[Note]:
-    """Notes of a dive whose lengths became ``times`` as long, as by ``aquaflow scale``."""
+    """Notes of a dive whose lengths became ``times`` as long, as by ``aquaflow measure scale``."""
     return [replace(note, places=note.places * times) for note in notes]
 
 

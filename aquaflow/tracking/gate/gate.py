@@ -20,6 +20,23 @@ from aquaflow.tracking.gate.thumbnail import (
 
 FIRST_LEVELS = 3
 """Frames before sharpness has a level to fall from."""
+DUPLICATE_WIDTHS = 0.3 / 480.0
+"""Motion over width below which a frame is a duplicate; 0.3 px at 480 px is what a checked DIS
+match is known to."""
+STATIC_SHARE = 0.8
+"""Part of the textured tiles that must stand still; fish move in the others."""
+MIN_SNR = 2.0
+"""Gradient of a textured tile over that of noise alone; measured: below 1.2 to 1.8 in the
+median tile, flow finds no more than chance matches."""
+MIN_USABLE = 0.05
+"""Textured share of the picture that a pose can come from."""
+DARK_LEVEL = 20.0
+"""Grey level that separates dark from blinded, in the reason."""
+BLUR_LOSS = 0.065
+"""Sharpness left, of the running median; measured at 480 px: Gaussian blur of 5 px leaves 0.07
+to 0.09 and still tracks, 8 px 0.04 to 0.06 and does not; good frames keep over 0.69."""
+BLUR_MEMORY = 9
+"""Frames that the running sharpness is taken from."""
 
 
 class GateKind(str, Enum):
@@ -61,7 +78,7 @@ class FrameGate:
     def __init__(self, config: GateConfig) -> None:
         self._config = config
         self._reference: Thumbnail | None = None
-        self._levels: deque[Float] = deque(maxlen=config.blur_memory)
+        self._levels: deque[Float] = deque(maxlen=BLUR_MEMORY)
         self._run = 0
 
     def judge(
@@ -74,7 +91,7 @@ class FrameGate:
         Of frames that show nothing, only ``longest_run`` in a row are skipped; the following ones
         pass until one is good again: the tracker has to know that it sees nothing.
         """
-        thumbnail = measure_thumbnail(image, mask, self._config.min_snr)
+        thumbnail = measure_thumbnail(image, mask, MIN_SNR)
         verdict = self._useless(thumbnail)
         if verdict is not None:
             return self._bounded(verdict)
@@ -92,9 +109,9 @@ class FrameGate:
     def _useless(self, thumbnail: Thumbnail) -> GateVerdict | None:
         """Dark, blinded or blurred; None for a picture that shows something."""
         config = self._config
-        if thumbnail.usable < config.min_usable:
+        if thumbnail.usable < MIN_USABLE:
             says = f"texture above the noise in {100 * thumbnail.usable:.0f} % of the picture"
-            dark = thumbnail.level < config.dark_level
+            dark = thumbnail.level < DARK_LEVEL
             if dark and config.skip_dark:
                 return GateVerdict(GateKind.DARK, f"dark: {says}", thumbnail.usable)
             if not dark and config.skip_blinded:
@@ -104,7 +121,7 @@ class FrameGate:
             return None
         usual = np.median(np.stack(self._levels), axis=0)
         left = float((thumbnail.sharpness / np.maximum(usual, 1e-6)).min())
-        if left >= config.blur_loss:
+        if left >= BLUR_LOSS:
             return None
         return GateVerdict(
             GateKind.BLURRED, f"blurred: {100 * left:.0f} % of the usual sharpness", left
@@ -124,8 +141,8 @@ class FrameGate:
         """Against the last frame that passed, so that slow drift adds up until it is seen."""
         if not self._config.skip_duplicates or self._reference is None:
             return GateVerdict(GateKind.PASS)
-        motion = motion_widths(self._reference, thumbnail, self._config.static_share)
-        if motion >= self._config.duplicate_widths:
+        motion = motion_widths(self._reference, thumbnail, STATIC_SHARE)
+        if motion >= DUPLICATE_WIDTHS:
             return GateVerdict(GateKind.PASS, measure=motion)
         reason = f"duplicate: moved by {100 * motion:.3f} % of the width since the last frame used"
         return GateVerdict(GateKind.DUPLICATE, reason, motion)

@@ -33,6 +33,8 @@ from aquaflow.tracking.loops.relocaliser import Places, Relocalised
 
 LOOP_SEARCH = "loop search"
 """Name of that work."""
+LINK_SCALE_SIGMA = 0.005
+"""Relative scale that a link along the path may lose; on the reef clip 12 keyframes lost 5 %."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +166,7 @@ class KeyframeGraph:
         self._known.append(keyframe)
         edge = None
         if link is not None:
-            sigma = self._config.link_scale_sigma
+            sigma = LINK_SCALE_SIGMA
             information = edge_information(link.covariance, sigma, link.T_fk)
             edge = Edge(number, link.keyframe, link.T_fk, information)
             self.graph.add_edge(edge)

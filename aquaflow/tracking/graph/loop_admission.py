@@ -23,6 +23,8 @@ from aquaflow.tracking.graph.equations import Array, Index, Mask, Rows, poses_of
 
 WITNESSES = 8
 """Other loop edges, the nearest first, that are tested for agreement with one."""
+CORROBORATION = 2
+"""Other loop edges that must agree with one for it to count as corroborated."""
 
 
 @dataclass
@@ -184,7 +186,7 @@ class Admission:
             pair = loops[[j, i]]
             ends = self.poses[pair["a"]], self.poses[pair["b"]]
             votes += gap_chi2(pair, *ends, chains, config) <= config.loop_chi2
-            if votes >= config.corroboration:
+            if votes >= CORROBORATION:
                 return True
         return False
 

@@ -22,6 +22,8 @@ NEAREST = 32
 ROLL_RAD = np.radians(20.0)
 """Turn about the viewing direction beyond which flow hardly matches two pictures: on synthetic
 dives 0.63 of the picture up to 10 degrees, 0.45 at 20, and nothing from 30 on."""
+CROWD_OVERLAP = 0.6
+"""Predicted share in view from which a keyframe counts as one of the place."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ class Neighbours:
             keyframe, points = here[i]
             T_fk = T_fw @ keyframe.T_wc
             neighbour = Neighbour(keyframe, T_fk, float(expected(points, T_fk, camera).mean()))
-            if neighbour.overlap >= self._config.crowd_overlap and neighbour.roll_rad < ROLL_RAD:
+            if neighbour.overlap >= CROWD_OVERLAP and neighbour.roll_rad < ROLL_RAD:
                 found.append(neighbour)
         return sorted(found, key=lambda neighbour: -neighbour.likeness)
 

@@ -21,6 +21,10 @@ from aquaflow.tracking.pose.solver import PoseEstimate, PoseProblem, solve_pose
 from aquaflow.tracking.pose.surroundings import surroundings
 from aquaflow.tracking.pose.visibility import Visibility, evenly_taken, visibility
 
+LEAST_TRIANGULATED = 0.3
+"""Of the matches of known depth, those triangulated, below which learned depths take part in
+poses."""
+
 
 @dataclass(frozen=True)
 class Matched:
@@ -110,7 +114,7 @@ class KeyframeMatcher:
         of the matches have others. A network's error is that of whole parts of a picture."""
         if pointmap.learned is None:
             return pointmap
-        known_sigma, least = self._config.known_sigma, self._config.learned.least_triangulated
+        known_sigma, least = self._config.known_sigma, LEAST_TRIANGULATED
         triangulated = (pair.valid & pointmap.known(known_sigma)).sum()
         if triangulated >= least * pair.valid.sum():
             return pointmap

@@ -54,7 +54,7 @@ def test_a_live_dive_with_a_checkpoint_is_to_be_finished(tmp_path: Path, state: 
     assert "before its first checkpoint" in (unfinished(dive) or "")
     (dive / "checkpoint").mkdir()
     (dive / "checkpoint" / "state.npz").touch()
-    assert f"`aquaflow dive finish {dive}` does the rest" in (unfinished(dive) or "")
+    assert f"`aquaflow run finish {dive}` does the rest" in (unfinished(dive) or "")
 
 
 def test_a_dive_that_a_process_writes_to_is_to_be_waited_for(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""`aquaflow batch` on this machine: whole dives, whatever some of the recordings do."""
+"""`aquaflow lab batch` on this machine: whole dives, whatever some of the recordings do."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def run_batch(
             resource.setrlimit(resource.RLIMIT_FSIZE, (room_bytes, room_bytes))
 
     return subprocess.run(
-        [AQUAFLOW, "batch", *map(str, arguments)],
+        [AQUAFLOW, "lab", "batch", *map(str, arguments)],
         env=environment, capture_output=True, text=True, check=False, preexec_fn=limited,
     )  # fmt: skip
 
@@ -148,7 +148,7 @@ def test_a_batch_that_is_stopped_leaves_no_process_and_can_be_continued(
     held = tmp_path / "long.hold"
     held.write_text(str(recordings / "dive0"))
     (tmp_path / "list.txt").write_text("long.hold\n")
-    command = (AQUAFLOW, "batch", tmp_path / "list.txt", "--out", tmp_path / "site", *SHORT)
+    command = (AQUAFLOW, "lab", "batch", tmp_path / "list.txt", "--out", tmp_path / "site", *SHORT)
     running = subprocess.Popen(
         [*map(str, command)], env=poisoned, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         text=True, start_new_session=True,

@@ -1,4 +1,4 @@
-"""`aquaflow batch --cluster` on a real Ray cluster of two nodes, parts of which are killed."""
+"""`aquaflow lab batch --cluster` on a real Ray cluster of two nodes, parts of which are killed."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def dives(small_recording: Path, tmp_path: Path) -> Path:
 
 
 def command(dives: Path, site: Path, *more: str) -> list[str]:
-    return [AQUAFLOW, "batch", str(dives), "--out", str(site), *SHORT, "--json", *more]
+    return [AQUAFLOW, "lab", "batch", str(dives), "--out", str(site), *SHORT, "--json", *more]
 
 
 def begin(environment: dict[str, str], words: list[str]) -> subprocess.Popen[str]:

@@ -19,7 +19,7 @@ def test_dives_of_a_batch_are_members_of_its_site_once(
 ) -> None:
     dives, site = season(tmp_path / "dives", small_recording, 1), tmp_path / "site"
     for _ in range(2):
-        ran = command("batch", dives, "--out", site, *SHORT, "--json")
+        ran = command("lab", "batch", dives, "--out", site, *SHORT, "--json")
         assert ran.code in (0, 3), ran.err + ran.out
         assert json.loads(ran.out)["notes"] == []
     assert [dive.path for dive in read_site(site)] == ["dives/dive0"]

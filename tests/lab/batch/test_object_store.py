@@ -47,7 +47,7 @@ def test_a_season_in_a_store_becomes_dives_in_a_store(
     memory.put(str(local), "/season/dives", recursive=True)
     cache = tmp_path / "cache"
     given = ("memory://season/dives", "--out", SITE, "--cache", cache, *SHORT, "--json")
-    ran = command("batch", *given)
+    ran = command("lab", "batch", *given)
     assert ran.code in (0, 3), ran.err
     manifest = json.loads(memory.cat_file("/season/site/dives/dive0/manifest.json"))
     files = {
@@ -57,7 +57,7 @@ def test_a_season_in_a_store_becomes_dives_in_a_store(
     assert "frames.csv" in files
     assert memory.exists("/season/site/batch.jsonl")
     assert [path.name for path in cache.iterdir()] == ["batch.jsonl"]
-    again = command("batch", *given)
+    again = command("lab", "batch", *given)
     assert json.loads(again.out)["dives"]["dive0"]["earlier"]
 
 
@@ -123,7 +123,7 @@ def test_a_store_is_listed_by_what_may_be_a_recording(memory: fsspec.AbstractFil
 
 @pytest.mark.parametrize("url", ["nonsense://x/y", "s3x://bucket", "memory://nowhere"])
 def test_a_store_that_is_none_is_told_in_a_sentence(url: str, command: Cli, tmp_path: Path) -> None:
-    ran = command("batch", url, "--out", tmp_path / "site")
+    ran = command("lab", "batch", url, "--out", tmp_path / "site")
     assert ran.code == 1
     [line] = ran.err.splitlines()
     assert url in line

@@ -46,14 +46,14 @@ def test_a_season_in_a_bucket_becomes_dives_in_a_bucket(
     system.put(str(season(tmp_path / "dives", small_recording, 1)), "season/dives", recursive=True)
     cache = tmp_path / "cache"
     given = (f"{bucket}/dives", "--out", f"{bucket}/site", "--cache", cache, *SHORT, "--json")
-    ran = command("batch", *given)
+    ran = command("lab", "batch", *given)
     assert ran.code in (0, 3), ran.err + ran.out
     manifest = json.loads(system.cat_file("season/site/dives/dive0/manifest.json"))
     found = {path.partition("/dives/dive0/")[2] for path in system.find("season/site/dives")}
     assert found == {*manifest["files"], "manifest.json"}
     assert "season/site/batch.jsonl" in system.ls("season/site")
     assert [path.name for path in cache.iterdir()] == ["batch.jsonl"]
-    again = command("batch", *given)
+    again = command("lab", "batch", *given)
     assert json.loads(again.out)["dives"]["dive0"]["earlier"]
 
 
@@ -66,6 +66,6 @@ def test_a_bucket_without_its_package_is_told_with_what_to_install(
         raise ImportError("Install s3fs to access S3")
 
     monkeypatch.setattr(fsspec.core, "url_to_fs", missing)
-    ran = command("batch", "s3://season/dives", "--out", tmp_path / "site")
+    ran = command("lab", "batch", "s3://season/dives", "--out", tmp_path / "site")
     assert ran.code == 1
     assert "pip install 'aquaflow[s3]'" in ran.err

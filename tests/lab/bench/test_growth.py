@@ -1,4 +1,4 @@
-"""``aquaflow bench growth``: jobs, one real survey, table, picture, failures, command line."""
+"""``aquaflow lab bench growth``: jobs, one real survey, table, picture, failures, command line."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def test_a_survey_is_mapped_and_looked_at(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_the_command_prints_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bm, "_in_process", pretended)
-    asked = ["bench", "growth", "--quick", "--preset", "fast", "--out", str(tmp_path)]
+    asked = ["lab", "bench", "growth", "--quick", "--preset", "fast", "--out", str(tmp_path)]
     said = CliRunner().invoke(app, asked).stdout
     assert "| 150 |" in said
     assert "| 300 |" in said

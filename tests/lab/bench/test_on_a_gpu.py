@@ -1,4 +1,4 @@
-"""`aquaflow bench --device cuda` and `bench render --device cuda`, on a pretended device."""
+"""`aquaflow lab bench --device cuda` and `bench render --device cuda`, on a pretended device."""
 
 from __future__ import annotations
 
@@ -104,7 +104,17 @@ def test_the_renderers_table_comes_out_on_a_device(
     monkeypatch.setattr(sizes, "QUICK_SIZES", (TINY,))
     monkeypatch.setattr(bm, "SMALL", SMALLEST)
     monkeypatch.setattr(bm, "parts_of", partial(parts_of, pictures=[(32, 24)], rows=[50]))
-    arguments = ["bench", "render", "--quick", "--repeats", "2", "--device", "cuda", "--json"]
+    arguments = [
+        "lab",
+        "bench",
+        "render",
+        "--quick",
+        "--repeats",
+        "2",
+        "--device",
+        "cuda",
+        "--json",
+    ]
     with pretended_device() as device:
         ran = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path)])
         assert device.calls > 0
@@ -286,7 +296,7 @@ def test_what_is_there_or_is_not_asked_for_is_not_refused(monkeypatch: pytest.Mo
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
-@pytest.mark.parametrize("words", [("bench", "--suite", "ci"), ("bench", "render")])
+@pytest.mark.parametrize("words", [("lab", "bench", "--suite", "ci"), ("lab", "bench", "render")])
 def test_both_commands_refuse_in_one_sentence_and_write_nothing(
     command: Cli, tmp_path: Path, words: tuple[str, ...]
 ) -> None:
@@ -312,7 +322,7 @@ def test_on_a_gpu_its_presets_run_too(monkeypatch: pytest.MonkeyPatch, tmp_path:
     monkeypatch.setattr(dives, "scenes_of", lambda *_: [])
     monkeypatch.setattr(dives, "benchmark", noted)
     for device in ("cuda", "cpu"):
-        arguments = ["bench", "--no-peers", "--device", device, "--out", str(tmp_path)]
+        arguments = ["lab", "bench", "--no-peers", "--device", device, "--out", str(tmp_path)]
         assert CliRunner().invoke(app, arguments).exit_code == 0
     (on_gpu, cuda), (on_cpu, cpu) = asked
     assert (cuda, cpu) == ("cuda", "cpu")

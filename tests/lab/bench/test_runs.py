@@ -239,8 +239,8 @@ def test_bench_on_a_small_dive(small_recording: Path, tmp_path: Path) -> None:
 
 
 def test_the_command_refuses_in_one_sentence() -> None:
-    ran = run_aquaflow("bench", "--suite", "real")
+    ran = run_aquaflow("lab", "bench", "--suite", "real")
     assert ran.code == 1
     assert ran.err.splitlines() == [
-        "aquaflow: --suite real needs a data folder: aquaflow bench --suite real DATA_DIR"
+        "aquaflow: --suite real needs a data folder: aquaflow lab bench --suite real DATA_DIR"
     ]

@@ -1,4 +1,4 @@
-"""What ``aquaflow evaluate`` prints: a label never touches what it labels."""
+"""What ``aquaflow lab evaluate`` prints: a label never touches what it labels."""
 
 from __future__ import annotations
 

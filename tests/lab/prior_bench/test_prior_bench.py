@@ -1,4 +1,4 @@
-"""``aquaflow prior bench``: a row for every prior, size and kind of frame, and what was found."""
+"""``lab prior bench``: a row for every prior, size and kind of frame, and what was found."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("quick")
 def test_every_prior_that_is_here_has_its_rows_and_its_recall() -> None:
     pytest.importorskip("onnxruntime", reason="pip install 'aquaflow[prior]'")
-    result = CliRunner().invoke(cli.app, ["prior", "bench", "--repeats", "1", "--json"])
+    result = CliRunner().invoke(cli.app, ["lab", "prior", "bench", "--repeats", "1", "--json"])
     assert result.exit_code == 0, result.output
     said = json.loads(result.stdout)
     names = ["classical none"]
@@ -45,7 +45,7 @@ def test_every_prior_that_is_here_has_its_rows_and_its_recall() -> None:
 
 @pytest.mark.usefixtures("quick")
 def test_the_table_says_what_the_machine_was() -> None:
-    result = CliRunner().invoke(cli.app, ["prior", "bench", "--repeats", "1"])
+    result = CliRunner().invoke(cli.app, ["lab", "prior", "bench", "--repeats", "1"])
     assert "64 x 48" in result.stdout
     assert "cores, load" in result.stdout
 

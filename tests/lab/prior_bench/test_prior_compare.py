@@ -1,4 +1,4 @@
-"""``aquaflow prior compare``: the same pairs for every method, and figures that hold."""
+"""``aquaflow lab prior compare``: the same pairs for every method, and figures that hold."""
 
 from __future__ import annotations
 
@@ -231,7 +231,7 @@ def test_the_command_compares_on_all_kinds_of_pairs(
     monkeypatch.setattr(comparison, "methods_here", lambda device: here)
     cv2.imwrite(str(tmp_path / "floor.png"), sea_floor(320, 240))
     options = ["--pairs", "1", "--pool", str(tmp_path / "pool"), "--pictures", str(tmp_path)]
-    ran = CliRunner().invoke(cli.app, ["prior", "compare", *options, "--json"])
+    ran = CliRunner().invoke(cli.app, ["lab", "prior", "compare", *options, "--json"])
     assert ran.exit_code == 0, ran.output
     said = json.loads(ran.stdout)
     assert {row["pairs"] for row in said["rows"]} == {
@@ -239,7 +239,7 @@ def test_the_command_compares_on_all_kinds_of_pairs(
     }  # fmt: skip
     assert {row["method"] for row in said["rows"]} == {"classical"}
     assert said["missing"] == here.missing
-    shown = CliRunner().invoke(cli.app, ["prior", "compare", *options])
+    shown = CliRunner().invoke(cli.app, ["lab", "prior", "compare", *options])
     assert "generated, wide (1)" in shown.stdout
     assert "XFeat: it is not installed" in shown.stdout
     assert "Times are of the processor." in shown.stdout

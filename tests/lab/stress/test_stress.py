@@ -1,4 +1,4 @@
-"""The short form of ``aquaflow stress`` passes, and each guard is what makes its case pass."""
+"""The short form of ``aquaflow lab stress`` passes, and each guard is what makes its case pass."""
 
 from __future__ import annotations
 
@@ -201,20 +201,20 @@ def test_an_exception_is_a_failure_with_its_seed() -> None:
     result = suite.run_case(suite.Case("broken", "solvers", "a.b", breaks, long=False), seed=7)
     assert not result.outcome.passed
     assert "RuntimeError: out of range" in result.outcome.detail
-    assert result.command == "aquaflow stress --case broken --seed 7"
+    assert result.command == "aquaflow lab stress --case broken --seed 7"
     assert result.to_json()["worst"] is None
 
 
 def test_the_command_prints_a_table_and_json(aquaflow: Cli) -> None:
-    table = aquaflow("stress", "--family", "water")
+    table = aquaflow("lab", "stress", "--family", "water")
     assert table.code == 0, table.err
     assert "transmission_to_0" in table.out
-    ran = aquaflow("stress", "--case", "sim3_chain", "--seed", 3, "--json")
+    ran = aquaflow("lab", "stress", "--case", "sim3_chain", "--seed", 3, "--json")
     (row,) = json.loads(ran.out)["cases"]
     assert {"name", "family", "passed", "worst", "guard", "seed"} <= set(row)
     assert (row["name"], row["passed"], row["seed"]) == ("sim3_chain", True, 3)
 
 
 def test_an_unknown_family_or_case_is_refused(aquaflow: Cli) -> None:
-    refused(aquaflow("stress", "--family", "weather"), "weather")
-    refused(aquaflow("stress", "--case", "weather"), "weather")
+    refused(aquaflow("lab", "stress", "--family", "weather"), "weather")
+    refused(aquaflow("lab", "stress", "--case", "weather"), "weather")

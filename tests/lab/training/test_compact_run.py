@@ -1,4 +1,4 @@
-"""`aquaflow prior train compact`: from nothing to a folder that tracks, and its record."""
+"""`aquaflow lab prior train compact`: from nothing to a folder that tracks, and its record."""
 
 from __future__ import annotations
 
@@ -138,7 +138,9 @@ def test_a_variance_is_widened_where_errors_are_larger_and_never_narrowed(
 @pytest.mark.usefixtures("small")
 def test_the_command_stops_when_its_hours_are_over(tmp_path: Path) -> None:
     options = ["--scenes", "8", "--batch", "2", "--steps", "3", "--out", str(tmp_path)]
-    result = CliRunner().invoke(cli.app, ["prior", "train", "compact", *options, "--hours", "0"])
+    result = CliRunner().invoke(
+        cli.app, ["lab", "prior", "train", "compact", *options, "--hours", "0"]
+    )
     assert result.exit_code == 0, result.output
     assert "give the same command to go on" in result.stdout
     assert (tmp_path / "checkpoint.pt").is_file()
@@ -150,7 +152,7 @@ def test_the_command_takes_maps_of_dives(tmp_path: Path, monkeypatch: pytest.Mon
     dive = small_dive(tmp_path / "dive")
     out = tmp_path / "out"
     options = ["--scenes", "8", "--batch", "2", "--steps", "3", "--out", str(out), "--hours", "0"]
-    command = ["prior", "train", "compact", *options, "--maps", str(dive)]
+    command = ["lab", "prior", "train", "compact", *options, "--maps", str(dive)]
     monkeypatch.setattr(compact, "CompactSettings", partial(CompactSettings, map_pairs=16))
     result = CliRunner().invoke(cli.app, command)
     assert result.exit_code == 0, result.output
@@ -166,7 +168,7 @@ def test_the_command_trains_exports_and_goes_on_where_it_stopped(tmp_path: Path)
     pytest.importorskip("onnxruntime", reason="pip install 'aquaflow[prior]'")
     pytest.importorskip("onnxscript", reason="pip install 'aquaflow[export]'")
     options = ["--scenes", "16", "--batch", "2", "--out", str(tmp_path), "--json"]
-    command = ["prior", "train", "compact", *options]
+    command = ["lab", "prior", "train", "compact", *options]
     first = CliRunner().invoke(cli.app, [*command, "--steps", "2"])
     assert first.exit_code == 0, first.output
     card = read_card(tmp_path / compact_run.PRIOR)

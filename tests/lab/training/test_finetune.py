@@ -131,7 +131,7 @@ def test_the_command_trains_and_writes_weights_that_export_reads(
     data: Path, tiny_checkpoint: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    arguments = ["prior", "train", "mast3r", "--checkpoint", tiny_checkpoint, "--out", out,
+    arguments = ["lab", "prior", "train", "mast3r", "--checkpoint", tiny_checkpoint, "--out", out,
                  "--data", f"tartanair={data}", "--width", 32, "--height", 32, "--epochs", 1,
                  "--accumulate", 2]  # fmt: skip
     result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments])

@@ -45,6 +45,7 @@ STALL_S = 4.0
 
 CONFIG = """
 # The pilot swims to and fro over 24 pictures: wherever a dive begins, it starts within 11 of them.
+lab: true
 threads: 1
 cameras:
   pilot: {{kind: stream, url: "udp://0.0.0.0:{camera}", stall_s: {stall_s}}}

@@ -109,7 +109,7 @@ def test_a_power_cut_costs_no_dive(rov: BlueRov2) -> None:
     rov.until(lambda said: said["dive"]["frames"] > frames + MOST, "frames after the power cut")
     rov.kill()
     done = subprocess.run(
-        [program(), "dive", "finish", str(dive)], capture_output=True, text=True, check=False
+        [program(), "run", "finish", str(dive)], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert_finished(dive)

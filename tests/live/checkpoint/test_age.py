@@ -96,7 +96,7 @@ def test_a_dive_that_was_being_finished_is_left_to_be_finished(tmp_path: Path) -
     old = unfinished(tmp_path, state=DiveState.FINISHING)
     choice = chosen(tmp_path, after(0.1, YESTERDAY.boot, 0.1), True)
     assert (choice.checkpoint, choice.left) == (None, old)
-    assert f"aquaflow dive finish {old}" in choice.notes[0]
+    assert f"aquaflow run finish {old}" in choice.notes[0]
 
 
 def test_a_finished_dive_that_was_not_tidied_is_not_gone_on_with(tmp_path: Path) -> None:

@@ -174,10 +174,10 @@ def test_status_prints_the_report_and_its_exit_code_says_if_all_is_well(
     aquaflow: Cli, server: HealthServer
 ) -> None:
     url = f"http://127.0.0.1:{server.port}"
-    asked = aquaflow("status", "--url", url)
+    asked = aquaflow("run", "status", "--url", url)
     assert asked.code == 0
     assert "tracking: every frame has a pose" in asked.out
-    asked = aquaflow("status", "--url", "http://127.0.0.1:1")
+    asked = aquaflow("run", "status", "--url", "http://127.0.0.1:1")
     assert asked.code == 1
     assert "no service answers" in asked.err
 

@@ -110,7 +110,7 @@ def test_what_ships_is_whole_small_and_was_torchs_when_it_was_exported() -> None
 
 
 def test_verify_reports_what_ships() -> None:
-    result = CliRunner().invoke(cli.app, ["prior", "verify", str(SHIPPED), "--json"])
+    result = CliRunner().invoke(cli.app, ["lab", "prior", "verify", str(SHIPPED), "--json"])
     names = {row["name"] for row in json.loads(result.stdout)["outputs"]}
     assert names == {"D", "Dc", "C", *OUTPUTS}
 

@@ -182,7 +182,7 @@ def test_without_onnxscript_the_extra_is_named(
 
 
 def test_verify_reports_each_output(folder: Path) -> None:
-    result = CliRunner().invoke(cli.app, ["prior", "verify", str(folder), "--json"])
+    result = CliRunner().invoke(cli.app, ["lab", "prior", "verify", str(folder), "--json"])
     outputs = json.loads(result.stdout)["outputs"]
     assert {row["name"] for row in outputs} == {"tokens", *OUTPUTS}
     assert all(row["prior"] == "mast3r" and row["max_rel"] <= 1e-4 for row in outputs)
@@ -193,13 +193,13 @@ def test_verify_refuses_a_prior_that_differs_from_torch(folder: Path, tmp_path: 
         (tmp_path / path.name).write_bytes(path.read_bytes())
     card = json.loads((folder / CARD).read_text())
     (tmp_path / CARD).write_text(json.dumps(card | {"parity": {"X_a": 0.01}}))
-    result = CliRunner().invoke(cli.app, ["prior", "verify", str(tmp_path)])
+    result = CliRunner().invoke(cli.app, ["lab", "prior", "verify", str(tmp_path)])
     assert isinstance(result.exception, AquaFlowError)
     assert "differs from torch by 1.0e-02" in str(result.exception)
 
 
 def test_export_shows_the_licence_before_it_reads_weights(tmp_path: Path) -> None:
-    arguments = ["prior", "export", "mast3r", "--checkpoint", str(tmp_path / "absent.pth")]
+    arguments = ["lab", "prior", "export", "mast3r", "--checkpoint", str(tmp_path / "absent.pth")]
     result = CliRunner().invoke(cli.app, arguments)
     assert "not for commercial use" in result.output
     assert isinstance(result.exception, InputError)

@@ -1,4 +1,4 @@
-"""``aquaflow scale`` brings the files of a dive without metres to metres."""
+"""``aquaflow measure scale`` brings the files of a dive without metres to metres."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def assert_scaled(dive: Path, before: dict[str, Any], times: float) -> None:
 
 def test_every_file_is_in_metres_after_a_length_was_marked(dive: Path, command: Cli) -> None:
     before = numbers(dive)
-    ran = command("scale", dive, *LENGTH)
+    ran = command("measure", "scale", dive, *LENGTH)
     assert ran.code == 0, ran.err
     assert "in metres now" in ran.out
     assert_scaled(dive, before, 3.0)
@@ -86,17 +86,17 @@ def test_every_file_is_in_metres_after_a_length_was_marked(dive: Path, command: 
 
 def test_a_length_that_is_marked_anew_replaces_the_scale(dive: Path, command: Cli) -> None:
     before = numbers(dive)
-    command("scale", dive, *LENGTH)
+    command("measure", "scale", dive, *LENGTH)
     # In the metres of the first time, the same two ends of the map.
     again = ("--from", "0,0,3", "--to", "0,1.5,3", "--length", 1.6)
-    said = json.loads(command("scale", dive, *again, "--json").out)
+    said = json.loads(command("measure", "scale", dive, *again, "--json").out)
     assert said["rescaled"]
     assert_scaled(dive, before, said["all_metres_per_unit"])
     assert said["all_metres_per_unit"] == pytest.approx(3.1, abs=0.05)
 
 
 def test_the_ground_is_measured_anew_in_metres_and_in_the_report(dive: Path, command: Cli) -> None:
-    ran = command("scale", dive, *LENGTH)
+    ran = command("measure", "scale", dive, *LENGTH)
     assert ran.code == 0, ran.err
     content = json.loads((dive / "reef_numbers.json").read_text())
     assert content["unit"] == "m"
@@ -128,7 +128,7 @@ def test_numbers_of_the_ground_that_cannot_be_measured_anew_are_taken_away(
 def test_notes_stay_where_they_are_in_the_map(dive: Path, command: Cli) -> None:
     place = np.array([[0.5, -0.25, 2.0]])
     write_notes(dive, [Note("a", "crack", "Point", place)], WorldFrame.unknown())
-    assert command("scale", dive, *LENGTH).code == 0
+    assert command("measure", "scale", dive, *LENGTH).code == 0
     [note] = read_notes(dive, read_metric_file(dive)[0])
     np.testing.assert_allclose(note.places, 3.0 * place)
 
@@ -136,18 +136,18 @@ def test_notes_stay_where_they_are_in_the_map(dive: Path, command: Cli) -> None:
 def test_a_dive_that_is_metric_already_keeps_its_metres(dive: Path, command: Cli) -> None:
     write_metric_file(dive, {0: metric_frame()}, main=0)
     before = numbers(dive)
-    ran = command("scale", dive, *LENGTH)
+    ran = command("measure", "scale", dive, *LENGTH)
     assert "keep the metres of bar30, compass; the marked lengths say +200.0 %" in ran.out
     assert_scaled(dive, before, 1.0)
 
 
 def test_a_dive_without_metric_file_keeps_its_unit(dive: Path, command: Cli) -> None:
     (dive / "metric.json").unlink()
-    assert "no metric.json" in command("scale", dive, *LENGTH).out
+    assert "no metric.json" in command("measure", "scale", dive, *LENGTH).out
 
 
 def test_a_damaged_file_is_named_and_none_is_changed(dive: Path, command: Cli) -> None:
     (dive / "trajectory.tum").write_text("1 2 three\n")
     before = (dive / "map.ply").read_bytes()
-    refused(command("scale", dive, *LENGTH), "trajectory.tum")
+    refused(command("measure", "scale", dive, *LENGTH), "trajectory.tum")
     assert (dive / "map.ply").read_bytes() == before

@@ -1,4 +1,4 @@
-"""``aquaflow scale``: a marked length of a finished dive gives the metres of a map unit."""
+"""``aquaflow measure scale``: a marked length of a finished dive gives the metres of a map unit."""
 
 from __future__ import annotations
 
@@ -78,12 +78,12 @@ def test_a_length_in_a_picture_gives_the_scale_that_the_path_has(
 
 def test_the_command_prints_metres_with_plus_minus_and_keeps_them(dive: Path, command: Cli) -> None:
     frame = mapped_frame(dive)
-    pixels = ("scale", dive, "--frame", frame, "--from", "40,60", "--to", "120,70")
+    pixels = ("measure", "scale", dive, "--frame", frame, "--from", "40,60", "--to", "120,70")
     ran = command(*pixels, "--length", 1.5)
     assert ran.code == 0, ran.err
     assert "1 map unit is" in ran.out
     assert " +- " in ran.out
-    points = ("scale", dive, "--from", "0,0,1", "--to", "0.5,0,1")
+    points = ("measure", "scale", dive, "--from", "0,0,1", "--to", "0.5,0,1")
     command(*points, "--length", 0.7, "--json")
     ran = command(*pixels, "--length", 1.5, "--sigma", 0.01, "--json")
     said = json.loads(ran.out)
@@ -124,7 +124,7 @@ def test_points_that_cannot_be_measured_are_refused_in_a_sentence(
     arguments: tuple[object, ...], sentence: str, dive: Path, command: Cli
 ) -> None:
     length = () if "--length" in arguments else ("--length", 1.0)
-    ran = command("scale", dive, *arguments, *length)
+    ran = command("measure", "scale", dive, *arguments, *length)
     assert ran.code != 0
     assert sentence in " ".join(ran.err.replace("│", " ").split())
     assert not (dive / FILE).exists()

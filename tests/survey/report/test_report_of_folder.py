@@ -1,4 +1,4 @@
-"""`aquaflow report`: a finished dive's folder as a PDF, and what it says of a damaged one."""
+"""`aquaflow export report`: a finished dive's folder as a PDF, or what is wrong with it."""
 
 from __future__ import annotations
 
@@ -60,17 +60,19 @@ def test_the_ground_in_numbers_is_that_of_the_page_until_its_unit_changes(dive: 
 
 def test_a_report_is_never_written_over_what_is_no_pdf(dive: Path, command: Cli) -> None:
     before = (dive / "camera.yaml").read_bytes()
-    refused(command("report", dive, "--pdf", dive / "camera.yaml"), "does not end in .pdf")
+    refused(
+        command("export", "report", dive, "--pdf", dive / "camera.yaml"), "does not end in .pdf"
+    )
     assert (dive / "camera.yaml").read_bytes() == before
 
 
 def test_report_writes_a_pdf_where_it_is_told_to(dive: Path, command: Cli, tmp_path: Path) -> None:
-    ran = command("report", dive, "--pdf", tmp_path / "reef.pdf", "--json")
+    ran = command("export", "report", dive, "--pdf", tmp_path / "reef.pdf", "--json")
     assert ran.code == 0, ran.err
     said = json.loads(ran.out)
     assert (tmp_path / "reef.pdf").read_bytes().startswith(b"%PDF")
     assert said["pages"] >= 3
-    ran = command("report", dive)
+    ran = command("export", "report", dive)
     assert ran.code == 0, ran.err
     assert (dive / "report.pdf").stat().st_size > 20_000
 
@@ -80,7 +82,7 @@ def test_report_writes_a_pdf_where_it_is_told_to(dive: Path, command: Cli, tmp_p
 )
 def test_a_damaged_file_is_named_in_a_sentence(dive: Path, command: Cli, name: str) -> None:
     (dive / name).write_bytes(b"{\x00 damaged")
-    refused(command("report", dive), name)
+    refused(command("export", "report", dive), name)
 
 
 def test_a_dive_of_before_this_command_has_a_report_without_coverage(
@@ -89,5 +91,5 @@ def test_a_dive_of_before_this_command_has_a_report_without_coverage(
     for name in ("coverage.npz", "coverage.json", "overview.png"):
         (dive / name).unlink()
     (dive / "heldout").joinpath("000000_real.png").write_bytes(b"no picture")
-    ran = command("report", dive)
+    ran = command("export", "report", dive)
     assert ran.code == 0, ran.err

@@ -241,20 +241,21 @@ def test_the_command_says_what_it_wrote_and_refuses_what_makes_no_sense(
     command: Cli, small_dive: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "fly.mp4"
-    ran = command("video", small_dive, "--kind", "fly-through", "--seconds", "0.2", "--out", out,
-                  "--width", "80", "--json")  # fmt: skip
+    ran = command("export", "video", small_dive, "--kind", "fly-through", "--seconds", "0.2",
+                  "--out", out, "--width", "80", "--json")  # fmt: skip
     assert ran.code == 0, ran.err
     assert json.loads(ran.out) == {"out": str(out), "frames": 5}
     assert len(pictures_of(out)) == 5
     other = ("--out", tmp_path / "b.mp4")
-    refused(command("video", small_dive, "--water", *other), "--water")
-    refused(command("video", small_dive, "--kind", "restored", *other), "--recording")
-    refused(command("video", small_dive, "--out", tmp_path / "b.avi"), "b.avi", ".mp4")
+    refused(command("export", "video", small_dive, "--water", *other), "--water")
+    refused(command("export", "video", small_dive, "--kind", "restored", *other), "--recording")
+    refused(command("export", "video", small_dive, "--out", tmp_path / "b.avi"), "b.avi", ".mp4")
     for wrong in ("0", "nan", "1e9"):
         flight = ("--kind", "fly-through", "--seconds", wrong)
-        refused(command("video", small_dive, *flight, *other), "--seconds")
+        refused(command("export", "video", small_dive, *flight, *other), "--seconds")
     refused(
-        command("video", small_dive, "--kind", "fly-through", "--width", "8", *other), "--width"
+        command("export", "video", small_dive, "--kind", "fly-through", "--width", "8", *other),
+        "--width",
     )
-    refused(command("video", tmp_path, *other), "no finished dive")
+    refused(command("export", "video", tmp_path, *other), "no finished dive")
     assert [path.name for path in tmp_path.glob("*.mp4")] == ["fly.mp4"]

@@ -1,4 +1,4 @@
-"""``aquaflow bench growth``: surveys of several lengths, one after the other."""
+"""``aquaflow lab bench growth``: surveys of several lengths, one after the other."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ def prepared_frames(scene: BenchmarkScene, config: Config) -> Prepared:
 
 
 def write_dive(out: Path, recording: Prepared, result: PeerResult) -> dict[str, Any]:
-    """Write trajectory.tum and frames.csv as ``aquaflow evaluate`` reads them; returns metrics.
+    """Write trajectory.tum and frames.csv as ``aquaflow lab evaluate`` reads them; returns metrics.
 
     Raises:
         NotMappedError: too few frames have a pose.

@@ -1,1 +1,1 @@
-"""``aquaflow bench render``: how fast each renderer draws and differentiates the same scenes."""
+"""``lab bench render``: how fast each renderer draws and differentiates the same scenes."""

@@ -1,4 +1,4 @@
-"""``aquaflow bench render``: contenders times sizes, and what is written about them."""
+"""``aquaflow lab bench render``: contenders times sizes, and what is written about them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The sizes of the scenes that `aquaflow bench render` draws."""
+"""The sizes of the scenes that `aquaflow lab bench render` draws."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``aquaflow bench render`` as a whole: contenders, peers, failures, files, command line."""
+"""``aquaflow lab bench render`` as a whole: contenders, peers, failures, files, command line."""
 
 from __future__ import annotations
 
@@ -113,7 +113,17 @@ def small_benchmark(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("small_benchmark")
 @pytest.mark.ci
 def test_the_benchmark_writes_rows_gradients_and_a_picture(tmp_path: Path) -> None:
-    arguments = ["bench", "render", "--quick", "--repeats", "2", "--json", "--out", str(tmp_path)]
+    arguments = [
+        "lab",
+        "bench",
+        "render",
+        "--quick",
+        "--repeats",
+        "2",
+        "--json",
+        "--out",
+        str(tmp_path),
+    ]
     ran = CliRunner().invoke(app, arguments)
     assert ran.exit_code == 0, ran.output
     written = json.loads((tmp_path / bm.JSON_FILE).read_text())
@@ -144,25 +154,31 @@ def test_bench_still_takes_a_suite_and_a_folder_in_any_order(
     tmp_path: Path, order: tuple[str, ...]
 ) -> None:
     refused(
-        run_aquaflow("bench", *(tmp_path if word == "DATA" else word for word in order)), tmp_path
+        run_aquaflow("lab", "bench", *(tmp_path if word == "DATA" else word for word in order)),
+        tmp_path,
     )
 
 
 def test_what_is_neither_a_command_nor_a_suite_is_refused() -> None:
-    refused(run_aquaflow("bench", "rendr"), "rendr", "render")
-    refused(run_aquaflow("bench"), "nothing to run")
+    refused(run_aquaflow("lab", "bench", "rendr"), "rendr", "render")
+    refused(run_aquaflow("lab", "bench"), "nothing to run")
 
 
 def test_bench_render_refuses_in_one_sentence(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_text("x")
-    refused(run_aquaflow("bench", "render", "--out", file), file)
-    refused(run_aquaflow("bench", "render", "--opensplat", "no-such-program"), "no-such-program")
+    refused(run_aquaflow("lab", "bench", "render", "--out", file), file)
+    refused(
+        run_aquaflow("lab", "bench", "render", "--opensplat", "no-such-program"), "no-such-program"
+    )
 
 
 @pytest.mark.parametrize(
     ("arguments", "shown"),
-    [(("bench", "--help"), "--suite"), (("bench", "render", "--help"), "--opensplat")],
+    [
+        (("lab", "bench", "--help"), "--suite"),
+        (("lab", "bench", "render", "--help"), "--opensplat"),
+    ],
 )
 def test_both_commands_explain_themselves(arguments: tuple[str, ...], shown: str) -> None:
     ran = CliRunner().invoke(app, arguments)
@@ -173,6 +189,6 @@ def test_both_commands_explain_themselves(arguments: tuple[str, ...], shown: str
 
 @pytest.mark.parametrize("option", [("--repeats", "0"), ("--sizes", "3"), ("extra",)])
 def test_wrong_options_of_bench_render_are_usage_errors(option: tuple[str, ...]) -> None:
-    ran = CliRunner().invoke(app, ["bench", "render", *option])
+    ran = CliRunner().invoke(app, ["lab", "bench", "render", *option])
     assert ran.exit_code == 2
     assert option[0] in ran.output

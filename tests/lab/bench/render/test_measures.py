@@ -1,4 +1,4 @@
-"""What ``aquaflow bench render`` measures: work counted, times, rates, peak, loss, optimiser."""
+"""What ``lab bench render`` measures: work counted, times, rates, peak, loss, optimiser."""
 
 from __future__ import annotations
 

@@ -1,0 +1,128 @@
+"""What is here and what a run would use: ``doctor``, ``doctor devices``, ``config``."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from aquaflow.base.errors import printable
+from aquaflow.cli.console import GroupWithDefault, Json, table_console
+
+if TYPE_CHECKING:
+    from aquaflow.sources.discovery import DiscoveryResult
+
+
+def doctor_group() -> typer.Typer:
+    """The group ``doctor`` with its commands."""
+    group = typer.Typer(cls=GroupWithDefault)
+    group.command("doctor")(doctor)
+    group.command()(devices)
+    return group
+
+
+def doctor(
+    config: Annotated[
+        Path | None, typer.Option(help="Check this YAML, and only what a run with it would open.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Report what this machine has, what AquaFlow will use, and what is missing."""
+    from aquaflow.doctor import examine, print_findings, to_json
+
+    if config is None:
+        findings = examine()
+    else:
+        from aquaflow.config.vehicle import load_any
+        from aquaflow.doctor.opened import opened
+
+        findings = opened(load_any(config))
+    if as_json:
+        typer.echo(json.dumps(to_json(findings)))
+    else:
+        print_findings(findings, table_console())
+
+
+def devices(
+    host: Annotated[
+        list[str] | None,
+        typer.Option(help="Ask this computer on the network; may be repeated. Else a BlueROV2's."),
+    ] = None,
+    local: Annotated[
+        bool, typer.Option("--local", help="Look at what is plugged in only, not at the network.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """List cameras, links and streams that are there, with the lines for the config."""
+    from aquaflow.sources.discovery import VEHICLE_HOSTS, discover
+
+    found = discover(() if local else tuple(host or VEHICLE_HOSTS))
+    if as_json:
+        typer.echo(json.dumps(asdict(found)))
+    else:
+        _print_devices(found)
+
+
+def config(
+    file: Annotated[
+        Path | None, typer.Argument(help="A config to check and complete, also a vehicle's.")
+    ] = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Also the lab's switches, which no user decides.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Print the effective configuration as YAML: every setting and its value, and what it opens."""
+    import yaml
+
+    from aquaflow.config import Config
+    from aquaflow.config.stage import without_the_lab
+    from aquaflow.config.vehicle import load_any
+    from aquaflow.doctor import to_json
+    from aquaflow.doctor.opened import opened
+
+    settings = Config() if file is None else load_any(file)
+    values, findings = settings.model_dump(mode="json"), opened(settings)
+    if not everything:
+        values = without_the_lab(type(settings), values)
+    if as_json:
+        typer.echo(json.dumps({"config": values, "opens": to_json(findings)["findings"]}))
+        return
+    typer.echo(yaml.safe_dump(values, sort_keys=False), nl=False)
+    for each in findings:
+        advice = f" ({each.advice})" if each.advice else ""
+        typer.echo(printable(f"# {each.name}: {each.used_for}: {each.found}{advice}"))
+
+
+def _print_devices(found: DiscoveryResult) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = table_console()
+    if found.devices:
+        table = Table(box=None, pad_edge=False, padding=(0, 2, 1, 0))
+        for heading in ("kind", "found", "what it gives", "for the config"):
+            table.add_column(heading, overflow="fold")
+        for device in found.devices:
+            table.add_row(
+                device.kind,
+                escape(f"{device.name}\n{device.id}"),
+                escape(device.detail),
+                escape(_as_yaml(device.config)),
+            )
+        console.print(table)
+    else:
+        typer.echo("Nothing was found: no camera, serial port, CAN interface, stream or DVL.")
+    for problem in found.problems:
+        typer.echo(f"Not looked for: {problem}.")
+
+
+def _as_yaml(config: dict[str, Any]) -> str:
+    import yaml
+
+    if not config:
+        return ""
+    return str(yaml.safe_dump(config, sort_keys=False)).rstrip()
