@@ -104,6 +104,11 @@ def only_where(
     return replace(frame, mask=shown if frame.mask is None else shown & frame.mask)
 
 
+SCARCE = 3.0
+"""Times ``min_support``: a keyframe that shows less of a frame is left, whatever hides it; another
+such step, and the camera is lost."""
+
+
 class KeyframeTracker:
     """Tracks frames against keyframes and classifies them."""
 
@@ -131,6 +136,9 @@ class KeyframeTracker:
             pair = self._prior.decode(self._reference(at), encoding)
             solved = self._matcher.pose(at.keyframe, camera, pair, predicted, at.T_fk)
         keyframe, wide = at.keyframe, self._wide_steps
+        if solved is not None and wide.contradicted(solved):
+            reference = self._reference(at)
+            solved = wide.confirmed(keyframe, reference, encoding, camera, solved, predicted)
         if wide.doubtful(keyframe, solved, at.T_fk, predicted, camera):
             reference = self._reference(at)
             return wide.best(keyframe, reference, encoding, camera, solved, predicted)
@@ -180,6 +188,7 @@ class KeyframeTracker:
         config = self._config
         hidden = self.hidden(solved)
         leaving = solved.visibility.overlap < KEYFRAME_OVERLAP
+        leaving |= solved.support < SCARCE * config.min_support
         if solved.share < config.keyframe_share and (leaving or not hidden):
             return FrameClass.KEYFRAME
         threshold = config.mapping_parallax_widths * camera.width

@@ -84,8 +84,10 @@ class MapStart:
 
     @property
     def turned_back(self) -> bool:
-        """True if the newest frame is the better reference (:attr:`Initialiser.turned_back`)."""
-        return self._initialiser is not None and self._initialiser.turned_back
+        """True if the newest frame is the better reference: the camera has turned back
+        (:attr:`Initialiser.turned_back`), or matches to this one contradict each other."""
+        initialiser = self._initialiser
+        return initialiser is not None and (initialiser.turned_back or initialiser.contradicted)
 
     def solve(self) -> NewMap | None:
         """Initialise a map from the waiting frames; None if no geometry is good enough."""

@@ -28,6 +28,8 @@ from aquaflow.tracking.pose.turning_step import turning_step
 RECOVERED_SUPPORT = 0.2
 """Matched share x inlier share of a lost frame that is found again in a keyframe left last; twice
 ``tracking.min_support``."""
+CONFIRMED_SEEN = 0.8
+"""Of what a pose puts into view, the share matched there from which it is not looked at again."""
 
 
 class WideSteps:
@@ -54,6 +56,45 @@ class WideSteps:
         steps = solved.estimate.T, predicted
         return any(is_wide(keyframe.pointmap, T_before, step, camera) for step in steps)
 
+    def contradicted(self, solved: Matched) -> bool:
+        """True if much of what the pose puts into view is not matched there."""
+        return (
+            solved.visibility.seen < CONFIRMED_SEEN
+            and solved.estimate.inlier_share < self._config.sure_inlier_share
+        )
+
+    def confirmed(
+        self,
+        keyframe: Keyframe,
+        reference: Encoding,
+        encoding: Encoding,
+        camera: CameraModel,
+        solved: Matched,
+        predicted: Sim3,
+    ) -> Matched:
+        """``solved``, or what flow finds that starts where its pose, or the one ``predicted``, puts
+        the keyframe's pixels, whichever is supported best."""
+        for pose in (solved.estimate.T, predicted):
+            rival = self._from_pose(keyframe, reference, encoding, camera, pose)
+            if rival is not None and rival.explained > solved.explained:
+                solved = rival
+            if not self.contradicted(solved):
+                break
+        return solved
+
+    def _from_pose(
+        self,
+        keyframe: Keyframe,
+        reference: Encoding,
+        encoding: Encoding,
+        camera: CameraModel,
+        pose: Sim3,
+    ) -> Matched | None:
+        """The pose from matches that are looked for only where ``pose`` puts them."""
+        seed = expected_matches(keyframe.pointmap, pose, camera)
+        pair = self._prior.decode(reference, encoding, seed, alone=True)
+        return self._matcher.pose(keyframe, camera, pair, pose, pose)
+
     def best(
         self,
         keyframe: Keyframe,
@@ -67,9 +108,7 @@ class WideSteps:
         motion so far speak for."""
         best, poses = solved, keypoint_poses(keyframe, encoding, camera, self._config.known_sigma)
         for pose in [*poses, predicted]:
-            seed = expected_matches(keyframe.pointmap, pose, camera)
-            pair = self._prior.decode(reference, encoding, seed, alone=True)
-            rival = self._matcher.pose(keyframe, camera, pair, pose, pose)
+            rival = self._from_pose(keyframe, reference, encoding, camera, pose)
             if rival is not None and (best is None or rival.explained > best.explained):
                 best = rival
             if best is not None and best.estimate.inlier_share >= self._config.sure_inlier_share:

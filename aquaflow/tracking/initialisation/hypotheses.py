@@ -31,6 +31,10 @@ HOPELESS = 1.1
 reef clip's wrong ones are at 2.1, its right ones within 1.02; Curasao's, every 2nd, at 1.4 and,
 from the pair that converges soon, 1.01."""
 
+RIVAL_DEG = 5.0
+"""Between directions of motion of two geometries that are not the same one: the decompositions of a
+plane's homography are tens of degrees apart, those of one geometry converge to within one."""
+
 
 @dataclass(frozen=True)
 class MatchedFrame:
@@ -57,6 +61,8 @@ class Hypotheses:
     ) -> None:
         self._camera, self._config, self._waiting = camera, config, waiting
         self._pixels_reference = pixels_reference
+        self.ambiguous = False
+        """True if another direction of motion explained the frames as well as the best."""
 
     def best(self) -> BundleResult | None:
         """The best candidate, adjusted to all frames in their order; None without candidates."""
@@ -75,7 +81,19 @@ class Hypotheses:
                 -result.residual_px,
             ),
         )
+        self.ambiguous = any(self._is_rival(each, best) for each in judged)
         return self._adjust(self._completed(best, test_frames), self._waiting)
+
+    @staticmethod
+    def _is_rival(result: BundleResult, best: BundleResult) -> bool:
+        """True of a geometry that is another one, and no worse."""
+        if result.residual_px > HOPELESS * best.residual_px:
+            return False
+        far = max(
+            range(len(best.bundle.T)), key=lambda v: float(np.linalg.norm(best.bundle.T[v].t))
+        )
+        mine, other = (_direction(each.bundle.T[far]) for each in (best, result))
+        return bool(mine @ other < np.cos(np.radians(RIVAL_DEG)))
 
     def explained(self, bundle: Bundle) -> float:
         """Share of all observations in front of their camera and within a pixel of their match."""
@@ -184,6 +202,12 @@ class Hypotheses:
             hits += int(good.sum())
             total += int(frame.observed.sum())
         return hits / max(total, 1)
+
+
+def _direction(T: Sim3) -> Array:
+    """[3] unit vector to the camera of ``T``, from the reference."""
+    centre = -T.R.T @ T.t
+    return np.asarray(centre / max(float(np.linalg.norm(centre)), 1e-12))
 
 
 def _on_the_way(T: Sim3, share: float) -> Sim3:

@@ -73,6 +73,11 @@ class Initialiser:
         """Parallax at the last attempt."""
         self._least_since_px = 0.0
         """Least parallax since the largest one."""
+        self._sure: list[int] = []
+        """Sure matches of the frames so far, in their order."""
+        self.contradicted = False
+        """True if no geometry explained the matches of the last attempt, which had little parallax:
+        they have gone wrong."""
         self._samples = _grid_samples(reference.interesting, config.points)
 
     def add(self, frame: Frame, encoding: Encoding) -> bool:
@@ -87,6 +92,7 @@ class Initialiser:
             self._pixels_reference[observed], pixels[observed], self.reference.camera
         )
         sure = observed & (pair.C[rows, columns] > MIN_CONFIDENCE)
+        self._sure.append(int(sure.sum()))
         if sure.sum() >= MIN_MATCHES:
             observed = sure
         # What is not a number compares with nothing: one such frame would hold up every start.
@@ -112,8 +118,23 @@ class Initialiser:
 
     @property
     def ready(self) -> bool:
-        """Enough parallax and, unless the motion is fast, enough views to judge it by."""
-        return len(self.waiting) >= self._config.min_views and self.parallax_px >= self._needed_px
+        """Enough parallax and, unless the motion is fast, enough views to judge it by; or so few
+        matches left that the next frame may have none."""
+        enough = self.parallax_px >= self._needed_px
+        return len(self.waiting) >= self._config.min_views and (enough or self.fading)
+
+    @property
+    def fading(self) -> bool:
+        """At the rate of the last frame, the next one will have too few sure matches.
+
+        Of a camera that moves along its view, the median parallax is small whatever the geometry is
+        known to: most of the picture is far, or near the epipole. Where the ground repeats itself,
+        what is near moves by a whole period after a few frames, and matches are wrong from then on.
+        """
+        if len(self._sure) < 2 or self.parallax_px < RETRY_GROWTH * self._tried_px:
+            return False
+        before, now = self._sure[-2:]
+        return before > MIN_MATCHES and now**2 < MIN_MATCHES * before
 
     @property
     def turned_back(self) -> bool:
@@ -131,9 +152,12 @@ class Initialiser:
         )
 
     @property
+    def _enough_px(self) -> float:
+        return self._config.parallax_widths * self.reference.camera.width
+
+    @property
     def _needed_px(self) -> float:
-        needed = self._config.parallax_widths * self.reference.camera.width
-        return max(needed, RETRY_GROWTH * self._tried_px)
+        return max(self._enough_px, RETRY_GROWTH * self._tried_px)
 
     def solve(self) -> Initialised | None:
         """The best explanation of all waiting frames; None when none is good enough."""
@@ -142,6 +166,10 @@ class Initialiser:
         result = hypotheses.best()
         explained = 0.0 if result is None else hypotheses.explained(result.bundle)
         trusted = result is not None and self._trustworthy(explained, result)
+        little = self.parallax_px < self._enough_px
+        if little:
+            trusted = trusted and result is not None and self._decided(hypotheses, result)
+        self.contradicted = little and explained < self._config.min_explained
         self._tried_px = self.parallax_px  # not where this raised: the next frame tries again
         if result is None or not trusted:
             return None
@@ -167,6 +195,15 @@ class Initialiser:
             and float(np.median(relative)) <= self._config.max_depth_sigma
             and focal_known
         )
+
+    def _decided(self, hypotheses: Hypotheses, result: BundleResult) -> bool:
+        """True if depths and direction are known, however little parallax there is: at the noise
+        that matches are known to have, not that of the few that are left, and without a rival."""
+        worse = max(self._config.sigma_px / result.residual_px, 1.0)
+        seen = np.any([frame.observed for frame in self.waiting], axis=0)
+        relative = worse * result.rho_sigma[seen] / np.maximum(result.bundle.rho[seen], 1e-6)
+        known = float(np.median(relative)) <= self._config.max_depth_sigma
+        return known and not hypotheses.ambiguous
 
     @property
     def _pixels_reference(self) -> Array:
