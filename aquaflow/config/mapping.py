@@ -201,7 +201,7 @@ class OptimiserConfig(StageConfig):
         0.2, ge=0, le=1, description="steps on the newest view (ARTDECO)"
     )
     refine_steps: int = Field(
-        1000, ge=0, description="steps after the last frame (docs/performance.md#refining)"
+        1000, ge=0, description="steps after the last frame (notes/performance.md#refining)"
     )
     refine_seconds: float | None = Field(
         None,

@@ -1,7 +1,7 @@
 """Pose of a frame against a keyframe's pointmap: Levenberg-Marquardt (paper, Eq. 3).
 
 Scale is held at 1 inside a keyframe, because a free scale shrinks at every link
-(docs/measurements.md#pose-solver); between keyframes it may be freed.
+(notes/measurements.md#pose-solver); between keyframes it may be freed.
 """
 
 from __future__ import annotations
