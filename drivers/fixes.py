@@ -61,7 +61,7 @@ class Fixes:
         return [Position(t_ns, arrival_ns, source, *place, sigma_m)]
 
 
-def moved(fix: Position, north_m: float, east_m: float) -> Position:
+def move(fix: Position, north_m: float, east_m: float) -> Position:
     """The fix of a point that lies ``north_m`` and ``east_m`` away, a few metres at most."""
     if abs(fix.latitude_deg) > ARM_LATITUDE_DEG:
         return fix

@@ -53,7 +53,7 @@ def units_of(data: bytes) -> Units:
     return [unit for unit in START.split(data) if unit]
 
 
-def decoded(
+def decode(
     pictures: Iterator[tuple[Label, Units]],
 ) -> Generator[tuple[Label, npt.NDArray[np.uint8] | None], None, None]:
     """Each label with its picture [H, W, 3] BGR; None where the bytes make none, or need an earlier
@@ -154,7 +154,9 @@ class _Flv(io.BufferedIOBase, Generic[Label]):
         configured = self._configured(units, number)
         if not self._parameters:
             return b""
-        return configured + _tag(number, PICTURE[_has(units, KEY_PICTURE)] + _sized(units))
+        return configured + _tag(
+            number, PICTURE[_has(units, KEY_PICTURE)] + _length_prefixed(units)
+        )
 
     def _configured(self, units: Units, number: int) -> bytes:
         """What precedes a picture that brings parameters other than those known."""
@@ -177,7 +179,7 @@ def _has(units: Units, kind: int) -> bool:
     return any(_kind(each) == kind for each in units)
 
 
-def _sized(units: Units) -> bytes:
+def _length_prefixed(units: Units) -> bytes:
     """Each unit after its length."""
     return b"".join(struct.pack(">I", len(unit)) + unit for unit in units)
 

@@ -84,7 +84,7 @@ class FaultyLink:
         if self._happens("drop", self._faults.drop):
             return []
         if self._happens("corrupt", self._faults.corrupt):
-            data = corrupted(data, self._rng)
+            data = corrupt(data, self._rng)
         chunks = [data]
         if self._happens("duplicate", self._faults.duplicate):
             chunks.append(data)
@@ -119,7 +119,7 @@ def faulty(open_link: OpenLink, faults: Faults) -> tuple[OpenLink, Counter[str]]
     return lambda: FaultyLink(open_link(), faults, rng, injected), injected
 
 
-def corrupted(data: bytes, rng: random.Random, share: float = 0.01) -> bytes:
+def corrupt(data: bytes, rng: random.Random, share: float = 0.01) -> bytes:
     """``data`` with a ``share`` of its bytes, at least one, changed."""
     changed = bytearray(data)
     for _ in range(max(1, round(share * len(data)))):

@@ -93,7 +93,7 @@ def _slice(
     between = np.frombuffer(_Bits().golomb(I_PCM).to_bytes(""), np.uint8)
     rest = np.concatenate([np.tile(between, (len(blocks), 1)), blocks], axis=1)
     stop = b"\x80"
-    return _escaped(first) + rest.tobytes()[len(between) :] + stop
+    return _escape(first) + rest.tobytes()[len(between) :] + stop
 
 
 def _blocks(
@@ -122,10 +122,10 @@ def _tiles(
 
 
 def _unit(kind: int, payload: bytes) -> bytes:
-    return bytes([kind]) + _escaped(payload)
+    return bytes([kind]) + _escape(payload)
 
 
-def _escaped(payload: bytes) -> bytes:
+def _escape(payload: bytes) -> bytes:
     """With emulation_prevention_three_byte wherever a start code could be seen (7.4.1)."""
     escaped = bytearray()
     for byte in payload:

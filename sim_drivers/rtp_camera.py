@@ -41,7 +41,7 @@ class Packetizer:
 
     def packets(self, units: Sequence[bytes], t_ns: int) -> list[bytes]:
         """Of one picture that was taken at ``t_ns``; the last is marked."""
-        aggregated = [_aggregated(units[:-1])] if len(units) > 1 else []
+        aggregated = [_aggregate(units[:-1])] if len(units) > 1 else []
         payloads = [*aggregated, *_fragments(units[-1])]
         ticks = t_ns * CLOCK_HZ // 1_000_000_000 & 0xFFFFFFFF
         return [
@@ -68,7 +68,7 @@ def session(port: int, payload_type: int = H264) -> str:
     return "".join(f"{line}\r\n" for line in lines)
 
 
-def _aggregated(units: Sequence[bytes]) -> bytes:
+def _aggregate(units: Sequence[bytes]) -> bytes:
     sized = [struct.pack(">H", len(unit)) + unit for unit in units]
     return bytes([units[0][0] & KEPT_BITS | AGGREGATE]) + b"".join(sized)
 

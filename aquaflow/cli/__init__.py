@@ -119,9 +119,9 @@ def map_command(
     }  # fmt: skip
     optimiser = {"refine_steps": refine_steps, "refine_seconds": refine_seconds}
     mapping = {"optimiser": optimiser, "enabled": False if tracking_only else None}
-    from aquaflow.config.presets import configured
+    from aquaflow.config.presets import load_configured
 
-    settings = configured(
+    settings = load_configured(
         config,
         preset,
         {"seed": seed, "threads": threads, "source": source_settings, "mapping": mapping},
@@ -268,9 +268,9 @@ def doctor(
         findings = examine()
     else:
         from aquaflow.config.vehicle import load_any
-        from aquaflow.doctor.opened import opened
+        from aquaflow.doctor.opened import check_opened
 
-        findings = opened(load_any(config))
+        findings = check_opened(load_any(config))
     if as_json:
         typer.echo(json.dumps(to_json(findings)))
     else:
@@ -290,10 +290,10 @@ def config_command(
     from aquaflow.config import Config
     from aquaflow.config.vehicle import load_any
     from aquaflow.doctor import to_json
-    from aquaflow.doctor.opened import opened
+    from aquaflow.doctor.opened import check_opened
 
     settings = Config() if file is None else load_any(file)
-    values, findings = settings.model_dump(mode="json"), opened(settings)
+    values, findings = settings.model_dump(mode="json"), check_opened(settings)
     if as_json:
         typer.echo(json.dumps({"config": values, "opens": to_json(findings)["findings"]}))
         return

@@ -28,7 +28,7 @@ from aquaflow.config.mapping import (
 from aquaflow.config.pictures import PicturesConfig
 from aquaflow.config.prior import PriorConfig
 from aquaflow.config.source import SourceConfig
-from aquaflow.config.stage import StageConfig, validated
+from aquaflow.config.stage import StageConfig, validate
 from aquaflow.config.tracking import (
     GateConfig,
     GraphConfig,
@@ -88,7 +88,7 @@ def parse_config(data: dict[str, Any], origin: str) -> Config:
     Raises:
         ConfigError: with the path of the first key that is unknown or out of range.
     """
-    return validated(Config, data, origin)
+    return validate(Config, data, origin)
 
 
 def load_config(path: Path, inside: bool = False) -> Config:

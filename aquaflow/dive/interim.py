@@ -149,7 +149,7 @@ class Interim:
 
     def _posed(self) -> DivePoses:
         if self._poses is None:
-            self._poses = posed(self._parts, self._keyframes, self._outputs)
+            self._poses = pose(self._parts, self._keyframes, self._outputs)
         return self._poses
 
     def _numbers(self, gaussians: int) -> dict[str, Any]:
@@ -180,7 +180,7 @@ class Interim:
         }
 
 
-def posed(
+def pose(
     parts: list[Array],  # each [n] FRAME
     keyframes: list[tuple[Sim3, int]],  # pose and sub-map of each
     outputs: MetricOutputs,

@@ -27,7 +27,7 @@ from aquaflow.telemetry.time_offset import (
     NotSynchronisedError,
     TimeOffset,
     offset_of_log,
-    synchronised,
+    synchronise_samples,
 )
 from aquaflow.telemetry.turns import Array, Turns
 from aquaflow.tracking.base.base import Base
@@ -196,7 +196,7 @@ def synchronise(run: DiveRun, telemetry: TelemetryInput) -> dict[str, TimeOffset
                 run.notes.append(str(error))
                 continue
             run.notes.append(in_words(name, offset))
-            for sample in synchronised(samples, offset):
+            for sample in synchronise_samples(samples, offset):
                 run.sample(sample)
             found[name] = offset
     return found

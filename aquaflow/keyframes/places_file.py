@@ -21,7 +21,7 @@ from aquaflow.base.storage.archive import UNREADABLE, open_archive, read_array
 from aquaflow.base.storage.atomic import atomic_write
 from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.keyframes.place import KeyframePlace, KeypointDepths, packed, unpacked
+from aquaflow.keyframes.place import KeyframePlace, KeypointDepths, pack, unpack
 
 Rows = npt.NDArray[Any]
 """A structured array."""
@@ -81,7 +81,7 @@ def write_places(
     rows = []
     with atomic_write(path) as stream, zipfile.ZipFile(stream, "w") as archive:
         for place, seen in places:
-            _add(archive, _name(place.number), packed(seen))
+            _add(archive, _name(place.number), pack(seen))
             rows.append(_row(place))
         index = np.array(rows, PLACE) if rows else np.zeros(0, PLACE)
         there = np.isin(edges["a"], index["number"]) & np.isin(edges["b"], index["number"])
@@ -125,7 +125,7 @@ class PlacesFile:
             InputError: it is damaged.
         """
         camera = self.by_number[number].camera
-        found: KeypointDepths = self._guarded(lambda: unpacked(self._array(_name(number)), camera))
+        found: KeypointDepths = self._guarded(lambda: unpack(self._array(_name(number)), camera))
         return found
 
     def _guarded(self, read: Callable[[], Any]) -> Any:

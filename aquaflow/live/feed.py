@@ -31,7 +31,7 @@ from aquaflow.config.device import MountingConfig
 from aquaflow.live.dive_clock import Continued
 from aquaflow.live.recorder.recorder import Recorder
 from aquaflow.live.recorder.session import HasSamples
-from aquaflow.recordings.playback import Event, Playback, arrived
+from aquaflow.recordings.playback import Event, Playback, delay_event
 from aquaflow.sources import CameraSource, TelemetrySource, mounting_of
 from aquaflow.sources.newest import Newest
 from aquaflow.sources.outbound import AcceptsMessages, OutboundMessage
@@ -400,7 +400,7 @@ class PlaybackFeed(_Pumps):
             if self.closing.is_set():
                 break
             # Moments stay as recorded, so that frames.csv can be compared with a replay's.
-            now = arrived(event, 0, time.monotonic_ns())
+            now = delay_event(event, 0, time.monotonic_ns())
             if isinstance(now, (Frame, Dropped)):
                 self.newest.put(now)
             else:

@@ -17,7 +17,7 @@ from aquaflow.live.feed import Feed
 from aquaflow.live.health.counters import Counters
 from aquaflow.live.health.degradation import DegradationLevel
 from aquaflow.live.health.pressure import Need, Pressure, Shortage
-from aquaflow.live.health.state import Facts, Judgement, ServiceState, judged
+from aquaflow.live.health.state import Facts, Judgement, ServiceState, judge
 from aquaflow.live.map_thread import MapThread
 from aquaflow.live.service_health import ServiceHealth
 from aquaflow.tracking.frames import FrameClass, Tracked
@@ -203,7 +203,7 @@ class LiveLoop:
         with contain("health state"):
             paused = self.control.paused
             self.health.set(
-                *(Judgement(ServiceState.PAUSED, PAUSED) if paused else judged(self._facts()))
+                *(Judgement(ServiceState.PAUSED, PAUSED) if paused else judge(self._facts()))
             )
         self.tell_watchers()
         with contain("notification of systemd"):

@@ -66,7 +66,7 @@ class PlanView:
         for keyframe in list(slam.keyframes.keyframes):  # tracking appends to it meanwhile
             centres.setdefault(keyframe.sub_map, []).append(keyframe.T_wc.t)
         plans = {
-            number: _SubMapPlan(slam.metric_frame(number), _thinned(own))
+            number: _SubMapPlan(slam.metric_frame(number), _thin(own))
             for number, own in sorted(centres.items())
         }
         now = None
@@ -111,7 +111,7 @@ class _SubMapPlan:
         }
 
 
-def _thinned(
+def _thin(
     centres: list[Array],  # each [3]
 ) -> Array:
     """[N, 3] at most MOST_POINTS of them, the first and the last among them."""

@@ -15,7 +15,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.mapping.scene import Scene
 from aquaflow.mapping.scene_water import adopt_water, fitting_water
 from aquaflow.render.views import View, in_time
-from aquaflow.water.pauses import finished
+from aquaflow.water.pauses import run_to_end
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ class WaterFitting:
     def at_once(self, views: Sequence[View]) -> None:
         """A whole fit, from its beginning."""
         with self.failures.contain("water fit"):
-            finished(self._fitting(views))
+            run_to_end(self._fitting(views))
         self._end(views)
 
     def moved(self, moves: Mapping[int, Sim3]) -> None:

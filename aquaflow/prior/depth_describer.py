@@ -18,7 +18,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.prior.contract import Float
 from aquaflow.prior.depth_card import NETWORK, UNITS, DepthCard
 from aquaflow.prior.folder import CARD, read_card
-from aquaflow.prior.framing import ImagePadding, as_input, multiple_of, resized
+from aquaflow.prior.framing import ImagePadding, as_input, multiple_of, resize
 from aquaflow.prior.learned_range import LearnedRange, cell_rays
 from aquaflow.prior.network import METRIC_SIGMA, Half, Picture
 from aquaflow.prior.runtime import NetworkSession, RuntimeSettings
@@ -65,7 +65,7 @@ class DepthDescriber:
         if self._frame is not None:
             return self._framing(height, width).framed(image)
         scale, step = (self._pixels / (height * width)) ** 0.5, self._card.multiple_px
-        return resized(image, multiple_of(scale * height, step), multiple_of(scale * width, step))
+        return resize(image, multiple_of(scale * height, step), multiple_of(scale * width, step))
 
     def features(
         self,

@@ -15,7 +15,7 @@ from aquaflow.prior.compact.quantise import INT8_ENCODER
 from aquaflow.prior.contract import Float, RangeUnit
 from aquaflow.prior.depth_describer import DepthDescriber
 from aquaflow.prior.folder import DECODER, ENCODER, read_card
-from aquaflow.prior.framing import as_input, multiple_of, resized
+from aquaflow.prior.framing import as_input, multiple_of, resize
 from aquaflow.prior.learned_range import MOST_LOG, LearnedRange, cell_rays
 from aquaflow.prior.mast3r.describer import Mast3rDescriber
 from aquaflow.prior.network import Describer, Half, Picture, unit
@@ -61,7 +61,7 @@ class CompactDescriber:
         else:
             scale = min((self._pixels / (height * width)) ** 0.5, 1.0)
             height, width = (multiple_of(scale * side, MULTIPLE_PX) for side in (height, width))
-        return resized(image, height, width)
+        return resize(image, height, width)
 
     def features(
         self,

@@ -39,8 +39,8 @@ def differences(folder: Path, settings: RuntimeSettings) -> dict[str, float]:
         InputError: no prior, changed files, or no network of that precision.
         AquaFlowError: the processor or the precision cannot be had.
     """
-    expected = _said(folder, RuntimeSettings(device="cpu", precision="fp32"))
-    found = _said(folder, settings)
+    expected = _run_network(folder, RuntimeSettings(device="cpu", precision="fp32"))
+    found = _run_network(folder, settings)
     return {name: difference(expected[name], found[name], _scale(name)) for name in expected}
 
 
@@ -76,7 +76,7 @@ def difference(
     return float(distance.max()) / max(largest, float(np.finfo(np.float32).tiny))
 
 
-def _said(folder: Path, settings: RuntimeSettings) -> dict[str, Array]:
+def _run_network(folder: Path, settings: RuntimeSettings) -> dict[str, Array]:
     """Outputs by name."""
     card, describer = read_card(folder), describer_in(folder, settings)
     wide = example_picture(card.height, card.width + MOVED_PX)

@@ -181,7 +181,7 @@ class McapCamera:
         topics = {self.topic: "picture"}
         if self._ours:  # elsewhere, topics of these names hold what their makers mean by them
             topics |= {f"{self._base}/{kind}": kind for kind in ("dropped", "exposure", "mask")}
-        for count, message in _numbered(self._messages.of(topics.__contains__), self.topic):
+        for count, message in _number_messages(self._messages.of(topics.__contains__), self.topic):
             kind = topics[message.topic]
             if kind == "mask":
                 mask = compressed_picture(self._payloads.decode(message).data)[..., 0] > 0
@@ -254,7 +254,9 @@ class McapCamera:
         return replace(frame, exposure_s=place.exposure_s, gain=place.gain, mask=place.mask)
 
 
-def _numbered(messages: Iterator[McapMessage], topic: str) -> Iterator[tuple[int, McapMessage]]:
+def _number_messages(
+    messages: Iterator[McapMessage], topic: str
+) -> Iterator[tuple[int, McapMessage]]:
     """Messages with the number of messages of ``topic`` before them."""
     count = 0
     for message in messages:

@@ -74,7 +74,7 @@ def solve(
     covariance = np.diag(prior**2)
     for _ in range(ROUNDS):
         residuals = [factor.residuals(state) for factor in factors]
-        kept = tuple(_gated(f, r) for f, r in zip(factors, residuals, strict=True))
+        kept = tuple(_gate(f, r) for f, r in zip(factors, residuals, strict=True))
         noise = tuple(
             likeliest(f.t_s[k], r[k], f.sigma[k], f.slow)
             for f, r, k in zip(factors, residuals, kept, strict=True)
@@ -212,7 +212,7 @@ def inverse_of(
     return np.asarray(np.outer(root, root) * cho_solve((scaled, True), np.eye(P)))
 
 
-def _gated(
+def _gate(
     factor: Factor,
     r: Array,  # [N, D]
 ) -> Mask:

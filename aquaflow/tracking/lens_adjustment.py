@@ -19,7 +19,7 @@ from aquaflow.tracking.lens_equations import (
     LensUnknowns,
     Weighting,
     residuals,
-    triangulated,
+    triangulate,
 )
 
 ROUNDS = 4
@@ -70,7 +70,7 @@ def adjust_lens(
     sigmas: list[float] = []
     weighting = Weighting(1.0, np.zeros(0, dtype=bool))
     for number in range(ROUNDS):
-        state = replace(state, rho=triangulated(observations, state))
+        state = replace(state, rho=triangulate(observations, state))
         size = np.linalg.norm(residuals(observations, state), axis=-1)
         ahead = state.rho[observations.point] > 0.0
         sigma = _sigma(size[ahead])

@@ -13,7 +13,7 @@ from aquaflow.geometry.camera import CameraModel
 from aquaflow.geometry.similarity import Sim3
 from aquaflow.keyframes import Pointmap
 from aquaflow.prior.contract import Encoding, PairGeometry, Prior
-from aquaflow.tracking.initialisation.initialiser import Initialiser, calibrated, fused_pointmap
+from aquaflow.tracking.initialisation.initialiser import Initialiser, calibrate, fused_pointmap
 from aquaflow.tracking.learned.fusion import add_learned
 from aquaflow.tracking.learned.scaling import LearnedDepth, agreement, unscaled_depth
 from aquaflow.tracking.pose.problem import pose_problem
@@ -127,7 +127,7 @@ class MapStart:
         solution = initialiser.solve()
         if solution is None:
             return None
-        reference, camera = initialiser.frame, calibrated(solution.camera)
+        reference, camera = initialiser.frame, calibrate(solution.camera)
         encoding = self._prior.encode(reference.image, camera, reference.mask)
         pointmap = fused_pointmap(solution, camera, self._config.sigma_px)
         pair = max(solution.waiting, key=lambda waiting: waiting.parallax_px).pair
@@ -191,7 +191,7 @@ def learned_start(
     depth_b = unscaled_depth(camera, pair.X_b, pair.Q_b)
     if depth_a is None or depth_b is None or _sigma(depth_a) > config.learned.start_sigma:
         return None
-    estimate, honesty = _posed(pair, camera, depth_a, depth_b, config)
+    estimate, honesty = _pose(pair, camera, depth_a, depth_b, config)
     if estimate is None or estimate.inlier_share < config.initialisation.min_explained:
         return None
     honest = unscaled_depth(camera, pair.X_a, pair.Q_a, max(honesty, 1.0))
@@ -205,7 +205,7 @@ def _sigma(depth: LearnedDepth) -> float:
     return float(np.sqrt(np.median(depth.variance[depth.known])))
 
 
-def _posed(
+def _pose(
     pair: PairGeometry,
     camera: CameraModel,
     depth_a: LearnedDepth,

@@ -26,7 +26,7 @@ from aquaflow.tracking.loops.relocaliser import Places
 from aquaflow.tracking.map_start import MapStart, NewMap
 from aquaflow.tracking.pose.matcher import Matched
 from aquaflow.tracking.repairs import LastFrame, Repairs
-from aquaflow.tracking.revisits import revisited
+from aquaflow.tracking.revisits import find_revisit
 from aquaflow.tracking.waiting_frames import Wait, WaitingFrames
 from aquaflow.types import Frame
 
@@ -282,7 +282,7 @@ class Tracker:
             return None
         self._joined.add(pair)
         pointmap, _ = self._keyframe_tracker.pointmap(at, solved, camera)
-        return revisited(at, solved, back, solved_back, pointmap)
+        return find_revisit(at, solved, back, solved_back, pointmap)
 
     # --- loss -----------------------------------------------------------------------------------
 

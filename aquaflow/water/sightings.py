@@ -51,7 +51,7 @@ def sighting(
 ) -> Generator[None, None, Observations]:
     """Observations of a random choice of the surface that several of the pictures, at least one,
     show; with pauses."""
-    places, ranges = _drawn(pictures, random)
+    places, ranges = _draw(pictures, random)
     yield
     samples, sigma = _patches(pictures, places, ranges)
     yield
@@ -60,7 +60,7 @@ def sighting(
     seen = np.isfinite(ranges) & whole_patches[:, None]
     for number, picture in enumerate(pictures):
         own = np.nonzero(seen[:, number])[0]
-        *found, whole = _observed(picture, samples[own], sigma[own])
+        *found, whole = _observe(picture, samples[own], sigma[own])
         for table, values in zip((colour, z, xy), found, strict=True):
             table[own, number] = values
         seen[own, number] = whole
@@ -74,7 +74,7 @@ def sighting(
     )
 
 
-def _drawn(pictures: Sequence[PosedPicture], random: np.random.Generator) -> tuple[Array, Array]:
+def _draw(pictures: Sequence[PosedPicture], random: np.random.Generator) -> tuple[Array, Array]:
     """Places [P, 3] in the world, and their range [P, V] in the views that are used; inf in
     others."""
     each = -(-CANDIDATES // max(len(pictures), 1))
@@ -132,7 +132,7 @@ def _patches(
     return samples, sigma
 
 
-def _observed(
+def _observe(
     picture: PosedPicture,
     samples: Array,  # [N, K, 3] world
     sigma: Array,  # [N] map units

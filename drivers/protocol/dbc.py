@@ -14,7 +14,7 @@ from aquaflow.config.can_devices import DbcConfig, DbcSignal
 from aquaflow.drivers.fixes import Fixes, sigma_of
 from aquaflow.drivers.protocol.can_records import CanFraming, frame_of
 from aquaflow.drivers.protocol.packets import PacketDecoder
-from aquaflow.drivers.rotation import Vector, from_euler, normalised
+from aquaflow.drivers.rotation import Vector, from_euler, normalise
 from aquaflow.types import (
     Acceleration,
     Altitude,
@@ -116,9 +116,7 @@ def _in_body(mapping: DbcSignal, scaled: list[float], t_ns: int, source: str) ->
     if mapping.sample == "euler":
         return Attitude(t_ns, t_ns, source, from_euler(*scaled))
     if mapping.sample == "attitude":
-        return Attitude(
-            t_ns, t_ns, source, normalised((scaled[0], scaled[1], scaled[2], scaled[3]))
-        )
+        return Attitude(t_ns, t_ns, source, normalise((scaled[0], scaled[1], scaled[2], scaled[3])))
     if mapping.sample in VECTORS:
         return VECTORS[mapping.sample](t_ns, t_ns, source, (scaled[0], scaled[1], scaled[2]))
     return SCALARS[mapping.sample](t_ns, t_ns, source, scaled[0])

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from aquaflow.config.telemetry import MavlinkConfig
 from aquaflow.drivers.fixes import Fixes, sigma_of
-from aquaflow.drivers.rotation import Quaternion, from_euler, inverse, normalised, rotate
+from aquaflow.drivers.rotation import Quaternion, from_euler, inverse, normalise, rotate
 from aquaflow.types import (
     Acceleration,
     Altitude,
@@ -108,7 +108,7 @@ class MavlinkSamples:
         )
 
     def _quaternion(self, message: Any, stamp: MessageTime) -> Samples:
-        q = normalised((message.q1, message.q2, message.q3, message.q4))
+        q = normalise((message.q1, message.q2, message.q3, message.q4))
         return self._orientation(q, message, stamp)
 
     def _orientation(self, q: Quaternion, message: Any, stamp: MessageTime) -> Samples:

@@ -23,7 +23,7 @@ from aquaflow.drivers.protocol.vectornav_frames import (
     fields_of,
     line_of,
 )
-from aquaflow.drivers.rotation import from_euler, normalised
+from aquaflow.drivers.rotation import from_euler, normalise
 from aquaflow.types import Acceleration, AngularRate, Attitude, TelemetrySample, UtcTime
 
 STARTUP = (Field(1, 0), Field(2, 0))
@@ -144,7 +144,7 @@ def _utc(fields: Fields, t_ns: int, arrival_ns: int, source: str) -> Samples:
 
 def _quaternion(xyzw: Numbers, t_ns: int, arrival_ns: int, source: str) -> Samples:
     x, y, z, w = xyzw
-    return [Attitude(t_ns, arrival_ns, source, normalised((w, x, y, z)))]
+    return [Attitude(t_ns, arrival_ns, source, normalise((w, x, y, z)))]
 
 
 def _angles(degrees: Numbers, t_ns: int, source: str) -> Samples:

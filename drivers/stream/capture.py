@@ -15,7 +15,7 @@ from aquaflow.drivers.ffmpeg import rgb_of
 from aquaflow.drivers.jpeg import jpeg_to_rgb
 from aquaflow.drivers.stream.address import for_logs, is_at_a_port
 from aquaflow.drivers.stream.ages import Ages
-from aquaflow.drivers.stream.ffmpeg import OPEN_TIMEOUT_S, format_of, opened
+from aquaflow.drivers.stream.ffmpeg import OPEN_TIMEOUT_S, format_of, open_capture
 from aquaflow.types import CameraModel, EncodedPicture
 
 MOTION_JPEG = "MJPG"
@@ -43,7 +43,7 @@ class StreamCapture:
         self._stale = ""
         self._damaged = 0
         self._grabbed = False
-        self._capture = opened(source, config)
+        self._capture = open_capture(source, config)
         if not self._capture.isOpened() or not self._has_size():
             self.close()
             raise ConnectionError(f"no video from {for_logs(config.url)}{_advice(config)}")

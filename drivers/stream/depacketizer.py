@@ -112,7 +112,7 @@ class Depacketizer:
         if 0 < kind <= LARGEST_WHOLE:
             self._picture.units.append(payload)
         elif kind == AGGREGATE:
-            self._picture.units += _aggregated(payload)
+            self._picture.units += _aggregate(payload)
         elif kind == FRAGMENT and len(payload) > 2:
             self._join(payload)
         else:
@@ -132,7 +132,7 @@ class Depacketizer:
             self._fragments.clear()
 
 
-def _aggregated(payload: bytes) -> Units:
+def _aggregate(payload: bytes) -> Units:
     units, at = [], 1
     while at + 2 < len(payload):
         (size,) = struct.unpack_from(">H", payload, at)

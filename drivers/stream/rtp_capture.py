@@ -15,7 +15,7 @@ from aquaflow.drivers.h264 import (
     SEQUENCE_PARAMETERS,
     TYPE_BITS,
     Units,
-    decoded,
+    decode,
 )
 from aquaflow.drivers.stream.ages import Ages
 from aquaflow.drivers.stream.depacketizer import Depacketizer, ReceivedPicture
@@ -47,7 +47,7 @@ class RtpCapture:
         self.format = f"H264 in RTP on UDP port {session.port.number}"
         self._depacketizer = Depacketizer(session.payload_type(first))
         self._ages = Ages(name, config)
-        self._pictures = decoded(self._received(first))
+        self._pictures = decode(self._received(first))
 
     def read(self, timeout_s: float) -> RawPicture | None:
         """The next picture; waits up to the configured stall time for its packets.

@@ -265,7 +265,7 @@ def report_of(dialect: Any, message: Any, template: Report) -> dict[str, Any]:
         key = "mavtype" if name == "type" else name
         if key in template:
             names = dialect.enums.get(message.fieldenums_by_name.get(name), {})
-            body[key] = _written(getattr(message, name), template[key], names)
+            body[key] = _write_value(getattr(message, name), template[key], names)
     header = message.get_header()
     sender = {"system_id": header.srcSystem, "component_id": header.srcComponent}
     return {"header": {**sender, "sequence": header.seq}, "message": body}
@@ -287,13 +287,13 @@ def _binary(dialect: Any, value: Any, kind: str) -> Any:
     return value
 
 
-def _written(value: Any, form: Any, names: Mapping[int, Any]) -> Any:
+def _write_value(value: Any, form: Any, names: Mapping[int, Any]) -> Any:
     """A field's value in the form of ``form``; ``names`` are those of its enumeration."""
     if isinstance(form, list):
         if isinstance(value, str | bytes):
             text = value if isinstance(value, str) else value.decode("ascii", "replace")
             return list(text.ljust(len(form), "\0"))
-        return [_written(each, 0, names) for each in value]
+        return [_write_value(each, 0, names) for each in value]
     if isinstance(form, dict):
         return {"bits": value} if "bits" in form else {"type": names[value].name}
     if isinstance(form, str):

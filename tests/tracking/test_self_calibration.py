@@ -10,9 +10,9 @@ from aquaflow.geometry.camera import CameraModel, guess_camera
 from aquaflow.geometry.lens_error import LENS_PRIOR_SIGMA
 from aquaflow.geometry.similarity import Sim3, so3_exp
 from aquaflow.prior.contract import Keypoints
-from aquaflow.tracking.lens_matches import MIN_PAIR_MATCHES, LensView, matched
+from aquaflow.tracking.lens_matches import MIN_PAIR_MATCHES, LensView, match_pixels
 from aquaflow.tracking.lens_views import LAST_SPACING, MOST_VIEWS, LensViews, motion
-from aquaflow.tracking.self_calibration import MIN_VIEWS, estimated, found_lens, pairs_of
+from aquaflow.tracking.self_calibration import MIN_VIEWS, estimate, found_lens, pairs_of
 from tests.tracking.lens_scenes import swim
 
 GUESS = guess_camera(480, 360)
@@ -23,7 +23,7 @@ NOTHING = Keypoints(np.zeros((0, 2), np.float32), np.zeros((0, 4), np.float32))
 def test_focal_length_and_distortion_are_found_from_a_guess_far_off(
     lens: tuple[float, float],
 ) -> None:
-    found = estimated(*swim(lens, views=10, reach=4))
+    found = estimate(*swim(lens, views=10, reach=4))
 
     assert found.known
     error = found.lens[:2] - lens
@@ -36,14 +36,14 @@ def test_focal_length_and_distortion_are_found_from_a_guess_far_off(
 def test_the_stated_sigma_is_the_spread() -> None:
     errors = []
     for seed in range(12):
-        found = estimated(*swim((0.05, 0.05), turning=0.03, views=8, seed=seed, reach=4))
+        found = estimate(*swim((0.05, 0.05), turning=0.03, views=8, seed=seed, reach=4))
         errors.append((found.lens[:2] - 0.05) / found.sigma)
 
     assert 0.3 < np.sqrt(np.mean(np.square(errors))) < 1.5
 
 
 def test_sideways_motion_over_a_plane_leaves_the_guess_and_says_so() -> None:
-    found = estimated(*swim((0.1, 0.0), turning=0.0, relief=0.0, views=8))
+    found = estimate(*swim((0.1, 0.0), turning=0.0, relief=0.0, views=8))
 
     assert not found.known
     assert abs(found.lens[0]) < 2.0 * LENS_PRIOR_SIGMA[0]
@@ -75,7 +75,9 @@ def test_pictures_of_different_places_do_not_match() -> None:
     other = rng.normal(size=(400, 64))
     other[: MIN_PAIR_MATCHES - 1] = seen[: MIN_PAIR_MATCHES - 1]
 
-    found = matched([view(pixels, seen), view(pixels, seen), view(pixels, other)], [(0, 1), (0, 2)])
+    found = match_pixels(
+        [view(pixels, seen), view(pixels, seen), view(pixels, other)], [(0, 1), (0, 2)]
+    )
 
     assert found is None or set(found.view) == {1}
 

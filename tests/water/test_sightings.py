@@ -12,7 +12,7 @@ from aquaflow.geometry.similarity import Sim3
 from aquaflow.render.views import View
 from aquaflow.water import sightings
 from aquaflow.water.observations import Observations
-from aquaflow.water.pauses import finished
+from aquaflow.water.pauses import run_to_end
 from aquaflow.water.posed_picture import PosedPicture
 from aquaflow.water.sightings import MIN_VIEWS, MOST_VIEWS, POINTS, sighting
 
@@ -48,7 +48,7 @@ def wall_picture(
 
 
 def looked(pictures: list[PosedPicture]) -> Observations:
-    return finished(sighting(pictures, np.random.default_rng(0)))
+    return run_to_end(sighting(pictures, np.random.default_rng(0)))
 
 
 def test_a_patch_has_the_same_colour_from_near_and_far() -> None:

@@ -6,7 +6,7 @@ import torch
 
 from aquaflow.lab.synthetic.texture import MipAtlas
 
-__all__ = ["laid"]
+__all__ = ["lay"]
 
 JOINT_SHARE = 0.05
 """Width of a joint over the edge of a tile."""
@@ -18,7 +18,7 @@ APART = (67.3, 41.9)
 """Texels between what neighbouring tiles read of the texture, so that their tints differ."""
 
 
-def laid(
+def lay(
     paint: torch.Tensor,  # [3, N] albedo of the glaze
     texture: MipAtlas,  # noise of unit variance in its first channel
     u: torch.Tensor,  # [N] m on the surface

@@ -20,7 +20,7 @@ from aquaflow import __version__
 from aquaflow.base.clocks.device import Learned
 from aquaflow.base.errors import InputError
 from aquaflow.dive.run import DiveRun
-from aquaflow.geometry.arrays import Arrays, of_sim3, prefixed, to_sim3, under
+from aquaflow.geometry.arrays import Arrays, add_prefix, of_sim3, to_sim3, under
 from aquaflow.live.checkpoint import tracking
 from aquaflow.live.checkpoint.generations import (
     FORMAT,
@@ -103,7 +103,7 @@ class Checkpointer:
         moment = replace(ClockReading.now(), dive_shift_ns=self._shift_ns())
         head = {"format": FORMAT, "version": __version__, "moment": moment.to_json()}
         head |= {"tracking": facts, "clocks": self._clocks()}
-        arrays = prefixed("tracking", arrays)
+        arrays = add_prefix("tracking", arrays)
 
         def write(maps: OwnedMaps, lacking: list[MapCorrection]) -> None:
             self._write(maps, lacking, head, arrays, files)
@@ -126,7 +126,7 @@ class Checkpointer:
             facts["lacking"], more = serialise_corrections(lacking)
             own |= more
             bring_to_disk([*files, self._dive / TELEMETRY, *maps.save_pictures()])
-            write_state(self._dive, head | {"mapping": facts}, arrays | prefixed("mapping", own))
+            write_state(self._dive, head | {"mapping": facts}, arrays | add_prefix("mapping", own))
             self.taken += 1
             self.size_bytes = state_file(self._dive).stat().st_size
         except (InputError, OSError) as error:

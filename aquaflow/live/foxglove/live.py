@@ -14,7 +14,7 @@ from aquaflow.dive.ros import messages, topics
 from aquaflow.dive.ros.frames import MAP, OPTICAL, FrameTree
 from aquaflow.dive.views import LOOK_S, DisplayThread, DiveView, RunningDive
 from aquaflow.geometry.similarity import Sim3
-from aquaflow.live.foxglove.map_moment import MapMoment, cloud_of, taken, water_status
+from aquaflow.live.foxglove.map_moment import MapMoment, cloud_of, take_map_moment, water_status
 from aquaflow.live.foxglove.server import FoxgloveServer
 from aquaflow.live.report import GOOD
 from aquaflow.mapping.work import OwnedMaps
@@ -119,7 +119,7 @@ class LiveFoxglove(DiveView):
         self._asked = False
         mapper = maps.mappers.get(sub_map)
         if mapper is not None and mapper.views and len(mapper.gaussians):
-            self._maps.put(taken(mapper, sub_map, frame, points, drawn))
+            self._maps.put(take_map_moment(mapper, sub_map, frame, points, drawn))
 
     # --- in the thread of its own -----------------------------------------------------------------
 

@@ -24,7 +24,7 @@ from aquaflow.dive.ros.definitions import (
     MESSAGE_ENCODING,
     SCHEMA_ENCODING,
     definition,
-    encoded,
+    encode,
     require_rosbags,
 )
 from aquaflow.dive.ros.topics import OF_FINISHED_DIVES, TYPES
@@ -86,7 +86,7 @@ class FoxgloveServer:
         """Queue a message for every client that has subscribed."""
         wanting = self._wanting(topic)
         if wanting:
-            data = encoded(message)
+            data = encode(message)
             for client, subscription in wanting:
                 client.put(MESSAGE_HEADER.pack(MESSAGE_DATA, subscription, t_ns), data)
 

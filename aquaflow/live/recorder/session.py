@@ -10,7 +10,7 @@ from typing import Protocol, TypeAlias, runtime_checkable
 
 from aquaflow.base.errors import AquaFlowError
 from aquaflow.live.recorder.recorder import Recorder
-from aquaflow.recordings.playback import Event, Playback, arrival_of, arrived
+from aquaflow.recordings.playback import Event, Playback, arrival_of, delay_event
 from aquaflow.sources import CameraSource, RawTap, TelemetrySource
 from aquaflow.sources.wall_clock import WallClock
 from aquaflow.types import Dropped, Frame, TelemetrySample
@@ -78,7 +78,7 @@ class RecordingSession:
                     return
                 now_ns = time.monotonic_ns()
                 shift_ns = now_ns - arrival_of(event) if shift_ns is None else shift_ns
-                self._hand_over(name, arrived(event, shift_ns, now_ns))
+                self._hand_over(name, delay_event(event, shift_ns, now_ns))
 
         try:
             self.recorder.mounted(name, playback.stated_mounting())

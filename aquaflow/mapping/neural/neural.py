@@ -217,7 +217,7 @@ class NeuralGaussians:
         if abs(size / self.groups.size - 1.0) <= OTHER_SIZE:
             return
         self.settle()
-        self.field.groups = resized(self.groups, self.gaussians.means, size)
+        self.field.groups = resize(self.groups, self.gaussians.means, size)
         self.optimisers.renew_shared()
         self.optimisers.bind()
 
@@ -240,7 +240,7 @@ class NeuralGaussians:
         optimisers.forget_gradients()
         whole = is_whole(self.groups, count)
         if not whole:
-            self.field.groups = regrouped(self.groups, self.gaussians.means)
+            self.field.groups = regroup(self.groups, self.gaussians.means)
         if not whole or len(optimisers.shared.steps) != len(self.groups):
             optimisers.renew_shared()
         if len(optimisers.local.steps) != count:
@@ -273,12 +273,12 @@ def is_whole(
     return listed and torch.equal(taken, groups.fill) and int(taken.sum()) == count
 
 
-def regrouped(
+def regroup(
     groups: VoxelGroups,
     means: Tensor,  # [N, 3] of all Gaussians
 ) -> VoxelGroups:
     """All Gaussians placed anew; a voxel's first group keeps the feature known of that voxel."""
-    new = _placed(groups, means, groups.size)
+    new = _place(groups, means, groups.size)
     known: dict[int, Tensor] = {}
     for voxel, feature in zip(groups_out(groups.voxel), groups.features, strict=False):
         known.setdefault(voxel, feature)
@@ -289,20 +289,20 @@ def regrouped(
     return new
 
 
-def resized(
+def resize(
     groups: VoxelGroups,
     means: Tensor,  # [N, 3] of all Gaussians
     size: float,
 ) -> VoxelGroups:
     """All Gaussians in voxels of ``size`` map units; a new group takes over the feature that its
     first Gaussian's had."""
-    new = _placed(groups, means, size)
+    new = _place(groups, means, size)
     if len(new):
         new.features.copy_(groups.features[groups.group[new.table[:, 0]]])
     return new
 
 
-def _placed(
+def _place(
     groups: VoxelGroups,
     means: Tensor,  # [N, 3]
     size: float,

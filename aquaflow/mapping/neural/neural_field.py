@@ -9,7 +9,7 @@ from torch import Tensor
 
 from aquaflow.config.mapping import DecoderConfig
 from aquaflow.mapping.gaussians.gaussians import GaussianMap
-from aquaflow.mapping.neural.decode import decoded, decoded_torch
+from aquaflow.mapping.neural.decode import decode, decoded_torch
 from aquaflow.mapping.neural.decoder import Decoder, Trunk
 from aquaflow.mapping.neural.observation import observation
 from aquaflow.mapping.neural.tokens import Tokens, visible_tokens
@@ -78,7 +78,7 @@ class NeuralField:
     ) -> dict[str, Tensor]:
         """The parameters as the camera of ``viewmat`` sees them; differentiable."""
         centre, places = camera_centre(viewmat), trunk.tokens.places(seen)
-        return decoded(self.decoder, trunk, parameters, places, centre, self.threads)
+        return decode(self.decoder, trunk, parameters, places, centre, self.threads)
 
     @torch.no_grad()
     def baked(

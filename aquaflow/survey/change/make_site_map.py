@@ -62,7 +62,7 @@ def make_site_map(site: Path, component: int | None, work: Path, progress: Progr
         raise InputError(f"component {chosen} of {site} has nothing to make a map of: {reasons}")
     parts = combine(days)
     stated = [
-        _stated(part, main, merged.fingerprints[main.dive])
+        _site_map_part(part, main, merged.fingerprints[main.dive])
         for part, main in zip(parts, placed, strict=True)
     ]
     write_site_map(site, chosen, stated, [part.gaussians for part in parts])
@@ -78,7 +78,7 @@ def _day(folder: Path, placed: PlacedSubMap, work: Path, progress: Progress) -> 
     return DayMap(placed.dive, gaussians.transformed(placed.T_sn), views)
 
 
-def _stated(part: Part, placed: PlacedSubMap, fingerprint: str) -> SiteMapPart:
+def _site_map_part(part: Part, placed: PlacedSubMap, fingerprint: str) -> SiteMapPart:
     return SiteMapPart(
         part.name, fingerprint, placed.T_sn.matrix.tolist(), len(part.gaussians.means),
         part.gone, part.replaced, list(part.gains),

@@ -194,11 +194,11 @@ class SubMapCoverage:
         then = Sim3Batch.of([layer.drawn[n][1] for n in numbers])
         depths = np.array([self._seen[n][0].depth for n in numbers])
         probes = depths[:, None, None] * PROBES
-        shift = _applied(now, probes) - _applied(then, probes)
+        shift = _apply(now, probes) - _apply(then, probes)
         return np.asarray(np.linalg.norm(shift, axis=2).max(axis=1) / layer.frame.cell)
 
 
-def _applied(
+def _apply(
     poses: Sim3Batch,
     points: Array,  # [K, 3, 3] three of each
 ) -> Array:

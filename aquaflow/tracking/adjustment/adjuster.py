@@ -30,7 +30,7 @@ from aquaflow.tracking.adjustment.anchored_points import (
 from aquaflow.tracking.adjustment.joint import adjust
 from aquaflow.tracking.adjustment.window import (
     MeasuredLink,
-    copied,
+    copy,
     improvement_of,
     poses_at,
     problem_of,
@@ -176,7 +176,7 @@ class Adjuster:
         pairs: Sequence[tuple[int, int]],
         certain: bool,
     ) -> AdjustmentJob:
-        points = {n: copied(self._points[n]) for n in numbers if n in self._points}
+        points = {n: copy(self._points[n]) for n in numbers if n in self._points}
         links = {n: self._links[n] for n in numbers if n in self._links}
         views = {n: self._view(n) for n in {n for pair in pairs for n in pair}}
         found = [(views[a], views[b]) for a, b in pairs]

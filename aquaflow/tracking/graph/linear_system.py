@@ -46,7 +46,7 @@ class LinearSystem:
         columns = np.concatenate([self._own, self._b, self._a])
         try:
             self._factor = splu(
-                _assembled(blocks, rows, columns, len(self._own)),
+                _assemble(blocks, rows, columns, len(self._own)),
                 permc_spec="NATURAL",
                 diag_pivot_thresh=0.0,
                 options={"SymmetricMode": True},
@@ -110,7 +110,7 @@ def _ordering(
     return np.asarray(factor.perm_c, dtype=np.intp)
 
 
-def _assembled(
+def _assemble(
     blocks: Array,  # [B, 7, 7]
     rows: Index,  # [B] of blocks
     columns: Index,  # [B] of blocks

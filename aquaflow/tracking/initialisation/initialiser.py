@@ -174,7 +174,7 @@ class Initialiser:
         return np.stack([columns + 0.5, rows + 0.5], -1)
 
 
-def calibrated(camera: CameraModel) -> CameraModel:
+def calibrate(camera: CameraModel) -> CameraModel:
     """The same camera, no longer a guess."""
     return replace(camera, calibrated=True)
 

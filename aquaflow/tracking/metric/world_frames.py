@@ -21,7 +21,7 @@ from aquaflow.tracking.frame_table import FrameTable
 from aquaflow.tracking.graph.pose_graph import solve
 from aquaflow.tracking.graph.table import GraphResult, Snapshot
 from aquaflow.tracking.metric.sightings import LengthSightings
-from aquaflow.tracking.metric.straightening import estimates_of, straightened
+from aquaflow.tracking.metric.straightening import estimates_of, straighten
 from aquaflow.tracking.metric.survey import TrackingSnapshot, sampled_points
 from aquaflow.tracking.metric.world_edges import World
 from aquaflow.types import TelemetrySample
@@ -145,7 +145,7 @@ class WorldFrames:
 
         def together(better: Snapshot) -> GraphResult:
             with self._failures.contain("telemetry in the keyframe graph"):
-                solved = straightened(better, replace(survey, nodes=better.nodes), t_s, bases)
+                solved = straighten(better, replace(survey, nodes=better.nodes), t_s, bases)
                 self._solved = solved.frames
                 return solved.result
             return solve(better)  # what telemetry cannot do must not cost the loops

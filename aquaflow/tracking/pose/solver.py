@@ -86,7 +86,7 @@ def solve_pose(
         step = _damped_step(H, g, damping)
         if step is None:
             return None
-        candidate = _moved(T, step)
+        candidate = _move(T, step)
         new_H, new_g, new_cost = equations.at(candidate)
         still = stop_converged and float(step @ H @ step) < STOP_SIGMAS**2
         if not np.isfinite(new_cost) or new_cost > cost * (1.0 + SLACK):
@@ -127,7 +127,7 @@ def _equations(matches: Matches, residual: PoseResidual) -> RowEquations | Pixel
     return PixelEquations(library, matches, HUBER)
 
 
-def _moved(
+def _move(
     T: Sim3,
     step: Array,  # [6 or 7]
 ) -> Sim3:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from aquaflow.lab.bench.meter import meter_of
-from aquaflow.lab.bench.render.timing import Clock, interleaved, spread_of, torch_threads
+from aquaflow.lab.bench.render.timing import Clock, interleave, spread_of, torch_threads
 from aquaflow.render.adam import SelectiveAdam
 from aquaflow.render.contract import CPU
 from aquaflow.render.photometric import photometric_loss
@@ -127,7 +127,7 @@ def time_parts(
 
     for part in parts:
         part.timed(clock)
-    results = interleaved([job(part) for part in parts], repeats)
+    results = interleave([job(part) for part in parts], repeats)
     return [_row(part, samples) for part, samples in zip(parts, results, strict=True)]
 
 

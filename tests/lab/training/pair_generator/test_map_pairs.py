@@ -23,7 +23,7 @@ from aquaflow.lab.training.pair_generator.map_pairs import (
 )
 from aquaflow.lab.training.pair_generator.mapped_scene import MappedScene
 from aquaflow.lab.training.pair_generator.stored_pairs import SHARD
-from aquaflow.lab.training.pairs import Pair, joined
+from aquaflow.lab.training.pairs import Pair, join
 from tests.lab.training.small_maps import small_dive
 from tests.mapping.mapping_scenes import FLOOR_M, path, pose
 
@@ -55,7 +55,7 @@ def pair(scene: MappedScene) -> Pair:
     """Some that the map covers."""
     draw = Draw(3)
     drawn = [drawn_pair(draw, scene, WIDTH, HEIGHT) for _ in range(24)]
-    return joined([each for each in drawn if each is not None])
+    return join([each for each in drawn if each is not None])
 
 
 def level_K(focal_px: float) -> torch.Tensor:
